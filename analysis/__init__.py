@@ -1,0 +1,1 @@
+"""What the records mean: differentiation, regressor rows, coupled identification, validation."""

@@ -1,0 +1,1 @@
+"""Bytes on a wire to blocks of SI samples, behind one interface (`drivers.base`)."""

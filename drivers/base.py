@@ -1,0 +1,107 @@
+"""The one interface between a bench and any device: outputs to valves, blocks of samples back.
+
+The device owns the sample clock. It evaluates one output law per joint at every tick,
+
+    v = clip(gain wave[(tick - start) mod period] + bias + position_gain (setpoint - s), +-limit)
+
+so that waveforms are device-timed, and streams what it measured as numbered blocks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class DeviceError(Exception):
+    """The device answered garbage, refused a command, or is not the one described."""
+
+
+class DeviceLost(DeviceError):
+    """The device does not answer any more (or never did)."""
+
+
+@dataclass(frozen=True)
+class DeviceInfo:
+    """Who answered: identity, size and clock of the device."""
+
+    identity: str
+    joints: int
+    channels: int
+    sample_rate: float
+    block_samples: int
+    virtual_time: bool
+
+
+@dataclass(frozen=True)
+class OutputLaw:
+    """What one joint's valve output follows; all zeros is a closed valve.
+
+    `gain` scales the uploaded waveform, `bias` [V] is added, `position_gain` [V/m] pulls the
+    piston to `setpoint` [m], `limit` [V] bounds the sum either way.
+    """
+
+    gain: float = 0.0
+    bias: float = 0.0
+    position_gain: float = 0.0
+    setpoint: float = 0.0
+    limit: float = 0.0
+
+
+OFF = OutputLaw()
+
+
+@dataclass(frozen=True)
+class SampleBlock:
+    """Consecutive samples, decoded to SI, in the order of `Rig.recorded`.
+
+    `tick` is the device's sample counter at the first row (an unbroken stream continues by
+    `len(data)`); `data` has shape (n, channels + joints): measured channels, then the commands
+    put out [V]; `saturated` marks samples at an end of their converter's range, same shape as the
+    measured part; `backlog` counts the blocks still waiting in the device; `tripped` says that
+    the device itself has zeroed its outputs (watchdog or fault).
+    """
+
+    sequence: int
+    tick: int
+    data: Array
+    saturated: NDArray[np.bool_]
+    backlog: int
+    tripped: bool
+
+
+class Driver(Protocol):
+    """A device behind a wire. Every call raises DeviceLost or DeviceError, nothing else."""
+
+    def connect(self) -> DeviceInfo:
+        """Open the wire, check that the device fits the rig, leave its outputs at zero."""
+
+    def close(self) -> None:
+        """Zero the outputs if the device still answers, then close; never raises."""
+
+    def zero_outputs(self) -> None:
+        """Put every output to zero now, whatever else is going on."""
+
+    def upload(self, joint: int, wave: Array) -> None:
+        """Store one period of joint `joint`'s (0-based) waveform [V], shape (period,)."""
+
+    def apply(self, laws: Sequence[OutputLaw], *, restart: bool = False) -> int:
+        """Set all laws at one tick; `restart` starts the waveforms there. Returns that tick."""
+
+    def start(self) -> None:
+        """Start streaming blocks, sequence and waveform phase anew."""
+
+    def read_block(self) -> SampleBlock:
+        """Return the next block, waiting for it; also feeds the device's watchdog."""
+
+    def stop(self) -> None:
+        """Stop streaming."""
+
+    def reset(self) -> None:
+        """Clear a latched trip of the device; only on a person's word."""

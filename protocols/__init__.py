@@ -1,0 +1,1 @@
+"""What to do on the bench, in what order: lock, excite, repeat."""

@@ -1,0 +1,56 @@
+"""Names and units of what a bench measures (CONTRACT: `spool_i piston_i cap_pressure_i …`).
+
+Glossary: joint i is 1-based in names and 0-based in arrays; `command_i` is the voltage the
+device put out to the valve of joint i, kept beside what was measured.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Final
+
+SPOOL: Final = "spool"
+PISTON: Final = "piston"
+CAP: Final = "cap_pressure"
+ROD: Final = "rod_pressure"
+COMMAND: Final = "command"
+SUPPLY: Final = "supply_pressure"
+TEMPERATURE: Final = "oil_temperature"
+
+JOINT_KINDS: Final = (SPOOL, PISTON, CAP, ROD)
+UNITS: Final[dict[str, str]] = {
+    SPOOL: "V",
+    PISTON: "m",
+    CAP: "Pa",
+    ROD: "Pa",
+    COMMAND: "V",
+    SUPPLY: "Pa",
+    TEMPERATURE: "degC",
+}
+_NAME = re.compile(rf"^(?P<kind>{SPOOL}|{PISTON}|{CAP}|{ROD}|{COMMAND})_(?P<joint>[1-9]\d*)$")
+
+
+def channel(kind: str, joint: int) -> str:
+    """Name the channel of one kind at joint `joint` (1-based): ``channel("spool", 2)``."""
+    return f"{kind}_{joint}"
+
+
+def kind_of(name: str) -> tuple[str, int | None]:
+    """Split a channel's name into (kind, joint or None for the bench); raises ValueError."""
+    if name in (SUPPLY, TEMPERATURE):
+        return name, None
+    match = _NAME.match(name)
+    if match is None:
+        raise ValueError(f"unknown channel {name!r}; expected one like 'cap_pressure_1'")
+    return match["kind"], int(match["joint"])
+
+
+def unit_of(name: str) -> str:
+    """Return the SI unit of a channel's samples; raises ValueError for an unknown name."""
+    return UNITS[kind_of(name)[0]]
+
+
+def measured(joints: int, *, supply: bool, temperature: bool) -> tuple[str, ...]:
+    """List the measured channels in the order every block and file keeps."""
+    names = [channel(kind, i) for i in range(1, joints + 1) for kind in JOINT_KINDS]
+    return (*names, *([SUPPLY] if supply else []), *([TEMPERATURE] if temperature else []))

@@ -1,0 +1,128 @@
+"""YAML text to models: every refusal names the file, the line, the key and what was expected."""
+
+from __future__ import annotations
+
+import re
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, ValidationError
+
+from rig.model.quantity import FROM_FILE, UnitError, parse_quantity
+
+Model = TypeVar("Model", bound=BaseModel)
+Path = tuple[str | int, ...]
+
+
+class InputError(ValueError):
+    """Bad input by the user: the message is one line that says what to do (exit code 2)."""
+
+
+# YAML 1.1 needs a dot in 7e-4 to see a number; people do not.
+_FLOAT = re.compile(r"^[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)$")
+
+
+class _Loader(yaml.SafeLoader):
+    """A safe loader of its own, so that its resolver does not touch the library's."""
+
+
+_Loader.yaml_implicit_resolvers = {
+    key: list(value) for key, value in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+_Loader.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+0123456789."))
+
+
+def _lines(node: yaml.Node, path: Path, found: dict[Path, int], source: str) -> None:
+    found.setdefault(path, node.start_mark.line + 1)
+    if isinstance(node, yaml.MappingNode):
+        seen: set[str] = set()
+        for key, value in node.value:
+            name = str(key.value)
+            line = key.start_mark.line + 1
+            if name in seen:
+                raise InputError(f"{source}:{line}: key {name!r} stands here a second time")
+            seen.add(name)
+            found[(*path, name)] = line
+            _lines(value, (*path, name), found, source)
+    elif isinstance(node, yaml.SequenceNode):
+        for index, value in enumerate(node.value):
+            found[(*path, index)] = value.start_mark.line + 1
+            _lines(value, (*path, index), found, source)
+
+
+def load_yaml(text: str, source: str) -> tuple[Any, dict[Path, int]]:
+    """Parse YAML safely into (data, line of each path); raises InputError with the line."""
+    loader = _Loader(text)
+    try:
+        node = loader.get_single_node()
+        if node is None:
+            raise InputError(f"{source}:1: the file is empty")
+        lines: dict[Path, int] = {}
+        _lines(node, (), lines, source)
+        return loader.construct_document(node), lines
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        line = mark.line + 1 if mark is not None else 1
+        problem = getattr(error, "problem", None) or str(error).splitlines()[0]
+        raise InputError(f"{source}:{line}: not valid YAML: {problem}") from error
+    except RecursionError as error:
+        raise InputError(f"{source}:1: nested too deeply to be a description") from error
+    except ValueError as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{source}:1: not valid YAML: {error}") from error
+    finally:
+        loader.dispose()
+
+
+def _first_problem(
+    error: ValidationError, lines: dict[Path, int], source: str, model: type[BaseModel]
+) -> str:
+    # An unknown key is often the misspelt form of the missing one: say the unknown one first.
+    problems = sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
+    problem = problems[0]
+    path: Path = tuple(problem["loc"])
+    # A tagged union puts its tag into the path; drop parts that the file does not have.
+    known: Path = ()
+    for part in path:
+        if (*known, part) in lines:
+            known = (*known, part)
+    line = lines.get(known, 1)
+    where = ".".join(str(part) for part in path) or model.__name__.lower()
+    text = problem["msg"].removeprefix("Value error, ")
+    if problem["type"] == "extra_forbidden":
+        text = "unknown key; remove it or correct its spelling"
+    elif problem["type"] == "missing":
+        text = "is missing here"
+    elif problem["type"] not in ("value_error",):
+        text = f"{text}, found {problem['input']!r}"
+    more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+    return f"{source}:{line}: {where}: {text}{more}"
+
+
+def parse_model(model: type[Model], text: str, source: str) -> Model:
+    """Read YAML text as `model`, units required beside numbers; raises InputError with the line."""
+    data, lines = load_yaml(text, source)
+    return validate_model(model, data, lines, source)
+
+
+def validate_model(model: type[Model], data: Any, lines: dict[Path, int], source: str) -> Model:
+    """Validate loaded YAML as `model`; raises InputError naming file, line, key and expectation."""
+    if not isinstance(data, dict):
+        raise InputError(f"{source}:1: expected keys and values, found {type(data).__name__}")
+    try:
+        return model.model_validate(data, context=FROM_FILE)
+    except ValidationError as error:
+        raise InputError(_first_problem(error, lines, source, model)) from error
+    except RecursionError as error:
+        raise InputError(f"{source}:1: refers to itself (a YAML alias?)") from error
+
+
+def read_quantity(text: Any, si: str, source: str) -> float:
+    """Read one quantity of a file in the SI unit `si`; raises InputError prefixed by `source`."""
+    try:
+        if not isinstance(text, str):
+            raise UnitError(f"{text!r} has no unit; write one beside the number, like '1 {si}'")
+        return parse_quantity(text, si)
+    except UnitError as error:
+        raise InputError(f"{source}: {error}") from error

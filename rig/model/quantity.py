@@ -1,0 +1,114 @@
+"""Numbers with units at the files' edge, plain SI floats inside.
+
+A model field is declared as ``stroke: Length``. Read from a file it must carry its unit
+(``75 mm``) and becomes a float in SI; built in code it is given as a float in SI already.
+The difference is the validation context that `rig.model.parse` passes: `FROM_FILE`.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import re
+from typing import Annotated, Any, cast
+
+import pint
+from pydantic import BeforeValidator, ValidationInfo
+
+FROM_FILE: dict[str, bool] = {"from_file": True}
+
+# One number, then a unit: "7 MPa", "-1.5e-3 m^2", "40 degC".
+_QUANTITY = re.compile(
+    r"^\s*(?P<number>[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(?P<unit>.*?)\s*$"
+)
+
+
+class UnitError(ValueError):
+    """A quantity that cannot be read: no number, no unit, or a unit of another dimension."""
+
+
+@functools.cache
+def _registry() -> pint.UnitRegistry[Any]:
+    return pint.UnitRegistry(autoconvert_offset_to_baseunit=True, cache_folder=None)
+
+
+@functools.cache
+def _linear_map(unit: str, si: str) -> tuple[float, float]:
+    """Return (scale, offset) with value_si = scale * value + offset.
+
+    Raises UnitError for an unknown unit or one of another dimension.
+    """
+    registry = _registry()
+    text = unit or "dimensionless"
+    target = si or "dimensionless"
+    try:
+        parsed = registry.Unit(text)
+    except Exception as error:  # pint raises tokenizer, attribute and type errors alike
+        raise UnitError(f"unknown unit {unit!r}; expected one like {target!r}") from error
+    try:
+        zero = registry.Quantity(0.0, parsed).to(target).magnitude
+        one = registry.Quantity(1.0, parsed).to(target).magnitude
+    except pint.PintError as error:
+        raise UnitError(
+            f"unit {text!r} does not measure what is wanted here; expected one like {target!r}"
+        ) from error
+    return float(one - zero), float(zero)
+
+
+def to_si(value: float, unit: str, si: str) -> float:
+    """Convert a number in `unit` to the SI unit `si` (a float; raises UnitError)."""
+    scale, offset = _linear_map(unit, si)
+    return scale * value + offset
+
+
+def unit_map(unit: str, si: str) -> tuple[float, float]:
+    """Return (scale, offset) of the map from `unit` to `si`, for whole arrays at a file's edge."""
+    return _linear_map(unit, si)
+
+
+def parse_quantity(text: str, si: str) -> float:
+    """Read ``"75 mm"`` as a float in the SI unit `si`; raises UnitError."""
+    match = _QUANTITY.match(text)
+    if match is None:
+        raise UnitError(f"{text!r} is not a number with a unit; expected one like '1 {si}'")
+    unit = match["unit"]
+    if not unit and si:
+        raise UnitError(f"{text!r} has no unit; write one beside the number, like '{text} {si}'")
+    value = to_si(float(match["number"]), unit, si)
+    if not math.isfinite(value):
+        raise UnitError(f"{text!r} is not a finite number")
+    return value
+
+
+def _validator(si: str) -> BeforeValidator:
+    def validate(value: Any, info: ValidationInfo) -> Any:
+        from_file = bool(info.context and cast(dict[str, bool], info.context).get("from_file"))
+        if isinstance(value, bool) or value is None:
+            raise UnitError(f"{value!r} is not a number with a unit; expected one like '1 {si}'")
+        if isinstance(value, str):
+            return parse_quantity(value, si)
+        if from_file and si:
+            raise UnitError(f"{value!r} has no unit; write one beside the number, like '1 {si}'")
+        if not math.isfinite(value):
+            raise UnitError(f"{value!r} is not a finite number")
+        return float(value)
+
+    return BeforeValidator(validate)
+
+
+Length = Annotated[float, _validator("m")]
+Area = Annotated[float, _validator("m^2")]
+Volume = Annotated[float, _validator("m^3")]
+Angle = Annotated[float, _validator("rad")]
+Speed = Annotated[float, _validator("m/s")]
+Acceleration = Annotated[float, _validator("m/s^2")]
+Pressure = Annotated[float, _validator("Pa")]
+PressureRate = Annotated[float, _validator("Pa/s")]
+Flow = Annotated[float, _validator("m^3/s")]
+Frequency = Annotated[float, _validator("Hz")]
+Time = Annotated[float, _validator("s")]
+Voltage = Annotated[float, _validator("V")]
+Density = Annotated[float, _validator("kg/m^3")]
+Temperature = Annotated[float, _validator("degC")]
+TemperatureDifference = Annotated[float, _validator("delta_degC")]
+Ratio = Annotated[float, _validator("")]

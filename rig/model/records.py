@@ -1,0 +1,55 @@
+"""What a run leaves behind, as data: one record per step and repeat."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Record:
+    """Samples of one repeat of one step, equally spaced, in SI.
+
+    `channels` maps a channel's name to n samples; `locked` holds the 1-based joints that were
+    locked; records of one run that differ only in `repeat` had the same excitation, started at
+    the same sample. `period` is the excitation's period in samples (0: not periodic), `lines` the
+    excited lines of that period (multiples of 1/period).
+    """
+
+    name: str
+    step: str
+    locked: tuple[int, ...]
+    repeat: int
+    sample_rate: float
+    channels: Mapping[str, Array]
+    start: float = 0.0
+    period: int = 0
+    lines: tuple[int, ...] = ()
+    attributes: Mapping[str, str | float | int] = field(default_factory=dict)
+
+    @property
+    def samples(self) -> int:
+        """Number of samples in every channel."""
+        return len(next(iter(self.channels.values())))
+
+    @property
+    def time(self) -> Array:
+        """Time of each sample from the record's first [s], shape (n,)."""
+        return np.arange(self.samples) / self.sample_rate
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run folder's content: the rig it was taken on, its records, where it came from."""
+
+    rig: Rig
+    records: tuple[Record, ...]
+    source: str = ""
+    state: str = "done"
