@@ -229,7 +229,9 @@ class Device:
         if not self.realtime or self._broken:
             return
         rate = self.rig.sample_rate
-        due = int((self._clock() - self._origin) * rate) - (self.tick - self._first_tick)
+        # A millionth of a sample early, so that rounding does not put off one that is due now.
+        elapsed = int((self._clock() - self._origin) * rate + 1e-6)
+        due = elapsed - (self.tick - self._first_tick)
         most = int(QUEUE_SECONDS * rate)
         if due > most:
             # The machine slept: the device's clock pauses rather than racing through hours.

@@ -29,14 +29,6 @@ class EndpointError(Exception):
     """The address cannot be listened on; the message names host, port and what to do."""
 
 
-class _Handler(ServerRequestHandler):
-    """One connection; the library's own way through a second event costs a third of the rate."""
-
-    def handle_later(self) -> None:
-        """Answer in a task of this loop."""
-        self._task = self.loop.create_task(self.handle_request())  # type: ignore[no-untyped-call]
-
-
 class _Session:
     """What one connection is to the device: an identity, and the news of its end."""
 
@@ -86,7 +78,7 @@ class BenchServer(ModbusTcpServer):
     def callback_new_connection(self) -> ServerRequestHandler:
         """Make the handler of one connection."""
         session = _Session(self._device, self._registers)
-        return _Handler(  # type: ignore[no-untyped-call]
+        return ServerRequestHandler(  # type: ignore[no-untyped-call]
             self, None, session.tag, session.connection
         )
 
