@@ -10,13 +10,16 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
 
 
 @contextmanager
 def device_process(mode: str = "virtual") -> Iterator[tuple[subprocess.Popen[str], int]]:
     """The integrator's bench as a process; gives (process, port) and ends it afterwards."""
     command = [sys.executable, "-m", "tests.hil_sim.integrator", mode, str(os.getpid())]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT) as process:
         try:
             assert process.stdout is not None
             endpoint = process.stdout.readline().strip()

@@ -278,6 +278,13 @@ def test_a_torn_upload_is_never_played(virtual: Bench) -> None:
     expect_refusal(Refusal.UPLOAD_TORN, virtual.write, *commit)
     expect_refusal(Refusal.UPLOAD_TORN, virtual.write, *commit)
     expect_refusal(Refusal.UPLOAD_TORN, page, virtual, 0, bad[:100])
+    # Even where the missing page would have been zeros, so that the checksum holds.
+    bad[100:] = 0
+    total = reg.wave_checksum(bad)
+    virtual.write(reg.UPLOAD_JOINT, 1, 0, 250)
+    page(virtual, 0, bad[:100])
+    commit = (reg.UPLOAD_COMMIT, total >> 16, total & 0xFFFF)
+    expect_refusal(Refusal.UPLOAD_TORN, virtual.write, *commit)
     assert set(played(virtual, 20)) == {round(16_000 * 2047 / 32767)}
 
 

@@ -17,7 +17,7 @@ from pymodbus.client import ModbusTcpClient
 from hil_sim.server import EndpointError, serve
 from rig.model import registers as reg
 from rig.model.registers import TripCause
-from tests.drivers.wires import device_process
+from tests.drivers.wires import ROOT, device_process
 from tests.hil_sim.integrator import IntegratorPlant, seed_rig
 
 PATIENCE = 30.0  # a loaded machine may take long; the assertions do not depend on it
@@ -50,7 +50,7 @@ def test_a_killed_host_leaves_outputs_at_zero(mode: str) -> None:
         device_process(mode) as (_, port),
         ModbusTcpClient("127.0.0.1", port=port, timeout=PATIENCE) as watcher,
         subprocess.Popen(
-            [sys.executable, "-c", HOST, str(port)], stdout=subprocess.PIPE, text=True
+            [sys.executable, "-c", HOST, str(port)], stdout=subprocess.PIPE, text=True, cwd=ROOT
         ) as host,
     ):
         assert host.stdout is not None
@@ -100,7 +100,7 @@ def test_it_ends_with_the_process_it_belongs_to() -> None:
         "p.wait()"
     )
     with subprocess.Popen(
-        [sys.executable, "-c", script], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, cwd=ROOT
     ) as parent:
         assert parent.stdout is not None
         pid, endpoint = parent.stdout.readline().split()
