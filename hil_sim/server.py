@@ -16,8 +16,10 @@ from pymodbus.server.requesthandler import ServerRequestHandler
 from pymodbus.simulator import DataType, SimData, SimDevice
 
 from hil_sim.device import Device, Plant
+from hil_sim.device_laws import LawTable
 from hil_sim.device_map import RegisterMap
 from hil_sim.server_pdu import REQUESTS, Request
+from rig.model import registers as reg
 from rig.model.rig import Rig
 
 logger = logging.getLogger(__name__)
@@ -121,13 +123,20 @@ def serve(
 ) -> None:
     """Serve a plant behind Modbus TCP until SIGTERM, SIGINT or the end of process `parent`.
 
-    `on_ready` is called once with the real endpoint, before any client is answered. In real time
-    the sample clock starts with this call, so the plant must not need to compile any more.
+    `on_ready` is called once with the real endpoint, before any client is answered. The sample
+    clock starts with this call and a host waits no longer than its timeout: where a plant's first
+    ticks compile, `warm_up` a spare one before.
     Raises EndpointError when the address cannot be listened on.
     """
     # The library's messages are about frames; what matters to people is raised or logged here.
     logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
     asyncio.run(_serve(rig, plant, host, port, realtime, on_ready, parent))
+
+
+def warm_up(rig: Rig, spare: Plant) -> None:
+    """Run one block on a plant that is not served, so that whatever compiles has compiled."""
+    table = LawTable(rig)
+    spare.advance(reg.block_layout(len(rig.channels), len(rig.joints)).samples, table.active)
 
 
 async def _serve(

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 import pytest
 from pymodbus.client import ModbusTcpClient
 
-from hil_sim.server import EndpointError, serve
+from hil_sim.server import EndpointError, serve, warm_up
 from rig.model import registers as reg
 from rig.model.registers import TripCause
 from tests.drivers.wires import ROOT, device_process
@@ -77,6 +77,13 @@ def test_a_port_in_use_is_named() -> None:
         port = taken.getsockname()[1]
         with pytest.raises(EndpointError, match=rf"127\.0\.0\.1:{port}: Address already in use"):
             serve(rig, IntegratorPlant(rig), port=port, on_ready=pytest.fail)
+
+
+def test_warming_up_runs_exactly_one_block_of_zero_outputs() -> None:
+    rig = seed_rig()
+    spare = IntegratorPlant(rig)
+    warm_up(rig, spare)
+    assert (spare.tick, spare.piston) == (10, [0.0, 0.0])
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
