@@ -1,0 +1,76 @@
+"""How well samples come over a wire: what was lost, what came late, how much arrival scatters."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from drivers.base import DeviceInfo, Driver
+
+
+def measure_acquisition(
+    driver: Driver,
+    info: DeviceInfo,
+    seconds: float,
+    clock: Callable[[], float] = time.perf_counter,
+) -> dict[str, float | int]:
+    """Stream for `seconds` of device time with outputs untouched and account for every sample.
+
+    `driver` is connected and `info` is what its `connect` returned. A block's lateness is its
+    arrival by the host's clock minus the time of its last sample by the device's, counted from
+    the earliest block after a straight line through all is removed (two clocks drift apart), so it
+    holds the wire, both ends' scheduling and the wait for the block, not the clocks' offset.
+    Raises ValueError for a device in virtual time, DeviceError and DeviceLost as the driver does.
+    """
+    if info.virtual_time:
+        raise ValueError("a device in virtual time has no arrival to be late for; use real time")
+    if seconds <= 0.0:
+        raise ValueError(f"a measurement takes longer than {seconds:g} s")
+    wanted = round(seconds * info.sample_rate)
+    ends: list[float] = []
+    arrivals: list[float] = []
+    lost = disordered = samples = backlog = 0
+    driver.start()
+    try:
+        block = driver.read_block()
+        first = expected = block.tick
+        while True:
+            arrivals.append(clock())
+            ends.append((block.tick + len(block.data)) / info.sample_rate)
+            samples += len(block.data)
+            backlog = max(backlog, block.backlog)
+            lost += max(block.tick - expected, 0)
+            disordered += block.tick < expected
+            expected = max(expected, block.tick + len(block.data))
+            if expected - first >= wanted:
+                break
+            block = driver.read_block()
+    finally:
+        driver.stop()
+    return {
+        "seconds": (expected - first) / info.sample_rate,
+        "blocks": len(ends),
+        "samples": samples,
+        "lost_samples": lost,
+        "out_of_order_blocks": disordered,
+        "backlog_max_blocks": backlog,
+        **_timing(np.array(ends), np.array(arrivals)),
+    }
+
+
+def _timing(ends: np.ndarray, arrivals: np.ndarray) -> dict[str, float | int]:
+    late = arrivals - ends
+    drift = float(np.polyfit(ends - ends[0], late, 1)[0]) if len(late) > 2 else 0.0
+    late = late - drift * (ends - ends[0])
+    late -= late.min()
+    interval = np.diff(arrivals) if len(arrivals) > 1 else np.zeros(1)
+    return {
+        "lateness_mean_s": float(late.mean()),
+        "lateness_p99_s": float(np.quantile(late, 0.99)),
+        "lateness_max_s": float(late.max()),
+        "jitter_rms_s": float(late.std()),
+        "interval_max_s": float(interval.max()),
+        "clock_drift_ppm": drift * 1e6,
+    }

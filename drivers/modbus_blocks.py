@@ -1,0 +1,94 @@
+"""From the bytes of a block to SI samples, and whether it can follow the block before."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+
+from drivers.base import DeviceError, SampleBlock
+from rig.model import channels as ch
+from rig.model import registers as reg
+from rig.model.registers import BlockHeader, Status
+from rig.model.rig import Rig
+
+logger = logging.getLogger(__name__)
+
+
+def unwrap(raw: int, near: int, bits: int) -> int:
+    """Return the number congruent to `raw` modulo 2^bits that is nearest to `near`."""
+    size = 1 << bits
+    return near + (raw - near + size // 2) % size - size // 2
+
+
+class BlockDecoder:
+    """Decodes the blocks of one stream in order; knows what the next one must look like."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.layout = reg.block_layout(len(rig.channels), len(rig.joints))
+        sensors = [rig.sensors.of(ch.kind_of(name)[0]) for name in rig.channels]
+        self._names = rig.recorded
+        self._low = np.array([sensor.range[0] for sensor in sensors])
+        high = np.array([sensor.range[1] for sensor in sensors])
+        self._top = np.array([(1 << sensor.bits) - 1 for sensor in sensors])
+        self._step = (high - self._low) / self._top
+        self._most = np.array([(1 << (j.valve.command_bits - 1)) - 1 for j in rig.joints])
+        self._volt = np.array([j.valve.command_range for j in rig.joints]) / self._most
+        self._sequence: int | None = None
+        self.tick = 0  # of the sample expected next
+
+    @property
+    def acknowledge(self) -> int:
+        """The number of the last block decoded; before the first one a number never offered."""
+        return 0xFFFF if self._sequence is None else self._sequence & 0xFFFF
+
+    def restart(self, tick: int | None = None) -> None:
+        """Expect a stream numbered anew; `tick` is where another device's clock stands."""
+        self._sequence = None
+        if tick is not None:
+            self.tick = tick
+
+    def decode(self, header: BlockHeader, answer: bytes) -> SampleBlock:
+        """Return the block in SI; raises DeviceError if it is impossible after the last one."""
+        sequence, tick = self._follow(header)
+        codes, outputs = reg.unpack_samples(answer[2 * reg.HEADER_WORDS :], self.layout)
+        self._possible(codes > self._top, codes, 0)
+        self._possible(np.abs(outputs.astype(np.int32)) > self._most, outputs, codes.shape[1])
+        data = np.empty((self.layout.samples, self.layout.columns))
+        data[:, : self.layout.channels] = self._low + codes * self._step
+        data[:, self.layout.channels :] = outputs * self._volt
+        self._sequence, self.tick = sequence, tick + self.layout.samples
+        return SampleBlock(
+            sequence=sequence,
+            tick=tick,
+            data=data,
+            saturated=(codes == 0) | (codes == self._top),
+            backlog=header.backlog,
+            tripped=bool(header.status & Status.TRIPPED),
+        )
+
+    def _follow(self, header: BlockHeader) -> tuple[int, int]:
+        """Return unwrapped (sequence, tick), if the numbers can be those of the next block."""
+        tick = unwrap(header.tick, self.tick, 32)
+        last = -1 if self._sequence is None else self._sequence
+        lost = (header.sequence - last - 1) & 0xFFFF
+        expected = self.tick + lost * self.layout.samples
+        # Before a stream's first block any time may pass, but none backwards.
+        if lost > 0x7FFF or tick < expected or (tick > expected and self._sequence is not None):
+            raise DeviceError(
+                f"impossible block: number {header.sequence} at sample {tick}, expected number "
+                f"{(last + 1) & 0xFFFF} at sample {self.tick} or a later one that fits"
+            )
+        if lost:
+            logger.warning("the device dropped %d blocks before sample %d", lost, tick)
+        return last + 1 + lost, tick
+
+    def _possible(
+        self, wrong: np.ndarray[tuple[int, ...], np.dtype[np.bool_]], codes: object, first: int
+    ) -> None:
+        if wrong.any():
+            row, column = np.argwhere(wrong)[0]
+            raise DeviceError(
+                f"impossible block: channel {self._names[first + column]} has the converter code "
+                f"{np.asarray(codes)[row, column]}, more than its bits can hold"
+            )

@@ -1,0 +1,294 @@
+"""The driver of a bench behind Modbus TCP (docs/wire-modbus-tcp.md)."""
+
+from __future__ import annotations
+
+import logging
+import struct
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import astuple
+
+import numpy as np
+
+from drivers.base import (
+    Array,
+    DeviceError,
+    DeviceInfo,
+    DeviceLost,
+    OutputLaw,
+    SampleBlock,
+)
+from drivers.modbus_blocks import BlockDecoder, unwrap
+from drivers.modbus_transport import DeviceRefused, DeviceSilent, ModbusConnection, unpack
+from rig.model import registers as reg
+from rig.model.codes import encode_output
+from rig.model.registers import Refusal, Status, TripCause
+from rig.model.rig import Rig, Wire
+
+logger = logging.getLogger(__name__)
+
+_TOLERANCE = 1e-6  # registers hold single precision
+
+
+class ModbusTcpDriver:
+    """`drivers.base.Driver` over Modbus TCP; see there for what each call promises."""
+
+    def __init__(
+        self, wire: Wire, rig: Rig, *, sleep: Callable[[float], None] = time.sleep
+    ) -> None:
+        self._wire = wire
+        self._rig = rig
+        self._sleep = sleep
+        # Two tries within the time after which a silent device counts as lost.
+        self._link = ModbusConnection(wire.host, wire.port, wire.timeout / 2)
+        self._layout = reg.block_layout(len(rig.channels), len(rig.joints))
+        self._decoder = BlockDecoder(rig)
+        self._heartbeat = 0
+        self._arrived: float | None = None
+        self.info: DeviceInfo | None = None
+
+    # -- session ----------------------------------------------------------------------------
+
+    def connect(self) -> DeviceInfo:
+        """Open the wire, check that the device fits the rig, leave its outputs at zero."""
+        self._link.open()
+        try:
+            self.info = self._identify()
+            self._command(reg.CONTROL_WATCHDOG, round(self._wire.watchdog * 1e3))
+            self._command(reg.CONTROL_ZERO, reg.ZERO_NOW)
+            self._command(reg.CONTROL_STREAM, reg.STREAM_STOP)
+            self._decoder.restart(unpack(">I", self._status(), _offset(reg.STATUS_TICK)))
+        except BaseException:
+            self._link.close()
+            raise
+        return self.info
+
+    def close(self) -> None:
+        """Zero the outputs if the device still answers, then close; never raises."""
+        try:
+            if self._link.is_open:
+                self._command(reg.CONTROL_ZERO, reg.ZERO_NOW)
+                self._command(reg.CONTROL_STREAM, reg.STREAM_STOP)
+        except DeviceError as error:
+            logger.debug("while closing: %s", error)
+        finally:
+            # A device that lost its controller zeroes its outputs by itself.
+            with suppress(OSError):
+                self._link.close()
+
+    def zero_outputs(self) -> None:
+        """Put every output to zero now; connects anew if need be, zero needs no control."""
+        if self._link.is_open:
+            try:
+                self._link.write(reg.CONTROL_ZERO.address, [reg.ZERO_NOW])
+            except DeviceError as error:
+                logger.warning("zeroing needs a second try: %s", error)
+            else:
+                return
+        self._link.open()
+        try:
+            self._link.write(reg.CONTROL_ZERO.address, [reg.ZERO_NOW])
+        except DeviceError:
+            self._link.close()
+            raise
+
+    def reset(self) -> None:
+        """Clear a latched trip of the device; only on a person's word."""
+        self._command(reg.CONTROL_RESET, reg.RESET_KEY)
+
+    def trip_cause(self) -> str | None:
+        """Say why the device has zeroed its outputs, or None if it has not."""
+        status = self._status()
+        cause = unpack(">H", status, _offset(reg.STATUS_CAUSE))
+        if cause == TripCause.NONE:
+            return None
+        tick = unpack(">I", status, _offset(reg.STATUS_TRIP_TICK))
+        known = cause in TripCause.__members__.values()
+        text = reg.TRIP_TEXT[TripCause(cause)] if known else f"cause {cause}"
+        return f"{text} (at sample {tick})"
+
+    # -- outputs ----------------------------------------------------------------------------
+
+    def upload(self, joint: int, wave: Array) -> None:
+        """Store one period of joint `joint`'s (0-based) waveform [V]; it acts from `apply` on."""
+        codes = self._wave_codes(joint, wave)
+        about = f"waveform of joint {joint + 1}"
+        words = codes.view(np.uint16).tolist()
+        self._control(reg.UPLOAD_JOINT.address, [joint + 1, *_u32(len(words))], about)
+        for first in range(0, len(words), reg.PAGE_SAMPLES):
+            page = words[first : first + reg.PAGE_SAMPLES]
+            self._control(reg.UPLOAD_OFFSET.address, [*_u32(first), *page], about)
+        self._control(reg.UPLOAD_COMMIT.address, _u32(reg.wave_checksum(codes)), about)
+
+    def apply(self, laws: Sequence[OutputLaw], *, restart: bool = False) -> int:
+        """Set all laws at one tick; `restart` starts the waveforms there. Returns that tick."""
+        if len(laws) != len(self._rig.joints):
+            raise DeviceError(f"{len(laws)} laws for a rig of {len(self._rig.joints)} joints")
+        values = np.array([astuple(law) for law in laws])
+        with np.errstate(over="ignore"):  # what single precision cannot hold the device refuses
+            words = reg.float_words(values)
+        self._control(reg.LAWS.address, words, f"laws {list(laws)}")
+        flag = reg.APPLY_AND_RESTART if restart else reg.APPLY
+        try:
+            answer = self._link.write_and_read(
+                reg.CONTROL_APPLY.address, [flag], reg.STATUS_APPLY_TICK.address, 2
+            )
+        except DeviceRefused as refused:
+            raise self._explained(refused, "apply") from refused
+        return unwrap(unpack(">I", answer), self._decoder.tick, 32)
+
+    # -- samples ----------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Start streaming blocks, sequence and waveform phase anew."""
+        self._command(reg.CONTROL_STREAM, reg.STREAM_START)
+        self._decoder.restart()
+        self._arrived = None
+
+    def stop(self) -> None:
+        """Stop streaming."""
+        self._command(reg.CONTROL_STREAM, reg.STREAM_STOP)
+
+    def read_block(self) -> SampleBlock:
+        """Return the next block, waiting for it; also feeds the device's watchdog."""
+        period = self._layout.samples / self._rig.sample_rate
+        deadline = time.monotonic() + period + self._wire.timeout
+        while True:
+            answer = self._exchange()
+            header = reg.unpack_header(answer)
+            if header.status & Status.BLOCK:
+                self._arrived = time.monotonic()
+                return self._decoder.decode(header, answer)
+            if not header.status & Status.STREAMING:
+                raise DeviceError(
+                    f"the device at {self._link.where} does not stream "
+                    f"({self.trip_cause() or 'not started'})"
+                )
+            now = time.monotonic()
+            if now > deadline:
+                raise DeviceLost(
+                    f"the device at {self._link.where} answers, but has measured nothing for "
+                    f"{self._wire.timeout:g} s"
+                )
+            # Asking is work for both ends: sleep to just before the block is due, then ask often.
+            due = now if self._arrived is None else self._arrived + 0.85 * period
+            self._sleep(max(due - now, 0.1 * period))
+
+    # -- inside -----------------------------------------------------------------------------
+
+    def _exchange(self) -> bytes:
+        try:
+            return self._exchange_once()
+        except DeviceSilent as silent:
+            # The block stays in the device until acknowledged, so the same one comes again.
+            logger.warning("%s; asking again", silent)
+            try:
+                return self._exchange_once()
+            except DeviceSilent:
+                self._link.close()
+                raise DeviceLost(
+                    f"the device at {self._link.where} has not answered for "
+                    f"{self._wire.timeout:g} s"
+                ) from None
+
+    def _exchange_once(self) -> bytes:
+        self._heartbeat = (self._heartbeat + 1) & 0xFFFF
+        words = [self._decoder.acknowledge, self._heartbeat]
+        try:
+            return self._link.write_and_read(
+                reg.CONTROL_ACK.address, words, reg.BLOCK.address, self._layout.words
+            )
+        except DeviceRefused as refused:
+            raise self._explained(refused, "block") from refused
+
+    def _status(self) -> bytes:
+        first, end = reg.STATUS_SPAN
+        return self._link.read(first, end - first)
+
+    def _command(self, register: reg.Register, value: int) -> None:
+        self._control(register.address, [value], register.name)
+
+    def _control(self, address: int, words: list[int], about: str) -> None:
+        try:
+            self._link.write(address, words)
+        except DeviceRefused as refused:
+            raise self._explained(refused, about) from refused
+
+    def _explained(self, refused: DeviceRefused, about: str) -> DeviceError:
+        """Return the refusal with the reason that the device's registers give."""
+        status = self._status()
+        reason = unpack(">H", status, _offset(reg.STATUS_REFUSAL))
+        joint = unpack(">H", status, _offset(reg.STATUS_REFUSAL_JOINT))
+        if reason not in Refusal.__members__.values():
+            return DeviceRefused(f"{refused} (reason {reason}): {about}")
+        text = reg.REFUSAL_TEXT[Refusal(reason)]
+        if reason == Refusal.TRIPPED:
+            text = f"tripped: {self.trip_cause()}; find the cause, then reset it"
+        at = f" (joint {joint})" if joint else ""
+        return DeviceRefused(f"device at {self._link.where} refused {about}{at}: {text}")
+
+    def _wave_codes(self, joint: int, wave: Array) -> np.ndarray[tuple[int], np.dtype[np.int16]]:
+        if not 0 <= joint < len(self._rig.joints):
+            raise DeviceError(f"no joint {joint + 1} on a rig of {len(self._rig.joints)}")
+        volts = np.asarray(wave, dtype=np.float64).ravel()
+        if not 1 <= len(volts) <= reg.WAVE_CAPACITY:
+            raise DeviceError(
+                f"waveform of joint {joint + 1} has {len(volts)} samples; "
+                f"the device takes 1 to {reg.WAVE_CAPACITY}"
+            )
+        limit = self._rig.joints[joint].valve.command_range
+        wrong = np.flatnonzero(~(np.abs(volts) <= limit))
+        if len(wrong):
+            raise DeviceError(
+                f"waveform of joint {joint + 1}: sample {wrong[0]} is {volts[wrong[0]]:g} V, "
+                f"outside the converter's range of +-{limit:g} V"
+            )
+        return encode_output(volts, limit, reg.WAVE_BITS).astype(np.int16)
+
+    def _identify(self) -> DeviceInfo:
+        rig, (first, end) = self._rig, reg.IDENTITY_SPAN
+        try:
+            data = self._link.read(first, end - first)
+        except DeviceRefused as refused:
+            raise DeviceError(f"{refused}: it is no bench of this protocol") from refused
+        magic, version, joints, channels, rate, samples, virtual, _, converters = (
+            struct.unpack_from(">IHHHfHHII", data)
+        )
+        name = data[_offset(reg.IDENTITY_NAME, first) :].rstrip(b"\0").decode("ascii", "replace")
+        expected_name = rig.name[: 2 * reg.IDENTITY_NAME.words]
+        where = self._link.where
+        checks: tuple[tuple[str, object, object, bool], ...] = (
+            ("magic number", hex(magic), hex(reg.MAGIC), magic == reg.MAGIC),
+            ("protocol version", version, reg.PROTOCOL_VERSION, version == reg.PROTOCOL_VERSION),
+            ("rig", repr(name), repr(expected_name), name == expected_name),
+            ("joints", joints, len(rig.joints), joints == len(rig.joints)),
+            ("channels", channels, len(rig.channels), channels == len(rig.channels)),
+            (
+                "sample rate [Hz]",
+                f"{rate:g}",
+                f"{rig.sample_rate:g}",
+                abs(rate - rig.sample_rate) <= _TOLERANCE * rig.sample_rate,
+            ),
+            ("samples per block", samples, self._layout.samples, samples == self._layout.samples),
+        )
+        for what, found, expected, fits in checks:
+            if not fits:
+                raise DeviceError(
+                    f"the device at {where} is not the rig described: {what} {found}, "
+                    f"expected {expected}"
+                )
+        if converters != reg.converter_checksum(rig):
+            raise DeviceError(
+                f"the device at {where} converts with other ranges or bits than the sensors and "
+                f"valves of rig {rig.name!r}; start it with the same rig file"
+            )
+        return DeviceInfo(name, joints, channels, rig.sample_rate, samples, bool(virtual))
+
+
+def _offset(register: reg.Register, first: int = reg.STATUS_SPAN[0]) -> int:
+    return 2 * (register.address - first)
+
+
+def _u32(value: int) -> list[int]:
+    return [value >> 16, value & 0xFFFF]

@@ -1,0 +1,181 @@
+"""One Modbus TCP connection as requests that return bytes or raise DeviceLost / DeviceError."""
+
+from __future__ import annotations
+
+import logging
+import socket
+import struct
+
+from pymodbus.client import ModbusTcpClient
+from pymodbus.exceptions import ConnectionException, ModbusException, ModbusIOException
+from pymodbus.pdu import ExceptionResponse, ModbusPDU
+from pymodbus.pdu.register_message import (
+    ReadHoldingRegistersRequest,
+    ReadHoldingRegistersResponse,
+    ReadWriteMultipleRegistersRequest,
+    ReadWriteMultipleRegistersResponse,
+)
+
+from drivers.base import DeviceError, DeviceLost
+
+logger = logging.getLogger(__name__)
+
+
+class DeviceRefused(DeviceError):
+    """The device understood a request and did not carry it out."""
+
+
+class DeviceSilent(DeviceLost):
+    """No answer came in time; the same request may be worth another try."""
+
+
+class _RawAnswer:
+    """Mixin: an answer kept as the bytes of its registers, not as a list of integers."""
+
+    payload = b""
+
+    def decode(self, data: bytes) -> None:
+        """Keep the registers' bytes; raises ModbusIOException if their count is not as stated."""
+        if len(data) < 1 or data[0] != len(data) - 1:
+            raise ModbusIOException(f"{len(data) - 1} bytes follow a byte count of {data[0]}")
+        self.payload = data[1:]
+
+    def __str__(self) -> str:
+        return type(self).__name__
+
+
+class _Read(_RawAnswer, ReadHoldingRegistersResponse):
+    pass
+
+
+class _ReadWrite(_RawAnswer, ReadWriteMultipleRegistersResponse):
+    pass
+
+
+class ModbusConnection:
+    """A connection that is opened once and, broken once, stays closed until opened again."""
+
+    def __init__(self, host: str, port: int, timeout: float) -> None:
+        self.where = f"{host}:{port}"
+        self._host, self._port, self._timeout = host, port, timeout
+        self._client: ModbusTcpClient | None = None
+        self._received = 0
+        # What the library logs is raised here as well, in words for people.
+        logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a request may be sent."""
+        return self._client is not None and self._client.connected
+
+    def open(self) -> None:
+        """Connect; raises DeviceLost when nothing listens there."""
+        self.close()
+        client = ModbusTcpClient(
+            self._host,
+            port=self._port,
+            timeout=self._timeout,
+            retries=0,
+            trace_packet=self._note,
+        )
+        client.set_max_no_responses(1_000_000)  # when to give up is decided by the driver
+        client.register(_Read)
+        client.register(_ReadWrite)
+        if not client.connect() or client.socket is None:  # type: ignore[no-untyped-call]
+            raise DeviceLost(
+                f"nothing answers at {self.where}; is the device (or `bramah sim`) running there?"
+            )
+        client.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._client = client
+
+    def close(self) -> None:
+        """Close the connection if there is one."""
+        client, self._client = self._client, None
+        if client is not None:
+            client.close()  # type: ignore[no-untyped-call]
+
+    def read(self, address: int, count: int) -> bytes:
+        """Read `count` registers (function 3) as big-endian bytes."""
+        return self._registers(ReadHoldingRegistersRequest(address=address, count=count), count)
+
+    def write(self, address: int, words: list[int]) -> None:
+        """Write registers from `address` on (functions 6 and 16)."""
+        client = self._usable()
+        try:
+            if len(words) == 1:
+                answer = self._checked(client.write_register(address, words[0]))
+            else:
+                answer = self._checked(client.write_registers(address, words))
+        except (ModbusException, OSError) as error:
+            raise self._failure(error) from error
+        if answer.address != address or len(words) not in (answer.count, len(answer.registers)):
+            self.close()
+            raise DeviceError(
+                f"device at {self.where} confirmed another write than that of "
+                f"{len(words)} registers at 0x{address:04X}"
+            )
+
+    def write_and_read(self, write_at: int, words: list[int], read_at: int, count: int) -> bytes:
+        """Write, then read, in one transaction (function 23)."""
+        request = ReadWriteMultipleRegistersRequest(
+            read_address=read_at,
+            read_count=count,
+            write_address=write_at,
+            write_registers=words,
+        )
+        return self._registers(request, count)
+
+    def _registers(self, request: ModbusPDU, count: int) -> bytes:
+        request.dev_id = 1
+        try:
+            answer = self._checked(self._usable().execute(False, request))
+        except (ModbusException, OSError) as error:
+            raise self._failure(error) from error
+        payload = answer.payload if isinstance(answer, _RawAnswer) else b""
+        if len(payload) != 2 * count:
+            self.close()  # what else is under way would be taken for the next answer
+            raise DeviceError(
+                f"device at {self.where} answered {len(payload)} bytes, {2 * count} expected"
+            )
+        return payload
+
+    def _usable(self) -> ModbusTcpClient:
+        # The library would reconnect by itself, to a device that has tripped meanwhile.
+        client = self._client
+        if client is None or not client.connected:
+            raise DeviceLost(f"the connection to the device at {self.where} is closed")
+        self._received = 0
+        return client
+
+    def _checked(self, answer: ModbusPDU) -> ModbusPDU:
+        if isinstance(answer, ExceptionResponse):
+            raise DeviceRefused(
+                f"device at {self.where} refused function {answer.function_code & 0x7F} "
+                f"with Modbus exception {answer.exception_code}"
+            )
+        return answer
+
+    def _failure(self, error: Exception) -> DeviceError:
+        """Return what a failed request means, and close a connection that is out of step."""
+        received = self._received
+        if isinstance(error, ConnectionException | ConnectionError):
+            self.close()
+            return DeviceLost(f"the device at {self.where} closed the connection")
+        if received:
+            self.close()
+            return DeviceError(
+                f"the device at {self.where} answered {received} bytes that are no Modbus answer "
+                "to the request; does another program listen on this port?"
+            )
+        return DeviceSilent(f"the device at {self.where} does not answer ({self._timeout:g} s)")
+
+    def _note(self, sending: bool, data: bytes) -> bytes:
+        if not sending:
+            self._received = len(data)
+        return data
+
+
+def unpack(form: str, data: bytes, offset: int = 0) -> int:
+    """Read one integer in `struct`'s form from bytes at `offset`."""
+    (value,) = struct.unpack_from(form, data, offset)
+    return int(value)

@@ -1,0 +1,84 @@
+"""The device's queue of sample blocks: numbered, kept until acknowledged, bounded."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.model.registers import BlockLayout, pack_samples
+
+Codes = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class QueuedBlock:
+    """One finished block: its number, the tick of its first sample, its samples as bytes."""
+
+    sequence: int
+    tick: int
+    samples: bytes
+
+
+class BlockQueue:
+    """First in, first out; when full the oldest block goes, and the numbers show the gap."""
+
+    def __init__(self, layout: BlockLayout, capacity: int) -> None:
+        self._layout = layout
+        self._capacity = capacity
+        self._blocks: deque[QueuedBlock] = deque()
+        self._parts: list[tuple[Codes, Codes]] = []
+        self._filled = 0
+        self._tick = 0
+        self._offered: int | None = None
+        self.next_sequence = 0
+        self.dropped = 0
+
+    def __len__(self) -> int:
+        return len(self._blocks)
+
+    @property
+    def room(self) -> int:
+        """Samples still missing to finish the block being filled."""
+        return self._layout.samples - self._filled
+
+    def clear(self) -> None:
+        """Forget everything and number anew from 0."""
+        self._blocks.clear()
+        self._parts.clear()
+        self._filled = 0
+        self._offered = None
+        self.next_sequence = 0
+        self.dropped = 0
+
+    def add(self, tick: int, measured: Codes, commands: Codes) -> None:
+        """Append samples that start at `tick`, at most `room` of them."""
+        if not self._parts:
+            self._tick = tick
+        self._parts.append((measured, commands))
+        self._filled += len(measured)
+        if self._filled < self._layout.samples:
+            return
+        rows = [np.concatenate(part) for part in zip(*self._parts, strict=True)]
+        self._parts.clear()
+        self._filled = 0
+        if len(self._blocks) == self._capacity:
+            self._blocks.popleft()
+            self.dropped += 1
+        self._blocks.append(QueuedBlock(self.next_sequence, self._tick, pack_samples(*rows)))
+        self.next_sequence = (self.next_sequence + 1) & 0xFFFF
+
+    def acknowledge(self, sequence: int) -> None:
+        """Drop the oldest block if it is the one last offered and carries this number."""
+        if self._blocks and self._offered == sequence == self._blocks[0].sequence:
+            self._blocks.popleft()
+            self._offered = None
+
+    def offer(self) -> QueuedBlock | None:
+        """Return the oldest block, which stays until acknowledged."""
+        if not self._blocks:
+            return None
+        self._offered = self._blocks[0].sequence
+        return self._blocks[0]

@@ -1,0 +1,104 @@
+"""Helpers of wire tests: a device in a process of its own, and a wire that misbehaves."""
+
+from __future__ import annotations
+
+import os
+import socket
+import struct
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+
+
+@contextmanager
+def device_process(mode: str = "virtual") -> Iterator[tuple[subprocess.Popen[str], int]]:
+    """The integrator's bench as a process; gives (process, port) and ends it afterwards."""
+    command = [sys.executable, "-m", "tests.hil_sim.integrator", mode, str(os.getpid())]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT) as process:
+        try:
+            assert process.stdout is not None
+            endpoint = process.stdout.readline().strip()
+            assert endpoint.startswith("modbus-tcp://127.0.0.1:"), endpoint
+            yield process, int(endpoint.rsplit(":", 1)[1])
+        finally:
+            process.terminate()
+            process.wait(10)
+
+
+class BadWire:
+    """A TCP proxy on loopback whose way back does what `fault` says, from then on.
+
+    "pass" hands answers on; "lose one" swallows the next one; "silent" swallows all; "garbage"
+    replaces them; "close" ends the connection; "short" keeps the tail of each; "fewer" makes each
+    a well-formed answer of fewer registers; "miscounted" corrupts the byte count.
+    """
+
+    def __init__(self, target: int) -> None:
+        self._target = target
+        self.fault = "pass"
+        self.connections = 0
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.port: int = self._listener.getsockname()[1]
+        self._sockets: list[socket.socket] = []
+        self._threads = [threading.Thread(target=self._accept, daemon=True)]
+        self._threads[0].start()
+
+    def close(self) -> None:
+        """End everything."""
+        for end in (self._listener, *self._sockets):
+            with suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+            end.close()
+        for thread in self._threads:
+            thread.join(5)
+
+    def _accept(self) -> None:
+        with suppress(OSError):
+            while True:
+                host, _ = self._listener.accept()
+                device = socket.create_connection(("127.0.0.1", self._target))
+                self.connections += 1
+                self._sockets += [host, device]
+                for pump, source, sink in (
+                    (self._forth, host, device),
+                    (self._back, device, host),
+                ):
+                    thread = threading.Thread(target=pump, args=(source, sink), daemon=True)
+                    self._threads.append(thread)
+                    thread.start()
+
+    @staticmethod
+    def _forth(source: socket.socket, sink: socket.socket) -> None:
+        with suppress(OSError):
+            while data := source.recv(4096):
+                sink.sendall(data)
+            sink.shutdown(socket.SHUT_RDWR)
+
+    def _back(self, source: socket.socket, sink: socket.socket) -> None:
+        with suppress(OSError):
+            while data := source.recv(4096):
+                sent = self._spoiled(data)
+                if sent is None:
+                    break
+                sink.sendall(sent)
+            sink.shutdown(socket.SHUT_RDWR)
+
+    def _spoiled(self, data: bytes) -> bytes | None:
+        fault = self.fault
+        if fault == "lose one":
+            self.fault = "pass"
+            return b""
+        return {
+            "pass": data,
+            "silent": b"",
+            "garbage": b"HTTP/1.1 400 Bad Request\r\n\r\n",
+            "close": None,
+            "short": data[: len(data) // 2],
+            "fewer": data[:4] + struct.pack(">HBBB", 7, data[6], data[7], 4) + data[9:13],
+            "miscounted": data[:8] + bytes([data[8] ^ 2]) + data[9:],
+        }[fault]
