@@ -12,12 +12,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from hil_sim import kernel
+from hil_sim import kernel, kernel_loop
 from hil_sim.kernel_data import ATMOSPHERE, LAW, record
 from hil_sim.plant_effects import Tables
 from hil_sim.plant_tables import build
 from hil_sim.scenario import Scenario
-from hil_sim.sensors import encode, ring_length
+from hil_sim.sensors import converters, encode, ring_length
 from hil_sim.truth import load_machine
 from rig.model.codes import Array, Codes
 from rig.model.rig import Rig
@@ -60,6 +60,8 @@ class Plant:
         self._period = 1.0 / rig.sample_rate
         self._substeps = math.ceil(self._period / STEP * (1.0 - 1e-9))
         self._state, self._spool = rest(self._tables)
+        self._converters = converters(rig)
+        self._laws: tuple[Law, ...] = ()
         channels, ring = len(rig.channels), ring_length(self._tables.channels, self._period)
         self._values, self._slopes = np.zeros((ring, channels)), np.zeros((ring, channels))
         self._fill_history()
@@ -74,11 +76,15 @@ class Plant:
         joints, channels = len(self._rig.joints), len(self._rig.channels)
         if len(laws) != joints:
             raise ValueError(f"{len(laws)} laws for {joints} joint(s)")
-        table, waves = _law_table(laws)
+        if len(self._laws) != joints or any(
+            a is not b for a, b in zip(laws, self._laws, strict=True)
+        ):
+            self._laws, self._law_table = tuple(laws), _law_table(laws)
+        table, waves = self._law_table
         measured = np.empty((ticks, channels))
         outputs = np.empty((ticks, joints), dtype=np.int64)
         t = self._tables
-        kernel.run(
+        kernel_loop.run(
             self.tick,
             self._period,
             self._substeps,
@@ -97,7 +103,7 @@ class Plant:
             outputs,
         )
         self.tick += ticks
-        return encode(self._rig, measured), outputs
+        return encode(measured, self._converters), outputs
 
     def truth(self) -> dict[str, float]:
         """Return the true parameters [SI] by the names of rig.model.parameters.
@@ -132,14 +138,14 @@ class Plant:
             "supply_pressure": supply,
             "port_pressure": port,
             "tank_pressure": np.array(y[5 * n + 2]),
-            "oil_temperature": np.array(kernel.temperature(self.tick * self._period, bench)),
+            "oil_temperature": np.array(kernel_loop.temperature(self.tick * self._period, bench)),
         }
 
     def _fill_history(self) -> None:
         # Before tick 0 the bench had been at rest, so every earlier sample is the first.
         t, bench, dy = self._tables, record(self._tables.bench), np.zeros_like(self._state)
-        heat = kernel.temperature(0.0, bench)
-        kernel.sense(
+        heat = kernel_loop.temperature(0.0, bench)
+        kernel_loop.sense(
             self._state, dy, self._spool, heat, t.joints, bench, t.channels,
             self._period, self._values[0], self._slopes[0],
         )  # fmt: skip

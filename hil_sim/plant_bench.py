@@ -5,16 +5,19 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from importlib import resources
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from hil_sim import kernel
+from hil_sim import kernel, kernel_loop
 from hil_sim.kernel_data import record
-from hil_sim.plant import Law, Plant
+from hil_sim.plant import STEP, Law, Plant
 from hil_sim.scenario import Scenario
 from rig.model.codes import Array, decode_output
+from rig.model.parse import parse_model
 from rig.model.rig import Rig
 
 PEAK = 1.6  # of the command, either joint [V]
@@ -61,7 +64,13 @@ class Reference:
         n = self.n
         # Errors are judged against 1 rad and 7 MPa; z is a pressure over the bulk modulus.
         self.scale = np.concatenate(
-            [np.ones(2 * n), np.full(2 * n, 0.03), np.full(n, 1e-4), [0.03, 0.03, 1e5], np.ones(3 * n)]
+            [
+                np.ones(2 * n),
+                np.full(2 * n, 0.03),
+                np.full(n, 1e-4),
+                [0.03, 0.03, 1e5],
+                np.ones(3 * n),
+            ]
         )
 
     def rates(self, target: Array, warmth: float) -> Callable[[float, Array], Array]:
@@ -72,10 +81,18 @@ class Reference:
         def f(_: float, y: Array) -> Array:
             out = np.empty_like(y)
             u, w, x = y[size : size + n], y[size + n : size + 2 * n], y[size + 2 * n :]
-            kernel.rates(y[:size], u - t.joints["null"], warmth, t.joints, self.bench, t.inertia,
-                         work, out[:size])
+            kernel.rates(
+                y[:size],
+                u - t.joints["null"],
+                warmth,
+                t.joints,
+                self.bench,
+                t.inertia,
+                work,
+                out[:size],
+            )
             for i in range(n):
-                rates = kernel.spool_rates(u[i], w[i], x[i], target[i], t.joints[i])
+                rates = kernel_loop.spool_rates(u[i], w[i], x[i], target[i], t.joints[i])
                 out[size + i], out[size + n + i], out[size + 2 * n + i] = rates
             return out
 
@@ -83,7 +100,7 @@ class Reference:
 
     def advance(self, target: Array, **options: Any) -> None:
         """Integrate one tick."""
-        heat = kernel.temperature(self.tick * self.period, self.bench)
+        heat = kernel_loop.temperature(self.tick * self.period, self.bench)
         warmth = 1.0 + self.bench.bulk_temperature * (heat - self.bench.temperature)
         rtol = options.pop("rtol")
         result = solve_ivp(
@@ -98,3 +115,94 @@ class Reference:
         n = self.n
         z = [*self.y[2 * n : 4 * n], self.y[5 * n]]
         return np.concatenate([self.y[:n], [kernel.pressure(v, self.bench) for v in z]])
+
+
+def _shipped() -> Rig:
+    path = resources.files("rig") / "shipped" / "shinshu-2dof.yaml"
+    return parse_model(Rig, path.read_text(encoding="utf-8"), path.name)
+
+
+def spool_targets(rig: Rig, outputs: NDArray[np.int64]) -> Array:
+    """Return what DA codes (ticks, joints) ask of the spools [V], same shape."""
+    columns = [
+        np.clip(
+            decode_output(outputs[:, i], j.valve.command_range, j.valve.command_bits)
+            * j.valve.spool_gain,
+            -j.valve.spool_stroke,
+            j.valve.spool_stroke,
+        )
+        for i, j in enumerate(rig.joints)
+    ]
+    return np.stack(columns, axis=1)
+
+
+def reference_run(rig: Rig, targets: Array, **options: Any) -> tuple[Array, float]:
+    """Integrate the targets (ticks, joints) from rest by scipy: (signals per tick, seconds)."""
+    reference = Reference(Plant(rig, Scenario(), 1))
+    rows = []
+    began = time.perf_counter()
+    for target in targets:
+        reference.advance(target, **options)
+        rows.append(reference.signals())
+    return np.stack(rows), time.perf_counter() - began
+
+
+def plant_run(rig: Rig, ticks: int) -> tuple[Array, Array]:
+    """Run the plant on the hard input: (signals per tick, spool targets)."""
+    plant, laws, rows, codes = Plant(rig, Scenario(), 1), hard_laws(rig), [], []
+    for _ in range(ticks):
+        codes.append(plant.advance(1, laws)[1])
+        rows.append(signals(plant))
+    return np.stack(rows), spool_targets(rig, np.concatenate(codes))
+
+
+def errors(found: Array, true: Array, joints: int) -> dict[str, float]:
+    """Return the largest error of angles and of pressures, each relative to its signal's range."""
+    relative = np.max(np.abs(found - true), axis=0) / np.ptp(true, axis=0)
+    return {
+        "angle_error": float(np.max(relative[:joints])),
+        "pressure_error": float(np.max(relative[joints:])),
+    }
+
+
+def accuracy(seconds: float = 1.0, rig: Rig | None = None) -> dict[str, float]:
+    """Return the plant's errors against scipy (DOP853, rtol 1e-10) on a hard input to all joints.
+
+    Keys: angle_error, pressure_error (relative to each signal's range), step [s], seconds.
+    """
+    rig = rig or _shipped()
+    found, targets = plant_run(rig, round(seconds * rig.sample_rate))
+    true, _ = reference_run(rig, targets, method="DOP853", rtol=1e-10)
+    return {**errors(found, true, len(rig.joints)), "step": STEP, "seconds": seconds}
+
+
+def speed(seconds: float = 10.0, rig: Rig | None = None) -> dict[str, float]:
+    """Return how much faster than time the plant runs on one core, converters and noise included.
+
+    Keys: real_time_ratio; lsoda_ratio, the time scipy's LSODA takes over the plant's for the same
+    input at the loosest of several tolerances that is no less exact, lsoda_rtol that tolerance,
+    plant_error and lsoda_error the two largest errors.
+    """
+    rig = rig or _shipped()
+    laws, ticks = hard_laws(rig), round(seconds * rig.sample_rate)
+    plant = Plant(rig, Scenario(), 1)
+    plant.advance(1, laws)
+    began = time.perf_counter()
+    plant.advance(ticks, laws)
+    taken = (time.perf_counter() - began) / seconds
+    part = 0.3
+    found, targets = plant_run(rig, round(part * rig.sample_rate))
+    true, _ = reference_run(rig, targets, method="DOP853", rtol=1e-11)
+    own = max(errors(found, true, len(rig.joints)).values())
+    for rtol in (1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10):
+        rough, lsoda = reference_run(rig, targets, method="LSODA", rtol=rtol)
+        other = max(errors(rough, true, len(rig.joints)).values())
+        if other <= own:
+            break
+    return {
+        "real_time_ratio": 1.0 / taken,
+        "lsoda_ratio": lsoda / part / taken,
+        "lsoda_rtol": rtol,
+        "lsoda_error": other,
+        "plant_error": own,
+    }

@@ -68,7 +68,7 @@ def _inclination(t: Tables, e: fx.BaseInclination) -> None:
 def _payload(t: Tables, e: fx.Payload) -> None:
     # A point mass at the tip: R_ij += m l_i l_j, W_i += m l_i.
     lengths = np.array([j.link_length for j in t.rig.joints])
-    t.inertia += e.mass * np.outer(lengths, lengths)
+    t.inertia[:] += e.mass * np.outer(lengths, lengths)
     t.joints["weight"] += e.mass * t.rig.gravity * lengths
 
 
@@ -149,8 +149,6 @@ def _air(t: Tables, e: fx.EntrainedAir) -> None:
 
 def _dead_volume(t: Tables, e: fx.DeadVolume) -> None:
     t.joints[f"{e.chamber}_volume"][e.joint] += e.volume
-
-
 
 
 def _delay(t: Tables, e: fx.ChannelDelay) -> None:

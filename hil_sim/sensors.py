@@ -8,6 +8,8 @@ tick: along the tangent of the true signal), and shows the world as it was `dela
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -25,17 +27,18 @@ def channel_table(rig: Rig, noise: float) -> Table:
         sensor = rig.sensors.of(kind)
         low, high = sensor.range
         top = (1 << sensor.bits) - 1
-        table[k] = (
-            KIND[kind],
-            (joint or 1) - 1,
-            sensor.noise * noise,
-            1.0,
-            0.0,
-            sensor.delay - k * rig.sensors.skew,
-            low,
-            (high - low) / top,
-            top,
-        )
+        row = {
+            "kind": KIND[kind],
+            "joint": (joint or 1) - 1,
+            "noise": sensor.noise * noise,
+            "gain": 1.0,
+            "lag": sensor.delay - k * rig.sensors.skew,
+            "low": low,
+            "step": (high - low) / top,
+            "top": top,
+        }
+        for field, value in row.items():
+            table[field][k] = value
     return table
 
 
@@ -45,10 +48,29 @@ def ring_length(table: Table, period: float) -> int:
     return max(math.ceil(longest / period), 0) + 3
 
 
-def encode(rig: Rig, measured: codes.Array) -> codes.Codes:
-    """Return the AD codes of measured SI values, both (ticks, channels)."""
-    out = np.empty(measured.shape, dtype=np.int64)
+@dataclass(frozen=True)
+class Converter:
+    """Channels that share one range and width: their columns, then low, high and bits."""
+
+    columns: tuple[int, ...]
+    low: float
+    high: float
+    bits: int
+
+
+def converters(rig: Rig) -> tuple[Converter, ...]:
+    """Return the AD converters of `rig`; together they cover every channel once."""
+    shared: dict[tuple[float, float, int], list[int]] = {}
     for k, name in enumerate(rig.channels):
         sensor = rig.sensors.of(kind_of(name)[0])
-        out[:, k] = codes.encode_input(measured[:, k], *sensor.range, sensor.bits)
+        shared.setdefault((*sensor.range, sensor.bits), []).append(k)
+    return tuple(Converter(tuple(columns), *key) for key, columns in shared.items())
+
+
+def encode(measured: codes.Array, parts: Sequence[Converter]) -> codes.Codes:
+    """Return the AD codes of measured SI values, both (ticks, channels)."""
+    out = np.empty(measured.shape, dtype=np.int64)
+    for part in parts:
+        columns = list(part.columns)
+        out[:, columns] = codes.encode_input(measured[:, columns], part.low, part.high, part.bits)
     return out
