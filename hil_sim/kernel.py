@@ -169,27 +169,32 @@ def angular(theta: Any, torque: Any, rate: Any, joints: Any, inertia: Any, m: An
     """
     n = len(joints)
     for i in range(n):
+        own = torque[i] - joints[i].weight * theta[0, i]
         if i + 1 < n:
-            torque[i] -= torque[i + 1]
-        torque[i] -= joints[i].weight * theta[0, i]
-    for i in range(n):
-        m[i, i] = inertia[i, i]
+            own -= torque[i + 1]
         for k in range(i):
-            m[i, k] = inertia[i, k] * (theta[1, i] * theta[1, k] + theta[0, i] * theta[0, k])
+            turned = theta[1, i] * theta[1, k] + theta[0, i] * theta[0, k]
             twist = inertia[i, k] * (theta[0, i] * theta[1, k] - theta[1, i] * theta[0, k])
-            torque[i] -= twist * rate[k] * rate[k]
+            m[i, k] = inertia[i, k] * turned
+            own -= twist * rate[k] * rate[k]
             torque[k] += twist * rate[i] * rate[i]
+        torque[i] = own
+    # m[i, i] keeps 1 / D_i, m[i, k] first L_ik D_k, then L_ik.
     for i in range(n):
+        diagonal, own = inertia[i, i], torque[i]
         for k in range(i):
+            scaled = m[i, k]
             for r in range(k):
-                m[i, k] -= m[i, r] * m[k, r] * m[r, r]
-            m[i, k] /= m[k, k]
-            m[i, i] -= m[i, k] * m[i, k] * m[k, k]
-            torque[i] -= m[i, k] * torque[k]
+                scaled -= m[i, r] * m[k, r] / m[r, r]
+            m[i, k] = scaled * m[k, k]
+            diagonal -= m[i, k] * scaled
+            own -= m[i, k] * torque[k]
+        m[i, i], torque[i] = 1.0 / diagonal, own
     for i in range(n - 1, -1, -1):
-        torque[i] /= m[i, i]
+        own = torque[i] * m[i, i]
         for k in range(i + 1, n):
-            torque[i] -= m[k, i] * torque[k]
+            own -= m[k, i] * torque[k]
+        torque[i] = own
 
 
 @jit
