@@ -1,4 +1,4 @@
-"""What the tests know about the bench on their own: its true signals, Newton's and mass balances."""
+"""What the tests know of the bench on their own: true signals, Newton and mass balances."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ MOVE_1 = [sine(RIG, 0.8, 1.0, position_gain=20.0), CLOSED]
 
 
 def sliding(t: Trace, joint: int = 1) -> tuple[Array, Array]:
-    """Return (speed, the force that friction takes) where the joint slides well and all has settled."""
+    """Return (speed, the force friction takes) where the joint slides well, once settled."""
     v, f = t["speed"][2:-2, joint], -t.missing_force()[:, joint]
     fast = np.abs(v) > 0.03
     fast[:1000] = False

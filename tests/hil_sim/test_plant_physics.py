@@ -86,18 +86,18 @@ def test_a_chain_of_any_length_accelerates_as_its_lagrangian_says(joints: int) -
     kernel.rates(state, np.zeros(joints), 1.0, tables.joints, b, tables.inertia, work, rate)
     a = rate[joints : 2 * joints]
 
-    def L(q: Array, v: Array) -> float:
+    def free(q: Array, v: Array) -> float:
         return lagrangian(q, v, machine.parameters, rig.gravity)
 
     def momentum(q: Array, v: Array, i: int) -> float:
         e = 1e-3 * np.eye(joints)[i]  # T is quadratic: the central difference is exact
-        return (L(q, v + e) - L(q, v - e)) / 2e-3
+        return (free(q, v + e) - free(q, v - e)) / 2e-3
 
     d = 1e-4
     for i in range(joints):
         e = d * np.eye(joints)[i]
         along = momentum(q + d * v, v + d * a, i) - momentum(q - d * v, v - d * a, i)
-        force = along / (2 * d) - (L(q + e, v) - L(q - e, v)) / (2 * d)
+        force = along / (2 * d) - (free(q + e, v) - free(q - e, v)) / (2 * d)
         assert force == pytest.approx(torque[i], abs=2e-5 * np.max(np.abs(torque)) + 2e-4)
 
 
@@ -239,7 +239,7 @@ def test_a_bench_without_a_machine_file_needs_every_nominal_value() -> None:
     nominal = {k: v for k, v in rig.nominal.items() if k not in ("b", "W2")}
     other = rig.model_copy(update={"name": "home-made"})
     assert Plant(other, Scenario(), 1).truth() == rig.nominal
-    with pytest.raises(InputError, match="home-made.*missing: W2 b$"):
+    with pytest.raises(InputError, match=r"home-made.*missing: W2 b$"):
         Plant(other.model_copy(update={"nominal": nominal}), Scenario(), 1)
 
 
