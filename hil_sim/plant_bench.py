@@ -137,14 +137,14 @@ def spool_targets(rig: Rig, outputs: NDArray[np.int64]) -> Array:
 
 
 def reference_run(rig: Rig, targets: Array, **options: Any) -> tuple[Array, float]:
-    """Integrate the targets (ticks, joints) from rest by scipy: (signals per tick, seconds)."""
+    """Integrate the targets (ticks, joints) from rest by scipy: (signals per tick, processor seconds)."""
     reference = Reference(Plant(rig, Scenario(), 1))
     rows = []
-    began = time.perf_counter()
+    began = time.process_time()
     for target in targets:
         reference.advance(target, **options)
         rows.append(reference.signals())
-    return np.stack(rows), time.perf_counter() - began
+    return np.stack(rows), time.process_time() - began
 
 
 def plant_run(rig: Rig, ticks: int) -> tuple[Array, Array]:
@@ -176,7 +176,7 @@ def accuracy(seconds: float = 1.0, rig: Rig | None = None) -> dict[str, float]:
     return {**errors(found, true, len(rig.joints)), "step": STEP, "seconds": seconds}
 
 
-def speed(seconds: float = 10.0, rig: Rig | None = None) -> dict[str, float]:
+def speed(seconds: float = 5.0, rig: Rig | None = None) -> dict[str, float]:
     """Return how much faster than time the plant runs on one core, converters and noise included.
 
     Keys: real_time_ratio; lsoda_ratio, the time scipy's LSODA takes over the plant's for the same
@@ -185,11 +185,12 @@ def speed(seconds: float = 10.0, rig: Rig | None = None) -> dict[str, float]:
     """
     rig = rig or _shipped()
     laws, ticks = hard_laws(rig), round(seconds * rig.sample_rate)
-    plant = Plant(rig, Scenario(), 1)
-    plant.advance(1, laws)
-    began = time.perf_counter()
-    plant.advance(ticks, laws)
-    taken = (time.perf_counter() - began) / seconds
+    taken = math.inf
+    for _ in range(3):  # the best of three, in processor time: other programs are not its fault
+        plant = Plant(rig, Scenario(), 1)
+        began = time.process_time()
+        plant.advance(ticks, laws)
+        taken = min(taken, (time.process_time() - began) / seconds)
     part = 0.3
     found, targets = plant_run(rig, round(part * rig.sample_rate))
     true, _ = reference_run(rig, targets, method="DOP853", rtol=1e-11)
