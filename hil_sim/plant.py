@@ -73,7 +73,8 @@ class Plant:
         """Run `ticks` ticks under one law per joint.
 
         Returns AD codes in the order of rig.channels, (ticks, channels), and the DA codes put out
-        at each tick and held until the next, (ticks, joints). Raises ValueError for a wrong
+        at each tick and held until the next, (ticks, joints). A law given again (the same object)
+        keeps the wave it had: give a new Law for a new wave. Raises ValueError for a wrong
         number of laws.
         """
         joints, channels = len(self._rig.joints), len(self._rig.channels)

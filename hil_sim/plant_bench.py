@@ -137,7 +137,7 @@ def spool_targets(rig: Rig, outputs: NDArray[np.int64]) -> Array:
 
 
 def reference_run(rig: Rig, targets: Array, **options: Any) -> tuple[Array, float]:
-    """Integrate the targets (ticks, joints) from rest by scipy: (signals per tick, processor seconds)."""
+    """Integrate the targets (ticks, joints) from rest: (signals per tick, processor seconds)."""
     reference = Reference(Plant(rig, Scenario(), 1))
     rows = []
     began = time.process_time()
