@@ -1,0 +1,119 @@
+"""What the simulated bench really is: its true parameters and the constants only a plant has.
+
+A shipped machine file `machines/<rig name>.yaml` holds them; a rig without one is built from its
+own `nominal` values. Nothing of this crosses the wire.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from importlib import resources
+from typing import Annotated, Any
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo, field_validator
+
+from rig.model.parameters import parameter_names, parameter_unit
+from rig.model.parse import InputError, parse_model
+from rig.model.quantity import Pressure, Ratio, UnitError, Volume, parse_quantity
+from rig.model.rig import Rig
+
+
+def in_unit(si: str) -> BeforeValidator:
+    """Return a validator that reads ``"80 N"`` in the SI unit `si`; a bare number is SI in code."""
+
+    def read(value: Any, info: ValidationInfo) -> Any:
+        if isinstance(value, str) or (info.context and si):
+            return read_with_unit(value, si)
+        return value
+
+    return BeforeValidator(read)
+
+
+def read_with_unit(value: Any, si: str) -> float:
+    """Read a file's value in the SI unit `si`; raises UnitError where the unit is missing."""
+    if not isinstance(value, str):
+        raise UnitError(f"{value!r} has no unit; write one beside the number, like '1 {si}'")
+    return parse_quantity(value, si)
+
+
+def with_units(read: Callable[[str], str]) -> Callable[[Any, ValidationInfo], Any]:
+    """Return a reader of a mapping of quantities whose SI unit follows from the key."""
+
+    def convert(value: Any, info: ValidationInfo) -> Any:
+        if not isinstance(value, dict) or not info.context:
+            return value
+        return {str(k): read_with_unit(v, read(str(k))) for k, v in value.items()}
+
+    return convert
+
+
+class Constants(BaseModel):
+    """Plant-only constants [SI]; the defaults suit a small bench on mineral oil."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    laminar_transition: Pressure = Field(
+        default=50e3, gt=0, description="pressure drop below which an orifice is laminar"
+    )
+    residual_air: Ratio = Field(
+        default=1e-5, gt=0, lt=0.1, description="undissolved gas at 1 atm, by volume"
+    )
+    bulk_temperature: Annotated[float, in_unit("delta_degC^-1")] = Field(
+        default=-0.004, description="relative change of the bulk modulus per kelvin"
+    )
+    spool_rate: Annotated[float, in_unit("V/s")] = Field(default=140.0, gt=0)
+    contact_stiffness: Annotated[float, in_unit("N/m^1.5")] = Field(default=5e9, gt=0)
+    contact_damping: Annotated[float, in_unit("s/m")] = Field(default=10.0, ge=0)
+    supply_volume: Volume = Field(default=0.5e-3, gt=0)
+    relief_override: Pressure = Field(
+        default=0.15e6, gt=0, description="from cracking to passing the whole pump flow"
+    )
+    relief_rounding: Pressure = Field(default=20e3, gt=0)
+
+
+class Machine(BaseModel):
+    """The true parameters by name [SI] and the plant's constants."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    parameters: dict[str, float]
+    constants: Constants = Constants()
+
+    @field_validator("parameters", mode="before")
+    @classmethod
+    def _units(cls, value: Any, info: ValidationInfo) -> Any:
+        return with_units(parameter_unit)(value, info)
+
+
+def machine_text(name: str) -> str | None:
+    """Return the machine file shipped for the rig called `name`, None where there is none."""
+    path = resources.files("hil_sim") / "machines" / f"{name}.yaml"
+    return path.read_text(encoding="utf-8") if path.is_file() else None
+
+
+def load_machine(rig: Rig, overrides: Mapping[str, float] | None = None) -> Machine:
+    """Return the machine of `rig`, parameters [SI] overridden by name.
+
+    Raises InputError naming parameters that are missing or that the rig does not have.
+    """
+    names = parameter_names(len(rig.joints))
+    text = machine_text(rig.name)
+    if text is None:
+        machine, source = Machine(parameters=dict(rig.nominal)), f"rig {rig.name!r}: nominal"
+    else:
+        source = f"machines/{rig.name}.yaml"
+        machine = parse_model(Machine, text, source)
+    for name in (*machine.parameters, *(overrides or {})):
+        if name not in names:
+            where = "scenario parameters" if name in (overrides or {}) else source
+            raise InputError(
+                f"{where}: {name!r} is no parameter of a rig with {len(rig.joints)} joint(s); "
+                f"expected one of: {' '.join(names)}"
+            )
+    merged = {**machine.parameters, **(overrides or {})}
+    missing = [name for name in names if name not in merged]
+    if missing:
+        raise InputError(
+            f"{source}: the simulated bench needs every parameter; missing: {' '.join(missing)}"
+        )
+    return Machine(parameters={n: merged[n] for n in names}, constants=machine.constants)
