@@ -24,7 +24,7 @@ from rig.model.parse import InputError
 from rig.model.records import Record
 from rig.services.files import sync_file, sync_folder
 from rig.services.journal import Journal
-from rig.services.sections import BETWEEN, Assembled, Section, assemble, blocks_of, plan
+from rig.services.sections import BETWEEN, Assembled, Section, Written, assemble, blocks_of, plan
 from rig.services.trips import RecordingFailed
 
 log = logging.getLogger(__name__)
@@ -126,16 +126,17 @@ def put_in_place(fresh: Path, path: Path) -> None:
     sync_folder(path.parent)
 
 
-def write_from_journal(journal: Journal, folder: Path, rig_name: str) -> list[Section]:
+def write_from_journal(journal: Journal, folder: Path, rig_name: str) -> Written:
     """Write records.h5 and verify it against the journal, sample by sample.
 
-    Returns the sections written; raises RecordingFailed and leaves no archive if it cannot.
+    Returns what it holds; raises RecordingFailed and leaves no archive if it cannot.
     """
     spans = journal.spans()
     sections = plan(journal, spans)
     columns = journal.meta("columns")
     needed = sum(section.ticks for section in sections) * len(columns) * 8
     fresh = folder / f"{NAME}.tmp"
+    lost = 0
     try:
         if shutil.disk_usage(folder).free < needed:
             raise OSError(f"{needed / 1e6:.1f} MB are needed and not free")
@@ -146,7 +147,8 @@ def write_from_journal(journal: Journal, folder: Path, rig_name: str) -> list[Se
                 each = {name: found.data[:, i] for i, name in enumerate(columns)}
                 write_group(file, section.group, each, attributes)
                 _note_saturation(file[section.group], columns, found)
-        verify(journal, fresh, sections)
+                lost += found.lost if section.meta else 0
+        damaged = verify(journal, fresh, sections)
         put_in_place(fresh, folder / NAME)
     except (OSError, RuntimeError) as error:  # h5py reports a failed flush as RuntimeError
         fresh.unlink(missing_ok=True)
@@ -154,7 +156,10 @@ def write_from_journal(journal: Journal, folder: Path, rig_name: str) -> list[Se
             f"{folder / NAME}: cannot be written ({error}); the journal keeps every sample: free "
             "some disk space, then `bramah recover` this run"
         ) from error
-    return sections
+    records = [section for section in sections if section.meta]
+    partial = sum(not section.complete for section in records)
+    samples = sum(section.ticks for section in records)
+    return Written(len(records), partial, samples, lost, damaged)
 
 
 def _note_saturation(group: h5py.Group, columns: Sequence[str], found: Assembled) -> None:
@@ -162,8 +167,11 @@ def _note_saturation(group: h5py.Group, columns: Sequence[str], found: Assembled
         group[name].attrs["saturated_samples"] = int(count)
 
 
-def verify(journal: Journal, path: Path, sections: Sequence[Section]) -> None:
-    """Compare every sample of the journal with the archive; raises OSError where they differ."""
+def verify(journal: Journal, path: Path, sections: Sequence[Section]) -> int:
+    """Compare every sample of the journal with the archive; raises OSError where they differ.
+
+    Returns the number of blocks whose checksum fails, which nothing can be compared with.
+    """
     columns, spans = journal.meta("columns"), journal.spans()
     total = damaged = 0
     with h5py.File(path, "r") as file:
@@ -186,6 +194,7 @@ def verify(journal: Journal, path: Path, sections: Sequence[Section]) -> None:
         raise OSError(
             f"only {total} of {int(spans.samples.sum())} samples of the journal are in it"
         )
+    return damaged
 
 
 def _record(name: str, group: h5py.Group, path: Path) -> Record:

@@ -149,7 +149,7 @@ class Guard:
             return -part.limits.command - step, part.limits.command + step
         if kind in (ch.CAP, ch.ROD):
             return part.limits.pressure
-        _, low, high = _piston_bounds(self.roles[joint - 1], self.rig, joint - 1)
+        _, low, high = piston_bounds(self.roles[joint - 1], self.rig, joint - 1)
         return low, high
 
     def gap(self, lost: int, tick: int) -> Violation | None:
@@ -194,7 +194,7 @@ class Guard:
         if not math.isfinite(value):
             limit = FINITE
         elif kind == ch.PISTON and joint is not None:
-            limit = _piston_bounds(self.roles[joint - 1], self.rig, joint - 1)[0]
+            limit = piston_bounds(self.roles[joint - 1], self.rig, joint - 1)[0]
         else:
             limit = "command" if kind == ch.COMMAND else "pressure"
         return Violation(limit, value, allowed, ch.unit_of(name), joint, name, block.tick + row)
@@ -244,7 +244,7 @@ class Guard:
         return [Violation("saturated sensor", value, ends, ch.unit_of(name), joint, name, tick)]
 
 
-def _piston_bounds(role: JointRole, rig: Rig, joint: int) -> tuple[str, float, float]:
+def piston_bounds(role: JointRole, rig: Rig, joint: int) -> tuple[str, float, float]:
     """Return (name of the limit, lowest, highest) of a joint's piston in its role."""
     part = rig.joints[joint]
     if role.locked_at is not None and math.isfinite(role.tolerance):

@@ -52,6 +52,17 @@ class Assembled:
 
 
 @dataclass(frozen=True)
+class Written:
+    """What an archive holds: records (complete or not), their samples, what is missing in them."""
+
+    records: int
+    partial: int
+    samples: int
+    lost_samples: int
+    damaged_blocks: int
+
+
+@dataclass(frozen=True)
 class _Run:
     """Ticks [start, end) of a stream that arrived without a gap."""
 
