@@ -145,8 +145,8 @@ class Journal:
             self._db.execute(sql, values)
         except sqlite3.Error as error:
             raise RecordingFailed(
-                f"{self.path}: cannot be written any more ({error}); free some disk space, "
-                "then `bramah recover` this run"
+                f"{self.path}: cannot be written any more ({error}; is the disk full?); what was "
+                "recorded until then is kept"
             ) from error
 
     def append(self, stream: int, block: SampleBlock, late: float | None) -> None:
