@@ -15,8 +15,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from fake_driver import FakeDriver, kill_self
-
 from drivers.base import OutputLaw
 from rig.services import archive, journal, recorder, store
 from rig.services.attach import Publisher
@@ -24,6 +22,7 @@ from rig.services.bench import Bench
 from rig.services.recorder import Recorder
 from rig.services.rigs import load_rig
 from rig.services.trips import OperatorStop, RecordingFailed
+from tests.services.fake_driver import FakeDriver, kill_self
 
 RIG = load_rig("shinshu-2dof")
 

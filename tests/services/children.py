@@ -9,9 +9,9 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-from fake_driver import samples
 
 from rig.services.rigs import load_rig
+from tests.services.fake_driver import samples
 
 RIG = load_rig("shinshu-2dof")
 HERE = Path(__file__).parent
@@ -19,7 +19,7 @@ ROOT = HERE.parents[1]
 
 
 def start(run: Path, mode: str, number: int, **kwargs) -> subprocess.Popen[str]:
-    environment = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{HERE}"}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     return subprocess.Popen(
         [sys.executable, str(HERE / "child.py"), str(run), mode, str(number)],
         env=environment,

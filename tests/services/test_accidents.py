@@ -10,14 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from children import RIG, acknowledged, assert_all_there, finish, measured, start
-from fake_driver import samples
 
 from rig.model.parse import InputError
 from rig.services.recover import recover
 from rig.services.runstate import read_events
 from rig.services.store import list_runs, load_run
 from rig.services.trips import RecordingFailed
+from tests.services.children import RIG, acknowledged, assert_all_there, finish, measured, start
+from tests.services.fake_driver import samples
 
 
 @pytest.mark.parametrize("block", [1, 17, 45])

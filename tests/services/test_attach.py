@@ -17,8 +17,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zmq
-from children import RIG, acknowledged, assert_all_there, start
-from fake_driver import FakeDriver
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -28,6 +26,8 @@ from rig.services.recorder import Recorder
 from rig.services.snapshot import Snapshot, decimate, from_json, to_json
 from rig.services.store import load_run
 from rig.services.trips import OperatorStop
+from tests.services.children import RIG, acknowledged, assert_all_there, start
+from tests.services.fake_driver import FakeDriver
 
 
 @pytest.fixture

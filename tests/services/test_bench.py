@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_driver import FakeDriver
 
 from drivers.base import DeviceError, DeviceInfo, DeviceLost, OutputLaw, SampleBlock
 from rig.services.bench import Bench
@@ -20,6 +19,7 @@ from rig.services.runstate import read_events
 from rig.services.safety import EXCITED, FREE, JointRole
 from rig.services.store import load_run
 from rig.services.trips import OperatorStop, SafetyTrip
+from tests.services.fake_driver import FakeDriver
 
 RIG = load_rig("shinshu-2dof")
 MOVE = [OutputLaw(bias=1.0, limit=2.0), OutputLaw()]

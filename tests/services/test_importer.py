@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_driver import samples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.io import savemat
@@ -15,6 +14,7 @@ from rig.model.parse import InputError
 from rig.services.importer import import_records
 from rig.services.rigs import load_rig
 from rig.services.store import list_runs, load_run
+from tests.services.fake_driver import samples
 
 RIG = load_rig("shinshu-2dof")
 NAMES = RIG.channels

@@ -8,7 +8,6 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from fake_driver import FakeDriver, samples
 
 from drivers.base import OutputLaw, SampleBlock
 from rig.model.channels import unit_of
@@ -18,6 +17,7 @@ from rig.services.recorder import Recorder, RecordMeta
 from rig.services.rigs import load_rig
 from rig.services.runstate import read_events
 from rig.services.store import list_runs, load_run
+from tests.services.fake_driver import FakeDriver, samples
 
 RIG = load_rig("shinshu-2dof")
 
