@@ -52,7 +52,7 @@ class Display:
         self._waiting.append(block.data)
         self._tick = block.tick + len(block.data)
         self._lost, self._roles = lost, roles
-        if self._clock() >= self._next:
+        if self.trip is not None or self._clock() >= self._next:
             self._publish(runstate.RUNNING if self.trip is None else runstate.TRIPPED, age)
             self._next = self._clock() + _INTERVAL
 

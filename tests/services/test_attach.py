@@ -20,12 +20,14 @@ import zmq
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from drivers.base import SampleBlock
 from rig.services.attach import AttachError, Attachment, Endpoint, Publisher
 from rig.services.bench import Bench
 from rig.services.recorder import Recorder
+from rig.services.safety import EXCITED, JointRole
 from rig.services.snapshot import Snapshot, decimate, from_json, to_json
 from rig.services.store import load_run
-from rig.services.trips import OperatorStop
+from rig.services.trips import OperatorStop, SafetyTrip
 from tests.services.children import RIG, acknowledged, assert_all_there, start
 from tests.services.fake_driver import FakeDriver
 
@@ -250,3 +252,37 @@ def test_a_snapshot_survives_its_wire_and_rubbish_is_refused() -> None:
     for raw in (b"", b"[]", b"{}", b'{"channels": {"a": {}}}', b"\xff"):
         with pytest.raises(ValueError):  # noqa: PT011
             from_json(raw)
+
+
+class Wall:
+    """A publisher's double: everything published, nothing asked."""
+
+    def __init__(self) -> None:
+        self.seen: list[Snapshot] = []
+        self.publish = self.seen.append
+        self.commands = list
+        self.close = dict
+
+
+def test_a_trip_is_shown_at_once_and_the_limits_follow_the_roles() -> None:
+    def spoil(block: SampleBlock) -> SampleBlock:
+        data = block.data.copy()
+        data[:, 2] = 9.5e6 if block.sequence == 1 else data[:, 2]
+        return replace(block, data=data)
+
+    wall = Wall()
+    driver = FakeDriver(RIG, spoil=spoil)
+    with Bench(RIG, driver, None, wall, clock=lambda: 0.0) as bench:
+        bench.guard([EXCITED, JointRole(locked_at=-0.02, tolerance=0.02)])
+        bench.exchange()
+        with pytest.raises(SafetyTrip):
+            bench.exchange()
+        assert [s.state for s in wall.seen] == ["running", "tripped"]
+    last = wall.seen[1]
+    assert "9.5 MPa" in str(last.trip)
+    assert (last.channels["piston_1"].low, last.channels["piston_1"].high) == RIG.joints[
+        0
+    ].limits.piston
+    assert last.channels["piston_2"].high == pytest.approx(0.0, abs=1e-12)
+    assert last.channels["command_1"].high == 4.0
+    assert (last.tick, last.device_time) == (20, 0.02)

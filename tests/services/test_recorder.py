@@ -8,15 +8,19 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import yaml
 
 from drivers.base import OutputLaw, SampleBlock
 from rig.model.channels import unit_of
 from rig.model.parse import InputError
+from rig.services import archive
 from rig.services.bench import Bench
 from rig.services.recorder import Recorder, RecordMeta
+from rig.services.recover import recover
 from rig.services.rigs import load_rig
 from rig.services.runstate import read_events
-from rig.services.store import list_runs, load_run
+from rig.services.store import list_runs, load_run, read_header
+from rig.services.trips import RecordingFailed
 from tests.services.fake_driver import FakeDriver, samples
 
 RIG = load_rig("shinshu-2dof")
@@ -220,3 +224,40 @@ def test_a_damaged_run_is_refused_in_one_line(tmp_path: Path, spoil, said: str) 
     assert "\n" not in str(error.value)
     with pytest.raises(InputError, match="no such run folder"):
         load_run(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize("fault", ["a sample", "a section", "a count"])
+def test_an_archive_that_differs_from_the_journal_is_never_put_in_its_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: str
+) -> None:
+    assemble, plan = archive.assemble, archive.plan
+
+    def spoiled(*given):
+        found = assemble(*given)
+        if fault == "a sample":
+            found.data[7, 3] = np.nextafter(found.data[7, 3], np.inf)
+        return replace(found, lost=found.lost + (fault == "a count"))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(archive, "assemble", spoiled)
+        if fault == "a section":
+            patch.setattr(archive, "plan", lambda *given: plan(*given)[1:])
+        with pytest.raises(RecordingFailed, match=r"differs|miscounts|samples of the journal"):
+            take(tmp_path / "run", FakeDriver(RIG))
+    left = {p.name for p in (tmp_path / "run").iterdir()}
+    assert "journal.sqlite" in left
+    assert not {"records.h5", "records.h5.tmp"} & left
+    assert list_runs(tmp_path)[0].state == "aborted"
+    assert recover(tmp_path / "run").state == "done"
+    assert len(load_run(tmp_path / "run").records) == 2
+
+
+def test_run_yaml_says_who_took_it_on_what_with_which_software(tmp_path: Path) -> None:
+    take(tmp_path / "run", FakeDriver(RIG))
+    head = yaml.safe_load((tmp_path / "run" / "run.yaml").read_text())
+    assert head["protocol"] == {"name": "demo", "steps": [1, 2]}
+    assert (head["seed"], head["device"]) == (7, "fake bench")
+    assert {"bramah", "python", "platform"} <= set(head["versions"])
+    assert all(head[key] for key in ("created", "operator", "host"))
+    assert head["rig"]["joints"][0]["cylinder"]["stroke"] == 0.075
+    assert read_header(tmp_path / "run").rig == RIG
