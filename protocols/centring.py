@@ -21,6 +21,7 @@ Array = NDArray[np.float64]
 RECENTRE = 0.5  # share of the offset taken out within the next record
 RECENTRE_CAP = 0.7  # of the allowed drift: recentring must not look like a drift itself
 TAIL = 0.25  # of a period, over which drift is averaged
+SHORTEST_LINE = 100  # samples; a slope through less is noise
 MARGIN = 0.5e-3  # [m] kept from a piston limit
 
 
@@ -39,10 +40,14 @@ class Motion:
 
 @dataclass(frozen=True)
 class Follow:
-    """How a piston follows its command: gain k [m/(s V)] and null v0 [V]."""
+    """How a piston follows its command: gain k [m/(s V)], null v0 [V], drift d [m/s]."""
 
     gain: float
     null: float
+    drift: float
+
+
+_UNKNOWN = Follow(float("nan"), float("nan"), float("nan"))
 
 
 def follow(command: Array, piston: Array, rate: float) -> Follow:
@@ -54,15 +59,15 @@ def follow(command: Array, piston: Array, rate: float) -> Follow:
     """
     known = np.isfinite(command) & np.isfinite(piston)
     if np.count_nonzero(known) < 10:
-        return Follow(float("nan"), float("nan"))
+        return _UNKNOWN
     middle = float(np.mean(command[known]))
     moved = np.cumsum(np.where(known, command - middle, 0.0)) / rate
     if np.ptp(moved) < 1e-9:
-        return Follow(float("nan"), float("nan"))
+        return _UNKNOWN
     time = np.arange(len(command)) / rate
     basis = np.column_stack((np.ones_like(time), time, moved))[known]
     _, drift, gain = np.linalg.lstsq(basis, piston[known], rcond=None)[0]
-    return Follow(float(gain), middle - float(drift / gain))
+    return Follow(float(gain), middle - float(drift / gain), float(drift))
 
 
 def motion(piston: Array, period: int, rate: float) -> Motion:
@@ -108,12 +113,12 @@ class Forecast:
 
 
 def forecast(reference: Array, seen: Array, horizon: int, rate: float) -> Forecast:
-    """Predict the rest of a record from the last period before it, phase by phase.
+    """Predict the way of a piston from one period that it is known, or believed, to repeat.
 
-    `reference` (period,) is the period before; `seen` (m,) the record so far, from phase 0;
-    `horizon` the samples still to come. seen - reference is a straight line where the drift
-    changed once, at the trim: it is continued. Before a tenth of a period, or 100 samples, has
-    been seen the slope is taken as 0: a line through less is noise.
+    `reference` (period,) is that period; `seen` (m,) what came since, from phase 0; `horizon`
+    the samples still to come. seen - reference is a straight line where the drift changed once,
+    at the trim. The line is continued, but no further than it has been seen: a slope from a
+    short look, or from an imperfect reference, does not carry far.
     """
     period, m = len(reference), len(seen)
     stride = max(1, min(period, m) // 500)
@@ -122,9 +127,10 @@ def forecast(reference: Array, seen: Array, horizon: int, rate: float) -> Foreca
     known = np.isfinite(apart)
     shift = float(np.mean(apart[known][-20:])) if known.any() else 0.0
     slope = 0.0
-    if m >= max(100, period // 10) and np.count_nonzero(known) > 2:
+    if m >= SHORTEST_LINE and np.count_nonzero(known) > 2:
         slope = float(np.polyfit(past[known] / rate, apart[known], 1)[0])
-    ahead = np.arange(0, max(1, horizon), max(1, horizon // 1000))
+    reach = max(1, min(horizon, m))
+    ahead = np.arange(0, reach, max(1, reach // 1000))
     path = reference[(m + ahead) % period] + shift + slope * ahead / rate
     return Forecast(float(np.nanmin(path)), float(np.nanmax(path)), slope, shift)
 

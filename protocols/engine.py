@@ -9,14 +9,16 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 
+import numpy as np
+
+from protocols.driven import Driven
 from protocols.errors import ProtocolAborted
-from protocols.excitation import Driven, Excitation
+from protocols.excitation import Excitation
 from protocols.locking import Hold, Lock, give, lock
 from protocols.model import CLOSED
 from protocols.placing import look, move
 from protocols.plan import LockPlan, Plan, StepPlan
-from protocols.session import Bench, RecordHandle, Session
-from rig.model.parse import InputError
+from protocols.session import Bench, Session
 from rig.model.rig import Rig
 from rig.services.recorder import RecordMeta
 from rig.services.safety import EXCITED, FREE, JointRole
@@ -35,15 +37,9 @@ def run(plan: Plan, rig: Rig, bench: Bench, on_phase: OnPhase | None = None) -> 
     """Run every step of a plan; the records are in the bench's recorder when it returns.
 
     `on_phase` is told every phase: "place", "lock", "warm-up", "centre", "record", "stop",
-    "done". Raises InputError if the device is another size or rate than the plan,
-    ProtocolAborted (or its LockFailed) if the bench does not do what a step needs, and whatever
-    the bench raises.
+    "done". Raises ProtocolAborted (or its LockFailed) if the bench does not do what a step needs,
+    and whatever the bench raises.
     """
-    if bench.info.joints != len(rig.joints) or bench.info.sample_rate != plan.sample_rate:
-        raise InputError(
-            f"the device has {bench.info.joints} joint(s) at {bench.info.sample_rate:g} samples/s; "
-            f"the plan is for {len(rig.joints)} at {plan.sample_rate:g}"
-        )
     tell = on_phase or _nobody
     keep = max(s.record + 2 * s.period + s.warm_up for s in plan.steps)
     session = Session(bench, rig, keep + round(SPARE * rig.sample_rate))
@@ -116,23 +112,30 @@ class _StepRun:
         disturbed = 0
         repeat = 1
         while repeat <= self.step.repeats:
-            self.tell("record", f"record {repeat} of {self.step.repeats}", repeat)
-            first, driven = excitation.at, excitation.joints
-            handle = self._begin(repeat, first)
-            if excitation.record():
-                handle.complete(self.step.record, self._attributes(first, driven, excitation))
+            if self._record(excitation, repeat):
                 repeat += 1
                 if repeat <= self.step.repeats and self._relock(excitation):
                     excitation.settle_bias()
                 continue
-            handle.discard()
             disturbed += 1
             if disturbed > self.step.tries:
-                raise ProtocolAborted(_too_wide(self.session, self.step, driven))
+                raise ProtocolAborted(_too_wide(self.session, self.step))
             self.tell("centre", f"record {repeat} was disturbed and is taken again", repeat)
             excitation.settle_bias()
 
-    def _begin(self, repeat: int, first: int) -> RecordHandle:
+    def _record(self, excitation: Excitation, repeat: int) -> bool:
+        """Take one record; False if it was disturbed, and so is none."""
+        self.tell("record", f"record {repeat} of {self.step.repeats}", repeat)
+        first, driven = excitation.at, excitation.joints
+        meta = self._meta(repeat)
+        with self.session.bench.record(meta, start_tick=first, ticks=self.step.record) as record:
+            if not excitation.record():
+                record.discard("a bias had to be corrected within it")
+                return False
+            record.note(**self._attributes(first, driven, excitation))
+        return True
+
+    def _meta(self, repeat: int) -> RecordMeta:
         attributes: dict[str, str | float | int] = {
             "excited": " ".join(str(e.joint + 1) for e in self.step.excite)
         }
@@ -140,7 +143,7 @@ class _StepRun:
             if e.wave.detection_lines:
                 lines = " ".join(str(k) for k in e.wave.detection_lines)
                 attributes[f"detection_lines_{e.joint + 1}"] = lines
-        meta = RecordMeta(
+        return RecordMeta(
             step=self.step.name,
             repeat=repeat,
             locked=tuple(held.joint + 1 for held in self.locks),
@@ -148,7 +151,6 @@ class _StepRun:
             lines=self.step.lines,
             attributes=attributes,
         )
-        return self.session.bench.record(meta, first)
 
     def _attributes(
         self, first: int, driven: Sequence[Driven], excitation: Excitation
@@ -162,10 +164,9 @@ class _StepRun:
             found[f"lock_piston_m_{j}"] = held.piston
             found[f"lock_give_m_{j}"] = give(self.session, held, first, last)
         for before, after in zip(driven, excitation.joints, strict=True):
-            j = before.plan.joint + 1
-            loop = 0.0 if before.open_loop else before.plan.settings.centring.position_gain
+            j = before.joint + 1
             found[f"bias_v_{j}"] = before.bias
-            found[f"position_gain_v_per_m_{j}"] = loop
+            found[f"position_gain_v_per_m_{j}"] = before.loop
             found[f"drift_m_{j}"] = after.moved.drift * self.step.record / self.session.rate
             found[f"centre_m_{j}"] = after.moved.mean
         return found
@@ -204,16 +205,16 @@ def _lock_text(part: LockPlan) -> str:
     return f"to its end stop ({part.at}), held there"
 
 
-def _too_wide(session: Session, step: StepPlan, driven: Sequence[Driven]) -> str:
+def _too_wide(session: Session, step: StepPlan) -> str:
     texts = []
-    for joint in driven:
-        low, high = session.rig.joints[joint.plan.joint].limits.piston
-        piston = session.piston(joint.plan.joint, session.now - step.period, session.now)
+    for part in step.excite:
+        low, high = session.rig.joints[part.joint].limits.piston
+        piston = session.piston(part.joint, session.now - step.period, session.now)
         texts.append(
-            f"joint {joint.plan.joint + 1} swings {1e3 * min(piston):.1f} to "
-            f"{1e3 * max(piston):.1f} mm of the allowed {1e3 * low:g} to {1e3 * high:g} mm"
+            f"joint {part.joint + 1} swings {1e3 * np.nanmin(piston):.1f} to "
+            f"{1e3 * np.nanmax(piston):.1f} mm of the allowed {1e3 * low:g} to {1e3 * high:g} mm"
         )
     return (
-        f"{step.name}: a record was disturbed {step.tries + 1} times: {'; '.join(texts)}; "
+        f"{step.name}: records were disturbed {step.tries + 1} times: {'; '.join(texts)}; "
         "lower the amplitude"
     )

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Protocol
+from types import TracebackType
+from typing import Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,21 +20,30 @@ Watch = Callable[[], None]
 
 
 class RecordHandle(Protocol):
-    """A record that has begun: it ends complete, or it never was one."""
+    """A record being taken: complete where its `with` block ends, partial if it is left early."""
 
-    def complete(self, ticks: int, attributes: Mapping[str, str | float | int]) -> None:
-        """End the record after `ticks` samples, with what is known of it only now."""
+    def __enter__(self) -> Self:
+        """Begin the record."""
 
-    def discard(self) -> None:
-        """Forget the record; its samples stay in the journal."""
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """End the record."""
+
+    def note(self, **attributes: str | float | int) -> None:
+        """Add what is known of it only now."""
+
+    def discard(self, reason: str) -> None:
+        """Make it no record; its samples stay in the run."""
 
 
 class Bench(Protocol):
     """What the engine needs of `rig.services.bench.Bench`."""
 
-    @property
-    def info(self) -> DeviceInfo:
-        """Who answered, and its clock."""
+    info: DeviceInfo
 
     def upload(self, joint: int, wave: Array) -> None:
         """Store one period of a joint's (0-based) waveform [V]."""
@@ -47,8 +57,11 @@ class Bench(Protocol):
     def guard(self, roles: Sequence[JointRole]) -> None:
         """Say what each joint does, and so which limits hold."""
 
-    def record(self, meta: RecordMeta, start: int) -> RecordHandle:
-        """Begin a record at tick `start`."""
+    def record(
+        self, meta: RecordMeta | None = None, *, start_tick: int | None = None,
+        ticks: int | None = None,
+    ) -> RecordHandle:  # fmt: skip
+        """Make a record of `ticks` samples from `start_tick`, to be entered by `with`."""
 
 
 class Session:

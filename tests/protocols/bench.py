@@ -7,8 +7,9 @@ with the analysis model or the simulated bench.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,15 +49,21 @@ class Handle:
 
     meta: RecordMeta
     start: int
-    ticks: int | None = None
+    ticks: int
     state: str = "open"
-    attributes: Mapping[str, object] = field(default_factory=dict)
+    attributes: dict[str, Any] = field(default_factory=dict)
 
-    def complete(self, ticks: int, attributes: Mapping[str, object] | None = None) -> None:
-        self.ticks, self.state = ticks, "complete"
-        self.attributes = {**self.meta.attributes, **(attributes or {})}
+    def __enter__(self) -> Handle:
+        return self
 
-    def discard(self) -> None:
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
+        if self.state == "open":
+            self.state = "complete" if error is None else "partial"
+
+    def note(self, **attributes: Any) -> None:
+        self.attributes.update(attributes)
+
+    def discard(self, reason: str) -> None:
         self.state = "discarded"
 
 
@@ -99,8 +106,17 @@ class LittleBench:
     def guard(self, roles: Sequence[JointRole]) -> None:
         self.roles = list(roles)
 
-    def record(self, meta: RecordMeta, start: int) -> Handle:
-        self.records.append(Handle(meta, start))
+    def record(
+        self,
+        meta: RecordMeta | None = None,
+        *,
+        start_tick: int | None = None,
+        ticks: int | None = None,
+    ) -> Handle:
+        assert meta is not None
+        assert start_tick is not None
+        assert ticks is not None
+        self.records.append(Handle(meta, start_tick, ticks, attributes=dict(meta.attributes)))
         return self.records[-1]
 
     def exchange(self) -> SampleBlock:
