@@ -41,7 +41,7 @@ def run(plan: Plan, rig: Rig, bench: Bench, on_phase: OnPhase | None = None) -> 
     and whatever the bench raises.
     """
     tell = on_phase or _nobody
-    keep = max(s.record + 2 * s.period + s.warm_up for s in plan.steps)
+    keep = max(s.record + 2 * s.period for s in plan.steps)
     session = Session(bench, rig, keep + round(SPARE * rig.sample_rate))
     for step in plan.steps:
         _StepRun(session, plan, step, tell).run()

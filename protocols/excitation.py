@@ -27,12 +27,13 @@ from protocols.driven import (
 )
 from protocols.locking import Lock, verify
 from protocols.model import Place
-from protocols.plan import StepPlan
+from protocols.plan import FIRM_SECONDS, StepPlan
 from protocols.session import Session
 
 log = logging.getLogger(__name__)
 
 RAMP_STEP = 0.05  # [s] between two sizes of the growing waveform
+LOOSER = 0.8  # factor between two position gains while the loop is loosened
 RAMP_DOWN = 0.5  # [s] a moving arm is not stopped by closing its valve at once
 LOOK_AHEAD = 0.1  # [s] between two forecasts
 NEAR = 20  # samples whose mean says where a piston is now
@@ -57,27 +58,28 @@ class Excitation:
     def warm_up(self, nulls: Mapping[int, float]) -> None:
         """Let the waveforms grow under a firm position loop, then loosen it and find the biases.
 
-        `nulls` [V] are the commands that held the pistons still, by joint (0-based). Raises
-        ProtocolAborted for a piston that does not follow its command.
+        `nulls` [V] are the commands that held the pistons still, by joint (0-based). A loop turns
+        the phase of the motion, so loosening it at once would leave the piston off centre: it is
+        loosened slowly. Raises ProtocolAborted for a piston that does not follow its command.
         """
         self.joints = tuple(Driven(e, nulls[e.joint]) for e in self.step.excite)
         for driven in self.joints:
             self.session.bench.upload(driven.joint, driven.plan.wave.samples)
         firm = self.place.position_gain
         silent = {d.joint: self._law(d, 0.0, firm) for d in self.joints}
-        self.start = self.at = self.session.apply(silent, restart=True)
+        self.start = self.session.apply(silent, restart=True)
         self._checked = self.session.now
-        grown = self._grow(firm)
-        period = self.step.period
-        first = period * max(
-            math.ceil((grown - self.start) / period), self.step.warm_up // period // 2
-        )
-        self._advance(first)
-        self._find_biases(grown)
+        self._grow(firm)
+        self._go_on(FIRM_SECONDS)
+        self._find_biases(round(FIRM_SECONDS * self.session.rate))
+        self._play(loop=firm)
+        self._go_on(0.5 * FIRM_SECONDS)
+        self._loosen(firm)
         self.hold()
-        loose = self.at
-        self._advance(self.step.warm_up - first)
-        self._find_biases(loose)
+        passed = self.session.now - self.start
+        self.at = self.start + math.ceil(passed / self.step.period) * self.step.period
+        self._advance(self.step.warm_up)
+        self._find_biases(self.step.warm_up)
 
     def settle_bias(self) -> None:
         """Play trials until every piston is centred and its drift is what was asked for.
@@ -116,7 +118,7 @@ class Excitation:
 
     def hold(self) -> None:
         """Centre by the slow loop, until the next trial."""
-        self._play(loop=min(d.centring.position_gain for d in self.joints))
+        self._play(loop=self._loose())
         self._alone = True
 
     def resume(self, locks: Sequence[Lock]) -> None:
@@ -144,14 +146,28 @@ class Excitation:
             {d.joint: self._law(d, scale, d.loop if loop is None else loop) for d in self.joints}
         )
 
-    def _grow(self, loop: float) -> int:
-        """Let the waveforms grow to full size; returns the tick at which they have it."""
+    def _grow(self, loop: float) -> None:
+        """Let the waveforms grow to full size."""
         sizes = max(1, round(self.step.ramp / RAMP_STEP))
         for size in range(1, sizes + 1):
-            tick = self.start + round(size * RAMP_STEP * self.session.rate)
-            self.session.until(tick, self._watch_locks)
+            self._go_on(RAMP_STEP)
             self._play(size / sizes, loop)
-        return self.session.now
+
+    def _loosen(self, firm: float) -> None:
+        """Lower the position gain to the slow loop's, no faster than the loop itself settles."""
+        loop, loose = firm, self._loose()
+        slowest = min(d.gain for d in self.joints)
+        while loop * LOOSER > loose:
+            loop *= LOOSER
+            self._play(loop=loop)
+            self._go_on(0.5 / (slowest * loop))
+
+    def _loose(self) -> float:
+        return min(d.centring.position_gain for d in self.joints)
+
+    def _go_on(self, seconds: float) -> None:
+        """Play on for a time, wherever that ends, with an eye on the locks."""
+        self.session.wait(seconds, self._watch_locks)
 
     def _watch_locks(self) -> None:
         for held in self.locks:
@@ -163,16 +179,15 @@ class Excitation:
         self.at += samples
         self.session.until(self.at, self._watch_locks)
 
-    def _find_biases(self, since: int) -> None:
-        """Take each bias from the last two periods after tick `since`, or from what there is."""
-        first = max(since, self.at - 2 * self.step.period)
-        if first > self.at - 2 * self.step.period:
-            first = max(since, self.at - self.step.period)
+    def _find_biases(self, samples: int) -> None:
+        """Take each bias from the last `samples`, or the last two periods if those are fewer."""
+        last = self.session.now
+        first = last - min(samples, 2 * self.step.period)
         self.joints = tuple(
             found_under_loop(
                 driven,
-                self.session.command(driven.joint, first, self.at),
-                self.session.piston(driven.joint, first, self.at),
+                self.session.command(driven.joint, first, last),
+                self.session.piston(driven.joint, first, last),
                 self.step.period,
                 self.session.rate,
                 self.step.name,

@@ -155,7 +155,9 @@ class Step(_Part):
     excite: tuple[Excite, ...] = Field(min_length=1)
     repeats: int = Field(default=1, ge=1, le=MAX_REPEATS)
     duration: Time | None = Field(default=None, gt=0, description="of a record; one period if not")
-    warm_up: int = Field(default=2, ge=2, le=1000, description="periods before the first trim")
+    warm_up: int = Field(
+        default=1, ge=1, le=1000, description="periods under the slow loop, before the first trim"
+    )
     ramp: Time = Field(default=2.0, gt=0, description="the waveform grows to full size in [s]")
     settle: Time = Field(default=1.0, gt=0, description="at rest before a lock is believed [s]")
 

@@ -18,6 +18,8 @@ from rig.model.rig import Rig
 
 MOVE_SECONDS = 4.0  # a joint's way to its place, for the estimate of the duration only
 TRIAL_SECONDS = 3.0  # drift is judged over about this long, or one period if that is longer
+FIRM_SECONDS = 3.0  # at full size under the firm loop, until its mean correction is known
+LOOSEN_SECONDS = 8.0  # about as long as it takes to loosen that loop, for the estimate only
 LONGEST_PERIOD = 600.0  # [s] a common period of two joints beyond this is a mistake
 NYQUIST_SHARE = 4.0  # excited lines stay below Nyquist / 4
 
@@ -66,7 +68,7 @@ class StepPlan:
     """One step, lengths in samples.
 
     `period` is common to all its waveforms; `record`, `trial` (over which the bias is judged)
-    and `warm_up` are multiples of it. `ramp` and `settle` are in seconds.
+    and `warm_up` (under the slow loop) are multiples of it. `ramp` and `settle` are in seconds.
     """
 
     name: str
@@ -91,9 +93,11 @@ class StepPlan:
         """How often a bias is trimmed, or a disturbed record repeated, before giving up."""
         return max(e.settings.centring.tries for e in self.excite)
 
-    def samples(self) -> int:
-        """Samples from the start of the waveform to its end, if the first trim is good."""
-        return self.warm_up + self.trial + self.repeats * self.record
+    def samples(self, rate: float) -> int:
+        """Samples from the start of the waveform to its end, if the second trim is good."""
+        growing = (self.ramp + 1.5 * FIRM_SECONDS + LOOSEN_SECONDS) * rate
+        settling = math.ceil(growing / self.period) * self.period + self.warm_up
+        return settling + 2 * self.trial + self.repeats * self.record
 
 
 @dataclass(frozen=True)
@@ -186,7 +190,6 @@ def _step(step: Step, rig: Rig) -> StepPlan:
             f"{period / rig.sample_rate:g} s; choose frequencies with a short common period"
         )
     record = period if step.duration is None else _whole(step, period, rig.sample_rate)
-    ramp = math.ceil(step.ramp * rig.sample_rate / period)
     return StepPlan(
         name=step.name,
         locks=tuple(_lock(part, step, rig) for part in step.lock),
@@ -195,8 +198,7 @@ def _step(step: Step, rig: Rig) -> StepPlan:
         period=period,
         record=record,
         trial=period * max(1, round(min(record, TRIAL_SECONDS * rig.sample_rate) / period)),
-        # The ramp and then one whole undisturbed period, whatever the file says.
-        warm_up=period * max(step.warm_up, ramp + 1),
+        warm_up=period * step.warm_up,
         ramp=step.ramp,
         settle=step.settle,
     )
@@ -262,5 +264,5 @@ def _excite(part: Excite, step: Step, rig: Rig) -> ExcitePlan:
 
 
 def _seconds(steps: Sequence[StepPlan], rig: Rig) -> float:
-    moves = sum(MOVE_SECONDS * (1 + len(s.locks)) + 2.0 * s.settle + s.ramp for s in steps)
-    return moves + sum(s.samples() for s in steps) / rig.sample_rate
+    moves = sum(MOVE_SECONDS * (1 + len(s.locks)) + 2.0 * s.settle for s in steps)
+    return moves + sum(s.samples(rig.sample_rate) for s in steps) / rig.sample_rate
