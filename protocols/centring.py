@@ -1,0 +1,140 @@
+"""Keeping an open-loop piston centred: pure functions from samples to the next bias.
+
+A valve's gains differ by chamber and direction, so a symmetric command makes an asymmetric
+cylinder drift, by millimetres a second. About a working point the piston is an integrator,
+
+    ds/dt = k (v - v0)          k [m/(s V)], v0 [V] the command that neither extends nor retracts,
+
+with k and v0 depending on the waveform. Both are measured from the motion itself, period by
+period; a nominal model is not needed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+RECENTRE = 0.5  # share of the offset taken out within the next record
+RECENTRE_CAP = 0.7  # of the allowed drift: recentring must not look like a drift itself
+TAIL = 0.25  # of a period, over which drift is averaged
+SHORTEST_LINE = 100  # samples; a slope through less is noise
+MARGIN = 0.5e-3  # [m] kept from a piston limit
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How a piston moved lately.
+
+    `drift` [m/s] is its mean velocity, `mean` [m] the mean of the last period, `ends` [m] what
+    that mean has become when the last sample is past.
+    """
+
+    drift: float
+    mean: float
+    ends: float
+
+
+@dataclass(frozen=True)
+class Follow:
+    """How a piston follows its command: gain k [m/(s V)], null v0 [V], drift d [m/s]."""
+
+    gain: float
+    null: float
+    drift: float
+
+
+_UNKNOWN = Follow(float("nan"), float("nan"), float("nan"))
+
+
+def follow(command: Array, piston: Array, rate: float) -> Follow:
+    """Fit s = c + d t + k integral(v - mean v) to a stretch of samples; v0 = mean v - d / k.
+
+    Needs no derivative of a measured signal, no whole period and no particular law: what the
+    device put out is known. NaN samples are left out. Returns NaN where the command hardly
+    varies, or too few samples arrived, to tell.
+    """
+    known = np.isfinite(command) & np.isfinite(piston)
+    if np.count_nonzero(known) < 10:
+        return _UNKNOWN
+    middle = float(np.mean(command[known]))
+    moved = np.cumsum(np.where(known, command - middle, 0.0)) / rate
+    if np.ptp(moved) < 1e-9:
+        return _UNKNOWN
+    time = np.arange(len(command)) / rate
+    basis = np.column_stack((np.ones_like(time), time, moved))[known]
+    _, drift, gain = np.linalg.lstsq(basis, piston[known], rcond=None)[0]
+    return Follow(float(gain), middle - float(drift / gain), float(drift))
+
+
+def motion(piston: Array, period: int, rate: float) -> Motion:
+    """Return the drift between the last two periods of `piston`, shape (n >= 2 period,).
+
+    Samples one period apart have the same phase: their difference, averaged over the last
+    quarter of a period, is the drift whatever the waveform.
+    """
+    last, before = piston[-period:], piston[-2 * period : -period]
+    tail = max(1, round(TAIL * period))
+    drift = float(np.nanmean(last[-tail:] - before[-tail:])) * rate / period
+    return moved_by(last, drift, rate)
+
+
+def moved_by(last: Array, drift: float, rate: float) -> Motion:
+    """Return the motion of a piston whose last period and drift [m/s] are known."""
+    mean = float(np.nanmean(last))
+    return Motion(drift, mean, mean + drift * 0.5 * len(last) / rate)
+
+
+def recentring(moved: Motion, centre: float, seconds: float, cap: float) -> float:
+    """Return the drift to ask for [m/s]: half of the offset in `seconds`, at most `cap` [m]."""
+    return -float(np.clip(RECENTRE * (moved.ends - centre), -cap, cap)) / seconds
+
+
+def trim(bias: float, drift: float, wanted: float, gain: float) -> float:
+    """Return the bias [V] that changes the drift [m/s] into the one wanted: v + (w - d) / k."""
+    return bias + (wanted - drift) / gain
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """Lowest and highest piston [m] expected until the end.
+
+    `shift` [m] is how far the piston is now from where it was a period ago, `slope` [m/s] how
+    fast that grows.
+    """
+
+    low: float
+    high: float
+    slope: float
+    shift: float
+
+
+def forecast(reference: Array, seen: Array, horizon: int, rate: float) -> Forecast:
+    """Predict the way of a piston from one period that it is known, or believed, to repeat.
+
+    `reference` (period,) is that period; `seen` (m,) what came since, from phase 0; `horizon`
+    the samples still to come. seen - reference is a straight line where the drift changed once,
+    at the trim. The line is continued, but no further than it has been seen: a slope from a
+    short look, or from an imperfect reference, does not carry far.
+    """
+    period, m = len(reference), len(seen)
+    stride = max(1, min(period, m) // 500)
+    past = np.arange(m - 1, -1, -stride)[::-1]
+    apart = seen[past] - reference[past % period]
+    known = np.isfinite(apart)
+    shift = float(np.mean(apart[known][-20:])) if known.any() else 0.0
+    slope = 0.0
+    if m >= SHORTEST_LINE and np.count_nonzero(known) > 2:
+        slope = float(np.polyfit(past[known] / rate, apart[known], 1)[0])
+    reach = max(1, min(horizon, m))
+    ahead = np.arange(0, reach, max(1, reach // 1000))
+    path = reference[(m + ahead) % period] + shift + slope * ahead / rate
+    return Forecast(float(np.nanmin(path)), float(np.nanmax(path)), slope, shift)
+
+
+def leaves(expected: Forecast, low: float, high: float) -> bool:
+    """Say whether the forecast passes a piston limit [m], less a margin."""
+    return expected.low < low + MARGIN or expected.high > high - MARGIN

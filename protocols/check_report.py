@@ -1,0 +1,143 @@
+"""What a protocol is expected to do on a rig, laid out like a test sheet."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from rig.model.parse import InputError
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """One line of the report, like a test sheet: quantity, predicted range, allowed range, unit.
+
+    `joint` is 1-based, None for the bench. Only a `binding` line can refuse the plan; the others
+    say where the records will be poorer (a sagging supply, cavitation).
+    """
+
+    quantity: str
+    joint: int | None
+    low: float
+    high: float
+    allowed_low: float
+    allowed_high: float
+    unit: str
+    binding: bool = True
+
+    @property
+    def margin(self) -> float:
+        """Distance of the prediction to the nearest limit, in `unit`; negative if passed."""
+        return min(self.low - self.allowed_low, self.allowed_high - self.high)
+
+    @property
+    def ok(self) -> bool:
+        """Whether the limit is kept."""
+        return self.margin >= 0.0
+
+
+@dataclass(frozen=True)
+class StepCheck:
+    """The predictions of one step, and the bias [V] of each excited joint (1-based) on the twin."""
+
+    step: str
+    predictions: tuple[Prediction, ...]
+    biases: Mapping[int, float]
+
+
+@dataclass(frozen=True)
+class CheckReport:
+    """What a protocol is expected to do on a rig."""
+
+    protocol: str
+    rig: str
+    seconds: float
+    steps: tuple[StepCheck, ...] = field(default=())
+
+    @property
+    def refused(self) -> tuple[str, ...]:
+        """One line per limit that would be passed."""
+        return tuple(
+            _text(check.step, line)
+            for check in self.steps
+            for line in check.predictions
+            if line.binding and not line.ok
+        )
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """One line per expectation that is no limit but will be missed."""
+        return tuple(
+            _text(check.step, line)
+            for check in self.steps
+            for line in check.predictions
+            if not line.binding and not line.ok
+        )
+
+    @property
+    def ok(self) -> bool:
+        """Whether every limit is kept."""
+        return not self.refused
+
+    def require(self) -> None:
+        """Raise InputError naming the first limit that would be passed."""
+        if self.refused:
+            more = f" (and {len(self.refused) - 1} more)" if len(self.refused) > 1 else ""
+            raise InputError(f"protocol {self.protocol!r} refused: {self.refused[0]}{more}")
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as plain data, SI, for JSON."""
+        return {
+            "protocol": self.protocol,
+            "rig": self.rig,
+            "seconds": self.seconds,
+            "ok": self.ok,
+            "steps": [
+                {
+                    "step": check.step,
+                    "biases": {str(j): v for j, v in check.biases.items()},
+                    "predictions": [
+                        {
+                            "quantity": line.quantity,
+                            "joint": line.joint,
+                            "predicted": [line.low, line.high],
+                            "allowed": [line.allowed_low, line.allowed_high],
+                            "margin": line.margin,
+                            "unit": line.unit,
+                            "binding": line.binding,
+                            "ok": line.ok,
+                        }
+                        for line in check.predictions
+                    ],
+                }
+                for check in self.steps
+            ],
+        }
+
+
+_SHOWN = {"m": (1e3, "mm"), "Pa": (1e-6, "MPa"), "Pa/s": (1e-9, "GPa/s"), "m^3/s": (6e4, "L/min")}
+
+
+def _text(step: str, line: Prediction) -> str:
+    scale, unit = _SHOWN.get(line.unit, (1.0, line.unit))
+    who = "the bench" if line.joint is None else f"joint {line.joint}"
+    low, high = scale * line.low, scale * line.high
+    return (
+        f"{step}, {who}: {line.quantity} {low:.4g} to {high:.4g} {unit} on the twin, allowed "
+        f"{scale * line.allowed_low:.4g} to {scale * line.allowed_high:.4g} {unit}"
+    )
+
+
+def worst(report: CheckReport) -> Sequence[tuple[str, Prediction]]:
+    """Return, step by step, the binding line with the least margin as a share of its range."""
+    found = []
+    for entry in report.steps:
+        binding = [line for line in entry.predictions if line.binding]
+        found.append(
+            (
+                entry.step,
+                min(binding, key=lambda p: p.margin / (p.allowed_high - p.allowed_low)),
+            )
+        )
+    return found

@@ -1,0 +1,185 @@
+"""A bench in the test's own process: the same calls as the real one, a plant of a few lines.
+
+The plant is what a protocol has to cope with, not hydraulics: each piston integrates its spool
+with different gains for the two directions, drifts, lags, stops at its ends. It shares nothing
+with the analysis model or the simulated bench.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.base import DeviceInfo, OutputLaw, SampleBlock
+from rig.model import channels as ch
+from rig.model.rig import Rig
+from rig.services.recorder import RecordMeta
+from rig.services.safety import JointRole
+
+Array = NDArray[np.float64]
+BLOCK = 10
+
+
+@dataclass
+class Cylinder:
+    """A joint of the little plant; mutable so that a test can break it in the middle of a run."""
+
+    piston: float = 0.0
+    extend: float = 0.17  # m/s per command volt
+    retract: float = 0.15
+    offset: float = 0.0  # V, spool off its null
+    load: float = 0.0  # m/s, creeps under load whatever the command
+    lag: float = 0.01  # s
+    stop: float = 0.0375
+    give: float = 0.0  # m, moves by this times the other joint's speed / 0.1 m/s
+    speed: float = 0.0
+
+
+class Clipped(Exception):
+    """The plant passed a piston limit of an excited joint: the real bench would have tripped."""
+
+
+@dataclass
+class Handle:
+    """What the bench gives for a record."""
+
+    meta: RecordMeta
+    start: int
+    ticks: int
+    state: str = "open"
+    attributes: dict[str, Any] = field(default_factory=dict)
+
+    def __enter__(self) -> Handle:
+        return self
+
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
+        if self.state == "open":
+            self.state = "complete" if error is None else "partial"
+
+    def note(self, **attributes: Any) -> None:
+        self.attributes.update(attributes)
+
+    def discard(self, reason: str) -> None:
+        self.state = "discarded"
+
+
+class LittleBench:
+    """Runs as fast as it is read; keeps everything, so that tests can look at it afterwards."""
+
+    def __init__(
+        self, rig: Rig, cylinders: Sequence[Cylinder], seed: int = 0, lose: Sequence[int] = ()
+    ) -> None:
+        self.rig = rig
+        self.cylinders = list(cylinders)
+        self.info = DeviceInfo(
+            "little", len(cylinders), len(rig.channels), rig.sample_rate, BLOCK, True
+        )
+        self.rng = np.random.default_rng(seed)
+        self.laws = [OutputLaw()] * len(cylinders)
+        self.waves = [np.zeros(1) for _ in cylinders]
+        self.roles: list[JointRole] = []
+        self.records: list[Handle] = []
+        self.tick = 0
+        self.start = 0
+        self.rows: list[Array] = []
+        self.lose = set(lose)  # numbers of blocks that never arrive
+        self.blocks = 0
+        self.applied: list[tuple[int, tuple[OutputLaw, ...]]] = []
+        self.at_tick: dict[int, object] = {}
+
+    def upload(self, joint: int, wave: Array) -> None:
+        self.waves[joint] = np.array(wave)
+
+    def apply(self, laws: Sequence[OutputLaw], restart: bool = False) -> int:
+        for law, joint in zip(laws, self.rig.joints, strict=True):
+            assert law.limit <= joint.limits.command
+        self.laws = list(laws)
+        if restart:
+            self.start = self.tick
+        self.applied.append((self.tick, tuple(laws)))
+        return self.tick
+
+    def guard(self, roles: Sequence[JointRole]) -> None:
+        self.roles = list(roles)
+
+    def record(
+        self,
+        meta: RecordMeta | None = None,
+        *,
+        start_tick: int | None = None,
+        ticks: int | None = None,
+    ) -> Handle:
+        assert meta is not None
+        assert start_tick is not None
+        assert ticks is not None
+        self.records.append(Handle(meta, start_tick, ticks, attributes=dict(meta.attributes)))
+        return self.records[-1]
+
+    def exchange(self) -> SampleBlock:
+        while True:
+            first = self.tick
+            data = np.array([self._sample() for _ in range(BLOCK)])
+            self.rows.append(data)
+            self.blocks += 1
+            self._check(data)
+            if self.blocks in self.lose:
+                continue
+            saturated = np.zeros((BLOCK, len(self.rig.channels)), dtype=bool)
+            return SampleBlock(self.blocks, first, data, saturated, 0, False)
+
+    def _sample(self) -> Array:
+        action = self.at_tick.pop(self.tick, None)
+        if callable(action):
+            action()
+        dt = 1.0 / self.rig.sample_rate
+        row = dict.fromkeys(self.rig.recorded, 3e6)
+        speeds = [c.speed for c in self.cylinders]
+        for j, (c, law) in enumerate(zip(self.cylinders, self.laws, strict=True)):
+            wave = self.waves[j][(self.tick - self.start) % len(self.waves[j])]
+            others = sum(speeds) - speeds[j]
+            s = c.piston + c.give * others / 0.1 + 1e-5 * self.rng.standard_normal()
+            v = law.gain * wave + law.bias + law.position_gain * (law.setpoint - s)
+            v = min(max(v, -law.limit), law.limit)
+            u = v + c.offset
+            wish = (c.extend if u > 0 else c.retract) * u + c.load
+            c.speed += dt / c.lag * (wish - c.speed)
+            c.piston += dt * c.speed
+            if abs(c.piston) > c.stop:
+                c.piston, c.speed = float(np.clip(c.piston, -c.stop, c.stop)), 0.0
+            row[ch.channel(ch.PISTON, j + 1)] = s
+            row[ch.channel(ch.SPOOL, j + 1)] = 0.1 * u
+            row[ch.channel(ch.COMMAND, j + 1)] = v
+        self.tick += 1
+        return np.array([row[name] for name in self.rig.recorded])
+
+    def _check(self, data: Array) -> None:
+        for j, role in enumerate(self.roles):
+            piston = data[:, self.rig.recorded.index(ch.channel(ch.PISTON, j + 1))]
+            low, high = self.rig.joints[j].limits.piston
+            if role.excited and (piston.min() < low or piston.max() > high):
+                self.laws = [OutputLaw()] * len(self.laws)
+                raise Clipped(
+                    f"joint {j + 1} at {1e3 * piston.min():.1f}..{1e3 * piston.max():.1f}"
+                )
+
+    def channel(self, name: str, start: int = 0, ticks: int | None = None) -> Array:
+        """Everything that was ever measured of a channel, from the first tick on."""
+        data = np.concatenate(self.rows)[:, self.rig.recorded.index(name)]
+        return data[start : None if ticks is None else start + ticks]
+
+    @property
+    def complete(self) -> list[Handle]:
+        return [r for r in self.records if r.state == "complete"]
+
+
+def default_cylinders() -> list[Cylinder]:
+    """Two joints that drift about as the seed bench does."""
+    return [Cylinder(extend=0.17, retract=0.16), Cylinder(extend=0.155, retract=0.175)]
+
+
+def broken(cylinder: Cylinder, **changes: float) -> Cylinder:
+    return replace(cylinder, **changes)
