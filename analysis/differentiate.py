@@ -8,7 +8,7 @@ A smoother is a row of symmetric taps per derivative: y_k = (d/dt)^k (h * x). Fi
 twice in the analysis, and for a reason. Products such as sqrt(p_s - p) u or cos(q2) q1'' do not
 commute with a filter, so the channels first pass a wide filter that loses nothing the bench can
 do (default 80 Hz), the rows are built from them point by point, and then WHOLE rows, columns and
-right-hand side alike, pass a second low-pass (`row_filter`, default about 2.5 times the highest
+right-hand side alike, pass a second low-pass (`row_filter`, default 1.5 times the highest
 excited line): a linear equation that holds at every instant still holds after any linear filter.
 The row filter takes the noise out that differentiation has amplified, and allows honest
 decimation. `analysis.differentiate_study` prints the measured bias and scatter of each choice.

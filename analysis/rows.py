@@ -29,9 +29,9 @@ from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
-ROW_CUTOFF = 25.0  # [Hz] where a record does not tell its excited lines
-ROW_CUTOFF_RANGE = (10.0, 40.0)  # [Hz]
-LINES_FACTOR = 2.5  # row filter over the highest excited line: nonlinearity answers above it
+ROW_CUTOFF = 15.0  # [Hz] where a record does not tell its excited lines
+ROW_CUTOFF_RANGE = (8.0, 30.0)  # [Hz]
+LINES_FACTOR = 1.5  # row filter over the highest excited line; the noise goes with its 5th power
 MASKED_SHARE = 1e-3  # of a filter's weight on masked samples: a row with more is dropped
 
 

@@ -8,8 +8,8 @@ Sign convention of every row (NOTES): sum of columns times coefficients = right-
 right-hand sides G F (torque_i), + A_cap ds/dt (flow_cap_i), - A_rod ds/dt (flow_rod_i).
 
 Simulation. Each term has a kernel, a numba function of fixed signature, so that the integrator is
-compiled once and is handed terms as function pointers (15 ns a call measured; composing by
-recompiling costs seconds per model):
+compiled once and is handed the addresses of the terms' functions (a call costs about 5 ns;
+composing by recompiling the integrator costs seconds per model):
 
     kernel(phase, bench, x, z, par, out, M, dz) -> None
     phase  PREPARE: may change `bench` and `x` (what all terms see: dead band, supply sag);
@@ -25,12 +25,13 @@ recompiling costs seconds per model):
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Final
 
 import numpy as np
-from numba import njit, types
+from numba import cfunc, types
 from numpy.typing import NDArray
 
 from analysis.signals import Mask, Signals
@@ -38,7 +39,6 @@ from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 Columns = dict[str, dict[str, Array]]  # equation -> coefficient name -> column (n,)
-Kernel = Callable[..., None]
 
 PREPARE: Final = 0
 CONTRIBUTE: Final = 1
@@ -55,9 +55,23 @@ KERNEL_SIGNATURE = types.void(
 FAMILIES: Final = {"mechanical": ("torque",), "fluid": ("flow_cap", "flow_rod")}
 
 
-def kernel(function: Kernel) -> Kernel:
-    """Mark a term's kernel; it is compiled (or read from numba's cache) when first simulated."""
-    return njit(cache=True, error_model="numpy")(function)  # type: ignore[no-any-return]
+class Kernel:
+    """A term's kernel, compiled (or read from numba's cache) when its address is first asked."""
+
+    def __init__(self, function: Callable[..., None]) -> None:
+        self.function = function
+
+    @functools.cached_property
+    def address(self) -> int:
+        """Machine address of the compiled function."""
+        compiled = cfunc(KERNEL_SIGNATURE, cache=True, error_model="numpy")(self.function)
+        self._keep = compiled  # the code lives as long as this object
+        return int(compiled.address)
+
+
+def kernel(function: Callable[..., None]) -> Kernel:
+    """Mark a function as a term's kernel (see the module for its signature)."""
+    return Kernel(function)
 
 
 @dataclass(frozen=True)
@@ -80,6 +94,7 @@ class Term:
     """
 
     name: ClassVar[str]
+    prepares: ClassVar[bool] = False  # whether the kernel acts in phase PREPARE
     where: str = "bench"
 
     @property

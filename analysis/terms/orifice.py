@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
+from numba import njit
 
 from analysis.signals import Mask, Signals
 from analysis.terms.base import (
@@ -88,7 +89,7 @@ def _root(drop: Array) -> Array:
     return np.sqrt(np.maximum(drop, 0.0))
 
 
-@kernel
+@njit(cache=True)
 def _signed_root(drop):  # type: ignore[no-untyped-def]
     return math.sqrt(drop) if drop >= 0.0 else -math.sqrt(-drop)
 
