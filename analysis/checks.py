@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 MOVED = 50.0  # an excited piston travels at least this many times its sensor's noise
 CLIPPED_SHARE = 0.01
-MASKED_SHARE = 0.05
+MASKED_SHARE = 0.2
 CONDITION_LIMIT = 200.0  # scaled columns; the paper's are 10 to 27
 BULK_RANGE = (5e7, 2.5e9)  # [Pa] hoses with air .. pure mineral oil with margin
 LENGTH_TOLERANCE = 0.05  # relative, of R12/W2 against l1
