@@ -67,7 +67,7 @@ class FirSmoother:
     @property
     def reach(self) -> int:
         """Samples on either side that an output depends on."""
-        return (self.taps.shape[1] - 1) // 2
+        return int(self.taps.shape[1] - 1) // 2
 
     def apply(self, x: Array, order: int = 0) -> Array:
         """Return the filtered (d/dt)^order of x (n, ...); raises InputError if x is too short."""
@@ -230,7 +230,7 @@ def align(x: Array, shift: float) -> Array:
         return x
     reach = ALIGN_HALF_WIDTH + abs(whole)
     offsets = np.arange(-reach, reach + 1)
-    distance = offsets - whole - fraction
+    distance: Array = np.asarray(offsets - whole - fraction, dtype=np.float64)
     taps = _kernel(distance, 0.425, ALIGN_HALF_WIDTH + 0.5, 8.0)
     # Convolution turns the taps round.
     return _convolve(_extended(x, reach, "alignment"), taps[::-1] / taps.sum())
