@@ -1,4 +1,4 @@
-"""The analysis' part of the performance figures; each function returns a dict and prints nothing."""
+"""The analysis' part of the performance figures, as dicts; nothing here prints."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def simulation_figures(run: Run, model: Model, repeats: int = 5) -> dict[str, An
         "wall_seconds": best,
         "times_real_time": seconds / best,
         "evaluations_per_second": result.evaluations / seconds,
-        "lsoda_over_own": lsoda / best * seconds,
+        "lsoda_over_own": float(lsoda / best * seconds),
         "piston_difference_to_lsoda_m": difference,
         "failure": result.failure,
     }

@@ -25,7 +25,10 @@ LEAD = 2.0  # [s] simulated before the record starts, so that the start has fade
 END = 0.99  # of half the stroke: where a joint stands that is locked at its end
 
 
-def multisine(rng: np.random.Generator, rate: float, period: float, top: float) -> tuple[Array, tuple[int, ...]]:  # fmt: skip
+Wave = tuple[Array, tuple[int, ...]]  # one period of unit RMS, its lines
+
+
+def multisine(rng: np.random.Generator, rate: float, period: float, top: float) -> Wave:
     """Return one period of unit RMS of a random-phase odd multisine from 0.3 Hz to `top` [Hz]."""
     n = round(period * rate)
     lines = np.arange(1, int(top * period) + 1, 2)
@@ -36,7 +39,7 @@ def multisine(rng: np.random.Generator, rate: float, period: float, top: float) 
     return wave / np.std(wave), tuple(int(line) for line in lines)
 
 
-def sine(rate: float, hertz: float) -> tuple[Array, tuple[int, ...]]:
+def sine(rate: float, hertz: float) -> Wave:
     """Return one period of a sine of unit RMS."""
     n = round(rate / hertz)
     return np.sqrt(2) * np.sin(2 * np.pi * np.arange(n) / n), (1,)
@@ -61,7 +64,7 @@ def lock_steps(joints: int) -> list[tuple[str, dict[int, float]]]:
 def synthetic_run(
     rig: Rig,
     rng: np.random.Generator,
-    wave: tuple[Array, tuple[int, ...]],
+    wave: Wave,
     *,
     rms: float,
     repeats: int,
@@ -98,7 +101,7 @@ def synthetic_run(
                     channels,
                     period=len(wave[0]),
                     lines=wave[1],
-                )  # fmt: skip
+                )
             )
     return Run(ideal, tuple(records), source="synthetic")
 

@@ -215,6 +215,26 @@ def _sense(name: str, y: Array, t: Array, args: tuple[object, ...]) -> Array:
     return np.array([_spool(a, joint, b, waves, biases, centring) for a, b in zip(t, piston)])  # noqa: B905
 
 
+def centred(
+    rig: Rig,
+    step: Step,
+    wave: dict[int, Excitation],
+    *,
+    seconds: float = 10.0,
+    truth: dict[str, float] = TRUTH,
+    centring: float = 0.3,
+) -> dict[str, Array]:
+    """Simulate with the bias that brings the mean stroke to the middle."""
+    bias = np.zeros(2)
+    for _ in range(2):
+        clean = simulate(rig, step, wave, bias=tuple(bias), centring=centring, truth=truth)
+        for joint in wave:
+            bias[joint] -= centring * clean[f"piston_{joint + 1}"].mean()
+    return simulate(
+        rig, step, wave, seconds=seconds, bias=tuple(bias), centring=centring, truth=truth
+    )
+
+
 NOISE = {"spool": 0.2e-3, "piston": 10e-6, "cap_pressure": 5e3, "rod_pressure": 5e3,
          "supply_pressure": 5e3, "oil_temperature": 0.05}  # fmt: skip
 
@@ -245,7 +265,7 @@ def experiment(
     records = []
     for step in steps:
         wave = excitations[step.name]
-        clean = simulate(rig, step, wave, seconds=seconds, truth=truth)
+        clean = centred(rig, step, wave, seconds=seconds, truth=truth)
         first = next(iter(wave.values()))
         for repeat in range(1, repeats + 1):
             records.append(
