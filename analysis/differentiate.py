@@ -84,8 +84,9 @@ class FirSmoother:
 class FourierSmoother:
     """Differentiation in the frequency domain of whole periods, exact where a record is periodic.
 
-    A record drifts and is trimmed between periods, so the line joining its ends is taken out
-    first and put back; what a line cannot describe leaks, which is why this is not the default.
+    A record drifts and is trimmed between periods, so the line to the sample that would come
+    next is taken out first and put back; what a line cannot describe, and the noise of the ends,
+    leaks: that, and records that are not whole periods, are why this is not the default.
     """
 
     rate: float
@@ -104,7 +105,7 @@ class FourierSmoother:
     def apply(self, x: Array, order: int = 0) -> Array:
         """Return the low-passed (d/dt)^order of x (n, ...), x being whole periods plus a line."""
         n = len(x)
-        slope = (x[-1] - x[0]) / (n - 1)
+        slope = (2 * x[-1] - x[-2] - x[0]) / n
         line = np.multiply.outer(np.arange(n, dtype=np.float64), slope)
         frequency = np.fft.rfftfreq(n, 1 / self.rate)
         gain = np.where(frequency <= self.cutoff, (2j * np.pi * frequency) ** order, 0.0)

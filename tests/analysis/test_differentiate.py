@@ -18,10 +18,9 @@ FIR = [
     d.channel_filter(RATE),
     d.row_filter(RATE, 15.0),
 ]
-ALL = [*FIR, d.FourierSmoother(RATE, 80.0)]
 
 
-@pytest.mark.parametrize("smoother", ALL, ids=lambda s: s.name)
+@pytest.mark.parametrize("smoother", FIR, ids=lambda s: s.name)
 @pytest.mark.parametrize("hertz", [1.0, 3.0, 9.5])
 def test_value_and_derivatives_of_a_sine_share_one_gain_and_no_phase(
     smoother: d.Smoother, hertz: float
@@ -61,12 +60,11 @@ def test_polynomials_are_differentiated_exactly() -> None:
 
 def test_fourier_is_exact_on_whole_periods_that_drift() -> None:
     t = np.arange(2000) / RATE
-    drift = 0.3 * t * 2000 / 1999
-    x = np.cos(2 * np.pi * 4 * t) + drift
+    x = np.cos(2 * np.pi * 4 * t) + 0.3 * t
     wanted = -8 * np.pi * np.sin(2 * np.pi * 4 * t) + 0.3
     smoother = d.FourierSmoother(RATE, 40.0)
     inner = slice(smoother.reach, -smoother.reach)
-    assert np.abs(smoother.apply(x, 1) - wanted)[inner].max() < 0.05
+    assert np.abs(smoother.apply(x, 1) - wanted)[inner].max() < 0.01
 
 
 def test_decimation_picks_samples_of_the_filtered_rows() -> None:

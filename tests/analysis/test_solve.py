@@ -54,7 +54,7 @@ def test_a_triangle_of_fewer_rows_than_columns_is_still_one() -> None:
     X, y = np.array([[1.0, 2.0, 3.0]]), np.array([4.0])
     R = triangle(X, y)
     assert R.shape == (4, 4)
-    assert R.T @ R == pytest.approx(np.outer([1, 2, 3, 4], [1, 2, 3, 4]))
+    assert pytest.approx(np.outer([1, 2, 3, 4], [1, 2, 3, 4])) == R.T @ R
 
 
 def test_errors_are_the_stratified_cluster_formula_on_the_rows_themselves() -> None:

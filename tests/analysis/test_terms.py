@@ -7,7 +7,7 @@ import pytest
 
 from analysis.rows import right_sides
 from analysis.signals import Signals
-from analysis.terms import baseline, base, known, make
+from analysis.terms import base, baseline, known, make
 from analysis.terms.inertia import chain_matrix, mass_matrix
 from rig.model.parameters import inertia_names, parameter_names
 from rig.model.parse import InputError
