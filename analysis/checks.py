@@ -1,0 +1,242 @@
+"""Statements about records before, and about parameters after, an identification.
+
+What makes a number meaningless is refused (InputError naming record and channel); what a person
+should know is a `Check`, ok or not, with the figures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.model import Estimate, rig_difference
+from analysis.signals import clipped_samples
+from analysis.solve import Solution
+from analysis.terms.inertia import chain_matrix, mass_matrix
+from rig.model import channels as ch
+from rig.model.parameters import gain_names, inertia_names
+from rig.model.parse import InputError
+from rig.model.records import Record, Run
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+
+MOVED = 50.0  # an excited piston travels at least this many times its sensor's noise
+CLIPPED_SHARE = 0.01
+MASKED_SHARE = 0.2
+CONDITION_LIMIT = 200.0  # scaled columns; the paper's are 10 to 27
+BULK_RANGE = (5e7, 2.5e9)  # [Pa] hoses with air .. pure mineral oil with margin
+LENGTH_TOLERANCE = 0.05  # relative, of R12/W2 against l1
+
+
+@dataclass(frozen=True)
+class Check:
+    """One statement: its name, whether all is well, and the figures."""
+
+    name: str
+    ok: bool
+    detail: str
+
+
+def common_rig(runs: Sequence[Run]) -> Rig:
+    """Return the rig all runs share; raises InputError where they differ or hold no record."""
+    if not runs or not any(run.records for run in runs):
+        raise InputError("no records to work on: the run holds none (was it aborted at once?)")
+    for run in runs[1:]:
+        difference = rig_difference(runs[0].rig, run.rig)
+        if difference:
+            raise InputError(
+                f"{runs[0].source or 'the first run'} and {run.source or 'another'} are of "
+                f"different rigs: {difference}; identify them apart"
+            )
+    return runs[0].rig
+
+
+def refuse_dead_channels(rig: Rig, record: Record) -> None:
+    """Raise InputError for an excited joint that never moved or a channel that stood still."""
+    for i in range(1, len(rig.joints) + 1):
+        if i in record.locked:
+            continue
+        for kind in ch.JOINT_KINDS:
+            name = ch.channel(kind, i)
+            if name in record.channels and np.ptp(record.channels[name]) == 0.0:
+                raise InputError(
+                    f"record {record.name!r}, channel {name!r}: every sample is "
+                    f"{record.channels[name][0]:g}; is the sensor connected?"
+                )
+        piston = np.asarray(record.channels.get(ch.channel(ch.PISTON, i), np.zeros(1)))
+        travel, noise = float(np.ptp(piston)), rig.sensors.piston.noise
+        if piston.size > 1 and travel < MOVED * noise:
+            raise InputError(
+                f"record {record.name!r}, channel 'piston_{i}': joint {i} is not locked but moved "
+                f"only {travel * 1e3:.3g} mm (sensor noise {noise * 1e3:.3g} mm); it was not "
+                "excited, or belongs under 'locked'"
+            )
+
+
+def clipping(rig: Rig, runs: Sequence[Run]) -> list[Check]:
+    """State every sensor that touched an end of its range, by step, with the worst record."""
+    worst: dict[tuple[str, str], tuple[int, float, str]] = {}
+    for run in runs:
+        for record in run.records:
+            for name, mask in clipped_samples(rig, record).items():
+                joint = ch.kind_of(name)[1]
+                if joint in record.locked and not name.startswith(ch.PISTON):
+                    continue
+                found = (int(mask.sum()), float(mask.mean()), record.name)
+                worst[record.step, name] = max(found, worst.get((record.step, name), found))
+    out = []
+    for (_, name), (count, share, record_name) in worst.items():
+        low, high = rig.sensors.of(ch.kind_of(name)[0]).range
+        out.append(
+            Check(
+                "clipped sensor",
+                share < CLIPPED_SHARE,
+                f"record {record_name!r}, channel {name!r}: {count} samples "
+                f"({100 * share:.2g} %) at the end of {low:g}..{high:g} {ch.unit_of(name)}; "
+                "masked (the worst record of its step)",
+            )
+        )
+    return out or [Check("clipped sensor", True, "no sensor reached the end of its range")]
+
+
+def repeats(strata: Mapping[tuple[int, str], int]) -> Check:
+    """State the repeats behind the intervals, `strata` being (run, step) -> repeats."""
+    single = sorted({step for (_, step), count in strata.items() if count < 2})
+    if single:
+        return Check(
+            "repeats",
+            False,
+            f"only one repeat of {' '.join(single)}: scatter between repeats cannot be had; the "
+            "intervals come from segments within the record and may be too narrow",
+        )
+    return Check("repeats", True, f"{min(strata.values())} or more repeats of every step")
+
+
+def joints_excited(rig: Rig, records: Sequence[Record]) -> Check:
+    """State joints that no record excites: their parameters cannot be identified."""
+    still = [
+        i for i in range(1, len(rig.joints) + 1) if all(i in record.locked for record in records)
+    ]
+    if still:
+        return Check(
+            "excited joints", False,
+            f"no record excites joint {' '.join(map(str, still))}: its gains and friction are not "
+            "identifiable from these records; add a step that excites it",
+        )  # fmt: skip
+    return Check("excited joints", True, "every joint is excited in some record")
+
+
+def identifiability(solutions: Mapping[str, Solution]) -> list[Check]:
+    """State what could not be identified and how well conditioned the rest is."""
+    out = []
+    for family, solution in solutions.items():
+        lost = "; ".join(f"{name}: {why}" for name, why in solution.unidentifiable.items())
+        out.append(
+            Check(f"identifiable {family}", not lost, lost or "every parameter is determined")
+        )
+        out.append(
+            Check(
+                f"condition {family}",
+                solution.condition_number < CONDITION_LIMIT,
+                f"{solution.condition_number:.1f} (scaled columns; below {CONDITION_LIMIT:g} "
+                "wanted, a richer excitation lowers it)",
+            )
+        )
+    return out
+
+
+def masked(rows: int, dropped: int) -> Check:
+    """State the share of rows lost to pressures outside [0, p_s] or clipped sensors."""
+    share = dropped / max(rows + dropped, 1)
+    return Check(
+        "masked rows",
+        share < MASKED_SHARE,
+        f"{dropped} of {rows + dropped} rows ({100 * share:.2g} %) lie outside the model's "
+        "domain (chamber pressure below tank or above supply, clipped sensor) and were left out",
+    )
+
+
+def consistency(rig: Rig, estimates: Mapping[str, Estimate]) -> list[Check]:
+    """State signs, positive inertia over the workspace, R12/W2 against l1, and b."""
+    return [_signs(rig, estimates), *_inertia(rig, estimates), *_bulk(estimates)]
+
+
+def _signs(rig: Rig, estimates: Mapping[str, Estimate]) -> Check:
+    joints = range(1, len(rig.joints) + 1)
+    positive = [f"Fv{i}" for i in joints] + ["b"]
+    positive += [name for i in joints for name in gain_names(i)]
+    bad = [
+        f"{name} = {estimates[name].value:.4g}"
+        for name in positive
+        if name in estimates and estimates[name].value <= 0
+    ]
+    return Check(
+        "signs", not bad, "; ".join(bad) or "friction, bulk modulus and flow gains are positive"
+    )
+
+
+def _inertia(rig: Rig, estimates: Mapping[str, Estimate]) -> list[Check]:
+    N = len(rig.joints)
+    names = inertia_names(N)
+    values = {name: estimates[name].value for name in names if name in estimates}
+    if len(values) < len(names) or not np.isfinite(list(values.values())).all():
+        return [Check("inertia", False, "cannot be judged: not every inertia is identified")]
+    R = chain_matrix(values, N)
+    smallest, where = min(
+        ((float(np.linalg.eigvalsh(mass_matrix(R, q))[0]), q) for q in workspace(rig)),
+        key=lambda pair: pair[0],
+    )
+    angles = " ".join(f"{np.degrees(v):.0f}" for v in where)
+    out = [
+        Check(
+            "inertia",
+            smallest > 0,
+            f"smallest eigenvalue of M over the workspace {smallest:.4g} kg m^2, "
+            f"at q = {angles} deg",
+        )
+    ]
+    for i in range(N):
+        for j in range(i + 1, N):
+            W = estimates[f"W{j + 1}"].value if f"W{j + 1}" in estimates else np.nan
+            if np.isfinite(W) and W != 0:
+                length, ratio = rig.joints[i].link_length, R[i, j] / W
+                off = ratio / length - 1
+                out.append(
+                    Check(
+                        "link length",
+                        bool(abs(off) < LENGTH_TOLERANCE),
+                        f"R{i + 1}{j + 1}/W{j + 1} = {ratio:.4g} m against link {i + 1} of "
+                        f"{length:g} m ({100 * off:+.1f} %); rigid bodies give equality",
+                    )
+                )
+    return out
+
+
+def _bulk(estimates: Mapping[str, Estimate]) -> list[Check]:
+    b = estimates["b"].value if "b" in estimates else np.nan
+    if not np.isfinite(b):
+        return []
+    low, high = BULK_RANGE
+    detail = f"b = {b / 1e6:.4g} MPa; plausible {low / 1e6:g} to {high / 1e6:g} MPa"
+    return [Check("bulk modulus", low < b < high, detail)]
+
+
+def workspace(rig: Rig, points: int = 9) -> list[Array]:
+    """Return joint angles (N,) spread over the stroke: a grid, or a fixed lattice."""
+    N = len(rig.joints)
+    if points**N <= 4096:
+        axes = np.meshgrid(*([np.linspace(0, 1, points)] * N), indexing="ij")
+        unit = np.column_stack([axis.ravel() for axis in axes])
+    else:
+        # Additive recurrence with square roots of primes fills the cube evenly.
+        steps = np.sqrt([2, 3, 5, 7, 11, 13, 17, 19, 23][:N])
+        unit = np.outer(np.arange(4096), steps) % 1.0
+    angles = np.empty_like(unit)
+    for i, joint in enumerate(rig.joints):
+        half = joint.cylinder.stroke / 2
+        angles[:, i] = joint.linkage.angle((2 * unit[:, i] - 1) * half)
+    return list(angles)

@@ -1,0 +1,239 @@
+"""Identification: runs in, parameters with intervals, checks and a model out."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis import checks as ck
+from analysis.checks import Check
+from analysis.model import Estimate, Model, estimate_json, finite
+from analysis.rows import Filtering, Rows, default_filtering, parameters_of, record_rows
+from analysis.signals import condition
+from analysis.solve import Cluster, Solution, half_width, solve, triangle
+from analysis.terms import baseline
+from analysis.terms.base import FAMILIES, Coefficient, Used, family_of
+from rig.model.parse import InputError
+from rig.model.records import Record, Run
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+log = logging.getLogger(__name__)
+
+METHODS = ("coupled",)
+LATER_METHODS = ("sequential", "simultaneous", "pso", "ga")
+SEGMENTS = 10  # of the only repeat of a step, where there are not more repeats
+
+
+@dataclass(frozen=True)
+class RecordRows:
+    """The rows of one record by equation, and which run, step and repeat it is."""
+
+    run: int
+    record: str
+    step: str
+    repeat: int
+    rows: Mapping[str, Rows]
+
+
+@dataclass(frozen=True)
+class Identification:
+    """What an identification found: estimates, conditioning, rows used and left out, checks."""
+
+    method: str
+    estimates: Mapping[str, Estimate]
+    solutions: Mapping[str, Solution]
+    rows: Mapping[str, int]
+    masked_rows: int
+    solve_seconds: float
+    checks: tuple[Check, ...]
+    model: Model
+
+
+def identify(
+    runs: Sequence[Run],
+    method: str = "coupled",
+    terms: Sequence[Used] | None = None,
+    filtering: Callable[[Record], Filtering] = default_filtering,
+) -> Identification:
+    """Identify all parameters from all records of the runs at once (the paper's STEP4).
+
+    `terms` defaults to the paper's model. Raises InputError for another method, for runs of
+    different rigs and for records that cannot be used, naming record and channel.
+    """
+    _refuse_method(method)
+    rig = ck.common_rig(runs)
+    used = tuple(terms) if terms is not None else tuple(Used(term) for term in baseline())
+    per_record = build_rows(rig, runs, used, filtering)
+    started = time.perf_counter()
+    solutions = solve_rows(rig, used, per_record)
+    seconds = time.perf_counter() - started
+    estimates, covariance = _estimates(rig, used, solutions)
+    rows = {family: solution.rows for family, solution in solutions.items()}
+    masked = sum(r.masked for one in per_record for r in one.rows.values())
+    statements = _statements(rig, runs, per_record, solutions, estimates, rows, masked)
+    provenance = {
+        "method": method,
+        "runs": [run.source for run in runs],
+        "records": [one.record for one in per_record],
+        "rows": rows,
+        "checks_failed": [c.name for c in statements if not c.ok],
+    }
+    model = Model(rig, used, estimates, covariance, provenance)
+    log.info("identified %d parameters from %d records", len(estimates), len(per_record))
+    return Identification(method, estimates, solutions, rows, masked, seconds, statements, model)
+
+
+def _refuse_method(method: str) -> None:
+    if method in LATER_METHODS:
+        raise InputError(
+            f"method {method!r} comes with a later version; this one knows: {' '.join(METHODS)}"
+        )
+    if method not in METHODS:
+        raise InputError(f"unknown method {method!r}; known: {' '.join(METHODS)}")
+
+
+def build_rows(
+    rig: Rig,
+    runs: Sequence[Run],
+    terms: Sequence[Used],
+    filtering: Callable[[Record], Filtering] = default_filtering,
+) -> list[RecordRows]:
+    """Return the filtered, decimated rows of every record; raises InputError for a bad one."""
+    built = []
+    for index, run in enumerate(runs):
+        for record in run.records:
+            ck.refuse_dead_channels(rig, record)
+            filters = filtering(record)
+            signals = condition(rig, record, filters.channels)
+            rows = record_rows(rig, terms, signals, filters)
+            built.append(RecordRows(index, record.name, record.step, record.repeat, rows))
+    return built
+
+
+def repeats_of(per_record: Sequence[RecordRows]) -> dict[tuple[int, str], int]:
+    """Count the repeats of every (run, step)."""
+    seen: dict[tuple[int, str], set[int]] = {}
+    for one in per_record:
+        seen.setdefault((one.run, one.step), set()).add(one.repeat)
+    return {key: len(values) for key, values in seen.items()}
+
+
+def solve_rows(
+    rig: Rig, terms: Sequence[Used], per_record: Sequence[RecordRows]
+) -> dict[str, Solution]:
+    """Reduce the rows to one triangle per cluster and solve each family once."""
+    repeats = repeats_of(per_record)
+    out = {}
+    for family in FAMILIES:
+        names = parameters_of(rig, terms, family)
+        clusters: list[Cluster] = []
+        for one in per_record:
+            pieces = 1 if repeats[one.run, one.step] > 1 else SEGMENTS
+            clusters += _clusters(one, family, pieces)
+        if names:
+            out[family] = solve(names, clusters)
+    return out
+
+
+def _clusters(one: RecordRows, family: str, pieces: int) -> list[Cluster]:
+    out = []
+    rows = [r for name, r in one.rows.items() if family_of(name) == family]
+    for piece in range(pieces):
+        parts = [_piece(r, piece, pieces) for r in rows]
+        count = sum(len(rhs) for _, rhs in parts)
+        if count:
+            matrix = np.concatenate([m for m, _ in parts])
+            rhs = np.concatenate([y for _, y in parts])
+            key: Hashable = one.repeat if pieces == 1 else (one.repeat, piece)
+            out.append(Cluster((one.run, one.step), key, triangle(matrix, rhs), count))
+    return out
+
+
+def _piece(rows: Rows, piece: int, pieces: int) -> tuple[Array, Array]:
+    edges = np.linspace(0, len(rows.rhs), pieces + 1).astype(int)
+    inside = slice(edges[piece], edges[piece + 1])
+    return rows.matrix[inside], rows.rhs[inside]
+
+
+def _estimates(
+    rig: Rig, terms: Sequence[Used], solutions: Mapping[str, Solution]
+) -> tuple[dict[str, Estimate], Array]:
+    """Turn the rows' coefficients into parameters (b = 1/coefficient) with intervals."""
+    coefficients = {c.parameter: c for used in terms for c in used.term.coefficients(rig)}
+    found: dict[str, Estimate] = {}
+    blocks = []
+    for solution in solutions.values():
+        std = np.sqrt(np.diag(solution.covariance))
+        half = half_width(std, solution.dof)
+        slopes = np.ones(len(std))
+        for i, name in enumerate(solution.names):
+            c = coefficients[name]
+            note = solution.unidentifiable.get(name, "")
+            found[name], slopes[i] = _estimate(c, solution.value[i], std[i], half[i], note)
+        blocks.append(solution.covariance * np.outer(slopes, slopes))
+    names = list(found)
+    covariance = np.zeros((len(names), len(names)))
+    start = 0
+    for block in blocks:
+        covariance[start : start + len(block), start : start + len(block)] = block
+        start += len(block)
+    return found, covariance
+
+
+def _estimate(
+    c: Coefficient, value: float, std: float, half: float, note: str
+) -> tuple[Estimate, float]:
+    """Return the parameter's estimate and d parameter / d coefficient."""
+    low, high = value - half, value + half
+    if not c.reciprocal:
+        return Estimate(float(value), c.unit, float(std), (float(low), float(high)), note), 1.0
+    if value == 0:
+        return Estimate(np.nan, c.unit, np.nan, (np.nan, np.nan), "its row came out zero"), np.nan
+    slope = -1.0 / value**2
+    # An interval of 1/b that reaches zero leaves b unbounded above.
+    ends = (1.0 / high, 1.0 / low if low > 0 else np.inf) if value > 0 else (np.nan, np.nan)
+    estimate = Estimate(float(1.0 / value), c.unit, float(abs(slope) * std), ends, note)
+    return estimate, float(slope)
+
+
+def _statements(
+    rig: Rig,
+    runs: Sequence[Run],
+    per_record: Sequence[RecordRows],
+    solutions: Mapping[str, Solution],
+    estimates: Mapping[str, Estimate],
+    rows: Mapping[str, int],
+    masked: int,
+) -> tuple[Check, ...]:
+    records = [record for run in runs for record in run.records]
+    return (
+        ck.repeats(repeats_of(per_record)),
+        ck.joints_excited(rig, records),
+        *ck.clipping(rig, runs),
+        ck.masked(sum(rows.values()), masked),
+        *ck.identifiability(solutions),
+        *ck.consistency(rig, estimates),
+    )
+
+
+def to_json(result: Identification) -> dict[str, Any]:
+    """Return the identification as the contract's JSON; null where a number does not exist."""
+    return {
+        "method": result.method,
+        "parameters": {name: estimate_json(p) for name, p in result.estimates.items()},
+        "condition_number": {
+            family: finite(s.condition_number) for family, s in result.solutions.items()
+        },
+        "rows": dict(result.rows),
+        "masked_rows": result.masked_rows,
+        "solve_seconds": result.solve_seconds,
+        "checks": [{"name": c.name, "ok": bool(c.ok), "detail": c.detail} for c in result.checks],
+        "residual_rms": {family: finite(s.residual_rms) for family, s in result.solutions.items()},
+    }

@@ -1,0 +1,205 @@
+"""The identified model as data and as a file: rig, terms with shapes, parameters, provenance.
+
+The file is JSON, SI throughout, `null` where a parameter could not be identified.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from analysis.terms import make
+from analysis.terms.base import Used
+from rig.model.parse import InputError
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+
+FORMAT: Final = "bramah-model"
+VERSION: Final = 1
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One parameter: SI value, standard error and 95 % interval; NaN where not identifiable."""
+
+    value: float
+    unit: str
+    std: float
+    ci95: tuple[float, float]
+    note: str = ""
+
+    @property
+    def identified(self) -> bool:
+        """Whether the records determine it."""
+        return math.isfinite(self.value)
+
+
+@dataclass(frozen=True)
+class Model:
+    """A rig, the terms that describe it, their parameters and where those came from.
+
+    `covariance` (k, k) belongs to `parameters` in their order; NaN where unknown.
+    """
+
+    rig: Rig
+    terms: tuple[Used, ...]
+    parameters: Mapping[str, Estimate]
+    covariance: Array
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Parameter values by name."""
+        return {name: p.value for name, p in self.parameters.items()}
+
+
+def nominal_model(rig: Rig, terms: Sequence[Used]) -> Model:
+    """Return the model of the rig's nominal values; raises InputError where one is missing."""
+    parameters = {}
+    for used in terms:
+        for c in used.term.coefficients(rig):
+            if c.parameter not in rig.nominal:
+                raise InputError(
+                    f"rig {rig.name!r} has no nominal {c.parameter!r} [{c.unit}]; the twin needs "
+                    "one: add it under 'nominal' in the rig file"
+                )
+            value = rig.nominal[c.parameter]
+            parameters[c.parameter] = Estimate(value, c.unit, math.nan, (math.nan, math.nan))
+    k = len(parameters)
+    return Model(rig, tuple(terms), parameters, np.full((k, k), np.nan), {"source": "nominal"})
+
+
+def finite(value: float) -> float | None:
+    """Return the number, or None for what JSON cannot hold."""
+    return float(value) if math.isfinite(value) else None
+
+
+def estimate_json(estimate: Estimate) -> dict[str, Any]:
+    """Return one parameter as the contract's JSON, `note` added where there is one."""
+    out: dict[str, Any] = {
+        "value": finite(estimate.value),
+        "unit": estimate.unit,
+        "std": finite(estimate.std),
+        "ci95": [finite(end) for end in estimate.ci95],
+    }
+    return out | ({"note": estimate.note} if estimate.note else {})
+
+
+def model_json(model: Model) -> dict[str, Any]:
+    """Return the whole model as plain JSON data."""
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "rig": model.rig.model_dump(mode="json"),
+        "terms": [
+            {"name": u.term.name, "where": u.term.where, "shape": list(u.shape)}
+            for u in model.terms
+        ],
+        "parameters": {name: estimate_json(p) for name, p in model.parameters.items()},
+        "covariance": [[finite(v) for v in row] for row in model.covariance],
+        "provenance": dict(model.provenance),
+    }
+
+
+def save_model(model: Model, path: Path) -> None:
+    """Write the model file, replacing an old one only when the new one is complete."""
+    text = json.dumps(model_json(model), indent=1, allow_nan=False)
+    part = path.with_name(path.name + ".part")
+    part.write_text(text + "\n", encoding="utf-8")
+    part.replace(path)
+
+
+def load_model(path: Path) -> Model:
+    """Read a model file; raises InputError saying what is wrong with it."""
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot read the model file {path}: {error}") from error
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise InputError(f"{path} is not a model file: not valid JSON ({error})") from error
+    if not isinstance(data, dict) or data.get("format") != FORMAT:
+        raise InputError(f"{path} is not a model file: 'format' is not {FORMAT!r}")
+    if data.get("version") != VERSION:
+        raise InputError(
+            f"{path} is a model file of version {data.get('version')!r}; this version reads "
+            f"{VERSION}: identify again"
+        )
+    try:
+        return _from_json(data)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise InputError(f"{path}: rig.{where}: {first['msg']}") from error
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{path} is damaged: {type(error).__name__} at {error}") from error
+
+
+def _number(value: Any) -> float:
+    return math.nan if value is None else float(value)
+
+
+def _from_json(data: Mapping[str, Any]) -> Model:
+    rig = Rig.model_validate(data["rig"])
+    terms = tuple(
+        Used(make(t["name"], t["where"]), tuple(float(v) for v in t["shape"]))
+        for t in data["terms"]
+    )
+    parameters = {}
+    for name, p in data["parameters"].items():
+        low, high = p["ci95"]
+        parameters[name] = Estimate(
+            _number(p["value"]), str(p["unit"]), _number(p["std"]),
+            (_number(low), _number(high)), str(p.get("note", "")),
+        )  # fmt: skip
+    for used in terms:
+        for c in used.term.coefficients(rig):
+            if c.parameter not in parameters:
+                raise InputError(f"parameters: {c.parameter!r} of {used.term.name!r} is missing")
+    covariance = np.array([[_number(v) for v in row] for row in data["covariance"]])
+    if covariance.shape != (len(parameters), len(parameters)):
+        raise InputError(
+            f"covariance: {covariance.shape} does not fit {len(parameters)} parameters"
+        )
+    return Model(rig, terms, parameters, covariance, dict(data["provenance"]))
+
+
+def refuse_other_rig(model: Model, rig: Rig, source: str) -> None:
+    """Raise InputError where records of `rig` do not belong to the model's rig."""
+    reason = rig_difference(model.rig, rig)
+    if reason:
+        raise InputError(
+            f"{source} was recorded on another rig than the model was identified on: {reason}"
+        )
+
+
+def rig_difference(one: Rig, other: Rig) -> str:
+    """Say what differs between two rigs as far as physics is concerned ('' if nothing)."""
+    if one.name != other.name:
+        return f"name {one.name!r} and {other.name!r}"
+    ignored = {"description", "nominal", "wire", "sample_rate"}
+    first, second = (r.model_dump(exclude=ignored) for r in (one, other))
+    for key, value in first.items():
+        if value != second[key]:
+            if key == "joints":
+                differing = [
+                    f"joints.{i}.{part}"
+                    for i, (a, b) in enumerate(zip(value, second[key], strict=False), start=1)
+                    for part in a
+                    if a[part] != b[part] and part not in ("limits", "name")
+                ]
+                if len(value) == len(second[key]) and not differing:
+                    continue
+                return ", ".join(differing) or f"{len(value)} and {len(second[key])} joints"
+            return f"{key} {value!r} and {second[key]!r}"
+    return ""

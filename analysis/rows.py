@@ -1,0 +1,193 @@
+"""Rows of the regression: what every term says about every equation of one record.
+
+Used are the torque rows and the chamber-flow rows of the excited joints only: a locked joint's
+contact torque is unknown, and its valve is shut. Rows are built point by point from the filtered
+signals, then whole rows pass the row filter and are decimated (`analysis.differentiate` says why).
+Sum of columns times coefficients = right-hand side; units: torque_i [N m], flow_* [m^3/s].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import upfirdn
+
+from analysis.differentiate import (
+    FirSmoother,
+    Smoother,
+    butterworth,
+    channel_filter,
+    moving_average,
+    row_filter,
+    row_step,
+)
+from analysis.signals import Mask, Signals
+from analysis.terms.base import FAMILIES, Columns, Used, equation
+from rig.model.records import Record
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+
+ROW_CUTOFF = 15.0  # [Hz] where a record does not tell its excited lines
+ROW_CUTOFF_RANGE = (8.0, 30.0)  # [Hz]
+LINES_FACTOR = 1.5  # row filter over the highest excited line; the noise goes with its 5th power
+MASKED_SHARE = 1e-3  # of a filter's weight on masked samples: a row with more is dropped
+
+
+@dataclass(frozen=True)
+class Filtering:
+    """The filters of one record: `channels` before, `rows` (or none) after."""
+
+    channels: Smoother
+    rows: FirSmoother | None
+    step: int = 1
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Rows of one equation of one record: matrix (m, k), rhs (m,), time [s] of each row (m,).
+
+    `names` are the parameters of the columns; `masked` rows were dropped because a sample under
+    the filter lay outside the model or was clipped.
+    """
+
+    equation: str
+    names: tuple[str, ...]
+    matrix: Array
+    rhs: Array
+    time: Array
+    masked: int
+
+
+def default_filtering(record: Record) -> Filtering:
+    """Return the filters that the bias study chose, fitted to the record's excitation."""
+    rate = record.sample_rate
+    cutoff = ROW_CUTOFF
+    if record.period and record.lines:
+        highest = max(record.lines) * rate / record.period
+        cutoff = float(np.clip(LINES_FACTOR * highest, *ROW_CUTOFF_RANGE))
+    return Filtering(channel_filter(rate), row_filter(rate, cutoff), row_step(rate, cutoff))
+
+
+def paper_filtering(record: Record) -> Filtering:
+    """Return the paper's: a 20-sample average (zero-phase here), differences, every row used."""
+    return Filtering(moving_average(record.sample_rate), None)
+
+
+def butterworth_filtering(record: Record) -> Filtering:
+    """Return a zero-phase Butterworth on the channels in place of the windowed sinc."""
+    chosen = default_filtering(record)
+    cutoff = min(80.0, 0.2 * record.sample_rate)
+    return replace(chosen, channels=butterworth(record.sample_rate, cutoff))
+
+
+FILTERINGS: dict[str, Callable[[Record], Filtering]] = {
+    "default": default_filtering,
+    "moving-average": paper_filtering,
+    "butterworth": butterworth_filtering,
+}
+
+
+def right_sides(rig: Rig, signals: Signals) -> dict[str, Array]:
+    """Return the right-hand side (n,) of every equation: G F, A_cap ds/dt, - A_rod ds/dt.
+
+    The torque is G F (NOTES; the paper's regressor lines print the inverse of G).
+    """
+    sides = {}
+    for i, joint in enumerate(rig.joints):
+        cap, rod = joint.cylinder.cap_area, joint.cylinder.rod_area
+        force = cap * signals.p_cap[:, i] - rod * signals.p_rod[:, i]
+        sides[equation("torque", i)] = signals.G[:, i] * force
+        sides[equation("flow_cap", i)] = cap * signals.sd[:, i]
+        sides[equation("flow_rod", i)] = -rod * signals.sd[:, i]
+    return sides
+
+
+def parameters_of(rig: Rig, terms: Sequence[Used], family: str) -> tuple[str, ...]:
+    """Return the parameters that the terms put into one family's rows, in the terms' order."""
+    names = {
+        c.parameter: None
+        for used in terms
+        for c in used.term.coefficients(rig)
+        if c.family == family
+    }
+    return tuple(names)
+
+
+def record_rows(
+    rig: Rig, terms: Sequence[Used], signals: Signals, filtering: Filtering
+) -> dict[str, Rows]:
+    """Return the filtered rows of every equation of the excited joints of one record."""
+    for used in terms:
+        signals = used.term.prepare(rig, signals, used.shape)
+    columns: Columns = {}
+    valid: dict[str, Mask] = {}
+    for used in terms:
+        for name, more in used.term.columns(rig, signals, used.shape).items():
+            here = columns.setdefault(name, {})
+            here.update({p: here[p] + v if p in here else v for p, v in more.items()})
+        for name, mask in used.term.valid(rig, signals, used.shape).items():
+            valid[name] = valid.get(name, np.ones(len(mask), dtype=bool)) & mask
+    sides = right_sides(rig, signals)
+    edges = filtering.channels.reach
+    out = {}
+    for family, kinds in FAMILIES.items():
+        names = parameters_of(rig, terms, family)
+        for i in map(int, np.flatnonzero(signals.excited)):
+            # Inertia couples: a clipped piston of any joint spoils every torque row.
+            whole = family == "mechanical"
+            sensors = np.asarray(signals.valid.all(axis=1) if whole else signals.valid[:, i])
+            for kind in kinds:
+                name = equation(kind, i)
+                good = sensors & valid.get(name, sensors)
+                out[name] = _filtered(
+                    name, names, columns.get(name, {}), sides[name], good, signals, filtering, edges
+                )
+    return out
+
+
+def _filtered(
+    name: str,
+    names: tuple[str, ...],
+    columns: dict[str, Array],
+    side: Array,
+    good: Mask,
+    signals: Signals,
+    filtering: Filtering,
+    edges: int,
+) -> Rows:
+    """Filter and decimate one equation's columns and right side together, dropping masked rows."""
+    inside = slice(edges, len(side) - edges)
+    filled = [k for k, parameter in enumerate(names) if parameter in columns]
+    stack = np.column_stack([*(columns[names[k]] for k in filled), side])[inside]
+    bad = ~good[inside]
+    time = signals.t[inside]
+    if filtering.rows is not None:
+        stack, dropped, time = _low_passed(stack, bad, time, filtering.rows, filtering.step)
+    else:
+        stack, dropped, time = (
+            stack[:: filtering.step],
+            bad[:: filtering.step],
+            time[:: filtering.step],
+        )
+    kept = ~dropped
+    matrix = np.zeros((int(kept.sum()), len(names)))
+    matrix[:, filled] = stack[kept, :-1]
+    return Rows(name, names, matrix, stack[kept, -1], time[kept], int(dropped.sum()))
+
+
+def _low_passed(
+    stack: Array, bad: Mask, time: Array, rows: FirSmoother, step: int
+) -> tuple[Array, Mask, Array]:
+    filtered = rows.decimate(stack, step)
+    first = -(-2 * rows.reach // step) * step - rows.reach
+    centres = first + step * np.arange(len(filtered))
+    if not bad.any():
+        return filtered, np.zeros(len(filtered), dtype=bool), time[centres]
+    weights = np.abs(rows.taps[0]) / np.abs(rows.taps[0]).sum()
+    share = upfirdn(weights, bad.astype(np.float64), 1, step)
+    start = -(-2 * rows.reach // step)
+    return filtered, share[start : start + len(filtered)] > MASKED_SHARE, time[centres]

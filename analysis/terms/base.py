@@ -1,0 +1,156 @@
+"""What a term is: columns of the regression and, in simulation, a part of the right-hand side.
+
+A model is a list of terms (DESIGN, "Identification is an algebra of rows"). Adding an effect is one
+file in this package (or one later listed in `analysis.terms.PACKAGES`) that holds a frozen
+dataclass derived from `Term` and names it in `TERMS`; nothing else changes.
+
+Sign convention of every row (NOTES): sum of columns times coefficients = right-hand side, with
+right-hand sides G F (torque_i), + A_cap ds/dt (flow_cap_i), - A_rod ds/dt (flow_rod_i).
+
+Simulation. Each term has a kernel, a numba function of fixed signature, so that the integrator is
+compiled once and is handed the addresses of the terms' functions (a call costs about 5 ns;
+composing by recompiling the integrator costs seconds per model):
+
+    kernel(phase, bench, x, z, par, out, M, dz) -> None
+    phase  PREPARE: may change `bench` and `x` (what all terms see: dead band, supply sag);
+           CONTRIBUTE: adds to `out`, `M`, `dz`
+    bench  (4,) by TIME, P_S, P_TANK, TEMPERATURE
+    x      (X_ROWS, N) by Q, QD, THETA, G, S, SD, U, P_CAP, P_ROD, V_CAP, V_ROD
+    z, dz  hidden states of this term and their rates, (hidden(rig),)
+    par    what `pack` made of coefficients and shape
+    out    (OUT_ROWS, N): TORQUE generalised torque on the joint [N m], FLOW_CAP, FLOW_ROD flow
+           into the chamber [m^3/s], COMP_CAP, COMP_ROD compressibility V/b [m^3/Pa]
+    M      (N, N) inertia in joint coordinates [kg m^2]
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Final
+
+import numpy as np
+from numba import cfunc, types
+from numpy.typing import NDArray
+
+from analysis.signals import Mask, Signals
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+Columns = dict[str, dict[str, Array]]  # equation -> coefficient name -> column (n,)
+
+PREPARE: Final = 0
+CONTRIBUTE: Final = 1
+TIME, P_S, P_TANK, TEMPERATURE = range(4)
+Q, QD, THETA, G, S, SD, U, P_CAP, P_ROD, V_CAP, V_ROD = range(11)
+X_ROWS: Final = 11
+TORQUE, FLOW_CAP, FLOW_ROD, COMP_CAP, COMP_ROD = range(5)
+OUT_ROWS: Final = 5
+
+_VECTOR, _MATRIX = types.float64[::1], types.float64[:, ::1]
+KERNEL_SIGNATURE = types.void(
+    types.int64, _VECTOR, _MATRIX, _VECTOR, _VECTOR, _MATRIX, _MATRIX, _VECTOR
+)
+FAMILIES: Final = {"mechanical": ("torque",), "fluid": ("flow_cap", "flow_rod")}
+
+
+class Kernel:
+    """A term's kernel, compiled (or read from numba's cache) when its address is first asked."""
+
+    def __init__(self, function: Callable[..., None]) -> None:
+        self.function = function
+
+    @functools.cached_property
+    def address(self) -> int:
+        """Machine address of the compiled function."""
+        compiled = cfunc(KERNEL_SIGNATURE, cache=True, error_model="numpy")(self.function)
+        self._keep = compiled  # the code lives as long as this object
+        return int(compiled.address)
+
+
+def kernel(function: Callable[..., None]) -> Kernel:
+    """Mark a function as a term's kernel (see the module for its signature)."""
+    return Kernel(function)
+
+
+@dataclass(frozen=True)
+class Coefficient:
+    """A linear unknown of one family's rows and the parameter that it stands for.
+
+    `family` is `mechanical` (torque rows) or `fluid` (chamber-flow rows). With `reciprocal` the
+    rows' coefficient is 1/parameter (1/b in the rows, b for people).
+    """
+
+    parameter: str
+    unit: str
+    family: str
+    reciprocal: bool = False
+
+
+@dataclass(frozen=True)
+class Term:
+    """One effect at one place; a subclass sets `name` and overrides what it needs.
+
+    `where` is `bench`, `joint I` or `joint I cap|rod`.
+    """
+
+    name: ClassVar[str]
+    prepares: ClassVar[bool] = False  # whether the kernel acts in phase PREPARE
+    where: str = "bench"
+
+    @property
+    def kernel(self) -> Kernel:
+        """The compiled contribution in simulation (see the module)."""
+        raise NotImplementedError
+
+    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
+        """Return the linear unknowns, in the order of `pack`."""
+        raise NotImplementedError
+
+    def shape_names(self) -> tuple[str, ...]:
+        """Name the shape parameters (0 to 2) that enter nonlinearly."""
+        return ()
+
+    def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
+        """Return the signals as all terms shall see them (default: unchanged)."""
+        return signals
+
+    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
+        """Return the columns, each (n,), by equation and parameter; absent ones are zero."""
+        raise NotImplementedError
+
+    def valid(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Mapping[str, Mask]:
+        """Return, by equation, where (n,) the term's equation holds (default: everywhere)."""
+        return {}
+
+    def hidden(self, rig: Rig) -> int:
+        """Return the number of hidden states that the kernel integrates."""
+        return 0
+
+    def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
+        """Return the kernel's `par` (default: coefficients as in the rows, then the shape)."""
+        linear = [
+            1.0 / values[c.parameter] if c.reciprocal else values[c.parameter]
+            for c in self.coefficients(rig)
+        ]
+        return np.array([*linear, *shape], dtype=np.float64)
+
+
+def equation(kind: str, joint: int) -> str:
+    """Name an equation, joint 0-based: ``equation("flow_cap", 0)`` is ``flow_cap_1``."""
+    return f"{kind}_{joint + 1}"
+
+
+def family_of(name: str) -> str:
+    """Return the family, `mechanical` or `fluid`, of an equation's name."""
+    kind: Any = name.rsplit("_", 1)[0]
+    return next(family for family, kinds in FAMILIES.items() if kind in kinds)
+
+
+@dataclass(frozen=True)
+class Used:
+    """A term of a model together with its fitted shape parameters."""
+
+    term: Term
+    shape: tuple[float, ...] = ()

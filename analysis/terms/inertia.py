@@ -1,0 +1,140 @@
+"""Inertia of a planar chain of N links."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from analysis.signals import Signals
+from analysis.terms.base import (
+    CONTRIBUTE,
+    QD,
+    THETA,
+    TORQUE,
+    Array,
+    Coefficient,
+    Columns,
+    Kernel,
+    Term,
+    equation,
+    kernel,
+)
+from rig.model.parameters import inertia_names, parameter_unit
+from rig.model.rig import Rig
+
+
+@dataclass(frozen=True)
+class Inertia(Term):
+    """T = 1/2 sum_ij R_ij cos(theta_i - theta_j) theta_i' theta_j' (NOTES, "N DOF planar chain").
+
+    In absolute angles the torque on link k is sum_j R_kj [cos(theta_k - theta_j) theta_j'' +
+    sin(theta_k - theta_j) theta_j'^2]; joint i carries the links i..N, so tau_i sums k >= i.
+    For N = 2, R11 = M1 - M2, R22 = M2: this is NOTES' M(q) q'' + h with h already a torque.
+    """
+
+    name: ClassVar[str] = "inertia"
+
+    @property
+    def kernel(self) -> Kernel:
+        """The compiled contribution."""
+        return _kernel
+
+    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
+        """Return M1 | M1 M2 R12 | R_ij."""
+        names = inertia_names(len(rig.joints))
+        return tuple(Coefficient(name, parameter_unit(name), "mechanical") for name in names)
+
+    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
+        """Return the torque columns of every inertia parameter."""
+        N = signals.joints
+        rate, acceleration = np.cumsum(signals.qd, axis=1), np.cumsum(signals.qdd, axis=1)
+        weights = inertia_map(N)
+        out: Columns = {equation("torque", i): {} for i in range(N)}
+        for index, coefficient in enumerate(self.coefficients(rig)):
+            on_link = np.zeros_like(rate)
+            for k in range(N):
+                for j in range(N):
+                    if weights[index, k, j]:
+                        turn = signals.theta[:, k] - signals.theta[:, j]
+                        on_link[:, k] += weights[index, k, j] * (
+                            np.cos(turn) * acceleration[:, j] + np.sin(turn) * rate[:, j] ** 2
+                        )
+            on_joint = np.cumsum(on_link[:, ::-1], axis=1)[:, ::-1]
+            for i in range(N):
+                out[equation("torque", i)][coefficient.parameter] = on_joint[:, i]
+        return out
+
+    def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
+        """Return the matrix R, flattened."""
+        return chain_matrix(values, len(rig.joints)).ravel()
+
+
+def inertia_map(joints: int) -> Array:
+    """Return (parameters, N, N): how each inertia parameter enters the symmetric matrix R."""
+    names = inertia_names(joints)
+    weights = np.zeros((len(names), joints, joints))
+    if joints == 2:
+        weights[0, 0, 0] = 1.0  # M1 = R11 + R22
+        weights[1] = np.diag([-1.0, 1.0])  # M2 = R22
+        weights[2, 0, 1] = weights[2, 1, 0] = 1.0
+        return weights
+    index = 0
+    for i in range(joints):
+        for j in range(i, joints):
+            weights[index, i, j] = weights[index, j, i] = 1.0
+            index += 1
+    return weights
+
+
+def chain_matrix(values: Mapping[str, float], joints: int) -> Array:
+    """Return the symmetric matrix R (N, N) [kg m^2] of named inertia parameters."""
+    vector = np.array([values[name] for name in inertia_names(joints)])
+    return np.asarray(np.tensordot(vector, inertia_map(joints), axes=1))
+
+
+def mass_matrix(R: Array, q: Array) -> Array:
+    """Return M(q) (N, N) of the chain: M_ij = sum_{k>=i, l>=j} R_kl cos(theta_k - theta_l)."""
+    theta = np.cumsum(q)
+    turned = R * np.cos(theta[:, None] - theta[None, :])
+    partial = np.cumsum(turned[::-1, ::-1], axis=0).cumsum(axis=1)
+    return np.asarray(partial[::-1, ::-1])
+
+
+@kernel
+def _kernel(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase != CONTRIBUTE:
+        return
+    N = x.shape[1]
+    for k in range(N):
+        rate_k = 0.0
+        for m in range(k + 1):
+            rate_k += x[QD, m]
+        for j in range(k, N):
+            R = par[k * N + j]
+            if R == 0.0:
+                continue
+            if j == k:
+                for a in range(k + 1):
+                    for b in range(k + 1):
+                        M[a, b] += R
+                continue
+            rate_j = rate_k
+            for m in range(k + 1, j + 1):
+                rate_j += x[QD, m]
+            turn = x[THETA, k] - x[THETA, j]
+            c, s = R * math.cos(turn), R * math.sin(turn)
+            # Link k feels + s theta_j'^2, link j feels - s theta_k'^2; joints below carry both.
+            for a in range(j + 1):
+                if a <= k:
+                    out[TORQUE, a] -= s * rate_j * rate_j
+                out[TORQUE, a] += s * rate_k * rate_k
+                for b in range(k + 1):
+                    M[a, b] += c
+                    M[b, a] += c
+
+
+TERMS = (Inertia,)

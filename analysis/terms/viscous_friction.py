@@ -1,0 +1,55 @@
+"""Viscous friction of every joint."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+from analysis.signals import Signals
+from analysis.terms.base import (
+    CONTRIBUTE,
+    QD,
+    TORQUE,
+    Coefficient,
+    Columns,
+    Kernel,
+    Term,
+    equation,
+    kernel,
+)
+from rig.model.parameters import parameter_unit
+from rig.model.rig import Rig
+
+
+@dataclass(frozen=True)
+class ViscousFriction(Term):
+    """Torque Fv_i q_i' against the motion of joint i (NOTES, "Mechanics")."""
+
+    name: ClassVar[str] = "viscous_friction"
+
+    @property
+    def kernel(self) -> Kernel:
+        """The compiled contribution."""
+        return _kernel
+
+    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
+        """Return Fv_1 .. Fv_N [N m s/rad]."""
+        names = (f"Fv{i}" for i in range(1, len(rig.joints) + 1))
+        return tuple(Coefficient(name, parameter_unit(name), "mechanical") for name in names)
+
+    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
+        """Return q_i' in the rows of joint i."""
+        return {
+            equation("torque", i): {f"Fv{i + 1}": signals.qd[:, i]} for i in range(signals.joints)
+        }
+
+
+@kernel
+def _kernel(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == CONTRIBUTE:
+        for i in range(x.shape[1]):
+            out[TORQUE, i] -= par[i] * x[QD, i]
+
+
+TERMS = (ViscousFriction,)

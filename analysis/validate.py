@@ -1,0 +1,174 @@
+"""Validation: the model driven by the measured spool against what was measured.
+
+FIT = 100 (1 - |y - yhat| / |y - mean y|) per channel (NOTES, Table IV), free run from the record's
+first sample; windowed RMSE restarts the model from the data every 0.25 s, which shows the model's
+rates without the drift that a free run collects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.differentiate import Smoother
+from analysis.model import Model, finite, refuse_other_rig
+from analysis.rows import Filtering, default_filtering
+from analysis.signals import Signals, aligned_channels, condition
+from analysis.simulate import Simulation, State, compiled, drive_of, simulate, state_at
+from rig.model import channels as ch
+from rig.model.parse import InputError
+from rig.model.records import Record, Run
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+
+WINDOW = 0.25  # [s]
+START_SAMPLES = 0.04  # [s] of samples that the first state is fitted to
+START_DEGREE = 3
+
+
+@dataclass(frozen=True)
+class RecordValidation:
+    """One record: FIT [%], RMSE and windowed RMSE [SI] per channel of the excited joints.
+
+    `simulation` is the free run and `measured` the aligned channels, for plots; `failure` and
+    `outside` are the free run's; NaN stands where a window's model failed.
+    """
+
+    record: str
+    step: str
+    fit: Mapping[str, float]
+    rmse: Mapping[str, float]
+    window_rmse: Mapping[str, float]
+    failure: str
+    outside: int
+    simulation: Simulation
+    measured: Mapping[str, Array]
+    time: Array
+
+
+def fit_percent(measured: Array, simulated: Array) -> float:
+    """Return FIT [%] of one channel (n,); NaN where the measured one stands still."""
+    spread = float(np.linalg.norm(measured - measured.mean()))
+    if spread == 0:
+        return float("nan")
+    return 100.0 * (1.0 - float(np.linalg.norm(measured - simulated)) / spread)
+
+
+def validate(model: Model, runs: Sequence[Run]) -> list[RecordValidation]:
+    """Simulate every record of the runs with its measured spool and compare.
+
+    Raises InputError for a run of another rig, a record too short, or a model with parameters
+    that were not identified.
+    """
+    out = []
+    for run in runs:
+        refuse_other_rig(model, run.rig, run.source or "the run")
+        out += [validate_record(model, run.rig, record) for record in run.records]
+    if not out:
+        raise InputError("no records to validate on: the run holds none")
+    return out
+
+
+def validate_record(
+    model: Model, rig: Rig, record: Record,
+    filtering: Callable[[Record], Filtering] = default_filtering,
+) -> RecordValidation:  # fmt: skip
+    """Validate on one record (see `validate`)."""
+    smoother = filtering(record).channels
+    signals = _seen_by(model, rig, condition(rig, record, smoother))
+    measured = _compared(aligned_channels(rig, record), signals)
+    ready, drive = compiled(model), drive_of(signals)
+    free = simulate(ready, drive, first_state(rig, record, signals))
+    channels = free.channels()
+    windows = dict.fromkeys(measured, 0.0)
+    count = 0
+    for first, length in _windows(record, smoother):
+        short = simulate(ready, drive, state_at(signals, first), first, length)
+        stretch = short.channels()
+        for name, y in measured.items():
+            error = stretch[name] - y[first : first + length]
+            windows[name] += np.nan if short.failure else float(error @ error)
+        count += length
+    return RecordValidation(
+        record.name,
+        record.step,
+        {name: fit_percent(y, channels[name]) for name, y in measured.items()},
+        {name: float(np.sqrt(np.mean((y - channels[name]) ** 2))) for name, y in measured.items()},
+        {name: float(np.sqrt(v / count)) if count else np.nan for name, v in windows.items()},
+        free.failure,
+        free.outside,
+        free,
+        measured,
+        record.time,
+    )
+
+
+def _seen_by(model: Model, rig: Rig, signals: Signals) -> Signals:
+    """Let terms that correct measurements do so; those that prepare in simulation do it there."""
+    for used in model.terms:
+        if not used.term.prepares:
+            signals = used.term.prepare(rig, signals, used.shape)
+    return signals
+
+
+def _compared(channels: Mapping[str, Array], signals: Signals) -> dict[str, Array]:
+    """Return the measured piston and pressures of the excited joints."""
+    return {
+        ch.channel(kind, i + 1): channels[ch.channel(kind, i + 1)]
+        for i in map(int, np.flatnonzero(signals.excited))
+        for kind in (ch.PISTON, ch.CAP, ch.ROD)
+    }
+
+
+def _windows(record: Record, smoother: Smoother) -> Iterator[tuple[int, int]]:
+    length = round(WINDOW * record.sample_rate)
+    for first in range(smoother.reach, record.samples - smoother.reach - length + 1, length):
+        yield first, length
+
+
+def first_state(rig: Rig, record: Record, signals: Signals) -> State:
+    """Return the state at the first sample, from a cubic fitted to the first 40 ms of data.
+
+    The filter has no samples before the first; a short one-sided fit is the better edge. The
+    velocity is the fit's first derivative.
+    """
+    count = min(record.samples, max(START_DEGREE + 2, round(START_SAMPLES * record.sample_rate)))
+    t = np.arange(count) / record.sample_rate
+    channels = aligned_channels(rig, record)
+    state = state_at(signals, 0)
+    q, qd, cap, rod = (a.copy() for a in (state.q, state.qd, state.p_cap, state.p_rod))
+    for i in map(int, np.flatnonzero(signals.excited)):
+
+        def fitted(kind: str, joint: int = i) -> Array:
+            samples = channels[ch.channel(kind, joint + 1)][:count]
+            return np.asarray(np.polynomial.polynomial.polyfit(t, samples, START_DEGREE))
+
+        s = fitted(ch.PISTON)
+        linkage = rig.joints[i].linkage
+        q[i] = linkage.angle(s[0])
+        qd[i] = s[1] / linkage.jacobian(q[i])
+        cap[i], rod[i] = fitted(ch.CAP)[0], fitted(ch.ROD)[0]
+    return replace(state, q=q, qd=qd, p_cap=cap, p_rod=rod)
+
+
+def to_json(results: Sequence[RecordValidation]) -> dict[str, Any]:
+    """Return the validation as the contract's JSON; `failure` and `outside` added per record."""
+    return {
+        "records": [
+            {
+                "record": r.record,
+                "step": r.step,
+                "fit": {name: finite(v) for name, v in r.fit.items()},
+                "rmse": {name: finite(v) for name, v in r.rmse.items()},
+                "window_rmse": {name: finite(v) for name, v in r.window_rmse.items()},
+                "failure": r.failure or None,
+                "outside_samples": r.outside,
+            }
+            for r in results
+        ]
+    }
