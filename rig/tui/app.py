@@ -77,18 +77,20 @@ class Monitor(App[int]):
         self._slow = -float("inf")
         self.stop_asked: Stop | None = None  # the newest stop and what became of it
         self._told = 0
+        self._header, self._notices = Header(id="header"), Notices(id="notices")
+        self._chooser, self._bench = Chooser(id="chooser"), Bench(id="bench")
+        self._events = RichLog(id="log", markup=False, wrap=True, min_width=20, max_lines=500)
+        self._events.can_focus = False
 
     def compose(self) -> ComposeResult:
         """Lay the screen out: header, notices, bench (or what stands in for it), log, keys."""
-        yield Header(id="header")
-        yield Notices(id="notices")
+        yield self._header
+        yield self._notices
         with ContentSwitcher(initial="waiting", id="main"):
             yield Waiting(self._rig, id="waiting")
-            yield Chooser(id="chooser")
-            yield Bench(id="bench")
-        log = RichLog(id="log", markup=False, wrap=True, min_width=20, max_lines=500)
-        log.can_focus = False
-        yield log
+            yield self._chooser
+            yield self._bench
+        yield self._events
         yield Footer()
 
     def on_mount(self) -> None:
@@ -109,13 +111,15 @@ class Monitor(App[int]):
 
     def draw(self, *, force: bool = False) -> None:
         """Draw the newest frame if it has changed, and what depends on time every so often."""
+        if not self._bench.is_attached:
+            return  # the screen is being taken down around a last tick of its timer
         frame, now = self.link.frame, self._clock()
         if frame is self._drawn and now - self._slow < SLOW and not force:
             return
         self._drawn, self._slow = frame, now
-        self.query_one(Header).show(frame, now)
+        self._header.show(frame, now)
         paused = self._held is not None
-        self.query_one(Notices).show(notices(frame, self.stop_asked, now, paused=paused))
+        self._notices.show(notices(frame, self.stop_asked, now, paused=paused))
         self._draw_log(frame)
         self._draw_main(frame, now)
 
@@ -124,12 +128,12 @@ class Monitor(App[int]):
         self._told = frame.told
         for line in frame.story[len(frame.story) - fresh :]:
             time = (f"{line.device_time:9.2f} s  ", OLD)
-            self.query_one(RichLog).write(Text.assemble(time, (line.text, line.style)))
+            self._events.write(Text.assemble(time, (line.text, line.style)))
 
     def _draw_main(self, frame: Frame, now: float) -> None:
         main = self.query_one(ContentSwitcher)
         if frame.stage is Stage.CHOOSING:
-            self.query_one(Chooser).show(frame.sessions, appearing=main.current != "chooser")
+            self._chooser.show(frame.sessions, appearing=main.current != "chooser")
             main.current = "chooser"
         elif frame.snapshot is None:
             main.current = "waiting"
@@ -151,14 +155,14 @@ class Monitor(App[int]):
             remark = f" · paused at {shown.snapshot.device_time:.1f} s"
         else:
             remark = f" · OLD, {age_text(newest.age(now))}"
-        if not self.query_one(Bench).show(shown, self._look, remark):
+        if not self._bench.show(shown, self._look, remark):
             self.call_after_refresh(self.draw, force=True)
 
     def action_stop(self) -> None:
         """Zero the outputs of the run on the screen, or of the one marked in the chooser."""
         frame = self.link.frame
         choosing = frame.stage is Stage.CHOOSING
-        endpoint = self.query_one(Chooser).marked if choosing else frame.endpoint
+        endpoint = self._chooser.marked if choosing else frame.endpoint
         if endpoint is None:
             self.stop_asked = Stop(self._clock(), None, Answer.NOWHERE)
         else:
@@ -195,7 +199,7 @@ class Monitor(App[int]):
 
     def action_scroll(self, rows: int) -> None:
         """Scroll a bench of more joints than fit."""
-        self.query_one(Bench).scroll_relative(y=5 * rows, animate=False)
+        self._bench.scroll_relative(y=5 * rows, animate=False)
 
     def action_choose(self) -> None:
         """Go back to the list of runs; with a single one there is nothing to choose."""
@@ -206,7 +210,7 @@ class Monitor(App[int]):
 
     def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
         """Attach to the chosen run."""
-        self.link.choose(self.query_one(Chooser).at(event.option_index))
+        self.link.choose(self._chooser.at(event.option_index))
 
     def action_help(self) -> None:
         """Show the page of help."""

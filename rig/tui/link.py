@@ -20,7 +20,7 @@ from rig.tui.story import Line, tell
 
 log = logging.getLogger(__name__)
 
-FRAME: Final = 1 / 15  # shortest time between two frames [s]
+FRAME: Final = 1 / 12  # shortest time between two frames [s]
 POLL: Final = 0.1  # longest wait for a snapshot, and between looks for a session [s]
 QUIET: Final = 1.0  # a run silent for this long is stale, and it is asked whether it still is [s]
 STORY: Final = 100

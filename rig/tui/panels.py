@@ -153,7 +153,6 @@ class JointPanel(Vertical):
     DEFAULT_CSS = """
     JointPanel { border: round $primary; padding: 0 1; height: 1fr; }
     JointPanel.old { border: round $foreground-darken-3; }
-    JointPanel > Static { height: auto; }
     """
 
     def __init__(self, joint: int, channels: Sequence[str]) -> None:
@@ -165,6 +164,7 @@ class JointPanel(Vertical):
         }
         self._gauges = [(kind, names[kind]) for kind in GAUGES if names[kind] in channels]
         self._bars = Static()
+        self._bars.styles.height = len(self._gauges)
 
     def compose(self) -> ComposeResult:
         """Put the curves above the gauges."""
@@ -178,8 +178,7 @@ class JointPanel(Vertical):
         if snapshot is None:
             return
         self.set_class(not look.live, "old")
-        self.border_title = f"joint {self.joint}{remark}"
-        self.border_subtitle = f"last {look.seconds:g} s"
+        self._entitle(f"joint {self.joint}{remark}", f"last {look.seconds:g} s")
         for name, curve in self._curves.items():
             if (view := snapshot.channels.get(name)) is not None:
                 curve.show(name, view, frame, look)
@@ -196,7 +195,14 @@ class JointPanel(Vertical):
             for kind, name in self._gauges
             if (view := snapshot.channels.get(name)) is not None
         ]
-        self._bars.update(Group(*lines))
+        self._bars.update(Group(*lines), layout=False)
+
+    def _entitle(self, title: str, subtitle: str) -> None:
+        # Setting a border's words lays the whole screen out anew, even where they stay the same.
+        if self.border_title != title:
+            self.border_title = title
+        if self.border_subtitle != subtitle:
+            self.border_subtitle = subtitle
 
 
 class Bench(ItemGrid):

@@ -140,6 +140,7 @@ class LivePlot(Widget):
         """Return one line of the plot."""
         size = (self.size.width, self.size.height)
         if self._drawn != size and self._trace is not None:
-            self._strips, self._drawn = draw(self._trace, *size), size
-        strip = self._strips[y] if y < len(self._strips) else Strip.blank(size[0])
-        return strip.apply_style(self.rich_style)
+            ground = self.rich_style
+            self._strips = [strip.apply_style(ground) for strip in draw(self._trace, *size)]
+            self._drawn = size
+        return self._strips[y] if y < len(self._strips) else Strip.blank(size[0], self.rich_style)
