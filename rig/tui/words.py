@@ -104,17 +104,28 @@ def stop_notice(frame: Frame, stop: Stop, now: float) -> Notice:
 
 
 def _stop_of_the_shown(frame: Frame, stop: Stop, now: float) -> Notice:
-    # The run zeroes its outputs before it says that it is aborted or tripped.
-    if frame.snapshot is not None and frame.snapshot.state in ("aborted", "tripped"):
+    if frame.snapshot is not None and _zeroed(frame.snapshot):
         return Notice("good", "STOP SENT, OUTPUTS ZEROED: the run confirmed it")
     if stop.answer is Answer.SENDING:
         return Notice("warn", "STOP: sending ...")
     if frame.over:
-        return Notice("warn", "STOP SENT and taken; the run ended without confirming it. Look.")
+        why = frame.snapshot.message if frame.snapshot is not None else ""
+        said = f" ({why})" if why else ""
+        return Notice("alarm", f"STOP TAKEN, NOT CONFIRMED: the run ended{said}. {EMERGENCY}")
     late = now - stop.at
     if late > CONFIRM:
         return Notice("alarm", f"STOP TAKEN, NOT CONFIRMED for {age_text(late)}. {EMERGENCY}")
     return Notice("warn", "STOP sent and taken; waiting for the run to confirm it ...")
+
+
+def _zeroed(snapshot: Snapshot) -> bool:
+    """Whether the run says that it stopped; it zeroes its outputs before it says so.
+
+    A run that was aborted for another reason, a lost device say, may not have reached them.
+    """
+    said = snapshot.message.lower()
+    stopped = snapshot.state == "aborted" and "stopped" in said
+    return (stopped or snapshot.state == "tripped") and "not confirmed" not in said
 
 
 def _ended(frame: Frame) -> Notice:

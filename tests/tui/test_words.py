@@ -47,8 +47,8 @@ def test_the_age_includes_how_late_the_block_already_was() -> None:
         (Answer.SENDING, "running", 0.1, "warn", "sending"),
         (Answer.TAKEN, "running", 0.1, "warn", "waiting for the run to confirm"),
         (Answer.TAKEN, "running", 2.5, "alarm", "NOT CONFIRMED for 2.5 s"),
-        (Answer.TAKEN, "aborted", 0.1, "good", "OUTPUTS ZEROED"),
-        (Answer.TAKEN, "done", 0.1, "warn", "ended without confirming"),
+        (Answer.TAKEN, "tripped", 0.1, "good", "OUTPUTS ZEROED"),
+        (Answer.TAKEN, "done", 0.1, "alarm", "NOT CONFIRMED: the run ended"),
         (Answer.NONE, "running", 0.1, "alarm", "NO ANSWER"),
         (Answer.NONE, "done", 0.1, "warn", "the run had ended (done)"),
         (Answer.NOWHERE, "running", 0.1, "alarm", "NOTHING SENT"),
@@ -63,6 +63,20 @@ def test_a_stop_is_called_what_it_is(
     )
     assert notice[0] == level
     assert words in notice[1]
+
+
+@pytest.mark.parametrize(
+    ("message", "level"),
+    [
+        ("stopped by operator (from the screen)", "good"),
+        ("the device does not answer", "alarm"),
+        ("stopped by operator; outputs not confirmed at zero", "alarm"),
+    ],
+)
+def test_only_a_run_that_says_it_stopped_confirms_a_stop(message: str, level: str) -> None:
+    frame = replace(LIVE, snapshot=replace(VIEW, state="aborted", message=message))
+    notice = next(n for n in said(frame, Stop(100.0, HERE, Answer.TAKEN)) if "STOP" in n[1])
+    assert notice[0] == level
 
 
 def test_a_stop_of_another_run_is_never_confirmed_by_the_one_shown() -> None:
