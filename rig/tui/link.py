@@ -1,0 +1,299 @@
+"""The link to a run: a thread that receives snapshots and hands immutable frames to the screen.
+
+The screen never waits for the wire and the run never waits for the screen. A stop has a
+connection and a thread of its own, so that it leaves at once whatever the receiving side is doing.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import Final, Protocol
+
+from rig.services.attach import Attachment, Endpoint, Snapshot
+from rig.tui.history import EMPTY, History, Window
+from rig.tui.story import Line, tell
+
+log = logging.getLogger(__name__)
+
+FRAME: Final = 1 / 12  # shortest time between two frames [s]
+POLL: Final = 0.1  # longest wait for a snapshot, and between looks for a session [s]
+QUIET: Final = 1.0  # a run silent for this long is stale, and it is asked whether it still is [s]
+STORY: Final = 100
+ENDED_STATES: Final = frozenset({"done", "aborted", "tripped", "interrupted"})
+
+
+class SnapshotSource(Protocol):
+    """One connection to a run; what `rig.services.attach.Attachment` offers."""
+
+    def receive(self, timeout: float) -> Snapshot | None:
+        """Return the next snapshot, or None when none came within `timeout` seconds."""
+        ...
+
+    def send(self, command: str) -> bool:
+        """Send a command; False when the run did not answer."""
+        ...
+
+    def close(self) -> None:
+        """Let go of the connection."""
+        ...
+
+
+class Sessions(Protocol):
+    """Where running sessions are found and opened."""
+
+    def find(self) -> Sequence[Endpoint]:
+        """Return the live sessions, those of a wanted rig only."""
+        ...
+
+    def open(self, endpoint: Endpoint) -> SnapshotSource:
+        """Connect to one of them; raises OSError when it has just gone."""
+        ...
+
+
+class LocalSessions:
+    """The sessions of this machine's user, over the local sockets."""
+
+    def __init__(self, rig: str | None) -> None:
+        self._rig = rig
+
+    def find(self) -> Sequence[Endpoint]:
+        """Return the live sessions of the rig (of every rig when it is None)."""
+        return Attachment.find(self._rig)
+
+    def open(self, endpoint: Endpoint) -> SnapshotSource:
+        """Connect to one of them."""
+        return Attachment(endpoint)
+
+
+class Stage(Enum):
+    """What the link is doing."""
+
+    WAITING = "waiting"  # no session: looking for one
+    CHOOSING = "choosing"  # several: the operator says which
+    ATTACHED = "attached"
+    ENDED = "ended"  # the run is over or its process has gone; the last picture stays
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Everything the screen draws from; `received` is when the newest samples came [monotonic s].
+
+    A snapshot without new samples does not make those before it any younger.
+    """
+
+    stage: Stage = Stage.WAITING
+    sessions: tuple[Endpoint, ...] = ()
+    endpoint: Endpoint | None = None
+    snapshot: Snapshot | None = None
+    received: float = 0.0
+    window: Window = EMPTY
+    speed: float = 1.0  # device seconds per wall second
+    story: tuple[Line, ...] = ()  # what happened, oldest first, the newest STORY lines of it
+    told: int = 0  # how many lines there have ever been
+    trouble: str = ""  # why sessions cannot be looked for
+
+    def age(self, now: float) -> float:
+        """Return how old the newest sample is [s]: its age when published plus the time since."""
+        block = self.snapshot.block_age if self.snapshot else 0.0
+        return max(block, 0.0) + now - self.received
+
+    @property
+    def over(self) -> bool:
+        """Whether the run has ended: it said so, or its process has gone."""
+        said = self.snapshot is not None and self.snapshot.state in ENDED_STATES
+        return self.stage is Stage.ENDED or said
+
+
+class Link:
+    """Finds a session, follows it, and makes frames; `step` is one turn of its thread."""
+
+    def __init__(self, sessions: Sessions, clock: Callable[[], float] = time.monotonic) -> None:
+        self._sessions, self._clock = sessions, clock
+        self._frame = Frame()
+        self._source: SnapshotSource | None = None
+        self._history = History()
+        self._chosen: Endpoint | None = None
+        self._choosing = False
+        self._looked = -float("inf")
+        self._framed = -float("inf")
+        self._dirty = False
+        self._closing = threading.Event()
+        self._thread: threading.Thread | None = None
+        self.window_seconds = 10.0  # set by the screen: how much of the past a frame carries
+
+    @property
+    def frame(self) -> Frame:
+        """The newest frame."""
+        return self._frame
+
+    def start(self) -> None:
+        """Start the receiving thread; a daemon, for a hung wire must not keep the screen open."""
+        self._thread = threading.Thread(target=self._run, name="bramah-link", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the receiving thread and let go of the run, which goes on."""
+        self._closing.set()
+        if self._thread is None:
+            self._detach()
+        else:
+            self._thread.join(timeout=10 * POLL)
+
+    def choose(self, endpoint: Endpoint | None) -> None:
+        """Attach to this session; None asks the operator to choose again."""
+        self._chosen, self._choosing = endpoint, endpoint is None
+
+    def stop(self, endpoint: Endpoint, answered: Callable[[bool], None]) -> None:
+        """Send "stop" at once on a connection and a thread of its own, then report the answer."""
+
+        def send() -> None:
+            answered(self._send(endpoint, "stop"))
+
+        threading.Thread(target=send, name="bramah-stop", daemon=True).start()
+
+    def _send(self, endpoint: Endpoint, command: str) -> bool:
+        try:
+            source = self._sessions.open(endpoint)
+            try:
+                return source.send(command)
+            finally:
+                source.close()
+        except Exception:  # whatever happened, the operator must read "no answer", not a traceback
+            log.exception("sending %r to %s failed", command, endpoint)
+            return False
+
+    def _run(self) -> None:
+        while not self._closing.is_set():
+            try:
+                self.step(POLL)
+            except Exception as error:  # a broken link must be read on the screen, not kill it
+                log.exception("the link failed; looking for sessions again")
+                self._detach()
+                self._frame = replace(self._frame, trouble=str(error) or repr(error))
+                self._closing.wait(QUIET)
+        self._detach()
+
+    def step(self, timeout: float) -> None:
+        """Look for sessions if it is time, wait `timeout` [s] for a snapshot, make a frame."""
+        self._follow_sessions()
+        if self._source is None:
+            self._closing.wait(timeout)
+            return
+        snapshot = self._source.receive(timeout)
+        now = self._clock()
+        if snapshot is not None:
+            self._take(snapshot, now)
+        if self._dirty and (snapshot is None or snapshot.trip or now - self._framed >= FRAME):
+            window = self._history.window(self.window_seconds)
+            self._frame = replace(self._frame, window=window)
+            self._framed, self._dirty = now, False
+
+    def _take(self, snapshot: Snapshot, now: float) -> None:
+        before = self._frame
+        quiet = before.snapshot is not None and now - before.received > QUIET
+        snapshot = _carried(before.snapshot, snapshot)
+        self._history.add(snapshot, after_gap=quiet)
+        lines = tell(before.snapshot, snapshot)
+        # The window follows at the frame rate; what is said in words follows every snapshot.
+        self._frame = replace(
+            before,
+            snapshot=snapshot,
+            received=now if _has_news(before.snapshot, snapshot) else before.received,
+            speed=_speed(before, snapshot),
+            story=(*before.story, *lines)[-STORY:],
+            told=before.told + len(lines),
+        )
+        self._dirty = True
+
+    def _follow_sessions(self) -> None:
+        now = self._clock()
+        due = QUIET if self._source is not None else POLL
+        if now - self._looked < due and self._chosen is None and not self._choosing:
+            return
+        self._looked = now
+        live = tuple(self._sessions.find())
+        self._frame = replace(self._frame, sessions=live, trouble="")
+        chosen, self._chosen = self._chosen, None
+        choosing, self._choosing = self._choosing, False
+        if chosen is not None and chosen in live:
+            self._attach(chosen)
+        elif choosing and len(live) > 1:
+            self._detach()
+            self._frame = self._blank(Stage.CHOOSING)
+        elif self._source is not None:
+            if self._frame.endpoint not in live:
+                self._drain()
+                self._detach()
+                self._frame = replace(self._frame, stage=Stage.ENDED)
+        elif len(live) == 1:
+            self._attach(live[0])
+        elif live:
+            self._frame = self._blank(Stage.CHOOSING)
+        elif self._frame.stage is Stage.CHOOSING:
+            self._frame = self._blank(Stage.WAITING)
+
+    def _blank(self, stage: Stage, endpoint: Endpoint | None = None) -> Frame:
+        """Return a frame without a run's picture; what happened so far stays in the log."""
+        kept = self._frame
+        return Frame(
+            stage,
+            kept.sessions,
+            endpoint,
+            received=self._clock(),
+            story=kept.story,
+            told=kept.told,
+        )
+
+    def _drain(self) -> None:
+        """Take the last words of a run that has gone."""
+        while self._source is not None and (last := self._source.receive(0.0)) is not None:
+            self._take(last, self._clock())
+        self._frame = replace(self._frame, window=self._history.window(self.window_seconds))
+
+    def _attach(self, endpoint: Endpoint) -> None:
+        source = self._sessions.open(endpoint)
+        self._detach()
+        self._source = source
+        self._history = History()
+        self._frame = self._blank(Stage.ATTACHED, endpoint)
+
+    def _detach(self) -> None:
+        source, self._source = self._source, None
+        if source is not None:
+            source.close()
+
+
+def _has_news(last: Snapshot | None, snapshot: Snapshot) -> bool:
+    """Whether a snapshot brings samples that the one before did not have."""
+    return last is None or (last.run, last.tick) != (snapshot.run, snapshot.tick)
+
+
+def _carried(last: Snapshot | None, snapshot: Snapshot) -> Snapshot:
+    """Return a snapshot without new samples with the newest values of the one before it."""
+    if last is None or _has_news(last, snapshot):
+        return snapshot
+    channels = {
+        name: replace(view, last=last.channels[name].last) if name in last.channels else view
+        for name, view in snapshot.channels.items()
+    }
+    return replace(snapshot, channels=channels)
+
+
+def _speed(before: Frame, snapshot: Snapshot) -> float:
+    """Return device seconds per wall second, smoothed over about 20 snapshots.
+
+    Both times are the run's own: snapshots may wait in a queue and arrive in bursts.
+    """
+    previous = before.snapshot
+    if previous is None or previous.run != snapshot.run:
+        return before.speed
+    wall = snapshot.wall_time - previous.wall_time
+    if not 0 < wall < QUIET:
+        return before.speed
+    latest = (snapshot.device_time - previous.device_time) / wall
+    return before.speed + 0.05 * (latest - before.speed) if latest > 0 else before.speed

@@ -1,0 +1,89 @@
+"""SI inside, the operator's units on the glass: MPa, mm, and short words for times."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final
+
+
+@dataclass(frozen=True)
+class Shown:
+    """How a channel's SI unit is shown: its name, SI to shown factor, decimals."""
+
+    unit: str
+    factor: float
+    decimals: int
+
+    def number(self, value: float | None, *, sign: bool = False) -> str:
+        """Return the value's digits in the shown unit; an absent or NaN value is a dash."""
+        if value is None or math.isnan(value):
+            return "–"
+        # Adding zero turns the -0.0 of a rounded small negative number into 0.0.
+        scaled = round(value * self.factor, self.decimals) + 0.0
+        text = f"{scaled:+.{self.decimals}f}" if sign else f"{scaled:.{self.decimals}f}"
+        return text.replace("-", "−")
+
+    def short(self, value: float | None) -> str:
+        """Return the value with no more decimals than a limit needs: 9, −0.2, 36."""
+        if value is None or math.isnan(value):
+            return ""
+        text = f"{round(value * self.factor, self.decimals) + 0.0:g}"
+        return text.replace("-", "−")
+
+
+SHOWN: Final[dict[str, Shown]] = {
+    "Pa": Shown("MPa", 1e-6, 2),
+    "m": Shown("mm", 1e3, 1),
+    "V": Shown("V", 1.0, 3),
+    "degC": Shown("°C", 1.0, 1),
+    "rad": Shown("°", 180.0 / math.pi, 1),
+}
+
+
+def shown(unit: str) -> Shown:
+    """Return how an SI unit is shown; one not listed keeps its own name."""
+    return SHOWN.get(unit, Shown(unit, 1.0, 3))
+
+
+class Band(IntEnum):
+    """Where a value stands: well inside its limits, close to one, or beyond it."""
+
+    INSIDE = 0
+    NEAR = 1
+    BEYOND = 2
+
+
+def band(value: float, low: float | None, high: float | None, margin: float = 0.02) -> Band:
+    """Return where a value stands; NEAR is within `margin` of the range between the limits."""
+    beyond = (low is not None and value < low) or (high is not None and value > high)
+    if beyond:
+        return Band.BEYOND
+    if low is None or high is None:
+        return Band.INSIDE
+    near = margin * (high - low)
+    return Band.NEAR if value < low + near or value > high - near else Band.INSIDE
+
+
+def clock_text(seconds: float) -> str:
+    """Return 83 s as 1:23, 3723 s as 1:02:03; an unknown time as a dash."""
+    if not math.isfinite(seconds) or seconds < 0:
+        return "–"
+    minutes, rest = divmod(int(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+def age_text(seconds: float) -> str:
+    """Return the age of a sample in as many digits as matter: 0.05 s, 3.2 s, 75 s, 12 min."""
+    if seconds < 1:
+        return f"{max(seconds, 0.0):.2f} s"
+    if seconds < 10:
+        return f"{seconds:.1f} s"
+    return f"{seconds:.0f} s" if seconds < 600 else f"{seconds / 60:.0f} min"
+
+
+def limit(value: float | None) -> float | None:
+    """Return a limit that can be drawn, or None for one that is absent or infinite in effect."""
+    return value if value is not None and abs(value) < 1e300 else None

@@ -1,0 +1,142 @@
+"""A run as a screen receives it: snapshots of a two-joint arm, made from closed formulas.
+
+Joint 1 rests at its retracted end, joint 2 is excited at 1 Hz; nothing here is physics, only
+numbers of the size that the seed bench shows.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rig.services.attach import ChannelView, Snapshot
+
+RATE = 1000.0  # samples a second
+LIMITS = {
+    "piston_1": (-0.039, 0.039),
+    "piston_2": (-0.036, 0.036),
+    "cap_pressure": (-0.2e6, 9e6),
+    "rod_pressure": (-0.2e6, 9e6),
+    "command": (-4.0, 4.0),
+}
+UNITS = {"cap": "Pa", "rod": "Pa", "piston": "m", "spool": "V", "command": "V", "supply": "Pa"}
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What the recorded bench does."""
+
+    joints: int = 2
+    run: str = "runs/2024-05-17-lock-and-excite"
+    rig: str = "shinshu-2dof"
+    pid: int = 4711
+    total: float = 40.0  # device seconds of the whole protocol
+    spike: float | None = None  # cap pressure of joint 2 passes its limit at this time [s]
+
+
+def samples(bench: Bench, time: np.ndarray) -> dict[str, np.ndarray]:
+    """Return every channel at these device times [s], in SI."""
+    found: dict[str, np.ndarray] = {}
+    noise = np.random.default_rng(7).normal(size=len(time))
+    for joint in range(1, bench.joints + 1):
+        moving = 0.0 if joint == 1 else 1.0
+        phase = 2 * np.pi * time + joint
+        found[f"spool_{joint}"] = moving * 0.1 * np.sin(phase) + 2e-4 * noise
+        found[f"piston_{joint}"] = np.where(
+            moving, -0.022 * np.cos(phase) + 1e-5 * noise, -0.0374 + 1e-5 * noise
+        )
+        swing = moving * 1.1e6 * (np.sin(phase) + 0.3 * np.sin(3 * phase)) + 5e3 * noise
+        found[f"cap_pressure_{joint}"] = 2.4e6 + 0.4e6 * joint + swing
+        found[f"rod_pressure_{joint}"] = 3.9e6 - 0.3e6 * joint - 0.8 * swing
+    if bench.spike is not None:
+        found["cap_pressure_2"] = np.where(
+            np.abs(time - bench.spike) < 0.003, 9.31e6, found["cap_pressure_2"]
+        )
+    found["supply_pressure"] = 6.9e6 - 0.2e6 * np.abs(np.sin(2 * np.pi * time)) + 5e3 * noise
+    found["oil_temperature"] = 40.0 + 0.02 * time
+    for joint in range(1, bench.joints + 1):
+        found[f"command_{joint}"] = 10 * found[f"spool_{joint}"]
+    return found
+
+
+def _limits(name: str) -> tuple[float | None, float | None]:
+    return LIMITS.get(name) or LIMITS.get(name.rsplit("_", 1)[0], (None, None))
+
+
+def _unit(name: str) -> str:
+    return "degC" if name == "oil_temperature" else UNITS[name.split("_", maxsplit=1)[0]]
+
+
+def snapshot(bench: Bench, k: int, step: float = 0.05) -> Snapshot:
+    """Return snapshot k (from 1): the samples of `step` device seconds up to k * step."""
+    first, last = round((k - 1) * step * RATE), round(k * step * RATE)
+    time = np.arange(first, last) / RATE
+    cuts = np.linspace(0, len(time), min(len(time), 25) + 1).astype(int)[:-1]
+    channels = {
+        name: ChannelView(
+            _unit(name),
+            *_limits(name),
+            float(values[-1]),
+            np.minimum.reduceat(values, cuts).tolist(),
+            np.maximum.reduceat(values, cuts).tolist(),
+        )
+        for name, values in samples(bench, time).items()
+    }
+    now = last / RATE
+    repeat = min(int(now // 10) + 1, 4)
+    settling = now % 10 < 2
+    return Snapshot(
+        run=bench.run,
+        rig=bench.rig,
+        pid=bench.pid,
+        state="running",
+        step="step1",
+        phase="settle" if settling else "excite",
+        repeat=repeat,
+        repeats=4,
+        done_s=now,
+        total_s=bench.total,
+        tick=last,
+        device_time=now,
+        wall_time=1.7e9 + now,
+        block_age=0.012,
+        lost_samples=0,
+        trip=None,
+        message="joint 1 locked at its retracted end" if now > 1 else "filling the lines",
+        channels=channels,
+    )
+
+
+def run(bench: Bench, seconds: float, step: float = 0.05) -> Iterator[Snapshot]:
+    """Return the snapshots of the first `seconds` of a run."""
+    return (snapshot(bench, k, step) for k in range(1, round(seconds / step) + 1))
+
+
+def tripped(last: Snapshot) -> Snapshot:
+    """Return what a run says last when joint 2 passed its pressure limit."""
+    trip = (
+        "safety trip: limit 'pressure', cap_pressure_2 of joint 2 (arm): 9.31 MPa at "
+        f"{last.device_time - 0.003:.4f} s, allowed -0.2 to 9 MPa"
+    )
+    return replace(last, state="tripped", trip=trip, message="outputs zeroed")
+
+
+def stopped(last: Snapshot) -> Snapshot:
+    """Return what a run says last when the operator stopped it."""
+    still = {
+        name: replace(view, last=0.0, minimum=[], maximum=[])
+        if name.startswith("command")
+        else view
+        for name, view in last.channels.items()
+    }
+    return replace(
+        last, state="aborted", message="stopped by operator: outputs zeroed", channels=still
+    )
+
+
+def of_this_process(bench: Bench) -> Bench:
+    """Return the bench as this process would publish it."""
+    return replace(bench, pid=os.getpid())

@@ -1,0 +1,173 @@
+"""What the screen says, word by word."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rig.services.attach import ChannelView
+from rig.tui.app import farewell
+from rig.tui.gauge import bar, gauge
+from rig.tui.link import Frame, Stage
+from rig.tui.story import tell
+from rig.tui.units import Band, age_text, band, clock_text, limit, shown
+from rig.tui.words import Answer, Stop, notices
+from tests.tui.glass import endpoint
+from tests.tui.recorded import Bench, snapshot, stopped, tripped
+
+HERE = endpoint()
+VIEW = snapshot(Bench(), 80)
+LIVE = Frame(Stage.ATTACHED, (HERE,), HERE, VIEW, received=100.0)
+
+
+def said(frame: Frame, stop: Stop | None = None, now: float = 100.0) -> list[tuple[str, str]]:
+    return [(n.level, n.text) for n in notices(frame, stop, now, paused=False)]
+
+
+def test_a_healthy_run_needs_no_notice() -> None:
+    assert said(LIVE) == []
+
+
+def test_old_data_turns_from_a_warning_into_an_alarm() -> None:
+    assert said(LIVE, now=102.0)[0][0] == "warn"
+    assert said(LIVE, now=110.0)[0][0] == "alarm"
+
+
+def test_the_age_includes_how_late_the_block_already_was() -> None:
+    late = replace(LIVE, snapshot=replace(VIEW, block_age=1.2))
+    assert said(late)[0] == ("warn", "NO DATA for 1.2 s: what is shown is old")
+
+
+@pytest.mark.parametrize(
+    ("answer", "state", "later", "level", "words"),
+    [
+        (Answer.SENDING, "running", 0.1, "warn", "sending"),
+        (Answer.TAKEN, "running", 0.1, "warn", "waiting for the run to confirm"),
+        (Answer.TAKEN, "running", 2.5, "alarm", "NOT CONFIRMED for 2.5 s"),
+        (Answer.TAKEN, "tripped", 0.1, "good", "OUTPUTS ZEROED"),
+        (Answer.TAKEN, "done", 0.1, "alarm", "NOT CONFIRMED: the run ended"),
+        (Answer.NONE, "running", 0.1, "alarm", "NO ANSWER"),
+        (Answer.NONE, "done", 0.1, "warn", "the run had ended (done)"),
+        (Answer.NOWHERE, "running", 0.1, "alarm", "NOTHING SENT"),
+    ],
+)
+def test_a_stop_is_called_what_it_is(
+    answer: Answer, state: str, later: float, level: str, words: str
+) -> None:
+    frame = replace(LIVE, snapshot=replace(VIEW, state=state), received=100.0 + later)
+    notice = next(
+        n for n in said(frame, Stop(100.0, HERE, answer), 100.0 + later) if "STOP" in n[1]
+    )
+    assert notice[0] == level
+    assert words in notice[1]
+
+
+@pytest.mark.parametrize(
+    ("message", "level"),
+    [
+        ("stopped by operator (from the screen)", "good"),
+        ("the device does not answer", "alarm"),
+        ("stopped by operator; outputs not confirmed at zero", "alarm"),
+    ],
+)
+def test_only_a_run_that_says_it_stopped_confirms_a_stop(message: str, level: str) -> None:
+    frame = replace(LIVE, snapshot=replace(VIEW, state="aborted", message=message))
+    notice = next(n for n in said(frame, Stop(100.0, HERE, Answer.TAKEN)) if "STOP" in n[1])
+    assert notice[0] == level
+
+
+def test_a_stop_of_another_run_is_never_confirmed_by_the_one_shown() -> None:
+    elsewhere = Stop(100.0, endpoint("press", 7), Answer.TAKEN)
+    frame = replace(LIVE, snapshot=stopped(VIEW))
+    texts = [text for _, text in said(frame, elsewhere)]
+    assert any("press (process 7), which is not the run shown: taken" in text for text in texts)
+    assert not any("ZEROED" in text for text in texts)
+    assert not any("STOP" in text for _, text in said(frame, elsewhere, 200.0))
+
+
+def test_trouble_in_looking_for_runs_is_shown() -> None:
+    assert said(Frame(trouble="/tmp/x: belongs to user 0"))[0][0] == "alarm"
+
+
+def test_the_log_tells_each_turn_once() -> None:
+    first = [line.text for line in tell(None, VIEW)]
+    assert first[0].startswith("attached to run")
+    assert "step1 repeat 1 of 4 excite" in first
+    assert tell(VIEW, snapshot(Bench(), 81)) == []
+    after = replace(VIEW, step="step2", repeat=2, message="on to joint 1", lost_samples=3)
+    texts = [line.text for line in tell(VIEW, after)]
+    assert texts == ["step2 repeat 2 of 4 excite", "on to joint 1", "3 samples lost (3 in all)"]
+    trip = [line.text for line in tell(VIEW, tripped(VIEW))]
+    assert any(text.startswith("TRIP  limit 'pressure'") for text in trip)
+    assert "state: running → tripped" in trip
+
+
+def test_the_last_words_on_the_terminal() -> None:
+    assert "no run was attached" in farewell(Frame())
+    assert "GOES ON" in farewell(LIVE)
+    assert "had ended (aborted)" in farewell(replace(LIVE, snapshot=stopped(VIEW)))
+
+
+def test_numbers_wear_the_operators_units() -> None:
+    assert shown("Pa").number(9.314e6) == "9.31"
+    assert shown("m").number(-0.01234, sign=True) == "−12.3"
+    assert shown("m").number(-1e-6, sign=True) == "+0.0"
+    assert shown("Pa").number(float("nan")) == "–"
+    assert shown("Pa").short(-0.2e6) == "−0.2"
+    assert shown("N·m").unit == "N·m"
+
+
+def test_times_are_short() -> None:
+    assert [clock_text(t) for t in (5, 83, 3723, float("nan"))] == ["0:05", "1:23", "1:02:03", "–"]
+    assert [age_text(t) for t in (0.051, 3.24, 75, 7200)] == ["0.05 s", "3.2 s", "75 s", "120 min"]
+
+
+def test_a_value_is_near_a_limit_before_it_is_beyond_it() -> None:
+    assert [band(v, -0.2e6, 9e6) for v in (5e6, 8.9e6, 9.1e6, -0.1e6, -0.3e6)] == [
+        Band.INSIDE,
+        Band.NEAR,
+        Band.BEYOND,
+        Band.NEAR,
+        Band.BEYOND,
+    ]
+    assert band(1e12, None, None) is Band.INSIDE
+    assert limit(1.7e308) is None
+    assert limit(float("inf")) is None
+    assert limit(0.036) == 0.036
+
+
+def test_a_bar_shows_limits_travel_and_value() -> None:
+    assert bar(0.0, (-1.0, 1.0), (-0.5, 0.5), (-1.0, 1.0), 21) == "─├───━━━━━●━━━━━───┤─"
+    assert bar(9.0, (-1.0, 1.0), None, (-1.0, 1.0), 11)[-1] == "▶"
+    assert bar(-9.0, (-1.0, 1.0), None, (-1.0, 1.0), 11)[0] == "◀"
+    assert "●" not in bar(float("nan"), (-1.0, 1.0), None, (-1.0, 1.0), 11)
+
+
+@given(
+    st.floats(-1e3, 1e3),
+    st.floats(-1e3, 0).map(float),
+    st.floats(1e-3, 1e3),
+    st.integers(0, 200),
+)
+def test_a_bar_is_as_wide_as_asked_and_the_marker_keeps_its_side(
+    at: float, low: float, above: float, width: int
+) -> None:
+    high = low + above
+    drawn = bar(at, (low, high), None, (low, high), width)
+    assert len(drawn) == width
+    if width >= 40 and low < at < high:
+        marker, left, right = (drawn.find(c) for c in "●├┤")
+        assert left == -1 or left <= marker
+        assert right == -1 or marker <= right
+
+
+@pytest.mark.parametrize("width", [36, 40, 76])
+def test_a_gauge_fills_its_line(width: int) -> None:
+    view = ChannelView("m", -0.0375, 0.0375, 0.01, [], [])
+    line = gauge("piston", view, (0.0, 0.02), (-0.0375, 0.0375), width, live=True)
+    assert line.cell_len == width
+    assert "+10.0 mm −37.5 " in line.plain
+    assert line.plain.endswith(" 37.5")
