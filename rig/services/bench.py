@@ -32,6 +32,7 @@ from rig.services.stops import StopFlag
 from rig.services.trips import OperatorStop, RecordingFailed, SafetyTrip, Violation
 
 log = logging.getLogger(__name__)
+UNSURE = "outputs not confirmed at zero"
 Array = NDArray[np.float64]
 
 
@@ -109,12 +110,15 @@ class Bench:
         """Zero, close the wire, flush, report; the signals come back last."""
         state, message = _outcome(error)
         try:
-            self._outputs.close()
+            if not self._outputs.close():
+                message = f"{message}; {UNSURE}".lstrip("; ")
+            # A screen waits for this, and flushing can take seconds.
+            self._display.ended(state, message)
         finally:
             try:
                 self._flush(state, message, error)
             finally:
-                self._display.close(state, message)
+                self._display.close()
                 self._stop.restore()
 
     def _flush(self, state: str, message: str, error: BaseException | None) -> None:

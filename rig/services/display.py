@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,12 +94,14 @@ class Display:
                 found[name] = (ends[0], ends[1])
         return found
 
-    def close(self, state: str, message: str) -> None:
-        """Publish how it ended and close the sockets; never raises."""
-        if self._publisher is None:
-            return
+    def ended(self, state: str, message: str) -> None:
+        """Publish how the run ended, as soon as the outputs are at zero."""
         if message:
-            self.progress = Progress(**{**vars(self.progress), "message": message})
+            self.progress = replace(self.progress, message=message)
         self._publish(state, 0.0)
-        self._publisher.close()
-        self._publisher = None
+
+    def close(self) -> None:
+        """Close the sockets; never raises."""
+        if self._publisher is not None:
+            self._publisher.close()
+            self._publisher = None

@@ -86,14 +86,15 @@ class Outputs:
             _bounded(law, joint.limits.command) for law, joint in zip(laws, joints, strict=True)
         ]
 
-    def close(self) -> None:
-        """Zero once more, stop the stream, close the wire; never raises."""
-        self.zero()
+    def close(self) -> bool:
+        """Zero once more, stop the stream, close the wire; says whether zero is sure; no raise."""
+        zeroed = self.zero() or not self._connected
         if self._connected and not self._silent:
             with suppress(DeviceError):
                 self.driver.stop()
         self.driver.close()
         self._connected = False
+        return zeroed
 
 
 def _bounded(law: OutputLaw, most: float) -> OutputLaw:
