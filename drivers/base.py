@@ -103,5 +103,8 @@ class Driver(Protocol):
     def stop(self) -> None:
         """Stop streaming."""
 
+    def trip_cause(self) -> str | None:
+        """Say why the device has zeroed its outputs and keeps them so, or None if it has not."""
+
     def reset(self) -> None:
         """Clear a latched trip of the device; only on a person's word."""

@@ -29,7 +29,7 @@ from rig.services.outputs import Outputs
 from rig.services.recorder import Recorder, RecordMeta
 from rig.services.safety import Guard, GuardSettings, JointRole
 from rig.services.stops import StopFlag
-from rig.services.trips import OperatorStop, RecordingFailed, SafetyTrip, Violation
+from rig.services.trips import Latched, OperatorStop, RecordingFailed, SafetyTrip, Violation
 
 log = logging.getLogger(__name__)
 UNSURE = "outputs not confirmed at zero"
@@ -79,6 +79,9 @@ class Bench:
             self._stop.install()
         try:
             self.info = self._outputs.connect()
+            cause = self._outputs.safely(self._driver.trip_cause)
+            if cause is not None:
+                raise Latched(cause, self.rig)
             if self.recorder is not None:
                 self.recorder.open(self.info)
             self.restart()
@@ -222,7 +225,7 @@ class Bench:
         return trip
 
     def _report(self, trip: SafetyTrip) -> None:
-        log.error("%s", trip)
+        log.info("%s", trip)
         about = {k: v for k, v in asdict(trip.violation).items() if k != "tick"}
         with suppress(RecordingFailed):  # the trip is what the user must hear
             self.event("trip", trip.tick, message=str(trip), **about)

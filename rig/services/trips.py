@@ -80,6 +80,16 @@ class SafetyTrip(Exception):
         )
 
 
+class Latched(Exception):
+    """The device keeps its outputs at zero since an earlier trip (exit 3)."""
+
+    def __init__(self, cause: str, rig: Rig) -> None:
+        super().__init__(
+            f"the device tripped earlier and stays so: {cause}; look at the bench, "
+            f"then clear it with `bramah reset --rig {rig.name}`"
+        )
+
+
 class OperatorStop(Exception):
     """A person (or the system, by SIGTERM) ended the run; the outputs are at zero (exit 130)."""
 

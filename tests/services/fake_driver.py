@@ -67,6 +67,7 @@ class FakeDriver:
         self.waves: dict[int, Array] = {}
         self.laws: list[OutputLaw] = [OFF] * len(rig.joints)
         self.dead = False
+        self.latched: str | None = None
         self._start = 0
         self._log = log
         self._before = before_block or (lambda _: None)
@@ -117,8 +118,13 @@ class FakeDriver:
         self._alive()
         self._note("stop")
 
+    def trip_cause(self) -> str | None:
+        self._alive()
+        return self.latched
+
     def reset(self) -> None:
         self._alive()
+        self.latched = None
         self._note("reset")
 
     def _commands(self, ticks: NDArray[np.int64], data: Array) -> Array:

@@ -18,7 +18,7 @@ from rig.services.rigs import load_rig
 from rig.services.runstate import read_events
 from rig.services.safety import EXCITED, FREE, JointRole
 from rig.services.store import load_run
-from rig.services.trips import OperatorStop, SafetyTrip
+from rig.services.trips import Latched, OperatorStop, SafetyTrip
 from tests.services.fake_driver import FakeDriver
 
 RIG = load_rig("shinshu-2dof")
@@ -67,6 +67,18 @@ def test_a_trip_zeroes_the_outputs_before_anything_is_written(tmp_path: Path) ->
     assert driver.calls[:3] == ["recorder.append"] * 3
     assert driver.calls[3:6] == ["zero", "recorder.append", "recorder.event"]
     assert driver.calls[-3:] == ["stop", "close", "recorder.finish"]
+
+
+def test_a_device_that_tripped_earlier_is_left_alone_until_a_person_resets(
+    tmp_path: Path,
+) -> None:
+    driver = FakeDriver(RIG)
+    driver.latched = "host fell silent"
+    with pytest.raises(Latched, match="bramah reset"), Bench(RIG, driver, signals=False):
+        pytest.fail("a run began on a tripped device")
+    driver.reset()
+    with Bench(RIG, driver, signals=False) as bench:
+        bench.exchange()
 
 
 def test_a_trip_is_in_the_run_with_its_block_and_the_state_is_tripped(tmp_path: Path) -> None:

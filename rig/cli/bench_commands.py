@@ -1,0 +1,178 @@
+"""Verbs of the bench: sim, check, run, monitor, runs, recover."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rig.cli.output import progress, table, write_json
+from rig.model.parse import InputError
+
+log = logging.getLogger(__name__)
+
+RigOption = Annotated[
+    str, typer.Option("--rig", help="A shipped rig's name, or the path of a rig file.")
+]
+JsonOption = Annotated[
+    Path | None,
+    typer.Option("--json", help="Write the machine-readable result here; - is standard output."),
+]
+
+
+def sim(
+    rig: RigOption,
+    wire: Annotated[str, typer.Option(help="Only modbus-tcp for now.")] = "modbus-tcp",
+    scenario: Annotated[
+        Path | None, typer.Option(help="A file of hidden effects; none: what every bench has.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Of noise, temperature and the like.", min=0)] = 0,
+    port: Annotated[
+        int | None, typer.Option(help="0 takes a free one.  [default: the rig's]", min=0, max=65535)
+    ] = None,
+    real_time: Annotated[
+        bool, typer.Option("--real-time", help="Keep pace with the clock on the wall.")
+    ] = False,
+    truth: Annotated[
+        Path | None, typer.Option(help="Write the plant's true parameters to this JSON file.")
+    ] = None,
+    parent: Annotated[int | None, typer.Option(hidden=True)] = None,
+) -> None:
+    """Run the simulated bench as a process of its own; its endpoint is the first line printed.
+
+    Example: bramah sim --rig shinshu-2dof --wire modbus-tcp --seed 1
+    """
+    from rig.cli.simulator import Served, serve_bench
+
+    if wire != "modbus-tcp":
+        raise InputError(f"--wire {wire}: this version speaks modbus-tcp only")
+    serve_bench(Served(rig, seed, scenario, port, real_time, truth, parent))
+
+
+def check(
+    protocol: Annotated[str, typer.Argument(help="A shipped protocol's name, or a file.")],
+    rig: RigOption,
+    repeats: Annotated[int | None, typer.Option(min=1, help="Instead of the file's.")] = None,
+    json: JsonOption = None,
+) -> None:
+    """Read, resolve and prove a protocol against the limits on the twin; nothing moves.
+
+    Example: bramah check lock-and-excite --rig shinshu-2dof
+    """
+    from rig.cli.running import check_protocol, with_repeats
+    from rig.cli.sheets import check_text
+
+    report = check_protocol(protocol, rig, with_repeats(repeats))
+    write_json(json, report.as_dict())
+    if json != Path("-"):
+        typer.echo(check_text(report))
+    report.require()
+
+
+def run(
+    protocol: Annotated[str, typer.Argument(help="A shipped protocol's name, or a file.")],
+    rig: RigOption,
+    out: Annotated[Path, typer.Option(help="The run folder to make.")],
+    endpoint: Annotated[
+        str | None, typer.Option(help="modbus-tcp://HOST:PORT instead of the rig's wire.")
+    ] = None,
+    repeats: Annotated[int | None, typer.Option(min=1, help="Instead of the file's.")] = None,
+    operator: Annotated[
+        str | None, typer.Option(help="Written into the run.  [default: you]")
+    ] = None,
+) -> None:
+    """Run a protocol unattended into a run folder; Ctrl-C zeroes the outputs and keeps the data.
+
+    Example: bramah run lock-and-excite-multisine --rig shinshu-2dof --out runs/monday
+    """
+    from rig.cli.running import Job, run_protocol, with_repeats
+
+    job = Job(protocol, rig, out, endpoint, with_repeats(repeats), operator)
+    folder = run_protocol(job, progress)
+    typer.echo(str(folder))
+
+
+def reset(
+    rig: RigOption,
+    endpoint: Annotated[
+        str | None, typer.Option(help="modbus-tcp://HOST:PORT instead of the rig's wire.")
+    ] = None,
+) -> None:
+    """Clear a trip that the device has latched, after a person has looked at the bench.
+
+    Example: bramah reset --rig shinshu-2dof
+    """
+    from rig.cli.running import reset_device
+
+    typer.echo(f"cleared: {reset_device(rig, endpoint)}")
+
+
+def monitor(
+    rig: Annotated[str | None, typer.Option("--rig", help="Only runs of this rig.")] = None,
+) -> None:
+    """Watch a running protocol: pressures, limits, pistons; s stops it, q leaves it running.
+
+    Example: bramah monitor --rig shinshu-2dof
+    """
+    from rig.tui.app import main
+
+    raise typer.Exit(main(rig))
+
+
+def runs(
+    folder: Annotated[Path, typer.Argument(help="A folder that holds run folders.")] = Path(),
+    json: JsonOption = None,
+) -> None:
+    """List runs with their state.
+
+    Example: bramah runs runs/
+    """
+    from rig.services.store import list_runs
+
+    found = list_runs(folder)
+    write_json(json, [{**asdict(one), "path": str(one.path)} for one in found])
+    if json == Path("-"):
+        return
+    if not found:
+        progress(f"no runs in {folder}")
+        return
+    header = ("run", "state", "rig", "protocol", "created", "records")
+    rows = [
+        (
+            one.path.name,
+            one.state,
+            one.rig,
+            one.protocol,
+            one.created[:16],
+            str(one.records) if one.records >= 0 else "—",
+        )
+        for one in found
+    ]
+    typer.echo(table(header, rows))
+    for one in found:
+        if one.message:
+            typer.echo(f"{one.path.name}: {one.message}")
+
+
+def recover(
+    run: Annotated[Path, typer.Argument(help="The run folder of an interrupted run.")],
+    force: Annotated[
+        bool, typer.Option("--force", help="Also a run of another computer that looks alive.")
+    ] = False,
+) -> None:
+    """Finalise an interrupted run from its journal; what was recorded becomes readable.
+
+    Example: bramah recover runs/monday
+    """
+    from rig.services.recover import recover as recover_run
+
+    typer.echo(recover_run(run, force=force).message)
+
+
+def register(app: typer.Typer) -> None:
+    """Add these verbs to the command line."""
+    for verb in (sim, check, run, reset, monitor, runs, recover):
+        app.command()(verb)

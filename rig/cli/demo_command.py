@@ -1,0 +1,29 @@
+"""The `demo` verb."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def demo(
+    out: Annotated[Path, typer.Option(help="Each demo makes a folder of its own in here.")] = Path(
+        "demo-out"
+    ),
+    seed: Annotated[int, typer.Option(min=0, help="Of the simulated bench.")] = 0,
+    repeats: Annotated[int | None, typer.Option(min=1, help="Instead of the protocol's.")] = None,
+) -> None:
+    """Run the whole loop on a simulated bench: protocol, records, parameters, report.
+
+    Example: bramah demo --out demo-out
+    """
+    from rig.cli.story import tell
+
+    tell(out, seed, repeats)
+
+
+def register(app: typer.Typer) -> None:
+    """Add this verb to the command line."""
+    app.command()(demo)

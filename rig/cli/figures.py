@@ -1,0 +1,176 @@
+"""The figures behind `bramah bench`, each against the number it has to meet."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from analysis import paper_tables
+from analysis.analysis_bench import identify_figures, simulation_figures
+from drivers import make_driver
+from drivers.acquisition_bench import measure_acquisition
+from hil_sim import plant_bench
+from protocols.plan import Overrides
+from rig.cli.output import table
+from rig.cli.running import wire_at
+from rig.cli.simulated import simulated_bench
+from rig.cli.story import RIG, Experiment, experiment
+from rig.model import channels as ch
+from rig.model.parse import InputError
+from rig.services.rigs import load_rig
+from rig.services.store import load_run
+
+JUDGING_SEED = 100  # seeds below were used to tune; these and above judge
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One measured number: `limit` is what it must keep below, or above if `above`."""
+
+    group: str
+    name: str
+    value: float
+    unit: str = ""
+    limit: float | None = None
+    above: bool = False
+
+    @property
+    def ok(self) -> bool:
+        """Whether the limit is kept; always where there is none."""
+        if self.limit is None:
+            return True
+        return self.value >= self.limit if self.above else self.value <= self.limit
+
+
+def plant_figures(_: Path, say: Say) -> list[Figure]:
+    """Measure the plant's accuracy and speed."""
+    say("plant: accuracy against scipy, speed, LSODA at equal accuracy")
+    exact, fast = plant_bench.accuracy(), plant_bench.speed()
+    return [
+        Figure("plant", "relative error, angles", exact["angle_error"], "", 1e-6),
+        Figure("plant", "relative error, pressures", exact["pressure_error"], "", 1e-6),
+        Figure("plant", "speed on one core", fast["real_time_ratio"], "x real time", 100, True),
+        Figure("plant", "LSODA at equal accuracy takes", fast["lsoda_ratio"], "x as long"),
+    ]
+
+
+def analysis_figures(folder: Path, say: Say) -> list[Figure]:
+    """Measure identification and simulation on 30 records of 10 s taken over the wire."""
+    say("analysis: 30 records of 10 s from a simulated bench")
+    done = experiment(folder / "thirty", JUDGING_SEED - 1, Overrides(repeats=10), _quiet)
+    started = time.perf_counter()
+    run = load_run(folder / "thirty" / "identify")
+    loading = time.perf_counter() - started
+    found = identify_figures(run)
+    speed = simulation_figures(done.judged[0], done.identification.model)
+    return [
+        Figure("analysis", "records of 10 s", found["records"]),
+        Figure("analysis", "load and identify", loading + found["identify_seconds"], "s", 5.0),
+        Figure("analysis", "of it the solve", 1e3 * found["solve_seconds"], "ms", 50.0),
+        Figure("analysis", "model simulation", speed["times_real_time"], "x real time", 500, True),
+        Figure("analysis", "LSODA takes", speed["lsoda_over_own"], "x as long"),
+    ]
+
+
+def parameter_errors(done: Experiment) -> dict[str, float]:
+    """Return each parameter's relative error [%] against the bench's truth."""
+    return {
+        name: 100.0 * (estimate.value / done.truth[name] - 1.0)
+        for name, estimate in done.identification.estimates.items()
+    }
+
+
+def fit_margins(done: Experiment) -> dict[str, float]:
+    """Return FIT minus the paper's [%] for each cell of its Table IV that has a number."""
+    measured = {result.step: result for result in done.validation}
+    return {
+        f"{cell.step} {kind}": measured[cell.step].fit[ch.channel(kind, cell.joint)] - paper
+        for cell in paper_tables.TABLE_IV
+        if cell.fit is not None
+        for kind, paper in zip((ch.PISTON, ch.CAP, ch.ROD), cell.fit, strict=True)
+    }
+
+
+def demo_figures(folder: Path, say: Say, seeds: int) -> list[Figure]:
+    """Identify benches of unseen seeds and print the worst of each."""
+    figures = []
+    for seed in range(JUDGING_SEED, JUDGING_SEED + seeds):
+        say(f"demo: seed {seed}")
+        started = time.monotonic()
+        done = experiment(folder / f"seed-{seed}", seed, Overrides(), _quiet)
+        spent = time.monotonic() - started
+        errors, margins = parameter_errors(done), fit_margins(done)
+        bulk = abs(errors.pop("b"))
+        worst = max(errors, key=lambda name: abs(errors[name]))
+        least = min(margins, key=lambda name: margins[name])
+        group = f"seed {seed}"
+        figures += [
+            Figure(group, f"worst error but b ({worst})", abs(errors[worst]), "%", 2.0),
+            Figure(group, "error of b", bulk, "%", 5.0),
+            Figure(group, f"FIT over the paper's, least ({least})", margins[least], "%", 0.0, True),
+            Figure(group, "the whole loop", spent, "s", 120.0),
+        ]
+    return figures
+
+
+def acquisition_figures(_: Path, say: Say, minutes: float) -> list[Figure]:
+    """Stream every channel in real time over the wire and count what was lost or late."""
+    say(f"acquisition: {minutes:g} min in real time over the wire")
+    rig = load_rig(RIG)
+    with simulated_bench(RIG, seed=JUDGING_SEED, real_time=True) as endpoint:
+        driver = make_driver(wire_at(endpoint, rig.wire), rig)
+        try:
+            found = measure_acquisition(driver, driver.connect(), 60.0 * minutes)
+        finally:
+            driver.close()
+    return [
+        Figure("acquisition", "samples of every channel", found["samples"]),
+        Figure("acquisition", "samples lost", found["lost_samples"], "", 0.0),
+        Figure("acquisition", "blocks out of order", found["out_of_order_blocks"], "", 0.0),
+        Figure("acquisition", "lateness, mean", 1e3 * found["lateness_mean_s"], "ms"),
+        Figure("acquisition", "lateness, 99 %", 1e3 * found["lateness_p99_s"], "ms"),
+        Figure("acquisition", "lateness, worst", 1e3 * found["lateness_max_s"], "ms"),
+    ]
+
+
+def _quiet(_: str) -> None:
+    pass
+
+
+def measure(minutes: float, seeds: int, only: str | None, say: Say) -> list[Figure]:
+    """Measure all groups, or the one named; raises InputError for an unknown name."""
+    groups: Mapping[str, Callable[[Path, Say], list[Figure]]] = {
+        "plant": plant_figures,
+        "analysis": analysis_figures,
+        "demo": lambda folder, tell: demo_figures(folder, tell, seeds),
+        "acquisition": lambda folder, tell: acquisition_figures(folder, tell, minutes),
+    }
+    if only is not None and only not in groups:
+        raise InputError(f"--only {only}: expected one of: {' '.join(groups)}")
+    with tempfile.TemporaryDirectory(prefix="bramah-bench-") as folder:
+        chosen = [groups[only]] if only else list(groups.values())
+        return [figure for group in chosen for figure in group(Path(folder), say)]
+
+
+def as_json(figures: Sequence[Figure]) -> list[dict[str, Any]]:
+    """Return the figures as plain data."""
+    return [{**asdict(figure), "ok": figure.ok} for figure in figures]
+
+
+def text(figures: Sequence[Figure]) -> str:
+    """Return the figures as a table, with the limit each has to keep."""
+    rows = []
+    for figure in figures:
+        limit = ""
+        if figure.limit is not None and math.isfinite(figure.limit):
+            limit = f"{'>=' if figure.above else '<='} {figure.limit:g}"
+        verdict = "" if figure.limit is None else ("ok" if figure.ok else "MISSED")
+        name = f"{figure.group}: {figure.name}"
+        rows.append([name, f"{figure.value:.4g}", figure.unit, limit, verdict])
+    return table(["figure", "measured", "unit", "wanted", ""], rows)

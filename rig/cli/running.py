@@ -1,0 +1,139 @@
+"""The `run` and `check` verbs' work: protocol, twin check, bench, run folder."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from drivers import make_driver
+from protocols import engine, library
+from protocols.check import CheckReport, check
+from protocols.plan import Overrides, Plan, resolve
+from rig.model.parse import InputError
+from rig.model.rig import Rig, Wire
+from rig.services.attach import AttachError, Publisher
+from rig.services.bench import Bench
+from rig.services.recorder import Recorder
+from rig.services.rigs import load_rig
+
+log = logging.getLogger(__name__)
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Job:
+    """One unattended run: what, where, into which folder."""
+
+    protocol: str
+    rig: str
+    out: Path
+    endpoint: str | None = None
+    overrides: Overrides = field(default_factory=Overrides)
+    operator: str | None = None
+
+
+def wire_at(endpoint: str, wire: Wire) -> Wire:
+    """Return the wire to an endpoint like ``modbus-tcp://127.0.0.1:5020``; raises InputError."""
+    try:
+        parts = urlsplit(endpoint)
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        host = port = None
+        parts = urlsplit("")
+    if parts.scheme != wire.kind or not host or not port:
+        raise InputError(f"--endpoint {endpoint}: expected one like {wire.kind}://127.0.0.1:5020")
+    return wire.model_copy(update={"host": host, "port": port})
+
+
+def _plan(protocol: str, rig: str, overrides: Overrides) -> tuple[Rig, Plan]:
+    bench = load_rig(rig)
+    return bench, resolve(library.load(protocol), bench, overrides)
+
+
+def check_protocol(protocol: str, rig: str, overrides: Overrides) -> CheckReport:
+    """Prove a protocol against the rig's limits on the twin; raises InputError for bad files."""
+    from analysis.twin import simulate_commands
+
+    bench, plan = _plan(protocol, rig, overrides)
+    return check(plan, bench, simulate_commands)
+
+
+class _Story:
+    """Tells the phases of a run to the person, to the run's log and to any screen."""
+
+    def __init__(self, bench: Bench, plan: Plan, say: Say) -> None:
+        self._bench, self._plan, self._say = bench, plan, say
+        self._began: int | None = None  # the device's tick, known with its first block
+
+    def phase(self, step: str, phase: str, repeat: int, repeats: int, message: str) -> None:
+        tick = self._bench.tick
+        if self._began is None and tick:
+            self._began = tick
+        at = (tick - (self._began or tick)) / self._plan.sample_rate
+        self._say(f"{at:8.1f} s  {step:10s} {phase:8s}  {message}")
+        self._bench.event("phase", tick, step=step, phase=phase, message=message)
+        self._bench.status(
+            step=step,
+            phase=phase,
+            repeat=repeat,
+            repeats=repeats,
+            message=message,
+            done_s=at,
+            total_s=self._plan.seconds,
+        )
+
+
+def _publisher(rig: Rig, say: Say) -> Publisher | None:
+    try:
+        return Publisher(rig.name)
+    except AttachError as error:
+        # A run must not fail for want of a screen.
+        say(f"no screen can attach to this run: {error}")
+        return None
+
+
+def run_protocol(job: Job, say: Say) -> Path:
+    """Run a protocol into its folder and return that; raises what ended it, outputs at zero."""
+    rig, plan = _plan(job.protocol, job.rig, job.overrides)
+    wire = rig.wire if job.endpoint is None else wire_at(job.endpoint, rig.wire)
+    rig = rig.model_copy(update={"wire": wire})
+    say(f"checking {plan.protocol.name} on the twin of {rig.name}")
+    from analysis.twin import simulate_commands
+
+    report = check(plan, rig, simulate_commands)
+    report.require()
+    for note in report.notes:
+        say(f"note: {note}")
+    say(f"running {len(plan.records)} records, about {plan.seconds:.0f} s of the device's time")
+    recorder = Recorder(
+        job.out, rig, protocol=plan.protocol.model_dump(mode="json"), operator=job.operator
+    )
+    with ExitStack() as stack:
+        publisher = _publisher(rig, say)
+        bench = stack.enter_context(Bench(rig, make_driver(wire, rig), recorder, publisher))
+        story = _Story(bench, plan, say)
+        engine.run(plan, rig, bench, story.phase)
+    return job.out
+
+
+def reset_device(rig: str, endpoint: str | None) -> str:
+    """Clear a device's latched trip on a person's word; returns what had tripped it."""
+    described = load_rig(rig)
+    wire = described.wire if endpoint is None else wire_at(endpoint, described.wire)
+    driver = make_driver(wire, described)
+    try:
+        driver.connect()
+        cause = driver.trip_cause()
+        driver.reset()
+    finally:
+        driver.close()
+    return cause or "nothing"
+
+
+def with_repeats(repeats: int | None) -> Overrides:
+    """Return overrides that change the number of repeats only."""
+    return replace(Overrides(), repeats=repeats)

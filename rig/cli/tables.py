@@ -1,0 +1,94 @@
+"""Results as text for a terminal: SI values in the units people use, three significant digits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+from analysis.identify import Identification
+from analysis.model import Estimate
+from analysis.validate import RecordValidation
+from rig.cli.output import table
+from rig.model.quantity import unit_map
+
+# SI unit of a parameter -> the unit it is shown in
+_SHOWN = {"Pa": "MPa"}
+
+
+def _shown(estimate: Estimate) -> tuple[float, str]:
+    unit = _SHOWN.get(estimate.unit, estimate.unit)
+    scale, _ = unit_map(estimate.unit, unit) if unit != estimate.unit else (1.0, 0.0)
+    return scale, unit.replace("*", "·").replace("^2", "²").replace("^3", "³").replace(
+        "Pa^0.5", "√Pa"
+    )
+
+
+def _percent(value: float, digits: int = 2) -> str:
+    return f"{value:.{digits}f} %" if math.isfinite(value) else "—"
+
+
+def parameter_table(
+    estimates: Mapping[str, Estimate], truth: Mapping[str, float] | None = None
+) -> str:
+    """Return the parameters with their 95 % half-widths and, on a simulated bench, the truth."""
+    header = ["parameter", "value", "± 95 %", "unit"]
+    rows = []
+    for name, estimate in estimates.items():
+        scale, unit = _shown(estimate)
+        if not estimate.identified:
+            row = [name, "—", "—", unit]
+        else:
+            low, high = estimate.ci95
+            half = 50.0 * (high - low) / abs(estimate.value)
+            row = [name, f"{scale * estimate.value:.4g}", _percent(half), unit]
+        if truth is not None:
+            known = truth.get(name, math.nan)
+            row += [
+                f"{scale * known:.4g}" if math.isfinite(known) else "—",
+                _percent(100.0 * (estimate.value / known - 1.0)) if known else "—",
+            ]
+        rows.append(row)
+    return table(header + ([] if truth is None else ["truth", "error"]), rows)
+
+
+def identification_text(result: Identification, truth: Mapping[str, float] | None = None) -> str:
+    """Return parameters, conditioning and every check in words."""
+    lines = [parameter_table(result.estimates, truth), ""]
+    for family, solution in result.solutions.items():
+        lines.append(
+            f"{family}: {result.rows[family]} rows, condition number "
+            f"{solution.condition_number:.1f}"
+        )
+    lines.append(f"masked rows: {result.masked_rows}; solved in {result.solve_seconds:.3f} s")
+    lines += [
+        f"{'ok    ' if check.ok else 'NOT OK'} {check.name}: {check.detail}"
+        for check in result.checks
+    ]
+    lines += [f"note: {n}: {e.note}" for n, e in result.estimates.items() if e.note]
+    return "\n".join(lines)
+
+
+def validation_text(results: Sequence[RecordValidation]) -> str:
+    """Return FIT of the free run and RMSE of restarted windows, a row per record and channel."""
+    rows = []
+    for result in results:
+        for name, fit in result.fit.items():
+            is_piston = name.startswith("piston")
+            scale, unit = (1e3, "mm") if is_piston else (1e-3, "kPa")
+            rows.append(
+                [
+                    f"{result.record} {name}",
+                    _percent(fit, 1),
+                    f"{scale * result.rmse[name]:.3g}",
+                    f"{scale * result.window_rmse[name]:.3g}",
+                    unit,
+                ]
+            )
+    lines = [table(["record and channel", "FIT", "RMSE", "0.25 s RMSE", "unit"], rows)]
+    lines += [f"{r.record}: the model failed: {r.failure}" for r in results if r.failure]
+    lines += [
+        f"{r.record}: {r.outside} samples with a chamber pressure outside 0 .. supply"
+        for r in results
+        if r.outside
+    ]
+    return "\n".join(lines)

@@ -1,0 +1,88 @@
+"""The command as a user has it, and a simulated bench beside it, each a process of its own."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+START = "from rig.cli.main import run; run()"
+LONG = 120.0  # [s] nothing here takes it; a hang ends in an error that says so
+
+SHORT = """
+name: short
+description: One joint, two short records
+joints: 2
+steps:
+  - name: step1
+    lock: [{joint: 1, at: closed, piston: 0 mm, tolerance: 2 mm}]
+    excite:
+      - joint: 2
+        signal: {kind: sine, frequency: 2 Hz, amplitude: 0.8 V}
+        centre: 0 mm
+        centring: {mode: open-loop, drift: 4 mm, offset: 6 mm, tries: 6}
+    repeats: 2
+    duration: 2 s
+    warm_up: 2
+    ramp: 1 s
+    settle: 0.2 s
+"""
+ENDLESS = SHORT.replace("repeats: 2", "repeats: 400").replace("name: short", "name: endless")
+
+
+def words(*arguments: object) -> list[str]:
+    """The command line that starts `bramah` with these arguments."""
+    return [sys.executable, "-c", START, *map(str, arguments)]
+
+
+def bramah(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """Run `bramah` to its end."""
+    return subprocess.run(
+        words(*arguments), capture_output=True, text=True, timeout=LONG, cwd=cwd, check=False
+    )
+
+
+@contextmanager
+def started(*arguments: object) -> Iterator[subprocess.Popen[str]]:
+    """Run `bramah` in the background, killed at the end if it has not ended."""
+    with subprocess.Popen(
+        words(*arguments),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    ) as process:
+        try:
+            yield process
+        finally:
+            if process.poll() is None:
+                process.kill()
+
+
+@contextmanager
+def simulated(*more: object) -> Iterator[tuple[str, subprocess.Popen[str]]]:
+    """A simulated bench on a free port: (endpoint, process)."""
+    line = ["sim", "--rig", "shinshu-2dof", "--port", 0, "--parent", os.getpid(), *more]
+    with started(*line) as process:
+        assert process.stdout is not None
+        yield process.stdout.readline().strip(), process
+        process.send_signal(signal.SIGTERM)
+        process.wait(LONG)
+
+
+def wait_for(what: str, process: subprocess.Popen[str], seen: Sequence[str] = ()) -> list[str]:
+    """Read the process's progress until a line contains `what`; returns all lines so far."""
+    assert process.stderr is not None
+    lines = list(seen)
+    deadline = time.monotonic() + LONG
+    while not any(what in line for line in lines):
+        line = process.stderr.readline()
+        assert line, f"ended before {what!r}: {lines}"
+        assert time.monotonic() < deadline, lines
+        lines.append(line)
+    return lines

@@ -1,0 +1,216 @@
+"""An operator, a night-shift script and their accidents, on a simulated bench over a real wire."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+from pathlib import Path
+
+import pytest
+
+from drivers.modbus_tcp import ModbusTcpDriver
+from rig.cli.running import wire_at
+from rig.services.rigs import load_rig
+from rig.services.store import load_run
+from tests.cli.bench import ENDLESS, LONG, SHORT, bramah, simulated, started, wait_for
+
+RIG = "shinshu-2dof"
+
+
+@pytest.fixture
+def short(tmp_path: Path) -> Path:
+    path = tmp_path / "short.yaml"
+    path.write_text(SHORT)
+    return path
+
+
+@pytest.fixture
+def endless(tmp_path: Path) -> Path:
+    path = tmp_path / "endless.yaml"
+    path.write_text(ENDLESS)
+    return path
+
+
+def outputs_are_zero(endpoint: str) -> bool:
+    """Ask the device itself, over a connection of one's own."""
+    rig = load_rig(RIG)
+    driver = ModbusTcpDriver(wire_at(endpoint, rig.wire), rig)
+    try:
+        driver.connect()
+        driver.start()
+        commands = driver.read_block().data[:, -len(rig.joints) :]
+        return bool((commands == 0.0).all())
+    finally:
+        driver.close()
+
+
+def test_a_protocol_is_checked_run_listed_and_identified(short: Path, tmp_path: Path) -> None:
+    checked = bramah("check", short, "--rig", RIG)
+    assert checked.returncode == 0, checked.stderr
+    assert "step1 joint 2 piston" in checked.stdout
+
+    run = tmp_path / "monday"
+    with simulated("--seed", 5) as (endpoint, _):
+        done = bramah("run", short, "--rig", RIG, "--out", run, "--endpoint", endpoint)
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.strip() == str(run)
+        again = bramah("run", short, "--rig", RIG, "--out", run, "--endpoint", endpoint)
+        assert again.returncode == 2
+        assert "not empty" in again.stderr
+
+    listed = bramah("runs", tmp_path)
+    assert "monday" in listed.stdout
+    assert "done" in listed.stdout
+    records = load_run(run).records
+    assert [record.name for record in records] == ["step1_r1", "step1_r2"]
+    assert all(record.attributes["lost_samples"] == 0 for record in records)
+
+    found = bramah("identify", run, "--json", "-", "--model", tmp_path / "model.json")
+    assert found.returncode == 0, found.stderr
+    result = json.loads(found.stdout)
+    assert result["method"] == "coupled"
+    assert result["parameters"]["C_pp_2"]["value"] == pytest.approx(6.28e-7, rel=0.05)
+    # Joint 1 was never excited: its gains are not numbers that look fine.
+    assert result["parameters"]["C_pp_1"]["value"] is None
+    judged = bramah("validate", tmp_path / "model.json", run)
+    assert judged.returncode == 2
+    assert "C_pp_1" in judged.stderr
+    assert judged.stderr.count("\n") == 1
+
+
+def test_ctrl_c_twice_zeroes_the_outputs_and_keeps_the_records(
+    endless: Path, tmp_path: Path
+) -> None:
+    run = tmp_path / "stopped"
+    with simulated() as (endpoint, _):
+        line = ("run", endless, "--rig", RIG, "--out", run, "--endpoint", endpoint)
+        with started(*line) as process:
+            wait_for("record 3 of", process)
+            process.send_signal(signal.SIGINT)
+            process.send_signal(signal.SIGINT)
+            _, errors = process.communicate(timeout=LONG)
+            assert process.returncode == 130
+            assert "Traceback" not in errors
+        assert outputs_are_zero(endpoint)
+    assert (run / "state").read_text().strip() == "aborted"
+    assert len(load_run(run).records) >= 2
+
+
+def test_a_killed_run_leaves_valves_closed_and_is_recovered(endless: Path, tmp_path: Path) -> None:
+    run = tmp_path / "killed"
+    with simulated() as (endpoint, _):
+        line = ("run", endless, "--rig", RIG, "--out", run, "--endpoint", endpoint)
+        with started(*line) as process:
+            wait_for("record 3 of", process)
+            process.kill()
+            process.wait(LONG)
+        assert outputs_are_zero(endpoint)
+        refused = bramah(
+            "run", endless, "--rig", RIG, "--out", tmp_path / "next", "--endpoint", endpoint
+        )
+        assert refused.returncode == 3, refused.stderr
+        assert "bramah reset" in refused.stderr
+        cleared = bramah("reset", "--rig", RIG, "--endpoint", endpoint)
+        assert cleared.returncode == 0, cleared.stderr
+        assert not (tmp_path / "next").exists()
+    assert "interrupted" in bramah("runs", tmp_path).stdout
+    unread = bramah("identify", run)
+    assert unread.returncode == 2
+    assert "bramah recover" in unread.stderr
+    recovered = bramah("recover", run)
+    assert recovered.returncode == 0, recovered.stderr
+    assert len(load_run(run).records) >= 2
+
+
+def test_a_bench_that_dies_mid_run_is_reported_and_its_data_kept(
+    endless: Path, tmp_path: Path
+) -> None:
+    run = tmp_path / "lost"
+    with simulated() as (endpoint, bench):
+        line = ("run", endless, "--rig", RIG, "--out", run, "--endpoint", endpoint)
+        with started(*line) as process:
+            wait_for("record 3 of", process)
+            os.kill(bench.pid, signal.SIGKILL)
+            _, errors = process.communicate(timeout=LONG)
+        assert process.returncode == 4, errors
+        assert "does not answer" in errors or "not answered" in errors or "closed" in errors
+        assert "Traceback" not in errors
+    assert len(load_run(run).records) >= 2
+
+
+def test_a_passed_limit_trips_with_limit_value_and_joint(short: Path, tmp_path: Path) -> None:
+    # A pressure that reads 6 MPa too high: the twin cannot foresee it, the guard must see it.
+    scenario = tmp_path / "scenario.yaml"
+    scenario.write_text(
+        "effects: [{name: sensor_offset, channel: cap_pressure_2, offset: 6 MPa}]\n"
+    )
+    run = tmp_path / "tripped"
+    with simulated("--scenario", scenario) as (endpoint, _):
+        done = bramah("run", short, "--rig", RIG, "--out", run, "--endpoint", endpoint)
+        assert done.returncode == 3, done.stderr
+        last = done.stderr.strip().splitlines()[-1]
+        for word in ("joint 2", "cap_pressure_2", "MPa", "9"):
+            assert word in last
+        assert outputs_are_zero(endpoint)
+    assert (run / "state").read_text().strip() == "tripped"
+    events = (run / "events.jsonl").read_text().splitlines()
+    assert any(json.loads(line)["event"] == "trip" for line in events)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (("run", "nothing.yaml", "--rig", RIG, "--out", "x"), 2, "nothing.yaml"),
+        (("run", "lock-and-excite", "--rig", "none", "--out", "x"), 2, "shinshu-2dof"),
+        (("check", "validate", "--rig", "none.yaml"), 2, "none.yaml"),
+        (("identify", "nowhere"), 2, "nowhere"),
+        (("identify", "nowhere", "--method", "coupled", "--bogus"), 2, "--bogus"),
+        (("validate", "m.json", "nowhere"), 2, "m.json"),
+        (("import", "manifest.yaml", "--out", "x"), 2, "manifest.yaml"),
+        (("recover", "nowhere"), 2, "nowhere"),
+        (("sim", "--rig", RIG, "--wire", "smoke-signals"), 2, "modbus-tcp"),
+        (("nonsense",), 2, "nonsense"),
+    ],
+)
+def test_bad_input_is_one_line_that_names_it(
+    arguments: tuple[str, ...], code: int, words: str, tmp_path: Path
+) -> None:
+    done = bramah(*arguments, cwd=tmp_path)
+    assert done.returncode == code, done.stderr
+    assert words in done.stderr
+    assert done.stderr.count("\n") == 1, done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_nobody_at_the_other_end_is_exit_code_4(tmp_path: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))  # bound, not listening: refuses
+        endpoint = f"modbus-tcp://127.0.0.1:{taken.getsockname()[1]}"
+        done = bramah(
+            "run", "validate", "--rig", RIG, "--out", tmp_path / "x", "--endpoint", endpoint
+        )
+    assert done.returncode == 4
+    assert not (tmp_path / "x").exists()
+
+
+def test_a_busy_port_is_said_with_its_number() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        done = bramah("sim", "--rig", RIG, "--port", port)
+    assert done.returncode == 1
+    assert str(port) in done.stderr
+    assert done.stdout == ""
+
+
+def test_every_verb_explains_itself_with_an_example() -> None:
+    top = bramah("--help")
+    verbs = [line.split()[0] for line in top.stdout.split("Commands:")[1].splitlines() if line]
+    assert {"demo", "sim", "check", "run", "monitor", "runs", "recover", "import"} <= set(verbs)
+    for verb in verbs:
+        shown = bramah(verb, "--help")
+        assert shown.returncode == 0
+        assert f"Example: bramah {verb}" in " ".join(shown.stdout.split())
