@@ -1,0 +1,69 @@
+"""Small files that must be whole or absent: read with limits, replaced atomically, synced."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from rig.model.parse import InputError
+
+MAX_TEXT = 1 << 20  # a description, not data: a megabyte is far beyond any honest one
+
+
+def read_text(path: Path, what: str, limit: int = MAX_TEXT) -> str:
+    """Return the UTF-8 text of a description; raises InputError saying what is wrong with it."""
+    try:
+        if path.is_dir():
+            raise InputError(f"{path}: is a folder; expected {what}")
+        if not path.is_file() and path.exists():
+            raise InputError(f"{path}: is no regular file; expected {what}")
+        with path.open("rb") as stream:
+            raw = stream.read(limit + 1)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; expected {what}") from None
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the path
+        reason = getattr(error, "strerror", None) or str(error)
+        raise InputError(f"{path}: cannot be read ({reason}); expected {what}") from error
+    if len(raw) > limit:
+        raise InputError(f"{path}: larger than {limit // 1024} KiB; expected {what}")
+    if b"\0" in raw:
+        raise InputError(f"{path}: a binary file; expected {what} as text")
+    try:
+        return raw.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = raw.count(b"\n", 0, error.start) + 1
+        raise InputError(
+            f"{path}:{line}: byte {error.start} is not UTF-8; save {what} as UTF-8 text"
+        ) from error
+
+
+def sync_folder(folder: Path) -> None:
+    """Make renames and new names in `folder` survive a power cut; raises OSError."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def sync_file(path: Path) -> None:
+    """Force a file's content to the disk; raises OSError."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Replace a small file so that a reader sees the old or the new text, never half of one."""
+    fresh = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with fresh.open("w", encoding="utf-8") as stream:
+            stream.write(text)
+            stream.flush()
+            os.fsync(stream.fileno())
+        fresh.replace(path)
+    finally:
+        fresh.unlink(missing_ok=True)
+    sync_folder(path.parent)

@@ -1,0 +1,126 @@
+"""What a screen sees of a run: immutable snapshots, min/max-decimated, some twenty a second."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+BUCKETS = 25  # of new samples per snapshot: at 20 snapshots a second, 500 columns for a plot
+
+
+@dataclass(frozen=True)
+class ChannelView:
+    """One channel since the previous snapshot, in SI; `low` and `high` are its limits."""
+
+    unit: str
+    low: float | None
+    high: float | None
+    last: float
+    minimum: list[float] = field(default_factory=list)
+    maximum: list[float] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """The run at one moment.
+
+    `state` is running, tripped, done or aborted; `device_time` and `wall_time` are in seconds
+    (the latter since the epoch); `block_age` [s] is how late the newest block came.
+    """
+
+    run: str
+    rig: str
+    pid: int
+    state: str
+    step: str
+    phase: str
+    repeat: int
+    repeats: int
+    done_s: float
+    total_s: float
+    tick: int
+    device_time: float
+    wall_time: float
+    block_age: float
+    lost_samples: int
+    trip: str | None
+    message: str
+    channels: dict[str, ChannelView]
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where the protocol stands; the engine says it, the screen shows it."""
+
+    step: str = ""
+    phase: str = ""
+    repeat: int = 0
+    repeats: int = 0
+    done_s: float = 0.0
+    total_s: float = 0.0
+    message: str = ""
+
+
+@dataclass(frozen=True)
+class BenchView:
+    """What the bench itself adds to a snapshot."""
+
+    run: str
+    rig: str
+    state: str
+    tick: int
+    device_time: float
+    wall_time: float
+    block_age: float
+    lost_samples: int
+    trip: str | None
+
+
+def decimate(samples: Array, buckets: int = BUCKETS) -> tuple[Array, Array]:
+    """Return (minimum, maximum) of at most `buckets` slices of (n, channels) samples."""
+    n = len(samples)
+    if n == 0:
+        return samples, samples
+    edges = np.unique(np.linspace(0, n, min(n, buckets) + 1).astype(int)[:-1])
+    return np.minimum.reduceat(samples, edges), np.maximum.reduceat(samples, edges)
+
+
+def take_snapshot(
+    view: BenchView,
+    progress: Progress,
+    samples: Array,
+    units: Mapping[str, str],
+    limits: Mapping[str, tuple[float | None, float | None]],
+) -> Snapshot:
+    """Make a snapshot of the samples (n, channels) since the previous one; n may be 0."""
+    low, high = decimate(samples)
+    channels = {}
+    for column, (name, unit) in enumerate(units.items()):
+        last = float(samples[-1, column]) if len(samples) else float("nan")
+        channels[name] = ChannelView(
+            unit, *limits[name], last, low[:, column].tolist(), high[:, column].tolist()
+        )
+    return Snapshot(pid=os.getpid(), channels=channels, **asdict(view), **asdict(progress))
+
+
+def to_json(snapshot: Snapshot) -> bytes:
+    """Write a snapshot as JSON."""
+    return json.dumps(asdict(snapshot)).encode()
+
+
+def from_json(raw: bytes) -> Snapshot:
+    """Read a snapshot; raises ValueError for anything else."""
+    try:
+        data: dict[str, Any] = json.loads(raw)
+        channels = {name: ChannelView(**view) for name, view in data.pop("channels").items()}
+        return Snapshot(**data, channels=channels)
+    except (TypeError, KeyError, AttributeError) as error:
+        raise ValueError(f"not a snapshot: {error}") from error

@@ -1,0 +1,88 @@
+"""What stops a run: a limit that was passed, an operator, a recorder that cannot write."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+from rig.model.rig import Rig
+
+FINITE: Final = "finite samples"
+DEVICE: Final = "device watchdog or fault"
+
+# People read bar-sized and millimetre-sized numbers better than exponents.
+_SHOWN = {"Pa": (1e-6, "MPa"), "Pa/s": (1e-9, "GPa/s"), "m": (1e3, "mm")}
+
+
+@dataclass(frozen=True)
+class Violation:
+    """A limit and the sample that passed it, in SI; `joint` is 1-based, None for the bench."""
+
+    limit: str
+    value: float
+    allowed: tuple[float, float]
+    unit: str
+    joint: int | None
+    channel: str
+    tick: int
+
+
+def show(value: float, unit: str) -> str:
+    """Write a value for a person: '9.31 MPa'."""
+    factor, shown = _SHOWN.get(unit, (1.0, unit))
+    return f"{value * factor:.4g} {shown}"
+
+
+def _value(violation: Violation) -> str:
+    return show(violation.value, violation.unit) if violation.unit else "reported by the device"
+
+
+def _allowed(violation: Violation) -> str:
+    low, high = violation.allowed
+    if violation.limit == DEVICE:
+        return "nothing but running"
+    if violation.limit == FINITE:
+        return "finite numbers only"
+    if math.isinf(low):
+        return f"at most {show(high, violation.unit)}"
+    factor, shown = _SHOWN.get(violation.unit, (1.0, violation.unit))
+    return f"{low * factor:.4g} to {high * factor:.4g} {shown}"
+
+
+class SafetyTrip(Exception):
+    """A limit was passed and the outputs are at zero; the message names everything (exit 3).
+
+    `violation` is the frozen data; `limit value allowed unit joint channel tick` are its fields,
+    `device_time` [s] is the violating sample's.
+    """
+
+    def __init__(self, violation: Violation, rig: Rig) -> None:
+        self.violation = violation
+        self.limit = violation.limit
+        self.value = violation.value
+        self.allowed = violation.allowed
+        self.unit = violation.unit
+        self.joint = violation.joint
+        self.channel = violation.channel
+        self.tick = violation.tick
+        self.device_time = violation.tick / rig.sample_rate
+        super().__init__(self._message(rig))
+
+    def _message(self, rig: Rig) -> str:
+        where = "the bench"
+        if self.joint is not None:
+            where = f"joint {self.joint} ({rig.joints[self.joint - 1].name})"
+        subject = f"{self.channel} of {where}" if self.channel else where
+        return (
+            f"safety trip: limit '{self.limit}', {subject}: {_value(self.violation)} "
+            f"at {self.device_time:.4f} s, allowed {_allowed(self.violation)}"
+        )
+
+
+class OperatorStop(Exception):
+    """A person (or the system, by SIGTERM) ended the run; the outputs are at zero (exit 130)."""
+
+
+class RecordingFailed(Exception):
+    """What is measured can no longer be written; the message is one line (exit 1)."""

@@ -1,0 +1,1 @@
+"""The services of a bench session, told as stories."""

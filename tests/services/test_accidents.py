@@ -1,0 +1,237 @@
+"""Runs that end badly: killed at any moment, out of disk, interrupted twice; nothing is lost."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import sqlite3
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rig.model.parse import InputError
+from rig.services.recover import recover
+from rig.services.runstate import read_events
+from rig.services.store import list_runs, load_run
+from rig.services.trips import RecordingFailed
+from tests.services.children import RIG, acknowledged, assert_all_there, finish, measured, start
+from tests.services.fake_driver import samples
+
+
+@pytest.mark.parametrize("block", [1, 17, 45])
+def test_killed_while_recording_every_acknowledged_sample_is_recovered(
+    tmp_path: Path, block: int
+) -> None:
+    run = tmp_path / "run"
+    code, _ = finish(run, "kill at block", block)
+    assert code == -signal.SIGKILL
+    (summary,) = list_runs(tmp_path)
+    assert summary.state == "interrupted"
+    with pytest.raises(InputError, match=r"interrupted, .*bramah recover"):
+        load_run(run)
+    report = recover(run)
+    assert report.state == "interrupted"
+    assert_all_there(run)
+    assert not list(run.glob("journal*"))
+    if block == 45:
+        assert [r.name for r in load_run(run).records] == ["s_r1"]
+        first, second = load_run(run, partial=True).records
+        assert (first.samples, second.samples) == (300, 140)
+        assert (report.records, report.partial) == (2, 1)
+    else:
+        with pytest.raises(InputError, match="before any record was complete"):
+            load_run(run)
+    assert recover(run).message == "was finalised already"
+
+
+@pytest.mark.parametrize("place", range(10))
+def test_killed_while_the_archive_is_written_the_run_is_finished_by_recover(
+    tmp_path: Path, place: int
+) -> None:
+    run = tmp_path / "run"
+    code, _ = finish(run, "kill in archive", place)
+    assert code == -signal.SIGKILL
+    report = recover(run)
+    assert report.state == "done"
+    assert [(r.name, r.samples) for r in load_run(run).records] == [("s_r1", 300), ("s_r2", 300)]
+    assert_all_there(run)
+    left = {p.name for p in run.iterdir()}
+    assert left == {"events.jsonl", "records.h5", "run.yaml", "state"}
+
+
+@pytest.mark.parametrize("place", range(5))
+def test_killed_while_the_folder_is_made_it_is_an_empty_run_or_none(
+    tmp_path: Path, place: int
+) -> None:
+    run = tmp_path / "run"
+    code, _ = finish(run, "kill at start", place)
+    assert code == -signal.SIGKILL
+    if place < 2:
+        assert list_runs(tmp_path) == []
+        with pytest.raises(InputError, match="not a run folder"):
+            recover(run)
+    else:
+        report = recover(run)
+        assert (report.state, report.records) == ("interrupted", 0)
+        assert [s.state for s in list_runs(tmp_path)] == ["interrupted"]
+        with pytest.raises(InputError):
+            load_run(run)
+
+
+def test_killed_at_a_random_moment_from_outside_nothing_is_lost(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    child = start(run, "serve", 100_000)
+    deadline = time.monotonic() + 30
+    while time.monotonic() < deadline:
+        if run.with_suffix(".ack").exists() and acknowledged(run) > 200:
+            break
+        time.sleep(0.01)
+    with pytest.raises(InputError, match=f"being written by process {child.pid}"):
+        recover(run)
+    with pytest.raises(InputError, match=f"still being recorded .process {child.pid}"):
+        load_run(run)
+    child.kill()
+    child.communicate(timeout=30)
+    recover(run)
+    assert acknowledged(run) > 200
+    assert_all_there(run)
+
+
+@pytest.fixture
+def interrupted(tmp_path: Path) -> Path:
+    """A run killed in its second record, with everything still in the write-ahead log."""
+    run = tmp_path / "run"
+    finish(run, "kill at block", 45)
+    return run
+
+
+def test_a_torn_end_of_the_journal_costs_its_last_blocks_only(interrupted: Path) -> None:
+    log = interrupted / "journal.sqlite-wal"
+    raw = log.read_bytes()
+    log.write_bytes(raw[: len(raw) - 3000])
+    recover(interrupted)
+    found = measured(interrupted)
+    known = samples(RIG, np.arange(len(found)))[:, RIG.recorded.index("piston_1")]
+    np.testing.assert_array_equal(found, known)
+    assert 430 <= len(found) < 450
+    assert load_run(interrupted).records[0].samples == 300
+
+
+def test_a_damaged_block_is_found_by_its_checksum_and_becomes_lost_samples(
+    interrupted: Path,
+) -> None:
+    with sqlite3.connect(interrupted / "journal.sqlite") as db:
+        (blob,) = db.execute("SELECT data FROM block WHERE tick = 100").fetchone()
+        spoiled = bytes([blob[0] ^ 1]) + blob[1:]
+        db.execute("UPDATE block SET data = ? WHERE tick = 100", (spoiled,))
+    db.close()
+    report = recover(interrupted)
+    assert (report.damaged_blocks, report.lost_samples) == (1, 10)
+    record = load_run(interrupted).records[0]
+    assert np.flatnonzero(np.isnan(record.channels["piston_1"])).tolist() == list(range(90, 100))
+    assert record.attributes["damaged_blocks"] == 1
+    assert (interrupted / "journal.damaged.sqlite").exists()
+
+
+def test_a_missing_state_and_a_torn_event_do_not_stop_the_recovery(interrupted: Path) -> None:
+    (interrupted / "state").unlink()
+    events = interrupted / "events.jsonl"
+    events.write_bytes(events.read_bytes()[:-5])
+    assert recover(interrupted).state == "interrupted"
+    found = [e["event"] for e in read_events(interrupted)]
+    assert found[-1] == "recovered"
+    assert found[:2] == ["start", "record begins"]
+
+
+def test_a_run_copied_from_another_computer_is_recovered_by_force_only(interrupted: Path) -> None:
+    owner = interrupted / "owner.json"
+    owner.write_text('{"pid": 1, "started": "1", "host": "bench-pc"}')
+    with pytest.raises(InputError, match="on computer 'bench-pc'"):
+        recover(interrupted)
+    assert recover(interrupted, force=True).records == 2
+
+
+def test_a_journal_that_is_none_is_refused(interrupted: Path) -> None:
+    for name in ("journal.sqlite-wal", "journal.sqlite-shm"):
+        (interrupted / name).unlink()
+    (interrupted / "journal.sqlite").write_bytes(b"rubbish" * 1000)
+    with pytest.raises(InputError, match="not a readable journal"):
+        recover(interrupted)
+
+
+@pytest.mark.parametrize("limit", [60_000, 130_000])
+def test_a_journal_that_cannot_grow_zeroes_the_outputs_and_what_it_took_is_readable(
+    tmp_path: Path, limit: int
+) -> None:
+    run = tmp_path / "run"
+    code, said = finish(run, "file limit", limit)
+    assert code == 1
+    assert "is the disk full?" in said.strip().splitlines()[-1]
+    assert "Traceback" not in said
+    device = run.with_suffix(".device").read_text().split()
+    assert device[-3:] == ["zero", "stop", "close"]
+    assert (run / "state").read_text() == "aborted\n"
+    assert_all_there(run)
+    assert len(measured(run)) > limit / 5000
+
+
+def test_a_disk_without_room_for_the_archive_either_is_recovered_when_there_is(
+    tmp_path: Path,
+) -> None:
+    run = tmp_path / "run"
+    code, said = finish(run, "disk full", 130_000)
+    assert code == 1
+    assert "Traceback" not in said
+    assert run.with_suffix(".device").read_text().split()[-3:] == ["zero", "stop", "close"]
+    assert (run / "state").read_text() == "aborted\n"
+    with pytest.raises(InputError, match=r"aborted, .*bramah recover"):
+        load_run(run)
+    report = recover(run)
+    assert report.state == "aborted"
+    assert report.samples >= 100
+    assert_all_there(run)
+
+
+def test_a_disk_that_takes_the_journal_but_not_the_archive_keeps_the_journal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = tmp_path / "run"
+    finish(run, "kill at block", 45)
+    usage = shutil.disk_usage(run)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=1000))
+    with pytest.raises(RecordingFailed, match="needed and not free"):
+        recover(run)
+    monkeypatch.undo()
+    assert (run / "journal.sqlite").exists()
+    assert not (run / "records.h5.tmp").exists()
+    recover(run)
+    assert_all_there(run)
+
+
+def test_ctrl_c_twice_still_zeroes_and_finishes_the_run(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    code, said = finish(run, "ctrl-c twice", 40)
+    assert code == 130
+    assert "Traceback" not in said
+    device = run.with_suffix(".device").read_text().split()
+    assert device[-5:] == ["zero", "zero", "zero", "stop", "close"]
+    assert (run / "state").read_text() == "aborted\n"
+    assert [r.samples for r in load_run(run, partial=True).records] == [300, 100]
+    assert_all_there(run)
+
+
+def test_sigterm_is_a_stop(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    child = start(run, "serve", 100_000)
+    while child.poll() is None and not (
+        run.with_suffix(".ack").exists() and acknowledged(run) > 100
+    ):
+        time.sleep(0.01)
+    child.terminate()
+    _, said = child.communicate(timeout=60)
+    assert child.returncode == 130, said
+    assert run.with_suffix(".device").read_text().split()[-3:] == ["zero", "stop", "close"]
+    assert read_events(run)[-1]["message"] == "stopped by SIGTERM"
+    assert_all_there(run)

@@ -1,0 +1,262 @@
+"""Somebody brings records from another bench: they enter as a run, or are refused by the cell."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.io import savemat
+
+from rig.model.parse import InputError
+from rig.services.importer import import_records
+from rig.services.rigs import load_rig
+from rig.services.store import list_runs, load_run
+from tests.services.fake_driver import samples
+
+RIG = load_rig("shinshu-2dof")
+NAMES = RIG.channels
+DATA = samples(RIG, np.arange(50))[:, : len(NAMES)]
+HEAD = "rig: shinshu-2dof\nsample_rate: 1 kHz\n"
+ONE = HEAD + "records:\n  - {file: a.csv, step: s, locked: [1], repeat: 1}\n"
+
+
+def csv(names=NAMES, data=DATA, delimiter=",") -> str:
+    rows = [delimiter.join(repr(float(v)) for v in row) for row in data]
+    return "\n".join([delimiter.join(names), *rows]) + "\n"
+
+
+def bring(folder: Path, manifest: str, **files: str):
+    for name, text in files.items():
+        (folder / name.replace("__", ".")).write_text(text)
+    (folder / "manifest.yaml").write_text(manifest)
+    return import_records(folder / "manifest.yaml", folder / "run")
+
+
+def test_the_documented_manifest_becomes_a_run_like_any_other(tmp_path: Path) -> None:
+    bar = DATA.copy()
+    column = NAMES.index("cap_pressure_1")
+    bar[:, column] /= 1e5
+    renamed = ["fSpoolPosition" if n == "spool_1" else n for n in NAMES]
+    renamed[column] = "fPa"
+    manifest = (
+        HEAD
+        + """records:
+  - {file: step1_r1.csv, step: step1, locked: [1], repeat: 1}
+  - {file: both_r1.csv,  step: both,  locked: [],  repeat: 1}
+columns:
+  spool_1: {column: fSpoolPosition, unit: V, scale: 1.0, offset: 0.0}
+  cap_pressure_1: {column: fPa, unit: bar}
+"""
+    )
+    text = csv(renamed, bar)
+    report = bring(tmp_path, manifest, step1_r1__csv=text, both_r1__csv=text)
+    assert (report.records, report.samples, report.warnings) == (2, 100, ())
+    run = load_run(tmp_path / "run")
+    assert (run.rig, run.state) == (RIG, "done")
+    assert [(r.step, r.locked, r.repeat) for r in run.records] == [
+        ("step1", (1,), 1),
+        ("both", (), 1),
+    ]
+    for index, name in enumerate(NAMES):
+        np.testing.assert_allclose(run.records[0].channels[name], DATA[:, index], rtol=1e-14)
+    (summary,) = list_runs(tmp_path / "run")
+    assert (summary.state, summary.records) == ("done", 2)
+    assert sorted(p.name for p in (tmp_path / "run").iterdir()) == [
+        "events.jsonl", "records.h5", "run.yaml", "state",
+    ]  # fmt: skip
+
+
+def test_scale_and_offset_apply_to_the_raw_number_and_the_unit_to_their_result(
+    tmp_path: Path,
+) -> None:
+    raw = DATA.copy()
+    column = NAMES.index("piston_1")
+    raw[:, column] = (raw[:, column] * 1e3 + 37.5) / 0.5  # mm from the retracted end, half steps
+    temperature = NAMES.index("oil_temperature")
+    raw[:, temperature] = raw[:, temperature] * 9 / 5 + 32
+    manifest = (
+        ONE
+        + "columns:\n  piston_1: {unit: mm, scale: 0.5, offset: -37.5}\n"
+        + "  oil_temperature: {unit: degF}\n"
+    )
+    bring(tmp_path, manifest, a__csv=csv(data=raw))
+    (record,) = load_run(tmp_path / "run").records
+    np.testing.assert_allclose(record.channels["piston_1"], DATA[:, column], atol=1e-15)
+    np.testing.assert_allclose(record.channels["oil_temperature"], DATA[:, temperature], rtol=1e-12)
+
+
+@pytest.mark.parametrize("delimiter", [",", ";", "\t"])
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_the_csv_dialects_of_spreadsheets_are_read(
+    tmp_path: Path, delimiter: str, end: str
+) -> None:
+    text = csv(delimiter=delimiter)
+    if delimiter == ";":
+        text = text.replace(".", ",")  # the decimal comma of the same spreadsheets
+    text = "\n".join(
+        delimiter.join(f'"{cell}"' for cell in line.split(delimiter)) for line in text.splitlines()
+    )
+    (tmp_path / "a.csv").write_bytes(("\ufeff" + text.replace("\n", end) + end + end).encode())
+    bring(tmp_path, ONE)
+    (record,) = load_run(tmp_path / "run").records
+    for index, name in enumerate(NAMES):
+        np.testing.assert_array_equal(record.channels[name], DATA[:, index])
+
+
+@pytest.mark.parametrize("shape", [(50, 1), (1, 50)])
+def test_mat_vectors_of_either_orientation_with_a_time_column(
+    tmp_path: Path, shape: tuple[int, int]
+) -> None:
+    content = {name: DATA[:, i].reshape(shape) for i, name in enumerate(NAMES)}
+    content["time"] = (2.0 + np.arange(50) / 500).reshape(shape)
+    savemat(tmp_path / "a.mat", content)
+    manifest = ONE.replace("a.csv", "a.mat").replace("sample_rate: 1 kHz\n", "")
+    report = bring(tmp_path, manifest)
+    (record,) = load_run(tmp_path / "run").records
+    assert (record.sample_rate, record.start) == (500.0, 2.0)
+    np.testing.assert_array_equal(record.channels["piston_2"], DATA[:, NAMES.index("piston_2")])
+    assert report.warnings == ("sampled at 500 Hz, the rig samples at 1000 Hz",)
+
+
+def test_a_sensor_of_the_bench_may_be_missing_and_the_report_says_so(tmp_path: Path) -> None:
+    report = bring(tmp_path, ONE, a__csv=csv(NAMES[:8], DATA[:, :8]))
+    assert len(report.warnings) == 2
+    assert report.warnings[0].startswith("supply_pressure: the rig has it, the data does not")
+    (record,) = load_run(tmp_path / "run").records
+    assert tuple(record.channels) == tuple(sorted(NAMES[:8]))
+
+
+def replaced(row: int, column: str, cell: str) -> str:
+    lines = csv().splitlines()
+    cells = lines[row - 1].split(",")
+    cells[NAMES.index(column)] = cell
+    lines[row - 1] = ",".join(cells)
+    return "\n".join(lines) + "\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (replaced(17, "rod_pressure_2", "nan"), "a.csv:17: column 'rod_pressure_2', row 17: "),
+        (replaced(17, "spool_1", "-inf"), "a.csv:17: column 'spool_1', row 17: found -inf"),
+        (replaced(9, "piston_1", ""), "a.csv:9: column 'piston_1', row 9: the cell is empty"),
+        (replaced(51, "piston_1", "1.0.0"), "a.csv:51: column 'piston_1', row 51: found '1.0.0'"),
+        (replaced(2, "spool_2", "off"), "a.csv:2: column 'spool_2', row 2: found 'off'"),
+        (replaced(30, "spool_2", "1,2"), "a.csv:30: row 30 has 11 cells, the header has 10"),
+        ("\n\n" + replaced(5, "spool_2", "x"), "a.csv:7: column 'spool_2', row 7"),
+        (csv(NAMES[1:], DATA[:, 1:]), "a.csv: has no column 'spool_1'; found: cap_pressure_1"),
+        (csv((*NAMES[:9], "spool_1")), "a.csv:1: column 'spool_1' stands there twice"),
+        (csv(data=DATA[:0]), "a.csv: has a header row but no numbers"),
+        ("", "a.csv: the file is empty"),
+        ("\n \n", "a.csv: the file is empty"),
+        ("a\0b", "a.csv: a binary file"),
+    ],
+)  # fmt: skip
+def test_a_bad_cell_is_named_by_file_column_and_row_of_the_editor(
+    tmp_path: Path, text: str, said: str
+) -> None:
+    with pytest.raises(InputError) as error:
+        bring(tmp_path, ONE, a__csv=text)
+    assert said in str(error.value)
+    assert "\n" not in str(error.value)
+    assert not (tmp_path / "run").exists()
+
+
+@given(
+    st.integers(2, 51),
+    st.sampled_from(NAMES),
+    st.sampled_from(["", "NaN", "inf", "x", "1e", "--1", "1 2", "#REF!"]),
+)
+@settings(max_examples=40, deadline=None)
+def test_any_bad_cell_anywhere_is_found(tmp_path_factory, row: int, column: str, cell: str) -> None:
+    folder = tmp_path_factory.mktemp("cell")
+    with pytest.raises(InputError, match=rf"a\.csv:{row}: column '{column}', row {row}"):
+        bring(folder, ONE, a__csv=replaced(row, column, cell))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda t: np.where(np.arange(50) == 20, t - 0.0015, t), ":22: column 'time'"),
+        (lambda t: np.where(np.arange(50) == 20, t[19], t), ":22: column 'time'"),
+        (lambda t: t + 0.001 * (np.arange(50) >= 30), ":32: column 'time', row 32: a step"),
+        (lambda t: 2 * t, "steps at 500 Hz, but the manifest's sample_rate is 1000 Hz"),
+    ],
+)  # fmt: skip
+def test_time_that_stands_still_jumps_or_contradicts_is_refused(
+    tmp_path: Path, change, said: str
+) -> None:
+    time = change(np.arange(50) / 1000)
+    text = csv((*NAMES, "time"), np.column_stack((DATA, time)))
+    manifest = ONE + "columns: {time: {unit: s}}\n"
+    with pytest.raises(InputError) as error:
+        bring(tmp_path, manifest, a__csv=text)
+    assert said in str(error.value)
+
+
+def test_time_stamps_rounded_to_a_tenth_of_the_step_are_even_enough(tmp_path: Path) -> None:
+    time = np.round(np.arange(50) / 1000 + 1.23456, 5)
+    text = csv((*NAMES, "ms"), np.column_stack((DATA, time * 1e3)))
+    manifest = ONE.replace("sample_rate: 1 kHz\n", "") + "columns: {time: {column: ms, unit: ms}}\n"
+    bring(tmp_path, manifest, a__csv=text)
+    (record,) = load_run(tmp_path / "run").records
+    assert record.sample_rate == pytest.approx(1000, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("manifest", "said"),
+    [
+        (ONE.replace("step: s", "stop: s"), ":4: records.0.stop: unknown key"),
+        (ONE + "extra: 1\n", ":5: extra: unknown key"),
+        (ONE.replace("1 kHz", "1 kPa"), ":2: sample_rate: unit 'kPa'"),
+        (ONE.replace("1 kHz", "1000"), ":2: sample_rate: 1000 has no unit"),
+        (ONE.replace("1 kHz", "-1 kHz"), ":2: sample_rate"),
+        (ONE.replace("[1]", "[3]"), ":4: records.0.locked: [3] is no list of different joints"),
+        (ONE.replace("[1]", "[1, 1]"), ":4: records.0.locked"),
+        (ONE.replace("shinshu-2dof", "shinshu"), ":1: rig: "),
+        (ONE + "columns:\n  spool_3: {unit: V}\n", ":6: columns.spool_3: no channel of rig"),
+        (ONE + "columns:\n  spool_1: {unit: furlong_s}\n", ":6: columns.spool_1.unit: unknown"),
+        (ONE + "columns:\n  spool_1: {unit: bar}\n", ":6: columns.spool_1.unit: unit 'bar'"),
+        (ONE + "columns:\n  spool_1: {scale: 0}\n", ":6: columns.spool_1: scale 0"),
+        (ONE + "columns:\n  supply_pressure: {column: pS}\n", "has no column 'pS'"),
+        (ONE + "  - {file: a.csv, step: s, repeat: 1}\n", ":5: records: step 's' repeat 1 stands"),
+        (ONE.replace("a.csv", "b.csv"), "b.csv: no such file"),
+        (ONE.replace("a.csv", "."), "is a folder"),
+        (ONE.replace("step: s", "step: a/b"), "'a/b' cannot name a record"),
+        (ONE.replace("sample_rate: 1 kHz\n", ""), "no sample_rate; give one of the two"),
+        (HEAD + "records: []\n", ":3: records"),
+        (HEAD, "records: is missing here"),
+    ],
+)  # fmt: skip
+def test_a_wrong_manifest_is_refused_by_its_line(tmp_path: Path, manifest: str, said: str) -> None:
+    with pytest.raises(InputError) as error:
+        bring(tmp_path, manifest, a__csv=csv())
+    assert said in str(error.value)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ({"spool_1": np.array([1.0, np.nan])}, "column 'spool_1', row 2: found nan"),
+        ({"spool_1": np.eye(2)}, "variable 'spool_1' has shape (2, 2)"),
+        ({"spool_1": np.array([1j, 2])}, "expected real numbers"),
+        ({"spool_1": "text"}, "expected real numbers"),
+        ({"spool_1": np.zeros(3)}, "has no column 'piston_1'"),
+        ({**{n: np.zeros(5) for n in NAMES}, "piston_1": np.zeros(4)}, "expected the same number"),
+        (b"MATLAB 7.3 MAT-file" + bytes(105) + b"\x00\x02IM" + bytes(400), "version 7.3"),
+        (b"rubbish" * 50, "MAT file"),
+        (b"", "MAT file"),
+    ],
+)  # fmt: skip
+def test_a_mat_file_that_does_not_fit_is_refused(tmp_path: Path, content, said: str) -> None:
+    if isinstance(content, bytes):
+        (tmp_path / "a.mat").write_bytes(content)
+    else:
+        savemat(tmp_path / "a.mat", content)
+    with pytest.raises(InputError) as error:
+        bring(tmp_path, ONE.replace("a.csv", "a.mat"))
+    assert said in str(error.value)
