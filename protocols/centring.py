@@ -21,7 +21,6 @@ Array = NDArray[np.float64]
 RECENTRE = 0.5  # share of the offset taken out within the next record
 RECENTRE_CAP = 0.7  # of the allowed drift: recentring must not look like a drift itself
 TAIL = 0.25  # of a period, over which drift is averaged
-SHORTEST_LINE = 100  # samples; a slope through less is noise
 MARGIN = 0.5e-3  # [m] kept from a piston limit
 
 
@@ -112,13 +111,13 @@ class Forecast:
     shift: float
 
 
-def forecast(reference: Array, seen: Array, horizon: int, rate: float) -> Forecast:
+def forecast(reference: Array, seen: Array, horizon: int, rate: float, shortest: int) -> Forecast:
     """Predict the way of a piston from one period that it is known, or believed, to repeat.
 
     `reference` (period,) is that period; `seen` (m,) what came since, from phase 0; `horizon`
     the samples still to come. seen - reference is a straight line where the drift changed once,
-    at the trim. The line is continued, but no further than it has been seen: a slope from a
-    short look, or from an imperfect reference, does not carry far.
+    at the trim. Where `shortest` samples or more have been seen the line is continued, but no
+    further than it was seen: a slope from a short look does not carry far.
     """
     period, m = len(reference), len(seen)
     stride = max(1, min(period, m) // 500)
@@ -127,7 +126,7 @@ def forecast(reference: Array, seen: Array, horizon: int, rate: float) -> Foreca
     known = np.isfinite(apart)
     shift = float(np.mean(apart[known][-20:])) if known.any() else 0.0
     slope = 0.0
-    if m >= SHORTEST_LINE and np.count_nonzero(known) > 2:
+    if m >= shortest and np.count_nonzero(known) > 2:
         slope = float(np.polyfit(past[known] / rate, apart[known], 1)[0])
     reach = max(1, min(horizon, m))
     ahead = np.arange(0, reach, max(1, reach // 1000))

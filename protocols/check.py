@@ -87,7 +87,8 @@ def _centred(
     which = ", ".join(str(part.joint + 1) for part in step.excite)
     raise InputError(
         f"{step.name}: on the twin joint {which} cannot be centred: after {BIAS_TRIES} biases it "
-        "still drifts, or its state ceases to exist (end of the linkage, vacuum); lower the amplitude, or allow more drift"
+        "still drifts, or its state ceases to exist (end of the linkage, vacuum); "
+        "lower the amplitude, or allow more drift"
     )
 
 

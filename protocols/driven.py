@@ -21,7 +21,6 @@ from protocols.centring import (
     trim,
 )
 from protocols.errors import ProtocolAborted
-from protocols.excite import integral
 from protocols.model import OPEN_LOOP, Centring
 from protocols.plan import ExcitePlan
 
@@ -29,6 +28,7 @@ log = logging.getLogger(__name__)
 
 AT_REST = Motion(0.0, 0.0, 0.0)
 FASTEST_RETURN = 0.03  # [m/s] by which a piston about to leave its limits is brought back
+SHORTEST_LINE = 100  # samples; a slope through less is noise
 SHORTEST_RETURN = 0.5  # [s] in which it is back
 
 
@@ -84,11 +84,9 @@ def found_under_loop(
     return replace(driven, bias=bias, gain=seen.gain, moved=moved)
 
 
-def expected_period(driven: Driven, start: float, rate: float) -> Array:
-    """Return one period of the piston [m] that starts at `start`: k times the wave's integral."""
-    wave = driven.plan.wave
-    moved = integral(wave.samples, np.array(wave.lines)) * (wave.period / rate)
-    return np.asarray(start + driven.gain * (moved - moved[0]), dtype=np.float64)
+def off_centre(driven: Driven) -> float:
+    """Return how far the piston was off its centre, as a share of the offset allowed."""
+    return abs(driven.moved.ends - driven.plan.centre) / driven.centring.offset
 
 
 def settled(driven: Driven, moved: Motion, record: float, step: str) -> bool:
@@ -116,24 +114,34 @@ def trimmed(driven: Driven, moved: Motion, seconds: float, gently: bool) -> Driv
 
 
 def corrected(
-    driven: Driven, reference: Array, seen: Array, horizon: int, rate: float,
-    limits: tuple[float, float], step: str,
+    driven: Driven,
+    reference: Array,
+    other_law: bool,
+    seen: Array,
+    horizon: int,
+    rate: float,
+    limits: tuple[float, float],
+    step: str,
 ) -> Driven | None:  # fmt: skip
     """Return the joint with a bias that keeps it within `limits` [m], None if it stays anyway.
 
-    `reference`, `seen` and `horizon` are those of `forecast`. The piston is sent back so as to
-    be centred at the end of the period.
+    `reference`, `seen` and `horizon` are those of `forecast`; `other_law`, if the reference was
+    measured under another law than this. The piston is sent back so as to be centred at the end
+    of the period.
     """
     if driven.loop > 0.0:
         return None
-    ahead = forecast(reference, seen, horizon, rate)
+    # Another law gave the reference another shape, whose mismatch looks like a drift until a whole
+    # period has passed; and its own drift tells nothing of this one.
+    shortest = len(reference) if other_law else max(SHORTEST_LINE, len(reference) // 10)
+    ahead = forecast(reference, seen, horizon, rate, shortest)
     if not leaves(ahead, *limits):
         return None
     rest = len(reference) - len(seen) % len(reference)
     off = float(np.nanmean(reference)) + ahead.shift - driven.plan.centre
     back = -off / max(SHORTEST_RETURN, rest / rate)
     back = float(np.clip(back, -FASTEST_RETURN, FASTEST_RETURN))
-    drift = driven.moved.drift + ahead.slope
+    drift = ahead.slope + (0.0 if other_law else driven.moved.drift)
     log.warning(
         "%s: joint %d would reach %.1f..%.1f mm; its bias is corrected at once",
         step, driven.joint + 1, 1e3 * ahead.low, 1e3 * ahead.high,

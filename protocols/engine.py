@@ -97,7 +97,11 @@ class _StepRun:
         where = ", ".join(f"joint {j + 1} to {1e3 * s:g} mm" for j, s in targets.items())
         self.tell("place", where)
         self.session.wait(0.01)  # so that the session knows the device's time
-        return move(self.session, targets, self.place, self.step.settle, self.step.name)
+        # They are centred again when they move: here half of what that allows is near enough.
+        near = 0.5 * min(e.settings.centring.offset for e in self.step.excite)
+        tolerance = max(self.place.tolerance, near)
+        settle, name = self.step.settle, self.step.name
+        return move(self.session, targets, self.place, tolerance, settle, name)
 
     def _lock(self) -> list[Lock]:
         """Lock the joints: end stops first, because the push shakes what is merely closed."""
@@ -162,6 +166,7 @@ class _StepRun:
             j = held.joint + 1
             found[f"lock_{j}"] = held.at
             found[f"lock_piston_m_{j}"] = held.piston
+            found[f"lock_gain_v_per_m_{j}"] = held.law.position_gain
             found[f"lock_give_m_{j}"] = give(self.session, held, first, last)
         for before, after in zip(driven, excitation.joints, strict=True):
             j = before.joint + 1

@@ -11,16 +11,14 @@ import logging
 import math
 from collections.abc import Mapping, Sequence
 
-import numpy as np
-
 from drivers.base import OutputLaw
 from protocols.centring import Array, Motion, follow, motion, moved_by
 from protocols.driven import (
     Driven,
     corrected,
-    expected_period,
     found_under_loop,
     not_centred,
+    off_centre,
     returned,
     settled,
     trimmed,
@@ -33,10 +31,10 @@ from protocols.session import Session
 log = logging.getLogger(__name__)
 
 RAMP_STEP = 0.05  # [s] between two sizes of the growing waveform
+WARM_UPS = 3  # at most; more than one only if the first left the piston off centre
 LOOSER = 0.8  # factor between two position gains while the loop is loosened
 RAMP_DOWN = 0.5  # [s] a moving arm is not stopped by closing its valve at once
 LOOK_AHEAD = 0.1  # [s] between two forecasts
-NEAR = 20  # samples whose mean says where a piston is now
 
 
 class Excitation:
@@ -52,7 +50,8 @@ class Excitation:
         self.joints: tuple[Driven, ...] = ()
         self.start = 0
         self.at = 0
-        self._alone = True  # the period before ran under other laws: no reference for this one
+        self._alone = True  # the period before ran under other laws than this one
+        self._references: list[Array] = []  # the last period of each joint that went undisturbed
         self._checked = 0  # locks are verified up to here
 
     def warm_up(self, nulls: Mapping[int, float]) -> None:
@@ -75,11 +74,15 @@ class Excitation:
         self._play(loop=firm)
         self._go_on(0.5 * FIRM_SECONDS)
         self._loosen(firm)
-        self.hold()
         passed = self.session.now - self.start
         self.at = self.start + math.ceil(passed / self.step.period) * self.step.period
-        self._advance(self.step.warm_up)
-        self._find_biases(self.step.warm_up)
+        for _ in range(WARM_UPS):
+            self.hold()
+            self._advance(self.step.warm_up)
+            self._find_biases(self.step.warm_up)
+            if max(off_centre(driven) for driven in self.joints) < 0.5:
+                break
+        self._references = self._last_period()
 
     def settle_bias(self) -> None:
         """Play trials until every piston is centred and its drift is what was asked for.
@@ -204,13 +207,9 @@ class Excitation:
             return moved_by(piston, follow(command, piston, rate).drift, rate)
         return motion(self.session.piston(j, self.at - 2 * period, self.at), period, rate)
 
-    def _reference(self, driven: Driven) -> Array:
-        """Return the period of the piston that the stretch now beginning should repeat."""
-        if not self._alone:
-            return self.session.piston(driven.joint, self.at - self.step.period, self.at)
-        start = self.session.piston(driven.joint, self.at - NEAR, self.at)
-        own = expected_period(driven, float(np.nanmean(start)), self.session.rate)
-        return np.resize(own, self.step.period)  # a whole number of its own periods
+    def _last_period(self) -> list[Array]:
+        first = self.at - self.step.period
+        return [self.session.piston(d.joint, first, self.at) for d in self.joints]
 
     def _stretch(self, samples: int) -> list[Motion] | None:
         """Play on for whole periods; returns how each joint moved.
@@ -219,10 +218,9 @@ class Excitation:
         once, and the stretch ended with the period begun.
         """
         first, last = self.at, self.at + samples
-        references = [self._reference(driven) for driven in self.joints]
         while self.at < last:
             self._advance(min(last - self.at, round(LOOK_AHEAD * self.session.rate)))
-            if self.at < last and self._correct(references, first, last):
+            if self.at < last and self._correct(first, last):
                 past = (self.at - first) % self.step.period
                 self._advance(self.step.period - past if past else 0)
                 self.joints = tuple(returned(d) for d in self.joints)
@@ -230,21 +228,23 @@ class Excitation:
                 return None
         moved = [self._moved(driven) for driven in self.joints]
         self._alone = False
+        self._references = self._last_period()
         return moved
 
-    def _correct(self, references: Sequence[Array], first: int, last: int) -> bool:
+    def _correct(self, first: int, last: int) -> bool:
         """Correct the biases of pistons about to leave their limits; says whether any was."""
         found = [
             corrected(
                 driven,
                 reference,
+                self._alone,
                 self.session.piston(driven.joint, first, self.at),
                 last - self.at,
                 self.session.rate,
                 self.session.rig.joints[driven.joint].limits.piston,
                 self.step.name,
             )
-            for driven, reference in zip(self.joints, references, strict=True)
+            for driven, reference in zip(self.joints, self._references, strict=True)
         ]
         if not any(found):
             return False

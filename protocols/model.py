@@ -54,7 +54,7 @@ class Place(_Part):
     limit: Voltage = Field(default=0.6, gt=0, description="largest command while moving [V]")
     push: Voltage = Field(default=0.4, gt=0, description="held against an end stop [V]")
     tolerance: Length = Field(default=0.5e-3, gt=0, description="in place when closer [m]")
-    timeout: Time = Field(default=20.0, gt=0, description="for each move [s]")
+    timeout: Time = Field(default=30.0, gt=0, description="for each move [s]")
 
     @model_validator(mode="after")
     def _push_is_weaker(self) -> Self:

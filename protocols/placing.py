@@ -20,7 +20,9 @@ from protocols.session import Session
 log = logging.getLogger(__name__)
 
 LOOK = 0.1  # [s] of samples behind one mean: noise of 10 um becomes 1 um
-STILL = 1e-3  # [m/s] a piston slower than this stands
+STILL = 1e-3  # [m/s] a piston slower than this stands, against an end stop
+# One step of a coarse output is worth about 1 mm/s: in a loop a piston rocks by that for ever.
+ROCKING = 3e-3  # [m/s]
 INTEGRAL = 0.5  # share of the remaining error that one look takes out
 
 
@@ -55,9 +57,14 @@ def position_law(place: Place, target: float, bias: float) -> OutputLaw:
 
 
 def move(
-    session: Session, targets: Mapping[int, float], place: Place, settle: float, step: str
+    session: Session,
+    targets: Mapping[int, float],
+    place: Place,
+    tolerance: float,
+    settle: float,
+    step: str,
 ) -> dict[int, float]:
-    """Bring joints (0-based) to their places [m] and hold them; returns each one's null [V].
+    """Bring joints (0-based) to their places +- tolerance [m], hold them; returns their nulls [V].
 
     The null is the command that kept the piston still while it was in place for `settle`
     seconds; the position laws stay in force. Raises ProtocolAborted after `place.timeout`.
@@ -68,13 +75,13 @@ def move(
     while True:
         first = session.wait(LOOK)
         seen = {j: look(session, j, first, session.now) for j in targets}
-        late = {j for j in targets if not _in_place(seen[j], targets[j], place)}
+        late = {j for j in targets if not _in_place(seen[j], targets[j], tolerance)}
         if late:
             still_since = session.now
         elif session.now - still_since >= settle * session.rate:
             return {j: look(session, j, still_since, session.now).command for j in targets}
         # Only what no longer moves is off for want of a command; the rest is still on its way.
-        stuck = {j for j in late if abs(seen[j].speed) < STILL}
+        stuck = {j for j in late if abs(seen[j].speed) < ROCKING}
         for j in stuck:
             biases[j] += INTEGRAL * place.position_gain * (targets[j] - seen[j].piston)
             biases[j] = float(np.clip(biases[j], -place.limit, place.limit))
@@ -86,10 +93,10 @@ def move(
                 f"{step}: joint {j + 1} did not reach its place within {place.timeout:g} s: "
                 f"piston measured at {1e3 * seen[j].piston:.2f} mm "
                 f"(moving {1e3 * seen[j].speed:.2f} mm/s), "
-                f"expected {1e3 * targets[j]:.2f} mm +- {1e3 * place.tolerance:g} mm; "
+                f"expected {1e3 * targets[j]:.2f} mm +- {1e3 * tolerance:g} mm; "
                 "is the pump on, and the valve connected the right way round?"
             )
 
 
-def _in_place(seen: Look, target: float, place: Place) -> bool:
-    return abs(seen.piston - target) <= place.tolerance and abs(seen.speed) <= STILL
+def _in_place(seen: Look, target: float, tolerance: float) -> bool:
+    return abs(seen.piston - target) <= tolerance and abs(seen.speed) <= ROCKING

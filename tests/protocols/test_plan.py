@@ -1,0 +1,154 @@
+"""Everything a plan can get wrong is said before anything moves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from protocols.library import load, shipped_names
+from protocols.model import Protocol
+from protocols.plan import Overrides, resolve
+from rig.model.parse import InputError, parse_model
+from rig.model.rig import Rig
+from rig.services.rigs import load_rig
+
+TEXT = """\
+name: mine
+joints: 2
+steps:
+  - name: step1
+    lock: [{joint: 1, at: closed, piston: 5 mm}]
+    excite:
+      - {joint: 2, signal: {kind: sine, frequency: 2 Hz, amplitude: 1 V}, centre: 3 mm}
+    repeats: 2
+    duration: 4 s
+"""
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return load_rig("shinshu-2dof")
+
+
+def plan_of(text: str, rig: Rig, **overrides: object):  # type: ignore[no-untyped-def]
+    protocol = parse_model(Protocol, text, "mine.yaml")
+    return resolve(protocol, rig, Overrides(**overrides))  # type: ignore[arg-type]
+
+
+def test_a_plan_is_in_samples_and_counts_joints_from_zero(rig: Rig) -> None:
+    plan = plan_of(TEXT, rig)
+    (step,) = plan.steps
+    assert (step.period, step.record, step.repeats) == (500, 4000, 2)
+    assert (step.locks[0].joint, step.locks[0].piston) == (0, pytest.approx(5e-3))
+    assert (step.excite[0].joint, step.excite[0].centre) == (1, pytest.approx(3e-3))
+    assert plan.records == ("step1_r1", "step1_r2")
+    assert plan.seconds > 2 * 4.0
+
+
+def test_every_shipped_protocol_resolves_on_the_seed_bench(rig: Rig) -> None:
+    for name in shipped_names():
+        plan = resolve(load(name), rig)
+        for step in plan.steps:
+            assert step.record % step.period == 0
+            assert step.warm_up % step.period == 0
+            busy = {p.joint for p in (*step.locks, *step.excite)}
+            assert busy == {0, 1}
+
+
+def test_the_shipped_steps_are_those_of_the_paper(rig: Rig) -> None:
+    for name in ("lock-and-excite", "lock-and-excite-multisine"):
+        steps = resolve(load(name), rig).steps
+        assert [s.name for s in steps] == ["step1", "step2", "step3"]
+        locks = [(s.locks[0].joint, s.locks[0].at, s.excite[0].joint) for s in steps]
+        assert locks == [(0, "closed", 1), (1, "end_min", 0), (1, "end_max", 0)]
+    records = resolve(load("validate"), rig).records
+    assert records == (
+        "step1_1hz_r1", "step1_3hz_r1", "step2_1hz_r1", "step2_3hz_r1",
+        "step3_1hz_r1", "step3_3hz_r1", "both_1hz_r1", "both_3hz_r1",
+    )  # fmt: skip
+
+
+def test_the_seed_sine_lasts_ten_times_ten_seconds(rig: Rig) -> None:
+    for step in resolve(load("lock-and-excite"), rig).steps:
+        assert (step.repeats, step.record, step.lines) == (10, 10_000, (1,))
+        assert np.abs(step.excite[0].wave.samples).max() == pytest.approx(1.0)
+
+
+def test_two_joints_share_a_period_and_their_lines(rig: Rig) -> None:
+    text = TEXT.replace("    lock: [{joint: 1, at: closed, piston: 5 mm}]\n", "").replace(
+        "    excite:\n",
+        "    excite:\n      - {joint: 1, signal: {kind: sine, frequency: 3 Hz, amplitude: 1 V}}\n",
+    )
+    (step,) = plan_of(text, rig).steps
+    assert (step.excite[0].wave.period, step.excite[1].wave.period) == (1000, 500)
+    assert step.period == 1000
+    assert step.lines == (2, 3)  # 2 Hz and 3 Hz in multiples of 1 Hz
+
+
+def test_overrides_change_a_protocol_without_its_file(rig: Rig) -> None:
+    name = "lock-and-excite-multisine"
+    plain = resolve(load(name), rig)
+    plan = resolve(
+        load(name),
+        rig,
+        Overrides(repeats=2, amplitude_scale=0.5, seed=40, steps=("step1", "step3")),
+    )
+    assert plan.records == ("step1_r1", "step1_r2", "step3_r1", "step3_r2")
+    rms = [np.sqrt(np.mean(s.excite[0].wave.samples ** 2)) for s in (*plan.steps, *plain.steps)]
+    assert rms[0] == pytest.approx(0.5 * rms[2])
+    assert rms[1] == pytest.approx(0.5 * rms[4])
+    seeds = [s.excite[0].settings.signal.seed for s in plan.steps]  # type: ignore[union-attr]
+    assert seeds == [40, 41]
+    assert plan.seconds < plain.seconds
+
+
+REFUSED = [
+    ("amplitude: 1 V", "amplitude: 5 V", "step 'step1', joint 2: the command reaches 5 V.*4 V"),
+    ("frequency: 2 Hz", "frequency: 125 Hz", "excites 125 Hz.*below 125 Hz"),
+    ("frequency: 2 Hz", "frequency: 2.00013 Hz", "joint 2: 2.00013 Hz never meets"),
+    ("piston: 5 mm", "piston: 38 mm", r"joint 1 .* 38 mm, outside its stroke of \+-37.5 mm"),
+    ("centre: 3 mm", "centre: -37 mm", "centre -37 mm is outside limits.piston, -36 to 36 mm"),
+    ("duration: 4 s", "duration: 4.2 s", "duration 4.2 s is 8.4 periods of 0.5 s"),
+    ("duration: 4 s", "duration: 0.1 s", "expected a whole number"),
+    ("joints: 2\n", "joints: 2\nplace: {limit: 5 V}\n", "place.limit 5 V is above.*'boom'"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "message"), REFUSED)
+def test_what_the_rig_does_not_allow_is_refused(old: str, new: str, message: str, rig: Rig) -> None:
+    with pytest.raises(InputError, match=message):
+        plan_of(TEXT.replace(old, new), rig)
+
+
+def test_a_command_beyond_the_spools_stroke_is_refused(rig: Rig) -> None:
+    joints = tuple(
+        j.model_copy(update={"valve": j.valve.model_copy(update={"spool_stroke": 0.05})})
+        for j in rig.joints
+    )
+    stiff = rig.model_copy(update={"joints": joints})
+    with pytest.raises(InputError, match=r"moves the spool 0.1 V; its stroke is 0.05 V"):
+        plan_of(TEXT, stiff)
+
+
+def test_a_rig_of_another_size_is_refused(rig: Rig) -> None:
+    single = rig.model_copy(update={"joints": rig.joints[:1]})
+    for name in shipped_names():
+        with pytest.raises(InputError, match=r"is for 2 joint\(s\), rig 'shinshu-2dof' has 1"):
+            resolve(load(name), single)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ({"repeats": 0}, "repeats is 0"),
+        ({"amplitude_scale": -1.0}, "amplitude's scale is -1"),
+        ({"seed": -3}, "seed is -3"),
+        ({"steps": ("step9",)}, "no step 'step9'; it has: step1"),
+        ({"duration": 1.3}, "duration 1.3 s is 2.6 periods"),
+    ],
+)
+def test_an_override_that_does_not_fit_is_refused(
+    overrides: dict[str, object], message: str, rig: Rig
+) -> None:
+    with pytest.raises(InputError, match=message):
+        plan_of(TEXT, rig, **overrides)
