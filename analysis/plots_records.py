@@ -136,7 +136,7 @@ def residual(found: Residual, key: str) -> Markup:
     with style():
         made = figure(3.3)
         top = made.add_axes((0.15, 0.60, 0.82, 0.32))
-        low = made.add_axes((0.15, 0.125, 0.82, 0.33))
+        low = made.add_axes((0.15, 0.125, 0.82, 0.31))
         t, mean = gapped(found.time, unit.scale * found.mean)
         if found.repeats > 1:
             _, band = gapped(found.time, unit.scale * found.scatter_band)
@@ -164,8 +164,8 @@ def _densities(axes: Any, found: Residual, scale: float, unit: str) -> None:
         axes.plot(found.frequency, scale * found.spectrum_scatter, color=GREY, linewidth=1.0)
         floor = scale * found.spectrum_scatter / np.sqrt(found.repeats)
         axes.plot(found.frequency, floor, color=MODEL, linewidth=0.9, linestyle=(0, (4, 2)))
-        note(axes, 0.29, 1.02, "scatter of one repeat", "#6b7280", **above)
-        note(axes, 0.63, 1.02, "what scatter leaves in the mean", "#c2410c", **above)
+        note(axes, 0.26, 1.02, "scatter of one repeat", "#6b7280", **above)
+        note(axes, 0.59, 1.02, "scatter left in the mean", "#c2410c", **above)
     axes.margins(x=0)
     axes.set_xlabel("frequency [Hz]", labelpad=1)
     axes.set_ylabel(f"{unit}/√Hz")

@@ -228,10 +228,10 @@ def _parameter_row(
         f"± {_half(0.5 * (high - low), places)}" if has_interval else "",
         unit.text,
         f"{fm.fixed(low, places)} … {fm.fixed(high, places)}" if has_interval else fm.DASH,
-        fm.percent(100 * estimate.std / abs(estimate.value)) if shown else fm.DASH,
+        fm.column_percent(100 * estimate.std / abs(estimate.value)) if shown else fm.DASH,
         _scaled(rig.nominal.get(name), unit.scale),
         _scaled(true, unit.scale),
-        fm.percent(100 * (estimate.value / true - 1), signed=True) if true and shown else fm.DASH,
+        fm.column_percent(100 * (estimate.value / true - 1), signed=True) if true and shown else fm.DASH,
         ("yes" if covers(estimate, true) else "no") if true and has_interval else fm.DASH,
         _scaled(mean, unit.scale),
         "" if shown and not estimate.note else f"not identifiable: {estimate.note or 'no value'}"

@@ -73,6 +73,14 @@ def percent(value: float | None, digits: int = 2, *, signed: bool = False) -> st
     return f"+{text}" if signed and value is not None and value > 0 and text != DASH else text
 
 
+def column_percent(value: float | None, *, signed: bool = False) -> str:
+    """Write a percentage for a column: three decimals below one, two below a hundred."""
+    if value is None or not math.isfinite(value) or abs(value) >= 100:
+        return percent(value, 3, signed=signed)
+    text = fixed(value, 3 if abs(value) < 1 else 2)
+    return f"+{text}" if signed and value > 0 and text.strip("0.") else text
+
+
 def fit(value: float | None) -> str:
     """Write a FIT ratio as the paper does, one decimal; huge negative ones in powers of ten."""
     if value is None or not math.isfinite(value):

@@ -189,10 +189,10 @@ def table_iii(
             Table3Row(
                 name, unit.text, shown(estimate.value),
                 *(shown(v) for v in ((ours.low, ours.mean, ours.high) if ours else (None,) * 3)),
-                fm.percent(ours.rsd if ours else None),
+                fm.column_percent(ours.rsd if ours else None),
                 mark,
                 _printed(theirs, unit.scale, 0 if name == "b" else 2),
-                fm.percent(deviation, signed=True),
+                fm.column_percent(deviation, signed=True),
             )
         )  # fmt: skip
     return out
