@@ -78,26 +78,29 @@ def refuse_dead_channels(rig: Rig, record: Record) -> None:
 
 
 def clipping(rig: Rig, runs: Sequence[Run]) -> list[Check]:
-    """State every sensor that touched an end of its range."""
-    found = []
+    """State every sensor that touched an end of its range, by step, with the worst record."""
+    worst: dict[tuple[str, str], tuple[int, float, str]] = {}
     for run in runs:
         for record in run.records:
             for name, mask in clipped_samples(rig, record).items():
                 joint = ch.kind_of(name)[1]
                 if joint in record.locked and not name.startswith(ch.PISTON):
                     continue
-                share = float(mask.mean())
-                low, high = rig.sensors.of(ch.kind_of(name)[0]).range
-                found.append(
-                    Check(
-                        "clipped sensor",
-                        share < CLIPPED_SHARE,
-                        f"record {record.name!r}, channel {name!r}: {int(mask.sum())} samples "
-                        f"({100 * share:.2g} %) at the end of {low:g}..{high:g} "
-                        f"{ch.unit_of(name)}; masked",
-                    )
-                )
-    return found or [Check("clipped sensor", True, "no sensor reached the end of its range")]
+                found = (int(mask.sum()), float(mask.mean()), record.name)
+                worst[record.step, name] = max(found, worst.get((record.step, name), found))
+    out = []
+    for (_, name), (count, share, record_name) in worst.items():
+        low, high = rig.sensors.of(ch.kind_of(name)[0]).range
+        out.append(
+            Check(
+                "clipped sensor",
+                share < CLIPPED_SHARE,
+                f"record {record_name!r}, channel {name!r}: {count} samples "
+                f"({100 * share:.2g} %) at the end of {low:g}..{high:g} {ch.unit_of(name)}; "
+                "masked (the worst record of its step)",
+            )
+        )
+    return out or [Check("clipped sensor", True, "no sensor reached the end of its range")]
 
 
 def repeats(strata: Mapping[tuple[int, str], int]) -> Check:
@@ -192,7 +195,8 @@ def _inertia(rig: Rig, estimates: Mapping[str, Estimate]) -> list[Check]:
         Check(
             "inertia",
             smallest > 0,
-            f"smallest eigenvalue of M over the workspace {smallest:.4g} kg m^2, at q = {angles} deg",
+            f"smallest eigenvalue of M over the workspace {smallest:.4g} kg m^2, "
+            f"at q = {angles} deg",
         )
     ]
     for i in range(N):
@@ -204,7 +208,7 @@ def _inertia(rig: Rig, estimates: Mapping[str, Estimate]) -> list[Check]:
                 out.append(
                     Check(
                         "link length",
-                        abs(off) < LENGTH_TOLERANCE,
+                        bool(abs(off) < LENGTH_TOLERANCE),
                         f"R{i + 1}{j + 1}/W{j + 1} = {ratio:.4g} m against link {i + 1} of "
                         f"{length:g} m ({100 * off:+.1f} %); rigid bodies give equality",
                     )
@@ -222,7 +226,7 @@ def _bulk(estimates: Mapping[str, Estimate]) -> list[Check]:
 
 
 def workspace(rig: Rig, points: int = 9) -> list[Array]:
-    """Return joint angles (N,) spread over the stroke: a grid, or 4096 points of a fixed lattice."""
+    """Return joint angles (N,) spread over the stroke: a grid, or a fixed lattice."""
     N = len(rig.joints)
     if points**N <= 4096:
         axes = np.meshgrid(*([np.linspace(0, 1, points)] * N), indexing="ij")

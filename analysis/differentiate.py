@@ -67,7 +67,7 @@ class FirSmoother:
     @property
     def reach(self) -> int:
         """Samples on either side that an output depends on."""
-        return (self.taps.shape[1] - 1) // 2
+        return int(self.taps.shape[1] - 1) // 2
 
     def apply(self, x: Array, order: int = 0) -> Array:
         """Return the filtered (d/dt)^order of x (n, ...); raises InputError if x is too short."""
@@ -84,8 +84,9 @@ class FirSmoother:
 class FourierSmoother:
     """Differentiation in the frequency domain of whole periods, exact where a record is periodic.
 
-    A record drifts and is trimmed between periods, so the line joining its ends is taken out
-    first and put back; what a line cannot describe leaks, which is why this is not the default.
+    A record drifts and is trimmed between periods, so the line to the sample that would come
+    next is taken out first and put back; what a line cannot describe, and the noise of the ends,
+    leaks: that, and records that are not whole periods, are why this is not the default.
     """
 
     rate: float
@@ -104,7 +105,7 @@ class FourierSmoother:
     def apply(self, x: Array, order: int = 0) -> Array:
         """Return the low-passed (d/dt)^order of x (n, ...), x being whole periods plus a line."""
         n = len(x)
-        slope = (x[-1] - x[0]) / (n - 1)
+        slope = (2 * x[-1] - x[-2] - x[0]) / n
         line = np.multiply.outer(np.arange(n, dtype=np.float64), slope)
         frequency = np.fft.rfftfreq(n, 1 / self.rate)
         gain = np.where(frequency <= self.cutoff, (2j * np.pi * frequency) ** order, 0.0)
@@ -230,7 +231,7 @@ def align(x: Array, shift: float) -> Array:
         return x
     reach = ALIGN_HALF_WIDTH + abs(whole)
     offsets = np.arange(-reach, reach + 1)
-    distance = offsets - whole - fraction
+    distance: Array = np.asarray(offsets - whole - fraction, dtype=np.float64)
     taps = _kernel(distance, 0.425, ALIGN_HALF_WIDTH + 0.5, 8.0)
     # Convolution turns the taps round.
     return _convolve(_extended(x, reach, "alignment"), taps[::-1] / taps.sum())

@@ -87,9 +87,7 @@ def identify(
     }
     model = Model(rig, used, estimates, covariance, provenance)
     log.info("identified %d parameters from %d records", len(estimates), len(per_record))
-    return Identification(
-        method, estimates, solutions, rows, masked, seconds, statements, model
-    )
+    return Identification(method, estimates, solutions, rows, masked, seconds, statements, model)
 
 
 def _refuse_method(method: str) -> None:
@@ -168,9 +166,7 @@ def _estimates(
     rig: Rig, terms: Sequence[Used], solutions: Mapping[str, Solution]
 ) -> tuple[dict[str, Estimate], Array]:
     """Turn the rows' coefficients into parameters (b = 1/coefficient) with intervals."""
-    coefficients = {
-        c.parameter: c for used in terms for c in used.term.coefficients(rig)
-    }
+    coefficients = {c.parameter: c for used in terms for c in used.term.coefficients(rig)}
     found: dict[str, Estimate] = {}
     blocks = []
     for solution in solutions.values():

@@ -15,7 +15,7 @@ import math
 from typing import Final
 
 import numpy as np
-from llvmlite import ir
+from llvmlite import ir  # type: ignore[import-untyped]
 from numba import njit, types
 from numba.extending import intrinsic
 
@@ -119,44 +119,41 @@ def _observe(t, y, inputs, rate, locked, geometry, bench, x, q_dd):  # type: ign
 
 
 @njit(cache=True, error_model="numpy")
-def _accelerate(M, load, locked, q_dd):  # type: ignore[no-untyped-def]
-    """Solve the free joints' rows of M q'' = load in place by Cholesky; False if M is not > 0."""
+def _impose(M, load, locked, q_dd):  # type: ignore[no-untyped-def]
+    """Replace the rows of locked joints by their given q'', moved to the others' loads."""
+    for i in range(len(load)):
+        if locked[i]:
+            for j in range(len(load)):
+                load[j] -= M[j, i] * q_dd[i]
+                M[i, j] = M[j, i] = 0.0
+            M[i, i], load[i] = 1.0, q_dd[i]
+
+
+@njit(cache=True, error_model="numpy")
+def _accelerate(M, load, q_dd):  # type: ignore[no-untyped-def]
+    """Solve M q'' = load by Cholesky, M becoming its factor; False where M is not > 0."""
     N = len(load)
     for i in range(N):
-        if locked[i]:
-            for j in range(N):
-                if not locked[j]:
-                    load[j] -= M[j, i] * q_dd[i]
-    for i in range(N):
-        if locked[i]:
-            continue
         for j in range(i + 1):
-            if locked[j]:
-                continue
             total = M[i, j]
             for k in range(j):
-                if not locked[k]:
-                    total -= M[i, k] * M[j, k]
-            if i == j:
-                if not total > 0.0:
-                    return False
+                total -= M[i, k] * M[j, k]
+            if i > j:
+                M[i, j] = total / M[j, j]
+            elif total > 0.0:
                 M[i, i] = math.sqrt(total)
             else:
-                M[i, j] = total / M[j, j]
+                return False
     for i in range(N):
-        if not locked[i]:
-            total = load[i]
-            for k in range(i):
-                if not locked[k]:
-                    total -= M[i, k] * q_dd[k]
-            q_dd[i] = total / M[i, i]
+        total = load[i]
+        for k in range(i):
+            total -= M[i, k] * q_dd[k]
+        q_dd[i] = total / M[i, i]
     for i in range(N - 1, -1, -1):
-        if not locked[i]:
-            total = q_dd[i]
-            for k in range(i + 1, N):
-                if not locked[k]:
-                    total -= M[k, i] * q_dd[k]
-            q_dd[i] = total / M[i, i]
+        total = q_dd[i]
+        for k in range(i + 1, N):
+            total -= M[k, i] * q_dd[k]
+        q_dd[i] = total / M[i, i]
     return True
 
 
@@ -184,7 +181,7 @@ def _call(typing, address, phase, bench, x, z, par, out, M, dz):  # type: ignore
 
 
 @njit(cache=True, error_model="numpy")
-def _rates(t, y, dy, inputs, rate, locked, geometry, model, work):  # type: ignore[no-untyped-def]
+def rates(t, y, dy, inputs, rate, locked, geometry, model, work):  # type: ignore[no-untyped-def]
     """Fill dy; return OK or why there is no derivative."""
     addresses, ends, hidden_ends, prepares, par = model
     bench, x, out, M, q_dd = work
@@ -202,7 +199,8 @@ def _rates(t, y, dy, inputs, rate, locked, geometry, model, work):  # type: igno
     for i in range(N):
         force = geometry[i, AREA_CAP] * x[P_CAP, i] - geometry[i, AREA_ROD] * x[P_ROD, i]
         out[TORQUE, i] += x[G, i] * force
-    if not _accelerate(M, out[TORQUE], locked, q_dd):
+    _impose(M, out[TORQUE], locked, q_dd)
+    if not _accelerate(M, out[TORQUE], q_dd):
         return BAD_INERTIA
     for i in range(N):
         if locked[i]:
@@ -216,6 +214,55 @@ def _rates(t, y, dy, inputs, rate, locked, geometry, model, work):  # type: igno
     return OK
 
 
+@njit(cache=True, error_model="numpy")
+def _stages(t, h, y, trial, k, inputs, rate, locked, geometry, model, work):  # type: ignore[no-untyped-def]
+    """Fill the six further stages k[1:] and the 5th-order `trial`; return (status, evaluations)."""
+    for stage in range(6):
+        for j in range(len(y)):
+            total = 0.0
+            for m in range(stage + 1):
+                total += _A[stage, m] * k[m, j]
+            trial[j] = y[j] + h * total
+        at = t + _C[stage] * h
+        status = rates(at, trial, k[stage + 1], inputs, rate, locked, geometry, model, work)
+        if status != OK:
+            return status, stage + 1
+    return OK, 6
+
+
+@njit(cache=True, error_model="numpy")
+def _error(h, y, trial, k, rtol, atol):  # type: ignore[no-untyped-def]
+    """Return the embedded error over the tolerance, root mean square over the state."""
+    error = 0.0
+    for j in range(len(y)):
+        e = 0.0
+        for m in range(7):
+            e += _E[m] * k[m, j]
+        scale = atol[j] + rtol * max(abs(y[j]), abs(trial[j]))
+        error += (h * e / scale) ** 2
+    return math.sqrt(error / len(y))
+
+
+@njit(cache=True, error_model="numpy")
+def _interpolate(t, h, y, trial, k, rate, ys, filled):  # type: ignore[no-untyped-def]
+    """Fill the samples that lie in the step just taken; return how many are filled now."""
+    n = ys.shape[0]
+    reached = filled
+    while reached < n and reached / rate <= t + h + 1e-12:
+        reached += 1
+    for j in range(len(y) if reached > filled else 0):
+        r2 = trial[j] - y[j]
+        r3 = h * k[0, j] - r2
+        r4 = r2 - h * k[6, j] - r3
+        r5 = 0.0
+        for m in range(7):
+            r5 += h * _D[m] * k[m, j]
+        for i in range(filled, reached):
+            a = min((i / rate - t) / h, 1.0)
+            ys[i, j] = y[j] + a * (r2 + (1.0 - a) * (r3 + a * (r4 + (1.0 - a) * r5)))
+    return reached
+
+
 @njit(SIGNATURE, cache=True, error_model="numpy")
 def integrate(model, inputs, rate, locked, geometry, rtol, atol, ys, work):  # type: ignore[no-untyped-def]
     """Integrate from ys[0]; fill ys (n, size) and return (status, samples filled, evaluations).
@@ -226,62 +273,30 @@ def integrate(model, inputs, rate, locked, geometry, rtol, atol, ys, work):  # t
     n, size = ys.shape
     k = np.zeros((7, size))
     y, trial = ys[0].copy(), np.empty(size)
-    r2, r3, r4, r5 = np.empty(size), np.empty(size), np.empty(size), np.empty(size)
     t, h, filled, evaluations = 0.0, 0.2 / rate, 1, 1
-    end = (n - 1) / rate
-    status = _rates(t, y, k[0], inputs, rate, locked, geometry, model, work)
+    end = (n - 1) / rate + 1e-9
+    status = rates(t, y, k[0], inputs, rate, locked, geometry, model, work)
     if status != OK:
         return status, filled, evaluations
-    last_failed = False
+    after_failure = False
     while filled < n:
-        h = min(h, end + 1e-9 - t) if end + 1e-9 - t > MIN_STEP else MIN_STEP
-        status = OK
-        for stage in range(6):
-            for j in range(size):
-                total = 0.0
-                for m in range(stage + 1):
-                    total += _A[stage, m] * k[m, j]
-                trial[j] = y[j] + h * total
-            status = _rates(t + _C[stage] * h, trial, k[stage + 1], inputs, rate, locked, geometry, model, work)
-            evaluations += 1
-            if status != OK:
-                break
-        error = 0.0
-        if status == OK:
-            for j in range(size):
-                e = 0.0
-                for m in range(7):
-                    e += _E[m] * k[m, j]
-                scale = atol[j] + rtol * max(abs(y[j]), abs(trial[j]))
-                error += (h * e / scale) ** 2
-            error = math.sqrt(error / size)
-        if status != OK or not error <= 1.0:
+        h = max(min(h, end - t), MIN_STEP)
+        status, used = _stages(t, h, y, trial, k, inputs, rate, locked, geometry, model, work)
+        evaluations += used
+        error = _error(h, y, trial, k, rtol, atol) if status == OK else np.inf
+        if not error <= 1.0:
             if h <= MIN_STEP:
-                if status != OK:
-                    return status, filled, evaluations
-                return (STEP_TOO_SMALL if error < np.inf else NOT_FINITE), filled, evaluations
-            shrink = 0.2 if (status != OK or not error < 1e6) else max(0.2, 0.9 * error**-0.2)
-            h = max(h * shrink, MIN_STEP)
-            last_failed = True
+                if status == OK:
+                    status = STEP_TOO_SMALL if error < np.inf else NOT_FINITE
+                return status, filled, evaluations
+            h *= max(0.2, 0.9 * error**-0.2) if error < 1e6 else 0.2
+            after_failure = True
             continue
-        for j in range(size):
-            r2[j] = trial[j] - y[j]
-            r3[j] = h * k[0, j] - r2[j]
-            r4[j] = r2[j] - h * k[6, j] - r3[j]
-            d = 0.0
-            for m in range(7):
-                d += _D[m] * k[m, j]
-            r5[j] = h * d
-        while filled < n and filled / rate <= t + h + 1e-12:
-            a = min((filled / rate - t) / h, 1.0)
-            for j in range(size):
-                inner = r3[j] + a * (r4[j] + (1.0 - a) * r5[j])
-                ys[filled, j] = y[j] + a * (r2[j] + (1.0 - a) * inner)
-            filled += 1
+        filled = _interpolate(t, h, y, trial, k, rate, ys, filled)
         t += h
         y[:] = trial
         k[0] = k[6]
-        grow = 5.0 if error < 1e-8 else min(5.0, 0.9 * error**-0.2)
-        h *= min(grow, 1.0) if last_failed else grow
-        last_failed = False
+        grow = 0.9 * max(error, 1e-8) ** -0.2
+        h *= min(grow, 1.0 if after_failure else 5.0)
+        after_failure = False
     return OK, filled, evaluations

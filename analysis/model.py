@@ -168,7 +168,9 @@ def _from_json(data: Mapping[str, Any]) -> Model:
                 raise InputError(f"parameters: {c.parameter!r} of {used.term.name!r} is missing")
     covariance = np.array([[_number(v) for v in row] for row in data["covariance"]])
     if covariance.shape != (len(parameters), len(parameters)):
-        raise InputError(f"covariance: {covariance.shape} does not fit {len(parameters)} parameters")
+        raise InputError(
+            f"covariance: {covariance.shape} does not fit {len(parameters)} parameters"
+        )
     return Model(rig, terms, parameters, covariance, dict(data["provenance"]))
 
 

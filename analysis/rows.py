@@ -8,8 +8,8 @@ Sum of columns times coefficients = right-hand side; units: torque_i [N m], flow
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,12 +18,14 @@ from scipy.signal import upfirdn
 from analysis.differentiate import (
     FirSmoother,
     Smoother,
+    butterworth,
     channel_filter,
+    moving_average,
     row_filter,
     row_step,
 )
 from analysis.signals import Mask, Signals
-from analysis.terms.base import FAMILIES, Columns, Used, equation, family_of
+from analysis.terms.base import FAMILIES, Columns, Used, equation
 from rig.model.records import Record
 from rig.model.rig import Rig
 
@@ -37,7 +39,7 @@ MASKED_SHARE = 1e-3  # of a filter's weight on masked samples: a row with more i
 
 @dataclass(frozen=True)
 class Filtering:
-    """The filters of one record: `channels` before, `rows` (None: no filter) after, every `step`."""
+    """The filters of one record: `channels` before, `rows` (or none) after."""
 
     channels: Smoother
     rows: FirSmoother | None
@@ -70,6 +72,25 @@ def default_filtering(record: Record) -> Filtering:
     return Filtering(channel_filter(rate), row_filter(rate, cutoff), row_step(rate, cutoff))
 
 
+def paper_filtering(record: Record) -> Filtering:
+    """Return the paper's: a 20-sample average (zero-phase here), differences, every row used."""
+    return Filtering(moving_average(record.sample_rate), None)
+
+
+def butterworth_filtering(record: Record) -> Filtering:
+    """Return a zero-phase Butterworth on the channels in place of the windowed sinc."""
+    chosen = default_filtering(record)
+    cutoff = min(80.0, 0.2 * record.sample_rate)
+    return replace(chosen, channels=butterworth(record.sample_rate, cutoff))
+
+
+FILTERINGS: dict[str, Callable[[Record], Filtering]] = {
+    "default": default_filtering,
+    "moving-average": paper_filtering,
+    "butterworth": butterworth_filtering,
+}
+
+
 def right_sides(rig: Rig, signals: Signals) -> dict[str, Array]:
     """Return the right-hand side (n,) of every equation: G F, A_cap ds/dt, - A_rod ds/dt.
 
@@ -87,30 +108,13 @@ def right_sides(rig: Rig, signals: Signals) -> dict[str, Array]:
 
 def parameters_of(rig: Rig, terms: Sequence[Used], family: str) -> tuple[str, ...]:
     """Return the parameters that the terms put into one family's rows, in the terms' order."""
-    joints = range(len(rig.joints))
-    kinds = FAMILIES[family]
-    empty = _empty_signals(len(rig.joints))
-    names: dict[str, None] = {}
-    for used in terms:
-        columns = used.term.columns(rig, empty, used.shape)
-        present = {
-            name
-            for kind in kinds
-            for i in joints
-            for name in columns.get(equation(kind, i), {})
-        }
-        names.update({c.parameter: None for c in used.term.coefficients(rig)
-                      if c.parameter in present})  # fmt: skip
+    names = {
+        c.parameter: None
+        for used in terms
+        for c in used.term.coefficients(rig)
+        if c.family == family
+    }
     return tuple(names)
-
-
-def _empty_signals(joints: int) -> Signals:
-    """Signals without samples: enough to ask a term which columns it has."""
-    wide, flat = np.zeros((0, joints)), np.zeros(0)
-    return Signals(
-        1.0, flat, *([wide] * 14), flat, flat, flat,
-        np.ones(joints, dtype=bool), np.zeros((0, joints), dtype=bool),
-    )  # fmt: skip
 
 
 def record_rows(
@@ -123,7 +127,8 @@ def record_rows(
     valid: dict[str, Mask] = {}
     for used in terms:
         for name, more in used.term.columns(rig, signals, used.shape).items():
-            columns.setdefault(name, {}).update(more)
+            here = columns.setdefault(name, {})
+            here.update({p: here[p] + v if p in here else v for p, v in more.items()})
         for name, mask in used.term.valid(rig, signals, used.shape).items():
             valid[name] = valid.get(name, np.ones(len(mask), dtype=bool)) & mask
     sides = right_sides(rig, signals)
@@ -131,12 +136,13 @@ def record_rows(
     out = {}
     for family, kinds in FAMILIES.items():
         names = parameters_of(rig, terms, family)
-        for i in np.flatnonzero(signals.excited):
+        for i in map(int, np.flatnonzero(signals.excited)):
             # Inertia couples: a clipped piston of any joint spoils every torque row.
-            sensors = signals.valid.all(axis=1) if family == "mechanical" else signals.valid[:, i]
+            whole = family == "mechanical"
+            sensors = np.asarray(signals.valid.all(axis=1) if whole else signals.valid[:, i])
             for kind in kinds:
-                name = equation(kind, int(i))
-                good = sensors & valid.get(name, np.True_)
+                name = equation(kind, i)
+                good = sensors & valid.get(name, sensors)
                 out[name] = _filtered(
                     name, names, columns.get(name, {}), sides[name], good, signals, filtering, edges
                 )
@@ -162,9 +168,11 @@ def _filtered(
     if filtering.rows is not None:
         stack, dropped, time = _low_passed(stack, bad, time, filtering.rows, filtering.step)
     else:
-        stack, dropped, time = stack[:: filtering.step], bad[:: filtering.step], time[
-            :: filtering.step
-        ]
+        stack, dropped, time = (
+            stack[:: filtering.step],
+            bad[:: filtering.step],
+            time[:: filtering.step],
+        )
     kept = ~dropped
     matrix = np.zeros((int(kept.sum()), len(names)))
     matrix[:, filled] = stack[kept, :-1]

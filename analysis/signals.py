@@ -1,14 +1,14 @@
 """Records to signals: aligned, filtered, differentiated, with the linkage's geometry beside them.
 
-Glossary: n samples, N joints. `u` spool [V], `s` piston [m], `q` joint angle [rad], `theta` absolute
-angle q_1 + ... + q_k, `G` = ds/dq [m], `p_cap p_rod` chamber pressures [Pa gauge], `V_cap V_rod`
-chamber volumes [m^3], `p_s p_tank` supply and return pressure [Pa gauge]. A trailing d is d/dt.
+Glossary: n samples, N joints. `u` spool [V], `s` piston [m], `q` joint angle [rad], `theta`
+absolute angle q_1 + ... + q_k, `G` = ds/dq [m], `p_cap p_rod` chamber pressures [Pa gauge],
+`V_cap V_rod` chamber volumes [m^3], `p_s p_tank` supply and return pressure [Pa gauge]. A
+trailing d is d/dt.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,7 +64,7 @@ class Signals:
     @property
     def joints(self) -> int:
         """N."""
-        return self.s.shape[1]
+        return int(self.s.shape[1])
 
 
 def aligned_channels(rig: Rig, record: Record) -> dict[str, Array]:
@@ -202,8 +202,3 @@ def _valid(rig: Rig, record: Record, reach: int) -> Mask:
     spread = np.apply_along_axis(np.convolve, 0, bad, np.ones(2 * reach + 1), "same") > 0.5
     spread[:reach] = spread[n - reach :] = True
     return np.asarray(~spread)
-
-
-def with_fields(signals: Signals, changes: Mapping[str, Array]) -> Signals:
-    """Return signals with some arrays replaced, for terms that change what others see."""
-    return replace(signals, **changes)  # type: ignore[arg-type]

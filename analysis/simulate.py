@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -96,7 +96,7 @@ def drive_of(signals: Signals) -> Drive:
 
 
 @dataclass(frozen=True)
-class _Compiled:
+class Compiled:
     """A model in the integrator's arrays."""
 
     addresses: NDArray[np.int64]
@@ -107,7 +107,7 @@ class _Compiled:
     geometry: Array
 
 
-def compiled(model: Model) -> _Compiled:
+def compiled(model: Model) -> Compiled:
     """Lay a model out for the integrator; raises InputError where a parameter is not identified."""
     missing = [name for name, p in model.parameters.items() if not p.identified]
     if missing:
@@ -117,7 +117,7 @@ def compiled(model: Model) -> _Compiled:
         )
     values = model.values
     packed = [u.term.pack(model.rig, values, u.shape) for u in model.terms]
-    return _Compiled(
+    return Compiled(
         np.array([u.term.kernel.address for u in model.terms], dtype=np.int64),
         np.cumsum([0, *(len(p) for p in packed)]),
         np.cumsum([0, *(u.term.hidden(model.rig) for u in model.terms)]),
@@ -146,7 +146,7 @@ def _geometry(rig: Rig) -> Array:
 
 
 def simulate(
-    model: Model | _Compiled, drive: Drive, start: State, first: int = 0, samples: int | None = None
+    model: Model | Compiled, drive: Drive, start: State, first: int = 0, samples: int | None = None
 ) -> Simulation:
     """Simulate `samples` samples of the drive from sample `first` on, beginning in `start`.
 
@@ -160,19 +160,14 @@ def simulate(
     hidden = int(ready.hidden_ends[-1])
     ys = np.zeros((samples, 4 * N + hidden))
     ys[0, : 4 * N] = np.concatenate((start.q, start.qd, start.p_cap, start.p_rod))
-    inputs = np.column_stack(
-        (drive.p_s, drive.temperature, drive.u, drive.q, drive.qd, drive.qdd)
-    )[first : first + samples]
+    inputs = _inputs(drive)[first : first + samples]
     atol = np.repeat(
         [ATOL_ANGLE, ATOL_RATE, ATOL_PRESSURE, ATOL_PRESSURE, ATOL_HIDDEN], [N, N, N, N, hidden]
     )
-    work = (
-        np.zeros(4), np.zeros((X_ROWS, N)), np.zeros((OUT_ROWS, N)), np.zeros((N, N)), np.zeros(N),
-    )  # fmt: skip
     status, filled, evaluations = integrate.integrate(
         (ready.addresses, ready.ends, ready.hidden_ends, ready.prepares, ready.par),
         np.ascontiguousarray(inputs), drive.rate, drive.locked, ready.geometry, RTOL, atol, ys,
-        work,
+        _workspace(N),
     )  # fmt: skip
     ys[filled:] = ys[filled - 1]
     failure = ""
@@ -203,13 +198,34 @@ def _result(
     )  # fmt: skip
 
 
+def rates_of(ready: Compiled, drive: Drive) -> Callable[[float, Array], Array]:
+    """Return dy/dt(t, y) of a compiled model under a drive, for other integrators to use."""
+    N = drive.u.shape[1]
+    inputs = np.ascontiguousarray(_inputs(drive))
+    work = _workspace(N)
+    parts = (ready.addresses, ready.ends, ready.hidden_ends, ready.prepares, ready.par)
+
+    def rates(t: float, y: Array) -> Array:
+        dy = np.zeros_like(y)
+        integrate.rates(t, y, dy, inputs, drive.rate, drive.locked, ready.geometry, parts, work)
+        return dy
+
+    return rates
+
+
+def _inputs(drive: Drive) -> Array:
+    return np.column_stack((drive.p_s, drive.temperature, drive.u, drive.q, drive.qd, drive.qdd))
+
+
+def _workspace(joints: int) -> tuple[Array, Array, Array, Array, Array]:
+    N = joints
+    return (
+        np.zeros(4), np.zeros((X_ROWS, N)), np.zeros((OUT_ROWS, N)), np.zeros((N, N)), np.zeros(N),
+    )  # fmt: skip
+
+
 def state_at(signals: Signals, sample: int) -> State:
     """Return the measured state at one sample of the filtered signals."""
     return State(
         signals.q[sample], signals.qd[sample], signals.p_cap[sample], signals.p_rod[sample]
     )
-
-
-def as_mapping(state: State) -> Mapping[str, Array]:
-    """Return a state by name, for reports."""
-    return {"q": state.q, "qd": state.qd, "p_cap": state.p_cap, "p_rod": state.p_rod}

@@ -68,7 +68,7 @@ def merge(triangles: Iterable[Array]) -> Array:
 
 def _square(stacked: Array) -> Array:
     width = stacked.shape[1]
-    R = np.linalg.qr(stacked, mode="r")
+    R: Array = np.asarray(np.linalg.qr(stacked, mode="r"))
     return np.vstack((R, np.zeros((width - len(R), width)))) if len(R) < width else R
 
 
@@ -86,7 +86,7 @@ def solve(names: Sequence[str], clusters: Sequence[Cluster]) -> Solution:
         return Solution(tuple(names), nan, np.full((k, k), np.nan), nan, np.inf, 0, np.nan, lost)
     U, sigma, Vt = np.linalg.svd(X[:, kept] / scale[kept], full_matrices=False)
     strong = sigma > RANK_TOLERANCE * sigma[0]
-    lost |= _confounded([names[i] for i in kept], Vt[~strong])
+    lost |= _confounded([names[int(i)] for i in kept], Vt[~strong])
     inverse = (Vt[strong].T / sigma[strong]) / scale[kept, None]  # pseudo-inverse without U'
     beta = np.zeros(k)
     beta[kept] = inverse @ (U[:, strong].T @ y)
@@ -147,4 +147,3 @@ def _clustered(beta: Array, bread: Array, clusters: Sequence[Cluster]) -> tuple[
 def half_width(std: Array, dof: Array, level: float = 0.95) -> Array:
     """Return the half width of confidence intervals, Student's t with `dof` (arrays alike)."""
     return np.asarray(student.ppf(0.5 + 0.5 * level, np.maximum(dof, 1.0)) * std)
-

@@ -59,9 +59,9 @@ def simulate_commands(
 
     `start` (N,) are the pistons' first positions [m], `locked` maps a 0-based joint to the piston
     position [m] that holds it. Returns `piston speed cap_pressure rod_pressure spool`, each (n, N)
-    in SI, and `valid` (n,), false from where the state ceased to exist (the last state is then
-    held, which lies outside every limit). Raises InputError for a rig without nominal values or
-    arrays that do not fit it.
+    in SI, and `valid` (n,), 0 from where the state ceased to exist and 1 before (the last state is
+    then held, which lies outside every limit). Raises InputError for a rig without nominal values
+    or arrays that do not fit it.
     """
     N = len(rig.joints)
     commands = np.asarray(commands, dtype=np.float64)
@@ -90,5 +90,5 @@ def simulate_commands(
         "cap_pressure": result.p_cap,
         "rod_pressure": result.p_rod,
         "spool": spool,
-        "valid": np.arange(n) < result.filled if result.failure else np.ones(n, dtype=bool),
+        "valid": (np.arange(n) < result.filled).astype(np.float64),
     }

@@ -120,7 +120,7 @@ def _compared(channels: Mapping[str, Array], signals: Signals) -> dict[str, Arra
     """Return the measured piston and pressures of the excited joints."""
     return {
         ch.channel(kind, i + 1): channels[ch.channel(kind, i + 1)]
-        for i in np.flatnonzero(signals.excited)
+        for i in map(int, np.flatnonzero(signals.excited))
         for kind in (ch.PISTON, ch.CAP, ch.ROD)
     }
 
@@ -142,10 +142,11 @@ def first_state(rig: Rig, record: Record, signals: Signals) -> State:
     channels = aligned_channels(rig, record)
     state = state_at(signals, 0)
     q, qd, cap, rod = (a.copy() for a in (state.q, state.qd, state.p_cap, state.p_rod))
-    for i in np.flatnonzero(signals.excited):
-        def fitted(kind: str, joint: int = int(i)) -> Array:
+    for i in map(int, np.flatnonzero(signals.excited)):
+
+        def fitted(kind: str, joint: int = i) -> Array:
             samples = channels[ch.channel(kind, joint + 1)][:count]
-            return np.polynomial.polynomial.polyfit(t, samples, START_DEGREE)
+            return np.asarray(np.polynomial.polynomial.polyfit(t, samples, START_DEGREE))
 
         s = fitted(ch.PISTON)
         linkage = rig.joints[i].linkage

@@ -76,13 +76,15 @@ def kernel(function: Callable[..., None]) -> Kernel:
 
 @dataclass(frozen=True)
 class Coefficient:
-    """A linear unknown of the rows and the parameter that it stands for.
+    """A linear unknown of one family's rows and the parameter that it stands for.
 
-    With `reciprocal` the rows' coefficient is 1/parameter (1/b in the rows, b for people).
+    `family` is `mechanical` (torque rows) or `fluid` (chamber-flow rows). With `reciprocal` the
+    rows' coefficient is 1/parameter (1/b in the rows, b for people).
     """
 
     parameter: str
     unit: str
+    family: str
     reciprocal: bool = False
 
 

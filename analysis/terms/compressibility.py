@@ -37,7 +37,7 @@ class Compressibility(Term):
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return b [Pa], the rows' coefficient being 1/b."""
-        return (Coefficient("b", parameter_unit("b"), reciprocal=True),)
+        return (Coefficient("b", parameter_unit("b"), "fluid", reciprocal=True),)
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return - V dp/dt of each chamber, V being that of the moving piston."""

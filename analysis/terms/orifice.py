@@ -53,7 +53,7 @@ class Orifice(Term):
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return C_pp C_pm C_mp C_mm of each joint."""
         names = (name for i in range(1, len(rig.joints) + 1) for name in gain_names(i))
-        return tuple(Coefficient(name, parameter_unit(name)) for name in names)
+        return tuple(Coefficient(name, parameter_unit(name), "fluid") for name in names)
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return the four roots times the opening, in the chamber that each edge serves."""

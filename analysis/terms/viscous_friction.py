@@ -36,7 +36,7 @@ class ViscousFriction(Term):
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return Fv_1 .. Fv_N [N m s/rad]."""
         names = (f"Fv{i}" for i in range(1, len(rig.joints) + 1))
-        return tuple(Coefficient(name, parameter_unit(name)) for name in names)
+        return tuple(Coefficient(name, parameter_unit(name), "mechanical") for name in names)
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return q_i' in the rows of joint i."""

@@ -52,7 +52,11 @@ def _lines(node: yaml.Node, path: Path, found: dict[Path, int], source: str) -> 
 
 def load_yaml(text: str, source: str) -> tuple[Any, dict[Path, int]]:
     """Parse YAML safely into (data, line of each path); raises InputError with the line."""
-    loader = _Loader(text)
+    try:
+        loader = _Loader(text)
+    except yaml.YAMLError as error:  # the reader refuses characters before any parsing
+        problem = str(error).splitlines()[0]
+        raise InputError(f"{source}:1: not a YAML text: {problem}") from error
     try:
         node = loader.get_single_node()
         if node is None:

@@ -279,20 +279,19 @@ class Rig(_Part):
     @field_validator("nominal", mode="before")
     @classmethod
     def _nominal_units(cls, value: object, info: ValidationInfo) -> object:
-        if not isinstance(value, dict) or not info.context:
+        if not isinstance(value, dict) or "joints" not in info.data:
             return value
-        return {k: parse_quantity(str(v), parameter_unit(str(k))) for k, v in value.items()}
-
-    @model_validator(mode="after")
-    def _nominal_is_known(self) -> Self:
-        known = parameter_names(len(self.joints))
-        for name in self.nominal:
+        joints = len(info.data["joints"])
+        known = parameter_names(joints)
+        for name in value:
             if name not in known:
                 raise ValueError(
-                    f"nominal {name!r} is no parameter of a rig with {len(self.joints)} joint(s); "
+                    f"{name!r} is no parameter of a rig with {joints} joint(s); "
                     f"expected one of: {' '.join(known)}"
                 )
-        return self
+        if not info.context:
+            return value
+        return {k: parse_quantity(str(v), parameter_unit(k)) for k, v in value.items()}
 
     @property
     def channels(self) -> tuple[str, ...]:

@@ -201,15 +201,11 @@ def simulate(
 
 
 def _sense(name: str, y: Array, t: Array, args: tuple[object, ...]) -> Array:
-    if name == "supply_pressure":
-        return np.full(len(t), SUPPLY)
-    if name == "oil_temperature":
-        return np.full(len(t), 40.0)
+    if name in ("supply_pressure", "oil_temperature"):
+        return np.full(len(t), SUPPLY if name == "supply_pressure" else 40.0)
     kind, joint = name.rsplit("_", 1)[0], int(name[-1]) - 1
-    if kind == "cap_pressure":
-        return y[:, 4 + 2 * joint]
-    if kind == "rod_pressure":
-        return y[:, 5 + 2 * joint]
+    if kind in ("cap_pressure", "rod_pressure"):
+        return y[:, (4 if kind == "cap_pressure" else 5) + 2 * joint]
     piston = np.array([_piston(q, joint)[0] for q in y[:, joint]])
     if kind == "piston":
         return piston
@@ -219,11 +215,33 @@ def _sense(name: str, y: Array, t: Array, args: tuple[object, ...]) -> Array:
     return np.array([_spool(a, joint, b, waves, biases, centring) for a, b in zip(t, piston)])  # noqa: B905
 
 
+def centred(
+    rig: Rig,
+    step: Step,
+    wave: dict[int, Excitation],
+    *,
+    seconds: float = 10.0,
+    truth: dict[str, float] = TRUTH,
+    centring: float = 0.3,
+) -> dict[str, Array]:
+    """Simulate with the bias that brings the mean stroke to the middle."""
+    bias = np.zeros(2)
+    for _ in range(2):
+        clean = simulate(rig, step, wave, bias=tuple(bias), centring=centring, truth=truth)
+        for joint in wave:
+            bias[joint] -= centring * clean[f"piston_{joint + 1}"].mean()
+    return simulate(
+        rig, step, wave, seconds=seconds, bias=tuple(bias), centring=centring, truth=truth
+    )
+
+
 NOISE = {"spool": 0.2e-3, "piston": 10e-6, "cap_pressure": 5e3, "rod_pressure": 5e3,
          "supply_pressure": 5e3, "oil_temperature": 0.05}  # fmt: skip
 
 
-def with_noise(clean: dict[str, Array], rng: np.random.Generator, scale: float = 1.0) -> dict[str, Array]:  # noqa: E501
+def with_noise(
+    clean: dict[str, Array], rng: np.random.Generator, scale: float = 1.0
+) -> dict[str, Array]:
     """Add each sensor's white noise."""
     return {
         name: value + scale * NOISE[name.rstrip("_12")] * rng.standard_normal(len(value))
@@ -247,16 +265,20 @@ def experiment(
     records = []
     for step in steps:
         wave = excitations[step.name]
-        clean = simulate(rig, step, wave, seconds=seconds, truth=truth)
+        clean = centred(rig, step, wave, seconds=seconds, truth=truth)
         first = next(iter(wave.values()))
         for repeat in range(1, repeats + 1):
             records.append(
                 Record(
-                    name=f"{step.name}_r{repeat}", step=step.name, locked=step.locked,
-                    repeat=repeat, sample_rate=rig.sample_rate,
+                    name=f"{step.name}_r{repeat}",
+                    step=step.name,
+                    locked=step.locked,
+                    repeat=repeat,
+                    sample_rate=rig.sample_rate,
                     channels=with_noise(clean, rng, scale),
-                    period=round(first.period * rig.sample_rate), lines=first.lines,
-                )  # fmt: skip
+                    period=round(first.period * rig.sample_rate),
+                    lines=first.lines,
+                )
             )
     return Run(rig, tuple(records), source=f"small bench, seed {seed}")
 

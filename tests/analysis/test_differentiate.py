@@ -1,0 +1,115 @@
+"""A filter that the balances can trust: nothing shifted, derivatives those of the value."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from analysis import differentiate as d
+from analysis.differentiate_study import markdown, table
+from rig.model.parse import InputError
+from rig.model.rig import Rig
+
+RATE = 1000.0
+FIR = [
+    d.moving_average(RATE),
+    d.butterworth(RATE, 80.0),
+    d.savitzky_golay(RATE),
+    d.channel_filter(RATE),
+    d.row_filter(RATE, 15.0),
+]
+
+
+@pytest.mark.parametrize("smoother", FIR, ids=lambda s: s.name)
+@pytest.mark.parametrize("hertz", [1.0, 3.0, 9.5])
+def test_value_and_derivatives_of_a_sine_share_one_gain_and_no_phase(
+    smoother: d.Smoother, hertz: float
+) -> None:
+    t = np.arange(4000) / RATE
+    w = 2 * np.pi * hertz
+    x = np.sin(w * t + 0.4)
+    inner = slice(smoother.reach, -smoother.reach)
+    quadrature = np.cos(w * t + 0.4)
+    gains = []
+    for order, wanted in enumerate((x, w * quadrature, -w * w * x)):
+        found = smoother.apply(x, order)[inner]
+        gain = found @ wanted[inner] / (wanted[inner] @ wanted[inner])
+        # Nothing is left beside the wanted signal, so the phase is zero.
+        assert np.abs(found - gain * wanted[inner]).max() < 2e-3 * w**order
+        gains.append(gain)
+    # The paper's average takes 6 % at 9.5 Hz: from all alike, which is what counts.
+    assert gains == pytest.approx([gains[0]] * 3, rel=2e-3)
+
+
+@pytest.mark.parametrize("smoother", [d.channel_filter(RATE), d.row_filter(RATE, 15.0)])
+def test_the_default_filters_change_nothing_in_their_band(smoother: d.FirSmoother) -> None:
+    t = np.arange(3000) / RATE
+    x = 3.0 + np.sin(2 * np.pi * 9.5 * t)
+    inner = slice(smoother.reach, -smoother.reach)
+    assert np.abs(smoother.apply(x) - x)[inner].max() < 2e-4
+
+
+def test_polynomials_are_differentiated_exactly() -> None:
+    t = np.arange(600) / RATE
+    x = 1.0 - 2.0 * t + 3.0 * t**2
+    for smoother in FIR[2:]:
+        inner = slice(smoother.reach, -smoother.reach)
+        assert smoother.apply(x, 1)[inner] == pytest.approx((-2 + 6 * t)[inner], abs=2e-6)
+        assert smoother.apply(x, 2)[inner] == pytest.approx(np.full(600, 6.0)[inner], abs=2e-3)
+
+
+def test_fourier_is_exact_on_whole_periods_that_drift() -> None:
+    t = np.arange(2000) / RATE
+    x = np.cos(2 * np.pi * 4 * t) + 0.3 * t
+    wanted = -8 * np.pi * np.sin(2 * np.pi * 4 * t) + 0.3
+    smoother = d.FourierSmoother(RATE, 40.0)
+    inner = slice(smoother.reach, -smoother.reach)
+    assert np.abs(smoother.apply(x, 1) - wanted)[inner].max() < 0.01
+
+
+def test_decimation_picks_samples_of_the_filtered_rows() -> None:
+    x = np.random.default_rng(0).standard_normal((1001, 3))
+    low = d.row_filter(RATE, 20.0)
+    step = d.row_step(RATE, 20.0)
+    kept = low.decimate(x, step)
+    full = low.apply(x)
+    first = -(-2 * low.reach // step) * step - low.reach
+    assert kept == pytest.approx(full[first::step][: len(kept)])
+    assert first >= low.reach
+    assert first + (len(kept) - 1) * step + low.reach < len(x)
+    # Honest decimation: what the filter lets through lies below the new Nyquist frequency.
+    response = np.abs(np.fft.rfft(low.taps[0], 8192))
+    beyond = np.fft.rfftfreq(8192, 1 / RATE) > 0.5 * RATE / step
+    assert response[beyond].max() < 1e-3
+
+
+@pytest.mark.parametrize("shift", [0.37, -0.07, -3.4, 5.0])
+def test_alignment_moves_a_signal_by_fractions_of_a_sample(shift: float) -> None:
+    n = np.arange(3000)
+    x = np.sin(2 * np.pi * 0.02 * n + 0.1)
+    wanted = np.sin(2 * np.pi * 0.02 * (n + shift) + 0.1)
+    assert np.abs(d.align(x, shift) - wanted)[60:-60].max() < 1e-4
+
+
+def test_a_record_shorter_than_the_filter_is_refused() -> None:
+    with pytest.raises(InputError, match="too short for the filter"):
+        d.channel_filter(RATE).apply(np.zeros(40))
+
+
+def test_a_filter_beyond_nyquist_is_refused() -> None:
+    with pytest.raises(InputError, match="sample rate above 240 Hz"):
+        d.windowed_sinc(200.0, 80.0, 40.0)
+
+
+def test_the_study_shows_why_the_default_is_the_default(rig: Rig) -> None:
+    entries = table(rig, np.random.default_rng(3), repeats=2)
+    by = {(e.excitation.split()[0], e.filtering.split(";")[0]): e for e in entries}
+    for excitation in ("sine", "multisine"):
+        default = by[excitation, "default (windowed sinc, 80 Hz"]
+        paper = by[excitation, "moving average, 20 samples"]
+        assert max(default.bias.values()) < 0.5
+        assert default.bias["inertia"] < 0.1 * max(
+            e.bias["inertia"] for e in entries if e.excitation.startswith(excitation)
+        )
+        assert paper.bias["inertia"] >= default.bias["inertia"] or "rows" in paper.filtering
+    assert markdown(entries).count("\n") == len(entries) + 1

@@ -1,0 +1,92 @@
+"""A person describes a bench in YAML; what cannot be built is refused with line and reason."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import rig
+from rig.model.parse import InputError, parse_model
+from rig.model.rig import Rig
+
+SHIPPED = Path(rig.__file__).parent / "shipped" / "shinshu-2dof.yaml"
+TEXT = SHIPPED.read_text()
+
+
+def line_of(fragment: str, text: str = TEXT) -> int:
+    return text[: text.index(fragment)].count("\n") + 1
+
+
+def refused(old: str, new: str) -> str:
+    text = TEXT.replace(old, new, 1)
+    assert text != TEXT
+    with pytest.raises(InputError) as caught:
+        parse_model(Rig, text, "bench.yaml")
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
+
+
+def test_the_shipped_bench_is_the_one_of_the_notes() -> None:
+    bench = parse_model(Rig, TEXT, "shinshu")
+    assert bench.supply.pressure == pytest.approx(7e6)
+    assert bench.supply.flow == pytest.approx(11.7e-3 / 60)
+    boom, arm = bench.joints
+    assert boom.cylinder.stroke == pytest.approx(0.075)
+    assert (boom.cylinder.cap_area, boom.cylinder.rod_area) == pytest.approx((7e-4, 5.4e-4))
+    assert (boom.cylinder.cap_pipe_volume, arm.cylinder.cap_pipe_volume) == pytest.approx(
+        (7.9e-5, 6.3e-5)
+    )
+    assert arm.linkage.offset == pytest.approx(-np.pi)
+    assert bench.channels[:4] == ("spool_1", "piston_1", "cap_pressure_1", "rod_pressure_1")
+    assert bench.recorded[-2:] == ("command_1", "command_2")
+
+
+def test_a_bench_survives_being_stored_with_a_run() -> None:
+    bench = parse_model(Rig, TEXT, "shinshu")
+    assert Rig.model_validate_json(bench.model_dump_json()) == bench
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "fragment", "expected"),
+    [
+        ("stroke: 75 mm", "stroke: 75 kg", "stroke: 75", "expected one like 'm'"),
+        ("stroke: 75 mm", "stroke: 75", "stroke: 75", "write one beside the number"),
+        ("pressure: 7 MPa", "pressure: seven", "supply:", "expected one like '1 Pa'"),
+        ("flow: 11.7 L/min", "flow: 11.7 L/fortnite", "supply:", "unknown unit"),
+        ("gravity:", "gravitas:", "gravity:", "unknown key"),
+        ("rod_area: 5.4e-4", "rod_area: 9.4e-4", "cylinder: &cylinder", "exceeds cap_area"),
+        ("mid_length: 0.30 m", "mid_length: 0.20 m", "- name: boom", "close a triangle"),
+        ("  M1: 5.00", "  M7: 5.00", "nominal:", "M7"),
+        ("name: boom", "name: [boom", "    link_length: 0.5 m", "not valid YAML"),
+        ("bits: 16", "bits: 64", "spool: {range", "less than or equal to 16"),
+    ],
+)
+def test_a_bench_that_cannot_be_built_is_refused_with_its_line(
+    old: str, new: str, fragment: str, expected: str
+) -> None:
+    message = refused(old, new)
+    assert expected in message
+    line = int(message.split(":")[1])
+    assert abs(line - line_of(fragment)) <= 1, message
+
+
+def test_a_key_written_twice_is_refused() -> None:
+    assert "second time" in refused("gravity: 9.8 m/s^2", "gravity: 9.8 m/s^2\ngravity: 1 m/s^2")
+
+
+@given(st.text(max_size=200))
+def test_any_text_at_all_is_read_or_refused_in_one_line(text: str) -> None:
+    with pytest.raises(InputError) as caught:
+        parse_model(Rig, text, "x.yaml")
+    assert str(caught.value).startswith("x.yaml:")
+
+
+@pytest.mark.parametrize("bad", ["- 1\n- 2\n", "just words", "joints: &a [*a]", "? [a]\n: 1", "{}"])
+def test_yaml_that_is_no_bench_is_refused(bad: str) -> None:
+    with pytest.raises(InputError):
+        parse_model(Rig, bad, "x.yaml")
