@@ -1,0 +1,227 @@
+"""The report: one self-contained HTML page that says what was done and how well, with figures.
+
+Every number is computed from the arguments. The page refers to nothing outside itself, needs no
+script, and the same arguments give the same bytes.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, FunctionLoader, StrictUndefined
+from markupsafe import Markup
+
+from analysis import paper_tables as paper
+from analysis import report_facts, report_figures, report_rig, report_tables
+from analysis import report_format as fm
+from analysis.identify import Identification, RecordRows, build_rows
+from analysis.model import Model, rig_difference
+from analysis.report_residuals import per_repeat, residuals
+from analysis.validate import RecordValidation
+from rig.model.parse import InputError
+from rig.model.records import Run
+from rig.model.rig import Rig
+
+log = logging.getLogger(__name__)
+
+TEMPLATE = "report.html"
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where the report comes from, as the caller knows it: nothing here is read from the clock.
+
+    `versions` maps a package to its version, `seeds` a purpose to its seed, `commands` are the
+    lines that make the report again, `notes` free lines.
+    """
+
+    date: str = ""
+    commands: tuple[str, ...] = ()
+    versions: Mapping[str, str] = field(default_factory=dict)
+    seeds: Mapping[str, str | int] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class _RunLine:
+    name: str
+    role: str
+    state: str
+    records: int
+
+
+def write_report(
+    path: Path,
+    *,
+    runs: Sequence[Run],
+    identification: Identification,
+    model: Model | None = None,
+    validation: Sequence[RecordValidation] = (),
+    validation_runs: Sequence[Run] = (),
+    truth: Mapping[str, float] | None = None,
+    title: str = "Identification report",
+    provenance: Provenance | None = None,
+    rows: Sequence[RecordRows] | None = None,
+) -> None:
+    """Write the report as one HTML file, replacing an old one only when the new one is complete.
+
+    See `render_report` for the arguments; raises InputError where the file cannot be written.
+    """
+    page = render_report(
+        runs=runs, identification=identification, model=model, validation=validation,
+        validation_runs=validation_runs, truth=truth, title=title, provenance=provenance, rows=rows,
+    )  # fmt: skip
+    part = path.with_name(path.name + ".part")
+    try:
+        part.write_text(page, encoding="utf-8")
+        part.replace(path)
+    except OSError as error:
+        raise InputError(f"cannot write the report {path}: {error.strerror or error}") from error
+    log.info("wrote %s, %d kB", path, len(page) // 1000)
+
+
+def render_report(
+    *,
+    runs: Sequence[Run],
+    identification: Identification,
+    model: Model | None = None,
+    validation: Sequence[RecordValidation] = (),
+    validation_runs: Sequence[Run] = (),
+    truth: Mapping[str, float] | None = None,
+    title: str = "Identification report",
+    provenance: Provenance | None = None,
+    rows: Sequence[RecordRows] | None = None,
+) -> str:
+    """Return the report as HTML text.
+
+    `runs` are those behind `identification`, `model` the one that was validated (default: the
+    identified one), `truth` the parameters of a simulated bench (SI, by name), `rows` the
+    regression rows where they were not built by the default filtering. Raises InputError for
+    records that cannot be used or a model of another rig.
+    """
+    model = model or identification.model
+    rig = identification.model.rig
+    difference = rig_difference(model.rig, rig)
+    if difference:
+        raise InputError(f"the model and the identification are of different rigs: {difference}")
+    if rows is None:
+        rows = build_rows(rig, runs, identification.model.terms)
+    context = {
+        "title": title,
+        "style": Markup(_read("report.css")),  # noqa: S704
+        "rig": rig,
+        "simulated": bool(truth),
+        "provenance": provenance or Provenance(),
+        "run_lines": _run_lines(runs, validation_runs),
+        **_headline(rig, runs, identification, validation, validation_runs, truth),
+        **_regression(identification, rows),
+        **_bench(rig, runs, identification, truth),
+        **_validated(rig, validation, validation_runs),
+    }
+    return _environment().get_template(TEMPLATE).render(context)
+
+
+def _read(name: str) -> str:
+    return (resources.files("analysis") / "templates" / name).read_text(encoding="utf-8")
+
+
+def _environment() -> Environment:
+    return Environment(
+        loader=FunctionLoader(_read), autoescape=True, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+
+
+def _headline(
+    rig: Rig,
+    runs: Sequence[Run],
+    identification: Identification,
+    validation: Sequence[RecordValidation],
+    validation_runs: Sequence[Run],
+    truth: Mapping[str, float] | None,
+) -> dict[str, Any]:
+    table4 = report_tables.table_iv(rig.name, validation)
+    return {
+        "sentences": report_facts.sentences(
+            rig, runs, identification, validation, validation_runs, simulated=bool(truth)
+        ),
+        "tiles": report_facts.tiles(identification, validation, truth, table4),
+        "checks": report_facts.check_lines(identification.checks),
+        "table4": table4,
+        "table4_search": {
+            name: tuple(fm.fit(v) for v in values)
+            for name, values in paper.TABLE_IV_SEARCH.items()
+        },
+    }
+
+
+def _regression(
+    identification: Identification, rows: Sequence[RecordRows]
+) -> dict[str, Any]:
+    left = residuals(identification, rows)
+    scatter = per_repeat(identification, rows)
+    rig = identification.model.rig
+    return {
+        "solutions": [
+            {
+                "family": family,
+                "condition": fm.significant(solution.condition_number),
+                "rows": f"{solution.rows}",
+                "parameters": len(solution.names),
+            }
+            for family, solution in identification.solutions.items()
+        ],
+        "method": identification.method,
+        "masked_rows": identification.masked_rows,
+        "solve": fm.significant(1e3 * identification.solve_seconds),
+        "paper": paper if rig.name == paper.RIG else None,
+        "residual_rows": report_figures.residual_rows(left),
+        "residual_figures": report_figures.residuals(left),
+        "largest_share": report_figures.largest_share(left),
+        "single": any(one.repeats < 2 for one in left),
+        "table3": report_tables.table_iii(rig.name, identification, scatter),
+        "repeats": max((s.repeats for s in scatter.values()), default=0),
+    }
+
+
+def _bench(
+    rig: Rig,
+    runs: Sequence[Run],
+    identification: Identification,
+    truth: Mapping[str, float] | None,
+) -> dict[str, Any]:
+    return {
+        "parameters": report_facts.parameter_rows(rig, identification, truth),
+        "parameter_figures": report_figures.parameters(rig, identification, truth),
+        "has_paper": rig.name == paper.RIG,
+        "arm": report_figures.arm(rig),
+        "bench": report_rig.bench_constants(rig),
+        "joints": report_rig.joint_constants(rig),
+        "steps": report_rig.step_rows(rig, runs),
+        "several_runs": len(runs) > 1,
+        "excitation_figures": report_figures.excitations(rig, runs),
+    }
+
+
+def _validated(
+    rig: Rig, validation: Sequence[RecordValidation], validation_runs: Sequence[Run]
+) -> dict[str, Any]:
+    return {
+        "fit_rows": report_tables.fit_rows(validation),
+        "fit_figures": report_figures.comparisons(rig, validation, validation_runs),
+        "validation_steps": report_rig.step_rows(rig, validation_runs),
+    }
+
+
+def _run_lines(runs: Sequence[Run], validation_runs: Sequence[Run]) -> list[_RunLine]:
+    """Name the run folders without where they lie: a report may leave the house."""
+    return [
+        _RunLine(fm.folder_name(run.source) or f"run {n}", role, run.state, len(run.records))
+        for role, group in (("identification", runs), ("validation", validation_runs))
+        for n, run in enumerate(group, start=1)
+    ]

@@ -1,0 +1,145 @@
+"""Numbers and names for people: significant digits that fit the interval, display units, meanings.
+
+A value is written to the decimal that its 95 % interval allows, never to fewer than three
+significant digits; what does not exist is a dash, what is unbounded is infinity.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from pathlib import PurePosixPath
+
+from rig.model.parameters import GAIN_SIGNS
+
+DASH = "—"
+MINUS = "−"
+_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+MAX_DIGITS = 6  # no measurement here is worth more
+
+
+@dataclass(frozen=True)
+class DisplayUnit:
+    """How an SI quantity is shown: shown number = scale * SI number, then `text`."""
+
+    scale: float
+    text: str
+
+
+_UNITS = {
+    "Pa": DisplayUnit(1e-6, "MPa"),
+    "m^3/(s*V*Pa^0.5)": DisplayUnit(1e7, "10⁻⁷ m³/(s·V·√Pa)"),
+    "kg*m^2": DisplayUnit(1.0, "kg·m²"),
+    "kg*m": DisplayUnit(1.0, "kg·m"),
+    "N*m*s/rad": DisplayUnit(1.0, "N·m·s/rad"),
+    "N*m": DisplayUnit(1.0, "N·m"),
+    "m^3/s": DisplayUnit(1e6, "mL/s"),
+    "m": DisplayUnit(1e3, "mm"),
+    "V": DisplayUnit(1.0, "V"),
+}
+
+
+def display_unit(si: str) -> DisplayUnit:
+    """Return the display unit of an SI unit as pint writes it; an unknown one is shown as it is."""
+    return _UNITS.get(si) or DisplayUnit(1.0, si.replace("*", "·"))
+
+
+def _tidy(text: str) -> str:
+    """Set a typographic minus, and none before a zero."""
+    if text.startswith("-") and not any(c in "123456789" for c in text):
+        text = text[1:]
+    return text.replace("-", MINUS)
+
+
+def significant(value: float | None, digits: int = 3) -> str:
+    """Write a number with `digits` significant digits, in powers of ten when very large or small."""
+    if value is None or math.isnan(value):
+        return DASH
+    if math.isinf(value):
+        return "∞" if value > 0 else f"{MINUS}∞"
+    if value == 0:
+        return "0"
+    exponent = int(f"{value:.{digits - 1}e}".partition("e")[2])
+    if not -4 <= exponent < 6:
+        mantissa = f"{value:.{digits - 1}e}".partition("e")[0]
+        return f"{_tidy(mantissa)}×10{str(exponent).translate(_SUPERSCRIPT)}"
+    return _tidy(f"{round(value, digits - 1 - exponent):.{max(digits - 1 - exponent, 0)}f}")
+
+
+def percent(value: float | None, digits: int = 2, *, signed: bool = False) -> str:
+    """Write a percentage without its sign of percent; with `signed` a plus is written out."""
+    text = significant(value, digits)
+    return f"+{text}" if signed and value is not None and value > 0 and text != DASH else text
+
+
+def column_percent(value: float | None, *, signed: bool = False) -> str:
+    """Write a percentage for a column: three decimals below one, two below a hundred."""
+    if value is None or not math.isfinite(value) or abs(value) >= 100:
+        return percent(value, 3, signed=signed)
+    text = fixed(value, 3 if abs(value) < 1 else 2)
+    return f"+{text}" if signed and value > 0 and text.strip("0.") else text
+
+
+def fit(value: float | None) -> str:
+    """Write a FIT ratio as the paper does, one decimal; huge negative ones in powers of ten."""
+    if value is None or not math.isfinite(value):
+        return DASH
+    return significant(value, 2) if abs(value) >= 9999.5 else _tidy(f"{value:.1f}")
+
+
+def decimals(value: float, half_width: float) -> int:
+    """Return the decimals that a value with this half interval deserves (3 to 6 digits in all)."""
+    if value == 0 or not math.isfinite(value):
+        return 2
+    leading = math.floor(math.log10(abs(value)))
+    least, most = 2 - leading, MAX_DIGITS - 1 - leading
+    if not math.isfinite(half_width) or half_width <= 0:
+        return max(least, 0)
+    place = math.floor(math.log10(half_width))
+    # Two digits of an interval that begins with 1 or 2, where rounding to one would be coarse.
+    wanted = -place + (1 if half_width / 10.0**place < 3 else 0)
+    return max(min(max(wanted, least), most), 0)
+
+
+def fixed(value: float | None, places: int) -> str:
+    """Write a number with so many decimals; dash and infinity as `significant`."""
+    if value is None or not math.isfinite(value):
+        return significant(value)
+    return _tidy(f"{value:.{places}f}")
+
+
+def count(number: int, noun: str, plural: str = "") -> str:
+    """Write ``1 record`` or ``30 records``."""
+    return f"{number:,} {noun if number == 1 else plural or noun + 's'}".replace(",", " ")
+
+
+def folder_name(source: str) -> str:
+    """Return the last part of a path of either kind: a report shows no directories."""
+    name = PurePosixPath(source.replace("\\", "/")).name
+    return name or source
+
+
+_GAIN = re.compile(rf"^C_({'|'.join(GAIN_SIGNS)})_(\d+)$")
+_SIDE = {"p": "cap side", "m": "rod side"}
+_SPOOL = {"p": "spool +", "m": f"spool {MINUS}"}
+
+
+def meaning(name: str, joints: int) -> str:
+    """Say in a few words what a parameter is; '' for one that is not of the baseline."""
+    if name == "b":
+        return "bulk modulus of the oil, all joints"
+    if gain := _GAIN.match(name):
+        chamber, spool = gain[1]
+        return f"flow gain, joint {gain[2]}, {_SIDE[chamber]}, {_SPOOL[spool]}"
+    if match := re.match(r"^Fv(\d)$", name):
+        return f"viscous friction, joint {match[1]}"
+    if match := re.match(r"^W(\d)$", name):
+        return f"gravity, link {match[1]} and what it carries"
+    if joints <= 2 and (match := re.match(r"^M(\d)$", name)):
+        return f"inertia about joint {match[1]}"
+    if match := re.match(r"^R(\d)(\d)$", name):
+        if match[1] == match[2]:
+            return f"inertia of link {match[1]}"
+        return f"inertia coupling, links {match[1]} and {match[2]}"
+    return ""
