@@ -63,14 +63,13 @@ def tell(out: Path, seed: int, repeats: int | None) -> None:
     from rig.cli.reporting import write_experiment
 
     started = time.monotonic()
-    now = datetime.now().astimezone()
-    folder = out / now.strftime("%Y-%m-%dT%H-%M-%S")
+    folder = out / datetime.now().strftime("%Y-%m-%dT%H-%M-%S")
     done = experiment(folder, seed, Overrides(repeats=repeats), progress)
     write_json(folder / "identify.json", identification_json(done.identification))
     write_json(folder / "validate.json", validation_json(done.validation))
     save_model(done.identification.model, folder / "model.json")
     command = f"bramah demo --out {shlex.quote(str(out))} --seed {seed}"
-    write_experiment(folder / "report.html", done, command, now)
+    write_experiment(folder / "report.html", done, command, seed)
     shutil.copyfile(folder / "report.html", out / "report.html")
     print(identification_text(done.identification, done.truth))
     print()

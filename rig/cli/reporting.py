@@ -1,0 +1,46 @@
+"""Reports with what only the command line knows: the date, the command, the versions."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Sequence
+from datetime import datetime
+from pathlib import Path
+
+from analysis.identify import Identification
+from analysis.report import Provenance, write_report
+from rig.cli.story import Experiment
+from rig.model.records import Run
+from rig.services.versions import versions
+
+
+def _provenance(commands: tuple[str, ...], seeds: dict[str, str | int]) -> Provenance:
+    date = datetime.now().astimezone().strftime("%Y-%m-%d %H:%M")
+    return Provenance(date=date, commands=commands, versions=versions(), seeds=seeds)
+
+
+def write_experiment(path: Path, done: Experiment, command: str, seed: int) -> None:
+    """Write the report of a whole loop on a simulated bench."""
+    write_report(
+        path,
+        runs=done.runs,
+        identification=done.identification,
+        validation=done.validation,
+        validation_runs=done.judged,
+        truth=done.truth,
+        title="A simulated bench, identified and validated",
+        provenance=_provenance((command,), {"simulated bench": seed}),
+    )
+
+
+def write_identification(path: Path, runs: Sequence[Run], result: Identification) -> None:
+    """Write the report of an identification alone."""
+    line = shlex.join(["bramah", *sys.argv[1:]])
+    write_report(
+        path,
+        runs=runs,
+        identification=result,
+        title=f"Identification of {result.model.rig.name}",
+        provenance=_provenance((line,), {}),
+    )
