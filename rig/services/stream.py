@@ -1,0 +1,67 @@
+"""Runs read piece by piece: heads first, then one record, or a part of one, at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+
+from rig.model.records import Record, RecordHead
+from rig.model.rig import Rig
+from rig.services import archive, store
+
+
+@dataclass(frozen=True)
+class RunHead:
+    """A run without samples: rig, the heads of its records, where it is and how it ended."""
+
+    rig: Rig
+    records: tuple[RecordHead, ...]
+    source: str
+    state: str
+
+
+class RecordReader:
+    """One record of an open archive, whose samples are read when asked for."""
+
+    def __init__(self, group: h5py.Group, head: RecordHead) -> None:
+        self.head = head
+        self._group = group
+
+    def read(self, first: int = 0, last: int | None = None) -> Record:
+        """Return the samples [first, last) as a record of their own."""
+        return archive.samples_of(self._group, self.head, first, last)
+
+
+def read_run_head(path: str | Path, *, partial: bool = False) -> RunHead:
+    """Read a run's heads; raises InputError as `store.load_run` does."""
+    folder = Path(path)
+    header, state = store.finished(folder)
+    file_path = folder / store.ARCHIVE
+    with archive.opened(file_path) as file:
+        heads = archive.read_heads(file, file_path)
+    chosen = store.chosen_of(folder, state, heads, partial)
+    return RunHead(header.rig, chosen, str(folder), state)
+
+
+@contextmanager
+def open_record(path: str | Path, name: str) -> Iterator[RecordReader]:
+    """Open one record of a run for reading in parts; raises InputError."""
+    file_path = Path(path) / store.ARCHIVE
+    with archive.opened(file_path) as file:
+        group = file[name]
+        yield RecordReader(group, archive.head_of(name, group, file_path))
+
+
+def iterate_records(path: str | Path, *, partial: bool = False) -> Iterator[Record]:
+    """Yield a run's records in the order they were taken, one in memory at a time.
+
+    Raises InputError as `store.load_run` does.
+    """
+    for head in read_run_head(path, partial=partial).records:
+        with open_record(path, head.name) as reader:
+            record = reader.read()
+        yield record
