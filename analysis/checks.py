@@ -21,6 +21,7 @@ from rig.model.parameters import gain_names, inertia_names
 from rig.model.parse import InputError
 from rig.model.records import Record, RecordHead, Run
 from rig.model.rig import Rig
+from rig.services.stream import RunHead
 
 Array = NDArray[np.float64]
 
@@ -43,7 +44,7 @@ class Check:
     detail: str
 
 
-def common_rig(runs: Sequence[Run]) -> Rig:
+def common_rig(runs: Sequence[Run] | Sequence[RunHead]) -> Rig:
     """Return the rig all runs share; raises InputError where they differ or hold no record."""
     if not runs or not any(run.records for run in runs):
         raise InputError("no records to work on: the run holds none (was it aborted at once?)")

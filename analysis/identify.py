@@ -13,8 +13,19 @@ from numpy.typing import NDArray
 
 from analysis import checks as ck
 from analysis.checks import Check
+from analysis.compute import Pool, Serial
 from analysis.model import Estimate, Model, estimate_json, finite
-from analysis.noise import noise_moments
+from analysis.reduce import (
+    SEGMENTS,
+    Reduction,
+    Task,
+    first_of_steps,
+    path_of,
+    reduce_runs,
+    reduce_task,
+    solve_reductions,
+)
+from analysis.reduce import repeats_of as reduced_repeats
 from analysis.rows import Filtering, Rows, default_filtering, parameters_of, record_rows
 from analysis.signals import condition
 from analysis.solve import Cluster, Solution, half_width, solve, triangle
@@ -23,13 +34,13 @@ from analysis.terms.base import FAMILIES, Coefficient, Used, family_of
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
+from rig.services.stream import read_run_head
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
 METHODS = ("coupled",)
 LATER_METHODS = ("sequential", "simultaneous", "pso", "ga")
-SEGMENTS = 10  # of the only repeat of a step, where there are not more repeats
 
 
 @dataclass(frozen=True)
@@ -73,25 +84,63 @@ def identify(
     _refuse_method(method)
     rig = ck.common_rig(runs)
     used = tuple(terms) if terms is not None else tuple(Used(term) for term in baseline())
-    per_record = build_rows(rig, runs, used, filtering)
-    # A stream of its own: the prediction of bias is the same every time.
-    noise = noise_moments(rig, runs, used, filtering, np.random.default_rng(0))
+    reductions = reduce_runs(rig, runs, used, filtering)
+    return conclude(rig, [run.source for run in runs], used, reductions, method, reject_noise)
+
+
+def identify_folders(
+    folders: Sequence[str],
+    method: str = "coupled",
+    terms: Sequence[Used] | None = None,
+    filtering: Callable[[Record], Filtering] = default_filtering,
+    reject_noise: bool = True,
+    pool: Pool | None = None,
+) -> Identification:
+    """Identify from run folders, of which one record at a time is in memory; see `identify`.
+
+    With a `pool` each record is reduced in one of its processes, where the folders are read; only
+    triangles come back. Raises InputError as `identify` and `load_run` do.
+    """
+    _refuse_method(method)
+    workers = pool or Serial()
+    used = tuple(terms) if terms is not None else tuple(Used(term) for term in baseline())
+    heads = list(workers.map(read_run_head, folders, reads=str))
+    rig = ck.common_rig(heads)
+    tasks = [
+        Task(rig, number, folder, record.name, used, filtering, record.name in first)
+        for number, (folder, head) in enumerate(zip(folders, heads, strict=True))
+        for first in (first_of_steps(head.records),)
+        for record in head.records
+    ]
+    reductions = list(workers.map(reduce_task, tasks, reads=path_of))
+    return conclude(rig, [h.source for h in heads], used, reductions, method, reject_noise)
+
+
+def conclude(
+    rig: Rig,
+    sources: Sequence[str],
+    used: tuple[Used, ...],
+    reductions: Sequence[Reduction],
+    method: str,
+    reject_noise: bool,
+) -> Identification:
+    """Solve the reductions of all records of the runs `sources`, and judge what comes out."""
     started = time.perf_counter()
-    solutions = solve_rows(rig, used, per_record, noise, reject_noise)
+    solutions = solve_reductions(rig, used, reductions, reject_noise)
     seconds = time.perf_counter() - started
     estimates, covariance = _estimates(rig, used, solutions)
     rows = {family: solution.rows for family, solution in solutions.items()}
-    masked = sum(r.masked for one in per_record for r in one.rows.values())
-    statements = _statements(rig, runs, per_record, solutions, estimates, rows, masked)
+    masked = sum(one.masked for one in reductions)
+    statements = _statements(rig, reductions, solutions, estimates, rows, masked)
     provenance = {
         "method": method,
-        "runs": [run.source for run in runs],
-        "records": [one.record for one in per_record],
+        "runs": list(sources),
+        "records": [one.head.name for one in reductions],
         "rows": rows,
         "checks_failed": [c.name for c in statements if not c.ok],
     }
     model = Model(rig, used, estimates, covariance, provenance)
-    log.info("identified %d parameters from %d records", len(estimates), len(per_record))
+    log.info("identified %d parameters from %d records", len(estimates), len(reductions))
     return Identification(method, estimates, solutions, rows, masked, seconds, statements, model)
 
 
@@ -215,18 +264,17 @@ def _estimate(
 
 def _statements(
     rig: Rig,
-    runs: Sequence[Run],
-    per_record: Sequence[RecordRows],
+    reductions: Sequence[Reduction],
     solutions: Mapping[str, Solution],
     estimates: Mapping[str, Estimate],
     rows: Mapping[str, int],
     masked: int,
 ) -> tuple[Check, ...]:
-    records = [record for run in runs for record in run.records]
     return (
-        ck.repeats(repeats_of(per_record)),
-        ck.joints_excited(rig, records),
-        *ck.clipping(rig, runs),
+        ck.repeats(reduced_repeats(reductions)),
+        ck.joints_excited(rig, [one.head for one in reductions]),
+        *ck.clipping(rig, [(one.head, one.clipped) for one in reductions]),
+        ck.lost_samples([(one.head, one.lost) for one in reductions]),
         ck.masked(sum(rows.values()), masked),
         *ck.identifiability(solutions),
         ck.noise_bias(solutions),

@@ -51,7 +51,7 @@ def noise_moments(
         for record in run.records:
             if record.step not in seen:
                 seen.add(record.step)
-                for family, moment in _moments(rig, record, terms, filtering, rng).items():
+                for family, moment in record_moments(rig, record, terms, filtering, rng).items():
                     total[family] += counts[record.step] * moment
     return total
 
@@ -67,13 +67,14 @@ def disturbed(rig: Rig, record: Record, rng: np.random.Generator) -> Record:
     return replace(record, channels=channels)
 
 
-def _moments(
+def record_moments(
     rig: Rig,
     record: Record,
     terms: Sequence[Used],
     filtering: Callable[[Record], Filtering],
     rng: np.random.Generator,
 ) -> dict[str, Array]:
+    """Return N (k+1, k+1) of [X y] for each family of one record."""
     filters, moving = filtering(record), moving_joints(rig, record)
     before, after = (
         record_rows(rig, terms, condition(rig, r, filters.channels, moving), filters)

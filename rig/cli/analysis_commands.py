@@ -43,25 +43,30 @@ def identify(
     json: JsonOption = None,
     model: Annotated[Path | None, typer.Option(help="Write the model file here.")] = None,
     report: Annotated[Path | None, typer.Option(help="Write an HTML report here.")] = None,
+    cluster: Annotated[
+        str | None,
+        typer.Option(help="tcp://HOST:PORT of a Dask scheduler: the work goes to its workers."),
+    ] = None,
 ) -> None:
     """Identify every parameter from all records of the runs at once.
 
     Example: bramah identify runs/monday --json parameters.json --model model.json
     """
-    from analysis.identify import identify as identify_runs
-    from analysis.identify import to_json
+    from analysis.cluster import Cluster
+    from analysis.compute import Serial
+    from analysis.identify import identify_folders, to_json
     from analysis.model import save_model
     from rig.cli.tables import identification_text
 
-    loaded = _load(runs)
-    result = identify_runs(loaded, method)
+    with Serial() if cluster is None else Cluster(cluster) as pool:
+        result = identify_folders([str(run) for run in runs], method, pool=pool)
     if model is not None:
         save_model(result.model, model)
     write_json(json, to_json(result))
     if report is not None:
         from rig.cli.reporting import write_identification
 
-        write_identification(report, loaded, result)
+        write_identification(report, _load(runs), result)
     if json != Path("-"):
         typer.echo(identification_text(result))
 

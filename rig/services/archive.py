@@ -231,17 +231,24 @@ def samples_of(
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[h5py.File]:
-    """Open an archive for reading; raises InputError if the file is none, or breaks on the way."""
+def readable(path: Path) -> Iterator[None]:
+    """Turn whatever a broken archive makes h5py raise into an InputError that names the file."""
     try:
-        with h5py.File(path, "r") as file:
-            if int(file.attrs.get("format", 0)) != FORMAT:
-                raise InputError(f"{path}: not an archive of this version's format {FORMAT}")
-            yield file
+        yield
     except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path}: not a readable records.h5: {error}") from error
+
+
+def open_archive(path: Path) -> h5py.File:
+    """Open an archive for reading; raises InputError if the file is none."""
+    with readable(path):
+        file = h5py.File(path, "r")
+        if int(file.attrs.get("format", 0)) != FORMAT:
+            file.close()
+            raise InputError(f"{path}: not an archive of this version's format {FORMAT}")
+        return file
 
 
 def _python(value: Any) -> Any:
@@ -258,7 +265,7 @@ def read_heads(file: h5py.File, path: Path) -> list[RecordHead]:
 
 def read_records(path: Path) -> list[Record]:
     """Read every record in the order it was taken; raises InputError if the file is no archive."""
-    with opened(path) as file:
+    with readable(path), open_archive(path) as file:
         return [samples_of(file[head.name], head) for head in read_heads(file, path)]
 
 

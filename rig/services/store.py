@@ -171,9 +171,7 @@ def finished(folder: Path) -> tuple[Header, str]:
     return header, state
 
 
-def chosen_of(
-    folder: Path, state: str, records: Sequence[T], partial: bool
-) -> tuple[T, ...]:
+def chosen_of(folder: Path, state: str, records: Sequence[T], partial: bool) -> tuple[T, ...]:
     """Return the complete records, with `partial` all; raises InputError where there are none."""
     chosen = tuple(r for r in records if partial or r.attributes["complete"])
     if not chosen:

@@ -27,13 +27,15 @@ class RunHead:
 class RecordReader:
     """One record of an open archive, whose samples are read when asked for."""
 
-    def __init__(self, group: h5py.Group, head: RecordHead) -> None:
+    def __init__(self, path: Path, group: h5py.Group, head: RecordHead) -> None:
         self.head = head
+        self._path = path
         self._group = group
 
     def read(self, first: int = 0, last: int | None = None) -> Record:
         """Return the samples [first, last) as a record of their own."""
-        return archive.samples_of(self._group, self.head, first, last)
+        with archive.readable(self._path):
+            return archive.samples_of(self._group, self.head, first, last)
 
 
 def read_run_head(path: str | Path, *, partial: bool = False) -> RunHead:
@@ -41,7 +43,7 @@ def read_run_head(path: str | Path, *, partial: bool = False) -> RunHead:
     folder = Path(path)
     header, state = store.finished(folder)
     file_path = folder / store.ARCHIVE
-    with archive.opened(file_path) as file:
+    with archive.readable(file_path), archive.open_archive(file_path) as file:
         heads = archive.read_heads(file, file_path)
     chosen = store.chosen_of(folder, state, heads, partial)
     return RunHead(header.rig, chosen, str(folder), state)
@@ -51,9 +53,11 @@ def read_run_head(path: str | Path, *, partial: bool = False) -> RunHead:
 def open_record(path: str | Path, name: str) -> Iterator[RecordReader]:
     """Open one record of a run for reading in parts; raises InputError."""
     file_path = Path(path) / store.ARCHIVE
-    with archive.opened(file_path) as file:
-        group = file[name]
-        yield RecordReader(group, archive.head_of(name, group, file_path))
+    with archive.open_archive(file_path) as file:
+        with archive.readable(file_path):
+            group = file[name]
+            head = archive.head_of(name, group, file_path)
+        yield RecordReader(file_path, group, head)
 
 
 def iterate_records(path: str | Path, *, partial: bool = False) -> Iterator[Record]:
