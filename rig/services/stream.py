@@ -1,4 +1,7 @@
-"""Runs read piece by piece: heads first, then one record, or a part of one, at a time."""
+"""Runs read piece by piece: heads first, then one record, or a part of one, at a time.
+
+And written from records at hand, for archives that no bench recorded (studies, tests, figures).
+"""
 
 from __future__ import annotations
 
@@ -9,9 +12,10 @@ from pathlib import Path
 
 import h5py
 
-from rig.model.records import Record, RecordHead
+from rig.model.records import Record, RecordHead, Run
 from rig.model.rig import Rig
 from rig.services import archive, store
+from rig.services.runstate import give_up_ownership
 
 
 @dataclass(frozen=True)
@@ -69,3 +73,20 @@ def iterate_records(path: str | Path, *, partial: bool = False) -> Iterator[Reco
         with open_record(path, head.name) as reader:
             record = reader.read()
         yield record
+
+
+def write_run(folder: str | Path, run: Run) -> Path:
+    """Write a finished run folder of records at hand; raises InputError if it is occupied."""
+    path = store.create_run(Path(folder), run.rig, source=run.source)
+    fresh = path / f"{archive.NAME}.tmp"
+    with archive.create(fresh, run.rig.name) as file:
+        for order, r in enumerate(run.records):
+            about = archive.record_attributes(
+                r.step, r.repeat, r.locked, r.sample_rate, r.start, r.period, r.lines, True
+            )
+            more = {**r.attributes, **about, "stream": order, "start_tick": 0}
+            archive.write_group(file, r.name, r.channels, more)
+    archive.put_in_place(fresh, path / archive.NAME)
+    store.mark_done(path)
+    give_up_ownership(path)
+    return path
