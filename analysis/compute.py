@@ -94,7 +94,7 @@ class Processes:
     def __enter__(self) -> Self:
         context = get_context("spawn")
         self._executor = ProcessPoolExecutor(self.workers, mp_context=context)
-        with _environment(ONE_THREAD):
+        with single_threaded():
             for _ in range(self.workers):  # each starts one process, which keeps this environment
                 self._executor.submit(_nothing)
         return self
@@ -144,10 +144,10 @@ def in_order(submit: Callable[[T], Any], items: Iterable[T], workers: int) -> It
 
 
 @contextmanager
-def _environment(changes: dict[str, str]) -> Iterator[None]:
-    """Change the environment for the processes started inside."""
-    before = {key: os.environ.get(key) for key in changes}
-    os.environ.update(changes)
+def single_threaded() -> Iterator[None]:
+    """Give the processes that are started inside one BLAS thread each."""
+    before = {key: os.environ.get(key) for key in ONE_THREAD}
+    os.environ.update(ONE_THREAD)
     try:
         yield
     finally:

@@ -128,7 +128,7 @@ def conclude(
     started = time.perf_counter()
     solutions = solve_reductions(rig, used, reductions, reject_noise)
     seconds = time.perf_counter() - started
-    estimates, covariance = _estimates(rig, used, solutions)
+    estimates, covariance = estimates_of(rig, used, solutions)
     rows = {family: solution.rows for family, solution in solutions.items()}
     masked = sum(one.masked for one in reductions)
     statements = _statements(rig, reductions, solutions, estimates, rows, masked)
@@ -221,7 +221,7 @@ def _piece(rows: Rows, piece: int, pieces: int) -> tuple[Array, Array]:
     return rows.matrix[inside], rows.rhs[inside]
 
 
-def _estimates(
+def estimates_of(
     rig: Rig, terms: Sequence[Used], solutions: Mapping[str, Solution]
 ) -> tuple[dict[str, Estimate], Array]:
     """Turn the rows' coefficients into parameters (b = 1/coefficient) with intervals."""

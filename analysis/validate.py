@@ -128,7 +128,7 @@ def _arrived(rig: Rig, record: Record) -> Mask:
             f"record {record.name!r}: {longest} samples in a row were lost; a model cannot be "
             f"simulated through more than {1000 * GAP:g} ms without its spool"
         )
-    return ~lost
+    return np.asarray(~lost)
 
 
 def _seen_by(model: Model, rig: Rig, signals: Signals) -> Signals:
