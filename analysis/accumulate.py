@@ -50,8 +50,8 @@ class Accumulator:
         self.rows += len(rhs)
 
     def merge(self, triangle: Array, rows: int) -> None:
-        """Fold another accumulator's triangle in, which stands for `rows` rows."""
-        space = self._stack(self._width)
+        """Fold another accumulator's triangle (or a part of one) in, which stands for `rows`."""
+        space = self._stack(len(triangle))
         space[self._width :] = triangle
         self._reduce(space)
         self.rows += rows

@@ -83,6 +83,12 @@ def run(
     operator: Annotated[
         str | None, typer.Option(help="Written into the run.  [default: you]")
     ] = None,
+    track: Annotated[
+        bool, typer.Option("--track", help="Follow b and the flow gains while it runs.")
+    ] = False,
+    memory: Annotated[
+        float, typer.Option(help="Of --track: forget with this time constant [s].")
+    ] = float("inf"),
 ) -> None:
     """Run a protocol unattended into a run folder; Ctrl-C zeroes the outputs and keeps the data.
 
@@ -90,7 +96,7 @@ def run(
     """
     from rig.cli.running import Job, run_protocol, with_repeats
 
-    job = Job(protocol, rig, out, endpoint, with_repeats(repeats), operator)
+    job = Job(protocol, rig, out, endpoint, with_repeats(repeats), operator, track, memory)
     folder = run_protocol(job, progress)
     typer.echo(str(folder))
 

@@ -47,7 +47,7 @@ class RecordHandle:
         recorder = self._bench.recorder
         if recorder is not None:
             self._number = recorder.begin_record(self.meta, self.start_tick)
-        self._bench.observers.record_begins(self.meta, self.start_tick)
+        self._bench.observers.record_begins(self.meta, self.start_tick, self._ticks)
         return self
 
     def close(self, state: str = "complete") -> None:

@@ -22,8 +22,8 @@ class Observer(Protocol):
     def block(self, block: SampleBlock) -> None:
         """Take a block that was checked and journalled."""
 
-    def record_begins(self, meta: RecordMeta, start: int) -> None:
-        """Hear that a record begins at a tick, which may be past or to come."""
+    def record_begins(self, meta: RecordMeta, start: int, ticks: int | None) -> None:
+        """Hear that a record begins at a tick, past or to come; `ticks` long if that is known."""
 
     def record_ends(self, meta: RecordMeta, start: int, ticks: int, state: str) -> None:
         """Hear which ticks a record holds, now that it is `complete`, `partial`, `discarded`."""
@@ -52,9 +52,9 @@ class Observers:
         if self._all:
             self._tell(lambda one: one.block(block))
 
-    def record_begins(self, meta: RecordMeta, start: int) -> None:
+    def record_begins(self, meta: RecordMeta, start: int, ticks: int | None) -> None:
         """Tell that a record begins."""
-        self._tell(lambda one: one.record_begins(meta, start))
+        self._tell(lambda one: one.record_begins(meta, start, ticks))
 
     def record_ends(self, meta: RecordMeta, start: int, ticks: int, state: str) -> None:
         """Tell that a record has ended."""
