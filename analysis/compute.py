@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -94,7 +94,7 @@ class Processes:
     def __enter__(self) -> Self:
         context = get_context("spawn")
         self._executor = ProcessPoolExecutor(self.workers, mp_context=context)
-        with single_threaded():
+        with environment():
             for _ in range(self.workers):  # each starts one process, which keeps this environment
                 self._executor.submit(_nothing)
         return self
@@ -144,10 +144,10 @@ def in_order(submit: Callable[[T], Any], items: Iterable[T], workers: int) -> It
 
 
 @contextmanager
-def single_threaded() -> Iterator[None]:
-    """Give the processes that are started inside one BLAS thread each."""
-    before = {key: os.environ.get(key) for key in ONE_THREAD}
-    os.environ.update(ONE_THREAD)
+def environment(changes: Mapping[str, str] = ONE_THREAD) -> Iterator[None]:
+    """Change what the processes that are started inside inherit; by default one BLAS thread."""
+    before = {key: os.environ.get(key) for key in changes}
+    os.environ.update(changes)
     try:
         yield
     finally:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from analysis.accumulate import Accumulator
 from analysis.analysis_bench import bench_run
 from analysis.cluster import Cluster
-from analysis.compute import Processes
+from analysis.compute import ONE_THREAD, Processes, environment
 from analysis.identify import identify_folders
 from rig.model.rig import Rig
 from rig.services.stream import write_run
@@ -25,6 +25,12 @@ COLUMNS = 9  # of the two-joint bench's fluid rows
 READ_ROWS = 16_384
 WRITE_ROWS = 100_000
 WARM_SECONDS = 0.3
+# Dask's own setting gives every freed array back to the system: twice the work (docs/scale.md).
+WORKER_ENVIRONMENT = {
+    **ONE_THREAD,
+    "MALLOC_TRIM_THRESHOLD_": "268435456",
+    "MALLOC_MMAP_THRESHOLD_": "33554432",
+}
 
 
 def write_rows(path: Path, rows: int, seed: int = 0) -> None:
@@ -114,6 +120,7 @@ def cluster_figures(
     # No dashboard, nothing but loopback; workers end with the block.
     for workers in (1, 2) * tries:
         with (
+            environment(WORKER_ENVIRONMENT),
             local_cluster(
                 n_workers=workers,
                 threads_per_worker=1,
@@ -137,6 +144,22 @@ def cluster_figures(
         "speedup": best[1] / best[2],
         "difference": float(np.abs(np.array(values) / expected - 1.0).max()),
     }
+
+
+def spin_figures(items: int = 16, tries: int = 3) -> float:
+    """Return how much faster two processes do bare arithmetic than one: what the machine gives."""
+    best = {1: np.inf, 2: np.inf}
+    for workers in (1, 2) * tries:
+        with Processes(workers) as pool:
+            list(pool.map(_warm, [WARM_SECONDS] * 4 * workers))
+            started = time.perf_counter()
+            list(pool.map(_spin, [1_000_000] * items))
+            best[workers] = min(best[workers], time.perf_counter() - started)
+    return best[1] / best[2]
+
+
+def _spin(rounds: int) -> int:
+    return sum(k & 3 for k in range(rounds))
 
 
 def _warm(seconds: float) -> None:

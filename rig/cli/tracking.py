@@ -24,7 +24,7 @@ from typing import Any, Self
 import numpy as np
 import zmq
 
-from analysis.compute import single_threaded
+from analysis.compute import environment
 from analysis.model import Estimate, estimate_json
 from analysis.online import Tracker
 from drivers.base import SampleBlock
@@ -101,7 +101,7 @@ class Tracking:
         self._socket.connect(endpoint)
         settings = Settings(self._rig, self._memory, endpoint)
         self._process = get_context("spawn").Process(target=work, args=(settings,), daemon=True)
-        with single_threaded():
+        with environment():
             self._process.start()
         return self
 
