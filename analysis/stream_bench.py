@@ -113,27 +113,32 @@ def cluster_figures(
 
     Each worker is a process with one thread. Raises ImportError without dask.distributed.
     """
-    local_cluster: Any = importlib.import_module("distributed").LocalCluster
+    distributed: Any = importlib.import_module("distributed")
     folders = write_archive(folder, rig, runs, repeats, seconds)
     best: dict[int, float] = {1: np.inf, 2: np.inf}
+    busiest = dict(best)  # processor seconds of the worker that used most
     values = []
     # No dashboard, nothing but loopback; workers end with the block.
     for workers in (1, 2) * tries:
         with (
             environment(WORKER_ENVIRONMENT),
-            local_cluster(
+            distributed.LocalCluster(
                 n_workers=workers,
                 threads_per_worker=1,
                 host="127.0.0.1",
                 dashboard_address=None,
                 silence_logs=50,
             ) as local,
+            distributed.Client(local, set_as_default=False) as watcher,
             Cluster(local.scheduler_address) as pool,
         ):
             list(pool.map(_warm, [WARM_SECONDS] * 4 * workers))
+            before = watcher.run(time.process_time)
             started = time.perf_counter()
             result = identify_folders(folders, pool=pool)
             best[workers] = min(best[workers], time.perf_counter() - started)
+            used = [after - before[w] for w, after in watcher.run(time.process_time).items()]
+            busiest[workers] = min(busiest[workers], max(used))
             values.append([estimate.value for estimate in result.estimates.values()])
     here = identify_folders(folders)
     expected = np.array([estimate.value for estimate in here.estimates.values()])
@@ -142,6 +147,7 @@ def cluster_figures(
         "one_seconds": best[1],
         "two_seconds": best[2],
         "speedup": best[1] / best[2],
+        "processor_ratio": busiest[1] / busiest[2],
         "difference": float(np.abs(np.array(values) / expected - 1.0).max()),
     }
 

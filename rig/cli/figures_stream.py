@@ -53,6 +53,7 @@ def _cluster(folder: Path, say: Say) -> list[Figure]:
         Figure(GROUP, "two Dask workers", found["two_seconds"], "s"),
         Figure(GROUP, "two workers over one", found["speedup"], "x", 1.6, True),
         Figure(GROUP, "two processes over one, bare arithmetic", plain, "x"),
+        Figure(GROUP, "one's processor time over the busier of two", found["processor_ratio"], "x"),
         Figure(GROUP, "archive: largest relative difference", found["difference"], "", 1e-10),
     ]
 
