@@ -174,7 +174,7 @@ def tiles(
             name = max(errors, key=lambda n: abs(errors[n]))
             inside = sum(covers(found[n], truth[n]) for n in errors)
             out.append(
-                Tile(f"{fm.percent(errors[name], signed=True)} %", "largest error against the truth",
+                Tile(f"{fm.percent(errors[name], signed=True)} %", "largest error against truth",
                      f"{name}; {inside} of {len(errors)} intervals hold the truth")
             )  # fmt: skip
     worst = worst_fit(validation)
@@ -183,15 +183,15 @@ def tiles(
                         f"{worst.channel}, {worst.record}"))  # fmt: skip
     failed = sum(bool(r.failure) for r in validation)
     if failed:
-        out.append(Tile(str(failed), "simulations failed", "see validation", True))
+        out.append(Tile(str(failed), "free runs that failed", "see validation", True))
     if table4.compared:
         out.append(Tile(f"{table4.above} of {table4.compared}", "FIT cells above the paper",
                         "Table IV", table4.above < table4.compared))  # fmt: skip
     lines = check_lines(identification.checks)
     bad = sum(not line.ok for line in lines)
     good = len(lines) - bad
-    out.append(Tile(f"{good} of {good + bad}", "checks ok",
-                    "all of them" if not bad else "the others are named below", bool(bad)))  # fmt: skip
+    which = "the others are named below" if bad else "all of them"
+    out.append(Tile(f"{good} of {good + bad}", "checks ok", which, bool(bad)))
     return out
 
 
@@ -220,6 +220,7 @@ def _parameter_row(
     true = truth.get(name)
     mean = paper.TABLE_III[name].mean if rig.name == paper.RIG and name in paper.TABLE_III else None
     shown = estimate.identified
+    error = 100 * (estimate.value / true - 1) if true and shown else None
     has_interval = shown and math.isfinite(low)
     return ParameterRow(
         name,
@@ -231,7 +232,7 @@ def _parameter_row(
         fm.column_percent(100 * estimate.std / abs(estimate.value)) if shown else fm.DASH,
         _scaled(rig.nominal.get(name), unit.scale),
         _scaled(true, unit.scale),
-        fm.column_percent(100 * (estimate.value / true - 1), signed=True) if true and shown else fm.DASH,
+        fm.column_percent(error, signed=True),
         ("yes" if covers(estimate, true) else "no") if true and has_interval else fm.DASH,
         _scaled(mean, unit.scale),
         "" if shown and not estimate.note else f"not identifiable: {estimate.note or 'no value'}"
