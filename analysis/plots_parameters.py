@@ -12,7 +12,7 @@ from analysis.model import Estimate
 from analysis.plots import BLUE, GREY, INK, MODEL, PALE, figure, style, svg
 
 ROW = 0.2  # [in] per parameter
-CAP = 4.0  # the axis ends here, in multiples of the upper quartile: one wild row hides no other
+CAP = 12.0  # the axis ends here, in multiples of the upper quartile: one wild row hides no other
 
 
 def against_reference(

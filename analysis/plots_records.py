@@ -35,6 +35,7 @@ from rig.model.rig import Rig
 Array = NDArray[np.float64]
 
 SHOWN_SECONDS = 10.0
+SPAN = 500.0  # of a residual spectrum, largest over smallest
 FEWEST_LINES = 10  # of the period's multiples that a spectrum shows: a sine's harmonics too
 
 
@@ -126,7 +127,7 @@ def _spectrum(axes: Any, record: Record, spool: Array) -> None:
 def _unknown_lines(axes: Any, record: Record, spool: Array) -> None:
     window = np.hanning(len(spool))
     spectrum = 2e3 * np.abs(np.fft.rfft((spool - spool.mean()) * window)) / window.sum()
-    frequency = np.fft.rfftfreq(len(spool), 1.0 / record.sample_rate)
+    frequency: Array = np.fft.rfftfreq(len(spool), 1.0 / record.sample_rate).astype(np.float64)
     inside = (frequency > 0) & (frequency <= min(50.0, 0.4 * record.sample_rate))
     seen: Array = np.maximum(spectrum[inside], 1e-9).astype(np.float64)
     axes.plot(*thin(frequency[inside], seen), color=BLUE, linewidth=0.8)
@@ -180,5 +181,7 @@ def _densities(axes: Any, found: Residual, scale: float, unit: str) -> None:
         note(axes, 0.26, 1.02, "scatter of one repeat", "#6b7280", **above)
         note(axes, 0.59, 1.02, "scatter left in the mean", "#c2410c", **above)
     axes.margins(x=0)
+    # The row filter's stop band would take up most of the axis.
+    axes.set_ylim(bottom=max(axes.get_ylim()[0], scale * float(found.spectrum.max()) / SPAN))
     axes.set_xlabel("frequency [Hz]", labelpad=1)
     axes.set_ylabel(f"{unit}/√Hz")

@@ -151,6 +151,7 @@ def _headline(
             rig, runs, identification, validation, validation_runs, simulated=bool(truth)
         ),
         "tiles": report_facts.tiles(identification, validation, truth, table4),
+        "truth_remark": report_facts.truth_remark(rig, truth),
         "checks": report_facts.check_lines(identification.checks),
         "table4": table4,
         "table4_search": {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,7 +11,7 @@ import numpy as np
 
 from analysis import paper_tables as paper
 from analysis import report_format as fm
-from analysis.checks import Check
+from analysis.checks import LENGTH_TOLERANCE, Check
 from analysis.identify import Identification
 from analysis.model import Estimate
 from analysis.plots_parameters import relative_half_width
@@ -56,6 +57,24 @@ def check_lines(checks: Sequence[Check]) -> list[CheckLine]:
         more = tuple(f"{'ok' if c.ok else 'not ok'}: {c.detail}" for c in ordered[1:])
         out.append(CheckLine(name, not bad, detail, more))
     return sorted(out, key=lambda line: line.ok)
+
+
+def truth_remark(rig: Rig, truth: Mapping[str, float] | None) -> str:
+    """Say where a simulated bench's own truth is no rigid body's (R_ij = l_i W_j), '' otherwise."""
+    found = []
+    for i, j in itertools.combinations(range(1, len(rig.joints) + 1), 2):
+        R, W = (truth or {}).get(f"R{i}{j}"), (truth or {}).get(f"W{j}")
+        length = rig.joints[i - 1].link_length
+        if R is not None and W and abs(R / W / length - 1) >= LENGTH_TOLERANCE:
+            found.append(
+                f"R{i}{j}/W{j} = {fm.significant(R / W)} m for a link of {fm.significant(length)} m"
+            )
+    if not found:
+        return ""
+    return (
+        f"The simulated bench's own truth has {'; '.join(found)}: there the check on link length "
+        "speaks of the bench, not of the identification."
+    )
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from analysis import paper_tables as paper
-from analysis import plots, plots_records, plots_rig
+from analysis import plots, plots_records, plots_rig, report_facts
 from analysis import report_format as fm
 from analysis.identify import RecordRows, build_rows, identify
 from analysis.report_residuals import per_repeat, residuals
@@ -187,3 +187,11 @@ def test_each_repeat_alone_gives_what_identifying_it_alone_gives(multisine_run: 
         assert (spread.low, spread.high) == pytest.approx((min(values), max(values)), rel=1e-9)
         assert spread.rsd == pytest.approx(100 * np.std(values, ddof=1) / np.mean(values), rel=1e-6)
     assert per_repeat(found, [r for r in rows if r.repeat == 1]) == {}
+
+
+def test_a_bench_that_is_no_rigid_body_is_told_from_a_bad_identification() -> None:
+    rig = _rig()
+    said = report_facts.truth_remark(rig, {"R12": 1.37, "W2": 3.30})
+    assert "R12/W2 = 0.415 m for a link of 0.500 m" in said
+    assert report_facts.truth_remark(rig, {"R12": 1.65, "W2": 3.30}) == ""
+    assert report_facts.truth_remark(rig, None) == ""
