@@ -29,6 +29,7 @@ CLIPPED_SHARE = 0.01
 MASKED_SHARE = 0.2
 CONDITION_LIMIT = 200.0  # scaled columns; the paper's are 10 to 27
 BULK_RANGE = (5e7, 2.5e9)  # [Pa] hoses with air .. pure mineral oil with margin
+NOISE_BIAS = 0.01  # relative
 LENGTH_TOLERANCE = 0.05  # relative, of R12/W2 against l1
 
 
@@ -147,6 +148,27 @@ def identifiability(solutions: Mapping[str, Solution]) -> list[Check]:
             )
         )
     return out
+
+
+def noise_bias(solutions: Mapping[str, Solution]) -> Check:
+    """State the worst relative bias that sensor noise in the columns is predicted to make."""
+    found = [
+        (abs(bias / value), name)
+        for solution in solutions.values()
+        for name, value, bias in zip(
+            solution.names, solution.value, solution.noise_bias, strict=True
+        )
+        if np.isfinite(value) and np.isfinite(bias) and value != 0
+    ]
+    if not found:
+        return Check("noise bias", False, "nothing identified to judge")
+    worst, name = max(found)
+    return Check(
+        "noise bias",
+        bool(worst < NOISE_BIAS),
+        f"the stated sensor noise biases {name} most, by {100 * worst:.2g} % as predicted "
+        f"(below {100 * NOISE_BIAS:g} % wanted)",
+    )
 
 
 def masked(rows: int, dropped: int) -> Check:

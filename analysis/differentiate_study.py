@@ -93,7 +93,7 @@ def table(rig: Rig, rng: np.random.Generator, repeats: int = 6) -> list[Entry]:
 
 
 def _entry(rig: Rig, run: Run, excitation: str, name: str, choice: Choice) -> Entry:
-    found = identify([run], filtering=choice).estimates
+    found = identify([run], filtering=choice, reject_noise=False).estimates
     bias, scatter = {}, {}
     for group, prefixes in GROUPS.items():
         members = [p for p in found if p.startswith(prefixes)]

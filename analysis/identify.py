@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from analysis import checks as ck
 from analysis.checks import Check
 from analysis.model import Estimate, Model, estimate_json, finite
+from analysis.noise import noise_moments
 from analysis.rows import Filtering, Rows, default_filtering, parameters_of, record_rows
 from analysis.signals import condition
 from analysis.solve import Cluster, Solution, half_width, solve, triangle
@@ -61,18 +62,22 @@ def identify(
     method: str = "coupled",
     terms: Sequence[Used] | None = None,
     filtering: Callable[[Record], Filtering] = default_filtering,
+    reject_noise: bool = True,
 ) -> Identification:
     """Identify all parameters from all records of the runs at once (the paper's STEP4).
 
-    `terms` defaults to the paper's model. Raises InputError for another method, for runs of
-    different rigs and for records that cannot be used, naming record and channel.
+    `terms` defaults to the paper's model. `reject_noise` False gives out parameters that rest on
+    sensor noise as well, for studies of just that. Raises InputError for another method, for runs
+    of different rigs and for records that cannot be used, naming record and channel.
     """
     _refuse_method(method)
     rig = ck.common_rig(runs)
     used = tuple(terms) if terms is not None else tuple(Used(term) for term in baseline())
     per_record = build_rows(rig, runs, used, filtering)
+    # A stream of its own: the prediction of bias is the same every time.
+    noise = noise_moments(rig, runs, used, filtering, np.random.default_rng(0))
     started = time.perf_counter()
-    solutions = solve_rows(rig, used, per_record)
+    solutions = solve_rows(rig, used, per_record, noise, reject_noise)
     seconds = time.perf_counter() - started
     estimates, covariance = _estimates(rig, used, solutions)
     rows = {family: solution.rows for family, solution in solutions.items()}
@@ -126,7 +131,11 @@ def repeats_of(per_record: Sequence[RecordRows]) -> dict[tuple[int, str], int]:
 
 
 def solve_rows(
-    rig: Rig, terms: Sequence[Used], per_record: Sequence[RecordRows]
+    rig: Rig,
+    terms: Sequence[Used],
+    per_record: Sequence[RecordRows],
+    noise: Mapping[str, Array] | None = None,
+    reject_noise: bool = True,
 ) -> dict[str, Solution]:
     """Reduce the rows to one triangle per cluster and solve each family once."""
     repeats = repeats_of(per_record)
@@ -138,7 +147,8 @@ def solve_rows(
             pieces = 1 if repeats[one.run, one.step] > 1 else SEGMENTS
             clusters += _clusters(one, family, pieces)
         if names:
-            out[family] = solve(names, clusters)
+            moments = noise[family] if noise else None
+            out[family] = solve(names, clusters, moments, reject_noise)
     return out
 
 
@@ -219,6 +229,7 @@ def _statements(
         *ck.clipping(rig, runs),
         ck.masked(sum(rows.values()), masked),
         *ck.identifiability(solutions),
+        ck.noise_bias(solutions),
         *ck.consistency(rig, estimates),
     )
 

@@ -82,10 +82,13 @@ def aligned_channels(rig: Rig, record: Record) -> dict[str, Array]:
     return moved
 
 
-def condition(rig: Rig, record: Record, smoother: Smoother | None = None) -> Signals:
+def condition(
+    rig: Rig, record: Record, smoother: Smoother | None = None, moving: Mask | None = None
+) -> Signals:
     """Turn a record into signals through one zero-phase filter (default `channel_filter`).
 
-    Raises InputError naming record and channel where one is missing or not a number.
+    `moving` (N,) overrides `moving_joints`. Raises InputError naming record and channel where one
+    is missing or not a number.
     """
     smoother = smoother or channel_filter(record.sample_rate)
     joints = range(1, len(rig.joints) + 1)
@@ -102,7 +105,8 @@ def condition(rig: Rig, record: Record, smoother: Smoother | None = None) -> Sig
         return smoother.apply(channels[name]) if name in channels else np.full(n, constant)
 
     raw_s, raw_p = stacked(ch.PISTON), (stacked(ch.CAP), stacked(ch.ROD))
-    s, sd, sdd = _motion(rig, raw_s, record.sample_rate, excited, smoother)
+    moving = moving_joints(rig, record) if moving is None else moving
+    s, sd, sdd = _motion(raw_s, moving, smoother)
     q, qd, qdd, G = _angles(rig, s, sd, sdd)
     volumes = [rig.chamber_volumes(i - 1, s[:, i - 1]) for i in joints]
     return Signals(
@@ -156,14 +160,20 @@ def _refuse_missing(rig: Rig, record: Record, excited: Mask) -> None:
                 )
 
 
-def _motion(
-    rig: Rig, raw: Array, rate: float, excited: Mask, smoother: Smoother
-) -> tuple[Array, Array, Array]:
-    """Return filtered s, ds/dt, d2s/dt2 (n, N); a locked joint that does not give is held."""
+def moving_joints(rig: Rig, record: Record) -> Mask:
+    """Return which joints (N,) move: the excited, and the locked whose lock visibly gives."""
+    found = []
+    for i in range(1, len(rig.joints) + 1):
+        piston = np.asarray(record.channels[ch.channel(ch.PISTON, i)])
+        locked = i in record.locked
+        found.append(not locked or gives(piston, record.sample_rate, rig.sensors.piston.noise))
+    return np.array(found)
+
+
+def _motion(raw: Array, moving: Mask, smoother: Smoother) -> tuple[Array, Array, Array]:
+    """Return filtered s, ds/dt, d2s/dt2 (n, N); a joint that does not move is held at its mean."""
     s, sd, sdd = (smoother.apply(raw, k) for k in range(3))
-    for i in np.flatnonzero(~excited):
-        if not gives(raw[:, i], rate, rig.sensors.piston.noise):
-            s[:, i], sd[:, i], sdd[:, i] = raw[:, i].mean(), 0.0, 0.0
+    s[:, ~moving], sd[:, ~moving], sdd[:, ~moving] = raw[:, ~moving].mean(axis=0), 0.0, 0.0
     return s, sd, sdd
 
 

@@ -24,7 +24,8 @@ from scipy.stats import t as student
 
 Array = NDArray[np.float64]
 
-RANK_TOLERANCE = 1e-4  # smallest singular value of the scaled matrix over the largest
+RANK_TOLERANCE = 1e-3  # smallest singular value of the scaled matrix over the largest
+SHARE_OF_NOISE = 0.1  # of a column's own information: beyond, the parameter rests on noise
 SHARE_OF_NULL = 0.05  # a parameter with more of a null direction than this is not identifiable
 
 
@@ -44,6 +45,7 @@ class Solution:
 
     Entries of parameters in `unidentifiable` (name -> why) are NaN. `condition_number` is of the
     column-scaled matrix, over all columns that are not zero. `residual_rms` has the rows' unit.
+    `noise_bias` is the bias that the stated sensor noise predicts, NaN where not asked for.
     """
 
     names: tuple[str, ...]
@@ -53,6 +55,7 @@ class Solution:
     condition_number: float
     rows: int
     residual_rms: float
+    noise_bias: Array
     unidentifiable: dict[str, str] = field(default_factory=dict)
 
 
@@ -72,36 +75,58 @@ def _square(stacked: Array) -> Array:
     return np.vstack((R, np.zeros((width - len(R), width)))) if len(R) < width else R
 
 
-def solve(names: Sequence[str], clusters: Sequence[Cluster]) -> Solution:
-    """Solve all clusters at once; parameters that the rows do not determine come out as NaN."""
+def solve(
+    names: Sequence[str],
+    clusters: Sequence[Cluster],
+    noise: Array | None = None,
+    reject_noise: bool = True,
+) -> Solution:
+    """Solve all clusters at once; parameters that the rows do not determine come out as NaN.
+
+    `noise` (k+1, k+1) is the part of [X y]'[X y] that sensors' noise makes
+    (`analysis.noise`); with `reject_noise` a parameter that rests on it counts as undetermined.
+    """
     k = len(names)
     R = merge(c.triangle for c in clusters)
     X, y = R[:k, :k], R[:k, k]
+    inverse, condition, lost = _pseudo_inverse(names, X)
+    beta, bread = inverse @ y, inverse @ inverse.T
+    covariance, dof = _clustered(beta, bread, clusters)
+    noise_bias = np.full(k, np.nan)
+    if noise is not None:
+        noise_bias = -bread @ (noise[:k, :k] @ beta - noise[:k, k])
+        share = np.diag(bread @ noise[:k, :k])
+        for name, part in zip(names, share, strict=True):
+            if reject_noise and part > SHARE_OF_NOISE:
+                lost.setdefault(name, "what these records show of it is mostly sensor noise")
+    rows = sum(c.rows for c in clusters)
+    squares = np.sum((y - X @ beta) ** 2) + R[k, k] ** 2
+    residual_rms = float(np.sqrt(squares / max(rows, 1)))
+    gone = np.array([name in lost for name in names])
+    beta[gone] = dof[gone] = np.nan
+    covariance[gone, :] = covariance[:, gone] = np.nan
+    return Solution(
+        tuple(names), beta, covariance, dof, condition, rows, residual_rms, noise_bias, lost
+    )
+
+
+def _pseudo_inverse(names: Sequence[str], X: Array) -> tuple[Array, float, dict[str, str]]:
+    """Return the inverse of X (k, k) with unit columns, their condition number, and who is lost.
+
+    Columns that are zero, and directions below the rank tolerance, are left out of the inverse.
+    """
     scale = np.linalg.norm(X, axis=0)
-    present = scale > 0.0
-    lost = {n: "no row contains it" for n, here in zip(names, present, strict=True) if not here}
-    kept = np.flatnonzero(present)
+    kept = np.flatnonzero(scale > 0.0)
+    lost = {n: "no row contains it" for n, size in zip(names, scale, strict=True) if size == 0.0}
+    inverse = np.zeros_like(X)
     if not len(kept):
-        nan = np.full(k, np.nan)
-        return Solution(tuple(names), nan, np.full((k, k), np.nan), nan, np.inf, 0, np.nan, lost)
+        return inverse, float("inf"), lost
     U, sigma, Vt = np.linalg.svd(X[:, kept] / scale[kept], full_matrices=False)
     strong = sigma > RANK_TOLERANCE * sigma[0]
     lost |= _confounded([names[int(i)] for i in kept], Vt[~strong])
-    inverse = (Vt[strong].T / sigma[strong]) / scale[kept, None]  # pseudo-inverse without U'
-    beta = np.zeros(k)
-    beta[kept] = inverse @ (U[:, strong].T @ y)
-    bread = np.zeros((k, k))
-    bread[np.ix_(kept, kept)] = inverse @ inverse.T
-    covariance, dof = _clustered(beta, bread, clusters)
-    rows = sum(c.rows for c in clusters)
-    residual = float(np.sqrt((np.sum((y - X @ beta) ** 2) + R[k, k] ** 2) / max(rows, 1)))
+    inverse[kept] = (Vt[strong].T / sigma[strong]) / scale[kept, None] @ U[:, strong].T
     condition = float(sigma[0] / sigma[-1]) if sigma[-1] > 0 else float("inf")
-    beta, covariance = beta.copy(), covariance.copy()
-    for i, name in enumerate(names):
-        if name in lost:
-            beta[i] = dof[i] = np.nan
-            covariance[i, :] = covariance[:, i] = np.nan
-    return Solution(tuple(names), beta, covariance, dof, condition, rows, residual, lost)
+    return inverse, condition, lost
 
 
 def _confounded(names: Sequence[str], null: Array) -> dict[str, str]:

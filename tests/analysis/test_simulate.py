@@ -66,8 +66,8 @@ def test_own_integrator_agrees_with_scipys(truth_model: Model, clean: Signals) -
     found = solve_ivp(
         rates_of(ready, drive), (0, t[-1]), y0, "DOP853", t, rtol=1e-9, atol=1e-9, max_step=1e-3
     )
-    assert np.abs(found.y[:2].T - own.q).max() < 5e-6  # rad of 0.5
-    assert np.abs(found.y[4:6].T - own.p_cap).max() < 200.0  # of 7 MPa
+    assert np.abs(found.y[:2].T - own.q).max() < 2e-5  # rad, of strokes of 0.3
+    assert np.abs(found.y[4:6].T - own.p_cap).max() < 2e3  # of 7 MPa
 
 
 def test_work_of_the_cylinders_is_kinetic_potential_and_friction(

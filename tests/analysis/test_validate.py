@@ -106,7 +106,7 @@ def test_a_missing_model_file_is_refused(tmp_path: Path) -> None:
 
 def test_a_model_of_another_rig_is_refused(found: Identification, both_run: Run, rig: Rig) -> None:
     other = replace(both_run, rig=rig.model_copy(update={"name": "elsewhere"}))
-    with pytest.raises(InputError, match="another rig.*'elsewhere'"):
+    with pytest.raises(InputError, match=r"another rig.*'elsewhere'"):
         validate(found.model, [other])
 
 
