@@ -11,7 +11,8 @@ from urllib.parse import urlsplit
 
 from drivers import make_driver
 from protocols import engine, library
-from protocols.check import CheckReport, check
+from protocols.check import check
+from protocols.check_report import CheckReport
 from protocols.plan import Overrides, Plan, resolve
 from rig.model.parse import InputError
 from rig.model.rig import Rig, Wire
