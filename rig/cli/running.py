@@ -83,7 +83,6 @@ class _Story:
             repeat=repeat,
             repeats=repeats,
             message=message,
-            done_s=at,
             total_s=self._plan.seconds,
         )
 
