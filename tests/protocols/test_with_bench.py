@@ -52,6 +52,9 @@ class LittleDriver:
 
     def stop(self) -> None: ...
 
+    def trip_cause(self) -> str | None:
+        return None
+
     def reset(self) -> None: ...
 
 
