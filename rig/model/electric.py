@@ -255,6 +255,11 @@ class ElectricRig(Rig):
         """The channels of a record: the drive is measured, there is no command beside it."""
         return self.channels
 
+    @property
+    def base_angle(self) -> float:
+        """Known inclination of the base [rad]; 0 where it is unknown."""
+        return 0.0 if self.inclination == UNKNOWN else float(self.inclination)
+
     def unit_of(self, channel: str) -> str:
         """Return the unit of a channel's samples."""
         kind, joint = ch.kind_of(channel)
@@ -286,3 +291,17 @@ def _unit(name: str, joints: tuple[ElectricJoint, ...]) -> str:
     if joints[0].kind == "revolute":
         return parameter_unit(name)
     return {"M1": "kg", "Fv1": "N*s/m"}.get(name, parameter_unit(name))
+
+
+def drive_gains(rig: Rig) -> tuple[float, ...]:
+    """Return each joint's drive gain; zeros for a hydraulic rig."""
+    if isinstance(rig, ElectricRig):
+        return tuple(joint.drive.gain for joint in rig.joints)
+    return (0.0,) * len(rig.joints)
+
+
+def position_limits(rig: Rig, joint: int) -> tuple[float, float]:
+    """Return the allowed positions [rad or m] of joint `joint` (0-based) of an electric rig."""
+    if not isinstance(rig, ElectricRig):
+        raise TypeError(f"rig {rig.name!r} is not electric")
+    return rig.joints[joint].limits.position

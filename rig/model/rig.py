@@ -325,6 +325,11 @@ class Rig(_Part):
         """Channel kinds that an excited joint needs."""
         return ch.JOINT_KINDS
 
+    @property
+    def base_angle(self) -> float:
+        """Known inclination of the base [rad], added to every absolute angle."""
+        return 0.0
+
     def unit_of(self, channel: str) -> str:
         """Return the unit of a channel's samples."""
         return ch.unit_of(channel)
