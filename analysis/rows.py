@@ -36,7 +36,7 @@ Array = NDArray[np.float64]
 ROW_CUTOFF = 15.0  # [Hz] where a record does not tell its excited lines
 ROW_CUTOFF_RANGE = (8.0, 30.0)  # [Hz]
 # An electric joint's rows need one derivative less of anything noisy, and its friction flips in
-# milliseconds: narrower loses of the flips (`analysis.emps_study` has the figures).
+# milliseconds: narrower loses of the flips (`bramah emps` prints the figures).
 ROW_CUTOFF_ELECTRIC = 30.0  # [Hz] where a record does not tell its excited lines
 LINES_FACTOR = 1.5  # row filter over the highest excited line; the noise goes with its 5th power
 MASKED_SHARE = 1e-3  # of a filter's weight on masked samples: a row with more is dropped
