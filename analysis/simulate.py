@@ -21,7 +21,7 @@ from rig.model.rig import Rig
 Array = NDArray[np.float64]
 
 RTOL = 1e-6
-ATOL_ANGLE, ATOL_RATE, ATOL_PRESSURE, ATOL_HIDDEN = 1e-7, 1e-5, 10.0, 1e-8  # rad, rad/s, Pa
+ATOL_ANGLE, ATOL_PRESSURE, ATOL_HIDDEN = 1e-7, 10.0, 1e-8  # rad, Pa; of rates the terms say
 _REASONS = {
     integrate.LEFT_STROKE: "a piston went half a stroke past its end",
     integrate.NOT_FINITE: "the state diverged",
@@ -110,6 +110,7 @@ class Compiled:
     prepares: NDArray[np.bool_]
     par: Array
     geometry: Array
+    rate_tolerance: float
 
 
 def compiled(model: Model) -> Compiled:
@@ -129,6 +130,7 @@ def compiled(model: Model) -> Compiled:
         np.array([u.term.prepares for u in model.terms]),
         np.concatenate(packed),
         _geometry(model.rig),
+        min(u.term.rate_tolerance for u in model.terms),
     )
 
 
@@ -173,7 +175,8 @@ def simulate(
     ys[0, : 4 * N] = np.concatenate((start.q, start.qd, start.p_cap, start.p_rod))
     inputs = _inputs(drive)[first : first + samples]
     atol = np.repeat(
-        [ATOL_ANGLE, ATOL_RATE, ATOL_PRESSURE, ATOL_PRESSURE, ATOL_HIDDEN], [N, N, N, N, hidden]
+        [ATOL_ANGLE, ready.rate_tolerance, ATOL_PRESSURE, ATOL_PRESSURE, ATOL_HIDDEN],
+        [N, N, N, N, hidden],
     )
     status, filled, evaluations = integrate.integrate(
         (ready.addresses, ready.ends, ready.hidden_ends, ready.prepares, ready.par),

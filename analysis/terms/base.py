@@ -112,6 +112,7 @@ class Term:
 
     name: ClassVar[str]
     prepares: ClassVar[bool] = False  # whether the kernel acts in phase PREPARE
+    rate_tolerance: ClassVar[float] = 1e-5  # [rad/s] that simulation needs because of this term
     per_joint: ClassVar[bool] = False  # whether it is at one joint, `where` being `joint I`
     where: str = "bench"
 

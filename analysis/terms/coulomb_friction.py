@@ -41,6 +41,7 @@ class CoulombFriction(Term):
 
     name: ClassVar[str] = "coulomb_friction"
     per_joint: ClassVar[bool] = True
+    rate_tolerance: ClassVar[float] = 1e-3 * TRANSITION  # coarser, the creep at rest is noise
     where: str = "joint 1"
 
     @property
