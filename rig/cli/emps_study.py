@@ -100,6 +100,9 @@ def models_table(data: Emps) -> str:
             open_loop(fit(data.second, effects).model, data.first),
         ]
         rows.append([name, *_values(values), *(f"{1e3 * e:.2f}" for e in errors)])
+    for name, half in (("1st half alone", data.first), ("2nd half alone", data.second)):
+        values = {n: e.value for n, e in fit(half).estimates.items()}
+        rows.append([name, *_values(values), "", "", ""])
     rows.append(["published", *_values(PUBLISHED), "", "", ""])
     head = ["model", "M [kg]", "Fv [N s/m]", "Fc [N]", "offset [N]"]
     return table([*head, "whole [mm]", "1st on 2nd [mm]", "2nd on 1st [mm]"], rows)

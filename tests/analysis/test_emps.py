@@ -12,16 +12,27 @@ import numpy as np
 import pytest
 
 from rig.cli import emps_study as study
+from rig.services.importer import import_records
 
 PLACE = Path(os.environ.get("BRAMAH_DATA", Path(__file__).parents[3] / "shared" / "data"))
 FILE = PLACE / "emps" / "DATA_EMPS.mat"
 
-pytestmark = pytest.mark.skipif(not FILE.exists(), reason=f"no measured record at {FILE}")
+if not FILE.exists():
+    pytest.skip(f"no measured record at {FILE}", allow_module_level=True)
 
 
 @pytest.fixture(scope="module")
 def data() -> study.Emps:
     return study.load(FILE)
+
+
+def test_the_documented_manifest_reads_it(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "emps.md").read_text()
+    manifest = page.split("```yaml\n", 1)[1].split("```", 1)[0]
+    (tmp_path / "emps.yaml").write_text(manifest)
+    (tmp_path / "DATA_EMPS.mat").symlink_to(FILE.resolve())
+    report = import_records(tmp_path / "emps.yaml", tmp_path / "run")
+    assert (report.samples, report.warnings) == (24841, ())
 
 
 def test_all_four_parameters_are_the_published_ones(data: study.Emps) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from rig.model.electric import ElectricRig
@@ -97,3 +99,9 @@ def test_a_prismatic_joint_stands_alone() -> None:
     text = text.replace(rest, "limits: {position: [-1 rad, 1 rad], speed: 8 rad/s, drive: 40 A}")
     text = text.replace("[-200 deg, 200 deg]", "[-2 m, 2 m]").replace("0.01 mrad", "1 um")
     assert "a prismatic joint is supported alone" in refused(text)
+
+
+def test_the_documented_rig_is_one(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "electric.md").read_text()
+    (tmp_path / "arm.yaml").write_text(page.split("```yaml\n", 1)[1].split("```", 1)[0])
+    assert load_rig(tmp_path / "arm.yaml").electric
