@@ -10,7 +10,7 @@ from typing import Final
 from analysis.terms.base import Term
 from rig.model.parse import InputError
 
-PACKAGES: Final = ("analysis.terms",)
+PACKAGES: Final = ("analysis.terms", "analysis.effects")
 BASELINE: Final = ("inertia", "viscous_friction", "gravity", "compressibility", "orifice")
 
 

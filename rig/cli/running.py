@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import urlsplit
 
 from drivers import make_driver
 from protocols import engine, library
-from protocols.check import CheckReport, check
+from protocols.check import check
+from protocols.check_report import CheckReport
 from protocols.plan import Overrides, Plan, resolve
 from rig.model.parse import InputError
 from rig.model.rig import Rig, Wire
@@ -82,7 +83,6 @@ class _Story:
             repeat=repeat,
             repeats=repeats,
             message=message,
-            done_s=at,
             total_s=self._plan.seconds,
         )
 
@@ -134,6 +134,12 @@ def reset_device(rig: str, endpoint: str | None) -> str:
     return cause or "nothing"
 
 
-def with_repeats(repeats: int | None) -> Overrides:
-    """Return overrides that change the number of repeats only."""
-    return replace(Overrides(), repeats=repeats)
+def overridden(
+    repeats: int | None,
+    duration: float | None,
+    amplitude_scale: float,
+    seed: int | None,
+    steps: Sequence[str] | None,
+) -> Overrides:
+    """Return what a person changed of a protocol on the command line."""
+    return Overrides(repeats, duration, amplitude_scale, seed, tuple(steps) if steps else None)
