@@ -54,6 +54,12 @@ def common_rig(runs: Sequence[Run]) -> Rig:
                 f"{runs[0].source or 'the first run'} and {run.source or 'another'} are of "
                 f"different rigs: {difference}; identify them apart"
             )
+    joints = set(range(1, len(runs[0].rig.joints) + 1))
+    if all(joints <= set(record.locked) for run in runs for record in run.records):
+        raise InputError(
+            "every record has every joint locked: nothing moved, so nothing can be identified; "
+            "record a step that excites a joint"
+        )
     return runs[0].rig
 
 

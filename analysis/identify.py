@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis import checks as ck
+from analysis.advice import base_statements
 from analysis.checks import Check
 from analysis.model import Estimate, Model, estimate_json, finite
 from analysis.noise import noise_moments
@@ -231,6 +232,7 @@ def _statements(
         *ck.clipping(rig, runs),
         ck.masked(sum(rows.values()), masked),
         *ck.identifiability(solutions),
+        *base_statements(rig, solutions),
         ck.noise_bias(solutions),
         *ck.consistency(rig, estimates),
     )

@@ -20,8 +20,8 @@ SMALLER, SIZES = 0.85, 12  # the amplitude is lowered so, at most so often
 TILTS = (0.4, 0.8, 1.2)
 MODEST = 0.25  # [V] rms below which a steeper multisine is tried
 # Share of a limit's range kept for what the bench does otherwise than the twin.
-SPARE = {"pump flow": 0.03, "cap_pressure (cavitation, supply)": 0.05,
-         "rod_pressure (cavitation, supply)": 0.05, "piston": 0.05}  # fmt: skip
+SPARE = {"pump flow": 0.03, "cap_pressure (cavitation, supply)": 0.1,
+         "rod_pressure (cavitation, supply)": 0.1, "piston": 0.05}  # fmt: skip
 
 
 def motion_within(step: Step, rig: Rig, twin: Twin) -> Mapping[str, Array] | None:
