@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,11 +24,13 @@ from rig.model.parse import InputError
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
 
+if TYPE_CHECKING:
+    from analysis.methods import SearchOptions
+
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
-METHODS = ("coupled",)
-LATER_METHODS = ("sequential", "simultaneous", "pso", "ga")
+METHODS = ("coupled", "sequential", "simultaneous", "pso", "ga")
 SEGMENTS = 10  # of the only repeat of a step, where there are not more repeats
 
 
@@ -55,6 +57,7 @@ class Identification:
     solve_seconds: float
     checks: tuple[Check, ...]
     model: Model
+    extra: Mapping[str, Any] = field(default_factory=dict)  # a method's own figures, plain data
 
 
 def identify(
@@ -63,16 +66,23 @@ def identify(
     terms: Sequence[Used] | None = None,
     filtering: Callable[[Record], Filtering] = default_filtering,
     reject_noise: bool = True,
+    rng: np.random.Generator | None = None,
+    search: SearchOptions | None = None,
 ) -> Identification:
     """Identify all parameters from all records of the runs at once (the paper's STEP4).
 
     `terms` defaults to the paper's model. `reject_noise` False gives out parameters that rest on
-    sensor noise as well, for studies of just that. Raises InputError for another method, for runs
+    sensor noise as well, for studies of just that. Another `method` is `analysis.methods`' work,
+    `rng` and `search` being for those that search. Raises InputError for another method, for runs
     of different rigs and for records that cannot be used, naming record and channel.
     """
     _refuse_method(method)
     rig = ck.common_rig(runs)
     used = tuple(terms) if terms is not None else tuple(Used(term) for term in baseline())
+    if method != "coupled":
+        from analysis.methods import identify_by  # which builds on this module
+
+        return identify_by(method, runs, used, filtering, reject_noise, rng, search)
     per_record = build_rows(rig, runs, used, filtering)
     # A stream of its own: the prediction of bias is the same every time.
     noise = noise_moments(rig, runs, used, filtering, np.random.default_rng(0))
@@ -96,10 +106,6 @@ def identify(
 
 
 def _refuse_method(method: str) -> None:
-    if method in LATER_METHODS:
-        raise InputError(
-            f"method {method!r} comes with a later version; this one knows: {' '.join(METHODS)}"
-        )
     if method not in METHODS:
         raise InputError(f"unknown method {method!r}; known: {' '.join(METHODS)}")
 
@@ -240,11 +246,15 @@ def to_json(result: Identification) -> dict[str, Any]:
         "method": result.method,
         "parameters": {name: estimate_json(p) for name, p in result.estimates.items()},
         "condition_number": {
-            family: finite(s.condition_number) for family, s in result.solutions.items()
+            family: finite(result.solutions[family].condition_number)
+            if family in result.solutions
+            else None
+            for family in FAMILIES
         },
         "rows": dict(result.rows),
         "masked_rows": result.masked_rows,
         "solve_seconds": result.solve_seconds,
         "checks": [{"name": c.name, "ok": bool(c.ok), "detail": c.detail} for c in result.checks],
         "residual_rms": {family: finite(s.residual_rms) for family, s in result.solutions.items()},
+        **result.extra,
     }
