@@ -89,7 +89,7 @@ def identify(
     started = time.perf_counter()
     solutions = solve_rows(rig, used, per_record, noise, reject_noise)
     seconds = time.perf_counter() - started
-    estimates, covariance = _estimates(rig, used, solutions)
+    estimates, covariance = estimates_of(rig, used, solutions)
     rows = {family: solution.rows for family, solution in solutions.items()}
     masked = sum(r.masked for one in per_record for r in one.rows.values())
     statements = _statements(rig, runs, per_record, solutions, estimates, rows, masked)
@@ -150,15 +150,18 @@ def solve_rows(
         names = parameters_of(rig, terms, family)
         clusters: list[Cluster] = []
         for one in per_record:
-            pieces = 1 if repeats[one.run, one.step] > 1 else SEGMENTS
-            clusters += _clusters(one, family, pieces)
+            clusters += clusters_of(one, family, repeats)
         if names:
             moments = noise[family] if noise else None
             out[family] = solve(names, clusters, moments, reject_noise)
     return out
 
 
-def _clusters(one: RecordRows, family: str, pieces: int) -> list[Cluster]:
+def clusters_of(
+    one: RecordRows, family: str, repeats: Mapping[tuple[int, str], int]
+) -> list[Cluster]:
+    """Reduce a record's rows of one family to a triangle, or to several of an only repeat."""
+    pieces = 1 if repeats[one.run, one.step] > 1 else SEGMENTS
     out = []
     rows = [r for name, r in one.rows.items() if family_of(name) == family]
     for piece in range(pieces):
@@ -178,7 +181,7 @@ def _piece(rows: Rows, piece: int, pieces: int) -> tuple[Array, Array]:
     return rows.matrix[inside], rows.rhs[inside]
 
 
-def _estimates(
+def estimates_of(
     rig: Rig, terms: Sequence[Used], solutions: Mapping[str, Solution]
 ) -> tuple[dict[str, Estimate], Array]:
     """Turn the rows' coefficients into parameters (b = 1/coefficient) with intervals."""
