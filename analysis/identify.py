@@ -25,7 +25,7 @@ from rig.model.records import Record, Run
 from rig.model.rig import Rig
 
 if TYPE_CHECKING:
-    from analysis.methods import SearchOptions
+    from analysis.methods.search import SearchOptions
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
@@ -80,7 +80,7 @@ def identify(
     rig = ck.common_rig(runs)
     used = tuple(terms) if terms is not None else tuple(Used(term) for term in baseline())
     if method != "coupled":
-        from analysis.methods import identify_by  # which builds on this module
+        from analysis.methods import identify_by  # noqa: PLC0415 (which builds on this module)
 
         return identify_by(method, runs, used, filtering, reject_noise, rng, search)
     per_record = build_rows(rig, runs, used, filtering)
@@ -249,10 +249,7 @@ def to_json(result: Identification) -> dict[str, Any]:
         "method": result.method,
         "parameters": {name: estimate_json(p) for name, p in result.estimates.items()},
         "condition_number": {
-            family: finite(result.solutions[family].condition_number)
-            if family in result.solutions
-            else None
-            for family in FAMILIES
+            family: finite(s.condition_number) for family, s in result.solutions.items()
         },
         "rows": dict(result.rows),
         "masked_rows": result.masked_rows,

@@ -16,9 +16,14 @@ import numpy as np
 
 from analysis.identify import Identification
 from analysis.methods.search import SearchOptions
+from analysis.methods.sequential import sequential
+from analysis.methods.simultaneous import simultaneous
+from analysis.methods.swarm import search
 from analysis.rows import Filtering
 from analysis.terms.base import Used
 from rig.model.records import Record, Run
+
+__all__ = ["SearchOptions", "identify_by"]
 
 SEARCHES = ("pso", "ga")
 
@@ -37,15 +42,9 @@ def identify_by(
     Raises InputError where the runs hold no record of the kind that the method needs.
     """
     if method in SEARCHES:
-        from analysis.methods.swarm import search
-
         # Without a generator of the caller's, the search is the same every time.
         rng = np.random.default_rng(0) if rng is None else rng
         return search(method, runs, terms, filtering, rng, options or SearchOptions())
     if method == "simultaneous":
-        from analysis.methods.simultaneous import simultaneous
-
         return simultaneous(runs, terms, filtering, reject_noise)
-    from analysis.methods.sequential import sequential
-
     return sequential(runs, terms, filtering, reject_noise)

@@ -14,6 +14,7 @@ import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 
 from analysis import checks as ck
 from analysis.checks import Check
-from analysis.identify import Identification
+from analysis.identify import Identification, estimates_of
 from analysis.methods.search import (
     COMPLEX,
     DEAD,
@@ -31,11 +32,11 @@ from analysis.methods.search import (
     make_task,
     score,
     step_one,
-    with_values,
 )
-from analysis.model import Estimate, Model
-from analysis.rows import Filtering
-from analysis.terms.base import Used
+from analysis.model import Model
+from analysis.rows import Filtering, parameters_of
+from analysis.solve import Solution
+from analysis.terms.base import FAMILIES, Used
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
 
@@ -43,6 +44,15 @@ Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
 AT_BOUND = 0.02  # of the decades searched: nearer to an end than this, the bound made the value
+
+_PYMOO = {
+    "pso": "algorithms.soo.nonconvex.pso",
+    "ga": "algorithms.soo.nonconvex.ga",
+    "evaluator": "core.evaluator",
+    "problem": "core.problem",
+    "termination": "core.termination",
+    "static": "problems.static",
+}
 
 
 @dataclass(frozen=True)
@@ -91,9 +101,7 @@ def search(
     return _identification(method, runs, task, trail, options)
 
 
-def run_search(
-    method: str, task: Task, options: SearchOptions, rng: np.random.Generator
-) -> Trail:
+def run_search(method: str, task: Task, options: SearchOptions, rng: np.random.Generator) -> Trail:
     """Let the algorithm propose generations until the evaluations are spent."""
     started = time.perf_counter()
     algorithm, evaluator, wrap = _pymoo(method, task, options, rng)
@@ -133,24 +141,27 @@ def _pymoo(
     method: str, task: Task, options: SearchOptions, rng: np.random.Generator
 ) -> tuple[Any, Any, Callable[[Array], Any]]:
     """Return pymoo's algorithm, its evaluator, and how it wants to be told errors (n,)."""
+    # An extra: who never searches need not install it.
     try:
-        from pymoo.algorithms.soo.nonconvex.ga import GA
-        from pymoo.algorithms.soo.nonconvex.pso import PSO
-        from pymoo.core.evaluator import Evaluator
-        from pymoo.core.problem import Problem
-        from pymoo.core.termination import NoTermination
-        from pymoo.problems.static import StaticProblem
+        core = {name: import_module(f"pymoo.{place}") for name, place in _PYMOO.items()}
     except ImportError as error:
         raise InputError(
             f"the methods pso and ga need the package pymoo ({error}); install bramah[search]"
         ) from error
     span = np.log10(task.high / task.low)
-    problem = Problem(n_var=len(span), n_obj=1, xl=np.zeros(len(span)), xu=span)
+    problem = core["problem"].Problem(n_var=len(span), n_obj=1, xl=np.zeros(len(span)), xu=span)
     size = min(options.population, options.evaluations)
-    algorithm = {"pso": PSO, "ga": GA}[method](pop_size=size)
+    algorithm = getattr(core[method], method.upper())(pop_size=size)
     seed = int(rng.integers(2**31))
-    algorithm.setup(problem, termination=NoTermination(), seed=seed, verbose=False)
-    return algorithm, Evaluator(), lambda errors: StaticProblem(problem, F=errors[:, None])
+    algorithm.setup(
+        problem, termination=core["termination"].NoTermination(), seed=seed, verbose=False
+    )
+    static = core["static"].StaticProblem
+    return (
+        algorithm,
+        core["evaluator"].Evaluator(),
+        lambda errors: static(problem, F=errors[:, None]),
+    )
 
 
 def _values(task: Task, point: Array) -> dict[str, float]:
@@ -160,14 +171,9 @@ def _values(task: Task, point: Array) -> dict[str, float]:
 def _identification(
     method: str, runs: Sequence[Run], task: Task, trail: Trail, options: SearchOptions
 ) -> Identification:
-    none = (np.nan, np.nan)
-    template = with_values(task.model, trail.values)
-    estimates = {
-        name: Estimate(p.value, p.unit, np.nan, none, "a search gives no interval")
-        if name in task.names
-        else Estimate(np.nan, p.unit, np.nan, none, f"{method} searches STEP1's parameters only")
-        for name, p in template.parameters.items()
-    }
+    rig, used = task.model.rig, task.model.terms
+    solutions = {family: _as_solution(method, task, trail, family) for family in FAMILIES}
+    estimates, covariance = estimates_of(rig, used, solutions)
     statements = _statements(method, runs, task, trail)
     provenance = {
         "method": method,
@@ -176,21 +182,35 @@ def _identification(
         "evaluations": trail.evaluations,
         "checks_failed": [c.name for c in statements if not c.ok],
     }
-    model = Model(template.rig, template.terms, estimates, template.covariance, provenance)
-    nothing = {"mechanical": 0, "fluid": 0}
+    model = Model(rig, used, estimates, covariance, provenance)
+    rows = dict.fromkeys(FAMILIES, 0)
     extra = {"search": trail_json(task, trail, options)}
     return Identification(
-        method, estimates, {}, nothing, 0, trail.seconds, statements, model, extra
+        method, estimates, solutions, rows, 0, trail.seconds, statements, model, extra
     )
+
+
+def _as_solution(method: str, task: Task, trail: Trail, family: str) -> Solution:
+    """Return a family's values as a solution of no rows: no interval, no condition number."""
+    coefficients = {
+        c.parameter: c for u in task.model.terms for c in u.term.coefficients(task.model.rig)
+    }
+    names = parameters_of(task.model.rig, task.model.terms, family)
+    nan = np.full(len(names), np.nan)
+    value = nan.copy()
+    for i, name in enumerate(names):
+        if name in trail.values:
+            found = trail.values[name]
+            value[i] = 1.0 / found if coefficients[name].reciprocal else found
+    lost = {n: f"{method} searches STEP1's parameters only" for n in names if n not in trail.values}
+    return Solution(names, value, np.diag(nan), nan, np.nan, 0, np.nan, nan, lost)
 
 
 def _fates(trail: Trail) -> str:
     return ", ".join(f"{count} {fate}" for fate, count in trail.lost.items())
 
 
-def _statements(
-    method: str, runs: Sequence[Run], task: Task, trail: Trail
-) -> tuple[Check, ...]:
+def _statements(method: str, runs: Sequence[Run], task: Task, trail: Trail) -> tuple[Check, ...]:
     gone = sum(trail.lost.values())
     share = 100.0 * gone / trail.evaluations
     parameters = len(task.model.parameters)
