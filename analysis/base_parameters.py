@@ -37,7 +37,7 @@ class Combination:
     @property
     def text(self) -> str:
         """The combination as people write it: "R11 + R22 + 1.56 R12"."""
-        words = []
+        words: list[str] = []
         for name, coefficient in self.parts:
             size = abs(coefficient)
             whole = round(size)
@@ -119,9 +119,9 @@ def _combinations(
         c[i], c[dependent] = 1.0, -(back @ null[:, i])
         # A column of zeros carries nothing: it is lost alone, and in no combination.
         c[(np.abs(c) < NEGLIGIBLE * np.abs(c).max()) | (size == 0.0)] = 0.0
-        parts = np.flatnonzero(c)
+        parts = [int(p) for p in np.flatnonzero(c)]
         plain = c * scale
-        if len(parts):
+        if parts:
             first = plain[parts[0]]
             out.append(Combination(tuple((names[p], float(plain[p] / first)) for p in parts)))
     return out

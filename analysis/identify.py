@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,11 +26,13 @@ from rig.model.parse import InputError
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
 
+if TYPE_CHECKING:
+    from analysis.methods.search import SearchOptions
+
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
-METHODS = ("coupled",)
-LATER_METHODS = ("sequential", "simultaneous", "pso", "ga")
+METHODS = ("coupled", "sequential", "simultaneous", "pso", "ga")
 SEGMENTS = 10  # of the only repeat of a step, where there are not more repeats
 
 
@@ -57,6 +59,7 @@ class Identification:
     solve_seconds: float
     checks: tuple[Check, ...]
     model: Model
+    extra: Mapping[str, Any] = field(default_factory=dict)  # a method's own figures, plain data
 
 
 def identify(
@@ -65,23 +68,30 @@ def identify(
     terms: Sequence[Used] | None = None,
     filtering: Callable[[Record], Filtering] = default_filtering,
     reject_noise: bool = True,
+    rng: np.random.Generator | None = None,
+    search: SearchOptions | None = None,
 ) -> Identification:
     """Identify all parameters from all records of the runs at once (the paper's STEP4).
 
     `terms` defaults to the paper's model. `reject_noise` False gives out parameters that rest on
-    sensor noise as well, for studies of just that. Raises InputError for another method, for runs
+    sensor noise as well, for studies of just that. Another `method` is `analysis.methods`' work,
+    `rng` and `search` being for those that search. Raises InputError for another method, for runs
     of different rigs and for records that cannot be used, naming record and channel.
     """
     _refuse_method(method)
     rig = ck.common_rig(runs)
     used = tuple(terms) if terms is not None else tuple(map(Used, baseline_of(rig)))
+    if method != "coupled":
+        from analysis.methods import identify_by  # noqa: PLC0415 (which builds on this module)
+
+        return identify_by(method, runs, used, filtering, reject_noise, rng, search)
     per_record = build_rows(rig, runs, used, filtering)
     # A stream of its own: the prediction of bias is the same every time.
     noise = noise_moments(rig, runs, used, filtering, np.random.default_rng(0))
     started = time.perf_counter()
     solutions = solve_rows(rig, used, per_record, noise, reject_noise)
     seconds = time.perf_counter() - started
-    estimates, covariance = _estimates(rig, used, solutions)
+    estimates, covariance = estimates_of(rig, used, solutions)
     rows = {family: solution.rows for family, solution in solutions.items()}
     masked = sum(r.masked for one in per_record for r in one.rows.values())
     statements = _statements(rig, runs, per_record, solutions, estimates, rows, masked)
@@ -98,10 +108,6 @@ def identify(
 
 
 def _refuse_method(method: str) -> None:
-    if method in LATER_METHODS:
-        raise InputError(
-            f"method {method!r} comes with a later version; this one knows: {' '.join(METHODS)}"
-        )
     if method not in METHODS:
         raise InputError(f"unknown method {method!r}; known: {' '.join(METHODS)}")
 
@@ -146,8 +152,7 @@ def solve_rows(
         names = parameters_of(rig, terms, family)
         clusters: list[Cluster] = []
         for one in per_record:
-            pieces = 1 if repeats[one.run, one.step] > 1 else SEGMENTS
-            clusters += _clusters(one, family, pieces)
+            clusters += clusters_of(one, family, repeats)
         if names:
             moments = noise[family] if noise else None
             linear = solve(names, clusters, moments, reject_noise)
@@ -155,7 +160,11 @@ def solve_rows(
     return out
 
 
-def _clusters(one: RecordRows, family: str, pieces: int) -> list[Cluster]:
+def clusters_of(
+    one: RecordRows, family: str, repeats: Mapping[tuple[int, str], int]
+) -> list[Cluster]:
+    """Reduce a record's rows of one family to a triangle, or to several of an only repeat."""
+    pieces = 1 if repeats[one.run, one.step] > 1 else SEGMENTS
     out = []
     rows = [r for name, r in one.rows.items() if family_of(name) == family]
     for piece in range(pieces):
@@ -175,7 +184,7 @@ def _piece(rows: Rows, piece: int, pieces: int) -> tuple[Array, Array]:
     return rows.matrix[inside], rows.rhs[inside]
 
 
-def _estimates(
+def estimates_of(
     rig: Rig, terms: Sequence[Used], solutions: Mapping[str, Solution]
 ) -> tuple[dict[str, Estimate], Array]:
     """Turn the rows' coefficients into parameters (b = 1/coefficient) with intervals."""
@@ -251,4 +260,5 @@ def to_json(result: Identification) -> dict[str, Any]:
         "solve_seconds": result.solve_seconds,
         "checks": [{"name": c.name, "ok": bool(c.ok), "detail": c.detail} for c in result.checks],
         "residual_rms": {family: finite(s.residual_rms) for family, s in result.solutions.items()},
+        **result.extra,
     }

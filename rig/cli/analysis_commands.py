@@ -39,7 +39,9 @@ def _load(folders: Sequence[Path]) -> list[Run]:
 
 def identify(
     runs: RunsArgument,
-    method: Annotated[str, typer.Option(help="Only coupled for now.")] = "coupled",
+    method: Annotated[
+        str, typer.Option(help="coupled, sequential, simultaneous, pso or ga.")
+    ] = "coupled",
     effects: Annotated[
         list[str] | None,
         typer.Option(
@@ -49,21 +51,35 @@ def identify(
     json: JsonOption = None,
     model: Annotated[Path | None, typer.Option(help="Write the model file here.")] = None,
     report: Annotated[Path | None, typer.Option(help="Write an HTML report here.")] = None,
+    evaluations: Annotated[
+        int, typer.Option(min=4, help="Candidates that pso or ga may simulate.")
+    ] = 2000,
+    seed: Annotated[int, typer.Option(min=0, help="Of pso and ga.")] = 0,
 ) -> None:
-    """Identify every parameter from all records of the runs at once.
+    """Identify every parameter from all records of the runs at once, or as others would.
 
     Example: bramah identify runs/monday --json parameters.json --model model.json
     """
+    import numpy as np
+
     from analysis.identify import identify as identify_runs
     from analysis.identify import to_json
+    from analysis.methods import SearchOptions
     from analysis.model import save_model
     from analysis.terms import with_effects
     from analysis.terms.base import Used
+    from rig.cli.method_text import method_text
     from rig.cli.tables import identification_text
 
     loaded = _load(runs)
     terms = [Used(term) for term in with_effects(loaded[0].rig, effects)] if effects else None
-    result = identify_runs(loaded, method, terms)
+    result = identify_runs(
+        loaded,
+        method,
+        terms,
+        rng=np.random.default_rng(seed),
+        search=SearchOptions(evaluations=evaluations),
+    )
     if model is not None:
         save_model(result.model, model)
     write_json(json, to_json(result))
@@ -72,7 +88,7 @@ def identify(
 
         write_identification(report, loaded, result)
     if json != Path("-"):
-        typer.echo(identification_text(result))
+        typer.echo(identification_text(result) + method_text(result))
 
 
 def validate(

@@ -56,6 +56,8 @@ def identification_text(result: Identification, truth: Mapping[str, float] | Non
     """Return parameters, conditioning and every check in words."""
     lines = [parameter_table(result.estimates, truth), ""]
     for family, solution in result.solutions.items():
+        if not result.rows[family]:
+            continue  # a search has no rows
         lines.append(
             f"{family}: {result.rows[family]} rows, condition number "
             f"{solution.condition_number:.1f}"
