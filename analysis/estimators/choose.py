@@ -217,6 +217,11 @@ def _told(
         compliance = float(beta[list(names).index("b")])
         alpha, spread_ = -100 * value / compliance, 100 * std / abs(compliance)
         said = f"b changes by {alpha:.2f} +- {2 * spread_:.2f} % per kelvin by these records"
+        if 100 * nu.SLOPE_STD < spread_:
+            said = (
+                "the oil's temperature hardly varied: its effect on b is taken as "
+                f"{100 * nu.SLOPE:.1f} +- {200 * nu.SLOPE_STD:.1f} % per kelvin"
+            )
         if wrong:
             said += ", which no oil does: b is that of the records' mean temperature"
         else:
