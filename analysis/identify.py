@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from analysis import checks as ck
 from analysis.checks import Check
-from analysis.estimators.choose import Job, refine
+from analysis.estimators.choose import Job, refine, refuse_unknown
 from analysis.model import Estimate, Model, estimate_json, finite
 from analysis.noise import noise_moments
 from analysis.rows import Filtering, Rows, default_filtering, parameters_of, record_rows
@@ -31,6 +31,7 @@ log = logging.getLogger(__name__)
 METHODS = ("coupled",)
 LATER_METHODS = ("sequential", "simultaneous", "pso", "ga")
 PLAIN = "plain"  # least squares as in the paper: no nuisances, scatter between repeats only
+FEWEST_DRAWS = 100  # of a bootstrap
 SEGMENTS = 10  # of the only repeat of a step, where there are not more repeats
 
 
@@ -78,6 +79,7 @@ def identify(
     of different rigs and for records that cannot be used, naming record and channel.
     """
     _refuse_method(method)
+    _refuse_estimator(estimator, bootstrap)
     rig = ck.common_rig(runs)
     used = tuple(terms) if terms is not None else tuple(Used(term) for term in baseline())
     per_record = build_rows(rig, runs, used, filtering)
@@ -120,6 +122,17 @@ def _refuse_method(method: str) -> None:
         )
     if method not in METHODS:
         raise InputError(f"unknown method {method!r}; known: {' '.join(METHODS)}")
+
+
+def _refuse_estimator(estimator: str, bootstrap: int) -> None:
+    if estimator != PLAIN:
+        refuse_unknown(estimator)
+    if bootstrap and bootstrap < FEWEST_DRAWS:
+        raise InputError(
+            f"{bootstrap} bootstrap draws tell no 95 % interval; take {FEWEST_DRAWS} or more"
+        )
+    if bootstrap and estimator in (PLAIN, "output-error"):
+        raise InputError(f"--bootstrap does not go with --estimator {estimator}; take ls or iv")
 
 
 def build_rows(
@@ -268,6 +281,7 @@ def to_json(result: Identification) -> dict[str, Any]:
     """Return the identification as the contract's JSON; null where a number does not exist."""
     return {
         "method": result.method,
+        "estimator": str(result.model.provenance.get("estimator", PLAIN)),
         "parameters": {name: estimate_json(p) for name, p in result.estimates.items()},
         "condition_number": {
             family: finite(s.condition_number) for family, s in result.solutions.items()

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.estimators.equations import Block, Fit, common, least_squares, residual_scatter
+from rig.model.parse import InputError
 
 Array = NDArray[np.float64]
 
@@ -51,8 +52,7 @@ def _whitened(blocks: Sequence[Block], fit: Fit) -> list[Block]:
             stacked = np.concatenate(
                 [np.column_stack([deviation[j] for j in member]) for member in members]
             )
-            covariance = stacked.T @ stacked / len(stacked)
-            factors[key] = np.linalg.inv(np.linalg.cholesky(covariance))
+            factors[key] = _whitener(stacked, b)
         L = factors[key]
         for row, target in enumerate(pair):
             X = sum(L[row, c] * blocks[j].X for c, j in enumerate(pair))
@@ -64,3 +64,15 @@ def _whitened(blocks: Sequence[Block], fit: Fit) -> list[Block]:
 def _paired(blocks: Sequence[Block], place: dict[tuple[int, str, str], int], b: Block) -> bool:
     cap = place.get((b.run, b.record, b.equation.replace("flow_rod", "flow_cap")))
     return cap is not None and len(blocks[cap].y) == len(b.y)
+
+
+def _whitener(deviation: Array, b: Block) -> Array:
+    """Return inv(cholesky(covariance)) of deviations (rows, equations of the pair)."""
+    covariance = deviation.T @ deviation / len(deviation)
+    try:
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
+    except np.linalg.LinAlgError:
+        raise InputError(
+            f"--estimator wls weighs by the scatter between repeats, but the repeats of "
+            f"{b.step!r} do not differ in {b.equation}: are they copies of one record?"
+        ) from None

@@ -40,6 +40,13 @@ def _load(folders: Sequence[Path]) -> list[Run]:
 def identify(
     runs: RunsArgument,
     method: Annotated[str, typer.Option(help="Only coupled for now.")] = "coupled",
+    estimator: Annotated[
+        str, typer.Option(help="ls, wls, iv, robust, output-error; auto: ls or iv as checked.")
+    ] = "ls",
+    bootstrap: Annotated[
+        int, typer.Option(min=0, help="Draws of whole repeats for the intervals; 0: by repeat.")
+    ] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of the bootstrap's draws.")] = 0,
     json: JsonOption = None,
     model: Annotated[Path | None, typer.Option(help="Write the model file here.")] = None,
     report: Annotated[Path | None, typer.Option(help="Write an HTML report here.")] = None,
@@ -54,7 +61,7 @@ def identify(
     from rig.cli.tables import identification_text
 
     loaded = _load(runs)
-    result = identify_runs(loaded, method)
+    result = identify_runs(loaded, method, estimator=estimator, bootstrap=bootstrap, seed=seed)
     if model is not None:
         save_model(result.model, model)
     write_json(json, to_json(result))
