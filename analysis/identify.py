@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from analysis import checks as ck
 from analysis.advice import base_statements
 from analysis.checks import Check
+from analysis.estimators.choose import Job, refine, refuse_unknown
 from analysis.model import Estimate, Model, estimate_json, finite
 from analysis.noise import noise_moments
 from analysis.reduce import reduced
@@ -33,6 +34,8 @@ Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
 METHODS = ("coupled", "sequential", "simultaneous", "pso", "ga")
+PLAIN = "plain"  # least squares as in the paper: no nuisances, scatter between repeats only
+FEWEST_DRAWS = 100  # of a bootstrap
 SEGMENTS = 10  # of the only repeat of a step, where there are not more repeats
 
 
@@ -68,6 +71,8 @@ def identify(
     terms: Sequence[Used] | None = None,
     filtering: Callable[[Record], Filtering] = default_filtering,
     reject_noise: bool = True,
+    estimator: str = "ls",
+    bootstrap: int = 0,
     rng: np.random.Generator | None = None,
     search: SearchOptions | None = None,
 ) -> Identification:
@@ -75,10 +80,14 @@ def identify(
 
     `terms` defaults to the paper's model. `reject_noise` False gives out parameters that rest on
     sensor noise as well, for studies of just that. Another `method` is `analysis.methods`' work,
-    `rng` and `search` being for those that search. Raises InputError for another method, for runs
+    `search` being for those that search. `estimator` is one of
+    `analysis.estimators.choose.ESTIMATORS`, "plain" the bare solution without nuisances;
+    `bootstrap` draws of whole repeats replace the intervals; `rng` is for what is drawn (default:
+    seed 0). Raises InputError for another method or estimator, for runs
     of different rigs and for records that cannot be used, naming record and channel.
     """
     _refuse_method(method)
+    _refuse_estimator(estimator, bootstrap)
     rig = ck.common_rig(runs)
     used = tuple(terms) if terms is not None else tuple(map(Used, baseline_of(rig)))
     if method != "coupled":
@@ -91,12 +100,23 @@ def identify(
     started = time.perf_counter()
     solutions = solve_rows(rig, used, per_record, noise, reject_noise)
     seconds = time.perf_counter() - started
+    more: tuple[Check, ...] = ()
+    if estimator != PLAIN:
+        job = Job(
+            rig, runs, used, lambda extra: build_rows(rig, runs, (*used, *extra), filtering),
+            estimator, bootstrap, rng or np.random.default_rng(0),
+        )  # fmt: skip
+        refined = refine(job, solutions)
+        solutions, more = refined.solutions, refined.checks
     estimates, covariance = estimates_of(rig, used, solutions)
+    if bootstrap and estimator != PLAIN:
+        estimates = _with_ends(estimates, refined.bootstrap)
     rows = {family: solution.rows for family, solution in solutions.items()}
     masked = sum(r.masked for one in per_record for r in one.rows.values())
-    statements = _statements(rig, runs, per_record, solutions, estimates, rows, masked)
+    statements = _statements(rig, runs, per_record, solutions, estimates, rows, masked) + more
     provenance = {
         "method": method,
+        "estimator": estimator if estimator == PLAIN else refined.estimator,
         "runs": [run.source for run in runs],
         "records": [one.record for one in per_record],
         "rows": rows,
@@ -110,6 +130,17 @@ def identify(
 def _refuse_method(method: str) -> None:
     if method not in METHODS:
         raise InputError(f"unknown method {method!r}; known: {' '.join(METHODS)}")
+
+
+def _refuse_estimator(estimator: str, bootstrap: int) -> None:
+    if estimator != PLAIN:
+        refuse_unknown(estimator)
+    if bootstrap and bootstrap < FEWEST_DRAWS:
+        raise InputError(
+            f"{bootstrap} bootstrap draws tell no 95 % interval; take {FEWEST_DRAWS} or more"
+        )
+    if bootstrap and estimator in (PLAIN, "output-error"):
+        raise InputError(f"--bootstrap does not go with --estimator {estimator}; take ls or iv")
 
 
 def build_rows(
@@ -225,6 +256,18 @@ def _estimate(
     return estimate, float(slope)
 
 
+def _with_ends(
+    estimates: Mapping[str, Estimate], ends: Mapping[str, tuple[float, float]]
+) -> dict[str, Estimate]:
+    """Replace intervals by the bootstrap's; `ends` are of the rows' coefficients (1/b)."""
+    out = dict(estimates)
+    for name, (low, high) in ends.items():
+        if name == "b":
+            low, high = 1.0 / high, 1.0 / low
+        out[name] = replace(out[name], ci95=(low, high))
+    return out
+
+
 def _statements(
     rig: Rig,
     runs: Sequence[Run],
@@ -251,6 +294,7 @@ def to_json(result: Identification) -> dict[str, Any]:
     """Return the identification as the contract's JSON; null where a number does not exist."""
     return {
         "method": result.method,
+        "estimator": str(result.model.provenance.get("estimator", PLAIN)),
         "parameters": {name: estimate_json(p) for name, p in result.estimates.items()},
         "condition_number": {
             family: finite(s.condition_number) for family, s in result.solutions.items()
