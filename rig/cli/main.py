@@ -12,6 +12,7 @@ from rig.cli import (
     bench_commands,
     demo_command,
     figures_command,
+    pendulum_command,
     plan_command,
 )
 from rig.cli.errors import guarded
@@ -30,6 +31,7 @@ for module in (
     plan_command,
     analysis_commands,
     figures_command,
+    pendulum_command,
 ):
     module.register(app)
 
