@@ -37,7 +37,7 @@ class Combination:
     @property
     def text(self) -> str:
         """The combination as people write it: "R11 + R22 + 1.56 R12"."""
-        words = []
+        words: list[str] = []
         for name, coefficient in self.parts:
             size = abs(coefficient)
             whole = round(size)
@@ -123,5 +123,5 @@ def _combinations(
         plain = c * scale
         if len(parts):
             first = plain[parts[0]]
-            out.append(Combination(tuple((names[p], float(plain[p] / first)) for p in parts)))
+            out.append(Combination(tuple((names[int(p)], float(plain[p] / first)) for p in parts)))
     return out

@@ -30,7 +30,7 @@ from rig.model.rig import Rig
 Array = NDArray[np.float64]
 
 TERMS = ("inertia", "viscous_friction", "gravity")
-SHOOTING_ROUNDS = 4
+SHOOTING_ROUNDS, HALVINGS = 6, 8
 STEP_OF_PARAMETER, STEP_OF_START = 1e-5, 1e-6  # finite differences: relative; rad and rad/s
 
 
@@ -64,11 +64,11 @@ def free_rows(rig: Rig, swing: Swing) -> dict[str, Array]:
     for i in range(len(rig.joints)):
         matrix = np.zeros((len(theta), len(names)))
         for term in map(make, TERMS):
-            for name, column in term.columns(rig, signals, ()).get(equation("torque", i), {}).items():
+            for name, column in (
+                term.columns(rig, signals, ()).get(equation("torque", i), {}).items()
+            ):
                 matrix[:, names.index(name)] += column
-        out[equation("torque", i)] = rows.decimate(
-            matrix[inside], row_step(swing.rate, ROW_CUTOFF)
-        )
+        out[equation("torque", i)] = rows.decimate(matrix[inside], row_step(swing.rate, ROW_CUTOFF))
     return out
 
 
@@ -103,7 +103,7 @@ def measured_starts(swing: Swing, firsts: Sequence[int]) -> Array:
 
 @dataclass(frozen=True)
 class Windows:
-    """Stretches of equal length: angles (samples, windows, N), states (windows, 2 N) to start in."""
+    """Stretches of equal length: angles (samples, windows, N), first states (windows, 2 N)."""
 
     theta: Array
     start: Array
@@ -115,7 +115,7 @@ def windows(swings: Sequence[Swing], seconds: float) -> Windows:
     for swing in swings:
         length, edge = round(seconds * swing.rate), channel_filter(swing.rate).reach
         firsts = range(edge, len(swing.theta) - edge - length + 1, length)
-        if len(firsts):
+        if firsts:
             stretches += [swing.theta[first : first + length] for first in firsts]
             starts.append(measured_starts(swing, firsts))
     return Windows(np.stack(stretches, axis=1), np.vstack(starts))
@@ -132,40 +132,46 @@ def refine_free(
 ) -> tuple[dict[str, float], Windows]:
     """Fit parameters and every window's start by output error (Gauss and Newton, from `values`).
 
-    The starts belong to one window each: they are eliminated window by window, which leaves the
-    normal equations of the parameters (Bock's multiple shooting without continuity).
+    A step that does not lower the error is halved until it does: a swinging chain soon forgets
+    where it started, and the error's valley is narrow. Ends where no step lowers it.
     """
     names = mechanical_names(len(rig.joints))
     free = [k for k, name in enumerate(names) if name != scale.name]
-    p = np.array([values[name] for name in names])
-    start = cut.start.copy()
+    p, start = np.array([values[name] for name in names]), cut.start
+    error = _squares(rig, p, start, cut.theta)
     for _ in range(SHOOTING_ROUNDS):
-        p, start = _round(rig, p, start, cut.theta, free)
+        dp, dstart = _step(rig, p, start, cut.theta, free)
+        for share in 0.5 ** np.arange(HALVINGS):
+            lower = _squares(rig, p + share * dp, start + share * dstart, cut.theta)
+            if lower < error:
+                p, start, error = p + share * dp, start + share * dstart, lower
+                break
+        else:
+            break
     return dict(zip(names, map(float, p), strict=True)), Windows(cut.theta, start)
 
 
-def _round(
+def _squares(rig: Rig, p: Array, start: Array, theta: Array) -> float:
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = _simulate(rig, np.tile(p, (len(start), 1)), start, len(theta))
+        return float(np.sum((found - theta) ** 2))
+
+
+def _step(
     rig: Rig, p: Array, start: Array, theta: Array, free: Sequence[int]
 ) -> tuple[Array, Array]:  # fmt: skip
-    """One step of Gauss and Newton with the starts eliminated."""
-    count, width, samples = len(start), start.shape[1], len(theta)
-    moves = [np.zeros_like(p)] * (1 + width)
-    shifts = [np.zeros(width), *(STEP_OF_START * np.eye(width))]
-    for k in free:
-        moves.append(STEP_OF_PARAMETER * p[k] * np.eye(len(p))[k])
-        shifts.append(np.zeros(width))
-    every_p = np.repeat([p + move for move in moves], count, axis=0)
-    every_start = np.vstack([start + shift for shift in shifts])
-    found = _simulate(rig, every_p, every_start, samples)
-    found = found.reshape(samples, len(moves), count, -1)
-    steps = [STEP_OF_START] * width + [STEP_OF_PARAMETER * p[k] for k in free]
-    residual = theta - found[:, 0]
-    slopes = [(found[:, 1 + m] - found[:, 0]) / step for m, step in enumerate(steps)]
+    """Return Gauss and Newton's step of p (k,) and of the starts (windows, 2 N).
+
+    A start belongs to one window: it is eliminated there, which leaves the normal equations of
+    the parameters (Bock's multiple shooting, with nothing to tie the windows together).
+    """
+    residual, slopes = _sensitivities(rig, p, start, theta, free)
+    width = start.shape[1]
     normal, side = np.zeros((len(free), len(free))), np.zeros(len(free))
     parts = []
-    for w in range(count):
-        J = np.stack([slope[:, w].ravel() for slope in slopes], axis=1)
-        own, common, r = J[:, :width], J[:, width:], residual[:, w].ravel()
+    for w in range(len(start)):
+        J, r = slopes[:, :, w].reshape(len(slopes), -1).T, residual[:, w].ravel()
+        own, common = J[:, :width], J[:, width:]
         Q = np.linalg.qr(own)[0]
         left = common - Q @ (Q.T @ common)
         normal += left.T @ left
@@ -173,10 +179,28 @@ def _round(
         parts.append((own, common, r))
     size = np.sqrt(np.diag(normal))
     step = np.linalg.solve(normal / np.outer(size, size), side / size) / size
-    better = p.copy()
-    better[list(free)] += step
-    moved = [np.linalg.lstsq(own, r - common @ step, rcond=None)[0] for own, common, r in parts]
-    return better, start + np.array(moved)
+    dp = np.zeros_like(p)
+    dp[list(free)] = step
+    dstart = [np.linalg.lstsq(own, r - common @ step, rcond=None)[0] for own, common, r in parts]
+    return dp, np.array(dstart)
+
+
+def _sensitivities(
+    rig: Rig, p: Array, start: Array, theta: Array, free: Sequence[int]
+) -> tuple[Array, Array]:  # fmt: skip
+    """Return theta less simulated (n, windows, N), and its slopes (2 N + free, n, windows, N)."""
+    count, width = start.shape
+    steps = np.array([STEP_OF_START] * width + [STEP_OF_PARAMETER * p[k] for k in free])
+    moves = np.zeros((1 + len(steps), len(p)))
+    shifts = np.zeros((1 + len(steps), width))
+    shifts[1 : 1 + width] = STEP_OF_START * np.eye(width)
+    for row, k in enumerate(free, start=1 + width):
+        moves[row, k] = steps[row - 1]
+    every_p = np.repeat(p + moves, count, axis=0)
+    every_start = (start[None] + shifts[:, None]).reshape(-1, width)
+    found = _simulate(rig, every_p, every_start, len(theta))
+    found = found.reshape(len(theta), len(moves), count, -1).swapaxes(0, 1)
+    return theta - found[0], (found[1:] - found[0]) / steps[:, None, None, None]
 
 
 def _simulate(rig: Rig, p: Array, start: Array, samples: int) -> Array:

@@ -43,7 +43,7 @@ def steps_needed(joints: int) -> int:
 def candidates(rig: Rig) -> tuple[Step, ...]:
     """Return all candidate steps, outermost joint first, with their first amplitude."""
     N = len(rig.joints)
-    found = []
+    found: list[Step] = []
     for excited in range(N, 0, -1):
         for places in _places(N - excited):
             beyond = tuple(zip(range(excited + 1, N + 1), places, strict=True))

@@ -76,10 +76,14 @@ def read_pendulum(folder: Path) -> Pendulum:
 
 
 def _mat(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        raise InputError(
+            f"{path} is not there; expected the folder of the two MATLAB files {DATA} and {AUTHORS}"
+        )
     try:
         found: dict[str, Any] = loadmat(path)
     except (OSError, ValueError, NotImplementedError) as error:
-        raise InputError(f"cannot read {path}: {error}; expected the MATLAB file of that name") from error
+        raise InputError(f"{path} is not a MATLAB file that can be read: {error}") from error
     return found
 
 
@@ -113,7 +117,10 @@ def compared_text(found: Compared) -> str:
     ]  # fmt: skip
     parameters = table(["parameter", *ways, "unit"], rows)
     lines = [
-        [f"{cells}, {seconds:g} s", *(f"{1e3 * found.errors[way][cells][seconds]:.3f}" for way in ways)]
+        [
+            f"{cells}, {seconds:g} s",
+            *(f"{1e3 * found.errors[way][cells][seconds]:.3f}" for way in ways),
+        ]
         for cells in ("Y_vad", "Y_id")
         for seconds in WINDOWS
     ]

@@ -38,7 +38,7 @@ def check_text(report: CheckReport) -> str:
 
 
 def proof_text(proof: Proof) -> str:
-    """Return one row per step (what it does, ranks and conditions so far, why), then the verdict."""
+    """Return one row per step (what it does, rank and condition so far, why), then the verdict."""
     families = list(proof.verdicts)
     rows = [
         [f"{r.step}: {r.told}", *(_so_far(r.verdicts, family) for family in families), r.why]

@@ -72,9 +72,7 @@ def chain(joints: int) -> Chain:
 
 def _motion(joints: int, samples: int = 40) -> tuple[Array, Array, Array]:
     rng = np.random.default_rng(joints)
-    return tuple(
-        rng.uniform(-scale, scale, (samples, joints)) for scale in (np.pi, 3.0, 20.0)
-    )  # type: ignore[return-value]
+    return tuple(rng.uniform(-scale, scale, (samples, joints)) for scale in (np.pi, 3.0, 20.0))  # type: ignore[return-value]
 
 
 def test_the_regressor_times_the_bodies_parameters_is_the_inverse_dynamics(
@@ -91,9 +89,9 @@ def test_the_regressor_times_the_bodies_parameters_is_the_inverse_dynamics(
     ours = np.zeros_like(q)
     for term in used:
         for i in range(joints):
-            for name, column in term.term.columns(described, signals, ()).get(
-                equation("torque", i), {}
-            ).items():
+            for name, column in (
+                term.term.columns(described, signals, ()).get(equation("torque", i), {}).items()
+            ):
                 ours[:, i] += column * values[name]
     theirs = np.array(
         [pin.rnea(chain.model, chain.data, *row) for row in zip(q, qd, qdd, strict=True)]
