@@ -152,7 +152,7 @@ def conditioning(done: Reproduction) -> Section:
             "units. One experiment each, least and largest over the experiments. Rows here are "
             "low-passed and decimated, which is why they are few.",
             Table("Conditioning of one experiment", header, rows),
-            f"To solve one experiment takes {1e3 * done.each.solve_seconds:.0f} ms at most (with "
+            f"To solve one experiment took {1e3 * done.each.solve_seconds:.0f} ms (median; with "
             f"every row of the paper's filter {1e3 * done.paper_each.solve_seconds:.0f} ms), all "
             f"{done.each.count} together {1e3 * done.coupled.solve_seconds:.0f} ms; the paper says "
             f"{paper.SOLVE_SECONDS} s on its computer.",
