@@ -17,6 +17,7 @@ from analysis.signals import clipped_samples
 from analysis.solve import Solution
 from analysis.terms.inertia import chain_matrix, mass_matrix
 from rig.model import channels as ch
+from rig.model.electric import position_limits
 from rig.model.parameters import gain_names, inertia_names
 from rig.model.parse import InputError
 from rig.model.records import Record, RecordHead, Run
@@ -55,6 +56,12 @@ def common_rig(runs: Sequence[Run] | Sequence[RunHead]) -> Rig:
                 f"{runs[0].source or 'the first run'} and {run.source or 'another'} are of "
                 f"different rigs: {difference}; identify them apart"
             )
+    joints = set(range(1, len(runs[0].rig.joints) + 1))
+    if all(joints <= set(record.locked) for run in runs for record in run.records):
+        raise InputError(
+            "every record has every joint locked: nothing moved, so nothing can be identified; "
+            "record a step that excites a joint"
+        )
     return runs[0].rig
 
 
@@ -78,7 +85,7 @@ def refuse_dead_channels(
     for i in range(1, len(rig.joints) + 1):
         if i in record.locked:
             continue
-        for kind in ch.JOINT_KINDS:
+        for kind in rig.joint_kinds:
             name = ch.channel(kind, i)
             if name not in spans:
                 continue
@@ -93,13 +100,15 @@ def refuse_dead_channels(
                     f"record {record.name!r}, channel {name!r}: every sample is {low:g}; is the "
                     "sensor connected?"
                 )
-        low, high = spans.get(ch.channel(ch.PISTON, i), (-np.inf, np.inf))
-        travel, noise = high - low, rig.sensors.piston.noise
+        place = ch.channel(rig.position_kind, i)
+        low, high = spans.get(place, (-np.inf, np.inf))
+        travel, noise = high - low, rig.sensors.of(rig.position_kind).noise
         if travel < MOVED * noise:
+            unit = "m" + rig.unit_of(place)
             raise InputError(
-                f"record {record.name!r}, channel 'piston_{i}': joint {i} is not locked but moved "
-                f"only {travel * 1e3:.3g} mm (sensor noise {noise * 1e3:.3g} mm); it was not "
-                "excited, or belongs under 'locked'"
+                f"record {record.name!r}, channel {place!r}: joint {i} is not locked but moved "
+                f"only {travel * 1e3:.3g} {unit} (sensor noise {noise * 1e3:.3g} {unit}); it was "
+                "not excited, or belongs under 'locked'"
             )
 
 
@@ -108,11 +117,13 @@ def clipped_counts(rig: Rig, record: Record) -> dict[str, int]:
     return {
         name: int(mask.sum())
         for name, mask in clipped_samples(rig, record).items()
-        if ch.kind_of(name)[1] not in record.locked or name.startswith(ch.PISTON)
+        if ch.kind_of(name)[1] not in record.locked or name.startswith(rig.position_kind)
     }
 
 
-def clipping(rig: Rig, found: Iterable[tuple[RecordHead, Mapping[str, int]]]) -> list[Check]:
+def clipping(
+    rig: Rig, found: Iterable[tuple[Record | RecordHead, Mapping[str, int]]]
+) -> list[Check]:
     """State every sensor that touched an end of its range, by step, with the worst record.
 
     `found` holds what `clipped_counts` says of every record.
@@ -130,14 +141,14 @@ def clipping(rig: Rig, found: Iterable[tuple[RecordHead, Mapping[str, int]]]) ->
                 "clipped sensor",
                 part < CLIPPED_SHARE,
                 f"record {record_name!r}, channel {name!r}: {count} samples "
-                f"({100 * part:.2g} %) at the end of {low:g}..{high:g} {ch.unit_of(name)}; "
+                f"({100 * part:.2g} %) at the end of {low:g}..{high:g} {rig.unit_of(name)}; "
                 "masked (the worst record of its step)",
             )
         )
     return out or [Check("clipped sensor", True, "no sensor reached the end of its range")]
 
 
-def lost_samples(found: Iterable[tuple[RecordHead, int]]) -> Check:
+def lost_samples(found: Iterable[tuple[Record | RecordHead, int]]) -> Check:
     """State how many samples never arrived, `found` being (record, its lost samples)."""
     pairs = [(lost, head) for head, lost in found]
     total = sum(lost for lost, _ in pairs)
@@ -245,9 +256,8 @@ def _signs(rig: Rig, estimates: Mapping[str, Estimate]) -> Check:
         for name in positive
         if name in estimates and estimates[name].value <= 0
     ]
-    return Check(
-        "signs", not bad, "; ".join(bad) or "friction, bulk modulus and flow gains are positive"
-    )
+    judged = "friction is" if rig.electric else "friction, bulk modulus and flow gains are"
+    return Check("signs", not bad, "; ".join(bad) or f"{judged} positive")
 
 
 def _inertia(rig: Rig, estimates: Mapping[str, Estimate]) -> list[Check]:
@@ -261,13 +271,14 @@ def _inertia(rig: Rig, estimates: Mapping[str, Estimate]) -> list[Check]:
         ((float(np.linalg.eigvalsh(mass_matrix(R, q))[0]), q) for q in workspace(rig)),
         key=lambda pair: pair[0],
     )
-    angles = " ".join(f"{np.degrees(v):.0f}" for v in where)
+    turns = rig.unit_of_parameter(names[0]) != "kg"
+    angles = " ".join(f"{np.degrees(v):.0f} deg" if turns else f"{v:.3g} m" for v in where)
     out = [
         Check(
             "inertia",
             smallest > 0,
-            f"smallest eigenvalue of M over the workspace {smallest:.4g} kg m^2, "
-            f"at q = {angles} deg",
+            f"smallest eigenvalue of M over the workspace {smallest:.4g} "
+            f"{rig.unit_of_parameter(names[0])}, at q = {angles}",
         )
     ]
     for i in range(N):
@@ -275,6 +286,8 @@ def _inertia(rig: Rig, estimates: Mapping[str, Estimate]) -> list[Check]:
             W = estimates[f"W{j + 1}"].value if f"W{j + 1}" in estimates else np.nan
             if np.isfinite(W) and W != 0:
                 length, ratio = rig.joints[i].link_length, R[i, j] / W
+                if not length:
+                    continue
                 off = ratio / length - 1
                 out.append(
                     Check(
@@ -308,6 +321,10 @@ def workspace(rig: Rig, points: int = 9) -> list[Array]:
         unit = np.outer(np.arange(4096), steps) % 1.0
     angles = np.empty_like(unit)
     for i, joint in enumerate(rig.joints):
+        if rig.electric:
+            low, high = position_limits(rig, i)
+            angles[:, i] = low + unit[:, i] * (high - low)
+            continue
         half = joint.cylinder.stroke / 2
         angles[:, i] = joint.linkage.angle((2 * unit[:, i] - 1) * half)
     return list(angles)

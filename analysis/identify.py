@@ -5,42 +5,49 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analysis import checks as ck
+from analysis.advice import base_statements
 from analysis.checks import Check
-from analysis.compute import Pool, Serial
-from analysis.model import Estimate, Model, estimate_json, finite
-from analysis.reduce import (
+from analysis.condense import (
     SEGMENTS,
     Reduction,
-    Task,
-    first_of_steps,
-    path_of,
     reduce_runs,
-    reduce_task,
     solve_reductions,
 )
-from analysis.reduce import repeats_of as reduced_repeats
+from analysis.condense import repeats_of as reduced_repeats
+from analysis.estimators.choose import Job, Refined, refine, refuse_unknown
+from analysis.model import Estimate, Model, estimate_json, finite
+from analysis.reduce import reduced
 from analysis.rows import Filtering, Rows, default_filtering, parameters_of, record_rows
 from analysis.signals import condition
 from analysis.solve import Cluster, Solution, half_width, solve, triangle
-from analysis.terms import baseline
+from analysis.terms import baseline_of
 from analysis.terms.base import FAMILIES, Coefficient, Used, family_of
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
-from rig.services.stream import read_run_head
+
+if TYPE_CHECKING:
+    from analysis.methods.search import SearchOptions
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
-METHODS = ("coupled",)
-LATER_METHODS = ("sequential", "simultaneous", "pso", "ga")
+METHODS = ("coupled", "sequential", "simultaneous", "pso", "ga")
+PLAIN = "plain"  # least squares as in the paper: no nuisances, scatter between repeats only
+FEWEST_DRAWS = 100  # of a bootstrap
+_UNREFINED = Check(
+    "estimator",
+    True,
+    "plain: least squares with intervals from the scatter between repeats alone; what the other "
+    "estimators refine (every row in memory, parameters linear in them) was not applied",
+)
 
 
 @dataclass(frozen=True)
@@ -66,6 +73,7 @@ class Identification:
     solve_seconds: float
     checks: tuple[Check, ...]
     model: Model
+    extra: Mapping[str, Any] = field(default_factory=dict)  # a method's own figures, plain data
 
 
 def identify(
@@ -74,46 +82,44 @@ def identify(
     terms: Sequence[Used] | None = None,
     filtering: Callable[[Record], Filtering] = default_filtering,
     reject_noise: bool = True,
+    estimator: str = "ls",
+    bootstrap: int = 0,
+    rng: np.random.Generator | None = None,
+    search: SearchOptions | None = None,
 ) -> Identification:
     """Identify all parameters from all records of the runs at once (the paper's STEP4).
 
     `terms` defaults to the paper's model. `reject_noise` False gives out parameters that rest on
-    sensor noise as well, for studies of just that. Raises InputError for another method, for runs
+    sensor noise as well, for studies of just that. Another `method` is `analysis.methods`' work,
+    `search` being for those that search. `estimator` is one of
+    `analysis.estimators.choose.ESTIMATORS`, "plain" the bare solution without nuisances;
+    `bootstrap` draws of whole repeats replace the intervals; `rng` is for what is drawn (default:
+    seed 0). Raises InputError for another method or estimator, for runs
     of different rigs and for records that cannot be used, naming record and channel.
     """
     _refuse_method(method)
+    _refuse_estimator(estimator, bootstrap)
     rig = ck.common_rig(runs)
-    used = tuple(terms) if terms is not None else tuple(Used(term) for term in baseline())
+    used = tuple(terms) if terms is not None else tuple(map(Used, baseline_of(rig)))
+    if method != "coupled":
+        from analysis.methods import identify_by  # noqa: PLC0415 (which builds on this module)
+
+        return identify_by(method, runs, used, filtering, reject_noise, rng, search)
+
+    estimator = _usable(rig, used, estimator, bootstrap)
+
+    def refined(solutions: Mapping[str, Solution]) -> Refined:
+        job = Job(
+            rig, runs, used, lambda extra: build_rows(rig, runs, (*used, *extra), filtering),
+            estimator, bootstrap, rng or np.random.default_rng(0),
+        )  # fmt: skip
+        return refine(job, solutions)
+
     reductions = reduce_runs(rig, runs, used, filtering)
-    return conclude(rig, [run.source for run in runs], used, reductions, method, reject_noise)
-
-
-def identify_folders(
-    folders: Sequence[str],
-    method: str = "coupled",
-    terms: Sequence[Used] | None = None,
-    filtering: Callable[[Record], Filtering] = default_filtering,
-    reject_noise: bool = True,
-    pool: Pool | None = None,
-) -> Identification:
-    """Identify from run folders, of which one record at a time is in memory; see `identify`.
-
-    With a `pool` each record is reduced in one of its processes, where the folders are read; only
-    triangles come back. Raises InputError as `identify` and `load_run` do.
-    """
-    _refuse_method(method)
-    workers = pool or Serial()
-    used = tuple(terms) if terms is not None else tuple(Used(term) for term in baseline())
-    heads = list(workers.map(read_run_head, folders, reads=str))
-    rig = ck.common_rig(heads)
-    tasks = [
-        Task(rig, number, folder, record.name, used, filtering, record.name in first)
-        for number, (folder, head) in enumerate(zip(folders, heads, strict=True))
-        for first in (first_of_steps(head.records),)
-        for record in head.records
-    ]
-    reductions = list(workers.map(reduce_task, tasks, reads=path_of))
-    return conclude(rig, [h.source for h in heads], used, reductions, method, reject_noise)
+    sources = [run.source for run in runs]
+    return conclude(
+        rig, sources, used, reductions, reject_noise, None if estimator == PLAIN else refined
+    )
 
 
 def conclude(
@@ -121,19 +127,27 @@ def conclude(
     sources: Sequence[str],
     used: tuple[Used, ...],
     reductions: Sequence[Reduction],
-    method: str,
     reject_noise: bool,
+    refined: Callable[[Mapping[str, Solution]], Refined] | None = None,
 ) -> Identification:
     """Solve the reductions of all records of the runs `sources`, and judge what comes out."""
     started = time.perf_counter()
     solutions = solve_reductions(rig, used, reductions, reject_noise)
     seconds = time.perf_counter() - started
+    found = Refined(solutions, (_UNREFINED,), PLAIN) if refined is None else refined(solutions)
+    solutions = found.solutions
     estimates, covariance = estimates_of(rig, used, solutions)
+    if found.bootstrap:
+        estimates = _with_ends(estimates, found.bootstrap)
     rows = {family: solution.rows for family, solution in solutions.items()}
     masked = sum(one.masked for one in reductions)
-    statements = _statements(rig, reductions, solutions, estimates, rows, masked)
+    statements = (
+        *_statements(rig, reductions, solutions, estimates, rows, masked),
+        *found.checks,
+    )
     provenance = {
-        "method": method,
+        "method": "coupled",
+        "estimator": found.estimator,
         "runs": list(sources),
         "records": [one.head.name for one in reductions],
         "rows": rows,
@@ -141,16 +155,43 @@ def conclude(
     }
     model = Model(rig, used, estimates, covariance, provenance)
     log.info("identified %d parameters from %d records", len(estimates), len(reductions))
-    return Identification(method, estimates, solutions, rows, masked, seconds, statements, model)
+    return Identification("coupled", estimates, solutions, rows, masked, seconds, statements, model)
 
 
 def _refuse_method(method: str) -> None:
-    if method in LATER_METHODS:
-        raise InputError(
-            f"method {method!r} comes with a later version; this one knows: {' '.join(METHODS)}"
-        )
     if method not in METHODS:
         raise InputError(f"unknown method {method!r}; known: {' '.join(METHODS)}")
+
+
+def _refuse_estimator(estimator: str, bootstrap: int) -> None:
+    if estimator != PLAIN:
+        refuse_unknown(estimator)
+    if bootstrap and bootstrap < FEWEST_DRAWS:
+        raise InputError(
+            f"{bootstrap} bootstrap draws tell no 95 % interval; take {FEWEST_DRAWS} or more"
+        )
+    if bootstrap and estimator in (PLAIN, "output-error"):
+        raise InputError(f"--bootstrap does not go with --estimator {estimator}; take ls or iv")
+
+
+def _usable(rig: Rig, used: Sequence[Used], estimator: str, bootstrap: int) -> str:
+    """Return the estimator for these terms, plain where ls cannot refine; raises InputError."""
+    if rig.electric and estimator == "output-error":
+        raise InputError(
+            "--estimator output-error simulates cylinders, of which an electric rig has none; "
+            "take ls"
+        )
+    reducing = [one.term.name for one in used if one.term.reduction(rig) is not None]
+    if not reducing or estimator == PLAIN:
+        return estimator
+    # The others solve for the rows' linear unknowns, which are more than the parameters here.
+    if estimator != "ls" or bootstrap:
+        asked = f"--estimator {estimator}" if estimator != "ls" else "--bootstrap"
+        raise InputError(
+            f"{asked} does not go with {' '.join(reducing)}, whose parameters are not linear in "
+            "the rows; leave it out"
+        )
+    return PLAIN
 
 
 def build_rows(
@@ -193,15 +234,19 @@ def solve_rows(
         names = parameters_of(rig, terms, family)
         clusters: list[Cluster] = []
         for one in per_record:
-            pieces = 1 if repeats[one.run, one.step] > 1 else SEGMENTS
-            clusters += _clusters(one, family, pieces)
+            clusters += clusters_of(one, family, repeats)
         if names:
             moments = noise[family] if noise else None
-            out[family] = solve(names, clusters, moments, reject_noise)
+            linear = solve(names, clusters, moments, reject_noise)
+            out[family] = reduced(rig, terms, linear, clusters, moments, reject_noise)
     return out
 
 
-def _clusters(one: RecordRows, family: str, pieces: int) -> list[Cluster]:
+def clusters_of(
+    one: RecordRows, family: str, repeats: Mapping[tuple[int, str], int]
+) -> list[Cluster]:
+    """Reduce a record's rows of one family to a triangle, or to several of an only repeat."""
+    pieces = 1 if repeats[one.run, one.step] > 1 else SEGMENTS
     out = []
     rows = [r for name, r in one.rows.items() if family_of(name) == family]
     for piece in range(pieces):
@@ -225,7 +270,7 @@ def estimates_of(
     rig: Rig, terms: Sequence[Used], solutions: Mapping[str, Solution]
 ) -> tuple[dict[str, Estimate], Array]:
     """Turn the rows' coefficients into parameters (b = 1/coefficient) with intervals."""
-    coefficients = {c.parameter: c for used in terms for c in used.term.coefficients(rig)}
+    coefficients = {c.parameter: c for used in terms for c in used.term.parameters(rig)}
     found: dict[str, Estimate] = {}
     blocks = []
     for solution in solutions.values():
@@ -262,6 +307,17 @@ def _estimate(
     return estimate, float(slope)
 
 
+def _with_ends(
+    estimates: Mapping[str, Estimate], ends: Mapping[str, tuple[float, float]]
+) -> dict[str, Estimate]:
+    """Replace intervals by the bootstrap's; `ends` are of the rows' coefficients (1/b)."""
+    out = dict(estimates)
+    for name, (low, high) in ends.items():
+        turned = (1.0 / high, 1.0 / low) if name == "b" else (low, high)
+        out[name] = replace(out[name], ci95=turned)
+    return out
+
+
 def _statements(
     rig: Rig,
     reductions: Sequence[Reduction],
@@ -277,6 +333,7 @@ def _statements(
         ck.lost_samples([(one.head, one.lost) for one in reductions]),
         ck.masked(sum(rows.values()), masked),
         *ck.identifiability(solutions),
+        *base_statements(rig, solutions),
         ck.noise_bias(solutions),
         *ck.consistency(rig, estimates),
     )
@@ -286,6 +343,7 @@ def to_json(result: Identification) -> dict[str, Any]:
     """Return the identification as the contract's JSON; null where a number does not exist."""
     return {
         "method": result.method,
+        "estimator": str(result.model.provenance.get("estimator", PLAIN)),
         "parameters": {name: estimate_json(p) for name, p in result.estimates.items()},
         "condition_number": {
             family: finite(s.condition_number) for family, s in result.solutions.items()
@@ -295,4 +353,5 @@ def to_json(result: Identification) -> dict[str, Any]:
         "solve_seconds": result.solve_seconds,
         "checks": [{"name": c.name, "ok": bool(c.ok), "detail": c.detail} for c in result.checks],
         "residual_rms": {family: finite(s.residual_rms) for family, s in result.solutions.items()},
+        **result.extra,
     }

@@ -32,7 +32,7 @@ from analysis.model import Estimate
 from analysis.rows import Filtering, Rows, default_filtering, parameters_of
 from analysis.solve import Cluster, Solution, merge, solve
 from analysis.stretches import Locks, divisible, overlap, stretch_rows
-from analysis.terms import baseline
+from analysis.terms import baseline_of
 from analysis.terms.base import Term, Used, family_of
 from rig.model.parse import InputError
 from rig.model.records import Record, RecordHead, head_of
@@ -215,12 +215,14 @@ class Tracker:
         rig: Rig,
         terms: Sequence[Used] | None = None,
         memory: float = np.inf,
-        families: Collection[str] = ("fluid",),
+        families: Collection[str] | None = None,
         filtering: Callable[[Record], Filtering] = default_filtering,
     ) -> None:
         if not memory > 0.0:
             raise InputError(f"a memory of {memory:g} s; expected more than 0")
-        used = tuple(terms) if terms is not None else tuple(Used(term) for term in baseline())
+        used = tuple(terms) if terms is not None else tuple(map(Used, baseline_of(rig)))
+        if families is None:  # what needs nothing of the locked joints, where there is such
+            families = ("mechanical",) if rig.electric else ("fluid",)
         self._rig, self._filtering, self._families = rig, filtering, tuple(families)
         self._terms = tuple(one for one in used if self._concerns(one))
         names = {family: parameters_of(rig, self._terms, family) for family in families}

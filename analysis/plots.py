@@ -7,6 +7,7 @@ anything outside, and the same input gives the same bytes.
 from __future__ import annotations
 
 import io
+import itertools
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -100,7 +101,7 @@ def thin(x: Array, y: Array, points: int = POINTS) -> tuple[Array, Array]:
         return x, y
     edges = np.linspace(0, n, points // 2 + 1).astype(int)
     kept: list[int] = [0]
-    for first, last in zip(edges[:-1], edges[1:], strict=True):
+    for first, last in itertools.pairwise(edges.tolist()):
         stretch = np.nan_to_num(y[first:last])
         kept += sorted((first + int(stretch.argmin()), first + int(stretch.argmax())))
     index = np.unique([*kept, n - 1, *np.flatnonzero(np.isnan(y))])
@@ -128,12 +129,13 @@ def svg(made: Figure, key: str, label: str) -> Markup:
     text = _PATH.sub(lambda m: f' d="{_LONG.sub(_short, m[1])}"'.replace(" \n", " "), text)
     text = re.sub(r'\bid="', f'id="{key}-', text)
     text = text.replace("url(#", f"url(#{key}-").replace('xlink:href="#', f'href="#{key}-')
-    text = _FONT.sub(lambda m: f"font-size: {m[2]}px" + (f"; font-weight: {m[1]}" if m[1] else ""), text)  # noqa: E501
-    opening = (
-        Markup('<svg viewBox="{}" role="img" aria-label="{}" preserveAspectRatio="xMidYMid">')
-        .format(_view_box(text), label)
+    text = _FONT.sub(
+        lambda m: f"font-size: {m[2]}px" + (f"; font-weight: {m[1]}" if m[1] else ""), text
     )
-    return Markup(_OPENING.sub(lambda _: str(opening), text, count=1).strip())  # noqa: S704
+    opening = Markup(
+        '<svg viewBox="{}" role="img" aria-label="{}" preserveAspectRatio="xMidYMid">'
+    ).format(_view_box(text), label)
+    return Markup(_OPENING.sub(lambda _: str(opening), text, count=1).strip())
 
 
 def _view_box(text: str) -> str:

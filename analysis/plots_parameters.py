@@ -12,7 +12,7 @@ from analysis.model import Estimate
 from analysis.plots import BLUE, GREY, INK, MODEL, PALE, figure, style, svg
 
 ROW = 0.2  # [in] per parameter
-CAP = 4.0  # the axis ends here, in multiples of the upper quartile: one wild row hides no other
+CAP = 12.0  # the axis ends here, in multiples of the upper quartile: one wild row hides no other
 
 
 def against_reference(
@@ -62,7 +62,9 @@ def _whisker(axes: Any, y: int, row: list[float], limit: float) -> None:
         axes.plot([value], [y], "o", color=BLUE, markersize=3.6)
     else:
         side = np.sign(value)
-        axes.plot([side * limit * 0.985], [y], ">" if side > 0 else "<", color=MODEL, markersize=4.5)
+        axes.plot(
+            [side * limit * 0.985], [y], ">" if side > 0 else "<", color=MODEL, markersize=4.5
+        )
         axes.text(
             side * limit * 0.95, y, f"{value:+.3g} %", color=MODEL, fontsize=7, va="center",
             ha="right" if side > 0 else "left",

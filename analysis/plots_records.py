@@ -35,6 +35,7 @@ from rig.model.rig import Rig
 Array = NDArray[np.float64]
 
 SHOWN_SECONDS = 10.0
+SPAN = 500.0  # of a residual spectrum, largest over smallest
 FEWEST_LINES = 10  # of the period's multiples that a spectrum shows: a sine's harmonics too
 
 
@@ -77,7 +78,9 @@ def excitation(rig: Rig, record: Record, joint: int, key: str) -> Markup:
         top = made.add_axes((0.13, 0.60, 0.84, 0.33))
         low = made.add_axes((0.13, 0.115, 0.84, 0.33))
         if command is not None:
-            top.plot(*thin(record.time[shown], np.asarray(command)[shown]), color=SKY, linewidth=2.2)
+            top.plot(
+                *thin(record.time[shown], np.asarray(command)[shown]), color=SKY, linewidth=2.2
+            )
         top.plot(*thin(record.time[shown], spool[shown] / gain), color=INK, linewidth=0.7)
         top.margins(x=0, y=0.22)
         top.set_ylabel("V of command")
@@ -100,7 +103,8 @@ def _spectrum(axes: Any, record: Record, spool: Array) -> None:
     if lines is None:
         _unknown_lines(axes, record, spool)
         return
-    amplitude = 1e3 * np.maximum(lines.amplitude, 1e-12)
+    # A line that is exactly empty would stretch the axis to nothing.
+    amplitude = 1e3 * np.maximum(lines.amplitude, 1e-7 * lines.amplitude.max() + 1e-12)
     floor = amplitude.min() / 3
     kinds = (
         ("excited", lines.excited, BLUE, "o", 3.2),
@@ -123,9 +127,10 @@ def _spectrum(axes: Any, record: Record, spool: Array) -> None:
 def _unknown_lines(axes: Any, record: Record, spool: Array) -> None:
     window = np.hanning(len(spool))
     spectrum = 2e3 * np.abs(np.fft.rfft((spool - spool.mean()) * window)) / window.sum()
-    frequency = np.fft.rfftfreq(len(spool), 1.0 / record.sample_rate)
+    frequency: Array = np.fft.rfftfreq(len(spool), 1.0 / record.sample_rate).astype(np.float64)
     inside = (frequency > 0) & (frequency <= min(50.0, 0.4 * record.sample_rate))
-    axes.plot(*thin(frequency[inside], np.maximum(spectrum[inside], 1e-9)), color=BLUE, linewidth=0.8)
+    seen: Array = np.maximum(spectrum[inside], 1e-9).astype(np.float64)
+    axes.plot(*thin(frequency[inside], seen), color=BLUE, linewidth=0.8)
     axes.margins(x=0)
     note(axes, 0.995, 0.99, "excited lines not stated in the record", GREY)
 
@@ -147,7 +152,9 @@ def residual(found: Residual, key: str) -> Markup:
         top.yaxis.set_major_locator(MaxNLocator(4))
         top.set_ylabel(unit.text)
         top.set_xlabel("time [s]", labelpad=1)
-        top.set_title(f"residual; measured side {significant(unit.scale * found.rms_side)} {unit.text} RMS")
+        top.set_title(
+            f"residual; measured side {significant(unit.scale * found.rms_side)} {unit.text} RMS"
+        )
         what = "mean of repeats, ±1 scatter" if found.repeats > 1 else "the only repeat"
         note(top, 0.995, 0.99, what, BLUE)
         _densities(low, found, unit.scale, unit.text)
@@ -159,7 +166,14 @@ def _densities(axes: Any, found: Residual, scale: float, unit: str) -> None:
     plain_log(axes.yaxis)
     axes.plot(found.frequency, scale * found.spectrum, color=BLUE, linewidth=1.0)
     above = {"va": "bottom", "ha": "left"}
-    note(axes, 0.0, 1.02, "mean of repeats" if found.repeats > 1 else "the only repeat", BLUE, **above)
+    note(
+        axes,
+        0.0,
+        1.02,
+        "mean of repeats" if found.repeats > 1 else "the only repeat",
+        BLUE,
+        **above,
+    )
     if found.repeats > 1:
         axes.plot(found.frequency, scale * found.spectrum_scatter, color=GREY, linewidth=1.0)
         floor = scale * found.spectrum_scatter / np.sqrt(found.repeats)
@@ -167,5 +181,7 @@ def _densities(axes: Any, found: Residual, scale: float, unit: str) -> None:
         note(axes, 0.26, 1.02, "scatter of one repeat", "#6b7280", **above)
         note(axes, 0.59, 1.02, "scatter left in the mean", "#c2410c", **above)
     axes.margins(x=0)
+    # The row filter's stop band would take up most of the axis.
+    axes.set_ylim(bottom=max(axes.get_ylim()[0], scale * float(found.spectrum.max()) / SPAN))
     axes.set_xlabel("frequency [Hz]", labelpad=1)
     axes.set_ylabel(f"{unit}/√Hz")

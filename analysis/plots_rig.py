@@ -44,7 +44,9 @@ def pose(rig: Rig, q: Array) -> Pose:
     points, inner, outer = [np.zeros(2)], [], []
     for k, joint in enumerate(rig.joints):
         before = theta[k - 1] if k else 0.0
-        inner.append(points[-1] + joint.linkage.base_pin * _direction(before - joint.linkage.offset))
+        inner.append(
+            points[-1] + joint.linkage.base_pin * _direction(before - joint.linkage.offset)
+        )
         outer.append(points[-1] + joint.linkage.arm_pin * _direction(theta[k]))
         points.append(points[-1] + joint.link_length * _direction(theta[k]))
     return Pose(np.array(points), np.array(inner), np.array(outer), theta)

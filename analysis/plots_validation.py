@@ -61,7 +61,9 @@ def comparison(
             if name not in result.measured:
                 note(axes, 0.5, 0.5, "not measured", GREY, ha="center")
                 continue
-            axes.plot(*thin(t, scale * result.measured[name][part], POINTS), color=INK, linewidth=2.2)
+            axes.plot(
+                *thin(t, scale * result.measured[name][part], POINTS), color=INK, linewidth=2.2
+            )
             end = min(real, part.stop)
             if end > part.start:
                 inside = slice(part.start, end)

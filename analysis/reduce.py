@@ -1,228 +1,96 @@
-"""One record reduced to what an identification needs of it: triangles, counts, noise.
+"""Fewer parameters than linear unknowns: nonlinear least squares on the reduced rows alone.
 
-A reduction is a few kilobytes whatever the record's length. It is made where the samples are (in
-this process, in another, on a worker of a cluster) and only it travels; `analysis.identify` puts
-reductions together. Every record is kept in SEGMENTS parts of its duration, because only when all
-records are known is it known whether a step has repeats to compare or must compare its own parts.
+Rows y = X x with x = h(p). Gauss and Newton's step from p0 is least squares of y - X c on X J,
+J = dh/dp at p0 and c = h(p0) - J p0; both follow from the triangle of [X y] by
+
+    [X J, y - X c] = [X y] S,   S = [[J, -c], [0, 1]],
+
+so the rows are never touched again, and covariance, noise bias and identifiability are those of
+`analysis.solve` at the solution (the delta method). Source: Bjorck, Numerical Methods for Least
+Squares Problems, section 9.2.
 """
 
 from __future__ import annotations
 
-import zlib
-from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import pairwise
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis import checks as ck
-from analysis.accumulate import Accumulator
-from analysis.noise import record_moments
-from analysis.rows import Filtering, Rows, parameters_of
-from analysis.signals import lost_samples
 from analysis.solve import Cluster, Solution, merge, solve
-from analysis.stretches import STRETCH, InMemory, Source, divisible, source_rows
-from analysis.terms.base import FAMILIES, Used, family_of
-from rig.model.records import Record, RecordHead, Run
+from analysis.terms.base import Reduction, Used
 from rig.model.rig import Rig
-from rig.services.stream import open_record
 
 Array = NDArray[np.float64]
-Part = tuple[Array, int]  # triangle (k+1, k+1) of [X y] and its rows
+log = logging.getLogger(__name__)
 
-SEGMENTS = 10  # parts of a record
-
-
-@dataclass(frozen=True)
-class Reduction:
-    """What one record says: by family, one triangle per part; what was left out; its noise.
-
-    `run` numbers the run; `noise` is the part of [X y]'[X y] that sensor noise makes, by family,
-    None where another record of the step stands for it.
-    """
-
-    run: int
-    head: RecordHead
-    parts: Mapping[str, tuple[Part, ...]]
-    masked: int
-    lost: int
-    clipped: Mapping[str, int]
-    noise: Mapping[str, Array] | None = None
+ROUNDS = 30
+TOLERANCE = 1e-10  # of a parameter, against the largest
 
 
-@dataclass(frozen=True)
-class Task:
-    """One record to reduce, by where it is; picklable as long as terms and filtering are."""
-
-    rig: Rig
-    run: int
-    path: str
-    record: str
-    terms: tuple[Used, ...]
-    filtering: Callable[[Record], Filtering]
-    with_noise: bool
-    stretch: int = STRETCH
-
-
-def reduce_task(task: Task) -> Reduction:
-    """Reduce a record of a run folder; raises InputError naming record and channel."""
-    with open_record(task.path, task.record) as reader:
-        short = reader.head.samples <= task.stretch
-        source: Source = InMemory(reader.read()) if short else reader
-        return reduce_record(
-            task.rig, task.run, source, task.terms, task.filtering, task.with_noise, task.stretch
-        )
-
-
-def path_of(task: Task) -> str:
-    """Return the run folder that a task reads."""
-    return task.path
-
-
-def reduce_runs(
+def reduced(
     rig: Rig,
-    runs: Sequence[Run],
-    terms: tuple[Used, ...],
-    filtering: Callable[[Record], Filtering],
-) -> list[Reduction]:
-    """Reduce all records of runs at hand."""
-    return [
-        reduce_record(rig, number, InMemory(record), terms, filtering, record.name in first)
-        for number, run in enumerate(runs)
-        for first in (first_of_steps(run.records),)
-        for record in run.records
-    ]
-
-
-def first_of_steps(records: Sequence[Record | RecordHead]) -> set[str]:
-    """Return the names of the records that stand for the noise of their step's repeats."""
-    first: dict[str, str] = {}
-    for record in records:
-        first.setdefault(record.step, record.name)
-    return set(first.values())
-
-
-def reduce_record(
-    rig: Rig,
-    run: int,
-    source: Source,
     terms: Sequence[Used],
-    filtering: Callable[[Record], Filtering],
-    with_noise: bool,
-    stretch: int = STRETCH,
-) -> Reduction:
-    """Reduce one record, a long one in stretches; raises InputError for one that cannot be used."""
-    head = source.head
-    filters = filtering(source.read(0, min(head.samples, stretch)))
-    lost, clipped = _inspect(rig, source, stretch)
-    sums = {
-        family: [Accumulator(len(parameters_of(rig, terms, family))) for _ in range(SEGMENTS)]
-        for family in FAMILIES
-    }
-    masked = 0
-    for found in source_rows(rig, terms, source, filters, stretch):
-        for name, rows in found.items():
-            masked += rows.masked
-            for part, inside in enumerate(parts_of(rows, head.samples / head.sample_rate)):
-                sums[family_of(name)][part].fold(rows.matrix[inside], rows.rhs[inside])
-    parts = {f: tuple((one.triangle, one.rows) for one in every) for f, every in sums.items()}
-    noise = None
-    if with_noise:
-        # Of a long record a stretch stands for the whole.
-        count = min(head.samples, stretch) if divisible(filters) else head.samples
-        noise = _noise(rig, source, count, terms, filtering)
-    return Reduction(run, head, parts, masked, lost, clipped, noise)
+    linear: Solution,
+    clusters: Sequence[Cluster],
+    noise: Array | None = None,
+    reject_noise: bool = True,
+) -> Solution:
+    """Return the solution in the terms' parameters; `linear` itself where no term reduces."""
+    solution = linear
+    for used in terms:
+        reduction = used.term.reduction(rig)
+        if reduction is not None and set(reduction.linear) <= set(solution.names):
+            solution, clusters, noise = _reduce(reduction, solution, clusters, noise, reject_noise)
+    return solution
 
 
-def parts_of(rows: Rows, duration: float) -> list[slice]:
-    """Cut rows, which are in the order of time, into SEGMENTS equal parts of a duration [s]."""
-    edges = np.searchsorted(rows.time, np.linspace(0.0, duration, SEGMENTS + 1)[1:-1])
-    ends = [0, *map(int, edges), len(rows.time)]
-    return [slice(a, b) for a, b in pairwise(ends)]
+def _reduce(
+    reduction: Reduction,
+    linear: Solution,
+    clusters: Sequence[Cluster],
+    noise: Array | None,
+    reject_noise: bool,
+) -> tuple[Solution, Sequence[Cluster], Array | None]:
+    names = linear.names
+    places = [names.index(name) for name in reduction.linear]
+    others = [i for i in range(len(names)) if i not in places]
+    new = (*(names[i] for i in others), *reduction.parameters)
+    x = np.nan_to_num(linear.value)
+    p = np.concatenate((x[others], reduction.start(x[places])))
+    # All clusters as one: the step needs the sum only, the scatter comes at the end.
+    whole = [Cluster("all", "all", merge(c.triangle for c in clusters), linear.rows)]
+    for _ in range(ROUNDS):
+        change = _transform(reduction, places, others, p)
+        stepped = solve(new, _transformed(whole, change), None, False)
+        found = np.where(np.isfinite(stepped.value), stepped.value, p)
+        step, p = np.abs(found - p).max(), found
+        if step <= TOLERANCE * np.abs(p).max():
+            break
+    else:
+        log.warning("%s: no convergence in %d rounds", " ".join(reduction.parameters), ROUNDS)
+    change = _transform(reduction, places, others, p)
+    moved = _transformed(clusters, change)
+    moment = None if noise is None else change.T @ noise @ change
+    return solve(new, moved, moment, reject_noise), moved, moment
 
 
-def _inspect(rig: Rig, source: Source, stretch: int) -> tuple[int, dict[str, int]]:
-    """Count lost and clipped samples; refuses a channel or joint that stood still."""
-    head = source.head
-    lost, clipped = 0, dict[str, int]()
-    spans: dict[str, tuple[float, float]] = {}
-    for first in range(0, head.samples, stretch):
-        part = source.read(first, min(first + stretch, head.samples))
-        lost += int(lost_samples(rig, part).any(axis=1).sum())
-        for name, count in ck.clipped_counts(rig, part).items():
-            clipped[name] = clipped.get(name, 0) + count
-        for name, (low, high) in ck.spans_of(part).items():
-            before = spans.get(name, (np.inf, -np.inf))
-            spans[name] = (min(low, before[0]), max(high, before[1]))
-    ck.refuse_dead_channels(rig, head, spans)
-    return lost, clipped
+def _transform(
+    reduction: Reduction, places: Sequence[int], others: Sequence[int], p: Array
+) -> Array:
+    """Return S (k+1, m+1) at p."""
+    k, kept = len(places) + len(others), len(others)
+    slope = np.zeros((k, len(p)))
+    slope[others, np.arange(kept)] = 1.0
+    slope[np.ix_(places, range(kept, len(p)))] = reduction.slope(p[kept:])
+    constant = np.zeros(k)
+    constant[places] = reduction.value(p[kept:]) - reduction.slope(p[kept:]) @ p[kept:]
+    S = np.zeros((k + 1, len(p) + 1))
+    S[:k, :-1], S[:k, -1], S[k, -1] = slope, -constant, 1.0
+    return S
 
 
-def _noise(
-    rig: Rig,
-    source: Source,
-    count: int,
-    terms: Sequence[Used],
-    filtering: Callable[[Record], Filtering],
-) -> dict[str, Array]:
-    """Return the noise moments of a record, from its first `count` samples."""
-    head = source.head
-    # A stream of its own for every step: the prediction is the same in any order of records.
-    rng = np.random.default_rng([0, zlib.crc32(head.step.encode())])
-    found = record_moments(rig, source.read(0, count), terms, filtering, rng)
-    return {family: moment * (head.samples / count) for family, moment in found.items()}
-
-
-def repeats_of(reductions: Sequence[Reduction]) -> dict[tuple[int, str], int]:
-    """Count the repeats of every (run, step)."""
-    seen: dict[tuple[int, str], set[int]] = {}
-    for one in reductions:
-        seen.setdefault((one.run, one.head.step), set()).add(one.head.repeat)
-    return {key: len(values) for key, values in seen.items()}
-
-
-def clusters_of(reductions: Sequence[Reduction], family: str) -> list[Cluster]:
-    """Return one cluster per record, or one per part where its step has this record only."""
-    repeats = repeats_of(reductions)
-    out: list[Cluster] = []
-    for one in reductions:
-        stratum = (one.run, one.head.step)
-        filled = [(n, R, rows) for n, (R, rows) in enumerate(one.parts[family]) if rows]
-        if repeats[stratum] > 1:
-            if filled:
-                whole = merge(R for _, R, _ in filled)
-                rows = sum(rows for *_, rows in filled)
-                out.append(Cluster(stratum, one.head.repeat, whole, rows))
-            continue
-        for n, R, rows in filled:
-            key: Hashable = (one.head.repeat, n)
-            out.append(Cluster(stratum, key, R, rows))
-    return out
-
-
-def noise_of(reductions: Sequence[Reduction], family: str) -> Array | None:
-    """Return the noise moments of all records, each step's by the record that stands for it."""
-    counts: dict[tuple[int, str], int] = {}
-    for one in reductions:
-        key = (one.run, one.head.step)
-        counts[key] = counts.get(key, 0) + 1
-    found = [
-        counts[one.run, one.head.step] * one.noise[family]
-        for one in reductions
-        if one.noise is not None and family in one.noise
-    ]
-    return np.sum(found, axis=0) if found else None
-
-
-def solve_reductions(
-    rig: Rig, terms: Sequence[Used], reductions: Sequence[Reduction], reject_noise: bool = True
-) -> dict[str, Solution]:
-    """Solve each family once from the triangles of all records."""
-    out = {}
-    for family in FAMILIES:
-        names = parameters_of(rig, terms, family)
-        if names:
-            noise = noise_of(reductions, family)
-            out[family] = solve(names, clusters_of(reductions, family), noise, reject_noise)
-    return out
+def _transformed(clusters: Sequence[Cluster], change: Array) -> list[Cluster]:
+    return [replace(c, triangle=merge([c.triangle @ change])) for c in clusters]

@@ -113,7 +113,7 @@ def render_report(
         rows = build_rows(rig, runs, identification.model.terms)
     context = {
         "title": title,
-        "style": Markup(_read("report.css")),  # noqa: S704
+        "style": Markup(_read("report.css")),
         "rig": rig,
         "simulated": bool(truth),
         "provenance": provenance or Provenance(),
@@ -151,18 +151,16 @@ def _headline(
             rig, runs, identification, validation, validation_runs, simulated=bool(truth)
         ),
         "tiles": report_facts.tiles(identification, validation, truth, table4),
+        "truth_remark": report_facts.truth_remark(rig, truth),
         "checks": report_facts.check_lines(identification.checks),
         "table4": table4,
         "table4_search": {
-            name: tuple(fm.fit(v) for v in values)
-            for name, values in paper.TABLE_IV_SEARCH.items()
+            name: tuple(fm.fit(v) for v in values) for name, values in paper.TABLE_IV_SEARCH.items()
         },
     }
 
 
-def _regression(
-    identification: Identification, rows: Sequence[RecordRows]
-) -> dict[str, Any]:
+def _regression(identification: Identification, rows: Sequence[RecordRows]) -> dict[str, Any]:
     left = residuals(identification, rows)
     scatter = per_repeat(identification, rows)
     rig = identification.model.rig

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,7 +11,7 @@ import numpy as np
 
 from analysis import paper_tables as paper
 from analysis import report_format as fm
-from analysis.checks import Check
+from analysis.checks import LENGTH_TOLERANCE, Check
 from analysis.identify import Identification
 from analysis.model import Estimate
 from analysis.plots_parameters import relative_half_width
@@ -56,6 +57,24 @@ def check_lines(checks: Sequence[Check]) -> list[CheckLine]:
         more = tuple(f"{'ok' if c.ok else 'not ok'}: {c.detail}" for c in ordered[1:])
         out.append(CheckLine(name, not bad, detail, more))
     return sorted(out, key=lambda line: line.ok)
+
+
+def truth_remark(rig: Rig, truth: Mapping[str, float] | None) -> str:
+    """Say where a simulated bench's own truth is no rigid body's (R_ij = l_i W_j), '' otherwise."""
+    found = []
+    for i, j in itertools.combinations(range(1, len(rig.joints) + 1), 2):
+        R, W = (truth or {}).get(f"R{i}{j}"), (truth or {}).get(f"W{j}")
+        length = rig.joints[i - 1].link_length
+        if R is not None and W and abs(R / W / length - 1) >= LENGTH_TOLERANCE:
+            found.append(
+                f"R{i}{j}/W{j} = {fm.significant(R / W)} m for a link of {fm.significant(length)} m"
+            )
+    if not found:
+        return ""
+    return (
+        f"The simulated bench's own truth has {'; '.join(found)}: there the check on link length "
+        "speaks of the bench, not of the identification."
+    )
 
 
 @dataclass(frozen=True)
@@ -174,7 +193,7 @@ def tiles(
             name = max(errors, key=lambda n: abs(errors[n]))
             inside = sum(covers(found[n], truth[n]) for n in errors)
             out.append(
-                Tile(f"{fm.percent(errors[name], signed=True)} %", "largest error against the truth",
+                Tile(f"{fm.percent(errors[name], signed=True)} %", "largest error against truth",
                      f"{name}; {inside} of {len(errors)} intervals hold the truth")
             )  # fmt: skip
     worst = worst_fit(validation)
@@ -183,15 +202,15 @@ def tiles(
                         f"{worst.channel}, {worst.record}"))  # fmt: skip
     failed = sum(bool(r.failure) for r in validation)
     if failed:
-        out.append(Tile(str(failed), "simulations failed", "see validation", True))
+        out.append(Tile(str(failed), "free runs that failed", "see validation", True))
     if table4.compared:
         out.append(Tile(f"{table4.above} of {table4.compared}", "FIT cells above the paper",
                         "Table IV", table4.above < table4.compared))  # fmt: skip
     lines = check_lines(identification.checks)
     bad = sum(not line.ok for line in lines)
     good = len(lines) - bad
-    out.append(Tile(f"{good} of {good + bad}", "checks ok",
-                    "all of them" if not bad else "the others are named below", bool(bad)))  # fmt: skip
+    which = "the others are named below" if bad else "all of them"
+    out.append(Tile(f"{good} of {good + bad}", "checks ok", which, bool(bad)))
     return out
 
 
@@ -220,6 +239,7 @@ def _parameter_row(
     true = truth.get(name)
     mean = paper.TABLE_III[name].mean if rig.name == paper.RIG and name in paper.TABLE_III else None
     shown = estimate.identified
+    error = 100 * (estimate.value / true - 1) if true and shown else None
     has_interval = shown and math.isfinite(low)
     return ParameterRow(
         name,
@@ -231,7 +251,7 @@ def _parameter_row(
         fm.column_percent(100 * estimate.std / abs(estimate.value)) if shown else fm.DASH,
         _scaled(rig.nominal.get(name), unit.scale),
         _scaled(true, unit.scale),
-        fm.column_percent(100 * (estimate.value / true - 1), signed=True) if true and shown else fm.DASH,
+        fm.column_percent(error, signed=True),
         ("yes" if covers(estimate, true) else "no") if true and has_interval else fm.DASH,
         _scaled(mean, unit.scale),
         "" if shown and not estimate.note else f"not identifiable: {estimate.note or 'no value'}"

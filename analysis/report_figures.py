@@ -116,9 +116,7 @@ def equation_text(found: Residual) -> str:
     return EQUATIONS[found.equation.rsplit("_", 1)[0]]
 
 
-def comparisons(
-    rig: Rig, validation: Sequence[RecordValidation], runs: Sequence[Run]
-) -> Gallery:
+def comparisons(rig: Rig, validation: Sequence[RecordValidation], runs: Sequence[Run]) -> Gallery:
     """Return measured against simulated for each kind of record and joint, first repeats only."""
     first: dict[str, tuple[RecordValidation, Record | None]] = {}
     for result, record in paired(validation, runs):

@@ -53,7 +53,7 @@ def _tidy(text: str) -> str:
 
 
 def significant(value: float | None, digits: int = 3) -> str:
-    """Write a number with `digits` significant digits, in powers of ten when very large or small."""
+    """Write with `digits` significant digits, in powers of ten where very large or small."""
     if value is None or math.isnan(value):
         return DASH
     if math.isinf(value):
@@ -82,7 +82,7 @@ def column_percent(value: float | None, *, signed: bool = False) -> str:
 
 
 def fit(value: float | None) -> str:
-    """Write a FIT ratio as the paper does, one decimal; huge negative ones in powers of ten."""
+    """Write a FIT ratio as the paper does, one decimal; beyond 10 000 two digits tell enough."""
     if value is None or not math.isfinite(value):
         return DASH
     return significant(value, 2) if abs(value) >= 9999.5 else _tidy(f"{value:.1f}")
@@ -130,16 +130,16 @@ def meaning(name: str, joints: int) -> str:
     if name == "b":
         return "bulk modulus of the oil, all joints"
     if gain := _GAIN.match(name):
-        chamber, spool = gain[1]
+        chamber, spool = gain[1][0], gain[1][1]
         return f"flow gain, joint {gain[2]}, {_SIDE[chamber]}, {_SPOOL[spool]}"
-    if match := re.match(r"^Fv(\d)$", name):
-        return f"viscous friction, joint {match[1]}"
-    if match := re.match(r"^W(\d)$", name):
-        return f"gravity, link {match[1]} and what it carries"
-    if joints <= 2 and (match := re.match(r"^M(\d)$", name)):
-        return f"inertia about joint {match[1]}"
-    if match := re.match(r"^R(\d)(\d)$", name):
-        if match[1] == match[2]:
-            return f"inertia of link {match[1]}"
-        return f"inertia coupling, links {match[1]} and {match[2]}"
-    return ""
+    match = re.match(r"^(M|R|W|Fv)(\d)(\d?)$", name)
+    if match is None or (match[1] == "M" and joints > 2):
+        return ""
+    kind, i, j = match[1], match[2], match[3]
+    texts = {
+        "M": f"inertia about joint {i}",
+        "R": f"inertia of link {i}" if i == j else f"inertia coupling, links {i} and {j}",
+        "W": f"gravity, link {i} and what it carries",
+        "Fv": f"viscous friction, joint {i}",
+    }
+    return texts[kind]

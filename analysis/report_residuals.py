@@ -77,9 +77,7 @@ def coefficients(
     return out
 
 
-def residuals(
-    identification: Identification, per_record: Sequence[RecordRows]
-) -> list[Residual]:
+def residuals(identification: Identification, per_record: Sequence[RecordRows]) -> list[Residual]:
     """Return the residual of every equation of every (run, step), torque before flows."""
     beta = coefficients(identification, per_record)
     groups: dict[tuple[int, str], list[RecordRows]] = {}
@@ -101,9 +99,7 @@ def _order(equation: str) -> tuple[int, int]:
     return int(joint), KINDS.index(kind)
 
 
-def _residual(
-    run: int, step: str, name: str, rows: Sequence[Rows], beta: Array
-) -> Residual | None:
+def _residual(run: int, step: str, name: str, rows: Sequence[Rows], beta: Array) -> Residual | None:
     common = rows[0].time
     for r in rows[1:]:
         common = np.intersect1d(common, r.time)
@@ -111,9 +107,7 @@ def _residual(
         return None
     picked = [np.isin(r.time, common) for r in rows]
     side = np.array([r.rhs[p] for r, p in zip(rows, picked, strict=True)])
-    left = np.array(
-        [(r.rhs - r.matrix @ beta)[p] for r, p in zip(rows, picked, strict=True)]
-    )
+    left = np.array([(r.rhs - r.matrix @ beta)[p] for r, p in zip(rows, picked, strict=True)])
     n = len(rows)
     band = left.std(axis=0, ddof=1) if n > 1 else np.full(len(common), np.nan)
     scatter = float(np.sqrt(np.mean(band**2)))
@@ -197,7 +191,9 @@ def _solve_once(
         if rows:
             matrix = np.concatenate([r.matrix for r in rows])
             rhs = np.concatenate([r.rhs for r in rows])
-            clusters.append(Cluster((one.run, one.step), one.repeat, triangle(matrix, rhs), len(rhs)))
+            clusters.append(
+                Cluster((one.run, one.step), one.repeat, triangle(matrix, rhs), len(rhs))
+            )
     if not clusters or family not in FAMILIES:
         return {}
     return dict(zip(names, solve(names, clusters).value, strict=True))

@@ -29,8 +29,9 @@ def bench_constants(rig: Rig) -> list[tuple[str, str]]:
                 f"± {_n(rig.oil.temperature_band)} °C"),
         ("gravity", f"{_n(rig.gravity)} m/s²"),
         ("sampled at", f"{_n(rig.sample_rate)} Hz"),
-        ("sensor noise (1σ)", f"spool {_n(s.spool.noise * 1e3)} mV, piston {_n(s.piston.noise * 1e6)} "
-                              f"µm, pressure {_n(s.chamber_pressure.noise / 1e3)} kPa"),
+        ("sensor noise (1σ)", f"spool {_n(s.spool.noise * 1e3)} mV, piston "
+                              f"{_n(s.piston.noise * 1e6)} µm, pressure "
+                              f"{_n(s.chamber_pressure.noise / 1e3)} kPa"),
         ("sensor bits", f"spool {s.spool.bits}, piston {s.piston.bits}, pressure "
                         f"{s.chamber_pressure.bits}"),
         ("supply pressure", "measured" if s.supply_pressure else "taken as constant"),
@@ -47,6 +48,7 @@ def _n(value: float) -> str:
 
 def joint_constants(rig: Rig) -> list[tuple[str, list[str]]]:
     """Return (what and unit, one value per joint)."""
+
     def row(text: str, value: object) -> tuple[str, list[str]]:
         return text, [value(k, joint) for k, joint in enumerate(rig.joints)]  # type: ignore[operator]
 
@@ -145,7 +147,7 @@ def _step_row(runs: Sequence[Run], step: Step) -> StepRow:
         "; ".join(_lock(i, first) for i in step.locked) or "none",
         " and ".join(map(str, step.excited)) or "none",
         str(len(step.records)),
-        _n(round(np.mean([r.samples / r.sample_rate for r in step.records]), 3)),
+        _n(round(float(np.mean([r.samples / r.sample_rate for r in step.records])), 3)),
         period,
         _per_joint(step, ch.SPOOL, 1e3, np.std),
         _per_joint(step, ch.PISTON, 1e3, np.ptp),

@@ -157,9 +157,7 @@ class Table3Row:
     name: str
     unit: str
     coupled: str
-    low: str
-    mean: str
-    high: str
+    repeats: tuple[str, ...]  # min, mean, max
     rsd: str
     rsd_mark: str
     paper: tuple[str, ...]  # min, mean, max, RSD, PSO, GA, nominal
@@ -183,12 +181,13 @@ def table_iii(
             return fm.DASH if value is None else fm.significant(value * scale, digits)
 
         ours = scatter.get(name)
+        spread = (ours.low, ours.mean, ours.high) if ours else (None, None, None)
         deviation = 100 * (estimate.value / theirs.mean - 1)
         mark = mark_of(ours.rsd, theirs.rsd) if ours and math.isfinite(ours.rsd) else ""
         out.append(
             Table3Row(
                 name, unit.text, shown(estimate.value),
-                *(shown(v) for v in ((ours.low, ours.mean, ours.high) if ours else (None,) * 3)),
+                tuple(shown(v) for v in spread),
                 fm.column_percent(ours.rsd if ours else None),
                 mark,
                 _printed(theirs, unit.scale, 0 if name == "b" else 2),
@@ -200,6 +199,7 @@ def table_iii(
 
 def _printed(theirs: paper.PaperParameter, scale: float, places: int) -> tuple[str, ...]:
     """Write the paper's min, mean, max, RSD, PSO, GA, nominal with the decimals it prints."""
+
     def shown(value: float | None) -> str:
         return fm.DASH if value is None else fm.fixed(scale * value, places)
 

@@ -15,7 +15,7 @@ from analysis.accumulate import Accumulator
 from analysis.analysis_bench import bench_run
 from analysis.cluster import Cluster
 from analysis.compute import ONE_THREAD, Processes, environment
-from analysis.identify import identify_folders
+from analysis.folders import identify_folders
 from rig.model.rig import Rig
 from rig.services.stream import write_run
 

@@ -144,7 +144,7 @@ def locks_of(rig: Rig, source: Source, stretch: int = STRETCH) -> Locks:
         low, high = max(0, first - band.reach), min(last + band.reach, head.samples)
         part = source.read(low, high)
         for i in range(N):
-            piston = np.asarray(part.channels[ch.channel(ch.PISTON, i + 1)])
+            piston = np.asarray(part.channels[ch.channel(rig.position_kind, i + 1)])
             own = piston[first - low : last - low]
             here = own[~np.isnan(own)]
             total[i] += here.sum()
@@ -154,7 +154,7 @@ def locks_of(rig: Rig, source: Source, stretch: int = STRETCH) -> Locks:
                 moments[:, i] += np.array([len(inner), inner.sum(), inner @ inner])
     size = np.maximum(moments[0], 1.0)
     spread = np.sqrt(np.maximum(moments[2] / size - (moments[1] / size) ** 2, 0.0))
-    floor = rig.sensors.piston.noise * float(np.linalg.norm(band.taps[2]))
+    floor = rig.sensors.of(rig.position_kind).noise * float(np.linalg.norm(band.taps[2]))
     excited = np.array([i not in head.locked for i in range(1, N + 1)])
     moving = excited | (spread > GIVE_THRESHOLD * floor)
     return Locks(moving, total / np.maximum(count, 1.0))

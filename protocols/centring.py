@@ -53,20 +53,22 @@ def follow(command: Array, piston: Array, rate: float) -> Follow:
     """Fit s = c + d t + k integral(v - mean v) to a stretch of samples; v0 = mean v - d / k.
 
     Needs no derivative of a measured signal, no whole period and no particular law: what the
-    device put out is known. NaN samples are left out. Returns NaN where the command hardly
+    device put out is known. Short gaps (NaN) are bridged. Returns NaN where the command hardly
     varies, or too few samples arrived, to tell.
     """
     known = np.isfinite(command) & np.isfinite(piston)
     if np.count_nonzero(known) < 10:
         return _UNKNOWN
-    middle = float(np.mean(command[known]))
-    moved = np.cumsum(np.where(known, command - middle, 0.0)) / rate
+    time = np.arange(len(command)) / rate
+    whole = np.interp(time, time[known], command[known])
+    middle = float(np.mean(whole))
+    moved = np.cumsum(whole - middle) / rate
     if np.ptp(moved) < 1e-9:
         return _UNKNOWN
-    time = np.arange(len(command)) / rate
     basis = np.column_stack((np.ones_like(time), time, moved))[known]
     _, drift, gain = np.linalg.lstsq(basis, piston[known], rcond=None)[0]
-    return Follow(float(gain), middle - float(drift / gain), float(drift))
+    null = middle - float(drift / gain) if gain else float("nan")
+    return Follow(float(gain), null, float(drift))
 
 
 def motion(piston: Array, period: int, rate: float) -> Motion:

@@ -89,6 +89,21 @@ def off_centre(driven: Driven) -> float:
     return abs(driven.moved.ends - driven.plan.centre) / driven.centring.offset
 
 
+def check_swing(
+    driven: Driven, period: Array, limits: tuple[float, float], step: str
+) -> None:  # fmt: skip
+    """Raise ProtocolAborted if a period (n,) of the piston has no room for its allowed offset."""
+    swing = period - np.nanmean(period) + driven.plan.centre
+    low, high = float(np.nanmin(swing)), float(np.nanmax(swing))
+    spare = driven.centring.offset
+    if low - spare < limits[0] or high + spare > limits[1]:
+        raise ProtocolAborted(
+            f"{step}: joint {driven.joint + 1} swings {1e3 * low:.1f} to {1e3 * high:.1f} mm; with "
+            f"the {1e3 * spare:g} mm that its centre may be off, that leaves its limits, "
+            f"{1e3 * limits[0]:g} to {1e3 * limits[1]:g} mm: lower the amplitude"
+        )
+
+
 def settled(driven: Driven, moved: Motion, record: float, step: str) -> bool:
     """Say whether drift over a record of `record` seconds and offset are as small as allowed."""
     off = moved.ends - driven.plan.centre

@@ -9,8 +9,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 
-import numpy as np
-
 from protocols.driven import Driven
 from protocols.errors import ProtocolAborted
 from protocols.excitation import Excitation
@@ -123,7 +121,10 @@ class _StepRun:
                 continue
             disturbed += 1
             if disturbed > self.step.tries:
-                raise ProtocolAborted(_too_wide(self.session, self.step))
+                raise ProtocolAborted(
+                    f"{self.step.name}: record {repeat} was about to leave the piston limits "
+                    f"{disturbed} times; lower the amplitude, or find out what makes it drift"
+                )
             self.tell("centre", f"record {repeat} was disturbed and is taken again", repeat)
             excitation.settle_bias()
 
@@ -208,18 +209,3 @@ def _lock_text(part: LockPlan) -> str:
     if part.at == CLOSED:
         return f"to {1e3 * part.piston:g} mm, valve closed there"
     return f"to its end stop ({part.at}), held there"
-
-
-def _too_wide(session: Session, step: StepPlan) -> str:
-    texts = []
-    for part in step.excite:
-        low, high = session.rig.joints[part.joint].limits.piston
-        piston = session.piston(part.joint, session.now - step.period, session.now)
-        texts.append(
-            f"joint {part.joint + 1} swings {1e3 * np.nanmin(piston):.1f} to "
-            f"{1e3 * np.nanmax(piston):.1f} mm of the allowed {1e3 * low:g} to {1e3 * high:g} mm"
-        )
-    return (
-        f"{step.name}: records were disturbed {step.tries + 1} times: {'; '.join(texts)}; "
-        "lower the amplitude"
-    )

@@ -15,6 +15,7 @@ from drivers.base import OutputLaw
 from protocols.centring import Array, Motion, follow, motion, moved_by
 from protocols.driven import (
     Driven,
+    check_swing,
     corrected,
     found_under_loop,
     not_centred,
@@ -59,7 +60,8 @@ class Excitation:
 
         `nulls` [V] are the commands that held the pistons still, by joint (0-based). A loop turns
         the phase of the motion, so loosening it at once would leave the piston off centre: it is
-        loosened slowly. Raises ProtocolAborted for a piston that does not follow its command.
+        loosened slowly. Raises ProtocolAborted for a piston that does not follow its command or
+        swings too far.
         """
         self.joints = tuple(Driven(e, nulls[e.joint]) for e in self.step.excite)
         for driven in self.joints:
@@ -83,6 +85,9 @@ class Excitation:
             if max(off_centre(driven) for driven in self.joints) < 0.5:
                 break
         self._references = self._last_period()
+        for driven, period in zip(self.joints, self._references, strict=True):
+            limits = self.session.rig.joints[driven.joint].limits.piston
+            check_swing(driven, period, limits, self.step.name)
 
     def settle_bias(self) -> None:
         """Play trials until every piston is centred and its drift is what was asked for.

@@ -17,6 +17,18 @@ log = logging.getLogger(__name__)
 RigOption = Annotated[
     str, typer.Option("--rig", help="A shipped rig's name, or the path of a rig file.")
 ]
+RepeatsOption = Annotated[int | None, typer.Option(min=1, help="Instead of the file's.")]
+DurationOption = Annotated[
+    float | None, typer.Option(min=0.01, help="Seconds per record, instead of the file's.")
+]
+ScaleOption = Annotated[float, typer.Option(help="Multiplies every amplitude of the file.")]
+WaveSeedOption = Annotated[
+    int | None, typer.Option("--wave-seed", min=0, help="Of the multisines' phases.")
+]
+StepOption = Annotated[list[str] | None, typer.Option("--step", help="Only this step; repeatable.")]
+EndpointOption = Annotated[
+    str | None, typer.Option(help="modbus-tcp://HOST:PORT instead of the rig's wire.")
+]
 JsonOption = Annotated[
     Path | None,
     typer.Option("--json", help="Write the machine-readable result here; - is standard output."),
@@ -55,17 +67,23 @@ def sim(
 def check(
     protocol: Annotated[str, typer.Argument(help="A shipped protocol's name, or a file.")],
     rig: RigOption,
-    repeats: Annotated[int | None, typer.Option(min=1, help="Instead of the file's.")] = None,
+    repeats: RepeatsOption = None,
+    duration: DurationOption = None,
+    amplitude_scale: ScaleOption = 1.0,
+    wave_seed: WaveSeedOption = None,
+    step: StepOption = None,
     json: JsonOption = None,
 ) -> None:
     """Read, resolve and prove a protocol against the limits on the twin; nothing moves.
 
     Example: bramah check lock-and-excite --rig shinshu-2dof
     """
-    from rig.cli.running import check_protocol, with_repeats
+    from rig.cli.running import check_protocol, overridden
     from rig.cli.sheets import check_text
 
-    report = check_protocol(protocol, rig, with_repeats(repeats))
+    report = check_protocol(
+        protocol, rig, overridden(repeats, duration, amplitude_scale, wave_seed, step)
+    )
     write_json(json, report.as_dict())
     if json != Path("-"):
         typer.echo(check_text(report))
@@ -76,10 +94,12 @@ def run(
     protocol: Annotated[str, typer.Argument(help="A shipped protocol's name, or a file.")],
     rig: RigOption,
     out: Annotated[Path, typer.Option(help="The run folder to make.")],
-    endpoint: Annotated[
-        str | None, typer.Option(help="modbus-tcp://HOST:PORT instead of the rig's wire.")
-    ] = None,
-    repeats: Annotated[int | None, typer.Option(min=1, help="Instead of the file's.")] = None,
+    endpoint: EndpointOption = None,
+    repeats: RepeatsOption = None,
+    duration: DurationOption = None,
+    amplitude_scale: ScaleOption = 1.0,
+    wave_seed: WaveSeedOption = None,
+    step: StepOption = None,
     operator: Annotated[
         str | None, typer.Option(help="Written into the run.  [default: you]")
     ] = None,
@@ -94,18 +114,17 @@ def run(
 
     Example: bramah run lock-and-excite-multisine --rig shinshu-2dof --out runs/monday
     """
-    from rig.cli.running import Job, run_protocol, with_repeats
+    from rig.cli.running import Job, overridden, run_protocol
 
-    job = Job(protocol, rig, out, endpoint, with_repeats(repeats), operator, track, memory)
+    changes = overridden(repeats, duration, amplitude_scale, wave_seed, step)
+    job = Job(protocol, rig, out, endpoint, changes, operator, track, memory)
     folder = run_protocol(job, progress)
     typer.echo(str(folder))
 
 
 def reset(
     rig: RigOption,
-    endpoint: Annotated[
-        str | None, typer.Option(help="modbus-tcp://HOST:PORT instead of the rig's wire.")
-    ] = None,
+    endpoint: EndpointOption = None,
 ) -> None:
     """Clear a trip that the device has latched, after a person has looked at the bench.
 

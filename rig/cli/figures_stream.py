@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from analysis.analysis_bench import bench_run
-from analysis.identify import identify
+from analysis.identify import PLAIN, identify
 from analysis.online import Tracker, track
 from analysis.stream_bench import cluster_figures, row_figures, spin_figures
 from drivers.base import SampleBlock
@@ -68,7 +68,7 @@ def _tracking(folder: Path, say: Say) -> list[Figure]:
         track(tracker, record, BLOCK)
     spent = time.process_time() - spent
     blocks = sum(record.samples for record in run.records) / BLOCK
-    batch = identify([run], reject_noise=False).estimates
+    batch = identify([run], reject_noise=False, estimator=PLAIN).estimates
     off = max(abs(e.value / batch[n].value - 1.0) for n, e in tracker.estimates().items())
     handed = _handover(rig, run.records[0], folder)
     return [

@@ -4,23 +4,24 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from drivers import make_driver
 from protocols import engine, library
-from protocols.check import CheckReport, check
+from protocols.check import check
+from protocols.check_report import CheckReport
 from protocols.plan import Overrides, Plan, resolve
 from rig.model.parse import InputError
 from rig.model.rig import Rig, Wire
 from rig.services.attach import AttachError, Publisher
 from rig.services.bench import Bench
 from rig.services.recorder import Recorder
-from rig.services.rigs import load_rig
+from rig.services.rigs import load_bench
 
 if TYPE_CHECKING:
     from rig.cli.tracking import Tracking
@@ -57,7 +58,7 @@ def wire_at(endpoint: str, wire: Wire) -> Wire:
 
 
 def _plan(protocol: str, rig: str, overrides: Overrides) -> tuple[Rig, Plan]:
-    bench = load_rig(rig)
+    bench = load_bench(rig)
     return bench, resolve(library.load(protocol), bench, overrides)
 
 
@@ -91,7 +92,6 @@ class _Story:
             repeat=repeat,
             repeats=repeats,
             message=message,
-            done_s=at,
             total_s=self._plan.seconds,
         )
 
@@ -151,7 +151,7 @@ def run_protocol(job: Job, say: Say) -> Path:
 
 def reset_device(rig: str, endpoint: str | None) -> str:
     """Clear a device's latched trip on a person's word; returns what had tripped it."""
-    described = load_rig(rig)
+    described = load_bench(rig)
     wire = described.wire if endpoint is None else wire_at(endpoint, described.wire)
     driver = make_driver(wire, described)
     try:
@@ -163,6 +163,12 @@ def reset_device(rig: str, endpoint: str | None) -> str:
     return cause or "nothing"
 
 
-def with_repeats(repeats: int | None) -> Overrides:
-    """Return overrides that change the number of repeats only."""
-    return replace(Overrides(), repeats=repeats)
+def overridden(
+    repeats: int | None,
+    duration: float | None,
+    amplitude_scale: float,
+    seed: int | None,
+    steps: Sequence[str] | None,
+) -> Overrides:
+    """Return what a person changed of a protocol on the command line."""
+    return Overrides(repeats, duration, amplitude_scale, seed, tuple(steps) if steps else None)

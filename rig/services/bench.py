@@ -281,7 +281,7 @@ class Bench:
         self._guard.set_roles(roles)
 
     def status(self, **changes: Any) -> None:
-        """Say where the protocol stands: step phase repeat repeats done_s total_s message."""
+        """Say where the protocol stands: step phase repeat repeats total_s message."""
         self._display.progress = replace(self._display.progress, **changes)
 
     def event(self, event: str, tick: int | None = None, **fields: Any) -> None:

@@ -39,6 +39,7 @@ class Display:
         self._waiting: list[Array] = []
         self._next = -np.inf
         self._tick = 0
+        self._first: int | None = None
         self._lost = 0
         self._roles: Sequence[JointRole] = ()
 
@@ -51,6 +52,10 @@ class Display:
         if self._publisher is None:
             return
         self._waiting.append(block.data)
+        if self._first is None:
+            self._first = block.tick
+        done = (block.tick - self._first) / self._rig.sample_rate
+        self.progress = replace(self.progress, done_s=done)
         self._tick = block.tick + len(block.data)
         self._lost, self._roles = lost, roles
         if self.trip is not None or self._clock() >= self._next:

@@ -85,7 +85,7 @@ def write_run(folder: str | Path, run: Run) -> Path:
                 r.step, r.repeat, r.locked, r.sample_rate, r.start, r.period, r.lines, True
             )
             more = {**r.attributes, **about, "stream": order, "start_tick": 0}
-            archive.write_group(file, r.name, r.channels, more)
+            archive.write_group(file, r.name, r.channels, more, run.rig.unit_of)
     archive.put_in_place(fresh, path / archive.NAME)
     store.mark_done(path)
     give_up_ownership(path)

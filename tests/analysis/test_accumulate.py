@@ -14,14 +14,15 @@ from hypothesis import strategies as st
 from scipy.linalg import lstsq
 
 from analysis.accumulate import Accumulator, accumulate
+from analysis.condense import InMemory, reduce_record, solve_reductions
+from analysis.folders import identify_folders
 from analysis.identify import (
+    PLAIN,
     Identification,
     build_rows,
     identify,
-    identify_folders,
     solve_rows,
 )
-from analysis.reduce import InMemory, reduce_record, solve_reductions
 from analysis.rows import default_filtering, paper_filtering
 from analysis.solve import triangle
 from analysis.stretches import locks_of, source_rows
@@ -97,7 +98,7 @@ def test_streamed_folders_give_what_all_rows_in_memory_give(
     folder: Path, multisine_run: Run, rig: Rig
 ) -> None:
     streamed = identify_folders([str(folder)])
-    assert_same(streamed, identify([multisine_run]))
+    assert_same(streamed, identify([multisine_run], estimator=PLAIN))
     # An independent route: every row of every record stacked, solved by LAPACK's gelsy.
     per_record = build_rows(rig, [multisine_run], TERMS)
     for family, solution in solve_rows(rig, TERMS, per_record).items():

@@ -17,7 +17,8 @@ import pytest
 
 from analysis.cluster import Cluster
 from analysis.compute import Pool, Processes, Serial, local_pool
-from analysis.identify import identify, identify_folders
+from analysis.folders import identify_folders
+from analysis.identify import PLAIN, identify
 from rig.model.parse import InputError
 from rig.model.records import Run
 from rig.services.stream import write_run
@@ -152,7 +153,8 @@ def test_a_cluster_identifies_what_one_process_does(
     folders = [str(write_run(tmp_path / name, multisine_run)) for name in ("monday", "tuesday")]
     with Cluster(scheduler) as pool:
         assert pool.workers == 1
-        assert_same(identify_folders(folders, pool=pool), identify([multisine_run, multisine_run]))
+        both = identify([multisine_run, multisine_run], estimator=PLAIN)
+        assert_same(identify_folders(folders, pool=pool), both)
         with pytest.raises(InputError, match="item 3 cannot be used"):
             list(pool.map(broken, [3]))
         with pytest.raises(InputError, match="wednesday: no worker of the cluster sees it"):

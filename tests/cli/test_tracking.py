@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.identify import identify_folders
+from analysis.folders import identify_folders
 from analysis.online import Tracker, track
 from drivers.base import SampleBlock
 from rig.cli.following import Follower

@@ -11,7 +11,9 @@ from hypothesis import strategies as st
 
 from protocols.library import load, shipped_names
 from protocols.model import Multisine, Protocol, Sine
+from protocols.plan import resolve
 from rig.model.parse import InputError, parse_model
+from rig.services.rigs import load_rig
 
 GOOD = """\
 name: mine
@@ -135,3 +137,10 @@ def test_whatever_a_file_holds_it_is_refused_in_one_line(content: object) -> Non
     # None of these is a whole protocol: the leaves lack what every one must have.
     with pytest.raises(InputError, match=r"\Amine\.yaml:\d+: [^\n]*\Z"):
         read(yaml.safe_dump(content))
+
+
+def test_the_example_in_the_documentation_is_a_protocol_of_the_seed_bench() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "protocols.md").read_text("utf-8")
+    example = page.split("```yaml\n")[1].split("```")[0]
+    plan = resolve(parse_model(Protocol, example, "docs"), load_rig("shinshu-2dof"))
+    assert plan.records[-1] == "step2_r4"

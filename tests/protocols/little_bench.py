@@ -7,8 +7,8 @@ with the analysis model or the simulated bench.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -89,7 +89,7 @@ class LittleBench:
         self.lose = set(lose)  # numbers of blocks that never arrive
         self.blocks = 0
         self.applied: list[tuple[int, tuple[OutputLaw, ...]]] = []
-        self.at_tick: dict[int, object] = {}
+        self.happenings: dict[int, Callable[[], None]] = {}  # what befalls the bench, by tick
 
     def upload(self, joint: int, wave: Array) -> None:
         self.waves[joint] = np.array(wave)
@@ -132,9 +132,8 @@ class LittleBench:
             return SampleBlock(self.blocks, first, data, saturated, 0, False)
 
     def _sample(self) -> Array:
-        action = self.at_tick.pop(self.tick, None)
-        if callable(action):
-            action()
+        if self.tick in self.happenings:
+            self.happenings.pop(self.tick)()
         dt = 1.0 / self.rig.sample_rate
         row = dict.fromkeys(self.rig.recorded, 3e6)
         speeds = [c.speed for c in self.cylinders]
@@ -179,7 +178,3 @@ class LittleBench:
 def default_cylinders() -> list[Cylinder]:
     """Two joints that drift about as the seed bench does."""
     return [Cylinder(extend=0.17, retract=0.16), Cylinder(extend=0.155, retract=0.175)]
-
-
-def broken(cylinder: Cylinder, **changes: float) -> Cylinder:
-    return replace(cylinder, **changes)
