@@ -75,10 +75,11 @@ def sequential(done: Reproduction) -> Section:
         (
             f"{len(several)} of {len(rows)} parameters are identified by more than one step and "
             f"have as many values. The bulk modulus, which is in every step, has {len(values)}: "
-            f"{', '.join(shown('b', v, 2) for v in values)} MPa, {several.get('b', 0.0):.1f} of their own "
-            "95 % intervals apart (column `apart`: difference over the common half-width; above "
-            f"1 are {' '.join(beyond) or 'none'}). {_by_temperature(done)}"
-            "STEP2 alone shows M1 and R12 as a sum only, so that E1 and E2 must carry their rows further. With E1's values the torque rows keep "
+            f"{', '.join(shown('b', v, 2) for v in values)} MPa, {several.get('b', 0.0):.1f} of "
+            "their own 95 % intervals apart (column `apart`: difference over the common "
+            f"half-width; above 1 are {' '.join(beyond) or 'none'}). {_by_temperature(done)}"
+            "STEP2 alone shows M1 and R12 as a sum only, so that E1 and E2 must carry their rows "
+            "further. With E1's values the torque rows keep "
             f"{ratio:.2f} times the residual that the coupled solution leaves.",
             Table("Every step by itself, E1, E2 and coupled", header, rows),
         ),

@@ -38,9 +38,10 @@ def searches(done: Reproduction) -> Section:
         "PSO and GA on STEP1",
         (
             f"At most {done.scale.evaluations} candidates each. The searches see STEP1 only, so "
-            "eight parameters have no value, and none has an interval. What a search finds, it finds in "
-            "combinations: gains, friction, inertia and gravity may shrink or grow together with "
-            "little change of the output over a short window, and 1 Hz hardly shows b.",
+            "eight parameters have no value, and none has an interval. What a search finds, it "
+            "finds in combinations: gains, friction, inertia and gravity may shrink or grow "
+            "together with little change of the output over a short window, and 1 Hz hardly "
+            "shows b.",
             Table("Parameters of STEP1", header, rows),
             _lost_table(found),
             _fit_table(done),
