@@ -112,10 +112,15 @@ def least_squares(rig: Rig, rows: Sequence[Mapping[str, Rows]]) -> dict[str, flo
     return out
 
 
-def board(rig: Rig, terms: Sequence[Used], members: Sequence[Scene]) -> Board:
-    """Lay out records under a model; see the module."""
+def board(
+    rig: Rig,
+    terms: Sequence[Used],
+    members: Sequence[Scene],
+    beta: Mapping[str, float] | None = None,
+) -> Board:
+    """Lay out records under a model with coefficients `beta`, or fitted here; see the module."""
     every = [scene_rows(rig, terms, scene) for scene in members]
-    beta = least_squares(rig, every)
+    beta = least_squares(rig, every) if beta is None else beta
     split = floors(rig, terms, members, every, beta)
     mean_scenes = averaged(rig, members)
     mean_rows = [scene_rows(rig, terms, scene) for scene in mean_scenes]

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis import checks as ck
+from analysis.effects.base import ordered
 from analysis.rows import Filtering, Rows, default_filtering, record_rows
 from analysis.signals import Signals, condition
 from analysis.terms.base import Columns, Term, Used
@@ -77,11 +78,6 @@ def changes_signals(term: Term) -> bool:
 def scene_rows(rig: Rig, terms: Sequence[Used], scene: Scene) -> dict[str, Rows]:
     """Return the rows of one record under a model (see `analysis.rows.record_rows`)."""
     return record_rows(rig, ordered(terms), scene.signals, scene.filtering)
-
-
-def ordered(terms: Sequence[Used]) -> tuple[Used, ...]:
-    """Return the terms, those that change the signals before those that read them."""
-    return tuple(sorted(terms, key=lambda u: not changes_signals(u.term)))
 
 
 def prepared(rig: Rig, terms: Sequence[Used], scene: Scene) -> Signals:

@@ -221,10 +221,24 @@ def search(board: Field, r: Array, noise: float = 1.0) -> Choice:
     return best
 
 
+def best_pairs(board: Field, r: Array, count: int) -> list[Choice]:
+    """Return the pairs of different candidates that leave least, whatever they are alone."""
+    starts: dict[Key, Choice] = {}
+    for first in _blind(board, r):
+        starts.setdefault(board.entries[first.members[0]].variant.key, first)
+    found: dict[frozenset[Key], Choice] = {}
+    for first in list(starts.values())[:STARTS]:
+        for pair in options(board, first.members, r, 1.0)[:3]:
+            keys = frozenset(board.entries[m].variant.key for m in pair.members)
+            if keys not in found or pair.total < found[keys].total:
+                found[keys] = pair
+    return sorted(found.values(), key=lambda p: p.total)[:count]
+
+
 def _blind(board: Field, r: Array) -> list[Choice]:
     """Return the best single entries although none earns a place alone: a pair may."""
     g = gains(board.K, board.columns.T @ r, board.groups, board.raw)
-    return [judged(board, (int(i),), r, 1.0) for i in np.argsort(-g)[: 3 * STARTS] if g[i] > 0]
+    return [judged(board, (int(i),), r, 1.0) for i in np.argsort(-g)[: 6 * STARTS] if g[i] > 0]
 
 
 def grow(board: Field, members: Sequence[int], r: Array, noise: float) -> Choice:
