@@ -63,10 +63,13 @@ def trace(
     notes = _notes(stage, judge)
     if within(listed.empty.excess, listed.limits):
         found: tuple[Found, ...] = ()
+        refused: tuple[Found, ...] = ()
         winner, verdict, moves = listed.empty, CLEAN, []
     else:
         winner = listed.run()
         found, winner, verdict = _named(listed, winner, judge, rng)
+        refused = tuple(f for f in found if not gates.stands(f))
+        found = tuple(f for f in found if gates.stands(f))
         moves = [] if verdict in (CLEAN, EXPLAINED) else _moves(stage, judge, winner)
     after = _extended(runs, terms, winner, before)
     error = held_out.errors(rig, judged, before, after, judge)
@@ -74,7 +77,7 @@ def trace(
     result = Trace(
         verdict, found, error.noise, error.before, error.after, fits[0], fits[1], before, after,
         _fraction(listed, winner), tuple(moves), _next(verdict, found, rig), stage.floors,
-        tuple(notes), seconds=time.perf_counter() - started,
+        tuple(notes), refused=refused, seconds=time.perf_counter() - started,
     )  # fmt: skip
     return replace(result, sentence=sentence(result))
 
@@ -151,11 +154,12 @@ def _named(
     if len(keep) < len(found):
         kept = {(f.name, f.where) for f in keep}
         smaller = tuple(u for u in winner.effects if (u.term.name, u.term.where) in kept)
+        refused = tuple(f for f in found if f not in keep)
         if not smaller:
-            return (), listed.empty, UNEXPLAINED
+            return refused, listed.empty, UNEXPLAINED
         winner = listed.exact(smaller)
         found = gates.judge(listed, winner, judge, rng)
-        return tuple(f for f in found), winner, UNEXPLAINED
+        return (*found, *refused), winner, UNEXPLAINED
     if not gates.explained(listed, winner, judge):
         return found, winner, UNEXPLAINED
     return found, winner, CONFOUNDED if tied else EXPLAINED

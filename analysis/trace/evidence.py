@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis import checks as ck
-from analysis.effects.base import ordered
+from analysis.effects.base import SENSOR, ordered
 from analysis.rows import Filtering, Rows, default_filtering, record_rows
 from analysis.signals import Signals, condition
 from analysis.terms.base import Columns, Term, Used
@@ -67,6 +67,17 @@ def scenes(
             filters = filtering(record)
             out.append(Scene(index, record, condition(rig, record, filters.channels), filters))
     return out
+
+
+def held(term: Term, scene: Scene) -> bool:
+    """Tell whether an effect at a joint cannot show because the joint is locked.
+
+    A sensor of a locked joint still tells where that joint stands.
+    """
+    where = term.where
+    if not where.startswith("joint ") or getattr(term, "stage", None) == SENSOR:
+        return False
+    return int(where.split()[1]) in scene.record.locked
 
 
 def changes_signals(term: Term) -> bool:

@@ -21,7 +21,8 @@ from analysis.trace.board import Board
 from analysis.trace.held_out import left as held_left
 from analysis.trace.refine import shapes_of
 from analysis.trace.result import Found, Gate, Rival
-from analysis.trace.shortlist import Listed, Shortlist, excess_of, parameter_values, within
+from analysis.trace.select import FORM
+from analysis.trace.shortlist import Listed, Shortlist, excess_of, parameter_values
 
 Array = NDArray[np.float64]
 Key = tuple[str, str]
@@ -85,9 +86,11 @@ def judge(
 
 def explained(listed: Shortlist, winner: Listed, held: Board) -> bool:
     """Tell whether what is left lies within the noise floor's band, on both sets of records."""
-    if not within(winner.excess, listed.limits):
+    if not listed.formed(winner):
         return False
     after = held_left(held, winner.fit)
+    start = excess_of(held, held_left(held, listed.empty.fit))
+    now = excess_of(held, after)
     rows: dict[str, int] = {}
     energy: dict[str, float] = {}
     for s in held.segments:
@@ -97,7 +100,9 @@ def explained(listed: Shortlist, winner: Listed, held: Board) -> bool:
         # Averaging has taken noise out: put back what a single record would show.
         more = count * (1 - 1 / s.repeats)
         energy[s.equation] = energy.get(s.equation, 0.0) + float(part @ part) + more
-    return all(np.sqrt(energy[e] / rows[e]) <= HELD_BAND for e in rows)
+    return all(
+        np.sqrt(energy[e] / rows[e]) <= HELD_BAND or now[e] <= 2 * FORM * start[e] for e in rows
+    )
 
 
 def _noise_like(stage: Board) -> Array:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from analysis.terms.base import Used
 from analysis.trace import select
 from analysis.trace.board import Board
-from analysis.trace.refine import Fit, jacobian, table
+from analysis.trace.refine import Fit, jacobian, shapes_of, table
 from analysis.trace.select import Field, orthonormal
 from analysis.trace.shortlist import Listed, Shortlist, excess_of
 
@@ -241,6 +241,9 @@ def invariance(
     names, J = jacobian(stage, model, used)
     base = _others(stage, model, names)
     left = model.left
+    # A shape such as the presliding distance is the form's, not the effect's size.
+    sizes = {c.parameter for c in used.term.coefficients(stage.rig)}
+    sizes |= {s.parameter for s in shapes_of(stage.rig, used) if s.neutral is not None}
     out = []
     for label, mask in subsets(stage, joint).items():
         if not mask.any():
@@ -248,6 +251,8 @@ def invariance(
         B = orthonormal(base[mask])
         J_s = J[mask] - B @ (B.T @ J[mask])
         for k, name in enumerate(names):
+            if name not in sizes:
+                continue
             if np.linalg.norm(J_s[:, k]) < 0.1 * np.linalg.norm(J[mask][:, k]):
                 continue
             rest = np.delete(J_s, k, axis=1)

@@ -16,15 +16,17 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares as search_shapes
 
 from analysis.effects.base import Effect, Shape
+from analysis.rows import Rows
 from analysis.terms.base import Used
 from analysis.trace.board import Board
-from analysis.trace.evidence import scene_rows
+from analysis.trace.evidence import Scene, held, scene_rows
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
 TOLERANCE = 1e-4
-MOST_STEPS = 12
+MOST_STEPS = 10
+REMEMBERED = 150  # rows of scenes under a model, about 0.2 MB each
 
 
 @dataclass(frozen=True)
@@ -59,8 +61,8 @@ def table(stage: Board, terms: Sequence[Used]) -> Table:
 
     Instants that the model masks become zero rows.
     """
-    built = [scene_rows(stage.rig, terms, scene) for scene in stage.scenes]
-    names = tuple(dict.fromkeys(n for one in built for r in one.values() for n in r.names))
+    built = [_rows(stage, terms, scene) for scene in stage.scenes]
+    names = tuple(dict.fromkeys(c.parameter for u in terms for c in u.term.coefficients(stage.rig)))
     M = stage.base.shape[0]
     X, y = np.zeros((M, len(names))), np.zeros(M)
     index = {scene.group: k for k, scene in enumerate(stage.scenes)}
@@ -75,6 +77,17 @@ def table(stage: Board, terms: Sequence[Used]) -> Table:
         X[np.ix_(at, columns)] = rows.matrix[there] * weight
         y[at] = rows.rhs[there] * weight
     return Table(names, X, y)
+
+
+def _rows(stage: Board, terms: Sequence[Used], scene: Scene) -> dict[str, Rows]:
+    """Return a scene's rows, remembered: many sets share what acts on a scene."""
+    acting = tuple(u for u in terms if not held(u.term, scene))
+    key = (scene.group, acting)
+    if key not in stage.memo:
+        if len(stage.memo) >= REMEMBERED:
+            stage.memo.clear()
+        stage.memo[key] = scene_rows(stage.rig, acting, scene)
+    return stage.memo[key]
 
 
 def fit(stage: Board, terms: Sequence[Used]) -> Fit:

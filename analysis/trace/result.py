@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Final
 
 from analysis.model import Estimate, Model, estimate_json, finite
@@ -76,7 +76,7 @@ class Trace:
     """The whole result; every `error` and `fit` figure is of the held-out records, SI and percent.
 
     `floors` are the training records' split residuals under the baseline, `notes` what a person
-    must know of the evidence's weakness.
+    must know of the evidence's weakness; `refused` fitted best but did not pass the gates.
     """
 
     verdict: str
@@ -95,7 +95,7 @@ class Trace:
     notes: tuple[str, ...] = ()
     sentence: str = ""
     seconds: float = 0.0
-    listed: tuple[tuple[str, float, float], ...] = field(default=())
+    refused: tuple[Found, ...] = ()
 
 
 def to_json(result: Trace) -> dict[str, Any]:
@@ -103,6 +103,7 @@ def to_json(result: Trace) -> dict[str, Any]:
     return {
         "verdict": result.verdict,
         "effects": [_effect(e) for e in result.effects],
+        "refused": [_effect(e) for e in result.refused],
         "error": {
             "noise_floor": _numbers(result.noise_floor),
             "before": _numbers(result.before),

@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 Key = tuple[str, str]
 
 BAND = 0.7  # repeatable rms over noise, below which there is nothing to explain
+FORM = 0.01  # of the energy before: what the catalogue's form of an effect may miss of the real one
 ADD_SHARE = 0.3  # of what is left in the equations it touches: less does not earn a place
 AS_GOOD = 1.25  # what a simpler candidate may leave over the best, before noise counts
 VISIBLE = 0.03  # of a column's length must stand out of the baseline's columns

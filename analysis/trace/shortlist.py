@@ -28,7 +28,8 @@ Key = tuple[str, str]
 log = logging.getLogger(__name__)
 
 SINGLES = 14  # refined exactly, best first
-PAIRS = 8
+PAIRS = 6
+NEAR = 0.25  # of the best gain: a single candidate with less is no rival
 NEXT = 6  # extensions of a set that are refined exactly
 DEEPEST = 3  # effects in a set found by extension
 
@@ -169,6 +170,8 @@ class Shortlist:
         now = self.prune(self.best([self.empty, *singles]))
         if within(now.excess, self.limits):
             return now
+        if self.formed(now):
+            return self.completed(now)
         pairs = [self.exact(e) for e in self._pairs(field, r, singles)]
         now = self.prune(self.best([self.empty, *singles, *pairs]))
         while not within(now.excess, self.limits) and len(now.effects) < DEEPEST:
@@ -176,7 +179,24 @@ class Shortlist:
             if grown.keys == now.keys or grown.total > 0.9 * now.total:
                 break
             now = grown
+            if self.formed(now):
+                return self.completed(now)
         return now
+
+    def formed(self, one: Listed) -> bool:
+        """Tell whether what is left may be the difference of form between effect and catalogue."""
+        return all(
+            left <= max(self.limits.band[e], select.FORM * self.empty.excess[e])
+            for e, left in one.excess.items()
+        )
+
+    def completed(self, now: Listed) -> Listed:
+        """Add one more effect only if that leaves nothing but noise: else it fits a form."""
+        if within(now.excess, self.limits) or len(now.effects) >= DEEPEST:
+            return now
+        more = [o for o in self.extensions(now) if within(o.excess, self.limits)]
+        best = self.best(more) if more else now
+        return best if best.effects and self.prune(best).keys == best.keys else now
 
     def _field(self, found: Sequence[Entry]) -> select.Field:
         rig = self.stage.rig
@@ -199,9 +219,10 @@ class Shortlist:
     def _singles(self, field: select.Field, r: Array) -> list[tuple[Used, ...]]:
         g = select.gains(field.K, field.columns.T @ r, field.groups, field.raw)
         out: dict[Key, tuple[Used, ...]] = {}
+        least = NEAR * float(np.max(g, initial=0.0))
         for i in map(int, np.argsort(-g)):
             variant = field.entries[i].variant
-            if g[i] > 0 and variant.key not in out and len(out) < SINGLES:
+            if (g[i] > least or (g[i] > 0 and len(out) < 3)) and variant.key not in out and len(out) < SINGLES:
                 out[variant.key] = (variant.used,)
         return list(out.values())
 
