@@ -10,9 +10,9 @@ adds 1 per row to a residual's energy, whatever the unit and the number of repea
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ from analysis.rows import Rows
 from analysis.signals import condition, moving_joints
 from analysis.terms.base import Used
 from analysis.trace.candidates import Variant
-from analysis.trace.evidence import Scene, candidate_columns, prepared, residual, scene_rows
+from analysis.trace.evidence import Scene, candidate_columns, held, prepared, residual, scene_rows
 from analysis.trace.floor import Floor, Group, floors
 from rig.model.rig import Rig
 
@@ -61,6 +61,7 @@ class Board:
     floors: tuple[Floor, ...]
     scenes: tuple[Scene, ...]
     rows: tuple[Mapping[str, Rows], ...]
+    memo: dict[Hashable, dict[str, Rows]] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def mean(self) -> Array:
@@ -112,10 +113,15 @@ def least_squares(rig: Rig, rows: Sequence[Mapping[str, Rows]]) -> dict[str, flo
     return out
 
 
-def board(rig: Rig, terms: Sequence[Used], members: Sequence[Scene]) -> Board:
-    """Lay out records under a model; see the module."""
+def board(
+    rig: Rig,
+    terms: Sequence[Used],
+    members: Sequence[Scene],
+    beta: Mapping[str, float] | None = None,
+) -> Board:
+    """Lay out records under a model with coefficients `beta`, or fitted here; see the module."""
     every = [scene_rows(rig, terms, scene) for scene in members]
-    beta = least_squares(rig, every)
+    beta = least_squares(rig, every) if beta is None else beta
     split = floors(rig, terms, members, every, beta)
     mean_scenes = averaged(rig, members)
     mean_rows = [scene_rows(rig, terms, scene) for scene in mean_scenes]
@@ -187,7 +193,7 @@ def _entry(stage: Board, variant: Variant, seen: Sequence[object]) -> Entry | No
     touched = set()
     M = stage.base.shape[0]
     for index, scene in enumerate(stage.scenes):
-        if _held(variant, scene):
+        if held(variant.effect, scene):
             continue
         rows = stage.rows[index]
         found = candidate_columns(
@@ -205,10 +211,3 @@ def _entry(stage: Board, variant: Variant, seen: Sequence[object]) -> Entry | No
         variant, tuple(columns), np.column_stack(list(columns.values())), frozenset(touched)
     )
 
-
-def _held(variant: Variant, scene: Scene) -> bool:
-    """Tell whether an effect at a joint cannot show because the joint is locked."""
-    where = variant.effect.where
-    if not where.startswith("joint ") or variant.effect.name.startswith(("sensor", "channel")):
-        return False
-    return int(where.split()[1]) in scene.record.locked

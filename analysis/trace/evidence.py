@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis import checks as ck
+from analysis.effects.base import SENSOR, ordered
 from analysis.rows import Filtering, Rows, default_filtering, record_rows
 from analysis.signals import Signals, condition
 from analysis.terms.base import Columns, Term, Used
@@ -68,6 +69,17 @@ def scenes(
     return out
 
 
+def held(term: Term, scene: Scene) -> bool:
+    """Tell whether an effect at a joint cannot show because the joint is locked.
+
+    A sensor of a locked joint still tells where that joint stands.
+    """
+    where = term.where
+    if not where.startswith("joint ") or getattr(term, "stage", None) == SENSOR:
+        return False
+    return int(where.split()[1]) in scene.record.locked
+
+
 def changes_signals(term: Term) -> bool:
     """Tell whether a term changes what all terms see, or where the equations hold."""
     kind = type(term)
@@ -77,11 +89,6 @@ def changes_signals(term: Term) -> bool:
 def scene_rows(rig: Rig, terms: Sequence[Used], scene: Scene) -> dict[str, Rows]:
     """Return the rows of one record under a model (see `analysis.rows.record_rows`)."""
     return record_rows(rig, ordered(terms), scene.signals, scene.filtering)
-
-
-def ordered(terms: Sequence[Used]) -> tuple[Used, ...]:
-    """Return the terms, those that change the signals before those that read them."""
-    return tuple(sorted(terms, key=lambda u: not changes_signals(u.term)))
 
 
 def prepared(rig: Rig, terms: Sequence[Used], scene: Scene) -> Signals:

@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 Key = tuple[str, str]
 
 BAND = 0.7  # repeatable rms over noise, below which there is nothing to explain
+FORM = 0.01  # of the energy before: what the catalogue's form of an effect may miss of the real one
 ADD_SHARE = 0.3  # of what is left in the equations it touches: less does not earn a place
 AS_GOOD = 1.25  # what a simpler candidate may leave over the best, before noise counts
 VISIBLE = 0.03  # of a column's length must stand out of the baseline's columns
@@ -221,10 +222,24 @@ def search(board: Field, r: Array, noise: float = 1.0) -> Choice:
     return best
 
 
+def best_pairs(board: Field, r: Array, count: int) -> list[Choice]:
+    """Return the pairs of different candidates that leave least, whatever they are alone."""
+    starts: dict[Key, Choice] = {}
+    for first in _blind(board, r):
+        starts.setdefault(board.entries[first.members[0]].variant.key, first)
+    found: dict[frozenset[Key], Choice] = {}
+    for first in list(starts.values())[:STARTS]:
+        for pair in options(board, first.members, r, 1.0)[:3]:
+            keys = frozenset(board.entries[m].variant.key for m in pair.members)
+            if keys not in found or pair.total < found[keys].total:
+                found[keys] = pair
+    return sorted(found.values(), key=lambda p: p.total)[:count]
+
+
 def _blind(board: Field, r: Array) -> list[Choice]:
     """Return the best single entries although none earns a place alone: a pair may."""
     g = gains(board.K, board.columns.T @ r, board.groups, board.raw)
-    return [judged(board, (int(i),), r, 1.0) for i in np.argsort(-g)[: 3 * STARTS] if g[i] > 0]
+    return [judged(board, (int(i),), r, 1.0) for i in np.argsort(-g)[: 6 * STARTS] if g[i] > 0]
 
 
 def grow(board: Field, members: Sequence[int], r: Array, noise: float) -> Choice:
