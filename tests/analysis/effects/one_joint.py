@@ -182,7 +182,9 @@ def channels(rig: Rig, wrong: Wrong, wave: Array, seconds: float = 8.0) -> dict[
     return _simulated(rig, wrong, wave, bias, seconds)
 
 
-def _simulated(rig: Rig, wrong: Wrong, wave: Array, bias: float, seconds: float) -> dict[str, Array]:
+def _simulated(
+    rig: Rig, wrong: Wrong, wave: Array, bias: float, seconds: float
+) -> dict[str, Array]:
     centring, settle = 0.3, 4.0
     q1 = angle(0.0, 0)
     par = np.array([TRUTH[name] for name in NAMES_1])
