@@ -15,10 +15,11 @@ from analysis import checks as ck
 from analysis.checks import Check
 from analysis.model import Estimate, Model, estimate_json, finite
 from analysis.noise import noise_moments
+from analysis.reduce import reduced
 from analysis.rows import Filtering, Rows, default_filtering, parameters_of, record_rows
 from analysis.signals import condition
 from analysis.solve import Cluster, Solution, half_width, solve, triangle
-from analysis.terms import baseline
+from analysis.terms import baseline_of
 from analysis.terms.base import FAMILIES, Coefficient, Used, family_of
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
@@ -72,7 +73,7 @@ def identify(
     """
     _refuse_method(method)
     rig = ck.common_rig(runs)
-    used = tuple(terms) if terms is not None else tuple(Used(term) for term in baseline())
+    used = tuple(terms) if terms is not None else tuple(map(Used, baseline_of(rig)))
     per_record = build_rows(rig, runs, used, filtering)
     # A stream of its own: the prediction of bias is the same every time.
     noise = noise_moments(rig, runs, used, filtering, np.random.default_rng(0))
@@ -148,7 +149,8 @@ def solve_rows(
             clusters += _clusters(one, family, pieces)
         if names:
             moments = noise[family] if noise else None
-            out[family] = solve(names, clusters, moments, reject_noise)
+            linear = solve(names, clusters, moments, reject_noise)
+            out[family] = reduced(rig, terms, linear, clusters, moments, reject_noise)
     return out
 
 
@@ -176,7 +178,7 @@ def _estimates(
     rig: Rig, terms: Sequence[Used], solutions: Mapping[str, Solution]
 ) -> tuple[dict[str, Estimate], Array]:
     """Turn the rows' coefficients into parameters (b = 1/coefficient) with intervals."""
-    coefficients = {c.parameter: c for used in terms for c in used.term.coefficients(rig)}
+    coefficients = {c.parameter: c for used in terms for c in used.term.parameters(rig)}
     found: dict[str, Estimate] = {}
     blocks = []
     for solution in solutions.values():
