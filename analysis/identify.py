@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,12 +13,14 @@ from numpy.typing import NDArray
 
 from analysis import checks as ck
 from analysis.checks import Check
+from analysis.estimators.choose import Job, refine
 from analysis.model import Estimate, Model, estimate_json, finite
 from analysis.noise import noise_moments
+from analysis.reduce import reduced
 from analysis.rows import Filtering, Rows, default_filtering, parameters_of, record_rows
 from analysis.signals import condition
 from analysis.solve import Cluster, Solution, half_width, solve, triangle
-from analysis.terms import baseline
+from analysis.terms import baseline_of
 from analysis.terms.base import FAMILIES, Coefficient, Used, family_of
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
@@ -29,6 +31,7 @@ log = logging.getLogger(__name__)
 
 METHODS = ("coupled",)
 LATER_METHODS = ("sequential", "simultaneous", "pso", "ga")
+PLAIN = "plain"  # least squares as in the paper: no nuisances, scatter between repeats only
 SEGMENTS = 10  # of the only repeat of a step, where there are not more repeats
 
 
@@ -63,28 +66,44 @@ def identify(
     terms: Sequence[Used] | None = None,
     filtering: Callable[[Record], Filtering] = default_filtering,
     reject_noise: bool = True,
+    estimator: str = "ls",
+    bootstrap: int = 0,
+    seed: int = 0,
 ) -> Identification:
     """Identify all parameters from all records of the runs at once (the paper's STEP4).
 
     `terms` defaults to the paper's model. `reject_noise` False gives out parameters that rest on
-    sensor noise as well, for studies of just that. Raises InputError for another method, for runs
+    sensor noise as well, for studies of just that. `estimator` is one of
+    `analysis.estimators.choose.ESTIMATORS`, "plain" the bare solution without nuisances;
+    `bootstrap` draws of whole repeats (from `seed`) replace the intervals. Raises InputError for another method, for runs
     of different rigs and for records that cannot be used, naming record and channel.
     """
     _refuse_method(method)
     rig = ck.common_rig(runs)
-    used = tuple(terms) if terms is not None else tuple(Used(term) for term in baseline())
+    used = tuple(terms) if terms is not None else tuple(map(Used, baseline_of(rig)))
     per_record = build_rows(rig, runs, used, filtering)
     # A stream of its own: the prediction of bias is the same every time.
     noise = noise_moments(rig, runs, used, filtering, np.random.default_rng(0))
     started = time.perf_counter()
     solutions = solve_rows(rig, used, per_record, noise, reject_noise)
     seconds = time.perf_counter() - started
+    more: tuple[Check, ...] = ()
+    if estimator != PLAIN:
+        job = Job(
+            rig, runs, used, lambda extra: build_rows(rig, runs, (*used, *extra), filtering),
+            estimator, bootstrap, np.random.default_rng(seed),
+        )  # fmt: skip
+        refined = refine(job, solutions)
+        solutions, more = refined.solutions, refined.checks
     estimates, covariance = _estimates(rig, used, solutions)
+    if bootstrap and estimator != PLAIN:
+        estimates = _with_ends(estimates, refined.bootstrap)
     rows = {family: solution.rows for family, solution in solutions.items()}
     masked = sum(r.masked for one in per_record for r in one.rows.values())
-    statements = _statements(rig, runs, per_record, solutions, estimates, rows, masked)
+    statements = _statements(rig, runs, per_record, solutions, estimates, rows, masked) + more
     provenance = {
         "method": method,
+        "estimator": estimator if estimator == PLAIN else refined.estimator,
         "runs": [run.source for run in runs],
         "records": [one.record for one in per_record],
         "rows": rows,
@@ -148,7 +167,8 @@ def solve_rows(
             clusters += _clusters(one, family, pieces)
         if names:
             moments = noise[family] if noise else None
-            out[family] = solve(names, clusters, moments, reject_noise)
+            linear = solve(names, clusters, moments, reject_noise)
+            out[family] = reduced(rig, terms, linear, clusters, moments, reject_noise)
     return out
 
 
@@ -176,7 +196,7 @@ def _estimates(
     rig: Rig, terms: Sequence[Used], solutions: Mapping[str, Solution]
 ) -> tuple[dict[str, Estimate], Array]:
     """Turn the rows' coefficients into parameters (b = 1/coefficient) with intervals."""
-    coefficients = {c.parameter: c for used in terms for c in used.term.coefficients(rig)}
+    coefficients = {c.parameter: c for used in terms for c in used.term.parameters(rig)}
     found: dict[str, Estimate] = {}
     blocks = []
     for solution in solutions.values():
@@ -211,6 +231,18 @@ def _estimate(
     ends = (1.0 / high, 1.0 / low if low > 0 else np.inf) if value > 0 else (np.nan, np.nan)
     estimate = Estimate(float(1.0 / value), c.unit, float(abs(slope) * std), ends, note)
     return estimate, float(slope)
+
+
+def _with_ends(
+    estimates: Mapping[str, Estimate], ends: Mapping[str, tuple[float, float]]
+) -> dict[str, Estimate]:
+    """Replace intervals by the bootstrap's; `ends` are of the rows' coefficients (1/b)."""
+    out = dict(estimates)
+    for name, (low, high) in ends.items():
+        if name == "b":
+            low, high = 1.0 / high, 1.0 / low
+        out[name] = replace(out[name], ci95=(low, high))
+    return out
 
 
 def _statements(

@@ -35,6 +35,7 @@ UNIT = "m^3/(s*Pa)"
 @dataclass(frozen=True)
 class _Leakage(Effect):
     family: ClassVar[str] = "fluid"
+    per_joint: ClassVar[bool] = True
     where: str = "joint 1"
 
     @classmethod

@@ -114,6 +114,7 @@ class JointSpring(Effect):
         "slow motion over the whole stroke at two poses of the other joints: gravity goes with the "
         "absolute angle, the spring with the joint's own"
     )
+    per_joint: ClassVar[bool] = True
     where: str = "joint 1"
 
     @property
@@ -196,6 +197,7 @@ class TorqueOffset(Effect):
     separated_by: ClassVar[str] = (
         "slow motion over the whole stroke: gravity, spring and a pressure's offset change with it"
     )
+    per_joint: ClassVar[bool] = True
     where: str = "joint 1"
 
     @property

@@ -34,6 +34,7 @@ class ValveEffect(Effect):
 
     family: ClassVar[str] = "valve"
     prepares: ClassVar[bool] = True
+    per_joint: ClassVar[bool] = True
     where: str = "joint 1"
 
     @classmethod

@@ -145,6 +145,8 @@ def _rivals(
 ) -> list[Rival]:
     """Return the sets that have another effect in place of one, those that leave least first."""
     others = winner.keys - {key}
+    rest = listed.exact([u for u in winner.effects if (u.term.name, u.term.where) != key])
+    equations = _touched(listed, winner, rest)
     out = []
     mine = _energy(held, after)
     own = _energy(listed.stage, winner.fit.left)
@@ -154,7 +156,6 @@ def _rivals(
             continue
         if one.size[1] > winner.size[1] or listed.physical(one):
             continue
-        equations = _different(listed, one, winner)
         theirs = _energy(held, held_left(held, one.fit))
         ratio = _ratio(theirs, mine, equations)
         training = _ratio(_energy(listed.stage, one.fit.left), own, equations)
@@ -173,14 +174,6 @@ def _energy(stage: Board, left: Array) -> dict[str, tuple[float, int]]:
         energy, rows = out.get(s.equation, (0.0, 0))
         out[s.equation] = energy + float(part @ part), rows + len(part)
     return out
-
-
-def _different(listed: Shortlist, one: Listed, winner: Listed) -> set[str]:
-    """Return the equations in which both together change most of what the baseline leaves."""
-    start = listed.empty.excess
-    change = {e: start[e] - min(one.excess[e], winner.excess[e]) for e in start}
-    most = max(change.values())
-    return {e for e, v in change.items() if v > 0.05 * most}
 
 
 def _ratio(

@@ -40,6 +40,12 @@ def _load(folders: Sequence[Path]) -> list[Run]:
 def identify(
     runs: RunsArgument,
     method: Annotated[str, typer.Option(help="Only coupled for now.")] = "coupled",
+    effects: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--with", help="Add an effect to the model: NAME (every joint) or 'NAME@joint 1'."
+        ),
+    ] = None,
     json: JsonOption = None,
     model: Annotated[Path | None, typer.Option(help="Write the model file here.")] = None,
     report: Annotated[Path | None, typer.Option(help="Write an HTML report here.")] = None,
@@ -51,10 +57,13 @@ def identify(
     from analysis.identify import identify as identify_runs
     from analysis.identify import to_json
     from analysis.model import save_model
+    from analysis.terms import with_effects
+    from analysis.terms.base import Used
     from rig.cli.tables import identification_text
 
     loaded = _load(runs)
-    result = identify_runs(loaded, method)
+    terms = [Used(term) for term in with_effects(loaded[0].rig, effects)] if effects else None
+    result = identify_runs(loaded, method, terms)
     if model is not None:
         save_model(result.model, model)
     write_json(json, to_json(result))

@@ -44,7 +44,7 @@ def effect(name: str, where: str) -> Effect:
 
 def test_every_name_of_the_contract_is_an_effect_with_its_rivals_and_its_experiment() -> None:
     kinds = {name: kind for name, kind in known().items() if issubclass(kind, Effect)}
-    assert CONTRACT <= set(kinds)
+    assert set(kinds) >= CONTRACT
     for name, kind in kinds.items():
         said = (kind.family, kind.variable, kind.separated_by, kind.__doc__)
         assert all(said), name
