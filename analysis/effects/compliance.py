@@ -37,8 +37,8 @@ MOST_VOLUME: Final = 10.0  # of the pipes' volume
 class EntrainedAir(Effect):
     """A share alpha of free air at atmospheric pressure p0 makes the oil softer at low pressure.
 
-    1/b_eff = 1/b + alpha p0 / (p + p0)^2, p gauge: an isothermal gas (Merritt 1967, section 2.4;
-    Wylie and Streeter 1993, section 1-4, with polytropic exponent 1: bubbles of less than a
+    1/b_eff = 1/b + alpha p0 / (p + p0)^2, p gauge: an isothermal gas (Merritt 1967, chapter 2;
+    Wylie and Streeter 1993, with polytropic exponent 1: bubbles of less than a
     millimetre keep the oil's temperature). Linear in alpha.
     """
 
@@ -94,7 +94,7 @@ class EntrainedAir(Effect):
 class DeadVolume(Effect):
     """Oil between valve and chamber beyond the rig file's pipe volume: V = V_file + V_dead.
 
-    Enters as V_dead dp/dt / b (continuity; Merritt 1967, section 3.5), in proportion to the 1/b
+    Enters as V_dead dp/dt / b (continuity; Merritt 1967, chapter 3), in proportion to the 1/b
     that all chambers share: a shape, so that b stays one. One chamber alone is told from a
     smaller b by the others; the same in all chambers is not, but for V's change with the piston.
     """

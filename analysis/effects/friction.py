@@ -2,8 +2,8 @@
 
 Torque row of joint i (friction stands with the load): ... + G F_f = G F. Every form is a level
 [N] times the state z of the contact, -1 <= z <= 1, which turns over within a presliding distance d
-of travel after each reversal (Dahl 1968; Armstrong-Helouvry, Dupont and Canudas de Wit 1994,
-section 3; Jelali and Kroll 2003, section 3.7.3):
+of travel after each reversal (Dahl 1968; Armstrong-Helouvry, Dupont and Canudas de Wit
+1994; Jelali and Kroll 2003):
 
     dz/ds = (sign(s') - z) / d        so that   dz/dt = (s' - |s'| z) / d
 
@@ -150,7 +150,7 @@ class CoulombFriction(_Friction):
 
 @dataclass(frozen=True)
 class StribeckFriction(_Friction):
-    """F_f = Fs exp(-(s'/vs)^2) z: breakaway above Coulomb's level (Armstrong-Helouvry 1994, eq. 4).
+    """F_f = Fs exp(-(s'/vs)^2) z: breakaway above Coulomb's level (Armstrong-Helouvry et al. 1994).
 
     Falls off over the Stribeck speed vs (shape). Alone it is the part that vanishes with speed;
     with `coulomb_friction` beside it it is the whole Stribeck curve.
@@ -201,7 +201,7 @@ class StribeckFriction(_Friction):
 class AsymmetricFriction(_Friction):
     """F_f = (F_ext [z > 0] + F_ret [z < 0]) z: seals that hold differently either way.
 
-    Source: Jelali and Kroll 2003, section 3.7.3 (different levels by direction of motion).
+    Source: Jelali and Kroll 2003 (different levels by direction of motion).
     """
 
     name: ClassVar[str] = "asymmetric_friction"
@@ -246,7 +246,7 @@ class AsymmetricFriction(_Friction):
 
 @dataclass(frozen=True)
 class PressureDependentFriction(_Friction):
-    """F_f = k (p_cap + p_rod) z: seals pressed on by the oil (Jelali and Kroll 2003, sec. 3.7.3).
+    """F_f = k (p_cap + p_rod) z: seals pressed on by the oil (Jelali and Kroll 2003).
 
     k [m^2] is the friction coefficient times the seals' area under pressure.
     """

@@ -1,7 +1,7 @@
 """Laminar leakage past the piston and out of the chambers.
 
-Flow in proportion to the pressure across a narrow gap (Merritt 1967, section 3.5; Jelali and Kroll
-2003, section 3.6.2): Q = c dp.
+Flow in proportion to the pressure across a narrow gap (Merritt 1967, chapter 3; Jelali and Kroll
+2003): Q = c dp.
 """
 
 from __future__ import annotations

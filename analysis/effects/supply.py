@@ -82,8 +82,8 @@ class SupplySag(_PortEffect):
     """The valves see less than the measured or nominal supply: p_s - dp (Q / Q_pump)^n.
 
     Where the rig measures its supply, what can be missing is the line between sensor and valves,
-    turbulent, n = 2 (Merritt 1967, section 3.2); where it does not, the pressure-compensated pump
-    or relief valve gives way in proportion to the flow taken, n = 1 (section 5.2). dp is a shape.
+    turbulent, n = 2 (Merritt 1967, chapter 3); where it does not, the pressure-compensated pump
+    or relief valve gives way in proportion to the flow taken, n = 1. dp is a shape.
     """
 
     name: ClassVar[str] = "supply_sag"
@@ -130,7 +130,7 @@ class SupplySag(_PortEffect):
 
 @dataclass(frozen=True)
 class TankPressure(_PortEffect):
-    """The return stands at p_t + p_back (Q / Q_pump)^2 instead of zero (Merritt 1967, sec. 3.2).
+    """The return stands at p_t + p_back (Q / Q_pump)^2 instead of zero (Merritt 1967, chapter 3).
 
     The line's part is turbulent; Q is the flow that the valves give back.
     """

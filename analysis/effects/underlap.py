@@ -37,7 +37,7 @@ class UnderlapLeakage(ValveEffect):
     """Edges open by w at the null: opening max(w + u, 0) ahead and max(w - u, 0) astern, at once.
 
     What is added to the zero-lap orifice: ahead edges d+ = max(u + w, 0) - max(u, 0), astern edges
-    d- = max(w - u, 0) - max(-u, 0), each times its own gain and root (Merritt 1967, section 5.4,
+    d- = max(w - u, 0) - max(-u, 0), each times its own gain and root (Merritt 1967, chapter 5,
     open-centre valve). The gains are the orifices' own: the columns add to theirs.
     """
 

@@ -74,7 +74,7 @@ class ValveEffect(Effect):
 class ValveDeadband(ValveEffect):
     """Overlapped edges: no opening for -w_astern < u < w_ahead, u less the edge beyond.
 
-    Source: Merritt 1967, section 5.1 (overlap, "dead band"); Jelali and Kroll 2003, section 3.5.2.
+    Source: Merritt 1967, chapter 5 (overlap, "dead band"); Jelali and Kroll 2003.
     Hides in the flow gains: 10 mV make those of the seed bench 12 to 17 % too small (NOTES).
     """
 
@@ -117,7 +117,7 @@ class ValveDeadband(ValveEffect):
 
 @dataclass(frozen=True)
 class SpoolOffset(ValveEffect):
-    """The edges' null lies at u0 of the LVDT: opening u - u0 (Merritt 1967, section 5.1, "null").
+    """The edges' null lies at u0 of the LVDT: opening u - u0 (Merritt 1967, chapter 5, "null").
 
     Hides in the gains of the two directions with opposite signs (NOTES: 5 mV, 7 to 9 %).
     """
@@ -157,7 +157,7 @@ class SpoolOffset(ValveEffect):
 
 @dataclass(frozen=True)
 class SpoolLag(ValveEffect):
-    """The opening follows the LVDT: tau dx/dt = u - x (Jelali and Kroll 2003, section 3.5.4).
+    """The opening follows the LVDT: tau dx/dt = u - x (Jelali and Kroll 2003).
 
     x is a hidden state; the rows have it by the exact response to the sampled spool, drawn as
     straight lines between samples.

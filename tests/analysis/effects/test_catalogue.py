@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from analysis.effects.base import Effect, ordered
 from analysis.effects.friction import contact_state
 from analysis.effects.measurement import Sensor
 from analysis.effects.payload import growth, payload_of_shift
+from analysis.effects_catalogue import FAMILIES, pages
 from analysis.identify import identify
 from analysis.signals import Signals
 from analysis.terms import base, baseline, known, make
@@ -299,3 +301,13 @@ def test_sensors_are_put_right_before_the_valve_and_the_valve_in_its_own_order()
 def test_a_place_that_is_none_is_named() -> None:
     with pytest.raises(InputError, match=r"coulomb_friction.*'bench'"):
         _ = effect("coulomb_friction", "bench").joint
+
+
+def test_the_pages_are_those_of_the_classes(rig: Rig) -> None:
+    """`bramah effects --docs docs/` was run after the last change of the catalogue."""
+    docs = Path(__file__).parents[3] / "docs"
+    for name, text in pages(rig).items():
+        written = (docs / name).read_text(encoding="utf-8")
+        assert written.startswith(text), f"{name} is old: run bramah effects --docs docs/"
+    for family in FAMILIES:
+        assert (docs / "images" / f"effects-{family}.svg").stat().st_size < 200_000
