@@ -23,7 +23,15 @@ from analysis.trace.board import Board, board
 from analysis.trace.candidates import catalogue, variants
 from analysis.trace.evidence import Scene, scenes
 from analysis.trace.floor import STATED
-from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, UNEXPLAINED, Dependence, Found, Trace
+from analysis.trace.result import (
+    CLEAN,
+    CONFOUNDED,
+    EXPLAINED,
+    UNEXPLAINED,
+    Dependence,
+    Found,
+    Trace,
+)
 from analysis.trace.shortlist import Listed, Shortlist, rebased, within
 from analysis.trace.words import sentence
 from rig.model.parse import InputError
@@ -112,14 +120,14 @@ def _refuse_short(stage: Board, train: Sequence[Scene]) -> None:
     for s in stage.segments:
         count = s.where.stop - s.where.start
         if count < LEAST_ROWS:
-            seconds = next(x.record.samples / x.record.sample_rate for x in train if x.group == s.group)
+            seconds = next(
+                x.record.samples / x.record.sample_rate for x in train if x.group == s.group
+            )
             raise InputError(
                 f"step {s.group[1]!r}: records of {seconds:.3g} s leave {count} rows of "
                 f"{s.equation} behind the filters' edges and masks; the trace needs {LEAST_ROWS}: "
                 "record longer"
             )
-    if not stage.segments:
-        raise InputError("the records are too short: no rows are left behind the filters' edges")
 
 
 def _notes(stage: Board, judge: Board) -> list[str]:
@@ -136,7 +144,9 @@ def _notes(stage: Board, judge: Board) -> list[str]:
         out.append("one repeat per step: the noise floor comes from periods within the record")
     few = min((f.count for f in stage.floors if f.count > 1), default=0)
     if 0 < few < 4:
-        out.append(f"{few} repeats: stability is judged on few half-samples; four or more tell more")
+        out.append(
+            f"{few} repeats: stability is judged on few half-samples; four or more tell more"
+        )
     if all(f.source == STATED for f in judge.floors):
         out.append("the held-out noise floor is the rig file's stated sensor noise")
     return out
@@ -182,9 +192,7 @@ def _fraction(listed: Shortlist, winner: Listed) -> float:
     return float(min(1.0, winner.total / start)) if start > 0 else 0.0
 
 
-def _extended(
-    runs: Sequence[Run], terms: Sequence[Used], winner: Listed, before: Model
-) -> Model:
+def _extended(runs: Sequence[Run], terms: Sequence[Used], winner: Listed, before: Model) -> Model:
     """Identify everything again together with the effects."""
     if not winner.effects:
         return before

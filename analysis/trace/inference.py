@@ -104,7 +104,9 @@ def linear(stage: Board, one: Listed) -> Linear:
     return Linear(one, orthonormal(np.column_stack([rows.matrix, *extra])), one.fit.left)
 
 
-def halves(stage: Board, rng: np.random.Generator, count: int = HALVES) -> list[tuple[Array, float]]:
+def halves(
+    stage: Board, rng: np.random.Generator, count: int = HALVES
+) -> list[tuple[Array, float]]:
     """Return changes (M,) of the averaged residual in random half-samples, and its noise energy.
 
     Halves of the repeats of every step; of a step with one repeat, halves of its blocks.
@@ -223,7 +225,9 @@ def subsets(stage: Board, joint: int | None) -> dict[str, Array]:
         time = stage.rows[index[s.group]][s.equation].time
         early[s.where] = time < 0.5 * (time[0] + time[-1])
         own = joint if joint is not None else int(s.equation.rsplit("_", 1)[1]) - 1
-        at = np.clip(np.rint(time * scene.record.sample_rate).astype(int), 0, len(scene.signals.t) - 1)
+        at = np.clip(
+            np.rint(time * scene.record.sample_rate).astype(int), 0, len(scene.signals.t) - 1
+        )
         ahead[s.where] = scene.signals.sd[at, own] > 0
         size = np.abs(scene.signals.sd[at, own])
         outer[s.where] = size > np.median(size)
@@ -244,6 +248,10 @@ def invariance(
     # A shape such as the presliding distance is the form's, not the effect's size.
     sizes = {c.parameter for c in used.term.coefficients(stage.rig)}
     sizes |= {s.parameter for s in shapes_of(stage.rig, used) if s.neutral is not None}
+    units = {c.parameter: c.unit for c in used.term.coefficients(stage.rig)}
+    units |= {s.parameter: s.unit for s in shapes_of(stage.rig, used)}
+    nothing = {s.parameter: s.neutral or 0.0 for s in shapes_of(stage.rig, used)}
+    neutral = np.array([nothing.get(n, 0.0) for n in names])
     out = []
     for label, mask in subsets(stage, joint).items():
         if not mask.any():
@@ -265,7 +273,9 @@ def invariance(
                 continue
             shift = float(own @ left[mask]) / size
             error = 1.0 / np.sqrt(size)
-            full = abs(float(value.value[k]))
+            # Two levels of one effect are judged by the larger: 2 N beside 100 N is a detail.
+            alike = [j for j, n in enumerate(names) if n in sizes and units[n] == units[name]]
+            full = float(np.max(np.abs(value.value[alike] - neutral[alike])))
             if error > POWER * full:
                 continue
             if abs(shift) > DEVIATIONS * np.hypot(error, TOLERANCE / DEVIATIONS * full):

@@ -127,8 +127,10 @@ def effect_text(sizes: Sizes, joint: int, level: int) -> tuple[str, tuple[str, s
 
     name, where, key, levels, other = sizes
     place = where.format(j=joint)
-    at = f"channel: {place.removeprefix('channel ')}" if place.startswith("channel ") else (
-        f"where: {place}"
+    at = (
+        f"channel: {place.removeprefix('channel ')}"
+        if place.startswith("channel ")
+        else (f"where: {place}")
     )
     text = f"{{name: {name}, {at}, {key}: {levels[level]}" + (f", {other}" if other else "") + "}"
     return text, (name, place_of(place)), si_size(levels[level])
@@ -169,7 +171,9 @@ def cases(
                     out.append(_case(SINGLE, [(sizes, int(rng.integers(1, 3)), size)], number))
                     number += 1
         elif kind == PAIR:
-            loud = [s for s in SINGLES if s[0] not in ("entrained_air", "dead_volume", "supply_sag")]
+            loud = [
+                s for s in SINGLES if s[0] not in ("entrained_air", "dead_volume", "supply_sag")
+            ]
             for _ in range(count):
                 one, two = rng.choice(len(loud), size=2, replace=False)
                 members = [(loud[int(i)], int(rng.integers(1, 3)), 2) for i in (one, two)]
@@ -189,8 +193,13 @@ def cases(
 def _case(kind: str, members: Sequence[tuple[Sizes, int, int]], seed: int) -> Case:
     built = [effect_text(*m) for m in members]
     scenario = "effects: [" + ", ".join(text for text, _, _ in built) + "]"
-    label = " + ".join(f"{m[0][3][m[2]]} {key[0]} at {key[1]}" for m, (_, key, _) in zip(members, built, strict=True))
-    return Case(kind, label, scenario, tuple(k for _, k, _ in built), seed, tuple(s for *_, s in built))
+    label = " + ".join(
+        f"{m[0][3][m[2]]} {key[0]} at {key[1]}"
+        for m, (_, key, _) in zip(members, built, strict=True)
+    )
+    return Case(
+        kind, label, scenario, tuple(k for _, k, _ in built), seed, tuple(s for *_, s in built)
+    )
 
 
 def perform(case: Case) -> Outcome:
@@ -207,9 +216,7 @@ def perform(case: Case) -> Outcome:
         rig, TRAIN, case.seed + 50_000, scenario,
         Overrides(seed=1000 + case.seed, amplitude_scale=0.7, repeats=2),
     )  # fmt: skip
-    judge, _ = simulated_run(
-        rig, JUDGE, case.seed + 90_000, scenario, Overrides(steps=JUDGE_STEPS)
-    )
+    judge, _ = simulated_run(rig, JUDGE, case.seed + 90_000, scenario, Overrides(steps=JUDGE_STEPS))
     started = time.process_time()
     found = trace([train], [other, judge])
     seconds = time.process_time() - started
@@ -248,9 +255,7 @@ def _size_error(case: Case, effects: Sequence[Any]) -> float:
     return max(errors) if errors else math.nan
 
 
-def all_of(
-    work: Sequence[Case], workers: int, say: Callable[[str], None]
-) -> Iterator[Outcome]:
+def all_of(work: Sequence[Case], workers: int, say: Callable[[str], None]) -> Iterator[Outcome]:
     """Perform the cases on `workers` processes, in the order they end; one that fails is told."""
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, mp_context=context) as pool:
