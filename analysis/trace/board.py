@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.rows import Rows
-from analysis.signals import condition, moving_joints
+from analysis.signals import Signals, condition, moving_joints
 from analysis.terms.base import Used
 from analysis.trace.candidates import Variant
 from analysis.trace.evidence import Scene, candidate_columns, held, prepared, residual, scene_rows
@@ -193,7 +193,7 @@ def entries(stage: Board, chosen: Sequence[Variant]) -> list[Entry]:
     return [entry for entry in found if entry is not None]
 
 
-def _entry(stage: Board, variant: Variant, seen: Sequence[object]) -> Entry | None:
+def _entry(stage: Board, variant: Variant, seen: Sequence[Signals]) -> Entry | None:
     columns: dict[str, Array] = {}
     touched = set()
     M = stage.base.shape[0]
@@ -208,7 +208,7 @@ def _entry(stage: Board, variant: Variant, seen: Sequence[object]) -> Entry | No
             seen[index],
             rows,
             stage.beta,
-            variant.used,  # type: ignore[arg-type]
+            variant.used,
         )
         for segment in stage.segments:
             if segment.group == scene.group and segment.equation in found:

@@ -1,4 +1,4 @@
-"""Candidates: every effect of the catalogue at every place of the rig, with points of first look."""
+"""Candidates: every effect of the catalogue at every place, with points of first look."""
 
 from __future__ import annotations
 

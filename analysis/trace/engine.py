@@ -16,7 +16,7 @@ from analysis import checks as ck
 from analysis.effects.base import Effect, ordered
 from analysis.identify import identify
 from analysis.model import Model
-from analysis.terms import baseline, known
+from analysis.terms import baseline_of, known
 from analysis.terms.base import Used
 from analysis.trace import clues, gates, held_out
 from analysis.trace.board import Board, board
@@ -41,6 +41,8 @@ from rig.model.rig import Rig
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
+# The other estimators add small faults of sensors of their own accord: here they are candidates.
+PLAIN = "plain"
 LEAST_ROWS = 40  # of an equation's rows in one record
 
 
@@ -60,14 +62,14 @@ def trace(
     rig = ck.common_rig([*runs, *holdout])
     _refuse_same(runs, holdout)
     rng = np.random.default_rng(seed)
-    terms = tuple(Used(term) for term in baseline())
+    terms = tuple(map(Used, baseline_of(rig)))
     train, judged = scenes(rig, runs), scenes(rig, holdout)
     stage = board(rig, terms, train)
     _refuse_short(stage, train)
     judge = board(rig, terms, judged, stage.beta)
     candidates = catalogue(rig) if effects is None else list(effects)
     listed = Shortlist(stage, variants(rig, candidates))
-    before = identify(runs).model
+    before = identify(runs, estimator=PLAIN).model
     notes = _notes(stage, judge)
     if within(listed.empty.excess, listed.limits):
         found: tuple[Found, ...] = ()
@@ -78,6 +80,8 @@ def trace(
         found, winner, verdict = _named(listed, winner, judge, rng)
         refused = tuple(f for f in found if not gates.stands(f))
         found = tuple(f for f in found if gates.stands(f))
+        if verdict == UNEXPLAINED and found:
+            notes += gates.remaining(listed, winner, judge)
         moves = [] if verdict in (CLEAN, EXPLAINED) else _moves(stage, judge, winner)
     after = _extended(runs, terms, winner, before)
     error = held_out.errors(rig, judged, before, after, judge)
@@ -196,7 +200,7 @@ def _extended(runs: Sequence[Run], terms: Sequence[Used], winner: Listed, before
     """Identify everything again together with the effects."""
     if not winner.effects:
         return before
-    return identify(runs, terms=ordered((*terms, *winner.effects))).model
+    return identify(runs, terms=ordered((*terms, *winner.effects)), estimator=PLAIN).model
 
 
 def _next(verdict: str, found: Sequence[Found], rig: Rig) -> Mapping[str, Any] | None:

@@ -63,7 +63,12 @@ def _left(rig: Rig, scene: Scene, model: Model) -> dict[str, tuple[Rows, Array]]
 
 
 def abscissae(
-    rig: Rig, lines: Sequence[Lines], effect: Effect | None, variable: str, equation: str, model: Model
+    rig: Rig,
+    lines: Sequence[Lines],
+    effect: Effect | None,
+    variable: str,
+    equation: str,
+    model: Model,
 ) -> Array:
     """Return what one equation's residuals are drawn against: the effect's own variable or one."""
     joint = int(equation.rsplit("_", 1)[1]) - 1
@@ -160,7 +165,9 @@ def unit_of_variable(name: str) -> str:
         }.get(stem, "")  # fmt: skip
 
 
-def equation_of(effect: Effect, rig: Rig, result: Trace, lines: Mapping[str, Sequence[Lines]]) -> str:
+def equation_of(
+    effect: Effect, rig: Rig, result: Trace, lines: Mapping[str, Sequence[Lines]]
+) -> str:
     """Return the equation whose residual shows an effect best: most over its noise before."""
     scene = next(iter(lines.values()))[0].scene
     own = [e for e in effect.abscissa(rig, scene.signals) if e in lines]

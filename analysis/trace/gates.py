@@ -155,7 +155,7 @@ def _rivals(listed: Shortlist, winner: Listed, key: Key, held: Board, after: Arr
         theirs = _energy(held, held_left(held, one.fit))
         ratio = _ratio(theirs, mine, equations)
         training = _ratio(_energy(listed.stage, one.fit.left), own, equations)
-        name, where = next(iter(fresh))
+        name, _ = next(iter(fresh))
         tied = ratio < TIE and (training < TIE_TRAINING or ratio < 0.95)
         place = next(_place(u.term) for u in one.effects if (u.term.name, u.term.where) in fresh)  # type: ignore[arg-type]
         out.append(Rival(name, place, ratio, training, tied))

@@ -33,7 +33,7 @@ DEVIATIONS = 3.5
 POWER = 0.25  # a subset judges a parameter that it knows this well, relative
 
 
-def blocks(stage: Board, seconds: float = BLOCK) -> Array:
+def blocks(stage: Board, seconds: float = BLOCK) -> NDArray[np.int64]:
     """Return for each row of the board the number of its block within its record (M,)."""
     out = np.zeros(stage.base.shape[0], dtype=np.int64)
     index = {scene.group: k for k, scene in enumerate(stage.scenes)}
@@ -145,7 +145,7 @@ def stability(
     if winner.keys not in [o.keys for o in near]:
         near.append(winner)
     tangents = [linear(stage, o) for o in near]
-    counts = {key: 0 for key in winner.keys}
+    counts = dict.fromkeys(winner.keys, 0)
     others: dict[str, int] = {}
     samples = halves(stage, rng)
     for change, noise in samples:
@@ -203,9 +203,9 @@ def _others(stage: Board, model: Fit, own: Sequence[str]) -> Array:
     kept = [k for k, n in enumerate(rows.names) if n not in own]
     extra = []
     for other in model.terms:
-        names, J = (), np.zeros((len(model.left), 0))
-        if other.shape:
-            names, J = jacobian(stage, model, other)
+        if not other.shape:
+            continue
+        names, J = jacobian(stage, model, other)
         picked = [k for k, n in enumerate(names) if n not in own and n not in rows.names]
         extra.append(J[:, picked])
     return orthonormal(np.column_stack([rows.matrix[:, kept], *extra]))

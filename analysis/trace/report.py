@@ -80,18 +80,14 @@ def _pictures(rig: Rig, holdout: Sequence[Run], result: Trace) -> list[dict[str,
     """Return per effect, else per clue, the residual against its variable and in time."""
     lines = figures.held_out(rig, holdout, result)
     out = []
-    effects = [
-        u.term for u in result.model_after.terms if isinstance(u.term, Effect)
-    ]
+    effects = [u.term for u in result.model_after.terms if isinstance(u.term, Effect)]
     for k, effect in enumerate(effects):
         equation = figures.equation_of(effect, rig, result, lines)
         heading = f"{effect.name.replace('_', ' ')} at {getattr(effect, 'place', effect.where)}"
         out.append(_pair(rig, lines, result, effect, effect.variable, equation, heading, f"e{k}"))
     for k, clue in enumerate(result.depends_on[:2]):
         heading = f"what is left of {clue.equation} against {clue.variable}"
-        out.append(
-            _pair(rig, lines, result, None, clue.variable, clue.equation, heading, f"c{k}")
-        )
+        out.append(_pair(rig, lines, result, None, clue.variable, clue.equation, heading, f"c{k}"))
     return out
 
 
@@ -118,7 +114,7 @@ def _pair(
 
 
 def _errors(result: Trace) -> list[tuple[str, ...]]:
-    out = []
+    out: list[tuple[str, ...]] = []
     for name, before in result.before.items():
         floor, after = result.noise_floor.get(name, math.nan), result.after.get(name, math.nan)
         out.append(
@@ -153,7 +149,7 @@ def _parameters(result: Trace) -> list[tuple[str, ...]]:
     if result.verdict == CLEAN or result.model_after is result.model_before:
         return []
     after = result.model_after.parameters
-    out = []
+    out: list[tuple[str, ...]] = []
     for name, one in result.model_before.parameters.items():
         if name in after and one.identified and after[name].identified:
             change = 100 * (after[name].value / one.value - 1) if one.value else math.nan

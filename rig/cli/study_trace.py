@@ -31,7 +31,10 @@ Sizes = tuple[str, str, str, tuple[str, str, str], str]
 SINGLES: Final[tuple[Sizes, ...]] = (
     ("coulomb_friction", "joint {j}", "force", ("15 N", "40 N", "100 N"), ""),
     ("stribeck_friction", "joint {j}", "force", ("30 N", "60 N", "120 N"), "speed: 20 mm/s"),
-    ("asymmetric_friction", "joint {j}", "extending", ("30 N", "60 N", "120 N"), "retracting: 10 N"),
+    (
+        "asymmetric_friction", "joint {j}", "extending", ("30 N", "60 N", "120 N"),
+        "retracting: 10 N",
+    ),
     (
         "pressure_dependent_friction", "joint {j}", "coefficient",
         ("5e-6 N/Pa", "1e-5 N/Pa", "3e-5 N/Pa"), "",
@@ -264,7 +267,7 @@ def all_of(work: Sequence[Case], workers: int, say: Callable[[str], None]) -> It
             case = waiting[done]
             try:
                 outcome = done.result()
-            except Exception as error:  # noqa: BLE001  a plant that leaves its limits is no result
+            except Exception as error:  # a plant that leaves its limits is no result
                 say(f"{k}/{len(work)} {case.label}, seed {case.seed}: no records ({error})")
                 continue
             say(f"{k}/{len(work)} {line_of(outcome)}")
