@@ -86,8 +86,17 @@ def judge(
 
 def explained(listed: Shortlist, winner: Listed, held: Board) -> bool:
     """Tell whether what is left lies within the noise floor's band, on both sets of records."""
-    if not listed.formed(winner):
-        return False
+    return not remaining(listed, winner, held)
+
+
+def remaining(listed: Shortlist, winner: Listed, held: Board) -> list[str]:
+    """Say which equations keep more than the noise floor's band, on which records."""
+    out = [
+        f"{e}: {100 * left / max(listed.empty.excess[e], 1e-30):.2g} % of what repeated stays, "
+        f"{left / listed.limits.band[e]:.2g} times the band"
+        for e, left in winner.excess.items()
+        if not listed.negligible(e, left)
+    ]
     after = held_left(held, winner.fit)
     start = excess_of(held, held_left(held, listed.empty.fit))
     now = excess_of(held, after)
@@ -100,7 +109,12 @@ def explained(listed: Shortlist, winner: Listed, held: Board) -> bool:
         part = after[s.where]
         found = float(part @ part) + count * (1 - 1 / s.repeats)
         energy[s.equation] = energy.get(s.equation, 0.0) + found * s.noise**2
-    return all(energy[e] <= HELD_BAND**2 * floor[e] or now[e] <= 2 * FORM * start[e] for e in floor)
+    out += [
+        f"{e}: held-out error {np.sqrt(energy[e] / floor[e]):.2f} times the noise floor"
+        for e in floor
+        if energy[e] > HELD_BAND**2 * floor[e] and now[e] > 2 * FORM * start[e]
+    ]
+    return out
 
 
 def _noise_like(stage: Board) -> Array:

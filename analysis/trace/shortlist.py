@@ -183,11 +183,12 @@ class Shortlist:
 
     def formed(self, one: Listed) -> bool:
         """Tell whether what is left may be the difference of form between effect and catalogue."""
-        allowed = (select.LEFT / select.BAND) ** 2
-        return all(
-            left <= max(allowed * self.limits.band[e], select.FORM * self.empty.excess[e])
-            for e, left in one.excess.items()
-        )
+        return all(self.negligible(e, left) for e, left in one.excess.items())
+
+    def negligible(self, equation: str, left: float) -> bool:
+        """Tell whether so much energy above noise may be left in an equation."""
+        allowed = (select.LEFT / select.BAND) ** 2 * self.limits.band[equation]
+        return left <= max(allowed, select.FORM * self.empty.excess[equation])
 
     def completed(self, now: Listed) -> Listed:
         """Add one more effect only if that leaves nothing but noise: else it fits a form."""

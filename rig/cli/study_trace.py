@@ -113,6 +113,7 @@ class Outcome:
     fit_before: float
     fit_after: float
     depends_on: tuple[str, ...]
+    notes: tuple[str, ...]
     seconds: float
 
 
@@ -236,7 +237,7 @@ def perform(case: Case) -> Outcome:
         ),
         max(f.ratio for f in found.floors), _size_error(case, found.effects), ratio,
         float(np.max(off)) if off else math.nan, _mean(found.fit_before), _mean(found.fit_after),
-        tuple(d.variable for d in found.depends_on), seconds,
+        tuple(d.variable for d in found.depends_on), found.notes, seconds,
     )  # fmt: skip
 
 
@@ -283,12 +284,13 @@ def line_of(o: Outcome) -> str:
         f"[{right(o)}] {o.case.label} (seed {o.case.seed}, {o.loudness:.1f} x noise): {o.verdict}, "
         f"{named}" + (f"; tied {tied}" if tied else "") + (f"; {more}" if more else "")
         + (f"; moves with {' '.join(o.depends_on[:2])}" if o.depends_on else "")
+        + "".join(f"; {note}" for note in o.notes)
         + f"; size off {100 * o.size_error:.1f} %, error {o.error_ratio:.2f} x floor, "
         f"parameters off {100 * o.parameter_error:.1f} %, {o.seconds:.0f} s"
     )  # fmt: skip
 
 
-def right(o: Outcome) -> str:
+def right(o: Outcome) -> str:  # noqa: PLR0911  a table of answers
     """Judge an outcome: right, in class, quiet, wrong, missed, abstained."""
     truth, named = set(o.case.truth), set(o.named)
     if o.case.kind == NONE:
