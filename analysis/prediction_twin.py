@@ -37,7 +37,8 @@ class PlannedStep:
     `waves` maps an excited joint to one period of its command [V] (all the same length), `lines`
     are multiples of 1/period; `held` maps a joint at an end stop, `closed` one behind a closed
     valve, to its piston [m]; `centres` and `biases` [V] belong to the excited joints; `samples`
-    are those of one record.
+    are those of one record. A closed joint may give by `gives` [m]; an excited one is centred to
+    within `offsets` [m]; `strokes` are the pistons [m] it starts from, where not its centres.
     """
 
     name: str
@@ -50,6 +51,8 @@ class PlannedStep:
     samples: int
     repeats: int
     strokes: Mapping[int, float] = field(default_factory=dict)
+    gives: Mapping[int, float] = field(default_factory=dict)
+    offsets: Mapping[int, float] = field(default_factory=dict)
 
     @property
     def period(self) -> int:
@@ -67,12 +70,14 @@ class Played:
     """What the twin did: the noise-free `record`, the step with its found biases, the motion.
 
     `motion` holds the twin's signals within the record, (samples, N) each, by the names of
-    `twin.simulate_commands`, and `command` [V].
+    `twin.simulate_commands`, and `command` [V]; `gains` [m/(s V)] how the excited pistons follow
+    their commands, as the bench will measure it to centre them.
     """
 
     step: PlannedStep
     record: Record
     motion: Mapping[str, Array]
+    gains: Mapping[int, float]
 
 
 def ideal(rig: Rig) -> Rig:
@@ -96,11 +101,11 @@ def play(rig: Rig, step: PlannedStep, trims: int = TRIMS) -> Played:
         moved = simulate_commands(rig, commands, start, _held(rig, step))
         exists = moved["valid"] > 0
         good = len(exists) if exists.all() else int(np.argmin(exists))
-        step, steady = _trimmed(rig, step, commands, moved["piston"], lead, good)
+        step, steady, gains = _trimmed(rig, step, commands, moved["piston"], lead, good)
         if good == len(exists) and (steady or attempt == trims - 1):
             motion = {name: values[lead:] for name, values in moved.items()}
             motion["command"] = commands[lead:]
-            return Played(step, _record(rig, step, motion), motion)
+            return Played(step, _record(rig, step, motion), motion, gains)
     raise InputError(
         f"step {step.name!r}: on the twin the state ceases to exist (end of the linkage, vacuum); "
         "lower the amplitude"
@@ -133,9 +138,9 @@ def _commands(rig: Rig, step: PlannedStep) -> tuple[Array, Array, int]:
 
 def _trimmed(
     rig: Rig, step: PlannedStep, commands: Array, piston: Array, lead: int, good: int
-) -> tuple[PlannedStep, bool]:
-    """Return the step with better biases and starts, and whether the pistons were steady."""
-    rate = rig.sample_rate
+) -> tuple[PlannedStep, bool, dict[int, float]]:
+    """Return the step with better biases and starts, whether it was steady, and the gains."""
+    rate, gains = rig.sample_rate, {}
     biases, starts, steady = dict(step.biases), dict(step.strokes), good == len(piston)
     for joint in step.waves:
         span = slice(lead if good > lead + rate else 0, good)
@@ -147,6 +152,7 @@ def _trimmed(
         _, drift, gain = np.linalg.lstsq(basis, s, rcond=None)[0]
         if not gain > 0:
             raise InputError(f"step {step.name!r}: the twin of joint {joint + 1} does not follow")
+        gains[joint] = float(gain)
         off = float(s.mean()) - step.centres.get(joint, 0.0)
         calm = abs(drift) * step.samples / rate < DRIFT and abs(off) < 4 * DRIFT
         if not calm:
@@ -154,7 +160,7 @@ def _trimmed(
             centre = starts.get(joint, step.centres.get(joint, 0.0))
             starts[joint] = float(np.clip(centre - off, *rig.joints[joint].limits.piston))
             steady = False
-    return replace(step, biases=biases, strokes=starts), steady
+    return replace(step, biases=biases, strokes=starts), steady, gains
 
 
 def _record(rig: Rig, step: PlannedStep, motion: Mapping[str, Array]) -> Record:

@@ -7,7 +7,13 @@ import sys
 
 import typer
 
-from rig.cli import analysis_commands, bench_commands, demo_command, figures_command
+from rig.cli import (
+    analysis_commands,
+    bench_commands,
+    demo_command,
+    design_command,
+    figures_command,
+)
 from rig.cli.errors import guarded
 
 app = typer.Typer(
@@ -18,7 +24,7 @@ app = typer.Typer(
     add_completion=False,
     rich_markup_mode=None,
 )
-for module in (demo_command, bench_commands, analysis_commands, figures_command):
+for module in (demo_command, bench_commands, analysis_commands, design_command, figures_command):
     module.register(app)
 
 
