@@ -37,7 +37,7 @@ log = logging.getLogger(__name__)
 Say = Callable[[str], None]
 
 FILL = 0.95  # share of the tightest limit that a design uses on the twin
-KEEP = 1.25  # times its first error is what a parameter may lose, or more while it stays better
+KEEP = 1.5  # times its first error is what a parameter may lose, or more while it stays better
 # than that which the criterion is about was at first
 WIDER = 1.6  # lines up to this times the highest of the protocol may be taken
 LOWER = 0.6  # and down to this times the lowest
@@ -47,6 +47,10 @@ TOO_FAR = 1.02  # of the share to fill: such a child is scaled down and played a
 LARGER = 3.0  # factor by which a spectrum is scaled at most, at once
 TILTS = (-0.8, 1.3)  # of new shapes, amplitudes f^-tilt
 GAIN_BAND = 0.2  # of the logarithm of a piston's gain, which the bench needs to centre it
+ANCHORS = 4  # lowest lines that a new shape keeps: they move the piston, and so centre it
+EARLY_SHARE = 0.6  # of the budget
+KINDS = ("shape", "bump", "lines", "phases")
+EARLY, LATE = (0.6, 0.2, 0.1, 0.1), (0.15, 0.35, 0.25, 0.25)  # how often each
 FEWEST = 3  # lines of a tone
 
 
@@ -125,7 +129,7 @@ def improve(
     search.loosen([c.found for c in candidates])
     while plays < budget:
         s, joint = free[int(rng.integers(len(free)))]
-        child, cost = search.child(candidates[s], joint)
+        child, cost = search.child(candidates[s], joint, plays < EARLY_SHARE * budget)
         plays, children = plays + cost, children + 1
         if child is None:
             continue
@@ -239,13 +243,15 @@ class _Search:
             cost += 1
         return candidate, cost
 
-    def child(self, parent: Candidate, joint: int) -> tuple[Candidate | None, int]:
+    def child(
+        self, parent: Candidate, joint: int, early: bool
+    ) -> tuple[Candidate | None, int]:
         """Return a changed copy of one step that keeps the limits, or None, and its cost.
 
         The forecast is made anew from each play, because the twin is not linear.
         """
         tone = parent.tones[joint]
-        spectrum, plays = self.mutated(tone)
+        spectrum, plays = self.mutated(tone, early)
         base, found = parent, None
         for cost in range(1, plays + 1):
             known = forecast_of(self.rig, base.played, joint, tone.lines)
@@ -276,11 +282,14 @@ class _Search:
         first = self.gains[played.step.name]
         return all(abs(math.log(k / first[j])) < GAIN_BAND for j, k in played.gains.items())
 
-    def mutated(self, tone: Tone) -> tuple[Spectrum, int]:
-        """Return the tone's spectrum with one random change, and how many plays that is worth."""
+    def mutated(self, tone: Tone, early: bool) -> tuple[Spectrum, int]:
+        """Return the tone's spectrum with one random change, and how many plays that is worth.
+
+        `early` in a search, large changes are more frequent.
+        """
         size, level = np.abs(tone.spectrum), envelope(tone)
         rng, many = self.rng, len(tone.lines)
-        kind = rng.choice(["phases", "bump", "band", "lines", "shape"])
+        kind = rng.choice(KINDS, p=EARLY if early else LATE)
         x = np.log(tone.lines / tone.lines[0])
         if kind == "phases":
             spread = rng.uniform(0.1, np.pi)
@@ -290,22 +299,32 @@ class _Search:
             middle, width = rng.uniform(x[0], x[-1]), rng.uniform(0.08, 0.6)
             height = 0.7 * rng.standard_normal()
             size = size * np.exp(height * np.exp(-0.5 * ((x - middle) / width) ** 2))
-        elif kind == "band":
-            low, high = sorted(rng.integers(0, many + 1, 2))
-            inside = (np.arange(many) >= low) & (np.arange(many) < high)
-            size = np.where(inside, np.where(size > 0, size, level), 0.0)
         elif kind == "lines":
             some = rng.random(many) < rng.uniform(0.03, 0.3)
             size = np.where(some, np.where(size > 0, 0.0, level), size)
         else:
-            low, high = int(rng.integers(0, many // 2)), int(rng.integers(many // 2, many + 1))
-            inside = (np.arange(many) >= low) & (np.arange(many) < high)
-            size = np.where(inside, tone.lines ** -rng.uniform(*TILTS), 0.0)
+            size = self.reshaped(tone)
         if np.count_nonzero(size) < FEWEST:
             return tone.spectrum, 1
         fresh = np.exp(2j * np.pi * rng.random(many))
         turn = np.where(np.abs(tone.spectrum) > 0, np.exp(1j * np.angle(tone.spectrum)), fresh)
-        return np.asarray(size * turn), 4 if kind in ("band", "shape") else 2
+        return np.asarray(size * turn), 4 if kind == "shape" else 2
+
+    def reshaped(self, tone: Tone) -> Array:
+        """Return amplitudes f^-tilt in a random band above the lowest lines, which stay."""
+        rng, size = self.rng, np.abs(tone.spectrum)
+        lowest = np.flatnonzero(size > 0)[:ANCHORS]
+        many, first = len(size), int(lowest[-1]) + 1
+        low, high = np.sort(rng.uniform(size=2) ** [2.0, 0.5]) * (many - first) + first
+        inside = (np.arange(many) >= low) & (np.arange(many) < high)
+        shape = tone.lines ** -rng.uniform(*TILTS) * inside
+        power = np.linalg.norm(shape)
+        if power == 0:
+            return size
+        above = np.linalg.norm(size[first:]) or np.linalg.norm(size)
+        shape *= above / power * np.exp(0.6 * rng.standard_normal())
+        shape[lowest] = size[lowest]
+        return np.asarray(shape)
 
 
 def tone_of(joint: int, wave: Array, empty: Sequence[int]) -> Tone:

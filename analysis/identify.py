@@ -79,7 +79,7 @@ def identify(
     started = time.perf_counter()
     solutions = solve_rows(rig, used, per_record, noise, reject_noise)
     seconds = time.perf_counter() - started
-    estimates, covariance = _estimates(rig, used, solutions)
+    estimates, covariance = estimates_of(rig, used, solutions)
     rows = {family: solution.rows for family, solution in solutions.items()}
     masked = sum(r.masked for one in per_record for r in one.rows.values())
     statements = _statements(rig, runs, per_record, solutions, estimates, rows, masked)
@@ -172,7 +172,7 @@ def _piece(rows: Rows, piece: int, pieces: int) -> tuple[Array, Array]:
     return rows.matrix[inside], rows.rhs[inside]
 
 
-def _estimates(
+def estimates_of(
     rig: Rig, terms: Sequence[Used], solutions: Mapping[str, Solution]
 ) -> tuple[dict[str, Estimate], Array]:
     """Turn the rows' coefficients into parameters (b = 1/coefficient) with intervals."""

@@ -46,6 +46,7 @@ class Solution:
     Entries of parameters in `unidentifiable` (name -> why) are NaN. `condition_number` is of the
     column-scaled matrix, over all columns that are not zero. `residual_rms` has the rows' unit.
     `noise_bias` is the bias that the stated sensor noise predicts, NaN where not asked for.
+    `triangle` (k+1, k+1) is the merged R of all rows.
     """
 
     names: tuple[str, ...]
@@ -57,6 +58,7 @@ class Solution:
     residual_rms: float
     noise_bias: Array
     unidentifiable: dict[str, str] = field(default_factory=dict)
+    triangle: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
 
 def triangle(matrix: Array, rhs: Array) -> Array:
@@ -106,7 +108,7 @@ def solve(
     beta[gone] = dof[gone] = np.nan
     covariance[gone, :] = covariance[:, gone] = np.nan
     return Solution(
-        tuple(names), beta, covariance, dof, condition, rows, residual_rms, noise_bias, lost
+        tuple(names), beta, covariance, dof, condition, rows, residual_rms, noise_bias, lost, R
     )
 
 

@@ -19,7 +19,7 @@ def design(
     ] = "E",
     budget: Annotated[
         int, typer.Option(min=1, max=5000, help="Simulations of a step on the twin.")
-    ] = 200,
+    ] = 300,
     seed: Annotated[int, typer.Option(min=0, help="Of the search; the same gives the same.")] = 0,
     json: JsonOption = None,
 ) -> None:
