@@ -48,6 +48,7 @@ LARGER = 3.0  # factor by which a spectrum is scaled at most, at once
 TILTS = (-0.8, 1.3)  # of new shapes, amplitudes f^-tilt
 GAIN_BAND = 0.2  # of the logarithm of a piston's gain, which the bench needs to centre it
 ANCHORS = 4  # lowest lines that a new shape keeps: they move the piston, and so centre it
+FIRST_TILTS = (0.0, 0.5, -0.5)  # tried on every tone before anything random
 EARLY_SHARE = 0.6  # of the budget
 KINDS = ("shape", "bump", "lines", "phases")
 EARLY, LATE = (0.6, 0.2, 0.1, 0.1), (0.15, 0.35, 0.25, 0.25)  # how often each
@@ -127,9 +128,10 @@ def improve(
         plays += cost
     best = search.value([c.found for c in candidates])
     search.loosen([c.found for c in candidates])
+    shapes = [(s, joint, tilt) for tilt in FIRST_TILTS for s, joint in free]
     while plays < budget:
-        s, joint = free[int(rng.integers(len(free)))]
-        child, cost = search.child(candidates[s], joint, plays < EARLY_SHARE * budget)
+        s, joint, tilt = shapes.pop(0) if shapes else (*free[int(rng.integers(len(free)))], None)
+        child, cost = search.child(candidates[s], joint, tilt, plays < EARLY_SHARE * budget)
         plays, children = plays + cost, children + 1
         if child is None:
             continue
@@ -244,14 +246,15 @@ class _Search:
         return candidate, cost
 
     def child(
-        self, parent: Candidate, joint: int, early: bool
+        self, parent: Candidate, joint: int, tilt: float | None, early: bool
     ) -> tuple[Candidate | None, int]:
         """Return a changed copy of one step that keeps the limits, or None, and its cost.
 
-        The forecast is made anew from each play, because the twin is not linear.
+        With a `tilt` all lines are used, amplitudes f^-tilt; without, the change is random. The
+        forecast is made anew from each play, because the twin is not linear.
         """
         tone = parent.tones[joint]
-        spectrum, plays = self.mutated(tone, early)
+        spectrum, plays = self.mutated(tone, early) if tilt is None else self.tilted(tone, tilt)
         base, found = parent, None
         for cost in range(1, plays + 1):
             known = forecast_of(self.rig, base.played, joint, tone.lines)
@@ -308,7 +311,13 @@ class _Search:
             return tone.spectrum, 1
         fresh = np.exp(2j * np.pi * rng.random(many))
         turn = np.where(np.abs(tone.spectrum) > 0, np.exp(1j * np.angle(tone.spectrum)), fresh)
-        return np.asarray(size * turn), 4 if kind == "shape" else 2
+        return np.asarray(size * turn), 4 if kind == "shape" else 3
+
+    def tilted(self, tone: Tone, tilt: float) -> tuple[Spectrum, int]:
+        """Return all lines with amplitudes f^-tilt, of the tone's power, and its worth in plays."""
+        size = tone.lines.astype(np.float64) ** -tilt
+        size *= np.linalg.norm(tone.spectrum) / np.linalg.norm(size)
+        return np.asarray(size * np.exp(2j * np.pi * self.rng.random(len(size)))), 4
 
     def reshaped(self, tone: Tone) -> Array:
         """Return amplitudes f^-tilt in a random band above the lowest lines, which stay."""
@@ -317,7 +326,7 @@ class _Search:
         many, first = len(size), int(lowest[-1]) + 1
         low, high = np.sort(rng.uniform(size=2) ** [2.0, 0.5]) * (many - first) + first
         inside = (np.arange(many) >= low) & (np.arange(many) < high)
-        shape = tone.lines ** -rng.uniform(*TILTS) * inside
+        shape = tone.lines.astype(np.float64) ** -rng.uniform(*TILTS) * inside
         power = np.linalg.norm(shape)
         if power == 0:
             return size

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from analysis import checks as ck
 from analysis.checks import Check
+from analysis.give import moving_by_step
 from analysis.model import Estimate, Model, estimate_json, finite
 from analysis.noise import noise_moments
 from analysis.rows import Filtering, Rows, default_filtering, parameters_of, record_rows
@@ -113,10 +114,11 @@ def build_rows(
     """Return the filtered, decimated rows of every record; raises InputError for a bad one."""
     built = []
     for index, run in enumerate(runs):
+        moving = moving_by_step(rig, run)
         for record in run.records:
             ck.refuse_dead_channels(rig, record)
             filters = filtering(record)
-            signals = condition(rig, record, filters.channels)
+            signals = condition(rig, record, filters.channels, moving[record.step])
             rows = record_rows(rig, terms, signals, filters)
             built.append(RecordRows(index, record.name, record.step, record.repeat, rows))
     return built

@@ -43,6 +43,9 @@ def identify(
     json: JsonOption = None,
     model: Annotated[Path | None, typer.Option(help="Write the model file here.")] = None,
     report: Annotated[Path | None, typer.Option(help="Write an HTML report here.")] = None,
+    physical: Annotated[
+        bool, typer.Option("--physical", help="Only parameters that real bodies can have.")
+    ] = False,
 ) -> None:
     """Identify every parameter from all records of the runs at once.
 
@@ -55,15 +58,21 @@ def identify(
 
     loaded = _load(runs)
     result = identify_runs(loaded, method)
+    told = to_json(result)
+    consistent = ""
+    if physical:
+        from rig.cli.physical import make_physical
+
+        result, told, consistent = make_physical(result)
     if model is not None:
         save_model(result.model, model)
-    write_json(json, to_json(result))
+    write_json(json, told)
     if report is not None:
         from rig.cli.reporting import write_identification
 
         write_identification(report, loaded, result)
     if json != Path("-"):
-        typer.echo(identification_text(result))
+        typer.echo(identification_text(result) + consistent)
 
 
 def validate(
