@@ -12,6 +12,7 @@ from rig.cli import (
     bench_commands,
     demo_command,
     design_command,
+    design_study_command,
     figures_command,
 )
 from rig.cli.errors import guarded
@@ -24,7 +25,14 @@ app = typer.Typer(
     add_completion=False,
     rich_markup_mode=None,
 )
-for module in (demo_command, bench_commands, analysis_commands, design_command, figures_command):
+for module in (
+    demo_command,
+    bench_commands,
+    analysis_commands,
+    design_command,
+    design_study_command,
+    figures_command,
+):
     module.register(app)
 
 
