@@ -10,7 +10,8 @@ first moments h_k and pseudo-inertias [[I_k, h_k], [h_k, m_k]] >= 0 behind the p
     R_kk = I_k + l_k^2 m_beyond(k),  W_k = h_k + l_k m_beyond(k),  m_beyond(k) = sum_{j>k} m_j;
 eliminating the links from the tip inwards takes the same Schur complements as R >= 0 (`links_of`).
 
-Solved as constrained least squares on the triangle that the identification has made already. A
+Solved as constrained least squares on the triangle that the identification has made already: the
+consistent parameters are those nearest to the free ones in the metric X'X of all rows. A
 constraint that moves the parameters further than their scatter between repeats explains is
 *rejected by the data* (Hotelling's T^2 on the active constraints, cluster covariance), and the
 parameters given out are then those of the level below.
@@ -101,7 +102,7 @@ def feasible(rig: Rig, names: tuple[str, ...], rigid: bool) -> Feasible:
     labels = tuple(f"{'1/b' if name == 'b' else name} >= 0" for name in signed)
     inertia = inertia_names(N)
     forms = np.zeros((k, 0, 0))
-    equal, equal_labels = np.zeros((0, k)), ()
+    equal, equal_labels = np.zeros((0, k)), tuple[str, ...]()
     if all(name in index for name in inertia):
         forms = np.zeros((k, N, N))
         weights = inertia_map(N)
@@ -115,14 +116,19 @@ def feasible(rig: Rig, names: tuple[str, ...], rigid: bool) -> Feasible:
 def _rigid(
     rig: Rig, index: Mapping[str, int], weights: Array
 ) -> tuple[Array, tuple[str, ...]]:
+    """Return R_ij - l_i W_j = 0 for i < j wherever length and weight are known."""
     N = len(rig.joints)
     inertia, rows, labels = inertia_names(N), [], []
     for i in range(N):
+        # A robot of electric joints may leave its lengths unsaid.
+        length = getattr(rig.joints[i], "link_length", None)
         for j in range(i + 1, N):
+            if length is None or f"W{j + 1}" not in index:
+                continue
             row = np.zeros(len(index))
             for name, weight in zip(inertia, weights, strict=True):
                 row[index[name]] = weight[i, j]
-            row[index[f"W{j + 1}"]] = -rig.joints[i].link_length
+            row[index[f"W{j + 1}"]] = -length
             rows.append(row)
             labels.append(f"R{i + 1}{j + 1} = l{i + 1} W{j + 1}")
     return np.array(rows).reshape(len(rows), len(index)), tuple(labels)
@@ -167,7 +173,8 @@ def _level(result: Identification, name: str, rigid: bool) -> Level:
     for family, solution in result.solutions.items():
         k = len(solution.names)
         X, y = solution.triangle[:k, :k], solution.triangle[:k, k]
-        found = minimise(X, y, feasible(rig, solution.names, rigid))
+        # An estimator may have moved the free solution off the triangle's own: project that one.
+        found = minimise(X, X @ solution.value, feasible(rig, solution.names, rigid))
         solutions[family] = _constrained(solution, X, found)
         prices[family] = _price(rig, solution, X, y, found)
     estimates, covariance = estimates_of(rig, result.model.terms, solutions)
@@ -215,7 +222,9 @@ def _words(label: str, rig: Rig, solution: Solution, row: Array, apart: float) -
     values = dict(zip(solution.names, solution.value, strict=True))
     R = chain_matrix(values, len(rig.joints))[i - 1, j - 1]
     rigid = rig.joints[i - 1].link_length * values[f"W{j}"]
-    return f"{label}: the data alone give {R:.4g} and {rigid:.4g} kg m^2 ({R / rigid - 1:+.1%}{far})"
+    return (
+        f"{label}: the data alone give {R:.4g} and {rigid:.4g} kg m^2 ({R / rigid - 1:+.1%}{far})"
+    )
 
 
 def _probability(solution: Solution, C: Array, apart: Array) -> float:

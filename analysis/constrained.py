@@ -136,7 +136,7 @@ def _interior(x: Array, G: Array, F: Array) -> Array:
     target, t = np.zeros(len(z)), 1.0
     for _ in range(400):
         shifted = np.append(np.zeros(len(G)), size)
-        value, gradient, hessian = _shifted(z, wide, shifted, wider)
+        gradient, hessian = _shifted(z, wide, shifted, wider)
         target[:] = 0.0
         target[-1] = t / size
         # Staying near the data's own point keeps the search bounded.
@@ -157,12 +157,13 @@ def _held(z: Array, G: Array, shift: Array, F: Array) -> bool:
     return bool((G @ z + shift > 0).all()) and (not F.shape[1] or _least(z, F) > 0)
 
 
-def _shifted(z: Array, G: Array, shift: Array, F: Array) -> tuple[float, Array, Array]:
+def _shifted(z: Array, G: Array, shift: Array, F: Array) -> tuple[Array, Array]:
+    """Return gradient and Hessian of - sum log(Gz + shift) - log det F(z)."""
     c = G @ z + shift
-    value, gradient = -float(np.log(c).sum()), -G.T @ (1.0 / c)
+    gradient = -G.T @ (1.0 / c)
     hessian = (G / c[:, None] ** 2).T @ G
     more = _barrier(z, np.zeros((0, len(z))), F)
-    return value + more[0], gradient + more[1], hessian + more[2]
+    return gradient + more[1], hessian + more[2]
 
 
 def _follow(A: Array, y: Array, G: Array, F: Array, x: Array) -> Array:

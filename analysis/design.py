@@ -114,11 +114,11 @@ def improve(
     """
     search = _Search(rig, criterion, rng)
     candidates = [search.first(step, empty) for step in steps]
-    free = [(s, j) for s, c in enumerate(candidates) for j, t in c.tones.items() if len(t.chosen) > 1]
+    free = [
+        (s, j) for s, c in enumerate(candidates) for j, t in c.tones.items() if len(t.chosen) > 1
+    ]
     if not free:
-        raise InputError(
-            "no step has a multisine to improve; start from lock-and-excite-multisine"
-        )
+        raise InputError("no step has a multisine to improve; start from lock-and-excite-multisine")
     search.begin([c.found for c in candidates])
     before = search.errors([c.found for c in candidates])
     shares = {c.found.step: (c.share, c.limit) for c in candidates}
@@ -222,7 +222,9 @@ class _Search:
         self, step: PlannedStep, empty: Mapping[tuple[str, int], tuple[int, ...]]
     ) -> Candidate:
         """Play the protocol's own step and lay its tones out."""
-        tones = {j: tone_of(j, wave, empty.get((step.name, j), ())) for j, wave in step.waves.items()}
+        tones = {
+            j: tone_of(j, wave, empty.get((step.name, j), ())) for j, wave in step.waves.items()
+        }
         candidate = self.judged(step, tones)
         self.gains[step.name] = candidate.played.gains
         return candidate

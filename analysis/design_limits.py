@@ -70,9 +70,7 @@ def bounds(rig: Rig, step: PlannedStep, motion: Mapping[str, Array]) -> list[Bou
     return out
 
 
-def _joint_bounds(
-    rig: Rig, step: PlannedStep, motion: Mapping[str, Array], j: int
-) -> list[Bound]:
+def _joint_bounds(rig: Rig, step: PlannedStep, motion: Mapping[str, Array], j: int) -> list[Bound]:
     joint = rig.joints[j]
     limits, valve = joint.limits, joint.valve
     piston = motion["piston"][:, j]
@@ -125,7 +123,9 @@ class Forecast:
 
     def shares(self, motion: Array) -> Array:
         """Return the share (b,) of its limit that each signal uses."""
-        return np.asarray(np.maximum(motion.max(axis=1) / self.high, -motion.min(axis=1) / self.low))
+        return np.asarray(
+            np.maximum(motion.max(axis=1) / self.high, -motion.min(axis=1) / self.low)
+        )
 
     def flattened(self, spectrum: Spectrum, rounds: int) -> tuple[Spectrum, float]:
         """Return the spectrum with other phases whose worst share is lower, and that share.

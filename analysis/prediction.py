@@ -244,9 +244,7 @@ def _inverse(A: Array) -> Array:
     return np.asarray(np.linalg.pinv(A * np.outer(scale, scale), 1e-12)) * np.outer(scale, scale)
 
 
-def _oil_scatter(
-    rig: Rig, found: Sequence[StepInformation], kept: NDArray[np.bool_]
-) -> Array:
+def _oil_scatter(rig: Rig, found: Sequence[StepInformation], kept: NDArray[np.bool_]) -> Array:
     """Return the scatter (k,) of the coefficients if 1/b differs from step to step with the oil."""
     A = np.sum([one.repeats * one.matrix["fluid"] for one in found], axis=0)
     kept = kept & (np.diag(A) > 0)

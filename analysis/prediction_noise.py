@@ -60,6 +60,7 @@ def inputs_of(rig: Rig, moving: Mask) -> tuple[Input, ...]:
     """Return the inputs of the rows; a joint that does not move is held and lets no noise in."""
     found = []
     for i in range(len(rig.joints)):
+
         def name(kind: str, joint: int = i + 1) -> str:
             return ch.channel(kind, joint)
 
@@ -137,9 +138,7 @@ def score_covariance(
         raise InputError(f"noise cannot be carried through the filter {channels.name!r}")
     n = len(signals.t)
     back = {name: _backwards(r, filtering, n, signals.rate) for name, r in rows.items()}
-    out = {
-        family_of(name): np.zeros((len(r.names), len(r.names))) for name, r in rows.items()
-    }
+    out = {family_of(name): np.zeros((len(r.names), len(r.names))) for name, r in rows.items()}
     by_channel: dict[str, list[Input]] = {}
     for what in inputs_of(rig, moving):
         by_channel.setdefault(what.channel, []).append(what)

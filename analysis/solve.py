@@ -46,7 +46,8 @@ class Solution:
     Entries of parameters in `unidentifiable` (name -> why) are NaN. `condition_number` is of the
     column-scaled matrix, over all columns that are not zero. `residual_rms` has the rows' unit.
     `noise_bias` is the bias that the stated sensor noise predicts, NaN where not asked for.
-    `triangle` (k+1, k+1) is the merged R of all rows.
+    `triangle` (k+1, k+1) of all rows and `noise`, as given (empty if not), serve questions asked
+    later (`analysis.base_parameters`).
     """
 
     names: tuple[str, ...]
@@ -59,6 +60,7 @@ class Solution:
     noise_bias: Array
     unidentifiable: dict[str, str] = field(default_factory=dict)
     triangle: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    noise: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
 
 def triangle(matrix: Array, rhs: Array) -> Array:
@@ -108,8 +110,9 @@ def solve(
     beta[gone] = dof[gone] = np.nan
     covariance[gone, :] = covariance[:, gone] = np.nan
     return Solution(
-        tuple(names), beta, covariance, dof, condition, rows, residual_rms, noise_bias, lost, R
-    )
+        tuple(names), beta, covariance, dof, condition, rows, residual_rms, noise_bias, lost,
+        R, np.zeros((0, 0)) if noise is None or not reject_noise else noise,
+    )  # fmt: skip
 
 
 def _pseudo_inverse(names: Sequence[str], X: Array) -> tuple[Array, float, dict[str, str]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 from collections.abc import Mapping
 
@@ -25,12 +26,18 @@ def spool_response(valve: Valve, command: Array, rate: float) -> Array:
 
     u'' + 2 d w u' + w^2 u = w^2 k v with natural frequency w and damping d of the rig file.
     """
-    w, d = 2 * np.pi * valve.natural_frequency, valve.damping_ratio
-    system = ([w * w], [1.0, 2 * d * w, w * w])
-    b, a, _ = cont2discrete(system, 1 / rate, method="zoh")
+    b, a = _held_response(valve.natural_frequency, valve.damping_ratio, rate)
     held = np.clip(command, -valve.command_range, valve.command_range) * valve.spool_gain
-    spool = lfilter(b.ravel(), a, np.clip(held, -valve.spool_stroke, valve.spool_stroke))
+    spool = lfilter(b, a, np.clip(held, -valve.spool_stroke, valve.spool_stroke))
     return np.asarray(np.clip(spool, -valve.spool_stroke, valve.spool_stroke))
+
+
+@functools.lru_cache(maxsize=32)
+def _held_response(frequency: float, damping: float, rate: float) -> tuple[Array, Array]:
+    """Return the digital filter (b, a) of a unit second-order lag between held samples."""
+    w, d = 2 * np.pi * frequency, damping
+    b, a, _ = cont2discrete(([w * w], [1.0, 2 * d * w, w * w]), 1 / rate, method="zoh")
+    return b.ravel(), a
 
 
 def holding_state(rig: Rig, model: Model, piston: Array) -> State:

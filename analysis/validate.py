@@ -1,4 +1,4 @@
-"""Validation: the model driven by the measured spool against what was measured.
+"""Validation: the model driven by the measured spool (electric: drive) against what was measured.
 
 FIT = 100 (1 - |y - yhat| / |y - mean y|) per channel (NOTES, Table IV), free run from the record's
 first sample; windowed RMSE restarts the model from the data every 0.25 s, which shows the model's
@@ -8,7 +8,7 @@ rates without the drift that a free run collects.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -49,6 +49,7 @@ class RecordValidation:
     simulation: Simulation
     measured: Mapping[str, Array]
     time: Array
+    units: Mapping[str, str] = field(default_factory=dict)
 
 
 def fit_percent(measured: Array, simulated: Array) -> float:
@@ -81,7 +82,7 @@ def validate_record(
     """Validate on one record (see `validate`)."""
     smoother = filtering(record).channels
     signals = _seen_by(model, rig, condition(rig, record, smoother))
-    measured = _compared(aligned_channels(rig, record), signals)
+    measured = _compared(rig, aligned_channels(rig, record), signals)
     ready, drive = compiled(model), drive_of(signals)
     free = simulate(ready, drive, first_state(rig, record, signals))
     channels = free.channels()
@@ -105,6 +106,7 @@ def validate_record(
         free,
         measured,
         record.time,
+        {name: rig.unit_of(name) for name in measured},
     )
 
 
@@ -116,12 +118,13 @@ def _seen_by(model: Model, rig: Rig, signals: Signals) -> Signals:
     return signals
 
 
-def _compared(channels: Mapping[str, Array], signals: Signals) -> dict[str, Array]:
-    """Return the measured piston and pressures of the excited joints."""
+def _compared(rig: Rig, channels: Mapping[str, Array], signals: Signals) -> dict[str, Array]:
+    """Return the measured piston and pressures (electric: position) of the excited joints."""
+    kinds = (rig.position_kind,) if rig.electric else (ch.PISTON, ch.CAP, ch.ROD)
     return {
         ch.channel(kind, i + 1): channels[ch.channel(kind, i + 1)]
         for i in map(int, np.flatnonzero(signals.excited))
-        for kind in (ch.PISTON, ch.CAP, ch.ROD)
+        for kind in kinds
     }
 
 
@@ -148,7 +151,10 @@ def first_state(rig: Rig, record: Record, signals: Signals) -> State:
             samples = channels[ch.channel(kind, joint + 1)][:count]
             return np.asarray(np.polynomial.polynomial.polyfit(t, samples, START_DEGREE))
 
-        s = fitted(ch.PISTON)
+        s = fitted(rig.position_kind)
+        if rig.electric:
+            q[i], qd[i] = s[0], s[1]
+            continue
         linkage = rig.joints[i].linkage
         q[i] = linkage.angle(s[0])
         qd[i] = s[1] / linkage.jacobian(q[i])

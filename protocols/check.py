@@ -50,12 +50,19 @@ def check(plan: Plan, rig: Rig, twin: Twin) -> CheckReport:
     Raises InputError where the twin cannot follow the commands at all; whether limits are kept
     is in the report.
     """
-    steps = tuple(_check_step(step, rig, twin) for step in plan.steps)
+    steps = tuple(check_step(step, rig, twin) for step in plan.steps)
     return CheckReport(plan.protocol.name, rig.name, plan.seconds, steps)
 
 
-def _check_step(step: StepPlan, rig: Rig, twin: Twin) -> StepCheck:
-    biases, moved = _centred(step, rig, twin)
+def check_step(step: StepPlan, rig: Rig, twin: Twin) -> StepCheck:
+    """Predict one step; raises InputError where the twin cannot follow it."""
+    return judge_motion(step, rig, *centred(step, rig, twin))
+
+
+def judge_motion(
+    step: StepPlan, rig: Rig, biases: Mapping[int, float], moved: Mapping[str, Array]
+) -> StepCheck:
+    """Compare a step's motion on the twin (see `centred`) with the rig's limits."""
     lines: list[Prediction] = []
     for part in step.excite:
         lines += _joint_lines(part, rig, biases[part.joint], moved)
@@ -63,10 +70,13 @@ def _check_step(step: StepPlan, rig: Rig, twin: Twin) -> StepCheck:
     return StepCheck(step.name, tuple(lines), {j + 1: v for j, v in biases.items()})
 
 
-def _centred(
+def centred(
     step: StepPlan, rig: Rig, twin: Twin
 ) -> tuple[dict[int, float], Mapping[str, Array]]:  # fmt: skip
-    """Seek biases and starts that keep the pistons centred; returns the last period's motion."""
+    """Seek biases that keep the pistons centred; returns them and the last period's motion.
+
+    Raises InputError where the twin cannot follow.
+    """
     rate, joints = rig.sample_rate, len(rig.joints)
     locked = {part.joint: part.piston for part in step.locks}
     biases = {part.joint: 0.0 for part in step.excite}

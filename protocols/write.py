@@ -1,58 +1,70 @@
-"""A protocol back as a file that `protocols.library.load` reads: units beside every number."""
+"""Writes a protocol as a file that `protocols.library.load` reads back unchanged."""
 
 from __future__ import annotations
 
-from typing import Any, Final
+from collections.abc import Mapping
+from typing import Any
 
 import yaml
 
 from protocols.model import Protocol
 
-_UNITS: Final = {
-    "base_frequency": "Hz", "frequency": "Hz", "f_min": "Hz", "f_max": "Hz",
-    "amplitude": "V", "amplitudes": "V", "limit": "V", "push": "V",
-    "phases": "rad", "position_gain": "V/m",
-    "piston": "m", "tolerance": "m", "centre": "m", "drift": "m", "offset": "m",
-    "timeout": "s", "duration": "s", "ramp": "s", "settle": "s",
-}  # fmt: skip
-_DIGITS: Final = {"amplitudes": 5, "phases": 5}  # significant; others are written in full
+# Unit written beside each quantity, and how many of it make an SI unit.
+_UNITS: Mapping[str, tuple[str, float]] = {
+    "position_gain": ("V/m", 1.0),
+    "limit": ("V", 1.0),
+    "push": ("V", 1.0),
+    "tolerance": ("mm", 1e3),
+    "timeout": ("s", 1.0),
+    "piston": ("mm", 1e3),
+    "frequency": ("Hz", 1.0),
+    "base_frequency": ("Hz", 1.0),
+    "f_min": ("Hz", 1.0),
+    "f_max": ("Hz", 1.0),
+    "amplitude": ("V", 1.0),
+    "amplitudes": ("V", 1.0),
+    "phases": ("rad", 1.0),
+    "drift": ("mm", 1e3),
+    "offset": ("mm", 1e3),
+    "centre": ("mm", 1e3),
+    "duration": ("s", 1.0),
+    "ramp": ("s", 1.0),
+    "settle": ("s", 1.0),
+}
 
 
-class _Flow(list[Any]):
-    """A list written on one line."""
+_DIGITS: Mapping[str, int] = {"amplitudes": 5, "phases": 5}  # significant; others: 12
+
+
+class _Row(list[Any]):
+    """A list of plain values, written on one line."""
 
 
 class _Dumper(yaml.SafeDumper):
-    """Its own class, so that the library's is left alone."""
+    """A dumper of its own, so that the library's is left alone."""
 
 
 _Dumper.add_representer(
-    _Flow, lambda d, x: d.represent_sequence("tag:yaml.org,2002:seq", x, flow_style=True)
+    _Row, lambda dumper, row: dumper.represent_sequence("tag:yaml.org,2002:seq", row, True)
 )
-_Dumper.ignore_aliases = lambda self, data: True  # type: ignore[method-assign]
-
-
-def _text(key: str, value: float) -> str:
-    digits = _DIGITS.get(key)
-    return f"{value:.{digits}g} {_UNITS[key]}" if digits else f"{value!r} {_UNITS[key]}"
-
-
-def _plain(key: str, value: Any) -> Any:
-    if isinstance(value, dict):
-        return {k: _plain(k, v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        inner = [_plain(key, v) for v in value]
-        return inner if any(isinstance(v, dict) for v in inner) else _Flow(inner)
-    if key in _UNITS and isinstance(value, int | float):
-        return _text(key, float(value))
-    return value
 
 
 def protocol_text(protocol: Protocol, comment: str = "") -> str:
-    """Return the file's text; `comment` lines stand above it. What was left at default stays so."""
-    data = protocol.model_dump(mode="json", exclude_unset=True)
-    body = yaml.dump(
-        _plain("", data), Dumper=_Dumper, sort_keys=False, width=100, allow_unicode=True
-    )
-    head = "".join(f"# {line}\n" for line in comment.splitlines())
-    return head + body
+    """Return the YAML of a protocol, `comment` above it; only what differs from the defaults."""
+    data = _quantities(protocol.model_dump(mode="json", exclude_defaults=True))
+    lines = [f"# {line}".rstrip() for line in comment.splitlines()]
+    body = yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100)
+    return "\n".join([*lines, body])
+
+
+def _quantities(value: Any, key: str = "") -> Any:
+    if isinstance(value, dict):
+        return {name: _quantities(item, name) for name, item in value.items()}
+    if isinstance(value, list):
+        items = [_quantities(item, key) for item in value]
+        return items if any(isinstance(item, dict) for item in items) else _Row(items)
+    if key in _UNITS and value is not None:
+        unit, scale = _UNITS[key]
+        digits = _DIGITS.get(key, 12)
+        return f"{float(f'{value * scale:.{digits}g}'):.{digits}g} {unit}"
+    return value

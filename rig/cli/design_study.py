@@ -1,4 +1,4 @@
-"""How good the predicted errors are, and what a design gains: many experiments on simulated benches.
+"""How good predicted errors are, and what a design gains: experiments on simulated benches.
 
 Each protocol is run on benches of several seeds, in this process, twice: with the oil held at its
 temperature, where sensor noise is all that differs between repeats, and with the oil swinging as
@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from analysis.identify import identify
+from analysis.identify import PLAIN, identify
 from analysis.prediction import Expected
 from protocols import library
 from protocols.plan import resolve
@@ -23,7 +23,7 @@ from rig.cli.foresight import of_plan, percent
 from rig.cli.output import table
 from rig.model.parse import InputError
 from rig.model.rig import Rig
-from rig.services.rigs import load_rig
+from rig.services.rigs import load_bench
 
 Say = Callable[[str], None]
 
@@ -53,8 +53,8 @@ class Studied:
 
 
 def study(protocols: Sequence[str], rig: str, first: int, seeds: int, say: Say) -> list[Studied]:
-    """Run every protocol on `seeds` benches from seed `first` on; raises InputError for bad ones."""
-    bench = load_rig(rig)
+    """Run every protocol on `seeds` benches, `first` the first; raises InputError for bad ones."""
+    bench = load_bench(rig)
     oil = bench.oil.model_copy(update={"temperature_band": 0.0})
     still = bench.model_copy(update={"oil": oil})
     out = []
@@ -75,7 +75,7 @@ def _found(protocol: str, rig: Rig, seeds: Sequence[int], say: Say) -> dict[str,
         band = rig.oil.temperature_band
         say(f"{protocol}, bench {seed}, oil +- {band:g} K")
         run, truth = simulated_run(rig, protocol, seed)
-        for name, estimate in identify([run]).estimates.items():
+        for name, estimate in identify([run], estimator=PLAIN).estimates.items():
             errors.setdefault(name, []).append(estimate.value / truth[name] - 1.0)
             stds.setdefault(name, []).append(estimate.std / abs(truth[name]))
     return {
@@ -125,7 +125,9 @@ def _gain_table(before: Studied, after: Studied) -> str:
             name, percent(expected.std), percent(later.std), f"{later.std / expected.std:.2f}",
             percent(was.std), percent(now.std), f"{now.std / was.std:.2f}",
         ])  # fmt: skip
-    return f"from {before.protocol} to {after.protocol}, standard errors in %\n{table(header, rows)}"
+    return (
+        f"from {before.protocol} to {after.protocol}, standard errors in %\n{table(header, rows)}"
+    )
 
 
 def study_json(found: Sequence[Studied]) -> list[dict[str, Any]]:

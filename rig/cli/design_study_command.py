@@ -9,8 +9,6 @@ import typer
 
 from rig.cli.bench_commands import JsonOption, RigOption
 
-GROUP = "study"
-
 
 def design(
     protocols: Annotated[
@@ -35,10 +33,7 @@ def design(
 
 
 def register(app: typer.Typer) -> None:
-    """Add this verb to the group `study`, making the group where it does not exist yet."""
-    known = [g.typer_instance for g in app.registered_groups if g.name == GROUP]
-    group = known[0] if known and known[0] is not None else typer.Typer(no_args_is_help=True)
-    if not known:
-        text = "Studies over many simulated experiments.\n\nExample: bramah study design --help"
-        app.add_typer(group, name=GROUP, help=text)
-    group.command("design")(design)
+    """Add this verb to the group `study`."""
+    from rig.cli.study_command import studies
+
+    studies.command("design")(design)

@@ -118,9 +118,7 @@ class DirectBench:
         assert meta is not None and start_tick is not None and ticks is not None
         return _Handle(self, meta, start_tick, ticks)
 
-    def keep(
-        self, meta: RecordMeta, start: int, ticks: int, more: dict[str, Attribute]
-    ) -> None:
+    def keep(self, meta: RecordMeta, start: int, ticks: int, more: dict[str, Attribute]) -> None:
         """Cut a record out of what was measured; every tick since the plant began is there."""
         rate = self.rig.sample_rate
         data = np.concatenate(self._blocks)[start : start + ticks]

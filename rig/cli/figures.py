@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -161,6 +162,33 @@ def measure(minutes: float, seeds: int, only: str | None, say: Say) -> list[Figu
 def as_json(figures: Sequence[Figure]) -> list[dict[str, Any]]:
     """Return the figures as plain data."""
     return [{**asdict(figure), "ok": figure.ok} for figure in figures]
+
+
+_PAGE = """# Figures
+
+Written by `bramah bench --docs docs/figures.md` on {cores} cores; `bramah bench` measures yours.
+Limits are those the project has set itself; seeds from {first} on judge and were never used to
+tune.
+
+```text
+{table}
+```
+
+- **plant**: the simulated bench's fixed step against scipy (DOP853, rtol 1e-10) over 1 s of a
+  hard multisine on both joints; speed in processor time, converters and noise included; the time
+  that scipy's LSODA takes for the same input at equal accuracy.
+- **analysis**: 30 records of 10 s taken over the wire, loaded and identified; the model's own
+  free-run simulation of a validation record, as `bramah validate` does it.
+- **seed N**: a simulated bench started, run, identified and validated as in `bramah demo`; FIT
+  is compared with every cell of the paper's Table IV.
+- **acquisition**: every channel at 1 kHz in real time over the wire. Lateness is a block's arrival
+  by the host's clock after the time of its last sample by the device's.
+"""
+
+
+def page(figures: Sequence[Figure]) -> str:
+    """Return the figures as a page of the documentation."""
+    return _PAGE.format(cores=os.cpu_count(), first=JUDGING_SEED, table=text(figures))
 
 
 def text(figures: Sequence[Figure]) -> str:

@@ -22,15 +22,18 @@ def bench(
     only: Annotated[
         str | None, typer.Option(help="One of: plant, analysis, demo, acquisition.")
     ] = None,
+    docs: Annotated[Path | None, typer.Option(help="Also write the table as a page.")] = None,
 ) -> None:
     """Measure this machine: plant, identification, ten unseen benches, acquisition.
 
     Example: bramah bench --minutes 0.5 --seeds 2
     """
-    from rig.cli.figures import as_json, measure, text
+    from rig.cli.figures import as_json, measure, page, text
 
     figures = measure(minutes, seeds, only, progress)
     write_json(json, as_json(figures))
+    if docs is not None:
+        docs.write_text(page(figures), encoding="utf-8")
     if json != Path("-"):
         typer.echo(text(figures))
 

@@ -21,7 +21,7 @@ from rig.cli.output import progress, table
 from rig.cli.planned import designed_protocol, empty_lines, planned_steps
 from rig.model.parse import InputError
 from rig.model.rig import Rig
-from rig.services.rigs import load_rig
+from rig.services.rigs import load_bench
 
 
 @dataclass(frozen=True)
@@ -34,8 +34,8 @@ class Foresight:
 
 
 def foresee(protocol: str, rig: str, overrides: Overrides) -> Foresight:
-    """Check a protocol's limits and predict its standard errors; raises InputError as check does."""
-    bench = load_rig(rig)
+    """Check a protocol's limits and predict its errors; raises InputError for bad files."""
+    bench = load_bench(rig)
     plan = resolve(library.load(protocol), bench, overrides)
     return of_plan(plan, bench)
 
@@ -51,7 +51,7 @@ def of_plan(plan: Plan, rig: Rig) -> Foresight:
 
 
 def as_dict(found: Foresight) -> dict[str, Any]:
-    """Return the check as plain data, `identification` being the prediction or why there is none."""
+    """Return the check as plain data, with the prediction, or why there is none."""
     told: dict[str, Any] = {"impossible": found.why}
     if found.prediction is not None:
         told = to_json(found.prediction)
@@ -64,7 +64,7 @@ def percent(value: float) -> str:
 
 
 def prediction_text(found: Foresight) -> str:
-    """Return each parameter's predicted standard error, conditioning, and what is not determined."""
+    """Return each parameter's predicted error, the conditioning, and what is not determined."""
     p = found.prediction
     if p is None:
         return f"standard errors cannot be predicted: {found.why}"
@@ -76,7 +76,8 @@ def prediction_text(found: Foresight) -> str:
     lines = ["predicted from the stated sensor noise, relative to the nominal value:"]
     lines.append(table(header, rows))
     for family, (rank, size) in p.rank.items():
-        lines.append(f"{family}: rank {rank} of {size}, condition number {p.condition[family]:.1f}")
+        condition = p.condition[family]
+        lines.append(f"{family}: rank {rank} of {size}, condition number {condition:.1f}")
     if p.masked_share > 0:
         lines.append(f"{100 * p.masked_share:.2g} % of the rows would be masked")
     lines += [f"NOT determined {n}: {e.note}" for n, e in p.parameters.items() if e.note]
@@ -97,7 +98,7 @@ class Designed:
 
 def design_protocol(protocol: str, rig: str, criterion: str, budget: int, seed: int) -> Designed:
     """Improve a protocol's multisines; raises InputError where it cannot be or limits are passed."""
-    bench = load_rig(rig)
+    bench = load_bench(rig)
     plan = resolve(library.load(protocol), bench)
     before = of_plan(plan, bench)
     biases = {step.step: step.biases for step in before.limits.steps}
@@ -119,7 +120,8 @@ def design_protocol(protocol: str, rig: str, criterion: str, budget: int, seed: 
 def design_text(found: Designed, out: Path) -> str:
     """Return the parameters before and after, and the limits that each step fills."""
     before, after = found.before.prediction, found.after.prediction
-    assert before is not None and after is not None  # the design itself needed them
+    assert before is not None  # the design itself needed it
+    assert after is not None
     rows = []
     for name, e in before.parameters.items():
         later = after.parameters[name]
@@ -136,7 +138,8 @@ def design_text(found: Designed, out: Path) -> str:
 def design_json(found: Designed) -> dict[str, Any]:
     """Return predicted relative standard errors before and after, and the shares of limits."""
     before, after = found.before.prediction, found.after.prediction
-    assert before is not None and after is not None
+    assert before is not None
+    assert after is not None
     return {
         "parameters": {
             name: {"before": e.std, "after": after.parameters[name].std}

@@ -1,8 +1,9 @@
-"""A check of a protocol as a test sheet: quantity, predicted, allowed, margin."""
+"""A check of a protocol as a test sheet, and a proof as a table of its steps."""
 
 from __future__ import annotations
 
 from protocols.check_report import CheckReport, Prediction
+from protocols.proof import Proof, Verdicts
 from rig.cli.output import table
 from rig.model.quantity import unit_map
 
@@ -34,3 +35,38 @@ def check_text(report: CheckReport) -> str:
     header = ["step, place, quantity", "predicted", "allowed", "margin", "unit", ""]
     minutes = report.seconds / 60.0
     return f"{table(header, rows)}\n\nabout {minutes:.1f} min of the device's time"
+
+
+def proof_text(proof: Proof) -> str:
+    """Return one row per step (what it does, rank and condition so far, why), then the verdict."""
+    families = list(proof.verdicts)
+    rows = [
+        [f"{r.step}: {r.told}", *(_so_far(r.verdicts, family) for family in families), r.why]
+        for r in proof.reasons
+    ]
+    header = ["step", *(f"{family} rank, cond." for family in families), "why"]
+    widths = [max(len(row[k]) for row in (header, *rows)) for k in range(len(header))]
+    lines = [
+        "  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip()
+        for row in (header, ["-" * w for w in widths], *rows)
+    ]
+    lines.append("")
+    for family, verdict in proof.verdicts.items():
+        size = len(verdict.names)
+        if verdict.complete:
+            lines.append(
+                f"{family}: all {size} parameters are determined, condition number "
+                f"{verdict.condition:.1f}"
+            )
+            continue
+        lines.append(f"{family}: rank {verdict.rank} of {size}")
+        lines.append(f"  not determined: {' '.join(verdict.lost)}")
+        lines += [f"  determined: {part.text}" for part in verdict.base]
+    lines += [f"would help: {step}" for step in proof.help]
+    return "\n".join(lines)
+
+
+def _so_far(verdicts: Verdicts, family: str) -> str:
+    verdict = verdicts[family]
+    condition = f"{verdict.condition:.1f}" if verdict.complete else "—"
+    return f"{verdict.rank} of {len(verdict.names)}, {condition}"

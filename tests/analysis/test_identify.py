@@ -260,12 +260,6 @@ def test_signals_follow_the_linkage(multisine_run: Run, rig: Rig) -> None:
     assert signals.excited.tolist() == [False, True]
 
 
-@pytest.mark.parametrize("method", ["sequential", "pso"])
-def test_methods_of_later_are_not_faked(multisine_run: Run, method: str) -> None:
-    with pytest.raises(InputError, match="comes with a later version"):
-        identify([multisine_run], method)
-
-
 def test_an_unknown_method_lists_the_known_ones(multisine_run: Run) -> None:
     with pytest.raises(InputError, match="unknown method 'guess'; known: coupled"):
         identify([multisine_run], "guess")

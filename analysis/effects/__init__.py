@@ -1,0 +1,1 @@
+"""The catalogue: effects that the baseline model lacks, one small class each."""

@@ -1,0 +1,41 @@
+"""The `plan` verb: a rig's lock-and-excite steps with the proof that they determine everything."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rig.cli.bench_commands import JsonOption, RigOption
+from rig.cli.output import progress, write_json
+
+
+def plan(
+    rig: RigOption,
+    out: Annotated[Path | None, typer.Option(help="Write the protocol file here.")] = None,
+    validation: Annotated[
+        Path | None, typer.Option(help="Write a protocol of new data to validate on here.")
+    ] = None,
+    prove: Annotated[
+        str | None, typer.Option(help="Prove this protocol (a name or a file) and generate none.")
+    ] = None,
+    json: JsonOption = None,
+) -> None:
+    """Generate the lock-and-excite steps of a rig, and prove that they determine everything.
+
+    Example: bramah plan --rig digger-3dof --out digger.yaml --validation digger-validate.yaml
+    """
+    from rig.cli.planning import Wish, planned
+    from rig.cli.sheets import proof_text
+
+    wish = Wish(rig, out, validation, prove)
+    proof = planned(wish, progress)
+    write_json(json, proof.as_dict())
+    if json != Path("-"):
+        typer.echo(proof_text(proof))
+
+
+def register(app: typer.Typer) -> None:
+    """Add this verb to the command line."""
+    app.command()(plan)
