@@ -15,6 +15,7 @@ from analysis import checks as ck
 from analysis.advice import base_statements
 from analysis.checks import Check
 from analysis.estimators.choose import Job, refine, refuse_unknown
+from analysis.give import moving_by_step
 from analysis.model import Estimate, Model, estimate_json, finite
 from analysis.noise import noise_moments
 from analysis.reduce import reduced
@@ -152,10 +153,11 @@ def build_rows(
     """Return the filtered, decimated rows of every record; raises InputError for a bad one."""
     built = []
     for index, run in enumerate(runs):
+        moving = moving_by_step(rig, run)
         for record in run.records:
             ck.refuse_dead_channels(rig, record)
             filters = filtering(record)
-            signals = condition(rig, record, filters.channels)
+            signals = condition(rig, record, filters.channels, moving.get(record.step))
             rows = record_rows(rig, terms, signals, filters)
             built.append(RecordRows(index, record.name, record.step, record.repeat, rows))
     return built
