@@ -75,8 +75,9 @@ def identify(
     `terms` defaults to the paper's model. `reject_noise` False gives out parameters that rest on
     sensor noise as well, for studies of just that. `estimator` is one of
     `analysis.estimators.choose.ESTIMATORS`, "plain" the bare solution without nuisances;
-    `bootstrap` draws of whole repeats (from `seed`) replace the intervals. Raises InputError for another method, for runs
-    of different rigs and for records that cannot be used, naming record and channel.
+    `bootstrap` draws of whole repeats (from `seed`) replace the intervals. Raises InputError for
+    another method, for runs of different rigs and for records that cannot be used, naming record
+    and channel.
     """
     _refuse_method(method)
     _refuse_estimator(estimator, bootstrap)
@@ -250,9 +251,8 @@ def _with_ends(
     """Replace intervals by the bootstrap's; `ends` are of the rows' coefficients (1/b)."""
     out = dict(estimates)
     for name, (low, high) in ends.items():
-        if name == "b":
-            low, high = 1.0 / high, 1.0 / low
-        out[name] = replace(out[name], ci95=(low, high))
+        interval = (1.0 / high, 1.0 / low) if name == "b" else (low, high)
+        out[name] = replace(out[name], ci95=interval)
     return out
 
 

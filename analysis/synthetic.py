@@ -149,4 +149,4 @@ def _channels(rig: Rig, drive: Drive, result: Simulation, lead: int) -> dict[str
     for i in range(len(rig.joints)):
         every[ch.channel(ch.SPOOL, i + 1)] = drive.u[:, i]
     every[ch.SUPPLY], every[ch.TEMPERATURE] = drive.p_s, drive.temperature
-    return {name: every[name][:: FINER][lead:] for name in rig.channels}
+    return {name: every[name][::FINER][lead:] for name in rig.channels}
