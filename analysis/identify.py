@@ -83,14 +83,21 @@ def identify(
     sensor noise as well, for studies of just that. Another `method` is `analysis.methods`' work,
     `search` being for those that search. `estimator` is one of
     `analysis.estimators.choose.ESTIMATORS`, "plain" the bare solution without nuisances;
+<<<<<<< HEAD
     `bootstrap` draws of whole repeats replace the intervals; `rng` is for what is drawn (default:
     seed 0). Raises InputError for another method or estimator, for runs
     of different rigs and for records that cannot be used, naming record and channel.
+=======
+    `bootstrap` draws of whole repeats (from `seed`) replace the intervals. Raises InputError for
+    another method, for runs of different rigs and for records that cannot be used, naming record
+    and channel.
+>>>>>>> estimators
     """
     _refuse_method(method)
     _refuse_estimator(estimator, bootstrap)
     rig = ck.common_rig(runs)
     used = tuple(terms) if terms is not None else tuple(map(Used, baseline_of(rig)))
+    estimator = _fitting_estimator(rig, estimator)
     if method != "coupled":
         from analysis.methods import identify_by  # noqa: PLC0415 (which builds on this module)
 
@@ -142,6 +149,17 @@ def _refuse_estimator(estimator: str, bootstrap: int) -> None:
         )
     if bootstrap and estimator in (PLAIN, "output-error"):
         raise InputError(f"--bootstrap does not go with --estimator {estimator}; take ls or iv")
+
+
+def _fitting_estimator(rig: Rig, estimator: str) -> str:
+    """Return the estimator for a rig: what refines the fluid's rows has none on electric ones."""
+    if not rig.electric or estimator == PLAIN:
+        return estimator
+    if estimator != "ls":
+        raise InputError(
+            f"--estimator {estimator} is for hydraulic rigs; {rig.name!r} is electric: take ls"
+        )
+    return PLAIN
 
 
 def build_rows(
@@ -264,9 +282,8 @@ def _with_ends(
     """Replace intervals by the bootstrap's; `ends` are of the rows' coefficients (1/b)."""
     out = dict(estimates)
     for name, (low, high) in ends.items():
-        if name == "b":
-            low, high = 1.0 / high, 1.0 / low
-        out[name] = replace(out[name], ci95=(low, high))
+        interval = (1.0 / high, 1.0 / low) if name == "b" else (low, high)
+        out[name] = replace(out[name], ci95=interval)
     return out
 
 
