@@ -83,15 +83,9 @@ def identify(
     sensor noise as well, for studies of just that. Another `method` is `analysis.methods`' work,
     `search` being for those that search. `estimator` is one of
     `analysis.estimators.choose.ESTIMATORS`, "plain" the bare solution without nuisances;
-<<<<<<< HEAD
     `bootstrap` draws of whole repeats replace the intervals; `rng` is for what is drawn (default:
     seed 0). Raises InputError for another method or estimator, for runs
     of different rigs and for records that cannot be used, naming record and channel.
-=======
-    `bootstrap` draws of whole repeats (from `seed`) replace the intervals. Raises InputError for
-    another method, for runs of different rigs and for records that cannot be used, naming record
-    and channel.
->>>>>>> estimators
     """
     _refuse_method(method)
     _refuse_estimator(estimator, bootstrap)

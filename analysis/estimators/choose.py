@@ -199,38 +199,6 @@ def _family(
     return Prepared(family, names, len(mine), tuple(blocks))
 
 
-<<<<<<< HEAD
-def _told(
-    belief: nu.Belief, names: Sequence[str], beta: Array, error: Spread, wrong: bool
-) -> Check:
-    i = list(names).index(belief.name)
-    value, std = float(beta[i]), float(np.sqrt(error.covariance[i, i]))
-    if belief.name == nu.KAPPA:
-        compliance = float(beta[list(names).index("b")])
-        alpha, spread_ = -100 * value / compliance, 100 * std / abs(compliance)
-        said = f"b changes by {alpha:.2f} +- {2 * spread_:.2f} % per kelvin by these records"
-        if spread_ > 100 * nu.SLOPE_STD:
-            said = (
-                "the oil's temperature hardly varied: its effect on b is taken as "
-                f"{100 * nu.SLOPE:.1f} +- {200 * nu.SLOPE_STD:.1f} % per kelvin"
-            )
-        if wrong:
-            said += ", which no oil does: b is that of the records' mean temperature"
-        else:
-            said += "; b is that of the rig's nominal oil temperature"
-        return Check("oil temperature", not wrong, said)
-    size = np.sqrt(max(value, 0.0) + 2 * std)
-    said = f"laminar below a drop of {size / 1e6:.2g} MPa at most by these records"
-    if wrong:
-        said = (
-            "the flow depends on the pressure drop in a way no orifice does (a tank pressure, a "
-            "sensor's offset, a leak?); the gains are those of the plain square root"
-        )
-    return Check("laminar transition", not wrong, said)
-
-
-=======
->>>>>>> estimators
 def _solve(p: Prepared, estimator: str) -> tuple[Array, Spread, Fit]:
     fit = _FITS[estimator](p.blocks)
     error = spread([pieces(fit), pieces(fit, "level")], fit.inverse)

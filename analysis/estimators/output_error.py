@@ -126,11 +126,7 @@ class _Search:
                 return new_theta, new_starts, new, True
         return theta, starts, reduced, False
 
-<<<<<<< HEAD
-    def _step(self, theta: Array, reduced: Sequence[_Reduced | None]) -> tuple[Array, Array]:
-=======
     def _step(self, theta: Array, reduced: Sequence[Reduced | None]) -> tuple[Array, Array]:
->>>>>>> estimators
         good = [r for r in reduced if r is not None]
         if not good:
             raise InputError(

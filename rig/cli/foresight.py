@@ -97,7 +97,7 @@ class Designed:
 
 
 def design_protocol(protocol: str, rig: str, criterion: str, budget: int, seed: int) -> Designed:
-    """Improve a protocol's multisines; raises InputError where it cannot be or limits are passed."""
+    """Improve a protocol's multisines; raises InputError where that cannot be done."""
     bench = load_bench(rig)
     plan = resolve(library.load(protocol), bench)
     before = of_plan(plan, bench)
