@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -18,14 +18,16 @@ from numpy.typing import NDArray
 
 from analysis import checks as ck
 from analysis.accumulate import Accumulator
+from analysis.give import moving_of
 from analysis.noise import record_moments
 from analysis.reduce import reduced
 from analysis.rows import Filtering, Rows, parameters_of
-from analysis.signals import lost_samples
+from analysis.signals import Mask, lost_samples, moving_joints
 from analysis.solve import Cluster, Solution, merge, solve
 from analysis.stretches import STRETCH, InMemory, Source, divisible, source_rows
 from analysis.terms.base import FAMILIES, Used, family_of
-from rig.model.records import Record, RecordHead, Run
+from rig.model import channels as ch
+from rig.model.records import Record, RecordHead, Run, head_of
 from rig.model.rig import Rig
 from rig.services.stream import open_record
 
@@ -64,6 +66,7 @@ class Task:
     filtering: Callable[[Record], Filtering]
     with_noise: bool
     stretch: int = STRETCH
+    moving: tuple[bool, ...] | None = None
 
 
 def reduce_task(task: Task) -> Reduction:
@@ -72,11 +75,60 @@ def reduce_task(task: Task) -> Reduction:
         short = reader.head.samples <= task.stretch
         source: Source = InMemory(reader.read()) if short else reader
         return reduce_record(
-            task.rig, task.run, source, task.terms, task.filtering, task.with_noise, task.stretch
+            task.rig, task.run, source, task.terms, task.filtering, task.with_noise, task.stretch,
+            None if task.moving is None else np.array(task.moving),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class StepTask:
+    """The repeats of one step of a run folder, of which is asked which joints move."""
+
+    rig: Rig
+    path: str
+    step: str
+    records: tuple[str, ...]
+    stretch: int = STRETCH
+
+
+def steps_of(rig: Rig, path: str, heads: Sequence[RecordHead]) -> list[StepTask]:
+    """Return the steps whose repeats decide together whether a lock gives (`analysis.give`)."""
+    names: dict[str, list[str]] = {}
+    for head in heads:
+        if head.locked:
+            names.setdefault(head.step, []).append(head.name)
+    return [StepTask(rig, path, step, tuple(n)) for step, n in names.items() if len(n) > 1]
+
+
+def moving_task(task: StepTask) -> tuple[bool, ...]:
+    """Return which joints (N,) move in a step; of a long record its first stretch tells."""
+    thin = []
+    for name in task.records:
+        with open_record(task.path, name) as reader:
+            thin.append(_positions(task.rig, reader.read(0, task.stretch)))
+    return tuple(map(bool, moving_of(task.rig, thin)))
+
+
+def _positions(rig: Rig, record: Record) -> Record:
+    """Return the record with the positions of the locked joints alone."""
+    names = [ch.channel(rig.position_kind, i) for i in record.locked]
+    return replace(record, channels={n: x for n, x in record.channels.items() if n in names})
+
+
+def _moving_here(rig: Rig, run: Run) -> dict[str, Mask]:
+    """Return what `moving_task` does of all steps of a run at hand."""
+    steps = steps_of(rig, "", [head_of(record) for record in run.records])
+    return {
+        one.step: moving_of(
+            rig,
+            [_positions(rig, InMemory(r).read(0, one.stretch)) for r in run.records
+             if r.name in one.records],
         )
+        for one in steps
+    }  # fmt: skip
 
 
-def path_of(task: Task) -> str:
+def path_of(task: Task | StepTask) -> str:
     """Return the run folder that a task reads."""
     return task.path
 
@@ -89,9 +141,17 @@ def reduce_runs(
 ) -> list[Reduction]:
     """Reduce all records of runs at hand."""
     return [
-        reduce_record(rig, number, InMemory(record), terms, filtering, record.name in first)
+        reduce_record(
+            rig,
+            number,
+            InMemory(record),
+            terms,
+            filtering,
+            record.name in first,
+            moving=moving.get(record.step),
+        )
         for number, run in enumerate(runs)
-        for first in (first_of_steps(run.records),)
+        for first, moving in ((first_of_steps(run.records), _moving_here(rig, run)),)
         for record in run.records
     ]
 
@@ -112,8 +172,12 @@ def reduce_record(
     filtering: Callable[[Record], Filtering],
     with_noise: bool,
     stretch: int = STRETCH,
+    moving: Mask | None = None,
 ) -> Reduction:
-    """Reduce one record, a long one in stretches; raises InputError for one that cannot be used."""
+    """Reduce one record, a long one in stretches; raises InputError for one that cannot be used.
+
+    `moving` (N,) as for `source_rows`.
+    """
     head = source.head
     filters = filtering(source.read(0, min(head.samples, stretch)))
     lost, clipped = _inspect(rig, source, stretch)
@@ -122,7 +186,7 @@ def reduce_record(
         for family in FAMILIES
     }
     masked = 0
-    for found in source_rows(rig, terms, source, filters, stretch):
+    for found in source_rows(rig, terms, source, filters, stretch, moving=moving):
         for name, rows in found.items():
             masked += rows.masked
             for part, inside in enumerate(parts_of(rows, head.samples / head.sample_rate)):
@@ -132,7 +196,7 @@ def reduce_record(
     if with_noise:
         # Of a long record a stretch stands for the whole.
         count = min(head.samples, stretch) if divisible(filters) else head.samples
-        noise = _noise(rig, source, count, terms, filtering)
+        noise = _noise(rig, source, count, terms, filtering, moving)
     return Reduction(run, head, parts, masked, lost, clipped, noise)
 
 
@@ -166,12 +230,15 @@ def _noise(
     count: int,
     terms: Sequence[Used],
     filtering: Callable[[Record], Filtering],
+    moving: Mask | None,
 ) -> dict[str, Array]:
     """Return the noise moments of a record, from its first `count` samples."""
     head = source.head
     # A stream of its own for every step: the prediction is the same in any order of records.
     rng = np.random.default_rng([0, zlib.crc32(head.step.encode())])
-    found = record_moments(rig, source.read(0, count), terms, filtering, rng)
+    part = source.read(0, count)
+    moves = moving_joints(rig, part) if moving is None else moving
+    found = record_moments(rig, part, terms, filtering, moves, rng)
     return {family: moment * (head.samples / count) for family, moment in found.items()}
 
 

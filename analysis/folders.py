@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 from analysis import checks as ck
 from analysis.compute import Pool, Serial
-from analysis.condense import Task, first_of_steps, path_of, reduce_task
+from analysis.condense import Task, first_of_steps, moving_task, path_of, reduce_task, steps_of
 from analysis.identify import Identification, conclude
 from analysis.rows import Filtering, default_filtering
 from analysis.terms import with_effects
@@ -35,8 +35,24 @@ def identify_folders(
     heads = list(workers.map(read_run_head, folders, reads=str))
     rig = ck.common_rig(heads)
     used = tuple(terms) if terms is not None else tuple(map(Used, with_effects(rig, effects)))
+    steps = [
+        (number, one)
+        for number, (folder, head) in enumerate(zip(folders, heads, strict=True))
+        for one in steps_of(rig, folder, head.records)
+    ]
+    found = workers.map(moving_task, [one for _, one in steps], reads=path_of)
+    moving = {(n, one.step): moves for (n, one), moves in zip(steps, found, strict=True)}
     tasks = [
-        Task(rig, number, folder, record.name, used, filtering, record.name in first)
+        Task(
+            rig,
+            number,
+            folder,
+            record.name,
+            used,
+            filtering,
+            record.name in first,
+            moving=moving.get((number, record.step)),
+        )
         for number, (folder, head) in enumerate(zip(folders, heads, strict=True))
         for first in (first_of_steps(head.records),)
         for record in head.records

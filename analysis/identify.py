@@ -14,14 +14,10 @@ from numpy.typing import NDArray
 from analysis import checks as ck
 from analysis.advice import base_statements
 from analysis.checks import Check
-from analysis.condense import (
-    SEGMENTS,
-    Reduction,
-    reduce_runs,
-    solve_reductions,
-)
+from analysis.condense import SEGMENTS, Reduction, reduce_runs, solve_reductions
 from analysis.condense import repeats_of as reduced_repeats
 from analysis.estimators.choose import Job, Refined, refine, refuse_unknown
+from analysis.give import moving_by_step
 from analysis.model import Estimate, Model, estimate_json, finite
 from analysis.reduce import reduced
 from analysis.rows import Filtering, Rows, default_filtering, parameters_of, record_rows
@@ -101,12 +97,11 @@ def identify(
     _refuse_estimator(estimator, bootstrap)
     rig = ck.common_rig(runs)
     used = tuple(terms) if terms is not None else tuple(map(Used, baseline_of(rig)))
+    estimator = _fitting_estimator(rig, used, estimator, bootstrap)
     if method != "coupled":
         from analysis.methods import identify_by  # noqa: PLC0415 (which builds on this module)
 
         return identify_by(method, runs, used, filtering, reject_noise, rng, search)
-
-    estimator = _usable(rig, used, estimator, bootstrap)
 
     def refined(solutions: Mapping[str, Solution]) -> Refined:
         job = Job(
@@ -174,23 +169,22 @@ def _refuse_estimator(estimator: str, bootstrap: int) -> None:
         raise InputError(f"--bootstrap does not go with --estimator {estimator}; take ls or iv")
 
 
-def _usable(rig: Rig, used: Sequence[Used], estimator: str, bootstrap: int) -> str:
-    """Return the estimator for these terms, plain where ls cannot refine; raises InputError."""
-    if rig.electric and estimator == "output-error":
-        raise InputError(
-            "--estimator output-error simulates cylinders, of which an electric rig has none; "
-            "take ls"
-        )
+def _fitting_estimator(rig: Rig, used: Sequence[Used], estimator: str, bootstrap: int) -> str:
+    """Return the estimator for a model: what refines the fluid's rows has none on electric rigs.
+
+    Nor are the others for parameters that are not linear in the rows (`Term.reduction`).
+    """
     reducing = [one.term.name for one in used if one.term.reduction(rig) is not None]
-    if not reducing or estimator == PLAIN:
+    if estimator == PLAIN or not (rig.electric or reducing):
         return estimator
-    # The others solve for the rows' linear unknowns, which are more than the parameters here.
     if estimator != "ls" or bootstrap:
         asked = f"--estimator {estimator}" if estimator != "ls" else "--bootstrap"
-        raise InputError(
-            f"{asked} does not go with {' '.join(reducing)}, whose parameters are not linear in "
-            "the rows; leave it out"
+        why = (
+            f"is for hydraulic rigs; {rig.name!r} is electric"
+            if rig.electric
+            else f"does not go with {' '.join(reducing)}, not linear in the rows"
         )
+        raise InputError(f"{asked} {why}: take ls without a bootstrap")
     return PLAIN
 
 
@@ -203,10 +197,11 @@ def build_rows(
     """Return the filtered, decimated rows of every record; raises InputError for a bad one."""
     built = []
     for index, run in enumerate(runs):
+        moving = moving_by_step(rig, run)
         for record in run.records:
             ck.refuse_dead_channels(rig, record)
             filters = filtering(record)
-            signals = condition(rig, record, filters.channels)
+            signals = condition(rig, record, filters.channels, moving.get(record.step))
             rows = record_rows(rig, terms, signals, filters)
             built.append(RecordRows(index, record.name, record.step, record.repeat, rows))
     return built
@@ -313,8 +308,8 @@ def _with_ends(
     """Replace intervals by the bootstrap's; `ends` are of the rows' coefficients (1/b)."""
     out = dict(estimates)
     for name, (low, high) in ends.items():
-        turned = (1.0 / high, 1.0 / low) if name == "b" else (low, high)
-        out[name] = replace(out[name], ci95=turned)
+        interval = (1.0 / high, 1.0 / low) if name == "b" else (low, high)
+        out[name] = replace(out[name], ci95=interval)
     return out
 
 

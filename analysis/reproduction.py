@@ -28,6 +28,7 @@ from analysis.solve import Cluster, Solution, merge, solve
 from analysis.terms import baseline
 from analysis.terms.base import FAMILIES, Used
 from analysis.validate import RecordValidation, validate
+from rig.model import channels as ch
 from rig.model.parameters import inertia_names
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
@@ -210,6 +211,16 @@ def payload_response(
         width = float(np.hypot(one_half, other_half))
         out[name] = Response(one.value, other.value, width, expected.get(name, 0.0))
     return out
+
+
+def oil_temperatures(run: Run) -> dict[str, float]:
+    """Return the mean measured oil temperature [degC] of every step; empty where not measured."""
+    found: dict[str, list[float]] = {}
+    for record in run.records:
+        if ch.TEMPERATURE in record.channels:
+            mean = float(np.mean(record.channels[ch.TEMPERATURE]))
+            found.setdefault(record.step, []).append(mean)
+    return {step: float(np.mean(values)) for step, values in found.items()}
 
 
 def steps_of(run: Run, steps: Sequence[str]) -> Run:

@@ -28,7 +28,7 @@ from analysis.signals import (
     held_pistons,
     moving_joints,
 )
-from analysis.terms.base import FAMILIES, Used
+from analysis.terms.base import FAMILIES, Term, Used
 from rig.model import channels as ch
 from rig.model.records import Record, RecordHead, head_of
 from rig.model.rig import Rig
@@ -115,13 +115,23 @@ def source_rows(
     filtering: Filtering,
     stretch: int = STRETCH,
     families: Collection[str] = tuple(FAMILIES),
+    moving: Mask | None = None,
 ) -> Iterator[dict[str, Rows]]:
-    """Yield the rows of a record, stretch by stretch; together they are the whole record's."""
+    """Yield the rows of a record, stretch by stretch; together they are the whole record's.
+
+    `moving` (N,) tells which joints move where more than this record decides it
+    (`analysis.give`). A term that prepares signals may look back any time: it gets all at once.
+    """
     n = source.head.samples
-    if n <= stretch or not divisible(filtering):
-        yield stretch_rows(rig, terms, source.read(), 0, (0, n), filtering, None, families)
+    prepares = any(type(used.term).prepare is not Term.prepare for used in terms)
+    if n <= stretch or prepares or not divisible(filtering):
+        whole = source.read()
+        given = None if moving is None else Locks(moving, held_pistons(rig, whole))
+        yield stretch_rows(rig, terms, whole, 0, (0, n), filtering, given, families)
         return
     locks = locks_of(rig, source, stretch)
+    if moving is not None:
+        locks = replace(locks, moving=moving)
     spare = overlap(rig, source.head.sample_rate, filtering)
     for first in range(0, n, stretch):
         last = min(first + stretch, n)

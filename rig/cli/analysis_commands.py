@@ -99,6 +99,9 @@ def identify(
     json: JsonOption = None,
     model: Annotated[Path | None, typer.Option(help="Write the model file here.")] = None,
     report: Annotated[Path | None, typer.Option(help="Write an HTML report here.")] = None,
+    physical: Annotated[
+        bool, typer.Option("--physical", help="Only parameters that real bodies can have.")
+    ] = False,
     evaluations: Annotated[
         int, typer.Option(min=4, help="Candidates that pso or ga may simulate.")
     ] = 2000,
@@ -153,15 +156,21 @@ def identify(
             rng=np.random.default_rng(seed),
             search=SearchOptions(evaluations=evaluations),
         )
+    told, more = to_json(result), method_text(result)
+    if physical:
+        from rig.cli.physical import make_physical
+
+        result, told, consistent = make_physical(result)
+        more += consistent
     if model is not None:
         save_model(result.model, model)
-    write_json(json, to_json(result))
+    write_json(json, told)
     if report is not None:
         from rig.cli.reporting import write_identification
 
         write_identification(report, _load(runs), result)
     if json != Path("-"):
-        typer.echo(identification_text(result) + method_text(result))
+        typer.echo(identification_text(result) + more)
 
 
 def validate(

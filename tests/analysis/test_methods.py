@@ -20,7 +20,13 @@ from analysis.methods.search import (
     searched_names,
     step_one,
 )
-from analysis.reproduction import experiments, payload_changes, payload_response, spread
+from analysis.reproduction import (
+    experiments,
+    oil_temperatures,
+    payload_changes,
+    payload_response,
+    spread,
+)
 from analysis.rows import default_filtering
 from analysis.terms import baseline
 from analysis.terms.base import Used
@@ -249,3 +255,12 @@ def test_a_payload_moves_what_rigid_bodies_say_and_nothing_else(rig: Rig) -> Non
     assert all(r.as_expected for r in found.values())
     for name, more in expected.items():
         assert found[name].change == pytest.approx(more, rel=0.02)
+
+
+def test_the_oil_of_every_step_is_averaged_and_an_unmeasured_one_left_out(sine_run: Run) -> None:
+    found = oil_temperatures(sine_run)
+    assert set(found) == {"step1", "step2", "step3"}
+    assert found["step2"] == pytest.approx(40.0, abs=0.01)
+    channels = {k: v for k, v in sine_run.records[0].channels.items() if k != "oil_temperature"}
+    blind = replace(sine_run, records=(replace(sine_run.records[0], channels=channels),))
+    assert oil_temperatures(blind) == {}
