@@ -18,11 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.rows import Rows
-from analysis.signals import condition, moving_joints
+from analysis.signals import Signals, condition, moving_joints
 from analysis.terms.base import Used
 from analysis.trace.candidates import Variant
 from analysis.trace.evidence import Scene, candidate_columns, held, prepared, residual, scene_rows
 from analysis.trace.floor import Floor, Group, floors
+from rig.model.parse import InputError
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
@@ -152,6 +153,10 @@ def board(
                 Segment(scene.group, equation, where, sigma, len(own), scene.record.locked)
             )
             start = where.stop
+    if not segments:
+        raise InputError(
+            "the records are too short: no rows are left behind the filters' edges; record longer"
+        )
     return Board(
         rig, tuple(terms), beta, names, np.concatenate(base), np.concatenate(left, axis=1),
         tuple(segments), tuple(split), tuple(mean_scenes), tuple(kept_rows),
@@ -188,7 +193,7 @@ def entries(stage: Board, chosen: Sequence[Variant]) -> list[Entry]:
     return [entry for entry in found if entry is not None]
 
 
-def _entry(stage: Board, variant: Variant, seen: Sequence[object]) -> Entry | None:
+def _entry(stage: Board, variant: Variant, seen: Sequence[Signals]) -> Entry | None:
     columns: dict[str, Array] = {}
     touched = set()
     M = stage.base.shape[0]
@@ -197,7 +202,13 @@ def _entry(stage: Board, variant: Variant, seen: Sequence[object]) -> Entry | No
             continue
         rows = stage.rows[index]
         found = candidate_columns(
-            stage.rig, stage.terms, scene, seen[index], rows, stage.beta, variant.used  # type: ignore[arg-type]
+            stage.rig,
+            stage.terms,
+            scene,
+            seen[index],
+            rows,
+            stage.beta,
+            variant.used,
         )
         for segment in stage.segments:
             if segment.group == scene.group and segment.equation in found:
@@ -210,4 +221,3 @@ def _entry(stage: Board, variant: Variant, seen: Sequence[object]) -> Entry | No
     return Entry(
         variant, tuple(columns), np.column_stack(list(columns.values())), frozenset(touched)
     )
-

@@ -1,4 +1,4 @@
-"""Candidates: every effect of the catalogue at every place of the rig, with points of first look."""
+"""Candidates: every effect of the catalogue at every place, with points of first look."""
 
 from __future__ import annotations
 
@@ -51,7 +51,9 @@ def points(effect: Effect, rig: Rig) -> list[tuple[float, ...]]:
     if len(grid) > MOST_POINTS:
         per = max(2, int(MOST_POINTS ** (1 / len(axes))))
         thinned = [
-            tuple(axis[i] for i in np.unique(np.linspace(0, len(axis) - 1, per).round().astype(int)))
+            tuple(
+                axis[i] for i in np.unique(np.linspace(0, len(axis) - 1, per).round().astype(int))
+            )
             for axis in axes
         ]
         grid = list(itertools.product(*thinned))

@@ -16,14 +16,22 @@ from analysis import checks as ck
 from analysis.effects.base import Effect, ordered
 from analysis.identify import identify
 from analysis.model import Model
-from analysis.terms import baseline, known
+from analysis.terms import baseline_of, known
 from analysis.terms.base import Used
 from analysis.trace import clues, gates, held_out
 from analysis.trace.board import Board, board
 from analysis.trace.candidates import catalogue, variants
 from analysis.trace.evidence import Scene, scenes
 from analysis.trace.floor import STATED
-from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, UNEXPLAINED, Dependence, Found, Trace
+from analysis.trace.result import (
+    CLEAN,
+    CONFOUNDED,
+    EXPLAINED,
+    UNEXPLAINED,
+    Dependence,
+    Found,
+    Trace,
+)
 from analysis.trace.shortlist import Listed, Shortlist, rebased, within
 from analysis.trace.words import sentence
 from rig.model.parse import InputError
@@ -33,6 +41,8 @@ from rig.model.rig import Rig
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
+# The other estimators add small faults of sensors of their own accord: here they are candidates.
+PLAIN = "plain"
 LEAST_ROWS = 40  # of an equation's rows in one record
 
 
@@ -52,14 +62,14 @@ def trace(
     rig = ck.common_rig([*runs, *holdout])
     _refuse_same(runs, holdout)
     rng = np.random.default_rng(seed)
-    terms = tuple(Used(term) for term in baseline())
+    terms = tuple(map(Used, baseline_of(rig)))
     train, judged = scenes(rig, runs), scenes(rig, holdout)
     stage = board(rig, terms, train)
     _refuse_short(stage, train)
     judge = board(rig, terms, judged, stage.beta)
     candidates = catalogue(rig) if effects is None else list(effects)
     listed = Shortlist(stage, variants(rig, candidates))
-    before = identify(runs).model
+    before = identify(runs, estimator=PLAIN).model
     notes = _notes(stage, judge)
     if within(listed.empty.excess, listed.limits):
         found: tuple[Found, ...] = ()
@@ -70,6 +80,8 @@ def trace(
         found, winner, verdict = _named(listed, winner, judge, rng)
         refused = tuple(f for f in found if not gates.stands(f))
         found = tuple(f for f in found if gates.stands(f))
+        if verdict == UNEXPLAINED and found:
+            notes += gates.remaining(listed, winner, judge)
         moves = [] if verdict in (CLEAN, EXPLAINED) else _moves(stage, judge, winner)
     after = _extended(runs, terms, winner, before)
     error = held_out.errors(rig, judged, before, after, judge)
@@ -112,14 +124,14 @@ def _refuse_short(stage: Board, train: Sequence[Scene]) -> None:
     for s in stage.segments:
         count = s.where.stop - s.where.start
         if count < LEAST_ROWS:
-            seconds = next(x.record.samples / x.record.sample_rate for x in train if x.group == s.group)
+            seconds = next(
+                x.record.samples / x.record.sample_rate for x in train if x.group == s.group
+            )
             raise InputError(
                 f"step {s.group[1]!r}: records of {seconds:.3g} s leave {count} rows of "
                 f"{s.equation} behind the filters' edges and masks; the trace needs {LEAST_ROWS}: "
                 "record longer"
             )
-    if not stage.segments:
-        raise InputError("the records are too short: no rows are left behind the filters' edges")
 
 
 def _notes(stage: Board, judge: Board) -> list[str]:
@@ -136,7 +148,9 @@ def _notes(stage: Board, judge: Board) -> list[str]:
         out.append("one repeat per step: the noise floor comes from periods within the record")
     few = min((f.count for f in stage.floors if f.count > 1), default=0)
     if 0 < few < 4:
-        out.append(f"{few} repeats: stability is judged on few half-samples; four or more tell more")
+        out.append(
+            f"{few} repeats: stability is judged on few half-samples; four or more tell more"
+        )
     if all(f.source == STATED for f in judge.floors):
         out.append("the held-out noise floor is the rig file's stated sensor noise")
     return out
@@ -182,13 +196,11 @@ def _fraction(listed: Shortlist, winner: Listed) -> float:
     return float(min(1.0, winner.total / start)) if start > 0 else 0.0
 
 
-def _extended(
-    runs: Sequence[Run], terms: Sequence[Used], winner: Listed, before: Model
-) -> Model:
+def _extended(runs: Sequence[Run], terms: Sequence[Used], winner: Listed, before: Model) -> Model:
     """Identify everything again together with the effects."""
     if not winner.effects:
         return before
-    return identify(runs, terms=ordered((*terms, *winner.effects))).model
+    return identify(runs, terms=ordered((*terms, *winner.effects)), estimator=PLAIN).model
 
 
 def _next(verdict: str, found: Sequence[Found], rig: Rig) -> Mapping[str, Any] | None:

@@ -97,9 +97,7 @@ def repeats_of(
         for rows in parts[1:]:
             common = np.intersect1d(common, rows.time)
         if len(common) >= 10:
-            picked = [
-                r[np.isin(p.time, common)] for p, r in zip(parts, left, strict=True)
-            ]
+            picked = [r[np.isin(p.time, common)] for p, r in zip(parts, left, strict=True)]
             return np.array(picked), REPEATS
     if len(parts) == 1:
         table = _periods(scene, parts[0], left[0])

@@ -32,7 +32,7 @@ CHOSEN = 0.9  # of half-samples
 P_LIMIT = 0.01
 TIE = 1.10  # held-out rms of a rival over the best's: below, the data do not tell them apart
 TIE_TRAINING = 1.25
-HELD_BAND = 1.3  # held-out rms after over the noise floor, per equation
+HELD_BAND = 1.5  # held-out rms after over the noise floor, per equation
 SHOWN = 4  # rivals in a result
 
 REMOVES, PHYSICAL, INVARIANT, STABLE, SIGNIFICANT, ALONE = (
@@ -86,23 +86,35 @@ def judge(
 
 def explained(listed: Shortlist, winner: Listed, held: Board) -> bool:
     """Tell whether what is left lies within the noise floor's band, on both sets of records."""
-    if not listed.formed(winner):
-        return False
+    return not remaining(listed, winner, held)
+
+
+def remaining(listed: Shortlist, winner: Listed, held: Board) -> list[str]:
+    """Say which equations keep more than the noise floor's band, on which records."""
+    out = [
+        f"{e}: {100 * left / max(listed.empty.excess[e], 1e-30):.2g} % of what repeated stays, "
+        f"{left / listed.limits.band[e]:.2g} times the band"
+        for e, left in winner.excess.items()
+        if not listed.negligible(e, left)
+    ]
     after = held_left(held, winner.fit)
     start = excess_of(held, held_left(held, listed.empty.fit))
     now = excess_of(held, after)
-    rows: dict[str, int] = {}
+    floor: dict[str, float] = {}
     energy: dict[str, float] = {}
     for s in held.segments:
-        count = s.where.stop - s.where.start
-        rows[s.equation] = rows.get(s.equation, 0) + count
-        part = after[s.where] / np.sqrt(s.repeats)
+        count = (s.where.stop - s.where.start) * s.repeats
+        floor[s.equation] = floor.get(s.equation, 0.0) + count * s.noise**2
         # Averaging has taken noise out: put back what a single record would show.
-        more = count * (1 - 1 / s.repeats)
-        energy[s.equation] = energy.get(s.equation, 0.0) + float(part @ part) + more
-    return all(
-        np.sqrt(energy[e] / rows[e]) <= HELD_BAND or now[e] <= 2 * FORM * start[e] for e in rows
-    )
+        part = after[s.where]
+        found = float(part @ part) + count * (1 - 1 / s.repeats)
+        energy[s.equation] = energy.get(s.equation, 0.0) + found * s.noise**2
+    out += [
+        f"{e}: held-out error {np.sqrt(energy[e] / floor[e]):.2f} times the noise floor"
+        for e in floor
+        if energy[e] > HELD_BAND**2 * floor[e] and now[e] > 2 * FORM * start[e]
+    ]
+    return out
 
 
 def _noise_like(stage: Board) -> Array:
@@ -140,9 +152,7 @@ def _removed(held: Board, rest: Listed, after: Array, touched: set[str]) -> floa
     return (start - end) / start if start > 0 else 0.0
 
 
-def _rivals(
-    listed: Shortlist, winner: Listed, key: Key, held: Board, after: Array
-) -> list[Rival]:
+def _rivals(listed: Shortlist, winner: Listed, key: Key, held: Board, after: Array) -> list[Rival]:
     """Return the sets that have another effect in place of one, those that leave least first."""
     others = winner.keys - {key}
     rest = listed.exact([u for u in winner.effects if (u.term.name, u.term.where) != key])
@@ -159,7 +169,7 @@ def _rivals(
         theirs = _energy(held, held_left(held, one.fit))
         ratio = _ratio(theirs, mine, equations)
         training = _ratio(_energy(listed.stage, one.fit.left), own, equations)
-        name, where = next(iter(fresh))
+        name, _ = next(iter(fresh))
         tied = ratio < TIE and (training < TIE_TRAINING or ratio < 0.95)
         place = next(_place(u.term) for u in one.effects if (u.term.name, u.term.where) in fresh)  # type: ignore[arg-type]
         out.append(Rival(name, place, ratio, training, tied))
@@ -199,7 +209,8 @@ def _differences(differing: Sequence[tuple[str, str, float, float]]) -> str:
     if not differing:
         return "the same in every step, half, direction and speed"
     return "; ".join(
-        f"{name} = {value:.3g} ± {error:.2g} in {label}" for label, name, value, error in differing[:3]
+        f"{name} = {value:.3g} ± {error:.2g} in {label}"
+        for label, name, value, error in differing[:3]
     )
 
 
@@ -216,4 +227,3 @@ def _told_apart(rivals: Sequence[Rival]) -> str:
     nearest = rivals[0]
     words = "cannot be told from" if nearest.tied else "the nearest is"
     return f"{words} {nearest.name} at {nearest.where}: {nearest.ratio:.2f} times the held-out rms"
-

@@ -45,9 +45,7 @@ def row_coefficients(model: Model) -> dict[str, float]:
     return out
 
 
-def errors(
-    rig: Rig, members: Sequence[Scene], before: Model, after: Model, judge: Board
-) -> Errors:
+def errors(rig: Rig, members: Sequence[Scene], before: Model, after: Model, judge: Board) -> Errors:
     """Return every equation's error under both models, and the noise floor, over all records."""
     noise: dict[str, list[float]] = {}
     counts: dict[str, list[int]] = {}

@@ -33,7 +33,7 @@ DEVIATIONS = 3.5
 POWER = 0.25  # a subset judges a parameter that it knows this well, relative
 
 
-def blocks(stage: Board, seconds: float = BLOCK) -> Array:
+def blocks(stage: Board, seconds: float = BLOCK) -> NDArray[np.int64]:
     """Return for each row of the board the number of its block within its record (M,)."""
     out = np.zeros(stage.base.shape[0], dtype=np.int64)
     index = {scene.group: k for k, scene in enumerate(stage.scenes)}
@@ -104,7 +104,9 @@ def linear(stage: Board, one: Listed) -> Linear:
     return Linear(one, orthonormal(np.column_stack([rows.matrix, *extra])), one.fit.left)
 
 
-def halves(stage: Board, rng: np.random.Generator, count: int = HALVES) -> list[tuple[Array, float]]:
+def halves(
+    stage: Board, rng: np.random.Generator, count: int = HALVES
+) -> list[tuple[Array, float]]:
     """Return changes (M,) of the averaged residual in random half-samples, and its noise energy.
 
     Halves of the repeats of every step; of a step with one repeat, halves of its blocks.
@@ -143,7 +145,7 @@ def stability(
     if winner.keys not in [o.keys for o in near]:
         near.append(winner)
     tangents = [linear(stage, o) for o in near]
-    counts = {key: 0 for key in winner.keys}
+    counts = dict.fromkeys(winner.keys, 0)
     others: dict[str, int] = {}
     samples = halves(stage, rng)
     for change, noise in samples:
@@ -201,9 +203,9 @@ def _others(stage: Board, model: Fit, own: Sequence[str]) -> Array:
     kept = [k for k, n in enumerate(rows.names) if n not in own]
     extra = []
     for other in model.terms:
-        names, J = (), np.zeros((len(model.left), 0))
-        if other.shape:
-            names, J = jacobian(stage, model, other)
+        if not other.shape:
+            continue
+        names, J = jacobian(stage, model, other)
         picked = [k for k, n in enumerate(names) if n not in own and n not in rows.names]
         extra.append(J[:, picked])
     return orthonormal(np.column_stack([rows.matrix[:, kept], *extra]))
@@ -223,7 +225,9 @@ def subsets(stage: Board, joint: int | None) -> dict[str, Array]:
         time = stage.rows[index[s.group]][s.equation].time
         early[s.where] = time < 0.5 * (time[0] + time[-1])
         own = joint if joint is not None else int(s.equation.rsplit("_", 1)[1]) - 1
-        at = np.clip(np.rint(time * scene.record.sample_rate).astype(int), 0, len(scene.signals.t) - 1)
+        at = np.clip(
+            np.rint(time * scene.record.sample_rate).astype(int), 0, len(scene.signals.t) - 1
+        )
         ahead[s.where] = scene.signals.sd[at, own] > 0
         size = np.abs(scene.signals.sd[at, own])
         outer[s.where] = size > np.median(size)
@@ -244,6 +248,10 @@ def invariance(
     # A shape such as the presliding distance is the form's, not the effect's size.
     sizes = {c.parameter for c in used.term.coefficients(stage.rig)}
     sizes |= {s.parameter for s in shapes_of(stage.rig, used) if s.neutral is not None}
+    units = {c.parameter: c.unit for c in used.term.coefficients(stage.rig)}
+    units |= {s.parameter: s.unit for s in shapes_of(stage.rig, used)}
+    nothing = {s.parameter: s.neutral or 0.0 for s in shapes_of(stage.rig, used)}
+    neutral = np.array([nothing.get(n, 0.0) for n in names])
     out = []
     for label, mask in subsets(stage, joint).items():
         if not mask.any():
@@ -265,7 +273,9 @@ def invariance(
                 continue
             shift = float(own @ left[mask]) / size
             error = 1.0 / np.sqrt(size)
-            full = abs(float(value.value[k]))
+            # Two levels of one effect are judged by the larger: 2 N beside 100 N is a detail.
+            alike = [j for j, n in enumerate(names) if n in sizes and units[n] == units[name]]
+            full = float(np.max(np.abs(value.value[alike] - neutral[alike])))
             if error > POWER * full:
                 continue
             if abs(shift) > DEVIATIONS * np.hypot(error, TOLERANCE / DEVIATIONS * full):

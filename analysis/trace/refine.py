@@ -70,7 +70,9 @@ def table(stage: Board, terms: Sequence[Used]) -> Table:
         k = index[segment.group]
         rows, before = built[k][segment.equation], stage.rows[k][segment.equation]
         _, here, there = np.intersect1d(before.time, rows.time, return_indices=True)
-        size = np.linalg.norm(before.rhs[here]) / max(np.linalg.norm(rows.rhs[there]), 1e-300)
+        size = np.linalg.norm(before.rhs[here]) / max(
+            float(np.linalg.norm(rows.rhs[there])), 1e-300
+        )
         weight = np.sqrt(segment.repeats) / segment.noise * size
         at = segment.where.start + here
         columns = [names.index(n) for n in rows.names]

@@ -99,7 +99,7 @@ class Trace:
 
 
 def to_json(result: Trace) -> dict[str, Any]:
-    """Return the contract's JSON; `gates`, `noise`, `notes`, `sentence`, `seconds` are additions."""
+    """Return the contract's JSON; `refused gates noise notes sentence seconds` are additions."""
     return {
         "verdict": result.verdict,
         "effects": [_effect(e) for e in result.effects],

@@ -22,7 +22,8 @@ Array = NDArray[np.float64]
 Key = tuple[str, str]
 
 BAND = 0.7  # repeatable rms over noise, below which there is nothing to explain
-FORM = 0.01  # of the energy before: what the catalogue's form of an effect may miss of the real one
+LEFT = 1.0  # repeatable rms over noise that an explanation may leave
+FORM = 0.02  # of the energy before: what the catalogue's form of an effect may miss of the real one
 ADD_SHARE = 0.3  # of what is left in the equations it touches: less does not earn a place
 AS_GOOD = 1.25  # what a simpler candidate may leave over the best, before noise counts
 VISIBLE = 0.03  # of a column's length must stand out of the baseline's columns
@@ -88,8 +89,8 @@ def field(
         where = np.arange(segment.where.start, segment.where.stop)
         where = where[keep[where] > 0]
         rows.setdefault(segment.equation, []).append(where)
-        band[segment.equation] = (
-            band.get(segment.equation, 0.0) + BAND**2 * segment.repeats * len(where)
+        band[segment.equation] = band.get(segment.equation, 0.0) + BAND**2 * segment.repeats * len(
+            where
         )
     return Field(
         tuple(found), projected, projected.T @ projected, basis, tuple(groups), raw,
@@ -209,7 +210,7 @@ def search(board: Field, r: Array, noise: float = 1.0) -> Choice:
     greedy = grow(board, (), r, noise)
     if len(greedy.members) == 1 and in_band(board, greedy, noise):
         return greedy
-    best, seen = greedy, set()
+    best, seen = greedy, set[Key]()
     for first in options(board, (), r, noise)[: 3 * STARTS] or _blind(board, r):
         key = board.entries[first.members[0]].variant.key
         if key in seen or len(seen) >= STARTS:

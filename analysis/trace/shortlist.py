@@ -115,9 +115,7 @@ class Shortlist:
 
     def _listed(self, effects: tuple[Used, ...], found: Fit) -> Listed:
         rig = self.stage.rig
-        return Listed(
-            effects, found, excess_of(self.stage, found.left), complexity(rig, effects)
-        )
+        return Listed(effects, found, excess_of(self.stage, found.left), complexity(rig, effects))
 
     def physical(self, one: Listed) -> str:
         """Say why a set is not physical ('' if it is)."""
@@ -185,10 +183,12 @@ class Shortlist:
 
     def formed(self, one: Listed) -> bool:
         """Tell whether what is left may be the difference of form between effect and catalogue."""
-        return all(
-            left <= max(self.limits.band[e], select.FORM * self.empty.excess[e])
-            for e, left in one.excess.items()
-        )
+        return all(self.negligible(e, left) for e, left in one.excess.items())
+
+    def negligible(self, equation: str, left: float) -> bool:
+        """Tell whether so much energy above noise may be left in an equation."""
+        allowed = (select.LEFT / select.BAND) ** 2 * self.limits.band[equation]
+        return left <= max(allowed, select.FORM * self.empty.excess[equation])
 
     def completed(self, now: Listed) -> Listed:
         """Add one more effect only if that leaves nothing but noise: else it fits a form."""
@@ -222,7 +222,11 @@ class Shortlist:
         least = NEAR * float(np.max(g, initial=0.0))
         for i in map(int, np.argsort(-g)):
             variant = field.entries[i].variant
-            if (g[i] > least or (g[i] > 0 and len(out) < 3)) and variant.key not in out and len(out) < SINGLES:
+            if (
+                (g[i] > least or (g[i] > 0 and len(out) < 3))
+                and variant.key not in out
+                and len(out) < SINGLES
+            ):
                 out[variant.key] = (variant.used,)
         return list(out.values())
 
@@ -298,4 +302,3 @@ def rebased(stage: Board, model: Fit) -> Board:
         stage, terms=model.terms, beta=dict(model.beta), names=rows.names, base=rows.matrix,
         rows=tuple(built),
     )  # fmt: skip
-

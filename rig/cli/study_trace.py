@@ -31,7 +31,10 @@ Sizes = tuple[str, str, str, tuple[str, str, str], str]
 SINGLES: Final[tuple[Sizes, ...]] = (
     ("coulomb_friction", "joint {j}", "force", ("15 N", "40 N", "100 N"), ""),
     ("stribeck_friction", "joint {j}", "force", ("30 N", "60 N", "120 N"), "speed: 20 mm/s"),
-    ("asymmetric_friction", "joint {j}", "extending", ("30 N", "60 N", "120 N"), "retracting: 10 N"),
+    (
+        "asymmetric_friction", "joint {j}", "extending", ("30 N", "60 N", "120 N"),
+        "retracting: 10 N",
+    ),
     (
         "pressure_dependent_friction", "joint {j}", "coefficient",
         ("5e-6 N/Pa", "1e-5 N/Pa", "3e-5 N/Pa"), "",
@@ -110,6 +113,7 @@ class Outcome:
     fit_before: float
     fit_after: float
     depends_on: tuple[str, ...]
+    notes: tuple[str, ...]
     seconds: float
 
 
@@ -127,8 +131,10 @@ def effect_text(sizes: Sizes, joint: int, level: int) -> tuple[str, tuple[str, s
 
     name, where, key, levels, other = sizes
     place = where.format(j=joint)
-    at = f"channel: {place.removeprefix('channel ')}" if place.startswith("channel ") else (
-        f"where: {place}"
+    at = (
+        f"channel: {place.removeprefix('channel ')}"
+        if place.startswith("channel ")
+        else (f"where: {place}")
     )
     text = f"{{name: {name}, {at}, {key}: {levels[level]}" + (f", {other}" if other else "") + "}"
     return text, (name, place_of(place)), si_size(levels[level])
@@ -169,7 +175,9 @@ def cases(
                     out.append(_case(SINGLE, [(sizes, int(rng.integers(1, 3)), size)], number))
                     number += 1
         elif kind == PAIR:
-            loud = [s for s in SINGLES if s[0] not in ("entrained_air", "dead_volume", "supply_sag")]
+            loud = [
+                s for s in SINGLES if s[0] not in ("entrained_air", "dead_volume", "supply_sag")
+            ]
             for _ in range(count):
                 one, two = rng.choice(len(loud), size=2, replace=False)
                 members = [(loud[int(i)], int(rng.integers(1, 3)), 2) for i in (one, two)]
@@ -189,8 +197,13 @@ def cases(
 def _case(kind: str, members: Sequence[tuple[Sizes, int, int]], seed: int) -> Case:
     built = [effect_text(*m) for m in members]
     scenario = "effects: [" + ", ".join(text for text, _, _ in built) + "]"
-    label = " + ".join(f"{m[0][3][m[2]]} {key[0]} at {key[1]}" for m, (_, key, _) in zip(members, built, strict=True))
-    return Case(kind, label, scenario, tuple(k for _, k, _ in built), seed, tuple(s for *_, s in built))
+    label = " + ".join(
+        f"{m[0][3][m[2]]} {key[0]} at {key[1]}"
+        for m, (_, key, _) in zip(members, built, strict=True)
+    )
+    return Case(
+        kind, label, scenario, tuple(k for _, k, _ in built), seed, tuple(s for *_, s in built)
+    )
 
 
 def perform(case: Case) -> Outcome:
@@ -207,9 +220,7 @@ def perform(case: Case) -> Outcome:
         rig, TRAIN, case.seed + 50_000, scenario,
         Overrides(seed=1000 + case.seed, amplitude_scale=0.7, repeats=2),
     )  # fmt: skip
-    judge, _ = simulated_run(
-        rig, JUDGE, case.seed + 90_000, scenario, Overrides(steps=JUDGE_STEPS)
-    )
+    judge, _ = simulated_run(rig, JUDGE, case.seed + 90_000, scenario, Overrides(steps=JUDGE_STEPS))
     started = time.process_time()
     found = trace([train], [other, judge])
     seconds = time.process_time() - started
@@ -226,7 +237,7 @@ def perform(case: Case) -> Outcome:
         ),
         max(f.ratio for f in found.floors), _size_error(case, found.effects), ratio,
         float(np.max(off)) if off else math.nan, _mean(found.fit_before), _mean(found.fit_after),
-        tuple(d.variable for d in found.depends_on), seconds,
+        tuple(d.variable for d in found.depends_on), found.notes, seconds,
     )  # fmt: skip
 
 
@@ -248,9 +259,7 @@ def _size_error(case: Case, effects: Sequence[Any]) -> float:
     return max(errors) if errors else math.nan
 
 
-def all_of(
-    work: Sequence[Case], workers: int, say: Callable[[str], None]
-) -> Iterator[Outcome]:
+def all_of(work: Sequence[Case], workers: int, say: Callable[[str], None]) -> Iterator[Outcome]:
     """Perform the cases on `workers` processes, in the order they end; one that fails is told."""
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, mp_context=context) as pool:
@@ -259,7 +268,7 @@ def all_of(
             case = waiting[done]
             try:
                 outcome = done.result()
-            except Exception as error:  # noqa: BLE001  a plant that leaves its limits is no result
+            except Exception as error:  # a plant that leaves its limits is no result
                 say(f"{k}/{len(work)} {case.label}, seed {case.seed}: no records ({error})")
                 continue
             say(f"{k}/{len(work)} {line_of(outcome)}")
@@ -275,12 +284,13 @@ def line_of(o: Outcome) -> str:
         f"[{right(o)}] {o.case.label} (seed {o.case.seed}, {o.loudness:.1f} x noise): {o.verdict}, "
         f"{named}" + (f"; tied {tied}" if tied else "") + (f"; {more}" if more else "")
         + (f"; moves with {' '.join(o.depends_on[:2])}" if o.depends_on else "")
+        + "".join(f"; {note}" for note in o.notes)
         + f"; size off {100 * o.size_error:.1f} %, error {o.error_ratio:.2f} x floor, "
         f"parameters off {100 * o.parameter_error:.1f} %, {o.seconds:.0f} s"
     )  # fmt: skip
 
 
-def right(o: Outcome) -> str:
+def right(o: Outcome) -> str:  # noqa: PLR0911  a table of answers
     """Judge an outcome: right, in class, quiet, wrong, missed, abstained."""
     truth, named = set(o.case.truth), set(o.named)
     if o.case.kind == NONE:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -49,7 +50,7 @@ def _counts(outcomes: Sequence[Outcome]) -> str:
 def _detection(outcomes: Sequence[Outcome]) -> str:
     edges = (0.0, 0.7, 1.5, 3.0, 6.0, 12.0, 25.0, np.inf)
     rows = []
-    for low, high in zip(edges, edges[1:], strict=False):
+    for low, high in itertools.pairwise(edges):
         here = [o for o in outcomes if o.case.truth and low <= o.loudness < high]
         if here:
             count = Counter(right(o) for o in here)

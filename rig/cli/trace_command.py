@@ -51,7 +51,7 @@ def trace(
     if report is not None:
         from rig.cli.trace_reporting import write_trace
 
-        write_trace(report, loaded, judged, result)
+        write_trace(report, judged, result)
     if json != Path("-"):
         typer.echo(trace_text(result))
 
