@@ -113,9 +113,7 @@ def feasible(rig: Rig, names: tuple[str, ...], rigid: bool) -> Feasible:
     return Feasible(equal, equal_labels, positive, labels, forms, "R positive definite")
 
 
-def _rigid(
-    rig: Rig, index: Mapping[str, int], weights: Array
-) -> tuple[Array, tuple[str, ...]]:
+def _rigid(rig: Rig, index: Mapping[str, int], weights: Array) -> tuple[Array, tuple[str, ...]]:
     """Return R_ij - l_i W_j = 0 for i < j wherever length and weight are known."""
     N = len(rig.joints)
     inertia, rows, labels = inertia_names(N), [], []

@@ -64,7 +64,7 @@ def percent(value: float) -> str:
 
 
 def prediction_text(found: Foresight) -> str:
-    """Return each parameter's predicted error, the conditioning, and what is not determined."""
+    """Return each parameter's predicted error, conditioning, and what is not determined."""
     p = found.prediction
     if p is None:
         return f"standard errors cannot be predicted: {found.why}"
@@ -97,7 +97,7 @@ class Designed:
 
 
 def design_protocol(protocol: str, rig: str, criterion: str, budget: int, seed: int) -> Designed:
-    """Improve a protocol's multisines; raises InputError where it cannot be or limits are passed."""
+    """Improve a protocol's multisines; raises InputError where that cannot be done."""
     bench = load_bench(rig)
     plan = resolve(library.load(protocol), bench)
     before = of_plan(plan, bench)
