@@ -123,5 +123,5 @@ def _combinations(
         plain = c * scale
         if parts:
             first = plain[parts[0]]
-            out.append(Combination(tuple((names[p], float(plain[p] / first)) for p in parts)))
+            out.append(Combination(tuple((names[int(p)], float(plain[p] / first)) for p in parts)))
     return out

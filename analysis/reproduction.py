@@ -28,6 +28,7 @@ from analysis.solve import Cluster, Solution, merge, solve
 from analysis.terms import baseline
 from analysis.terms.base import FAMILIES, Used
 from analysis.validate import RecordValidation, validate
+from rig.model import channels as ch
 from rig.model.parameters import inertia_names
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
@@ -59,7 +60,7 @@ class Conditions:
 
 @dataclass(frozen=True)
 class Experiments:
-    """Every repeat identified by itself."""
+    """Every repeat identified by itself; `solve_seconds` is the median."""
 
     count: int
     spreads: Mapping[str, Spread]
@@ -124,7 +125,7 @@ def experiments(run: Run, filtering: Choice = default_filtering) -> Experiments:
         len(single),
         {name: spread([one.values[name] for one in found]) for name in names},
         conditions,
-        max(one.seconds for one in found),
+        float(np.median([one.seconds for one in found])),
         sum(one.masked for one in found),
     )
 
@@ -212,16 +213,26 @@ def payload_response(
     return out
 
 
-def search_fit(
-    coupled: Model, found: Identification, runs: Sequence[Run], steps: Sequence[str]
-) -> list[RecordValidation]:
-    """Validate a search's parameters on the records of `steps` where they all play a part.
+def oil_temperatures(run: Run) -> dict[str, float]:
+    """Return the mean measured oil temperature [degC] of every step; empty where not measured."""
+    found: dict[str, list[float]] = {}
+    for record in run.records:
+        if ch.TEMPERATURE in record.channels:
+            mean = float(np.mean(record.channels[ch.TEMPERATURE]))
+            found.setdefault(record.step, []).append(mean)
+    return {step: float(np.mean(values)) for step, values in found.items()}
+
+
+def steps_of(run: Run, steps: Sequence[str]) -> Run:
+    """Return the run's records of some steps only."""
+    return replace(run, records=tuple(r for r in run.records if r.step in steps))
+
+
+def search_fit(coupled: Model, found: Identification, run: Run) -> list[RecordValidation]:
+    """Validate a search's parameters on records where they all play a part (STEP1's).
 
     The parameters that the search has no value for are lent by the coupled model; of them only
     the inertia that couples the joints plays a part, and only by what a locked joint gives.
     """
     values = {name: e.value for name, e in found.estimates.items() if e.identified}
-    chosen = [
-        replace(run, records=tuple(r for r in run.records if r.step in steps)) for run in runs
-    ]
-    return validate(with_values(coupled, values), chosen)
+    return validate(with_values(coupled, values), [run])

@@ -130,7 +130,7 @@ def compiled(model: Model) -> Compiled:
         np.array([u.term.prepares for u in model.terms]),
         np.concatenate(packed),
         _geometry(model.rig),
-        min(u.term.rate_tolerance for u in model.terms),
+        min(u.term.tolerance(u.shape) for u in model.terms),
     )
 
 

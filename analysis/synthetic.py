@@ -53,16 +53,17 @@ def sine(rate: float, hertz: float) -> Wave:
 def lock_steps(joints: int) -> list[tuple[str, dict[int, float]]]:
     """Return the lock-and-excite steps (name, 0-based locked joint -> place in half strokes).
 
-    Joint k moves while all others stand; the others stand at mid-stroke, then, for k < N, the
-    last at either end, as the paper's STEP1 to STEP3 do for two joints.
+    Joint k moves while all others stand: those below it at mid-stroke, the one above it at either
+    end while those beyond are retracted, then each of those extended; as the paper's STEP1 to
+    STEP3 do for two joints. These are N (N + 1) / 2 steps, as many as inertia parameters.
     """
-    if joints == 1:
-        return [("step1", {})]
-    last = joints - 1
-    steps = [{i: 0.0 for i in range(joints) if i != last}]
-    for k in range(last):
-        for place in (-END, END):
-            steps.append({i: place if i == last else 0.0 for i in range(joints) if i != k})
+    steps = []
+    for k in range(joints - 1, -1, -1):
+        below = dict.fromkeys(range(k), 0.0)
+        beyond = range(k + 1, joints)
+        steps.append(below | dict.fromkeys(beyond, -END))
+        for extended in range(len(beyond)):
+            steps.append(below | {j: END if n >= extended else -END for n, j in enumerate(beyond)})
     return [(f"step{number}", locked) for number, locked in enumerate(steps, start=1)]
 
 

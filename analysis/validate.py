@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.differentiate import Smoother
+from analysis.effects.measurement import corrected_channels
 from analysis.model import Model, finite, refuse_other_rig
 from analysis.rows import Filtering, default_filtering
 from analysis.signals import Signals, aligned_channels, condition
@@ -82,10 +83,13 @@ def validate_record(
     """Validate on one record (see `validate`)."""
     smoother = filtering(record).channels
     signals = _seen_by(model, rig, condition(rig, record, smoother))
-    measured = _compared(rig, aligned_channels(rig, record), signals)
+    # A sensor that the model says is wrong is put right before anything is compared with it.
+    channels = aligned_channels(rig, record)
+    channels = corrected_channels(rig, model.terms, channels, record.sample_rate)
+    measured = _compared(rig, channels, signals)
     ready, drive = compiled(model), drive_of(signals)
-    free = simulate(ready, drive, first_state(rig, record, signals))
-    channels = free.channels()
+    free = simulate(ready, drive, first_state(rig, record, signals, channels))
+    simulated = free.channels()
     windows = dict.fromkeys(measured, 0.0)
     count = 0
     for first, length in _windows(record, smoother):
@@ -98,8 +102,8 @@ def validate_record(
     return RecordValidation(
         record.name,
         record.step,
-        {name: fit_percent(y, channels[name]) for name, y in measured.items()},
-        {name: float(np.sqrt(np.mean((y - channels[name]) ** 2))) for name, y in measured.items()},
+        {name: fit_percent(y, simulated[name]) for name, y in measured.items()},
+        {name: float(np.sqrt(np.mean((y - simulated[name]) ** 2))) for name, y in measured.items()},
         {name: float(np.sqrt(v / count)) if count else np.nan for name, v in windows.items()},
         free.failure,
         free.outside,
@@ -134,15 +138,17 @@ def _windows(record: Record, smoother: Smoother) -> Iterator[tuple[int, int]]:
         yield first, length
 
 
-def first_state(rig: Rig, record: Record, signals: Signals) -> State:
+def first_state(
+    rig: Rig, record: Record, signals: Signals, channels: Mapping[str, Array] | None = None
+) -> State:
     """Return the state at the first sample, from a cubic fitted to the first 40 ms of data.
 
-    The filter has no samples before the first; a short one-sided fit is the better edge. The
-    velocity is the fit's first derivative.
+    `channels` defaults to the record's, aligned. The filter has no samples before the first; a
+    short one-sided fit is the better edge. The velocity is the fit's first derivative.
     """
     count = min(record.samples, max(START_DEGREE + 2, round(START_SAMPLES * record.sample_rate)))
     t = np.arange(count) / record.sample_rate
-    channels = aligned_channels(rig, record)
+    channels = aligned_channels(rig, record) if channels is None else channels
     state = state_at(signals, 0)
     q, qd, cap, rod = (a.copy() for a in (state.q, state.qd, state.p_cap, state.p_rod))
     for i in map(int, np.flatnonzero(signals.excited)):

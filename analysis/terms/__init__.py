@@ -15,6 +15,7 @@ from rig.model.rig import Rig
 
 PACKAGES: Final = ("analysis.terms", "analysis.effects")
 ELECTRIC: Final = ("inertia", "viscous_friction")
+INCLINED: Final = "inclined_gravity"  # gravity with the base's angle as one more unknown
 BASELINE: Final = ("inertia", "viscous_friction", "gravity", "compressibility", "orifice")
 
 
@@ -44,7 +45,7 @@ def baseline_of(rig: Rig) -> tuple[Term, ...]:
     """Return the terms that every model of the rig has."""
     if not isinstance(rig, ElectricRig):
         return baseline()
-    weight = "base_inclination" if rig.inclination == UNKNOWN else "gravity"
+    weight = INCLINED if rig.inclination == UNKNOWN else "gravity"
     pulled = not rig.prismatic and rig.gravity > 0
     return tuple(make(name) for name in (*ELECTRIC, *((weight,) if pulled else ())))
 
@@ -52,7 +53,8 @@ def baseline_of(rig: Rig) -> tuple[Term, ...]:
 def with_effects(rig: Rig, effects: Sequence[str]) -> tuple[Term, ...]:
     """Return the baseline with effects added: `name` (at every joint) or `name@joint 1`.
 
-    Raises InputError for an unknown name or place. `base_inclination` takes gravity's place.
+    Raises InputError for an unknown name or place. With `base_inclination` the angle is found by
+    least squares: `inclined_gravity` takes gravity's place.
     """
     terms = list(baseline_of(rig))
     for effect in effects:
@@ -61,7 +63,7 @@ def with_effects(rig: Rig, effects: Sequence[str]) -> tuple[Term, ...]:
         if not where and make(name).per_joint:
             each = [f"joint {i}" for i in range(1, len(rig.joints) + 1)]
         for place in each:
-            term = make(name, place)
+            term = make(INCLINED if name == "base_inclination" else name, place)
             if term in terms:
                 raise InputError(f"effect {name!r} at {place} is in the model already")
             if term.per_joint and term.joint >= len(rig.joints):

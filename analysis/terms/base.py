@@ -157,6 +157,10 @@ class Term:
         """Return, by equation, where (n,) the term's equation holds (default: everywhere)."""
         return {}
 
+    def tolerance(self, shape: Sequence[float]) -> float:
+        """Return the tolerance of rates [rad/s] that the simulation needs because of this term."""
+        return self.rate_tolerance
+
     def hidden(self, rig: Rig) -> int:
         """Return the number of hidden states that the kernel integrates."""
         return 0

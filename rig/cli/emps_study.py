@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.differentiate import butterworth, channel_filter, row_filter, row_step
+from analysis.effects.friction import TRANSITION
 from analysis.identify import Identification, identify
 from analysis.model import Model
 from analysis.rows import Filtering, default_filtering
 from analysis.terms import with_effects
 from analysis.terms.base import Used
-from analysis.terms.coulomb_friction import TRANSITION
 from analysis.validate import validate
 from rig.cli.output import table
 from rig.model.electric import drive_gains

@@ -18,13 +18,15 @@ import numpy as np
 from analysis.identify import Identification, identify
 from analysis.methods import SearchOptions
 from analysis.reproduction import (
+    Choice,
     Experiments,
     Response,
     experiments,
     payload_response,
     search_fit,
+    steps_of,
 )
-from analysis.rows import paper_filtering
+from analysis.rows import default_filtering, paper_filtering
 from analysis.validate import RecordValidation, validate
 from protocols.plan import Overrides
 from rig.cli.running import Job, run_protocol
@@ -76,10 +78,11 @@ class Search:
 
 @dataclass(frozen=True)
 class Simultaneous:
-    """The simultaneous method with one filter: all repeats at once, and each by itself."""
+    """The simultaneous method with one filter: all repeats at once, each by itself, its FIT."""
 
     found: Identification
     each: Experiments
+    fits: Sequence[RecordValidation]
 
 
 @dataclass(frozen=True)
@@ -152,13 +155,16 @@ def analyse(runs: Runs, seed: int, scale: Scale, say: Say) -> Reproduction:
         payload_response(runs.steps.rig, PAYLOAD, coupled, identify([runs.loaded])),
         sequential,
         validate(sequential.model, [runs.judged]),
-        Simultaneous(identify([runs.both], "simultaneous"), experiments(runs.both)),
-        Simultaneous(
-            identify([runs.both], "simultaneous", None, paper_filtering, reject_noise=False),
-            experiments(runs.both, paper_filtering),
-        ),
+        _simultaneous(runs, default_filtering),
+        _simultaneous(runs, paper_filtering),
         {method: _search(method, runs, coupled, seed, scale, say) for method in SEARCHES},
     )
+
+
+def _simultaneous(runs: Runs, filtering: Choice) -> Simultaneous:
+    found = identify([runs.both], "simultaneous", None, filtering, reject_noise=False)
+    fits = validate(found.model, [steps_of(runs.judged, SEARCH_STEPS)])
+    return Simultaneous(found, experiments(runs.both, filtering), fits)
 
 
 def _search(
@@ -173,4 +179,4 @@ def _search(
         search=SearchOptions(evaluations=scale.evaluations),
     )
     say(f"{method.upper()} took {time.monotonic() - started:.0f} s")
-    return Search(found, search_fit(coupled.model, found, [runs.judged], SEARCH_STEPS))
+    return Search(found, search_fit(coupled.model, found, steps_of(runs.judged, SEARCH_STEPS)))

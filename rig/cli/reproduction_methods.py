@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
-from analysis import paper_tables as paper
+import numpy as np
+
 from analysis.identify import Identification
-from analysis.plots_search import convergence
-from analysis.reproduction import Experiments
+from analysis.reproduction import Experiments, oil_temperatures
 from analysis.validate import RecordValidation
-from rig.cli.pages import Picture, Section, Table
+from rig.cli.pages import Section, Table
 from rig.cli.reproduction import Reproduction, Simultaneous
-from rig.cli.reproduction_page import DASH, KINDS, error, means, percent, scale_of, shown, worst
+from rig.cli.reproduction_page import DASH, error, means, percent, scale_of, shown, worst
+from rig.cli.reproduction_searches import fit, share
 from rig.model import channels as ch
 
 METHODS = Section(
@@ -75,13 +75,30 @@ def sequential(done: Reproduction) -> Section:
         (
             f"{len(several)} of {len(rows)} parameters are identified by more than one step and "
             f"have as many values. The bulk modulus, which is in every step, has {len(values)}: "
-            f"{', '.join(shown('b', v, 2) for v in values)} MPa, {several['b']:.1f} of their own "
-            "95 % intervals apart (column `apart`: difference over the common half-width; above "
-            f"1 are {' '.join(beyond) or 'none'}). STEP2 alone shows M1 and R12 as a sum only, so "
-            "that E1 and E2 must carry their rows further. With E1's values the torque rows keep "
+            f"{', '.join(shown('b', v, 2) for v in values)} MPa, {several.get('b', 0.0):.1f} of "
+            "their own 95 % intervals apart (column `apart`: difference over the common "
+            f"half-width; above 1 are {' '.join(beyond) or 'none'}). {_by_temperature(done)}"
+            "STEP2 alone shows M1 and R12 as a sum only, so that E1 and E2 must carry their rows "
+            "further. With E1's values the torque rows keep "
             f"{ratio:.2f} times the residual that the coupled solution leaves.",
             Table("Every step by itself, E1, E2 and coupled", header, rows),
         ),
+    )
+
+
+def _by_temperature(done: Reproduction) -> str:
+    """Set the steps' values of b beside their oil's temperature, with the slope of a line."""
+    oil = oil_temperatures(done.runs.steps)
+    found = done.sequential.extra["sequential"]["per_step"]["b"]
+    pairs = [(oil[e["step"]], e["value"]) for e in found if e["step"] in oil]
+    if len(pairs) < 3 or len({f"{t:.1f}" for t, _ in pairs}) < 3:
+        return ""
+    t, b = (np.array(column) for column in zip(*pairs, strict=True))
+    slope = 100.0 * float(np.polyfit(t, b, 1)[0]) / float(b.mean())
+    return (
+        f"The oil was at {', '.join(f'{x:.1f}' for x in t)} °C in these steps: b moves by "
+        f"{slope:+.2f} % a kelvin, so that each step's value may be right for its own oil, which "
+        "E1 and E2 cannot know and a joint interval does not show. "
     )
 
 
@@ -128,8 +145,20 @@ def simultaneous(done: Reproduction) -> Section:
             "The paper calls the method's result impossible because `W1 is larger than W2`; its "
             "own Table III has W1 > W2 too, and masses within their links demand "
             "W1/l1 >= W2/l2 >= 0. The check `gravity order` tests that.",
+            _oil_of_both(done),
             Table("Simultaneous and coupled, mean of the experiments", header, rows),
         ),
+    )
+
+
+def _oil_of_both(done: Reproduction) -> str:
+    both, lock = oil_temperatures(done.runs.both), oil_temperatures(done.runs.steps)
+    if not both or not lock:
+        return "The oil's temperature was not measured."
+    return (
+        f"The error of b is against oil at {done.rig.oil.temperature:g} °C; in these records it "
+        f"was at {np.mean(list(both.values())):.1f} °C, in those of the three steps at "
+        f"{np.mean(list(lock.values())):.1f} °C on average."
     )
 
 
@@ -139,8 +168,7 @@ def _error(done: Reproduction, each: Experiments, name: str) -> str:
 
 def _verdict(done: Reproduction, one: Simultaneous, filtering: str) -> str:
     name, off = worst(means(one.each), done.runs.truth)
-    physical = ("gravity order", "inertia", "signs")
-    broken = [c.name for c in one.found.checks if not c.ok and c.name in physical]
+    broken = _unphysical(one)
     W1, W2 = (one.each.spreads[n].mean for n in ("W1", "W2"))
     judged = (
         f"physically impossible (checks failed: {', '.join(broken)})"
@@ -153,99 +181,9 @@ def _verdict(done: Reproduction, one: Simultaneous, filtering: str) -> str:
     )
 
 
-def searches(done: Reproduction) -> Section:
-    """Show what PSO and GA found on STEP1, and how many candidates they lost."""
-    found = {method: s.found for method, s in done.searches.items()}
-    names = next(iter(found.values())).extra["search"]["bounds"]
-    rows = [
-        [
-            name, scale_of(name)[2], shown(name, paper.TABLE_III[name].pso, 2),
-            shown(name, paper.TABLE_III[name].ga, 2),
-            *(c for f in found.values() for c in _searched(f, name, done.runs.truth)),
-            shown(name, done.coupled.estimates[name].value),
-            percent(error(done.coupled.estimates[name].value, done.runs.truth[name])),
-        ]
-        for name in names
-    ]  # fmt: skip
-    header = [
-        "parameter", "unit", "paper PSO", "paper GA", "PSO here", "error %", "GA here", "error %",
-        "coupled", "error %",
-    ]  # fmt: skip
-    return Section(
-        "PSO and GA on STEP1",
-        (
-            f"{done.scale.evaluations} candidates each. The searches see STEP1 only, so eight "
-            "parameters have no value, and none has an interval. What a search finds, it finds in "
-            "combinations: gains, friction, inertia and gravity may shrink or grow together with "
-            "little change of the output over a short window, and 1 Hz hardly shows b.",
-            Table("Parameters of STEP1", header, rows),
-            _lost_table(found),
-            _fit_table(done),
-            Picture(
-                "search.svg",
-                str(convergence({m: f.extra["search"] for m, f in found.items()}, "search")),
-                "Best error so far, and the share of each generation that lost its state",
-            ),
-        ),
-    )
-
-
-def _searched(found: Identification, name: str, truth: Mapping[str, float]) -> tuple[str, str]:
-    value = found.estimates[name].value
-    return shown(name, value), percent(error(value, truth[name]), 1)
-
-
-def _lost_table(found: Mapping[str, Identification]) -> Table:
-    data: dict[str, Mapping[str, Any]] = {m: f.extra["search"] for m, f in found.items()}
-
-    def row(title: str, *cells: str) -> list[str]:
-        return [title, *cells]
-
-    fates = list(next(iter(data.values()))["lost"])
-    rows = [
-        row("candidates simulated", *(str(d["evaluations"]) for d in data.values())),
-        *(row(f"lost: {fate}", *(str(d["lost"][fate]) for d in data.values())) for fate in fates),
-        row("lost, share", *(f"{_share(d):.1f} %" for d in data.values())),
-        row(
-            "lost in the first generation",
-            *(f"{d['lost_first_generation']} of {d['generation_sizes'][0]}" for d in data.values()),
-        ),
-        row(
-            "best relative output error",
-            *(f"{d['error']:.3g}" for d in data.values()),
-        ),
-    ]
-    return Table("Candidates whose state ceased to exist", ["", *(m.upper() for m in data)], rows)
-
-
-def _share(data: Mapping[str, Any]) -> float:
-    return 100.0 * float(sum(data["lost"].values())) / float(data["evaluations"])
-
-
-def _fit_table(done: Reproduction) -> Table:
-    rows = []
-    for step, label in (("step1_1hz", "1 Hz"), ("step1_3hz", "3 Hz")):
-        theirs = paper.TABLE_IV_SEARCH if step == "step1_1hz" else {}
-        own = next(c.fit for c in paper.TABLE_IV if c.step == step) or (math.nan,) * 3
-        for kind, index in zip(KINDS, range(3), strict=True):
-            name = ch.channel(kind, 2)
-            rows.append(
-                [
-                    f"{name}, {label}", f"{own[index]:.1f}",
-                    *(f"{theirs[m][index]:.1f}" if m in theirs else DASH for m in ("PSO", "GA")),
-                    _fit(done.validation, step, name),
-                    *(_fit(s.fits, step, name) for s in done.searches.values()),
-                ]
-            )  # fmt: skip
-    header = [
-        "channel", "paper coupled", "paper PSO", "paper GA", "coupled here", "PSO here", "GA here",
-    ]  # fmt: skip
-    return Table("Table IV on STEP1's new records, FIT %", header, rows)
-
-
-def _fit(results: Sequence[RecordValidation], step: str, name: str) -> str:
-    found = next(r for r in results if r.step == step)
-    return f"{found.fit[name]:.1f}" + (" (failed)" if found.failure else "")
+def _unphysical(one: Simultaneous) -> list[str]:
+    physical = ("gravity order", "inertia", "signs")
+    return [c.name for c in one.found.checks if not c.ok and c.name in physical]
 
 
 def summary(done: Reproduction) -> Section:
@@ -253,13 +191,17 @@ def summary(done: Reproduction) -> Section:
     truth = done.runs.truth
     listed: list[tuple[str, Identification, Sequence[RecordValidation], str]] = [
         ("coupled", done.coupled, done.validation, ""),
-        ("sequential E1", done.sequential, done.sequential_fits, "one value of each parameter"),
-        ("simultaneous", done.simultaneous.found, (), _limits(done)),
+        ("sequential E1", done.sequential, done.sequential_fits, "give one value"),
+        ("simultaneous", done.simultaneous.found, done.simultaneous.fits, _limits(done)),
+        (
+            "simultaneous, paper's filter", done.paper_simultaneous.found,
+            done.paper_simultaneous.fits, _broken(done.paper_simultaneous),
+        ),
         *(
             (method.upper(), s.found, s.fits, _search_limits(s.found))
             for method, s in done.searches.items()
         ),
-    ]
+    ]  # fmt: skip
     rows = []
     for name, found, fits, could_not in listed:
         values = {n: e.value for n, e in found.estimates.items() if e.identified}
@@ -269,7 +211,7 @@ def summary(done: Reproduction) -> Section:
             [
                 name, f"{len(values)} of {len(truth)}", str(widths), f"{off:+.2f} ({off_name})",
                 percent(error(values["b"], truth["b"])),
-                _fit(fits, "step1_1hz", ch.channel(ch.PISTON, 2)) if fits else DASH,
+                fit(fits, "step1_1hz", ch.channel(ch.PISTON, 2)),
                 could_not or DASH,
             ]
         )  # fmt: skip
@@ -286,9 +228,14 @@ def summary(done: Reproduction) -> Section:
 def _limits(done: Reproduction) -> str:
     ours = done.simultaneous.each.conditions["mechanical"].plain[1]
     best = done.each.conditions["mechanical"].plain[1]
-    return f"keep the conditioning ({ours:.1f} against {best:.1f}); bear the paper's filter"
+    return f"keep the mechanical conditioning ({ours:.1f} against {best:.1f})"
+
+
+def _broken(one: Simultaneous) -> str:
+    broken = _unphysical(one)
+    return f"stay possible: {', '.join(broken)} failed" if broken else DASH
 
 
 def _search_limits(found: Identification) -> str:
     data = found.extra["search"]
-    return f"joint 1; intervals; keep {_share(data):.0f} % of its candidates alive"
+    return f"see joint 1; give intervals; keep the state of {share(data):.0f} % of candidates"

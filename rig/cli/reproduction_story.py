@@ -15,8 +15,9 @@ from analysis.validate import to_json as validation_json
 from rig.cli.output import progress, write_json
 from rig.cli.pages import Section, text, write_page
 from rig.cli.reproduction import FULL, QUICK, RIG, Reproduction, reproduce
-from rig.cli.reproduction_methods import METHODS, searches, sequential, simultaneous, summary
+from rig.cli.reproduction_methods import METHODS, sequential, simultaneous, summary
 from rig.cli.reproduction_page import conditioning, payload, table_iii, table_iv
+from rig.cli.reproduction_searches import searches
 
 TITLE = "The paper's experiment, reproduced"
 

@@ -210,7 +210,7 @@ def test_an_effect_given_twice_is_refused(robot: ElectricRig) -> None:
 def test_inclination_takes_the_place_of_gravity() -> None:
     names = [t.name for t in with_effects(load_rig("shinshu-2dof"), ["base_inclination"])]
     assert "gravity" not in names
-    assert names[-1] == "base_inclination"
+    assert names[-1] == "inclined_gravity"
 
 
 # Dry friction in simulation

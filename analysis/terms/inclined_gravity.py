@@ -29,7 +29,7 @@ PARAMETER = "base_inclination"
 
 
 @dataclass(frozen=True)
-class BaseInclination(Term):
+class InclinedGravity(Term):
     """V = - sum_k W_k g cos(theta_k + alpha), in place of `gravity`.
 
     Link k pulls W_k g sin(theta_k + alpha) = g [W_k cos(alpha) sin(theta_k) + W_k sin(alpha)
@@ -37,7 +37,7 @@ class BaseInclination(Term):
     (NOTES, "N DOF planar chain"; the common parameter of the paper's last claim).
     """
 
-    name: ClassVar[str] = PARAMETER
+    name: ClassVar[str] = "inclined_gravity"
 
     @property
     def kernel(self) -> Kernel:
@@ -110,4 +110,4 @@ def _kernel(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def
         out[TORQUE, i] -= carried
 
 
-TERMS = (BaseInclination,)
+TERMS = (InclinedGravity,)
