@@ -36,6 +36,7 @@ Array = NDArray[np.float64]
 Lines = NDArray[np.int64]
 log = logging.getLogger(__name__)
 Say = Callable[[str], None]
+Passes = Callable[[PlannedStep, Mapping[int, Tone]], bool]
 
 FILL = 0.95  # share of the tightest limit that a design uses on the twin
 KEEP = 1.5  # times its first error is what a parameter may lose, or more while it stays better
@@ -82,11 +83,13 @@ def improve(
     budget: int,
     rng: np.random.Generator,
     say: Say = log.info,
+    passes: Passes = lambda step, tones: True,
 ) -> Design:
     """Improve the steps' multisines with `budget` simulations of a step on the twin.
 
     `empty` names the detection lines of (step, 0-based joint) at the step's period; `criterion` is
-    D, E or a parameter. Raises InputError for an unknown one and where no step has a multisine.
+    D, E or a parameter; `passes` may refuse a step that is about to be kept. Raises InputError
+    for an unknown criterion and where no step has a multisine.
     """
     search = _Search(rig, criterion, rng)
     candidates = [search.first(step, empty) for step in steps]
@@ -113,7 +116,7 @@ def improve(
             continue
         trial = [*candidates[:s], child, *candidates[s + 1 :]]
         value = search.value([c.found for c in trial])
-        if value < best:
+        if value < best and passes(child.played.step, child.tones):
             candidates, best, kept = trial, value, kept + 1
             say(f"{plays:4d} of {budget}: {search.text(value)} ({child.limit} {child.share:.0%})")
     return Design(
