@@ -43,6 +43,9 @@ def identify(
     json: JsonOption = None,
     model: Annotated[Path | None, typer.Option(help="Write the model file here.")] = None,
     report: Annotated[Path | None, typer.Option(help="Write an HTML report here.")] = None,
+    truth: Annotated[
+        Path | None, typer.Option(help="Compare with this file of `bramah sim --truth`.")
+    ] = None,
 ) -> None:
     """Identify every parameter from all records of the runs at once.
 
@@ -51,7 +54,7 @@ def identify(
     from analysis.identify import identify as identify_runs
     from analysis.identify import to_json
     from analysis.model import save_model
-    from rig.cli.tables import identification_text
+    from rig.cli.tables import identification_text, read_truth
 
     loaded = _load(runs)
     result = identify_runs(loaded, method)
@@ -63,7 +66,7 @@ def identify(
 
         write_identification(report, loaded, result)
     if json != Path("-"):
-        typer.echo(identification_text(result))
+        typer.echo(identification_text(result, None if truth is None else read_truth(truth)))
 
 
 def validate(
