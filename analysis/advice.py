@@ -39,7 +39,7 @@ def base_statements(rig: Rig, solutions: Mapping[str, Solution]) -> list[Check]:
         noise = solution.noise[:k, :k] if len(solution.noise) else None
         found = determined(solution.names, solution.triangle[:k, :k], noise)
         combined = ", ".join(part.text for part in found.base) or "no combination of them"
-        helps = mechanical_help(rig, found) if family == "mechanical" else fluid_help(rig, found)
+        helps = _help(rig, family, found)
         out.append(
             Check(
                 f"base parameters {family}", False,
@@ -48,6 +48,12 @@ def base_statements(rig: Rig, solutions: Mapping[str, Solution]) -> list[Check]:
             )
         )  # fmt: skip
     return out
+
+
+def _help(rig: Rig, family: str, found: Determined) -> list[str]:
+    if rig.electric:  # its steps are not planned: no stroke says what motion is to be had
+        return []
+    return mechanical_help(rig, found) if family == "mechanical" else fluid_help(rig, found)
 
 
 def _told(helps: Sequence[str]) -> str:

@@ -119,9 +119,9 @@ def _combinations(
         c[i], c[dependent] = 1.0, -(back @ null[:, i])
         # A column of zeros carries nothing: it is lost alone, and in no combination.
         c[(np.abs(c) < NEGLIGIBLE * np.abs(c).max()) | (size == 0.0)] = 0.0
-        parts = np.flatnonzero(c)
+        parts = [int(p) for p in np.flatnonzero(c)]
         plain = c * scale
-        if len(parts):
+        if parts:
             first = plain[parts[0]]
             out.append(Combination(tuple((names[int(p)], float(plain[p] / first)) for p in parts)))
     return out

@@ -17,6 +17,7 @@ from analysis.signals import clipped_samples
 from analysis.solve import Solution
 from analysis.terms.inertia import chain_matrix, mass_matrix
 from rig.model import channels as ch
+from rig.model.electric import position_limits
 from rig.model.parameters import gain_names, inertia_names
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
@@ -67,20 +68,22 @@ def refuse_dead_channels(rig: Rig, record: Record) -> None:
     for i in range(1, len(rig.joints) + 1):
         if i in record.locked:
             continue
-        for kind in ch.JOINT_KINDS:
+        for kind in rig.joint_kinds:
             name = ch.channel(kind, i)
             if name in record.channels and np.ptp(record.channels[name]) == 0.0:
                 raise InputError(
                     f"record {record.name!r}, channel {name!r}: every sample is "
                     f"{record.channels[name][0]:g}; is the sensor connected?"
                 )
-        piston = np.asarray(record.channels.get(ch.channel(ch.PISTON, i), np.zeros(1)))
-        travel, noise = float(np.ptp(piston)), rig.sensors.piston.noise
-        if piston.size > 1 and travel < MOVED * noise:
+        place = ch.channel(rig.position_kind, i)
+        moved = np.asarray(record.channels.get(place, np.zeros(1)))
+        travel, noise = float(np.ptp(moved)), rig.sensors.of(rig.position_kind).noise
+        if moved.size > 1 and travel < MOVED * noise:
+            unit = "m" + rig.unit_of(place)
             raise InputError(
-                f"record {record.name!r}, channel 'piston_{i}': joint {i} is not locked but moved "
-                f"only {travel * 1e3:.3g} mm (sensor noise {noise * 1e3:.3g} mm); it was not "
-                "excited, or belongs under 'locked'"
+                f"record {record.name!r}, channel {place!r}: joint {i} is not locked but moved "
+                f"only {travel * 1e3:.3g} {unit} (sensor noise {noise * 1e3:.3g} {unit}); it was "
+                "not excited, or belongs under 'locked'"
             )
 
 
@@ -91,7 +94,7 @@ def clipping(rig: Rig, runs: Sequence[Run]) -> list[Check]:
         for record in run.records:
             for name, mask in clipped_samples(rig, record).items():
                 joint = ch.kind_of(name)[1]
-                if joint in record.locked and not name.startswith(ch.PISTON):
+                if joint in record.locked and not name.startswith(rig.position_kind):
                     continue
                 found = (int(mask.sum()), float(mask.mean()), record.name)
                 worst[record.step, name] = max(found, worst.get((record.step, name), found))
@@ -103,7 +106,7 @@ def clipping(rig: Rig, runs: Sequence[Run]) -> list[Check]:
                 "clipped sensor",
                 share < CLIPPED_SHARE,
                 f"record {record_name!r}, channel {name!r}: {count} samples "
-                f"({100 * share:.2g} %) at the end of {low:g}..{high:g} {ch.unit_of(name)}; "
+                f"({100 * share:.2g} %) at the end of {low:g}..{high:g} {rig.unit_of(name)}; "
                 "masked (the worst record of its step)",
             )
         )
@@ -202,9 +205,8 @@ def _signs(rig: Rig, estimates: Mapping[str, Estimate]) -> Check:
         for name in positive
         if name in estimates and estimates[name].value <= 0
     ]
-    return Check(
-        "signs", not bad, "; ".join(bad) or "friction, bulk modulus and flow gains are positive"
-    )
+    judged = "friction is" if rig.electric else "friction, bulk modulus and flow gains are"
+    return Check("signs", not bad, "; ".join(bad) or f"{judged} positive")
 
 
 def _inertia(rig: Rig, estimates: Mapping[str, Estimate]) -> list[Check]:
@@ -218,13 +220,14 @@ def _inertia(rig: Rig, estimates: Mapping[str, Estimate]) -> list[Check]:
         ((float(np.linalg.eigvalsh(mass_matrix(R, q))[0]), q) for q in workspace(rig)),
         key=lambda pair: pair[0],
     )
-    angles = " ".join(f"{np.degrees(v):.0f}" for v in where)
+    turns = rig.unit_of_parameter(names[0]) != "kg"
+    angles = " ".join(f"{np.degrees(v):.0f} deg" if turns else f"{v:.3g} m" for v in where)
     out = [
         Check(
             "inertia",
             smallest > 0,
-            f"smallest eigenvalue of M over the workspace {smallest:.4g} kg m^2, "
-            f"at q = {angles} deg",
+            f"smallest eigenvalue of M over the workspace {smallest:.4g} "
+            f"{rig.unit_of_parameter(names[0])}, at q = {angles}",
         )
     ]
     for i in range(N):
@@ -232,6 +235,8 @@ def _inertia(rig: Rig, estimates: Mapping[str, Estimate]) -> list[Check]:
             W = estimates[f"W{j + 1}"].value if f"W{j + 1}" in estimates else np.nan
             if np.isfinite(W) and W != 0:
                 length, ratio = rig.joints[i].link_length, R[i, j] / W
+                if not length:
+                    continue
                 off = ratio / length - 1
                 out.append(
                     Check(
@@ -265,6 +270,10 @@ def workspace(rig: Rig, points: int = 9) -> list[Array]:
         unit = np.outer(np.arange(4096), steps) % 1.0
     angles = np.empty_like(unit)
     for i, joint in enumerate(rig.joints):
+        if rig.electric:
+            low, high = position_limits(rig, i)
+            angles[:, i] = low + unit[:, i] * (high - low)
+            continue
         half = joint.cylinder.stroke / 2
         angles[:, i] = joint.linkage.angle((2 * unit[:, i] - 1) * half)
     return list(angles)

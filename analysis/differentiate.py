@@ -202,6 +202,21 @@ def savitzky_golay(rate: float, samples: int = 31, degree: int = 4) -> FirSmooth
     return FirSmoother(f"Savitzky-Golay, {samples} samples", np.stack(taps))
 
 
+def smoothing_spline(rate: float, cutoff: float) -> FirSmoother:
+    """Return the quintic smoothing spline on equal spacing, -6 dB at `cutoff` [Hz].
+
+    It minimises sum (x - f)^2 + lambda int |f^(3)|^2; far from the ends that is convolution with
+    a fixed symmetric kernel of frequency response 1 / (1 + (f / f_c)^6), taken to 1e-6.
+    Source: Reinsch (1967); Silverman (1984), Spline smoothing: the equivalent variable kernel.
+    """
+    count = int(2 ** np.ceil(np.log2(64 * rate / cutoff)))
+    f = np.fft.rfftfreq(count, 1.0 / rate)
+    kernel = np.fft.irfft(1.0 / (1.0 + (f / cutoff) ** 6), count)
+    strong = np.flatnonzero(np.abs(kernel[: count // 2]) > 1e-6 * kernel[0])
+    around = np.arange(-int(strong[-1]), int(strong[-1]) + 1)
+    return _differenced(f"smoothing spline, {cutoff:g} Hz", kernel[around], rate)
+
+
 def channel_filter(rate: float) -> FirSmoother:
     """Return the default filter of all channels: wide, scaled down for a slow sample rate."""
     scale = min(1.0, 0.3 * rate / (CHANNEL_CUTOFF + CHANNEL_TRANSITION))

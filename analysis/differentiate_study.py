@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -20,8 +21,9 @@ from analysis.differentiate import (
     row_filter,
     row_step,
     savitzky_golay,
+    smoothing_spline,
 )
-from analysis.identify import identify
+from analysis.identify import PLAIN, identify
 from analysis.rows import Filtering, default_filtering
 from analysis.synthetic import multisine, sine, synthetic_run
 from rig.model.records import Record, Run
@@ -63,6 +65,9 @@ def candidates(rate: float) -> dict[str, Choice]:
             pair(moving_average(rate), None),
             pair(moving_average(rate), 15.0),
             pair(savitzky_golay(rate), None),
+            pair(savitzky_golay(rate), 15.0),
+            pair(smoothing_spline(rate, 25.0), None),
+            pair(smoothing_spline(rate, 80.0), 15.0),
             pair(butterworth(rate, 25.0), None),
             pair(butterworth(rate, 80.0), 15.0),
             pair(FourierSmoother(rate, 80.0), 15.0),
@@ -93,13 +98,22 @@ def table(rig: Rig, rng: np.random.Generator, repeats: int = 6) -> list[Entry]:
 
 
 def _entry(rig: Rig, run: Run, excitation: str, name: str, choice: Choice) -> Entry:
-    found = identify([run], filtering=choice, reject_noise=False).estimates
+    found = identify([run], filtering=choice, reject_noise=False, estimator=PLAIN).estimates
     bias, scatter = {}, {}
     for group, prefixes in GROUPS.items():
         members = [p for p in found if p.startswith(prefixes)]
         bias[group] = max(100 * abs(found[p].value / rig.nominal[p] - 1) for p in members)
         scatter[group] = max(100 * abs(found[p].std / rig.nominal[p]) for p in members)
     return Entry(excitation, name, bias, scatter)
+
+
+def as_json(entries: Sequence[Entry]) -> list[dict[str, Any]]:
+    """Return the table as plain data."""
+    return [
+        {"excitation": e.excitation, "filtering": e.filtering, "bias_percent": dict(e.bias),
+         "scatter_percent": dict(e.scatter)}
+        for e in entries
+    ]  # fmt: skip
 
 
 def markdown(entries: Sequence[Entry]) -> str:

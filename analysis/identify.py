@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,22 +14,29 @@ from numpy.typing import NDArray
 from analysis import checks as ck
 from analysis.advice import base_statements
 from analysis.checks import Check
+from analysis.estimators.choose import Job, refine, refuse_unknown
+from analysis.give import moving_by_step
 from analysis.model import Estimate, Model, estimate_json, finite
 from analysis.noise import noise_moments
+from analysis.reduce import reduced
 from analysis.rows import Filtering, Rows, default_filtering, parameters_of, record_rows
 from analysis.signals import condition
 from analysis.solve import Cluster, Solution, half_width, solve, triangle
-from analysis.terms import baseline
+from analysis.terms import baseline_of
 from analysis.terms.base import FAMILIES, Coefficient, Used, family_of
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
 
+if TYPE_CHECKING:
+    from analysis.methods.search import SearchOptions
+
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
-METHODS = ("coupled",)
-LATER_METHODS = ("sequential", "simultaneous", "pso", "ga")
+METHODS = ("coupled", "sequential", "simultaneous", "pso", "ga")
+PLAIN = "plain"  # least squares as in the paper: no nuisances, scatter between repeats only
+FEWEST_DRAWS = 100  # of a bootstrap
 SEGMENTS = 10  # of the only repeat of a step, where there are not more repeats
 
 
@@ -56,6 +63,7 @@ class Identification:
     solve_seconds: float
     checks: tuple[Check, ...]
     model: Model
+    extra: Mapping[str, Any] = field(default_factory=dict)  # a method's own figures, plain data
 
 
 def identify(
@@ -64,28 +72,53 @@ def identify(
     terms: Sequence[Used] | None = None,
     filtering: Callable[[Record], Filtering] = default_filtering,
     reject_noise: bool = True,
+    estimator: str = "ls",
+    bootstrap: int = 0,
+    rng: np.random.Generator | None = None,
+    search: SearchOptions | None = None,
 ) -> Identification:
     """Identify all parameters from all records of the runs at once (the paper's STEP4).
 
     `terms` defaults to the paper's model. `reject_noise` False gives out parameters that rest on
-    sensor noise as well, for studies of just that. Raises InputError for another method, for runs
+    sensor noise as well, for studies of just that. Another `method` is `analysis.methods`' work,
+    `search` being for those that search. `estimator` is one of
+    `analysis.estimators.choose.ESTIMATORS`, "plain" the bare solution without nuisances;
+    `bootstrap` draws of whole repeats replace the intervals; `rng` is for what is drawn (default:
+    seed 0). Raises InputError for another method or estimator, for runs
     of different rigs and for records that cannot be used, naming record and channel.
     """
     _refuse_method(method)
+    _refuse_estimator(estimator, bootstrap)
     rig = ck.common_rig(runs)
-    used = tuple(terms) if terms is not None else tuple(Used(term) for term in baseline())
+    used = tuple(terms) if terms is not None else tuple(map(Used, baseline_of(rig)))
+    estimator = _fitting_estimator(rig, estimator)
+    if method != "coupled":
+        from analysis.methods import identify_by  # noqa: PLC0415 (which builds on this module)
+
+        return identify_by(method, runs, used, filtering, reject_noise, rng, search)
     per_record = build_rows(rig, runs, used, filtering)
     # A stream of its own: the prediction of bias is the same every time.
     noise = noise_moments(rig, runs, used, filtering, np.random.default_rng(0))
     started = time.perf_counter()
     solutions = solve_rows(rig, used, per_record, noise, reject_noise)
     seconds = time.perf_counter() - started
-    estimates, covariance = _estimates(rig, used, solutions)
+    more: tuple[Check, ...] = ()
+    if estimator != PLAIN:
+        job = Job(
+            rig, runs, used, lambda extra: build_rows(rig, runs, (*used, *extra), filtering),
+            estimator, bootstrap, rng or np.random.default_rng(0),
+        )  # fmt: skip
+        refined = refine(job, solutions)
+        solutions, more = refined.solutions, refined.checks
+    estimates, covariance = estimates_of(rig, used, solutions)
+    if bootstrap and estimator != PLAIN:
+        estimates = _with_ends(estimates, refined.bootstrap)
     rows = {family: solution.rows for family, solution in solutions.items()}
     masked = sum(r.masked for one in per_record for r in one.rows.values())
-    statements = _statements(rig, runs, per_record, solutions, estimates, rows, masked)
+    statements = _statements(rig, runs, per_record, solutions, estimates, rows, masked) + more
     provenance = {
         "method": method,
+        "estimator": estimator if estimator == PLAIN else refined.estimator,
         "runs": [run.source for run in runs],
         "records": [one.record for one in per_record],
         "rows": rows,
@@ -97,12 +130,30 @@ def identify(
 
 
 def _refuse_method(method: str) -> None:
-    if method in LATER_METHODS:
-        raise InputError(
-            f"method {method!r} comes with a later version; this one knows: {' '.join(METHODS)}"
-        )
     if method not in METHODS:
         raise InputError(f"unknown method {method!r}; known: {' '.join(METHODS)}")
+
+
+def _refuse_estimator(estimator: str, bootstrap: int) -> None:
+    if estimator != PLAIN:
+        refuse_unknown(estimator)
+    if bootstrap and bootstrap < FEWEST_DRAWS:
+        raise InputError(
+            f"{bootstrap} bootstrap draws tell no 95 % interval; take {FEWEST_DRAWS} or more"
+        )
+    if bootstrap and estimator in (PLAIN, "output-error"):
+        raise InputError(f"--bootstrap does not go with --estimator {estimator}; take ls or iv")
+
+
+def _fitting_estimator(rig: Rig, estimator: str) -> str:
+    """Return the estimator for a rig: what refines the fluid's rows has none on electric ones."""
+    if not rig.electric or estimator == PLAIN:
+        return estimator
+    if estimator != "ls":
+        raise InputError(
+            f"--estimator {estimator} is for hydraulic rigs; {rig.name!r} is electric: take ls"
+        )
+    return PLAIN
 
 
 def build_rows(
@@ -114,10 +165,11 @@ def build_rows(
     """Return the filtered, decimated rows of every record; raises InputError for a bad one."""
     built = []
     for index, run in enumerate(runs):
+        moving = moving_by_step(rig, run)
         for record in run.records:
             ck.refuse_dead_channels(rig, record)
             filters = filtering(record)
-            signals = condition(rig, record, filters.channels)
+            signals = condition(rig, record, filters.channels, moving.get(record.step))
             rows = record_rows(rig, terms, signals, filters)
             built.append(RecordRows(index, record.name, record.step, record.repeat, rows))
     return built
@@ -145,15 +197,19 @@ def solve_rows(
         names = parameters_of(rig, terms, family)
         clusters: list[Cluster] = []
         for one in per_record:
-            pieces = 1 if repeats[one.run, one.step] > 1 else SEGMENTS
-            clusters += _clusters(one, family, pieces)
+            clusters += clusters_of(one, family, repeats)
         if names:
             moments = noise[family] if noise else None
-            out[family] = solve(names, clusters, moments, reject_noise)
+            linear = solve(names, clusters, moments, reject_noise)
+            out[family] = reduced(rig, terms, linear, clusters, moments, reject_noise)
     return out
 
 
-def _clusters(one: RecordRows, family: str, pieces: int) -> list[Cluster]:
+def clusters_of(
+    one: RecordRows, family: str, repeats: Mapping[tuple[int, str], int]
+) -> list[Cluster]:
+    """Reduce a record's rows of one family to a triangle, or to several of an only repeat."""
+    pieces = 1 if repeats[one.run, one.step] > 1 else SEGMENTS
     out = []
     rows = [r for name, r in one.rows.items() if family_of(name) == family]
     for piece in range(pieces):
@@ -173,11 +229,11 @@ def _piece(rows: Rows, piece: int, pieces: int) -> tuple[Array, Array]:
     return rows.matrix[inside], rows.rhs[inside]
 
 
-def _estimates(
+def estimates_of(
     rig: Rig, terms: Sequence[Used], solutions: Mapping[str, Solution]
 ) -> tuple[dict[str, Estimate], Array]:
     """Turn the rows' coefficients into parameters (b = 1/coefficient) with intervals."""
-    coefficients = {c.parameter: c for used in terms for c in used.term.coefficients(rig)}
+    coefficients = {c.parameter: c for used in terms for c in used.term.parameters(rig)}
     found: dict[str, Estimate] = {}
     blocks = []
     for solution in solutions.values():
@@ -214,6 +270,17 @@ def _estimate(
     return estimate, float(slope)
 
 
+def _with_ends(
+    estimates: Mapping[str, Estimate], ends: Mapping[str, tuple[float, float]]
+) -> dict[str, Estimate]:
+    """Replace intervals by the bootstrap's; `ends` are of the rows' coefficients (1/b)."""
+    out = dict(estimates)
+    for name, (low, high) in ends.items():
+        interval = (1.0 / high, 1.0 / low) if name == "b" else (low, high)
+        out[name] = replace(out[name], ci95=interval)
+    return out
+
+
 def _statements(
     rig: Rig,
     runs: Sequence[Run],
@@ -240,6 +307,7 @@ def to_json(result: Identification) -> dict[str, Any]:
     """Return the identification as the contract's JSON; null where a number does not exist."""
     return {
         "method": result.method,
+        "estimator": str(result.model.provenance.get("estimator", PLAIN)),
         "parameters": {name: estimate_json(p) for name, p in result.estimates.items()},
         "condition_number": {
             family: finite(s.condition_number) for family, s in result.solutions.items()
@@ -249,4 +317,5 @@ def to_json(result: Identification) -> dict[str, Any]:
         "solve_seconds": result.solve_seconds,
         "checks": [{"name": c.name, "ok": bool(c.ok), "detail": c.detail} for c in result.checks],
         "residual_rms": {family: finite(s.residual_rms) for family, s in result.solutions.items()},
+        **result.extra,
     }

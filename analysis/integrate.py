@@ -7,6 +7,7 @@ Ordinary Differential Equations I, tables II.5.2 and section II.6.
 
 State y = [q (N), dq/dt (N), p_cap (N), p_rod (N), hidden]; M q'' = torques, and in each chamber
 (V/b) dp/dt = flow in - A ds/dt (cap), + A ds/dt (rod). A locked joint follows its measured motion.
+An electric joint has its drive's torque, s = q, G = 1, and pressures that stay zero.
 """
 
 from __future__ import annotations
@@ -49,7 +50,9 @@ OK, LEFT_STROKE, NOT_FINITE, STEP_TOO_SMALL, BAD_INERTIA = range(5)
 MIN_STEP: Final = 1e-7  # [s]
 
 # Columns of `geometry`, one row per joint.
-PIN_A, PIN_C, MID, OFFSET, AREA_CAP, AREA_ROD, DEAD_CAP, DEAD_ROD, STROKE = range(9)
+# GAIN is 0 of a hydraulic joint; of an
+# electric one it is the drive's, u being the drive and OFFSET the known turn of the joint's zero.
+PIN_A, PIN_C, MID, OFFSET, AREA_CAP, AREA_ROD, DEAD_CAP, DEAD_ROD, STROKE, GAIN = range(10)
 
 _A = np.array(
     [
@@ -100,6 +103,11 @@ def _observe(t, y, inputs, rate, locked, geometry, bench, x, q_dd):  # type: ign
             x[Q, i] = y[i]
             x[QD, i] = y[N + i]
         angle += x[Q, i]
+        if geometry[i, GAIN] != 0.0:
+            angle += geometry[i, OFFSET]
+            x[THETA, i], x[G, i], x[S, i], x[SD, i] = angle, 1.0, x[Q, i], x[QD, i]
+            x[P_CAP, i] = x[P_ROD, i] = x[V_CAP, i] = x[V_ROD, i] = 0.0
+            continue
         x[THETA, i] = angle
         a, c = geometry[i, PIN_A], geometry[i, PIN_C]
         beta = x[Q, i] + geometry[i, OFFSET]
@@ -197,6 +205,9 @@ def rates(t, y, dy, inputs, rate, locked, geometry, model, work):  # type: ignor
                 p = slice(ends[m], ends[m + 1])
                 _call(addresses[m], phase, bench, x, y[z], par[p], out, M, dy[z])
     for i in range(N):
+        if geometry[i, GAIN] != 0.0:
+            out[TORQUE, i] += geometry[i, GAIN] * x[U, i]
+            continue
         force = geometry[i, AREA_CAP] * x[P_CAP, i] - geometry[i, AREA_ROD] * x[P_ROD, i]
         out[TORQUE, i] += x[G, i] * force
     _impose(M, out[TORQUE], locked, q_dd)
@@ -208,6 +219,9 @@ def rates(t, y, dy, inputs, rate, locked, geometry, model, work):  # type: ignor
             continue
         dy[i] = x[QD, i]
         dy[N + i] = q_dd[i]
+        if geometry[i, GAIN] != 0.0:
+            dy[2 * N + i] = dy[3 * N + i] = 0.0
+            continue
         cap, rod = geometry[i, AREA_CAP] * x[SD, i], geometry[i, AREA_ROD] * x[SD, i]
         dy[2 * N + i] = (out[FLOW_CAP, i] - cap) / out[COMP_CAP, i]
         dy[3 * N + i] = (out[FLOW_ROD, i] + rod) / out[COMP_ROD, i]

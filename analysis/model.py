@@ -66,7 +66,7 @@ def nominal_model(rig: Rig, terms: Sequence[Used]) -> Model:
     """Return the model of the rig's nominal values; raises InputError where one is missing."""
     parameters = {}
     for used in terms:
-        for c in used.term.coefficients(rig):
+        for c in used.term.parameters(rig):
             if c.parameter not in rig.nominal:
                 raise InputError(
                     f"rig {rig.name!r} has no nominal {c.parameter!r} [{c.unit}]; the twin needs "
@@ -163,7 +163,7 @@ def _from_json(data: Mapping[str, Any]) -> Model:
             (_number(low), _number(high)), str(p.get("note", "")),
         )  # fmt: skip
     for used in terms:
-        for c in used.term.coefficients(rig):
+        for c in used.term.parameters(rig):
             if c.parameter not in parameters:
                 raise InputError(f"parameters: {c.parameter!r} of {used.term.name!r} is missing")
     covariance = np.array([[_number(v) for v in row] for row in data["covariance"]])
@@ -190,7 +190,7 @@ def rig_difference(one: Rig, other: Rig) -> str:
     ignored = {"description", "nominal", "wire", "sample_rate"}
     first, second = (r.model_dump(exclude=ignored) for r in (one, other))
     for key, value in first.items():
-        if value != second[key]:
+        if value != second.get(key):
             if key == "joints":
                 differing = [
                     f"joints.{i}.{part}"
@@ -201,5 +201,5 @@ def rig_difference(one: Rig, other: Rig) -> str:
                 if len(value) == len(second[key]) and not differing:
                     continue
                 return ", ".join(differing) or f"{len(value)} and {len(second[key])} joints"
-            return f"{key} {value!r} and {second[key]!r}"
+            return f"{key} {value!r} and {second.get(key)!r}"
     return ""

@@ -17,8 +17,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.give import moving_by_step
 from analysis.rows import Filtering, Rows, parameters_of, record_rows
-from analysis.signals import condition, moving_joints
+from analysis.signals import Mask, condition
 from analysis.terms.base import FAMILIES, Used, family_of
 from rig.model import channels as ch
 from rig.model.records import Record, Run
@@ -48,10 +49,13 @@ def noise_moments(
         for record in run.records:
             counts[record.step] = counts.get(record.step, 0) + 1
         seen: set[str] = set()
+        moving = moving_by_step(rig, run)
         for record in run.records:
             if record.step not in seen:
                 seen.add(record.step)
-                for family, moment in _moments(rig, record, terms, filtering, rng).items():
+                for family, moment in _moments(
+                    rig, record, terms, filtering, moving[record.step], rng
+                ).items():
                     total[family] += counts[record.step] * moment
     return total
 
@@ -72,9 +76,10 @@ def _moments(
     record: Record,
     terms: Sequence[Used],
     filtering: Callable[[Record], Filtering],
+    moving: Mask,
     rng: np.random.Generator,
 ) -> dict[str, Array]:
-    filters, moving = filtering(record), moving_joints(rig, record)
+    filters = filtering(record)
     before, after = (
         record_rows(rig, terms, condition(rig, r, filters.channels, moving), filters)
         for r in (record, disturbed(rig, record, rng))

@@ -26,6 +26,8 @@ from analysis.differentiate import (
 )
 from analysis.signals import Mask, Signals
 from analysis.terms.base import FAMILIES, Columns, Used, equation
+from rig.model import channels as ch
+from rig.model.electric import drive_gains
 from rig.model.records import Record
 from rig.model.rig import Rig
 
@@ -33,6 +35,9 @@ Array = NDArray[np.float64]
 
 ROW_CUTOFF = 15.0  # [Hz] where a record does not tell its excited lines
 ROW_CUTOFF_RANGE = (8.0, 30.0)  # [Hz]
+# An electric joint's rows need one derivative less of anything noisy, and its friction flips in
+# milliseconds: narrower loses of the flips (`bramah emps` prints the figures).
+ROW_CUTOFF_ELECTRIC = 30.0  # [Hz] where a record does not tell its excited lines
 LINES_FACTOR = 1.5  # row filter over the highest excited line; the noise goes with its 5th power
 MASKED_SHARE = 1e-3  # of a filter's weight on masked samples: a row with more is dropped
 
@@ -65,7 +70,7 @@ class Rows:
 def default_filtering(record: Record) -> Filtering:
     """Return the filters that the bias study chose, fitted to the record's excitation."""
     rate = record.sample_rate
-    cutoff = ROW_CUTOFF
+    cutoff = ROW_CUTOFF_ELECTRIC if ch.channel(ch.POSITION, 1) in record.channels else ROW_CUTOFF
     if record.period and record.lines:
         highest = max(record.lines) * rate / record.period
         cutoff = float(np.clip(LINES_FACTOR * highest, *ROW_CUTOFF_RANGE))
@@ -94,8 +99,13 @@ FILTERINGS: dict[str, Callable[[Record], Filtering]] = {
 def right_sides(rig: Rig, signals: Signals) -> dict[str, Array]:
     """Return the right-hand side (n,) of every equation: G F, A_cap ds/dt, - A_rod ds/dt.
 
+    An electric joint has its drive's torque or force alone: gain times drive.
+
     The torque is G F (NOTES; the paper's regressor lines print the inverse of G).
     """
+    if rig.electric:
+        gains = drive_gains(rig)
+        return {equation("torque", i): gain * signals.u[:, i] for i, gain in enumerate(gains)}
     sides = {}
     for i, joint in enumerate(rig.joints):
         cap, rod = joint.cylinder.cap_area, joint.cylinder.rod_area
@@ -142,6 +152,8 @@ def record_rows(
             sensors = np.asarray(signals.valid.all(axis=1) if whole else signals.valid[:, i])
             for kind in kinds:
                 name = equation(kind, i)
+                if name not in sides:
+                    continue
                 good = sensors & valid.get(name, sensors)
                 out[name] = _filtered(
                     name, names, columns.get(name, {}), sides[name], good, signals, filtering, edges

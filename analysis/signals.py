@@ -1,9 +1,9 @@
 """Records to signals: aligned, filtered, differentiated, with the linkage's geometry beside them.
 
-Glossary: n samples, N joints. `u` spool [V], `s` piston [m], `q` joint angle [rad], `theta`
-absolute angle q_1 + ... + q_k, `G` = ds/dq [m], `p_cap p_rod` chamber pressures [Pa gauge],
-`V_cap V_rod` chamber volumes [m^3], `p_s p_tank` supply and return pressure [Pa gauge]. A
-trailing d is d/dt.
+Glossary: n samples, N joints. `u` spool [V] (electric: drive), `s` piston [m] (electric: q), `q`
+joint angle [rad], `theta` absolute angle q_1 + ... + q_k, `G` = ds/dq [m], `p_cap p_rod` chamber
+pressures [Pa gauge], `V_cap V_rod` chamber volumes [m^3], `p_s p_tank` supply and return pressure
+[Pa gauge]. A trailing d is d/dt.
 """
 
 from __future__ import annotations
@@ -104,7 +104,8 @@ def condition(
     def bench(name: str, constant: float) -> Array:
         return smoother.apply(channels[name]) if name in channels else np.full(n, constant)
 
-    raw_s, raw_p = stacked(ch.PISTON), (stacked(ch.CAP), stacked(ch.ROD))
+    raw_s, raw_p = stacked(rig.position_kind), (stacked(ch.CAP), stacked(ch.ROD))
+    supply, oil = (0.0, 0.0) if rig.electric else (rig.supply.pressure, rig.oil.temperature)
     moving = moving_joints(rig, record) if moving is None else moving
     s, sd, sdd = _motion(raw_s, moving, smoother)
     q, qd, qdd, G = _angles(rig, s, sd, sdd)
@@ -112,17 +113,17 @@ def condition(
     return Signals(
         rate=record.sample_rate,
         t=record.time,
-        u=smoother.apply(stacked(ch.SPOOL)),
-        s=s, sd=sd, q=q, qd=qd, qdd=qdd, theta=np.cumsum(q, axis=1), G=G,
+        u=smoother.apply(stacked(ch.DRIVE if rig.electric else ch.SPOOL)),
+        s=s, sd=sd, q=q, qd=qd, qdd=qdd, theta=rig.base_angle + np.cumsum(q, axis=1), G=G,
         p_cap=smoother.apply(raw_p[0]),
         p_rod=smoother.apply(raw_p[1]),
         pd_cap=smoother.apply(raw_p[0], 1),
         pd_rod=smoother.apply(raw_p[1], 1),
         V_cap=np.column_stack([v[0] for v in volumes]),
         V_rod=np.column_stack([v[1] for v in volumes]),
-        p_s=bench(ch.SUPPLY, rig.supply.pressure),
+        p_s=bench(ch.SUPPLY, supply),
         p_tank=np.zeros(n),
-        temperature=bench(ch.TEMPERATURE, rig.oil.temperature),
+        temperature=bench(ch.TEMPERATURE, oil),
         excited=excited,
         valid=_valid(rig, record, smoother.reach),
     )  # fmt: skip
@@ -145,7 +146,7 @@ def clipped_samples(rig: Rig, record: Record) -> dict[str, Mask]:
 
 def _refuse_missing(rig: Rig, record: Record, excited: Mask) -> None:
     for i, moves in enumerate(excited, start=1):
-        for kind in ch.JOINT_KINDS if moves else (ch.PISTON,):
+        for kind in rig.joint_kinds if moves else (rig.position_kind,):
             name = ch.channel(kind, i)
             if name not in record.channels:
                 raise InputError(
@@ -164,9 +165,9 @@ def moving_joints(rig: Rig, record: Record) -> Mask:
     """Return which joints (N,) move: the excited, and the locked whose lock visibly gives."""
     found = []
     for i in range(1, len(rig.joints) + 1):
-        piston = np.asarray(record.channels[ch.channel(ch.PISTON, i)])
-        locked = i in record.locked
-        found.append(not locked or gives(piston, record.sample_rate, rig.sensors.piston.noise))
+        place = np.asarray(record.channels[ch.channel(rig.position_kind, i)])
+        locked, noise = i in record.locked, rig.sensors.of(rig.position_kind).noise
+        found.append(not locked or gives(place, record.sample_rate, noise))
     return np.array(found)
 
 
@@ -189,6 +190,8 @@ def gives(piston: Array, rate: float, noise: float) -> bool:
 
 def _angles(rig: Rig, s: Array, sd: Array, sdd: Array) -> tuple[Array, Array, Array, Array]:
     """Return q, dq/dt, d2q/dt2 and G (n, N): q' = s'/G, q'' = (s'' - (dG/dq) q'^2)/G."""
+    if rig.electric:
+        return s, sd, sdd, np.ones_like(s)
     q, G, slope = np.empty_like(s), np.empty_like(s), np.empty_like(s)
     for i, joint in enumerate(rig.joints):
         half = 0.55 * joint.cylinder.stroke  # a sensor may read a little past the stroke's end
@@ -207,7 +210,7 @@ def _valid(rig: Rig, record: Record, reach: int) -> Mask:
         if joint is None:
             if kind == ch.SUPPLY:
                 bad[mask] = 1.0
-        elif joint not in record.locked or kind == ch.PISTON:
+        elif joint not in record.locked or kind == rig.position_kind:
             bad[mask, joint - 1] = 1.0
     spread = np.apply_along_axis(np.convolve, 0, bad, np.ones(2 * reach + 1), "same") > 0.5
     spread[:reach] = spread[n - reach :] = True

@@ -14,13 +14,14 @@ from analysis.model import Model
 from analysis.signals import Signals
 from analysis.terms.base import OUT_ROWS, X_ROWS
 from rig.model import channels as ch
+from rig.model.electric import drive_gains
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
 RTOL = 1e-6
-ATOL_ANGLE, ATOL_RATE, ATOL_PRESSURE, ATOL_HIDDEN = 1e-7, 1e-5, 10.0, 1e-8  # rad, rad/s, Pa
+ATOL_ANGLE, ATOL_PRESSURE, ATOL_HIDDEN = 1e-7, 10.0, 1e-8  # rad, Pa; of rates the terms say
 _REASONS = {
     integrate.LEFT_STROKE: "a piston went half a stroke past its end",
     integrate.NOT_FINITE: "the state diverged",
@@ -76,11 +77,15 @@ class Simulation:
     filled: int
     outside: int
     evaluations: int
+    electric: bool = False
 
     def channels(self) -> dict[str, Array]:
-        """Return piston and chamber pressures by channel name, each (n,)."""
+        """Return piston and chamber pressures (electric: position) by channel name, each (n,)."""
         out = {}
         for i in range(self.q.shape[1]):
+            if self.electric:
+                out[ch.channel(ch.POSITION, i + 1)] = self.q[:, i]
+                continue
             out[ch.channel(ch.PISTON, i + 1)] = self.piston[:, i]
             out[ch.channel(ch.CAP, i + 1)] = self.p_cap[:, i]
             out[ch.channel(ch.ROD, i + 1)] = self.p_rod[:, i]
@@ -105,6 +110,7 @@ class Compiled:
     prepares: NDArray[np.bool_]
     par: Array
     geometry: Array
+    rate_tolerance: float
 
 
 def compiled(model: Model) -> Compiled:
@@ -124,6 +130,7 @@ def compiled(model: Model) -> Compiled:
         np.array([u.term.prepares for u in model.terms]),
         np.concatenate(packed),
         _geometry(model.rig),
+        min(u.term.tolerance(u.shape) for u in model.terms),
     )
 
 
@@ -133,12 +140,18 @@ def _geometry_cached(rows: tuple[tuple[float, ...], ...]) -> Array:
 
 
 def _geometry(rig: Rig) -> Array:
+    if rig.electric:
+        rows = [[0.0] * 10 for _ in rig.joints]
+        for row, gain in zip(rows, drive_gains(rig), strict=True):
+            row[integrate.GAIN] = gain
+        rows[0][integrate.OFFSET] = rig.base_angle
+        return _geometry_cached(tuple(map(tuple, rows)))
     return _geometry_cached(
         tuple(
             (
                 j.linkage.base_pin, j.linkage.arm_pin, j.linkage.mid_length, j.linkage.offset,
                 j.cylinder.cap_area, j.cylinder.rod_area,
-                j.cylinder.cap_pipe_volume, j.cylinder.rod_pipe_volume, j.cylinder.stroke,
+                j.cylinder.cap_pipe_volume, j.cylinder.rod_pipe_volume, j.cylinder.stroke, 0.0,
             )
             for j in rig.joints
         )
@@ -162,7 +175,8 @@ def simulate(
     ys[0, : 4 * N] = np.concatenate((start.q, start.qd, start.p_cap, start.p_rod))
     inputs = _inputs(drive)[first : first + samples]
     atol = np.repeat(
-        [ATOL_ANGLE, ATOL_RATE, ATOL_PRESSURE, ATOL_PRESSURE, ATOL_HIDDEN], [N, N, N, N, hidden]
+        [ATOL_ANGLE, ready.rate_tolerance, ATOL_PRESSURE, ATOL_PRESSURE, ATOL_HIDDEN],
+        [N, N, N, N, hidden],
     )
     status, filled, evaluations = integrate.integrate(
         (ready.addresses, ready.ends, ready.hidden_ends, ready.prepares, ready.par),
@@ -184,6 +198,11 @@ def _result(
     q, qd, cap, rod = (ys[:, k * N : (k + 1) * N].copy() for k in range(4))
     q[:, drive.locked] = inputs[:, 2 + N : 2 + 2 * N][:, drive.locked]
     qd[:, drive.locked] = inputs[:, 2 + 2 * N : 2 + 3 * N][:, drive.locked]
+    evaluated = int(evaluations)
+    if (geometry[:, integrate.GAIN] != 0.0).all():
+        return Simulation(
+            drive.rate, q, qd, cap, rod, q, qd, failure, int(filled), 0, evaluated, electric=True
+        )
     a, c, mid, offset = geometry[:, :4].T
     length = np.sqrt(a**2 + c**2 - 2 * a * c * np.cos(q + offset))
     slope = a * c * np.sin(q + offset) / length
@@ -194,7 +213,7 @@ def _result(
         beyond |= ((p[:filled, free] < 0) | (p[:filled, free] > p_s)).any(axis=1)
     return Simulation(
         drive.rate, q, qd, cap, rod, length - mid, slope * qd, failure, int(filled),
-        int(beyond.sum()), int(evaluations),
+        int(beyond.sum()), evaluated,
     )  # fmt: skip
 
 

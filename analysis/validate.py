@@ -1,4 +1,4 @@
-"""Validation: the model driven by the measured spool against what was measured.
+"""Validation: the model driven by the measured spool (electric: drive) against what was measured.
 
 FIT = 100 (1 - |y - yhat| / |y - mean y|) per channel (NOTES, Table IV), free run from the record's
 first sample; windowed RMSE restarts the model from the data every 0.25 s, which shows the model's
@@ -8,13 +8,14 @@ rates without the drift that a free run collects.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analysis.differentiate import Smoother
+from analysis.effects.measurement import corrected_channels
 from analysis.model import Model, finite, refuse_other_rig
 from analysis.rows import Filtering, default_filtering
 from analysis.signals import Signals, aligned_channels, condition
@@ -49,6 +50,7 @@ class RecordValidation:
     simulation: Simulation
     measured: Mapping[str, Array]
     time: Array
+    units: Mapping[str, str] = field(default_factory=dict)
 
 
 def fit_percent(measured: Array, simulated: Array) -> float:
@@ -81,10 +83,13 @@ def validate_record(
     """Validate on one record (see `validate`)."""
     smoother = filtering(record).channels
     signals = _seen_by(model, rig, condition(rig, record, smoother))
-    measured = _compared(aligned_channels(rig, record), signals)
+    # A sensor that the model says is wrong is put right before anything is compared with it.
+    channels = aligned_channels(rig, record)
+    channels = corrected_channels(rig, model.terms, channels, record.sample_rate)
+    measured = _compared(rig, channels, signals)
     ready, drive = compiled(model), drive_of(signals)
-    free = simulate(ready, drive, first_state(rig, record, signals))
-    channels = free.channels()
+    free = simulate(ready, drive, first_state(rig, record, signals, channels))
+    simulated = free.channels()
     windows = dict.fromkeys(measured, 0.0)
     count = 0
     for first, length in _windows(record, smoother):
@@ -97,14 +102,15 @@ def validate_record(
     return RecordValidation(
         record.name,
         record.step,
-        {name: fit_percent(y, channels[name]) for name, y in measured.items()},
-        {name: float(np.sqrt(np.mean((y - channels[name]) ** 2))) for name, y in measured.items()},
+        {name: fit_percent(y, simulated[name]) for name, y in measured.items()},
+        {name: float(np.sqrt(np.mean((y - simulated[name]) ** 2))) for name, y in measured.items()},
         {name: float(np.sqrt(v / count)) if count else np.nan for name, v in windows.items()},
         free.failure,
         free.outside,
         free,
         measured,
         record.time,
+        {name: rig.unit_of(name) for name in measured},
     )
 
 
@@ -116,12 +122,13 @@ def _seen_by(model: Model, rig: Rig, signals: Signals) -> Signals:
     return signals
 
 
-def _compared(channels: Mapping[str, Array], signals: Signals) -> dict[str, Array]:
-    """Return the measured piston and pressures of the excited joints."""
+def _compared(rig: Rig, channels: Mapping[str, Array], signals: Signals) -> dict[str, Array]:
+    """Return the measured piston and pressures (electric: position) of the excited joints."""
+    kinds = (rig.position_kind,) if rig.electric else (ch.PISTON, ch.CAP, ch.ROD)
     return {
         ch.channel(kind, i + 1): channels[ch.channel(kind, i + 1)]
         for i in map(int, np.flatnonzero(signals.excited))
-        for kind in (ch.PISTON, ch.CAP, ch.ROD)
+        for kind in kinds
     }
 
 
@@ -131,15 +138,17 @@ def _windows(record: Record, smoother: Smoother) -> Iterator[tuple[int, int]]:
         yield first, length
 
 
-def first_state(rig: Rig, record: Record, signals: Signals) -> State:
+def first_state(
+    rig: Rig, record: Record, signals: Signals, channels: Mapping[str, Array] | None = None
+) -> State:
     """Return the state at the first sample, from a cubic fitted to the first 40 ms of data.
 
-    The filter has no samples before the first; a short one-sided fit is the better edge. The
-    velocity is the fit's first derivative.
+    `channels` defaults to the record's, aligned. The filter has no samples before the first; a
+    short one-sided fit is the better edge. The velocity is the fit's first derivative.
     """
     count = min(record.samples, max(START_DEGREE + 2, round(START_SAMPLES * record.sample_rate)))
     t = np.arange(count) / record.sample_rate
-    channels = aligned_channels(rig, record)
+    channels = aligned_channels(rig, record) if channels is None else channels
     state = state_at(signals, 0)
     q, qd, cap, rod = (a.copy() for a in (state.q, state.qd, state.p_cap, state.p_rod))
     for i in map(int, np.flatnonzero(signals.excited)):
@@ -148,7 +157,10 @@ def first_state(rig: Rig, record: Record, signals: Signals) -> State:
             samples = channels[ch.channel(kind, joint + 1)][:count]
             return np.asarray(np.polynomial.polynomial.polyfit(t, samples, START_DEGREE))
 
-        s = fitted(ch.PISTON)
+        s = fitted(rig.position_kind)
+        if rig.electric:
+            q[i], qd[i] = s[0], s[1]
+            continue
         linkage = rig.joints[i].linkage
         q[i] = linkage.angle(s[0])
         qd[i] = s[1] / linkage.jacobian(q[i])

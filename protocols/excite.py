@@ -14,7 +14,8 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from protocols.model import Multisine, Sine
+from protocols.model import Lines as ChosenLines
+from protocols.model import Multisine, Signal, Sine
 
 Array = NDArray[np.float64]
 Lines = NDArray[np.int64]
@@ -126,12 +127,7 @@ def make_multisine(signal: Multisine, sample_rate: float) -> Waveform:
     stroke binds as much as the voltage does. The same seed gives the same samples. Raises
     ValueError where the period is not a whole number of samples or a line is beyond Nyquist.
     """
-    cycles, n = whole_period(signal.base_frequency, sample_rate)
-    if cycles != 1:
-        raise ValueError(
-            f"base_frequency {signal.base_frequency:g} Hz: its period is "
-            f"{sample_rate / signal.base_frequency:.6g} samples, not a whole number"
-        )
+    n = _period(signal.base_frequency, sample_rate)
     rng = np.random.default_rng(signal.seed)
     lines, empty = choose_lines(signal, rng)
     if lines[-1] >= n // 2:
@@ -146,11 +142,59 @@ def make_multisine(signal: Multisine, sample_rate: float) -> Waveform:
     return Waveform(start_centred(wave, lines), _ints(lines), _ints(empty))
 
 
-def make_waveform(signal: Sine | Multisine, sample_rate: float) -> Waveform:
-    """Make one period of any signal; raises ValueError as `make_sine` and `make_multisine` do."""
+def make_lines(signal: ChosenLines, sample_rate: float) -> Waveform:
+    """Make one period of chosen lines, rotated to start centred as every waveform is.
+
+    Raises ValueError where the period is not a whole number of samples or a line is beyond
+    Nyquist.
+    """
+    n = _period(signal.base_frequency, sample_rate)
+    lines = np.array(signal.lines, dtype=np.int64)
+    if lines[-1] >= n // 2:
+        raise ValueError(f"line {lines[-1]} is beyond half the sample rate")
+    amplitudes = np.array(signal.amplitudes) * np.exp(1j * np.array(signal.phases))
+    wave = start_centred(_sum_of_lines(n, lines, amplitudes), lines)
+    return Waveform(wave, _ints(lines), tuple(sorted(signal.detection_lines)))
+
+
+def chosen_lines(wave: Waveform, base_frequency: float) -> ChosenLines:
+    """Return the chosen lines that make this waveform: amplitudes and phases from its spectrum."""
+    spectrum = np.fft.rfft(wave.samples)[list(wave.lines)] * (2.0 / wave.period)
+    return ChosenLines(
+        kind="lines",
+        base_frequency=base_frequency,
+        lines=wave.lines,
+        amplitudes=tuple(float(a) for a in np.abs(spectrum)),
+        phases=tuple(float(a) for a in np.angle(spectrum)),
+        detection_lines=wave.detection_lines,
+    )
+
+
+def scaled(signal: Signal, factor: float) -> Signal:
+    """Return the signal with all its amplitudes multiplied."""
+    if isinstance(signal, ChosenLines):
+        amplitudes = tuple(factor * a for a in signal.amplitudes)
+        return signal.model_copy(update={"amplitudes": amplitudes})
+    return signal.model_copy(update={"amplitude": factor * signal.amplitude})
+
+
+def make_waveform(signal: Signal, sample_rate: float) -> Waveform:
+    """Make one period of any signal; raises ValueError as the makers of its kind do."""
     if isinstance(signal, Sine):
         return make_sine(signal, sample_rate)
+    if isinstance(signal, ChosenLines):
+        return make_lines(signal, sample_rate)
     return make_multisine(signal, sample_rate)
+
+
+def _period(base_frequency: float, sample_rate: float) -> int:
+    cycles, n = whole_period(base_frequency, sample_rate)
+    if cycles != 1:
+        raise ValueError(
+            f"base_frequency {base_frequency:g} Hz: its period is "
+            f"{sample_rate / base_frequency:.6g} samples, not a whole number"
+        )
+    return n
 
 
 def _sum_of_lines(n: int, lines: Lines, amplitudes: NDArray[np.complex128]) -> Array:

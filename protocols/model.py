@@ -9,6 +9,7 @@ What depends on the rig (joints that exist, limits, sample rate) is checked by `
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import (
@@ -22,7 +23,7 @@ from pydantic import (
 )
 
 from rig.model.parameters import MAX_JOINTS
-from rig.model.quantity import Frequency, Length, Time, UnitError, Voltage, parse_quantity
+from rig.model.quantity import Angle, Frequency, Length, Time, UnitError, Voltage, parse_quantity
 
 CLOSED: Final = "closed"
 END_MIN: Final = "end_min"
@@ -121,7 +122,32 @@ class Multisine(_Part):
         return self
 
 
-Signal = Annotated[Sine | Multisine, Field(discriminator="kind")]
+class Lines(_Part):
+    """Chosen lines with an amplitude and a phase each: sum_k A_k cos(2 pi k f0 t + phi_k)."""
+
+    kind: Literal["lines"]
+    base_frequency: Frequency = Field(gt=0, description="spacing of the lines, 1 / period")
+    lines: tuple[int, ...] = Field(min_length=1, description="numbers of the excited lines")
+    amplitudes: tuple[Voltage, ...] = Field(description="peak of each line [V]")
+    phases: tuple[Angle, ...] = Field(description="of each line's cosine [rad]")
+    detection_lines: tuple[int, ...] = Field(default=(), description="lines left empty on purpose")
+
+    @model_validator(mode="after")
+    def _one_of_each(self) -> Self:
+        for name, values in (("amplitudes", self.amplitudes), ("phases", self.phases)):
+            if len(values) != len(self.lines):
+                raise ValueError(f"{name} has {len(values)} entries for {len(self.lines)} lines")
+        if any(a <= 0 for a in self.amplitudes):
+            raise ValueError("amplitudes must be above zero; leave a line out instead")
+        if self.lines[0] < 1 or any(a >= b for a, b in pairwise(self.lines)):
+            raise ValueError("lines must be numbers from 1 on in rising order")
+        both = sorted(set(self.lines) & set(self.detection_lines))
+        if both:
+            raise ValueError(f"line {both[0]} is excited and a detection line; it can be one")
+        return self
+
+
+Signal = Annotated[Sine | Multisine | Lines, Field(discriminator="kind")]
 
 
 class Centring(_Part):

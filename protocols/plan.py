@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from protocols.excite import Waveform, make_waveform
+from protocols.excite import Waveform, make_waveform, scaled
 from protocols.model import CLOSED, END_MAX, Excite, Lock, Multisine, Place, Protocol, Step
 from rig.model.parse import InputError
 from rig.model.rig import Rig
@@ -167,10 +167,9 @@ def _kept(protocol: Protocol, names: Sequence[str] | None) -> tuple[Step, ...]:
 def _changed(step: Step, place: int, overrides: Overrides) -> Step:
     excite = []
     for part in step.excite:
-        update: dict[str, object] = {"amplitude": part.signal.amplitude * overrides.amplitude_scale}
-        if overrides.seed is not None and isinstance(part.signal, Multisine):
-            update["seed"] = overrides.seed + place
-        signal = part.signal.model_copy(update=update)
+        signal = scaled(part.signal, overrides.amplitude_scale)
+        if overrides.seed is not None and isinstance(signal, Multisine):
+            signal = signal.model_copy(update={"seed": overrides.seed + place})
         excite.append(part.model_copy(update={"signal": signal}))
     return step.model_copy(
         update={

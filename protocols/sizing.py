@@ -9,7 +9,7 @@ from protocols.candidates import AMPLITUDE, played, told
 from protocols.centring import Array
 from protocols.check import Twin, centred, judge_motion
 from protocols.check_report import Prediction
-from protocols.model import Protocol, Step
+from protocols.model import Multisine, Protocol, Step
 from protocols.plan import resolve
 from rig.model.parse import InputError
 from rig.model.rig import Rig
@@ -49,7 +49,9 @@ def sized(step: Step, seed: int, rig: Rig, twin: Twin) -> tuple[Step, Mapping[st
             tried = played(step, AMPLITUDE * SMALLER**size, tilt, seed)
             moved = motion_within(tried, rig, twin)
             if moved is not None:
-                found.setdefault(tried.excite[0].signal.amplitude, (tried, moved))
+                signal = tried.excite[0].signal
+                assert isinstance(signal, Multisine)  # as `played` makes them
+                found.setdefault(signal.amplitude, (tried, moved))
                 break
         if found and max(found) >= MODEST:
             break

@@ -22,6 +22,8 @@ _UNITS: Mapping[str, tuple[str, float]] = {
     "f_min": ("Hz", 1.0),
     "f_max": ("Hz", 1.0),
     "amplitude": ("V", 1.0),
+    "amplitudes": ("V", 1.0),
+    "phases": ("rad", 1.0),
     "drift": ("mm", 1e3),
     "offset": ("mm", 1e3),
     "centre": ("mm", 1e3),
@@ -31,11 +33,27 @@ _UNITS: Mapping[str, tuple[str, float]] = {
 }
 
 
+_DIGITS: Mapping[str, int] = {"amplitudes": 5, "phases": 5}  # significant; others: 12
+
+
+class _Row(list[Any]):
+    """A list of plain values, written on one line."""
+
+
+class _Dumper(yaml.SafeDumper):
+    """A dumper of its own, so that the library's is left alone."""
+
+
+_Dumper.add_representer(
+    _Row, lambda dumper, row: dumper.represent_sequence("tag:yaml.org,2002:seq", row, True)
+)
+
+
 def protocol_text(protocol: Protocol, comment: str = "") -> str:
     """Return the YAML of a protocol, `comment` above it; only what differs from the defaults."""
     data = _quantities(protocol.model_dump(mode="json", exclude_defaults=True))
     lines = [f"# {line}".rstrip() for line in comment.splitlines()]
-    body = yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=100)
+    body = yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100)
     return "\n".join([*lines, body])
 
 
@@ -43,8 +61,10 @@ def _quantities(value: Any, key: str = "") -> Any:
     if isinstance(value, dict):
         return {name: _quantities(item, name) for name, item in value.items()}
     if isinstance(value, list):
-        return [_quantities(item) for item in value]
+        items = [_quantities(item, key) for item in value]
+        return items if any(isinstance(item, dict) for item in items) else _Row(items)
     if key in _UNITS and value is not None:
         unit, scale = _UNITS[key]
-        return f"{float(f'{value * scale:.12g}'):.12g} {unit}"
+        digits = _DIGITS.get(key, 12)
+        return f"{float(f'{value * scale:.{digits}g}'):.{digits}g} {unit}"
     return value

@@ -15,21 +15,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.signals import Signals
-from analysis.terms.base import Term
+from analysis.terms.base import Kernel, Term, Used, kernel
+from rig.model.parse import InputError
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
+# Order of preparation: sensors, null of the spool, its lag, its edges, supply and return, the rest.
+SENSOR, NULL, LAG, EDGES, SUPPLY, PLANT = range(6)
+
 
 @dataclass(frozen=True)
 class Shape:
-    """A shape parameter: its parameter name, SI unit, physical bounds and points of first look."""
+    """A shape parameter: its parameter name, SI unit, physical bounds and points of first look.
+
+    At `neutral` the effect is not there; None where its size is a linear coefficient.
+    """
 
     parameter: str
     unit: str
     low: float
     high: float
     grid: tuple[float, ...]
+    neutral: float | None = None
 
 
 @dataclass(frozen=True)
@@ -38,12 +46,42 @@ class Effect(Term):
 
     `variable` names in plain words what the effect's contribution moves with; `confounders` are
     effects whose columns look alike on poor excitation, `separated_by` the excitation that tells
-    them apart.
+    them apart. `stage` orders the terms' `prepare` (see `ordered`): what a sensor distorts is
+    undone first, then comes what acts on the spool, in the oil's own order.
     """
 
+    family: ClassVar[str] = ""
     variable: ClassVar[str] = ""
     confounders: ClassVar[tuple[str, ...]] = ()
     separated_by: ClassVar[str] = ""
+    stage: ClassVar[int] = PLANT
+
+    @property
+    def place(self) -> str:
+        """Where it is, in the contract's words: `bench`, `joint I` or `joint I cap|rod`."""
+        words = self.where.split()
+        return " ".join(words[:2]) if words[-1] in ("piston", "spool") else self.where
+
+    @property
+    def joint(self) -> int:
+        """Its joint, 0-based; raises InputError where `where` names none."""
+        words = self.where.split()
+        if len(words) < 2 or words[0] != "joint" or not words[1].isdecimal() or words[1] == "0":
+            raise InputError(f"effect {self.name!r}: where {self.where!r} is not like 'joint 1'")
+        return int(words[1]) - 1
+
+    @property
+    def side(self) -> str:
+        """What `where` says after the joint: `cap`, `rod`, a sensor, or nothing."""
+        return self.where.split()[2] if len(self.where.split()) > 2 else ""
+
+    def absorbed(self, rig: Rig) -> str:
+        """Say why the baseline's free parameters hide it completely ('' if they do not)."""
+        return ""
+
+    def twins(self) -> tuple[tuple[str, str], ...]:
+        """Return (name, where) of effects that no data of this rig can tell from it."""
+        return ()
 
     @classmethod
     def places(cls, rig: Rig) -> tuple[str, ...]:
@@ -68,3 +106,41 @@ class Effect(Term):
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return, by equation, the variable (n,) to plot that equation's residual against."""
         raise NotImplementedError
+
+    def shape_of(self, rig: Rig, shape: Sequence[float]) -> tuple[float, ...]:
+        """Return the shape, or each parameter's middle point of first look where none is given."""
+        if len(shape):
+            return tuple(shape)
+        return tuple(s.grid[len(s.grid) // 2] for s in self.shapes(rig))
+
+    def outside(self, rig: Rig, shape: Sequence[float]) -> str:
+        """Say which shape parameter lies on or beyond its physical bounds ('' if none)."""
+        for s, value in zip(self.shapes(rig), shape, strict=True):
+            margin = 1e-3 * (s.high - s.low)
+            low = s.low + (margin if s.neutral is None or s.neutral != s.low else 0.0)
+            if not low <= value <= s.high - margin:
+                return (
+                    f"{s.parameter} = {value:.4g} {s.unit} lies at the edge of what is physical, "
+                    f"{s.low:.4g} to {s.high:.4g}"
+                )
+        return ""
+
+
+def beyond(parameter: str, value: float, unit: str, high: float, low: float = 0.0) -> str:
+    """Say that a coefficient is not within (low, high) ('' if it is)."""
+    if low < value < high:
+        return ""
+    return f"{parameter} = {value:.4g} {unit} is not between {low:.4g} and {high:.4g}"
+
+
+def ordered(terms: Sequence[Used]) -> tuple[Used, ...]:
+    """Return the terms in the order in which they must prepare (see `Effect.stage`), stable."""
+    return tuple(sorted(terms, key=lambda used: getattr(used.term, "stage", PLANT)))
+
+
+@kernel
+def _nothing(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    pass
+
+
+NO_KERNEL: Kernel = _nothing  # of effects that the plant does not feel

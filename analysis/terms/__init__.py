@@ -5,12 +5,17 @@ from __future__ import annotations
 import functools
 import importlib
 import pkgutil
+from collections.abc import Sequence
 from typing import Final
 
 from analysis.terms.base import Term
+from rig.model.electric import UNKNOWN, ElectricRig
 from rig.model.parse import InputError
+from rig.model.rig import Rig
 
 PACKAGES: Final = ("analysis.terms", "analysis.effects")
+ELECTRIC: Final = ("inertia", "viscous_friction")
+INCLINED: Final = "inclined_gravity"  # gravity with the base's angle as one more unknown
 BASELINE: Final = ("inertia", "viscous_friction", "gravity", "compressibility", "orifice")
 
 
@@ -34,6 +39,39 @@ def make(name: str, where: str = "bench") -> Term:
         raise InputError(
             f"unknown term {name!r}; this version knows: {' '.join(sorted(known()))}"
         ) from None
+
+
+def baseline_of(rig: Rig) -> tuple[Term, ...]:
+    """Return the terms that every model of the rig has."""
+    if not isinstance(rig, ElectricRig):
+        return baseline()
+    weight = INCLINED if rig.inclination == UNKNOWN else "gravity"
+    pulled = not rig.prismatic and rig.gravity > 0
+    return tuple(make(name) for name in (*ELECTRIC, *((weight,) if pulled else ())))
+
+
+def with_effects(rig: Rig, effects: Sequence[str]) -> tuple[Term, ...]:
+    """Return the baseline with effects added: `name` (at every joint) or `name@joint 1`.
+
+    Raises InputError for an unknown name or place. With `base_inclination` the angle is found by
+    least squares: `inclined_gravity` takes gravity's place.
+    """
+    terms = list(baseline_of(rig))
+    for effect in effects:
+        name, _, where = (part.strip() for part in effect.partition("@"))
+        each = [where] if where else ["bench"]
+        if not where and make(name).per_joint:
+            each = [f"joint {i}" for i in range(1, len(rig.joints) + 1)]
+        for place in each:
+            term = make(INCLINED if name == "base_inclination" else name, place)
+            if term in terms:
+                raise InputError(f"effect {name!r} at {place} is in the model already")
+            if term.per_joint and term.joint >= len(rig.joints):
+                raise InputError(f"effect {name!r}: rig {rig.name!r} has no {place}")
+            if name == "base_inclination":
+                terms = [t for t in terms if t.name != "gravity"]
+            terms.append(term)
+    return tuple(terms)
 
 
 def baseline() -> tuple[Term, ...]:

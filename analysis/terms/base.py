@@ -35,6 +35,7 @@ from numba import cfunc, types
 from numpy.typing import NDArray
 
 from analysis.signals import Mask, Signals
+from rig.model.parse import InputError
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
@@ -89,6 +90,20 @@ class Coefficient:
 
 
 @dataclass(frozen=True)
+class Reduction:
+    """Linear unknowns x = h(p) of fewer parameters p: names of both, a start, h and dh/dp.
+
+    `start` maps x (k,) to p (m,); `value` maps p to x; `slope` maps p to (k, m).
+    """
+
+    linear: tuple[str, ...]
+    parameters: tuple[str, ...]
+    start: Callable[[Array], Array]
+    value: Callable[[Array], Array]
+    slope: Callable[[Array], Array]
+
+
+@dataclass(frozen=True)
 class Term:
     """One effect at one place; a subclass sets `name` and overrides what it needs.
 
@@ -97,6 +112,8 @@ class Term:
 
     name: ClassVar[str]
     prepares: ClassVar[bool] = False  # whether the kernel acts in phase PREPARE
+    rate_tolerance: ClassVar[float] = 1e-5  # [rad/s] that simulation needs because of this term
+    per_joint: ClassVar[bool] = False  # whether it is at one joint, `where` being `joint I`
     where: str = "bench"
 
     @property
@@ -107,6 +124,22 @@ class Term:
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return the linear unknowns, in the order of `pack`."""
         raise NotImplementedError
+
+    def parameters(self, rig: Rig) -> tuple[Coefficient, ...]:
+        """Return the model's parameters (default: the linear unknowns themselves)."""
+        return self.coefficients(rig)
+
+    def reduction(self, rig: Rig) -> Reduction | None:
+        """Return how fewer parameters make the linear unknowns, where they do."""
+        return None
+
+    @property
+    def joint(self) -> int:
+        """The joint, 0-based, of `joint I`; raises InputError for another `where`."""
+        words = self.where.split()
+        if len(words) != 2 or words[0] != "joint" or not words[1].isdecimal() or words[1] == "0":
+            raise InputError(f"term {self.name!r}: where {self.where!r} is not like 'joint 1'")
+        return int(words[1]) - 1
 
     def shape_names(self) -> tuple[str, ...]:
         """Name the shape parameters (0 to 2) that enter nonlinearly."""
@@ -124,6 +157,10 @@ class Term:
         """Return, by equation, where (n,) the term's equation holds (default: everywhere)."""
         return {}
 
+    def tolerance(self, shape: Sequence[float]) -> float:
+        """Return the tolerance of rates [rad/s] that the simulation needs because of this term."""
+        return self.rate_tolerance
+
     def hidden(self, rig: Rig) -> int:
         """Return the number of hidden states that the kernel integrates."""
         return 0
@@ -132,7 +169,7 @@ class Term:
         """Return the kernel's `par` (default: coefficients as in the rows, then the shape)."""
         linear = [
             1.0 / values[c.parameter] if c.reciprocal else values[c.parameter]
-            for c in self.coefficients(rig)
+            for c in self.parameters(rig)
         ]
         return np.array([*linear, *shape], dtype=np.float64)
 

@@ -22,7 +22,6 @@ from analysis.terms.base import (
     equation,
     kernel,
 )
-from rig.model.parameters import parameter_unit
 from rig.model.rig import Rig
 
 
@@ -40,7 +39,7 @@ class Gravity(Term):
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return W_1 .. W_N [kg m]."""
         names = (f"W{i}" for i in range(1, len(rig.joints) + 1))
-        return tuple(Coefficient(name, parameter_unit(name), "mechanical") for name in names)
+        return tuple(Coefficient(name, rig.unit_of_parameter(name), "mechanical") for name in names)
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return g sin(theta_k) in the rows of joints 1 .. k."""

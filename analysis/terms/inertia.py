@@ -23,7 +23,7 @@ from analysis.terms.base import (
     equation,
     kernel,
 )
-from rig.model.parameters import inertia_names, parameter_unit
+from rig.model.parameters import inertia_names
 from rig.model.rig import Rig
 
 
@@ -46,7 +46,7 @@ class Inertia(Term):
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return M1 | M1 M2 R12 | R_ij."""
         names = inertia_names(len(rig.joints))
-        return tuple(Coefficient(name, parameter_unit(name), "mechanical") for name in names)
+        return tuple(Coefficient(name, rig.unit_of_parameter(name), "mechanical") for name in names)
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return the torque columns of every inertia parameter."""

@@ -18,7 +18,6 @@ from analysis.terms.base import (
     equation,
     kernel,
 )
-from rig.model.parameters import parameter_unit
 from rig.model.rig import Rig
 
 
@@ -36,7 +35,7 @@ class ViscousFriction(Term):
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return Fv_1 .. Fv_N [N m s/rad]."""
         names = (f"Fv{i}" for i in range(1, len(rig.joints) + 1))
-        return tuple(Coefficient(name, parameter_unit(name), "mechanical") for name in names)
+        return tuple(Coefficient(name, rig.unit_of_parameter(name), "mechanical") for name in names)
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return q_i' in the rows of joint i."""

@@ -74,20 +74,19 @@ def check(
     step: StepOption = None,
     json: JsonOption = None,
 ) -> None:
-    """Read, resolve and prove a protocol against the limits on the twin; nothing moves.
+    """Prove a protocol against the limits on the twin and predict its errors; nothing moves.
 
     Example: bramah check lock-and-excite --rig shinshu-2dof
     """
-    from rig.cli.running import check_protocol, overridden
+    from rig.cli.foresight import as_dict, foresee, prediction_text
+    from rig.cli.running import overridden
     from rig.cli.sheets import check_text
 
-    report = check_protocol(
-        protocol, rig, overridden(repeats, duration, amplitude_scale, wave_seed, step)
-    )
-    write_json(json, report.as_dict())
+    found = foresee(protocol, rig, overridden(repeats, duration, amplitude_scale, wave_seed, step))
+    write_json(json, as_dict(found))
     if json != Path("-"):
-        typer.echo(check_text(report))
-    report.require()
+        typer.echo(f"{check_text(found.limits)}\n\n{prediction_text(found)}")
+    found.limits.require()
 
 
 def run(

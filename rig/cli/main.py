@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import importlib
 import logging
+import os
+import pkgutil
 import sys
+from typing import Final
 
 import typer
 
-from rig.cli import (
-    analysis_commands,
-    bench_commands,
-    demo_command,
-    figures_command,
-    pendulum_command,
-    plan_command,
-)
+import rig.cli
 from rig.cli.errors import guarded
+
+# Matrices here are tall and narrow, and there are many: BLAS threads get in each other's way.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# Shown first, in this order; every other module named *_command registers its verbs after them.
+FIRST: Final = ("demo_command", "bench_commands", "plan_command", "analysis_commands")
 
 app = typer.Typer(
     name="bramah",
@@ -25,15 +28,9 @@ app = typer.Typer(
     add_completion=False,
     rich_markup_mode=None,
 )
-for module in (
-    demo_command,
-    bench_commands,
-    plan_command,
-    analysis_commands,
-    figures_command,
-    pendulum_command,
-):
-    module.register(app)
+_found = [m.name for m in pkgutil.iter_modules(rig.cli.__path__) if "_command" in m.name]
+for name in (*FIRST, *sorted(set(_found) - set(FIRST))):
+    importlib.import_module(f"rig.cli.{name}").register(app)
 
 
 def run(arguments: list[str] | None = None) -> None:

@@ -13,7 +13,7 @@ from protocols.model import Protocol
 from protocols.proof import Proof
 from protocols.write import protocol_text
 from rig.model.parse import InputError
-from rig.services.rigs import load_rig
+from rig.services.rigs import load_bench
 
 Say = Callable[[str], None]
 
@@ -38,7 +38,7 @@ def predictor() -> Predictor:
 
 def planned(wish: Wish, say: Say) -> Proof:
     """Generate or prove; returns the proof. Raises InputError for what does not fit together."""
-    rig, tools = load_rig(wish.rig), predictor()
+    rig, tools = load_bench(wish.rig), predictor()
     if wish.prove is not None:
         if wish.out is not None:
             raise InputError("--prove generates nothing to write: leave --out away, or --prove")

@@ -19,7 +19,7 @@ from rig.model.rig import Rig, Wire
 from rig.services.attach import AttachError, Publisher
 from rig.services.bench import Bench
 from rig.services.recorder import Recorder
-from rig.services.rigs import load_rig
+from rig.services.rigs import load_bench
 
 log = logging.getLogger(__name__)
 Say = Callable[[str], None]
@@ -51,7 +51,7 @@ def wire_at(endpoint: str, wire: Wire) -> Wire:
 
 
 def _plan(protocol: str, rig: str, overrides: Overrides) -> tuple[Rig, Plan]:
-    bench = load_rig(rig)
+    bench = load_bench(rig)
     return bench, resolve(library.load(protocol), bench, overrides)
 
 
@@ -122,7 +122,7 @@ def run_protocol(job: Job, say: Say) -> Path:
 
 def reset_device(rig: str, endpoint: str | None) -> str:
     """Clear a device's latched trip on a person's word; returns what had tripped it."""
-    described = load_rig(rig)
+    described = load_bench(rig)
     wire = described.wire if endpoint is None else wire_at(endpoint, described.wire)
     driver = make_driver(wire, described)
     try:

@@ -17,7 +17,12 @@ _END_SECONDS = 10.0
 
 @contextmanager
 def simulated_bench(
-    rig: str, *, seed: int, truth: Path | None = None, real_time: bool = False
+    rig: str,
+    *,
+    seed: int,
+    truth: Path | None = None,
+    real_time: bool = False,
+    scenario: Path | None = None,
 ) -> Iterator[str]:
     """Start `bramah sim` on a free port, yield its endpoint, end it; raises WorkError if it fails.
 
@@ -26,6 +31,7 @@ def simulated_bench(
     words = ["sim", "--rig", rig, "--port", "0", "--seed", str(seed), "--parent", str(os.getpid())]
     words += [] if truth is None else ["--truth", str(truth)]
     words += ["--real-time"] if real_time else []
+    words += [] if scenario is None else ["--scenario", str(scenario)]
     with subprocess.Popen(
         [sys.executable, "-c", _START, *words],
         stdout=subprocess.PIPE,

@@ -11,7 +11,7 @@ from hil_sim.server import EndpointError, serve, warm_up
 from rig.cli.errors import WorkError
 from rig.cli.output import write_json
 from rig.services.files import read_text
-from rig.services.rigs import load_rig
+from rig.services.rigs import load_bench
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ def _endpoint_first(endpoint: str) -> None:
 
 def serve_bench(what: Served) -> None:
     """Serve a simulated bench; raises InputError for bad files, WorkError for a busy port."""
-    rig = load_rig(what.rig)
+    rig = load_bench(what.rig)
     scenario = Scenario()
     if what.scenario is not None:
         scenario = parse_scenario(read_text(what.scenario, "a scenario"), str(what.scenario))

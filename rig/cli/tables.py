@@ -16,6 +16,7 @@ from rig.model.quantity import unit_map
 
 # SI unit of a parameter -> the unit it is shown in
 _SHOWN = {"Pa": "MPa"}
+_RESIDUAL = {"m": (1e3, "mm"), "rad": (1e3, "mrad"), "Pa": (1e-3, "kPa")}
 
 
 def _shown(estimate: Estimate) -> tuple[float, str]:
@@ -70,6 +71,8 @@ def identification_text(result: Identification, truth: Mapping[str, float] | Non
     """Return parameters, conditioning and every check in words."""
     lines = [parameter_table(result.estimates, truth), ""]
     for family, solution in result.solutions.items():
+        if not result.rows[family]:
+            continue  # a search has no rows
         lines.append(
             f"{family}: {result.rows[family]} rows, condition number "
             f"{solution.condition_number:.1f}"
@@ -88,8 +91,8 @@ def validation_text(results: Sequence[RecordValidation]) -> str:
     rows = []
     for result in results:
         for name, fit in result.fit.items():
-            is_piston = name.startswith("piston")
-            scale, unit = (1e3, "mm") if is_piston else (1e-3, "kPa")
+            si = result.units.get(name, "m" if name.startswith("piston") else "Pa")
+            scale, unit = _RESIDUAL[si]
             rows.append(
                 [
                     f"{result.record} {name}",

@@ -1,5 +1,8 @@
 """Names and units of what a bench measures (CONTRACT: `spool_i piston_i cap_pressure_i …`).
 
+Electric joints have `position_i` and `drive_i` instead; their units are the joint's
+(`Rig.unit_of`).
+
 Glossary: joint i is 1-based in names and 0-based in arrays; `command_i` is the voltage the
 device put out to the valve of joint i, kept beside what was measured.
 """
@@ -16,8 +19,11 @@ ROD: Final = "rod_pressure"
 COMMAND: Final = "command"
 SUPPLY: Final = "supply_pressure"
 TEMPERATURE: Final = "oil_temperature"
+POSITION: Final = "position"
+DRIVE: Final = "drive"
 
 JOINT_KINDS: Final = (SPOOL, PISTON, CAP, ROD)
+ELECTRIC_KINDS: Final = (POSITION, DRIVE)
 UNITS: Final[dict[str, str]] = {
     SPOOL: "V",
     PISTON: "m",
@@ -27,7 +33,8 @@ UNITS: Final[dict[str, str]] = {
     SUPPLY: "Pa",
     TEMPERATURE: "degC",
 }
-_NAME = re.compile(rf"^(?P<kind>{SPOOL}|{PISTON}|{CAP}|{ROD}|{COMMAND})_(?P<joint>[1-9]\d*)$")
+_KINDS = "|".join((*JOINT_KINDS, COMMAND, *ELECTRIC_KINDS))
+_NAME = re.compile(rf"^(?P<kind>{_KINDS})_(?P<joint>[1-9]\d*)$")
 
 
 def channel(kind: str, joint: int) -> str:
@@ -46,8 +53,11 @@ def kind_of(name: str) -> tuple[str, int | None]:
 
 
 def unit_of(name: str) -> str:
-    """Return the SI unit of a channel's samples; raises ValueError for an unknown name."""
-    return UNITS[kind_of(name)[0]]
+    """Return the SI unit of a channel's samples; raises ValueError for an unknown name.
+
+    Of an electric joint's channel only the rig knows it (`Rig.unit_of`): empty here.
+    """
+    return UNITS.get(kind_of(name)[0], "")
 
 
 def measured(joints: int, *, supply: bool, temperature: bool) -> tuple[str, ...]:

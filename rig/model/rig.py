@@ -5,13 +5,14 @@ Source of the geometry and constants: NOTES of the method, "Linkage" and "Bench 
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
+    ModelWrapValidatorHandler,
     ValidationInfo,
     field_validator,
     model_validator,
@@ -126,6 +127,7 @@ class Limits(_Part):
 class Joint(_Part):
     """One hydraulic joint: link, linkage, cylinder, valve and its limits."""
 
+    type: Literal["hydraulic"] = "hydraulic"
     name: str = Field(min_length=1)
     link_length: Length = Field(gt=0)
     linkage: Linkage
@@ -276,6 +278,21 @@ class Rig(_Part):
         description="design values by parameter name, for the twin and the report, not the fit",
     )
 
+    @model_validator(mode="wrap")
+    @classmethod
+    def _by_type(
+        cls, data: Any, handler: ModelWrapValidatorHandler[Self], info: ValidationInfo
+    ) -> Any:
+        """Hand a description of electric joints to `rig.model.electric.ElectricRig`."""
+        types = _types(data) if cls is Rig else set()
+        if "electric" not in types:
+            return handler(data)
+        if types != {"electric"}:
+            raise ValueError("joints of both types, hydraulic and electric, in one rig: not yet")
+        from rig.model.electric import ElectricRig  # noqa: PLC0415 - it is a Rig itself
+
+        return ElectricRig.model_validate(data, context=info.context)
+
     @field_validator("nominal", mode="before")
     @classmethod
     def _nominal_units(cls, value: object, info: ValidationInfo) -> object:
@@ -292,6 +309,34 @@ class Rig(_Part):
         if not info.context:
             return value
         return {k: parse_quantity(str(v), parameter_unit(k)) for k, v in value.items()}
+
+    @property
+    def electric(self) -> bool:
+        """Whether the joints are electric (`rig.model.electric`)."""
+        return False
+
+    @property
+    def position_kind(self) -> str:
+        """Channel kind of a joint's position."""
+        return ch.PISTON
+
+    @property
+    def joint_kinds(self) -> tuple[str, ...]:
+        """Channel kinds that an excited joint needs."""
+        return ch.JOINT_KINDS
+
+    @property
+    def base_angle(self) -> float:
+        """Known inclination of the base [rad], added to every absolute angle."""
+        return 0.0
+
+    def unit_of(self, channel: str) -> str:
+        """Return the unit of a channel's samples."""
+        return ch.unit_of(channel)
+
+    def unit_of_parameter(self, name: str) -> str:
+        """Return the SI unit of a parameter."""
+        return parameter_unit(name)
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -316,3 +361,11 @@ class Rig(_Part):
             c.cap_pipe_volume + (half + s) * c.cap_area,
             c.rod_pipe_volume + (half - s) * c.rod_area,
         )
+
+
+def _types(data: Any) -> set[str]:
+    """Return the types of the joints of a raw description, as far as it is one."""
+    joints = data.get("joints") if isinstance(data, dict) else None
+    if not isinstance(joints, list | tuple):
+        return set()
+    return {str(j.get("type", "hydraulic")) for j in joints if isinstance(j, dict)}

@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +36,11 @@ _OWN = ("step", "locked", "repeat", "sample_rate", "start_s", "period", "lines",
 
 
 def write_group(
-    file: h5py.File, group: str, columns: Mapping[str, Array], attributes: Mapping[str, Any]
+    file: h5py.File,
+    group: str,
+    columns: Mapping[str, Array],
+    attributes: Mapping[str, Any],
+    unit_of: Callable[[str], str] = ch.unit_of,
 ) -> None:
     """Write one group: a dataset with `units` per channel, attributes on the group."""
     target = file.create_group(group)
@@ -44,7 +48,7 @@ def write_group(
         target.attrs[key] = _plain(value)
     for name, values in columns.items():
         dataset = target.create_dataset(name, data=np.ascontiguousarray(values, dtype="<f8"))
-        dataset.attrs["units"] = ch.unit_of(name)
+        dataset.attrs["units"] = unit_of(name)
 
 
 def _plain(value: Any) -> Any:

@@ -102,7 +102,21 @@ def _read(source: _Source, entry: Entry) -> _Imported:
         scale, offset = source.maps.get(name, (1.0, 0.0))
         found[name] = raw * scale + offset if (scale, offset) != (1.0, 0.0) else raw
     rate, start = _time_base(source, file, found.pop(TIME, None))
-    return _Imported(entry, rate, start, {n: found[n] for n in every if n in found})
+    part = _part(entry, file, rate, len(next(iter(found.values()))))
+    channels = {n: found[n][part] for n in every if n in found}
+    return _Imported(entry, rate, start + part.start / rate, channels)
+
+
+def _part(entry: Entry, file: Path, rate: float, samples: int) -> slice:
+    """Return the samples between the entry's `begin` and `end`; raises InputError if none are."""
+    first = round(entry.begin * rate)
+    last = samples if entry.end is None else round(entry.end * rate)
+    if first >= samples - 1 or last > samples:
+        wanted = f"{entry.begin:g} s to {'the end' if entry.end is None else f'{entry.end:g} s'}"
+        raise InputError(
+            f"{file}: has {samples / rate:g} s of samples; the record asks for {wanted}"
+        )
+    return slice(first, last)
 
 
 def _read_columns(
@@ -233,5 +247,5 @@ def _write_archive(source: _Source, records: list[_Imported], folder: Path) -> N
                 "saturated_samples": 0,
                 "file": r.entry.file,
             }
-            archive.write_group(file, meta.name, r.channels, {**about, **more})
+            archive.write_group(file, meta.name, r.channels, {**about, **more}, source.rig.unit_of)
     archive.put_in_place(fresh, folder / archive.NAME)

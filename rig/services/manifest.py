@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from rig.model import channels as ch
 from rig.model.parse import InputError, load_yaml, validate_model
-from rig.model.quantity import Frequency, UnitError, unit_map
+from rig.model.quantity import Frequency, Time, UnitError, unit_map
 from rig.model.rig import Rig
 from rig.services.files import read_text
 from rig.services.recorder import RecordMeta
@@ -41,7 +41,10 @@ class Column(_Part):
 
 
 class Entry(_Part):
-    """One file, one record; `period` [samples] and `lines` describe a periodic excitation."""
+    """One file, one record, or the part of it from `begin` to `end`.
+
+    `period` [samples] and `lines` describe a periodic excitation.
+    """
 
     file: str = Field(min_length=1)
     step: str = Field(min_length=1)
@@ -50,10 +53,14 @@ class Entry(_Part):
     name: str = ""
     period: int = Field(default=0, ge=0)
     lines: tuple[int, ...] = ()
+    begin: Time = Field(default=0.0, ge=0, description="first sample, from the file's start [s]")
+    end: Time | None = Field(default=None, gt=0, description="last sample is before this [s]")
 
     @model_validator(mode="after")
     def _can_be_named(self) -> Self:
         self.meta()
+        if self.end is not None and self.end <= self.begin:
+            raise ValueError(f"end {self.end:g} s is not after begin {self.begin:g} s")
         if any(line < 1 for line in self.lines):
             raise ValueError("lines are multiples of 1/period, 1 and up")
         return self
@@ -123,7 +130,7 @@ def check_against_rig(
                 f"{path}:{line}: columns.{name}: no channel of rig {rig.name!r}; expected one of: "
                 f"{', '.join(known)}"
             )
-        si = "s" if name == TIME else ch.unit_of(name)
+        si = "s" if name == TIME else rig.unit_of(name)
         try:
             factor, shift = unit_map(si if column.unit is None else column.unit, si)
         except UnitError as error:
@@ -134,11 +141,15 @@ def check_against_rig(
 
 
 def _all_channels(rig: Rig) -> tuple[str, ...]:
+    if rig.electric:
+        return rig.channels
     commands = [ch.channel(ch.COMMAND, i + 1) for i in range(len(rig.joints))]
     return (*ch.measured(len(rig.joints), supply=True, temperature=True), *commands)
 
 
 def channels_of(rig: Rig) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return (channels a record must have, channels it may have) of an import."""
+    if rig.electric:
+        return rig.channels, ()
     required = ch.measured(len(rig.joints), supply=False, temperature=False)
     return required, tuple(name for name in _all_channels(rig) if name not in required)

@@ -40,6 +40,17 @@ def rig_text(name_or_path: str | Path, relative_to: Path | None = None) -> tuple
         raise InputError(f"{error}, or the name of a shipped rig: {known}") from error
 
 
+def load_bench(name: str | Path) -> Rig:
+    """Load a rig that this software can drive; raises InputError, also for an electric one."""
+    rig = load_rig(name)
+    if rig.electric:
+        raise InputError(
+            f"rig {rig.name!r} is electric: its records can be imported, identified and "
+            "validated, but only hydraulic benches are driven and simulated over a wire"
+        )
+    return rig
+
+
 def load_rig(name_or_path: str | Path, relative_to: Path | None = None) -> Rig:
     """Load a rig by shipped name or path; raises InputError naming file, line and expectation."""
     text, source = rig_text(name_or_path, relative_to)

@@ -15,6 +15,7 @@ FIR = [
     d.moving_average(RATE),
     d.butterworth(RATE, 80.0),
     d.savitzky_golay(RATE),
+    d.smoothing_spline(RATE, 80.0),
     d.channel_filter(RATE),
     d.row_filter(RATE, 15.0),
 ]

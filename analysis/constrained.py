@@ -1,0 +1,198 @@
+"""Least squares under linear equalities, linear inequalities and a linear matrix inequality.
+
+    minimise |X beta - y|^2   subject to   E beta = 0,   G beta >= 0,   sum_i beta_i F_i >= 0
+
+The problem is convex, so the answer is the answer. The equalities are eliminated with a basis of
+their null space, the inequalities enter as logarithmic barriers, and Newton's method follows the
+central path until the duality gap, (number of inequalities) / t, is negligible against |y|^2.
+Source: Boyd and Vandenberghe, Convex Optimization, sections 11.3 and 11.4.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import null_space
+
+from rig.model.parse import InputError
+
+Array = NDArray[np.float64]
+
+GAP = 1e-13  # of |y|^2
+FASTER = 15.0  # factor of t from one point of the central path to the next
+NEWTON_STEPS = 60
+ACTIVE = 1e-5  # of its size where the data alone put it: a constraint this near zero is active
+
+
+@dataclass(frozen=True)
+class Feasible:
+    """Constraints on beta (k,): E (e, k), G (g, k) and the symmetric forms F (k, n, n), labelled.
+
+    n = 0 where there is no matrix inequality.
+    """
+
+    equal: Array
+    equal_labels: tuple[str, ...]
+    positive: Array
+    positive_labels: tuple[str, ...]
+    forms: Array
+    form_label: str = ""
+
+    def form(self, beta: Array) -> Array:
+        """Return sum_i beta_i F_i (n, n)."""
+        return np.asarray(np.tensordot(beta, self.forms, axes=1))
+
+    def violated(self, beta: Array) -> list[str]:
+        """Name the inequalities that beta breaks."""
+        out = [
+            label
+            for label, value in zip(self.positive_labels, self.positive @ beta, strict=True)
+            if value < 0
+        ]
+        if self.forms.shape[1] and np.linalg.eigvalsh(self.form(beta))[0] < 0:
+            out.append(self.form_label)
+        return out
+
+
+@dataclass(frozen=True)
+class Minimum:
+    """The constrained solution, and rows C (q, k) with labels: what holds it, C beta = 0 there."""
+
+    beta: Array
+    active: Array
+    labels: tuple[str, ...]
+
+
+def minimise(X: Array, y: Array, feasible: Feasible) -> Minimum:
+    """Solve the problem for rows or a triangle X (m, k), y (m,); raises InputError if it cannot."""
+    scale = np.linalg.norm(X, axis=0)
+    if not (scale > 0).all():
+        raise InputError("the rows leave a parameter undetermined; nothing can be constrained")
+    basis = null_space(feasible.equal / scale) if len(feasible.equal) else np.eye(len(scale))
+    A = X / scale @ basis
+    G = (feasible.positive / scale) @ basis
+    G = G / np.maximum(np.linalg.norm(G, axis=1, keepdims=True), 1e-300)
+    F = np.tensordot(basis.T, feasible.forms / scale[:, None, None], axes=1)
+    F = F / max(float(np.abs(F).max(initial=0.0)), 1e-300)
+    x = np.asarray(np.linalg.lstsq(A, y, rcond=None)[0])
+    free = x
+    if not _inside(x, G, F):
+        x = _follow(A, y, G, F, _interior(x, G, F))
+    beta = basis @ x / scale
+    rows, labels = list(feasible.equal), list(feasible.equal_labels)
+    for label, row, at, alone in zip(
+        feasible.positive_labels, feasible.positive, G @ x, G @ free, strict=True
+    ):
+        if at <= ACTIVE * abs(alone) and alone < 0:
+            rows.append(row)
+            labels.append(label)
+    if F.shape[1] and _least(free, F) < 0:
+        values, vectors = np.linalg.eigh(np.tensordot(x, F, axes=1))
+        for value, v in zip(values, vectors.T, strict=True):
+            if value <= ACTIVE * abs(_least(free, F)):
+                rows.append(np.einsum("i,kij,j->k", v, feasible.forms, v))
+                labels.append(feasible.form_label)
+    return Minimum(beta, np.array(rows).reshape(len(rows), len(scale)), tuple(labels))
+
+
+def _least(x: Array, F: Array) -> float:
+    return float(np.linalg.eigvalsh(np.tensordot(x, F, axes=1))[0])
+
+
+def _inside(x: Array, G: Array, F: Array) -> bool:
+    return bool((G @ x > 0).all()) and (not F.shape[1] or _least(x, F) > 0)
+
+
+def _barrier(x: Array, G: Array, F: Array) -> tuple[float, Array, Array]:
+    """Return - sum log(Gx) - log det F(x), its gradient and Hessian; x inside."""
+    c = G @ x
+    value, gradient = -float(np.log(c).sum()), -G.T @ (1.0 / c)
+    hessian = (G / c[:, None] ** 2).T @ G
+    if F.shape[1]:
+        P = np.tensordot(x, F, axes=1)
+        inverse = np.linalg.inv(P)
+        turned = np.einsum("ij,kjl->kil", inverse, F)
+        value -= float(np.linalg.slogdet(P)[1])
+        gradient = gradient - np.einsum("kii->k", turned)
+        hessian = hessian + np.einsum("kij,lji->kl", turned, turned)
+    return value, gradient, hessian
+
+
+def _interior(x: Array, G: Array, F: Array) -> Array:
+    """Return a point strictly inside, by driving a common slack s below zero from where it holds.
+
+    Raises InputError where the constraints leave no interior.
+    """
+    n = F.shape[1]
+    wide = np.vstack((np.column_stack((G, np.ones(len(G)))), np.zeros((1, len(x) + 1))))
+    wide[-1, -1] = 1.0  # with the constant below: s > -size, the cone alone has no lower end
+    size = max(float(np.linalg.norm(x)), 1.0)
+    wider = np.concatenate((F, np.eye(n)[None]))
+    worst = float(np.min(G @ x, initial=0.0))
+    worst = min(worst, _least(x, F)) if n else worst
+    z = np.append(x, -2.0 * worst + size)
+    target, t = np.zeros(len(z)), 1.0
+    for _ in range(400):
+        shifted = np.append(np.zeros(len(G)), size)
+        gradient, hessian = _shifted(z, wide, shifted, wider)
+        target[:] = 0.0
+        target[-1] = t / size
+        # Staying near the data's own point keeps the search bounded.
+        pull = 1e-3 * np.append(z[:-1] - x, 0.0) / size**2
+        ridge = 1e-3 * np.diag(np.append(np.ones(len(x)), 0.0)) / size**2
+        step = -np.linalg.solve(hessian + ridge, gradient + target + pull)
+        length = 1.0
+        while length > 1e-12 and not _held(z + length * step, wide, shifted, wider):
+            length *= 0.5
+        z = z + 0.9 * length * step
+        if z[-1] < 0 and _inside(z[:-1], G, F):
+            return np.asarray(z[:-1])
+        t *= 1.2
+    raise InputError("the constraints leave no parameter set strictly inside them")
+
+
+def _held(z: Array, G: Array, shift: Array, F: Array) -> bool:
+    return bool((G @ z + shift > 0).all()) and (not F.shape[1] or _least(z, F) > 0)
+
+
+def _shifted(z: Array, G: Array, shift: Array, F: Array) -> tuple[Array, Array]:
+    """Return gradient and Hessian of - sum log(Gz + shift) - log det F(z)."""
+    c = G @ z + shift
+    gradient = -G.T @ (1.0 / c)
+    hessian = (G / c[:, None] ** 2).T @ G
+    more = _barrier(z, np.zeros((0, len(z))), F)
+    return gradient + more[1], hessian + more[2]
+
+
+def _follow(A: Array, y: Array, G: Array, F: Array, x: Array) -> Array:
+    """Follow the central path from x, strictly inside, to the minimum."""
+    many = len(G) + F.shape[1]
+    size = max(float(y @ y), 1e-300)
+    H, g = A.T @ A, A.T @ y
+    t = many / size
+    while True:
+        for _ in range(NEWTON_STEPS):
+            value, gradient, hessian = _barrier(x, G, F)
+            slope = t * (H @ x - g) + gradient
+            step = -np.linalg.solve(t * H + hessian, slope)
+            decrement = -float(slope @ step)
+            if decrement < 1e-10:
+                break
+            now = 0.5 * t * float(x @ H @ x - 2 * g @ x) + value
+            length = 1.0
+            while length > 1e-14:
+                trial = x + length * step
+                if _inside(trial, G, F):
+                    later = 0.5 * t * float(trial @ H @ trial - 2 * g @ trial)
+                    later += _barrier(trial, G, F)[0]
+                    if later <= now - 0.1 * length * decrement:
+                        break
+                length *= 0.5
+            else:
+                break  # rounding: the path cannot be followed more closely
+            x = x + length * step
+        if many / t < GAP * size:
+            return x
+        t *= FASTER

@@ -1,0 +1,182 @@
+"""Effects on the oil's stiffness: free air, and volume that the rig file does not know."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar, Final
+
+import numpy as np
+
+from analysis.effects.base import Array, Effect, Shape, beyond
+from analysis.signals import Signals
+from analysis.terms.base import (
+    COMP_CAP,
+    COMP_ROD,
+    CONTRIBUTE,
+    P_CAP,
+    P_ROD,
+    PREPARE,
+    V_CAP,
+    V_ROD,
+    Coefficient,
+    Columns,
+    Kernel,
+    equation,
+    kernel,
+)
+from rig.model.rig import Rig
+
+ATMOSPHERE: Final = 101_325.0  # [Pa]
+DEEPEST: Final = 0.95 * ATMOSPHERE  # below gauge zero: a colder vacuum is a sensor's error
+MOST_AIR: Final = 0.2
+MOST_VOLUME: Final = 10.0  # of the pipes' volume
+
+
+@dataclass(frozen=True)
+class EntrainedAir(Effect):
+    """A share alpha of free air at atmospheric pressure p0 makes the oil softer at low pressure.
+
+    1/b_eff = 1/b + alpha p0 / (p + p0)^2, p gauge: an isothermal gas (Merritt 1967, chapter 2;
+    Wylie and Streeter 1993, with polytropic exponent 1: bubbles of less than a
+    millimetre keep the oil's temperature). Linear in alpha.
+    """
+
+    name: ClassVar[str] = "entrained_air"
+    family: ClassVar[str] = "fluid"
+    variable: ClassVar[str] = "the pressure rate at low chamber pressure"
+    confounders: ClassVar[tuple[str, ...]] = ("dead_volume", "spool_lag", "channel_delay")
+    separated_by: ClassVar[str] = (
+        "fast pressure changes at low and at high chamber pressure: dead volume is equally soft"
+    )
+
+    @property
+    def kernel(self) -> Kernel:
+        """The compiled contribution."""
+        return _air
+
+    @classmethod
+    def places(cls, rig: Rig) -> tuple[str, ...]:
+        """Return the bench, where it is hydraulic."""
+        return () if getattr(rig, "electric", False) else ("bench",)
+
+    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
+        """Return alpha [-]."""
+        return (Coefficient("alpha_air", "", "fluid"),)
+
+    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
+        """Return - V dp/dt p0 / (p + p0)^2 of each chamber."""
+        out: Columns = {}
+        for i in range(signals.joints):
+            for side, V, p, rate in (
+                ("flow_cap", signals.V_cap, signals.p_cap, signals.pd_cap),
+                ("flow_rod", signals.V_rod, signals.p_rod, signals.pd_rod),
+            ):
+                absolute = np.maximum(p[:, i], -DEEPEST) + ATMOSPHERE
+                column = -V[:, i] * rate[:, i] * ATMOSPHERE / absolute**2
+                out[equation(side, i)] = {"alpha_air": column}
+        return out
+
+    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
+        """Refuse air that stiffens, and froth."""
+        return beyond("alpha_air", values["alpha_air"], "", MOST_AIR)
+
+    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
+        """Return each chamber's pressure [Pa]."""
+        out: dict[str, Array] = {}
+        for i in range(signals.joints):
+            out[equation("flow_cap", i)] = signals.p_cap[:, i]
+            out[equation("flow_rod", i)] = signals.p_rod[:, i]
+        return out
+
+
+@dataclass(frozen=True)
+class DeadVolume(Effect):
+    """Oil between valve and chamber beyond the rig file's pipe volume: V = V_file + V_dead.
+
+    Enters as V_dead dp/dt / b (continuity; Merritt 1967, chapter 3), in proportion to the 1/b
+    that all chambers share: a shape, so that b stays one. One chamber alone is told from a
+    smaller b by the others; the same in all chambers is not, but for V's change with the piston.
+    """
+
+    name: ClassVar[str] = "dead_volume"
+    prepares: ClassVar[bool] = True
+    family: ClassVar[str] = "fluid"
+    variable: ClassVar[str] = "the chamber's pressure rate"
+    confounders: ClassVar[tuple[str, ...]] = ("entrained_air", "spool_lag", "channel_delay")
+    separated_by: ClassVar[str] = (
+        "fast pressure changes near both ends of the stroke, of several chambers"
+    )
+    where: str = "joint 1 cap"
+
+    @property
+    def kernel(self) -> Kernel:
+        """The compiled preparation."""
+        return _dead
+
+    @classmethod
+    def places(cls, rig: Rig) -> tuple[str, ...]:
+        """Return each chamber of each hydraulic joint."""
+        joints = () if getattr(rig, "electric", False) else super().places(rig)
+        return tuple(f"{joint} {side}" for joint in joints for side in ("cap", "rod"))
+
+    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
+        """Return nothing: the volume is a shape."""
+        return ()
+
+    def shape_names(self) -> tuple[str, ...]:
+        """Name the volume."""
+        return (f"V_dead_{self.joint + 1}_{self.side}",)
+
+    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
+        """Return the volume [m^3], up to ten times the pipes'."""
+        cylinder = rig.joints[self.joint].cylinder
+        known = cylinder.cap_pipe_volume if self.side == "cap" else cylinder.rod_pipe_volume
+        grid = (0.1 * known, 0.5 * known, 2.0 * known)
+        return (Shape(self.shape_names()[0], "m^3", 0.0, MOST_VOLUME * known, grid, 0.0),)
+
+    def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
+        """Add the volume to the chamber's."""
+        field = "V_cap" if self.side == "cap" else "V_rod"
+        V = getattr(signals, field).copy()
+        V[:, self.joint] += self.shape_of(rig, shape)[0]
+        return replace(signals, **{field: V})
+
+    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
+        """Return nothing: `compressibility` sees the larger volume."""
+        return {}
+
+    def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
+        """Return joint, volume of the cap side, of the rod side."""
+        V = self.shape_of(rig, shape)[0]
+        return np.array([self.joint, V * (self.side == "cap"), V * (self.side == "rod")])
+
+    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
+        """Refuse a volume at its bounds."""
+        return self.outside(rig, shape)
+
+    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
+        """Return the chamber's pressure rate [Pa/s]."""
+        rate = signals.pd_cap if self.side == "cap" else signals.pd_rod
+        return {equation(f"flow_{self.side}", self.joint): rate[:, self.joint]}
+
+
+@kernel
+def _air(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == CONTRIBUTE:
+        for i in range(x.shape[1]):
+            cap = max(x[P_CAP, i], -DEEPEST) + ATMOSPHERE
+            rod = max(x[P_ROD, i], -DEEPEST) + ATMOSPHERE
+            out[COMP_CAP, i] += par[0] * x[V_CAP, i] * ATMOSPHERE / (cap * cap)
+            out[COMP_ROD, i] += par[0] * x[V_ROD, i] * ATMOSPHERE / (rod * rod)
+
+
+@kernel
+def _dead(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == PREPARE:
+        i = int(par[0])
+        x[V_CAP, i] += par[1]
+        x[V_ROD, i] += par[2]
+
+
+TERMS = (EntrainedAir, DeadVolume)

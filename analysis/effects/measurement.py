@@ -1,0 +1,280 @@
+"""Effects of measurement: a channel that lags, a wrong gain, an offset.
+
+They transform data, not the model: `prepare` undoes them in the signals, and the plant's equations
+hold between what is left. `correct` does the same to sampled channels, so that a simulation is
+compared with what a right sensor would have shown.
+
+`where` is `joint I cap|rod` for a chamber's pressure, `joint I piston|spool` for those sensors
+(reported as `joint I`: the parameter's name says which), and `bench` for the supply pressure.
+Source: each is the first-order model of a sensor, reading(t) = gain x(t - delay) + offset.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar, Final
+
+import numpy as np
+
+from analysis.differentiate import align
+from analysis.effects.base import NO_KERNEL, SENSOR, Array, Effect, Shape
+from analysis.signals import Signals
+from analysis.terms.base import Coefficient, Columns, Kernel, Used, equation
+from rig.model import channels as ch
+from rig.model.rig import Rig
+
+KINDS: Final = {"cap": ch.CAP, "rod": ch.ROD, "piston": ch.PISTON, "spool": ch.SPOOL}
+MARGIN: Final = 16  # [samples] that the interpolation of a shift reaches
+
+
+@dataclass(frozen=True)
+class Sensor(Effect):
+    """What the three share: the channel, and the way from one channel to all that follows."""
+
+    family: ClassVar[str] = "measurement"
+    stage: ClassVar[int] = SENSOR
+    where: str = "joint 1 piston"
+
+    @property
+    def kernel(self) -> Kernel:
+        """The plant does not feel its sensors."""
+        return NO_KERNEL
+
+    @property
+    def channel(self) -> str:
+        """The channel's name."""
+        if self.where == "bench":
+            return ch.SUPPLY
+        return ch.channel(KINDS[self.side], self.joint + 1)
+
+    @classmethod
+    def places(cls, rig: Rig) -> tuple[str, ...]:
+        """Return every channel that the model uses."""
+        if getattr(rig, "electric", False):
+            return ()
+        joints = range(1, len(rig.joints) + 1)
+        supply = ("bench",) if rig.sensors.supply_pressure is not None else ()
+        return (*(f"joint {i} {side}" for i in joints for side in KINDS), *supply)
+
+    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
+        """Return nothing: what a sensor distorts stands in every column."""
+        return ()
+
+    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
+        """Return nothing."""
+        return {}
+
+    def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
+        """Return nothing."""
+        return np.zeros(1)
+
+    def undone(self, x: Array, order: int, rate: float, value: float) -> Array:
+        """Return d^order/dt^order of the true quantity from that of the reading x (n,)."""
+        raise NotImplementedError
+
+    def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
+        """Undo the distortion in the channel's signal and all that is made of it."""
+        value = self.shape_of(rig, shape)[0]
+        if self.where == "bench":
+            return replace(signals, p_s=self.undone(signals.p_s, 0, signals.rate, value))
+        if self.side == "piston":
+            return self._moved(rig, signals, value)
+        fields = {"spool": ("u",), "cap": ("p_cap", "pd_cap"), "rod": ("p_rod", "pd_rod")}
+        new = {}
+        for order, field in enumerate(fields[self.side]):
+            new[field] = getattr(signals, field).copy()
+            x = new[field][:, self.joint]
+            new[field][:, self.joint] = self.undone(x, order, signals.rate, value)
+        return replace(signals, **new)
+
+    def _moved(self, rig: Rig, signals: Signals, value: float) -> Signals:
+        """Return the signals with another piston: angles, Jacobian and volumes follow."""
+        i, linkage = self.joint, rig.joints[self.joint].linkage
+        names = ("s", "sd", "q", "qd", "qdd", "G", "V_cap", "V_rod")
+        new = {name: getattr(signals, name).copy() for name in names}
+        old_slope = np.asarray(linkage.jacobian_rate(signals.q[:, i]))
+        acceleration = signals.G[:, i] * signals.qdd[:, i] + old_slope * signals.qd[:, i] ** 2
+        rate = signals.rate
+        s = self.undone(signals.s[:, i], 0, rate, value)
+        half = 0.55 * rig.joints[i].cylinder.stroke
+        s = np.clip(s, -half, half)
+        q = np.asarray(linkage.angle(s))
+        G, slope = np.asarray(linkage.jacobian(q)), np.asarray(linkage.jacobian_rate(q))
+        sd = self.undone(signals.sd[:, i], 1, rate, value)
+        new["s"][:, i], new["sd"][:, i], new["q"][:, i], new["G"][:, i] = s, sd, q, G
+        new["qd"][:, i] = sd / G
+        sdd = self.undone(acceleration, 2, rate, value)
+        new["qdd"][:, i] = (sdd - slope * (sd / G) ** 2) / G
+        volumes = rig.chamber_volumes(i, s)
+        # Other effects may have added to the volumes.
+        for field, now, before in zip(
+            ("V_cap", "V_rod"), volumes, rig.chamber_volumes(i, signals.s[:, i]), strict=True
+        ):
+            new[field][:, i] += now - before
+        turn = np.zeros_like(signals.theta)
+        turn[:, i:] = (q - signals.q[:, i])[:, None]
+        return replace(signals, theta=signals.theta + turn, **new)
+
+    def correct(
+        self, rig: Rig, channels: Mapping[str, Array], rate: float, shape: Sequence[float]
+    ) -> dict[str, Array]:
+        """Return the channels as a right sensor would have sampled them, each (n,)."""
+        out = dict(channels)
+        if self.channel in out:
+            value = self.shape_of(rig, shape)[0]
+            out[self.channel] = self.undone(out[self.channel], 0, rate, value)
+        return out
+
+    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
+        """Refuse a shape at its bounds."""
+        return self.outside(rig, shape)
+
+    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
+        """Return the channel, in the rows where it stands first."""
+        if self.where == "bench":
+            kinds = ("flow_cap", "flow_rod")
+            joints = range(signals.joints)
+            return {equation(kind, i): signals.p_s for kind in kinds for i in joints}
+        i = self.joint
+        flows = (equation("flow_cap", i), equation("flow_rod", i))
+        if self.side == "spool":
+            return dict.fromkeys(flows, self._shown(signals.u))
+        if self.side == "piston":
+            return {name: self._shown(signals.sd) for name in (*flows, equation("torque", i))}
+        p = signals.p_cap if self.side == "cap" else signals.p_rod
+        rows = (equation(f"flow_{self.side}", i), equation("torque", i))
+        return {name: self._shown(p) for name in rows}
+
+    def _shown(self, x: Array) -> Array:
+        return x[:, self.joint]
+
+
+@dataclass(frozen=True)
+class ChannelDelay(Sensor):
+    """reading(t) = x(t - delay), beyond the delay and skew that the rig file states."""
+
+    name: ClassVar[str] = "channel_delay"
+    variable: ClassVar[str] = "the channel's rate"
+    confounders: ClassVar[tuple[str, ...]] = ("spool_lag", "entrained_air", "dead_volume")
+    separated_by: ClassVar[str] = (
+        "a wide band: a delay turns the phase in proportion to frequency and leaves the amplitude"
+    )
+
+    def shape_names(self) -> tuple[str, ...]:
+        """Name the delay."""
+        return (f"delay_{self.channel}",)
+
+    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
+        """Return the delay [s], up to a tenth of a second."""
+        return (Shape(self.shape_names()[0], "s", 0.0, 0.1, (5e-4, 2e-3, 8e-3, 3e-2), 0.0),)
+
+    def undone(self, x: Array, order: int, rate: float, value: float) -> Array:
+        """Return x(t + delay)."""
+        return align(x, value * rate)
+
+    def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
+        """Advance the channel; the samples that come from beyond the record's end are invalid."""
+        lost = math.ceil(self.shape_of(rig, shape)[0] * signals.rate) + MARGIN
+        valid = signals.valid.copy()
+        valid[len(valid) - lost :] = False
+        return super().prepare(rig, replace(signals, valid=valid), shape)
+
+    def _shown(self, x: Array) -> Array:
+        return np.gradient(x[:, self.joint])
+
+
+@dataclass(frozen=True)
+class SensorGain(Sensor):
+    """reading = gain x."""
+
+    name: ClassVar[str] = "sensor_gain"
+    variable: ClassVar[str] = "the channel itself"
+    confounders: ClassVar[tuple[str, ...]] = (
+        "sensor_offset",
+        "supply_sag",
+        "tank_pressure",
+        "pressure_dependent_friction",
+    )
+    separated_by: ClassVar[str] = (
+        "two amplitudes and two working points: an offset does not grow with either"
+    )
+
+    def absorbed(self, rig: Rig) -> str:
+        """Say that the flow gains take up a spool's."""
+        return "the flow gains take a spool's gain up completely" if self.side == "spool" else ""
+
+    def shape_names(self) -> tuple[str, ...]:
+        """Name the gain."""
+        return (f"gain_{self.channel}",)
+
+    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
+        """Return reading over truth [-], between two thirds and one and a half."""
+        return (Shape(self.shape_names()[0], "", 0.67, 1.5, (0.9, 0.98, 1.02, 1.1), 1.0),)
+
+    def undone(self, x: Array, order: int, rate: float, value: float) -> Array:
+        """Return x / gain."""
+        return x / value
+
+
+@dataclass(frozen=True)
+class SensorOffset(Sensor):
+    """reading = x + offset, in the channel's unit.
+
+    Of a spool's LVDT it is the null's offset to the data, and stands there under that name
+    (`spool_offset`); it is offered for all other channels.
+    """
+
+    name: ClassVar[str] = "sensor_offset"
+    variable: ClassVar[str] = "nothing: it is constant"
+    confounders: ClassVar[tuple[str, ...]] = (
+        "torque_offset",
+        "sensor_gain",
+        "base_inclination",
+        "internal_leakage",
+        "tank_pressure",
+    )
+    separated_by: ClassVar[str] = (
+        "working points far apart: low and high pressure, both ends of the stroke"
+    )
+
+    def twins(self) -> tuple[tuple[str, str], ...]:
+        """Return the null's offset for a spool: valve and sensor are one to the data."""
+        return (("spool_offset", self.place),) if self.side == "spool" else ()
+
+    @classmethod
+    def places(cls, rig: Rig) -> tuple[str, ...]:
+        """Return every channel that the model uses but the spools."""
+        return tuple(place for place in super().places(rig) if not place.endswith("spool"))
+
+    def shape_names(self) -> tuple[str, ...]:
+        """Name the offset."""
+        return (f"offset_{self.channel}",)
+
+    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
+        """Return the offset, within a tenth of the sensor's span."""
+        kind = ch.kind_of(self.channel)[0]
+        low, high = rig.sensors.of(kind).range
+        span = high - low
+        grid = (-0.02 * span, -0.004 * span, 0.004 * span, 0.02 * span)
+        unit = ch.unit_of(self.channel)
+        return (Shape(self.shape_names()[0], unit, -0.1 * span, 0.1 * span, grid, 0.0),)
+
+    def undone(self, x: Array, order: int, rate: float, value: float) -> Array:
+        """Return x - offset; derivatives as they are."""
+        return x - value if order == 0 else x
+
+
+def corrected_channels(
+    rig: Rig, terms: Sequence[Used], channels: Mapping[str, Array], rate: float
+) -> dict[str, Array]:
+    """Return the sampled channels with every sensor effect of a model undone, each (n,)."""
+    out = dict(channels)
+    for used in terms:
+        if isinstance(used.term, Sensor):
+            out = used.term.correct(rig, out, rate, used.shape)
+    return out
+
+
+TERMS = (ChannelDelay, SensorGain, SensorOffset)

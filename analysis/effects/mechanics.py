@@ -1,0 +1,245 @@
+"""Effects on the arm: an inclined base, a spring, a constant torque (payload: `payload.py`)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+
+from analysis.effects.base import Array, Effect, Shape, beyond
+from analysis.signals import Signals
+from analysis.terms.base import (
+    CONTRIBUTE,
+    PREPARE,
+    THETA,
+    TORQUE,
+    Coefficient,
+    Columns,
+    Kernel,
+    Q,
+    equation,
+    kernel,
+)
+from rig.model.rig import Rig
+
+
+def torque_limit(rig: Rig, joint: int) -> float:
+    """Return half of the largest torque of the joint's cylinder [N m] at mid-stroke."""
+    if getattr(rig, "electric", False):
+        j = rig.joints[joint]
+        return 0.5 * abs(float(j.drive.gain)) * float(j.limits.drive)  # type: ignore[attr-defined]
+    linkage, cylinder = rig.joints[joint].linkage, rig.joints[joint].cylinder
+    lever = abs(float(linkage.jacobian(linkage.angle(0.0))))
+    return 0.5 * lever * cylinder.cap_area * rig.supply.pressure
+
+
+@dataclass(frozen=True)
+class BaseInclination(Effect):
+    """All absolute angles turned by one angle alpha: link k pulls W_k g sin(theta_k + alpha).
+
+    Inertia sees differences of absolute angles only, so turning them changes gravity alone (NOTES,
+    "N DOF planar chain"); W_k cos(alpha) and W_k sin(alpha) share one alpha, which is therefore a
+    shape and not N linear unknowns.
+    """
+
+    name: ClassVar[str] = "base_inclination"
+    prepares: ClassVar[bool] = True
+    family: ClassVar[str] = "mechanics"
+    variable: ClassVar[str] = "the cosine of the absolute angles"
+    confounders: ClassVar[tuple[str, ...]] = ("torque_offset", "joint_spring", "sensor_offset")
+    separated_by: ClassVar[str] = (
+        "slow motion of every joint over its whole stroke at several poses of the others"
+    )
+
+    @property
+    def kernel(self) -> Kernel:
+        """The compiled contribution."""
+        return _inclination
+
+    @classmethod
+    def places(cls, rig: Rig) -> tuple[str, ...]:
+        """Return the bench."""
+        return ("bench",)
+
+    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
+        """Return nothing: the angle is a shape."""
+        return ()
+
+    def shape_names(self) -> tuple[str, ...]:
+        """Name the angle."""
+        return ("inclination",)
+
+    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
+        """Return alpha [rad], up to 20 degrees either way."""
+        return (Shape("inclination", "rad", -0.35, 0.35, (-0.1, -0.02, 0.02, 0.1), 0.0),)
+
+    def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
+        """Turn the absolute angles."""
+        return replace(signals, theta=signals.theta + self.shape_of(rig, shape)[0])
+
+    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
+        """Return nothing: `gravity` sees the turned angles."""
+        return {}
+
+    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
+        """Refuse an angle at its bounds."""
+        return self.outside(rig, shape)
+
+    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
+        """Return each link's absolute angle [rad]."""
+        return {equation("torque", i): signals.theta[:, i] for i in range(signals.joints)}
+
+
+@kernel
+def _inclination(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == PREPARE:
+        for i in range(x.shape[1]):
+            x[THETA, i] += par[0]
+
+
+@dataclass(frozen=True)
+class JointSpring(Effect):
+    """Torque k (q - rest) back to the rest angle (a hose, a counterweight's spring): Hooke.
+
+    The rest angle is a shape; where the records cannot fix it, mid-stroke is as good.
+    """
+
+    name: ClassVar[str] = "joint_spring"
+    family: ClassVar[str] = "mechanics"
+    variable: ClassVar[str] = "the joint's angle"
+    confounders: ClassVar[tuple[str, ...]] = ("torque_offset", "base_inclination")
+    separated_by: ClassVar[str] = (
+        "slow motion over the whole stroke at two poses of the other joints: gravity goes with the "
+        "absolute angle, the spring with the joint's own"
+    )
+    per_joint: ClassVar[bool] = True
+    where: str = "joint 1"
+
+    @property
+    def kernel(self) -> Kernel:
+        """The compiled contribution."""
+        return _spring
+
+    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
+        """Return k [N m/rad]."""
+        return (Coefficient(f"k_spring_{self.joint + 1}", "N*m/rad", "mechanical"),)
+
+    def shape_names(self) -> tuple[str, ...]:
+        """Name the rest angle."""
+        return (f"rest_{self.joint + 1}",)
+
+    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
+        """Return the rest angle [rad], anywhere in the joint's reach."""
+        low, high = _reach(rig, self.joint)
+        middle = 0.5 * (low + high)
+        if not getattr(rig, "electric", False):
+            middle = float(rig.joints[self.joint].linkage.angle(0.0))
+        return (Shape(f"rest_{self.joint + 1}", "rad", low, high, (middle,)),)
+
+    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
+        """Return q - rest."""
+        rest = self.shape_of(rig, shape)[0]
+        column = signals.q[:, self.joint] - rest
+        return {equation("torque", self.joint): {f"k_spring_{self.joint + 1}": column}}
+
+    def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
+        """Return joint, k, rest."""
+        k = values[f"k_spring_{self.joint + 1}"]
+        return np.array([self.joint, k, self.shape_of(rig, shape)[0]])
+
+    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
+        """Refuse a spring that pushes away, one too stiff to move, a rest out of reach."""
+        name = f"k_spring_{self.joint + 1}"
+        low, high = _reach(rig, self.joint)
+        stiffest = torque_limit(rig, self.joint) / (0.5 * (high - low))
+        return beyond(name, values[name], "N*m/rad", stiffest) or self.outside(rig, shape)
+
+    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
+        """Return the joint's angle [rad]."""
+        return {equation("torque", self.joint): signals.q[:, self.joint]}
+
+
+def _reach(rig: Rig, joint: int) -> tuple[float, float]:
+    """Return the joint's smallest and largest angle."""
+    if getattr(rig, "electric", False):
+        low, high = rig.joints[joint].limits.position  # type: ignore[attr-defined]
+        return float(low), float(high)
+    part = rig.joints[joint]
+    ends = [float(part.linkage.angle(side * 0.5 * part.cylinder.stroke)) for side in (-1, 1)]
+    return min(ends), max(ends)
+
+
+@kernel
+def _spring(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == CONTRIBUTE:
+        i = int(par[0])
+        out[TORQUE, i] -= par[1] * (x[Q, i] - par[2])
+
+
+@dataclass(frozen=True)
+class TorqueOffset(Effect):
+    """A constant torque T on the joint, positive where it opens it: M q'' + ... = G F + T.
+
+    Of an electric joint the benchmark's sign and name are kept: M q'' + ... + offset = torque.
+    """
+
+    name: ClassVar[str] = "torque_offset"
+    family: ClassVar[str] = "mechanics"
+    variable: ClassVar[str] = "nothing: it is constant"
+    confounders: ClassVar[tuple[str, ...]] = (
+        "asymmetric_friction",
+        "base_inclination",
+        "joint_spring",
+        "sensor_offset",
+    )
+    separated_by: ClassVar[str] = (
+        "slow motion over the whole stroke: gravity, spring and a pressure's offset change with it"
+    )
+    per_joint: ClassVar[bool] = True
+    where: str = "joint 1"
+
+    @property
+    def kernel(self) -> Kernel:
+        """The compiled contribution."""
+        return _torque
+
+    def _name(self, rig: Rig) -> tuple[str, float]:
+        if getattr(rig, "electric", False):
+            return f"offset{self.joint + 1}", 1.0
+        return f"T_offset_{self.joint + 1}", -1.0
+
+    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
+        """Return T [N m] (electric: offset, N or N m)."""
+        unit = str(getattr(rig.joints[self.joint], "force_unit", "N*m"))
+        return (Coefficient(self._name(rig)[0], unit, "mechanical"),)
+
+    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
+        """Return -1: the offset stands with the drive (electric: +1)."""
+        name, sign = self._name(rig)
+        return {equation("torque", self.joint): {name: np.full(len(signals.t), sign)}}
+
+    def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
+        """Return joint and the torque on the load's side."""
+        name, sign = self._name(rig)
+        return np.array([self.joint, sign * values[name]])
+
+    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
+        """Refuse more than half of what the joint's drive can do."""
+        name = self._name(rig)[0]
+        limit = torque_limit(rig, self.joint)
+        return beyond(name, values[name], "N*m", limit, -limit)
+
+    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
+        """Return the joint's angle [rad]: the offset is level over it."""
+        return {equation("torque", self.joint): signals.q[:, self.joint]}
+
+
+@kernel
+def _torque(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == CONTRIBUTE:
+        out[TORQUE, int(par[0])] -= par[1]
+
+
+TERMS = (BaseInclination, JointSpring, TorqueOffset)

@@ -1,0 +1,148 @@
+"""A mass at the tip of the last link."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from analysis.effects.base import Array, Effect, beyond
+from analysis.signals import Signals
+from analysis.terms.base import (
+    CONTRIBUTE,
+    QD,
+    THETA,
+    TORQUE,
+    Coefficient,
+    Columns,
+    Kernel,
+    equation,
+    kernel,
+)
+from analysis.terms.gravity import Gravity
+from analysis.terms.inertia import Inertia, inertia_map
+from rig.model.parameters import inertia_names
+from rig.model.rig import Rig
+
+HEAVIEST = 200.0  # [kg] beyond what the catalogue's benches carry
+
+
+@dataclass(frozen=True)
+class Payload(Effect):
+    """A point mass m at the tip: R_ij grows by m l_i l_j, W_i by m l_i (NOTES, "N DOF chain").
+
+    Its columns are a sum of the baseline's own, so M, R and W of one run absorb it COMPLETELY: no
+    excitation of that run shows it. It is seen only against a reference: parameters of a model
+    identified without it (`payload_of_shift`), M, R and W held there.
+    """
+
+    name: ClassVar[str] = "payload"
+    family: ClassVar[str] = "mechanics"
+    variable: ClassVar[str] = "gravity and inertia alike"
+    confounders: ClassVar[tuple[str, ...]] = ()
+    separated_by: ClassVar[str] = (
+        "nothing within one run; a run without the payload, whose model is given as reference"
+    )
+
+    @property
+    def kernel(self) -> Kernel:
+        """The compiled contribution."""
+        return _payload
+
+    @classmethod
+    def places(cls, rig: Rig) -> tuple[str, ...]:
+        """Return the bench."""
+        return ("bench",)
+
+    def absorbed(self, rig: Rig) -> str:
+        """Say that the baseline's M, R and W take it all."""
+        return "M, R and W of one run take a payload up completely; compare with a run without it"
+
+    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
+        """Return m [kg]."""
+        return (Coefficient("m_payload", "kg", "mechanical"),)
+
+    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
+        """Return the sum of inertia's and gravity's columns, weighted by `growth`."""
+        weights = growth(rig)
+        out: Columns = {}
+        for term in (Inertia(), Gravity()):
+            for row, columns in term.columns(rig, signals, ()).items():
+                total = sum(weights[p] * column for p, column in columns.items())
+                here = out.setdefault(row, {"m_payload": np.zeros(len(signals.t))})
+                here["m_payload"] = here["m_payload"] + total
+        return out
+
+    def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
+        """Return m, g and the links' lengths."""
+        return np.array([values["m_payload"], rig.gravity, *(j.link_length for j in rig.joints)])
+
+    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
+        """Refuse a mass below nothing or beyond any bench."""
+        return beyond("m_payload", values["m_payload"], "kg", HEAVIEST)
+
+    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
+        """Return each link's absolute angle [rad]."""
+        return {equation("torque", i): signals.theta[:, i] for i in range(signals.joints)}
+
+
+def growth(rig: Rig) -> dict[str, float]:
+    """Return by how much each mechanical parameter grows per kilogram at the tip."""
+    lengths = np.array([j.link_length for j in rig.joints])
+    names = inertia_names(len(lengths))
+    # Of R = sum_k p_k E_k the coefficients are found by least squares on the disjoint patterns E.
+    patterns = inertia_map(len(lengths)).reshape(len(names), -1)
+    shares = np.linalg.lstsq(patterns.T, np.outer(lengths, lengths).ravel(), rcond=None)[0]
+    weights = {f"W{i}": float(length) for i, length in enumerate(lengths, start=1)}
+    return dict(zip(names, map(float, shares), strict=True)) | weights
+
+
+def payload_of_shift(
+    rig: Rig, reference: Mapping[str, float], found: Mapping[str, float], covariance: Array
+) -> tuple[float, float, float]:
+    """Return (m, its standard error [kg], misfit per degree of freedom) of a shift of parameters.
+
+    `covariance` (k, k) is that of the difference found - reference over the names of `growth`, in
+    their order. A misfit far above 1 says that something else than a payload moved them.
+    """
+    weights = growth(rig)
+    direction = np.array(list(weights.values()))
+    shift = np.array([found[name] - reference[name] for name in weights])
+    inverse = np.linalg.pinv(covariance)
+    information = float(direction @ inverse @ direction)
+    mass = float(direction @ inverse @ shift) / information
+    left = shift - mass * direction
+    dof = max(len(weights) - 1, 1)
+    return mass, information**-0.5, float(left @ inverse @ left) / dof
+
+
+@kernel
+def _payload(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    # The tip's Jacobian to joint i is the sum of l_k (cos, sin)(theta_k) over links k >= i; its
+    # acceleration at rest of the joints is the sum of l_k theta_k'^2 (-sin, cos)(theta_k).
+    if phase != CONTRIBUTE:
+        return
+    N = x.shape[1]
+    m, g = par[0], par[1]
+    ax, ay, rate = 0.0, 0.0, 0.0
+    for k in range(N):
+        rate += x[QD, k]
+        ax -= par[2 + k] * rate * rate * math.sin(x[THETA, k])
+        ay += par[2 + k] * rate * rate * math.cos(x[THETA, k])
+    jx_i, jy_i = 0.0, 0.0
+    for i in range(N - 1, -1, -1):
+        jx_i += par[2 + i] * math.cos(x[THETA, i])
+        jy_i += par[2 + i] * math.sin(x[THETA, i])
+        # theta = 0 hangs straight down: the tip's height grows by jy per unit of angle.
+        out[TORQUE, i] -= m * (jx_i * ax + jy_i * (ay + g))
+        jx_j, jy_j = 0.0, 0.0
+        for j in range(N - 1, -1, -1):
+            jx_j += par[2 + j] * math.cos(x[THETA, j])
+            jy_j += par[2 + j] * math.sin(x[THETA, j])
+            M[i, j] += m * (jx_i * jx_j + jy_i * jy_j)
+
+
+TERMS = (Payload,)

@@ -1,0 +1,251 @@
+"""Effects on the pressures at the valves' ports: a supply that sags, a return under pressure.
+
+Both follow the flow that all valves together take or give. The rows have that flow from the
+chambers' continuity, A s' + V p' / b with the rig's nominal b (the correction of a correction; left
+out where the rig states none); the simulation solves the orifices for it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar, Final
+
+import numpy as np
+from numba import njit
+
+from analysis.effects.base import SUPPLY, Array, Effect, Shape
+from analysis.signals import Signals
+from analysis.terms.base import (
+    P_CAP,
+    P_ROD,
+    P_S,
+    P_TANK,
+    PREPARE,
+    Coefficient,
+    Columns,
+    Kernel,
+    U,
+    equation,
+    kernel,
+)
+from rig.model.parameters import gain_names
+from rig.model.rig import Rig
+
+NEWTON: Final = 12  # steps; the equation is monotone and smooth but for u = 0
+
+
+@dataclass(frozen=True)
+class _PortEffect(Effect):
+    family: ClassVar[str] = "fluid"
+    prepares: ClassVar[bool] = True
+    stage: ClassVar[int] = SUPPLY
+
+    @classmethod
+    def places(cls, rig: Rig) -> tuple[str, ...]:
+        """Return the bench, where it is hydraulic."""
+        return () if getattr(rig, "electric", False) else ("bench",)
+
+    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
+        """Return nothing: pressures stand under the orifices' roots."""
+        return ()
+
+    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
+        """Return nothing: `orifice` sees the prepared pressures."""
+        return {}
+
+    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
+        """Refuse a shape at its bounds."""
+        return self.outside(rig, shape)
+
+
+def port_flow(rig: Rig, signals: Signals, drawn: bool) -> Array:
+    """Return the flow (n,) [m^3/s] that all valves draw from the supply, or give to the tank."""
+    softness = 1.0 / rig.nominal["b"] if "b" in rig.nominal else 0.0
+    total = np.zeros(len(signals.t))
+    for i, joint in enumerate(rig.joints):
+        cap, rod = joint.cylinder.cap_area, joint.cylinder.rod_area
+        into_cap = cap * signals.sd[:, i] + softness * signals.V_cap[:, i] * signals.pd_cap[:, i]
+        into_rod = softness * signals.V_rod[:, i] * signals.pd_rod[:, i] - rod * signals.sd[:, i]
+        ahead, astern = signals.u[:, i] > 0.0, signals.u[:, i] < 0.0
+        if drawn:
+            flow = np.where(ahead, into_cap, 0.0) + np.where(astern, into_rod, 0.0)
+        else:
+            flow = -np.where(ahead, into_rod, 0.0) - np.where(astern, into_cap, 0.0)
+        total += np.maximum(flow, 0.0)
+    return total
+
+
+@dataclass(frozen=True)
+class SupplySag(_PortEffect):
+    """The valves see less than the measured or nominal supply: p_s - dp (Q / Q_pump)^n.
+
+    Where the rig measures its supply, what can be missing is the line between sensor and valves,
+    turbulent, n = 2 (Merritt 1967, chapter 3); where it does not, the pressure-compensated pump
+    or relief valve gives way in proportion to the flow taken, n = 1. dp is a shape.
+    """
+
+    name: ClassVar[str] = "supply_sag"
+    variable: ClassVar[str] = "the flow drawn from the supply"
+    confounders: ClassVar[tuple[str, ...]] = ("tank_pressure", "sensor_gain", "sensor_offset")
+    separated_by: ClassVar[str] = (
+        "two amplitudes, one and both joints at once: the drop goes with the whole bench's flow"
+    )
+
+    @property
+    def kernel(self) -> Kernel:
+        """The compiled preparation."""
+        return _sag
+
+    def exponent(self, rig: Rig) -> float:
+        """Return n."""
+        return 2.0 if rig.sensors.supply_pressure is not None else 1.0
+
+    def shape_names(self) -> tuple[str, ...]:
+        """Name the drop."""
+        return ("dp_supply",)
+
+    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
+        """Return the drop at the pump's whole flow [Pa]."""
+        p = rig.supply.pressure
+        return (Shape("dp_supply", "Pa", 0.0, 0.9 * p, (0.05 * p, 0.2 * p), 0.0),)
+
+    def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
+        """Take the drop from the supply pressure."""
+        ratio = port_flow(rig, signals, drawn=True) / rig.supply.flow
+        drop = self.shape_of(rig, shape)[0] * ratio ** self.exponent(rig)
+        return replace(signals, p_s=signals.p_s - drop)
+
+    def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
+        """Return dp / Q_pump^n, n, then C_pp and C_mm of each joint."""
+        n = self.exponent(rig)
+        gains = _gains(rig, values, (0, 3))
+        return np.array([self.shape_of(rig, shape)[0] / rig.supply.flow**n, n, *gains])
+
+    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
+        """Return the flow drawn [m^3/s]."""
+        return _everywhere(signals, port_flow(rig, signals, drawn=True))
+
+
+@dataclass(frozen=True)
+class TankPressure(_PortEffect):
+    """The return stands at p_t + p_back (Q / Q_pump)^2 instead of zero (Merritt 1967, chapter 3).
+
+    The line's part is turbulent; Q is the flow that the valves give back.
+    """
+
+    name: ClassVar[str] = "tank_pressure"
+    variable: ClassVar[str] = "the pressure left across the edge to the tank"
+    confounders: ClassVar[tuple[str, ...]] = ("supply_sag", "sensor_offset", "external_leakage")
+    separated_by: ClassVar[str] = (
+        "motion at low chamber pressure: there little is left across the edge to the tank"
+    )
+
+    @property
+    def kernel(self) -> Kernel:
+        """The compiled preparation."""
+        return _tank
+
+    def shape_names(self) -> tuple[str, ...]:
+        """Name the constant pressure and the line's part."""
+        return ("p_tank", "p_back")
+
+    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
+        """Return both [Pa]; `p_back` is that at the pump's whole flow."""
+        p = rig.supply.pressure
+        return (
+            Shape("p_tank", "Pa", 0.0, 0.4 * p, (0.02 * p, 0.1 * p), 0.0),
+            Shape("p_back", "Pa", 0.0, 0.5 * p, (0.0, 0.05 * p), 0.0),
+        )
+
+    def shape_of(self, rig: Rig, shape: Sequence[float]) -> tuple[float, ...]:
+        """Return both; a constant pressure alone where only one is given."""
+        return super().shape_of(rig, shape) if len(shape) != 1 else (shape[0], 0.0)
+
+    def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
+        """Raise the tank pressure."""
+        constant, back = self.shape_of(rig, shape)
+        ratio = port_flow(rig, signals, drawn=False) / rig.supply.flow if back else 0.0
+        return replace(signals, p_tank=signals.p_tank + constant + back * ratio**2)
+
+    def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
+        """Return p_t, p_back / Q_pump^2, then C_mp and C_pm of each joint."""
+        constant, back = self.shape_of(rig, shape)
+        return np.array([constant, back / rig.supply.flow**2, *_gains(rig, values, (2, 1))])
+
+    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
+        """Refuse pressures at their bounds, but for one of the two that is not there."""
+        constant, back = self.shape_of(rig, shape)
+        if max(constant, back) <= 1e-3 * rig.supply.pressure:
+            return f"p_tank = {constant:.4g} Pa is nothing"
+        inner = tuple(s.grid[-1] for s in self.shapes(rig))
+        kept = (v if v > 1e-3 * s.high else g for v, s, g in
+                zip((constant, back), self.shapes(rig), inner, strict=True))  # fmt: skip
+        return self.outside(rig, tuple(kept))
+
+    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
+        """Return the pressure of the chamber that gives to the tank [Pa]."""
+        out: dict[str, Array] = {}
+        for i in range(signals.joints):
+            out[equation("flow_cap", i)] = signals.p_cap[:, i]
+            out[equation("flow_rod", i)] = signals.p_rod[:, i]
+        return out
+
+
+def _gains(rig: Rig, values: Mapping[str, float], chosen: tuple[int, int]) -> list[float]:
+    """Return for each joint the gains of its two chosen edges, that of a positive spool first."""
+    names = (gain_names(i) for i in range(1, len(rig.joints) + 1))
+    return [values[joint[k]] for joint in names for k in chosen]
+
+
+def _everywhere(signals: Signals, variable: Array) -> dict[str, Array]:
+    kinds = ("flow_cap", "flow_rod")
+    return {equation(kind, i): variable for i in range(signals.joints) for kind in kinds}
+
+
+@njit(cache=True, error_model="numpy")
+def _valve_flow(x, level, sign, resistance, power, par, drawn):  # type: ignore[no-untyped-def]
+    """Solve Q = sum C |u| sqrt(dp_i - resistance Q^n) for the common flow Q [m^3/s], by Newton.
+
+    dp_i is what each open edge has across it at Q = 0; the left grows and the right falls with Q.
+    """
+    Q = 0.0
+    for _ in range(NEWTON):
+        lost = resistance * Q**power
+        slope_lost = resistance * power * Q ** (power - 1.0)
+        given, slope = 0.0, 0.0
+        for i in range(x.shape[1]):
+            u = x[U, i]
+            ahead = (u > 0.0) == drawn  # the cap's edge is the open one
+            p = x[P_CAP, i] if ahead else x[P_ROD, i]
+            gain = par[2 + 2 * i] if u > 0.0 else par[3 + 2 * i]
+            left = sign * (level - p) - lost
+            if left > 0.0 and u != 0.0:
+                root = gain * abs(u) * math.sqrt(left)
+                given += root
+                slope -= 0.5 * root / left * slope_lost
+        step = (given - Q) / (1.0 - slope)
+        Q = max(Q + step, 0.0)
+        if abs(step) < 1e-10:
+            break
+    return Q
+
+
+@kernel
+def _sag(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == PREPARE and par[0] > 0.0:
+        Q = _valve_flow(x, bench[P_S], 1.0, par[0], par[1], par, True)
+        bench[P_S] -= par[0] * Q ** par[1]
+
+
+@kernel
+def _tank(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == PREPARE:
+        bench[P_TANK] += par[0]
+        if par[1] > 0.0:
+            Q = _valve_flow(x, bench[P_TANK], -1.0, par[1], 2.0, par, False)
+            bench[P_TANK] += par[1] * Q * Q
+
+
+TERMS = (SupplySag, TankPressure)

@@ -1,0 +1,121 @@
+"""Underlapped metering edges."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numba import njit
+
+from analysis.effects.base import Array, Shape
+from analysis.effects.valve import ValveEffect
+from analysis.signals import Signals
+from analysis.terms.base import (
+    CONTRIBUTE,
+    FLOW_CAP,
+    FLOW_ROD,
+    P_CAP,
+    P_ROD,
+    P_S,
+    P_TANK,
+    Coefficient,
+    Columns,
+    Kernel,
+    U,
+    equation,
+    kernel,
+)
+from rig.model.parameters import gain_names, parameter_unit
+from rig.model.rig import Rig
+
+
+@dataclass(frozen=True)
+class UnderlapLeakage(ValveEffect):
+    """Edges open by w at the null: opening max(w + u, 0) ahead and max(w - u, 0) astern, at once.
+
+    What is added to the zero-lap orifice: ahead edges d+ = max(u + w, 0) - max(u, 0), astern edges
+    d- = max(w - u, 0) - max(-u, 0), each times its own gain and root (Merritt 1967, chapter 5,
+    open-centre valve). The gains are the orifices' own: the columns add to theirs.
+    """
+
+    name: ClassVar[str] = "underlap_leakage"
+    prepares: ClassVar[bool] = False
+    variable: ClassVar[str] = "the spool near its null and the chamber pressures"
+    confounders: ClassVar[tuple[str, ...]] = (
+        "valve_deadband",
+        "internal_leakage",
+        "external_leakage",
+    )
+    separated_by: ClassVar[str] = (
+        "small spool amplitudes about the null beside large ones: leakage of seals does not care"
+    )
+
+    @property
+    def kernel(self) -> Kernel:
+        """The compiled contribution."""
+        return _underlap
+
+    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
+        """Return the joint's four gains, which `orifice` owns."""
+        names = gain_names(self.joint + 1)
+        return tuple(Coefficient(name, parameter_unit(name), "fluid") for name in names)
+
+    def shape_names(self) -> tuple[str, ...]:
+        """Name the underlap."""
+        return (f"w_underlap_{self.joint + 1}",)
+
+    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
+        """Return the underlap [V], up to a tenth of the spool's stroke."""
+        stroke = rig.joints[self.joint].valve.spool_stroke
+        grid = (0.002 * stroke, 0.006 * stroke, 0.02 * stroke)
+        return (Shape(self.shape_names()[0], "V", 0.0, 0.1 * stroke, grid, 0.0),)
+
+    def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
+        """Return the signals unchanged."""
+        return signals
+
+    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
+        """Return the additional openings times the roots, under the orifices' own names."""
+        i = self.joint
+        pp, pm, mp, mm = gain_names(i + 1)
+        u, w = signals.u[:, i], self.shape_of(rig, shape)[0]
+        ahead = np.maximum(u + w, 0.0) - np.maximum(u, 0.0)
+        astern = np.maximum(w - u, 0.0) - np.maximum(-u, 0.0)
+        cap, rod, p_s, p_t = signals.p_cap[:, i], signals.p_rod[:, i], signals.p_s, signals.p_tank
+        return {
+            equation("flow_cap", i): {pp: ahead * _root(p_s - cap), pm: -astern * _root(cap - p_t)},
+            equation("flow_rod", i): {mp: -ahead * _root(rod - p_t), mm: astern * _root(p_s - rod)},
+        }
+
+    def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
+        """Return joint, gains, underlap."""
+        gains = [values[name] for name in gain_names(self.joint + 1)]
+        return np.array([self.joint, *gains, self.shape_of(rig, shape)[0]])
+
+
+def _root(drop: Array) -> Array:
+    return np.sqrt(np.maximum(drop, 0.0))
+
+
+@njit(cache=True)
+def _signed(drop):  # type: ignore[no-untyped-def]
+    return math.sqrt(drop) if drop >= 0.0 else -math.sqrt(-drop)
+
+
+@kernel
+def _underlap(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase != CONTRIBUTE:
+        return
+    i = int(par[0])
+    u, w = x[U, i], par[5]
+    ahead = max(u + w, 0.0) - max(u, 0.0)
+    astern = max(w - u, 0.0) - max(-u, 0.0)
+    cap, rod, p_s, p_t = x[P_CAP, i], x[P_ROD, i], bench[P_S], bench[P_TANK]
+    out[FLOW_CAP, i] += par[1] * ahead * _signed(p_s - cap) - par[2] * astern * _signed(cap - p_t)
+    out[FLOW_ROD, i] += par[4] * astern * _signed(p_s - rod) - par[3] * ahead * _signed(rod - p_t)
+
+
+TERMS = (UnderlapLeakage,)

@@ -1,0 +1,246 @@
+"""Effects between the spool's LVDT and the metering edges: dead band, null offset, lag.
+
+They change the opening u that the orifices see and leave the orifices' equations as they are, so
+all of them are shapes: dq = C(u_effective) sqrt(dp). (Underlap: `underlap.py`.)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+from numba import njit
+
+from analysis.effects.base import EDGES, LAG, NULL, Array, Effect, Shape
+from analysis.signals import Signals
+from analysis.terms.base import (
+    PREPARE,
+    Coefficient,
+    Columns,
+    Kernel,
+    U,
+    equation,
+    kernel,
+)
+from rig.model.rig import Rig
+
+
+@dataclass(frozen=True)
+class ValveEffect(Effect):
+    """What the valve's effects share: one hydraulic joint, no linear unknown, spool as abscissa."""
+
+    family: ClassVar[str] = "valve"
+    prepares: ClassVar[bool] = True
+    per_joint: ClassVar[bool] = True
+    where: str = "joint 1"
+
+    @classmethod
+    def places(cls, rig: Rig) -> tuple[str, ...]:
+        """Return the hydraulic joints."""
+        return () if getattr(rig, "electric", False) else super().places(rig)
+
+    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
+        """Return nothing: the gains stay the orifices'."""
+        return ()
+
+    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
+        """Return nothing: `orifice` sees the prepared opening."""
+        return {}
+
+    def with_opening(self, signals: Signals, opening: Array) -> Signals:
+        """Return the signals with the joint's opening (n,) [V] in the place of its spool."""
+        u = signals.u.copy()
+        u[:, self.joint] = opening
+        return replace(signals, u=u)
+
+    def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
+        """Return joint, shape."""
+        return np.array([self.joint, *self.shape_of(rig, shape)], dtype=np.float64)
+
+    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
+        """Refuse a shape at its bounds."""
+        return self.outside(rig, shape)
+
+    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
+        """Return the spool [V]."""
+        u = signals.u[:, self.joint]
+        return {equation(kind, self.joint): u for kind in ("flow_cap", "flow_rod")}
+
+
+@dataclass(frozen=True)
+class ValveDeadband(ValveEffect):
+    """Overlapped edges: no opening for -w_astern < u < w_ahead, u less the edge beyond.
+
+    Source: Merritt 1967, chapter 5 (overlap, "dead band"); Jelali and Kroll 2003.
+    Hides in the flow gains: 10 mV make those of the seed bench 12 to 17 % too small (NOTES).
+    """
+
+    name: ClassVar[str] = "valve_deadband"
+    stage: ClassVar[int] = EDGES
+    variable: ClassVar[str] = "the spool near its null"
+    confounders: ClassVar[tuple[str, ...]] = ("spool_offset", "underlap_leakage", "spool_lag")
+    separated_by: ClassVar[str] = (
+        "small spool amplitudes about the null beside large ones, both edges reached"
+    )
+
+    @property
+    def kernel(self) -> Kernel:
+        """The compiled preparation."""
+        return _deadband
+
+    def shape_names(self) -> tuple[str, ...]:
+        """Name the two edges."""
+        return (f"w_ahead_{self.joint + 1}", f"w_astern_{self.joint + 1}")
+
+    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
+        """Return the edges [V], each up to four tenths of the spool's stroke."""
+        stroke = rig.joints[self.joint].valve.spool_stroke
+        grid = (0.003 * stroke, 0.01 * stroke, 0.05 * stroke, 0.2 * stroke)
+        return tuple(Shape(n, "V", 0.0, 0.4 * stroke, grid, 0.0) for n in self.shape_names())
+
+    def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
+        """Take the dead band out of the spool's signal."""
+        ahead, astern = self.shape_of(rig, shape)
+        u = signals.u[:, self.joint]
+        return self.with_opening(signals, np.maximum(u - ahead, 0.0) + np.minimum(u + astern, 0.0))
+
+    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
+        """Refuse a shape at its bounds, and one edge without the other."""
+        ahead, astern = shape
+        if min(ahead, astern) <= 0.05 * max(ahead, astern):
+            return "one edge overlaps and the other does not: this is nearer to spool_offset"
+        return self.outside(rig, shape)
+
+
+@dataclass(frozen=True)
+class SpoolOffset(ValveEffect):
+    """The edges' null lies at u0 of the LVDT: opening u - u0 (Merritt 1967, chapter 5, "null").
+
+    Hides in the gains of the two directions with opposite signs (NOTES: 5 mV, 7 to 9 %).
+    """
+
+    name: ClassVar[str] = "spool_offset"
+    stage: ClassVar[int] = NULL
+    variable: ClassVar[str] = "the spool's sign"
+    confounders: ClassVar[tuple[str, ...]] = ("valve_deadband", "internal_leakage")
+    separated_by: ClassVar[str] = (
+        "two spool amplitudes: the error of flow stays the same, that of a gain grows with them"
+    )
+
+    @property
+    def kernel(self) -> Kernel:
+        """The compiled preparation."""
+        return _offset
+
+    def shape_names(self) -> tuple[str, ...]:
+        """Name the null."""
+        return (f"u_null_{self.joint + 1}",)
+
+    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
+        """Return the null [V], within a tenth of the spool's stroke."""
+        stroke = rig.joints[self.joint].valve.spool_stroke
+        near, far = 0.003 * stroke, 0.02 * stroke
+        grid = (-far, -near, near, far)
+        return (Shape(self.shape_names()[0], "V", -0.1 * stroke, 0.1 * stroke, grid, 0.0),)
+
+    def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
+        """Take the null from the spool's signal."""
+        return self.with_opening(signals, signals.u[:, self.joint] - self.shape_of(rig, shape)[0])
+
+    def twins(self) -> tuple[tuple[str, str], ...]:
+        """Return the LVDT's own offset: valve and sensor are one to the data."""
+        return (("sensor_offset", f"joint {self.joint + 1}"),)
+
+
+@dataclass(frozen=True)
+class SpoolLag(ValveEffect):
+    """The opening follows the LVDT: tau dx/dt = u - x (Jelali and Kroll 2003).
+
+    x is a hidden state; the rows have it by the exact response to the sampled spool, drawn as
+    straight lines between samples.
+    """
+
+    name: ClassVar[str] = "spool_lag"
+    stage: ClassVar[int] = LAG
+    variable: ClassVar[str] = "the spool's velocity"
+    confounders: ClassVar[tuple[str, ...]] = ("channel_delay", "valve_deadband", "entrained_air")
+    separated_by: ClassVar[str] = (
+        "high frequencies: a lag loses amplitude there, a delay only phase"
+    )
+
+    @property
+    def kernel(self) -> Kernel:
+        """The compiled preparation."""
+        return _lag
+
+    def shape_names(self) -> tuple[str, ...]:
+        """Name the time constant."""
+        return (f"tau_spool_{self.joint + 1}",)
+
+    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
+        """Return the time constant [s]."""
+        return (Shape(self.shape_names()[0], "s", 0.0, 0.1, (5e-4, 2e-3, 1e-2, 4e-2), 0.0),)
+
+    def hidden(self, rig: Rig) -> int:
+        """Return 1: the opening."""
+        return 1
+
+    def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
+        """Let the spool's signal lag."""
+        tau = self.shape_of(rig, shape)[0]
+        u = np.ascontiguousarray(signals.u[:, self.joint])
+        return self.with_opening(signals, lagged(u, tau * signals.rate))
+
+    def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
+        """Return joint, time constant, kept above what the integrator can follow."""
+        return np.array([self.joint, max(self.shape_of(rig, shape)[0], 1e-4)])
+
+    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
+        """Return the spool's velocity [V/s]."""
+        rate = np.gradient(signals.u[:, self.joint]) * signals.rate
+        return {equation(kind, self.joint): rate for kind in ("flow_cap", "flow_rod")}
+
+
+def lagged(u: Array, tau: float) -> Array:
+    """Return the response (n,) of a first-order lag of `tau` samples, at rest before the first."""
+    return u if tau < 1e-3 else np.asarray(_lagged(u, tau))
+
+
+@njit(cache=True)
+def _lagged(u, tau):  # type: ignore[no-untyped-def]
+    # Exact for u linear between samples: x lags a ramp by tau times its slope.
+    decay = math.exp(-1.0 / tau)
+    x = np.empty_like(u)
+    x[0] = u[0]
+    for k in range(1, len(u)):
+        slope = u[k] - u[k - 1]
+        behind = x[k - 1] - (u[k - 1] - tau * slope)
+        x[k] = u[k] - tau * slope + behind * decay
+    return x
+
+
+@kernel
+def _deadband(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == PREPARE:
+        i = int(par[0])
+        x[U, i] = max(x[U, i] - par[1], 0.0) + min(x[U, i] + par[2], 0.0)
+
+
+@kernel
+def _offset(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == PREPARE:
+        x[U, int(par[0])] -= par[1]
+
+
+@kernel
+def _lag(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == PREPARE:
+        i = int(par[0])
+        dz[0] = (x[U, i] - z[0]) / par[1]
+        x[U, i] = z[0]
+
+
+TERMS = (ValveDeadband, SpoolOffset, SpoolLag)

@@ -1,0 +1,71 @@
+"""Candidates: every effect of the catalogue at every place, with points of first look."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from analysis.effects.base import Effect
+from analysis.terms import known
+from analysis.terms.base import Used
+from rig.model.rig import Rig
+
+MOST_POINTS = 24  # of a candidate's shape grid: two shapes of five points each, or one of many
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A candidate at one point of its shape grid."""
+
+    effect: Effect
+    shape: tuple[float, ...]
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """Name and place, whatever the shape."""
+        return self.effect.name, self.effect.where
+
+    @property
+    def used(self) -> Used:
+        """The term as a model takes it."""
+        return Used(self.effect, self.shape)
+
+
+def catalogue(rig: Rig, names: Sequence[str] | None = None) -> list[Effect]:
+    """Return every effect of the catalogue, or those named, at every place it can be at."""
+    return [
+        kind(where)
+        for name, kind in sorted(known().items())
+        if issubclass(kind, Effect) and (names is None or name in names)
+        for where in kind.places(rig)
+    ]
+
+
+def points(effect: Effect, rig: Rig) -> list[tuple[float, ...]]:
+    """Return the shape grid of an effect, thinned where it has too many points."""
+    axes = [shape.grid for shape in effect.shapes(rig)]
+    grid = list(itertools.product(*axes))
+    if len(grid) > MOST_POINTS:
+        per = max(2, int(MOST_POINTS ** (1 / len(axes))))
+        thinned = [
+            tuple(
+                axis[i] for i in np.unique(np.linspace(0, len(axis) - 1, per).round().astype(int))
+            )
+            for axis in axes
+        ]
+        grid = list(itertools.product(*thinned))
+    return grid
+
+
+def variants(rig: Rig, effects: Sequence[Effect]) -> list[Variant]:
+    """Return every candidate at every point of its grid."""
+    return [Variant(effect, shape) for effect in effects for shape in points(effect, rig)]
+
+
+def complexity(rig: Rig, used: Sequence[Used]) -> tuple[int, int]:
+    """Return the number of effects and of their free numbers: the simpler of two equals wins."""
+    free = sum(len(u.term.coefficients(rig)) + len(u.shape) for u in used)
+    return len(used), free

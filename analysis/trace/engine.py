@@ -1,0 +1,222 @@
+"""The trace: residual -> effect -> model with the effect -> error before and after."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis import checks as ck
+from analysis.effects.base import Effect, ordered
+from analysis.identify import identify
+from analysis.model import Model
+from analysis.terms import baseline_of, known
+from analysis.terms.base import Used
+from analysis.trace import clues, gates, held_out
+from analysis.trace.board import Board, board
+from analysis.trace.candidates import catalogue, variants
+from analysis.trace.evidence import Scene, scenes
+from analysis.trace.floor import STATED
+from analysis.trace.result import (
+    CLEAN,
+    CONFOUNDED,
+    EXPLAINED,
+    UNEXPLAINED,
+    Dependence,
+    Found,
+    Trace,
+)
+from analysis.trace.shortlist import Listed, Shortlist, rebased, within
+from analysis.trace.words import sentence
+from rig.model.parse import InputError
+from rig.model.records import Record, Run
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+log = logging.getLogger(__name__)
+
+# The other estimators add small faults of sensors of their own accord: here they are candidates.
+PLAIN = "plain"
+LEAST_ROWS = 40  # of an equation's rows in one record
+
+
+def trace(
+    runs: Sequence[Run],
+    holdout: Sequence[Run],
+    effects: Sequence[Effect] | None = None,
+    seed: int = 0,
+) -> Trace:
+    """Say what the baseline lacks on `runs`, name it or refuse to, and judge it on `holdout`.
+
+    `effects` are the candidates, by default the whole catalogue at every place. `seed` draws the
+    half-samples and sign flips. Raises InputError for records of different rigs, without held-out
+    records, with held-out records that are training records, or too short to tell anything.
+    """
+    started = time.perf_counter()
+    rig = ck.common_rig([*runs, *holdout])
+    _refuse_same(runs, holdout)
+    rng = np.random.default_rng(seed)
+    terms = tuple(map(Used, baseline_of(rig)))
+    train, judged = scenes(rig, runs), scenes(rig, holdout)
+    stage = board(rig, terms, train)
+    _refuse_short(stage, train)
+    judge = board(rig, terms, judged, stage.beta)
+    candidates = catalogue(rig) if effects is None else list(effects)
+    listed = Shortlist(stage, variants(rig, candidates))
+    before = identify(runs, estimator=PLAIN).model
+    notes = _notes(stage, judge)
+    if within(listed.empty.excess, listed.limits):
+        found: tuple[Found, ...] = ()
+        refused: tuple[Found, ...] = ()
+        winner, verdict, moves = listed.empty, CLEAN, []
+    else:
+        winner = listed.run()
+        found, winner, verdict = _named(listed, winner, judge, rng)
+        refused = tuple(f for f in found if not gates.stands(f))
+        found = tuple(f for f in found if gates.stands(f))
+        if verdict == UNEXPLAINED and found:
+            notes += gates.remaining(listed, winner, judge)
+        moves = [] if verdict in (CLEAN, EXPLAINED) else _moves(stage, judge, winner)
+    after = _extended(runs, terms, winner, before)
+    error = held_out.errors(rig, judged, before, after, judge)
+    fits = held_out.fits(rig, holdout, before, after)
+    result = Trace(
+        verdict, found, error.noise, error.before, error.after, fits[0], fits[1], before, after,
+        _fraction(listed, winner), tuple(moves), _next(verdict, found, rig), stage.floors,
+        tuple(notes), refused=refused, seconds=time.perf_counter() - started,
+    )  # fmt: skip
+    return replace(result, sentence=sentence(result))
+
+
+def _refuse_same(runs: Sequence[Run], holdout: Sequence[Run]) -> None:
+    if not holdout or not any(run.records for run in holdout):
+        raise InputError(
+            "no held-out records: give --holdout a run that the fit does not see, of another "
+            "excitation (other wave or amplitude)"
+        )
+    seen = {_digest(record): record.name for run in runs for record in run.records}
+    for run in holdout:
+        for record in run.records:
+            if _digest(record) in seen:
+                raise InputError(
+                    f"held-out record {record.name!r} is training record "
+                    f"{seen[_digest(record)]!r}, sample for sample; what the fit has seen cannot "
+                    "judge it: give --holdout other records"
+                )
+
+
+def _digest(record: Record) -> str:
+    """Return a digest of a record's samples; what it is called does not matter."""
+    found = hashlib.sha256()
+    for name in sorted(record.channels):
+        found.update(name.encode())
+        found.update(np.ascontiguousarray(record.channels[name], dtype=np.float64).tobytes())
+    return found.hexdigest()
+
+
+def _refuse_short(stage: Board, train: Sequence[Scene]) -> None:
+    for s in stage.segments:
+        count = s.where.stop - s.where.start
+        if count < LEAST_ROWS:
+            seconds = next(
+                x.record.samples / x.record.sample_rate for x in train if x.group == s.group
+            )
+            raise InputError(
+                f"step {s.group[1]!r}: records of {seconds:.3g} s leave {count} rows of "
+                f"{s.equation} behind the filters' edges and masks; the trace needs {LEAST_ROWS}: "
+                "record longer"
+            )
+
+
+def _notes(stage: Board, judge: Board) -> list[str]:
+    """State where the evidence is weaker than it should be."""
+    out = []
+    single = sorted({f.group[1] for f in stage.floors if f.count < 2})
+    if single:
+        out.append(
+            f"one repeat of {' '.join(single)} and no whole periods to compare: the noise floor is "
+            "the rig file's stated sensor noise; noise that the file does not state would pass "
+            "for model error, so nothing is named with full confidence"
+        )
+    elif any(f.source != "repeats" for f in stage.floors):
+        out.append("one repeat per step: the noise floor comes from periods within the record")
+    few = min((f.count for f in stage.floors if f.count > 1), default=0)
+    if 0 < few < 4:
+        out.append(
+            f"{few} repeats: stability is judged on few half-samples; four or more tell more"
+        )
+    if all(f.source == STATED for f in judge.floors):
+        out.append("the held-out noise floor is the rig file's stated sensor noise")
+    return out
+
+
+def _named(
+    listed: Shortlist, winner: Listed, judge: Board, rng: np.random.Generator
+) -> tuple[tuple[Found, ...], Listed, str]:
+    """Put the winner through the gates; returns what stands, the set that stands, the verdict."""
+    if not winner.effects:
+        return (), winner, UNEXPLAINED
+    found = gates.judge(listed, winner, judge, rng)
+    tied = any(r.tied for f in found for r in f.rivals)
+    keep = [f for f in found if gates.stands(f)]
+    if len(keep) < len(found):
+        kept = {(f.name, f.where) for f in keep}
+        smaller = tuple(u for u in winner.effects if (u.term.name, u.term.where) in kept)
+        refused = tuple(f for f in found if f not in keep)
+        if not smaller:
+            return refused, listed.empty, UNEXPLAINED
+        winner = listed.exact(smaller)
+        found = gates.judge(listed, winner, judge, rng)
+        return (*found, *refused), winner, UNEXPLAINED
+    if not gates.explained(listed, winner, judge):
+        return found, winner, UNEXPLAINED
+    return found, winner, CONFOUNDED if tied else EXPLAINED
+
+
+def _moves(stage: Board, judge: Board, winner: Listed) -> list[Dependence]:
+    """Return what the remaining residual moves with."""
+    held = held_out.left(judge, winner.fit)
+    now = rebased(stage, winner.fit)
+    later = rebased(judge, winner.fit)
+    loud = [e for e, v in sorted(winner.excess.items(), key=lambda kv: -kv[1]) if v > 0]
+    total = sum(winner.excess[e] for e in loud)
+    loud = [e for e in loud if winner.excess[e] > 0.1 * total]
+    return clues.dependence(now, winner.fit.left, later, held, loud)
+
+
+def _fraction(listed: Shortlist, winner: Listed) -> float:
+    """Return the share of the training records' repeatable energy that is left."""
+    start = listed.empty.total
+    return float(min(1.0, winner.total / start)) if start > 0 else 0.0
+
+
+def _extended(runs: Sequence[Run], terms: Sequence[Used], winner: Listed, before: Model) -> Model:
+    """Identify everything again together with the effects."""
+    if not winner.effects:
+        return before
+    return identify(runs, terms=ordered((*terms, *winner.effects)), estimator=PLAIN).model
+
+
+def _next(verdict: str, found: Sequence[Found], rig: Rig) -> Mapping[str, Any] | None:
+    """Return the experiment that would tell tied effects apart."""
+    if verdict != CONFOUNDED:
+        return None
+    for effect in found:
+        tied = [r for r in effect.rivals if r.tied]
+        if not tied:
+            continue
+        texts = [getattr(known()[n], "separated_by", "") for n in (effect.name, tied[0].name)]
+        return {
+            "separates": [
+                {"name": n, "where": w}
+                for n, w in ((effect.name, effect.where), *((r.name, r.where) for r in tied))
+            ],
+            "text": next((t for t in texts if t), "another amplitude and frequency"),
+        }
+    return None

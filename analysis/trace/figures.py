@@ -1,0 +1,187 @@
+"""The trace's pictures: residual before and after against what it moves with, in time, in figures.
+
+All of held-out records. Grey is before, blue after; the pale band is the noise (± one rms).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from markupsafe import Markup
+from numpy.typing import NDArray
+
+from analysis import report_format as fm
+from analysis.effects.base import Effect
+from analysis.model import Model
+from analysis.plots import BLUE, CARD, GREY, INK, MODEL, PALE, figure, gapped, note, style, svg
+from analysis.rows import Rows
+from analysis.trace.clues import binned, variables
+from analysis.trace.evidence import Scene, filtered, prepared, residual, scene_rows, scenes
+from analysis.trace.held_out import row_coefficients
+from analysis.trace.result import Trace
+from analysis.trace.words import UNITS, loudest
+from rig.model.channels import kind_of, unit_of
+from rig.model.records import Run
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+
+POINTS = 1500  # dots of a scatter
+SECONDS = 4.0  # of a time trace
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Held-out residuals of one equation of one record, SI, at the instants of its rows."""
+
+    scene: Scene
+    rows: Rows
+    before: Array
+    after: Array
+
+
+def held_out(rig: Rig, holdout: Sequence[Run], result: Trace) -> dict[str, list[Lines]]:
+    """Return, by equation, every held-out record's residual under both models."""
+    out: dict[str, list[Lines]] = {}
+    for scene in scenes(rig, holdout):
+        before = _left(rig, scene, result.model_before)
+        after = _left(rig, scene, result.model_after)
+        for name, (rows, r) in before.items():
+            later, q = after[name]
+            _, here, there = np.intersect1d(rows.time, later.time, return_indices=True)
+            part = Rows(name, rows.names, rows.matrix[here], rows.rhs[here], rows.time[here], 0)
+            out.setdefault(name, []).append(Lines(scene, part, r[here], q[there]))
+    return out
+
+
+def _left(rig: Rig, scene: Scene, model: Model) -> dict[str, tuple[Rows, Array]]:
+    beta = row_coefficients(model)
+    built = scene_rows(rig, model.terms, scene)
+    return {name: (rows, residual(rows, beta)) for name, rows in built.items()}
+
+
+def abscissae(
+    rig: Rig,
+    lines: Sequence[Lines],
+    effect: Effect | None,
+    variable: str,
+    equation: str,
+    model: Model,
+) -> Array:
+    """Return what one equation's residuals are drawn against: the effect's own variable or one."""
+    joint = int(equation.rsplit("_", 1)[1]) - 1
+    out = []
+    for line in lines:
+        if effect is not None:
+            seen = prepared(rig, model.terms, line.scene)
+            raw = effect.abscissa(rig, seen)[equation]
+        else:
+            raw = variables(line.scene.signals, joint)[variable]
+        out.append(filtered({"x": np.asarray(raw)}, line.scene, line.rows)["x"])
+    return np.concatenate(out)
+
+
+def against(
+    x: Array, lines: Sequence[Lines], noise: float, unit: str, label: str, key: str, after: bool
+) -> Markup:
+    """Draw the residual over a variable, before beside after on one scale, with binned means."""
+    parts = [("before", np.concatenate([line.before for line in lines]))]
+    if after:
+        parts.append(("after", np.concatenate([line.after for line in lines])))
+    top = 1.1 * max(float(np.quantile(np.abs(parts[0][1]), 0.995)), 2.5 * noise)
+    kept = np.linspace(0, len(x) - 1, min(POINTS, len(x))).astype(int)
+    with style():
+        made = figure(2.5, CARD * (2 if after else 1))
+        for k, (word, y) in enumerate(parts):
+            axes = made.add_subplot(1, len(parts), k + 1)
+            axes.axhspan(-noise, noise, color=PALE, alpha=0.7, lw=0)
+            colour = BLUE if k else GREY
+            axes.plot(x[kept], y[kept], ".", color=colour, ms=2.2, alpha=0.5, mew=0)
+            curve = binned(x, y)
+            axes.plot(curve["x"], curve["mean"], "-", color=MODEL, lw=1.8)
+            axes.plot(curve["x"], curve["mean"], "o", color=MODEL, ms=2.6)
+            axes.set_ylim(-top, top)
+            axes.set_xlabel(label)
+            if not k:
+                axes.set_ylabel(f"residual [{unit}]")
+            rms = float(np.sqrt(np.mean(y**2)))
+            note(axes, 0.98, 0.98, f"{word}: {fm.significant(rms)} {unit} rms", INK)
+        made.tight_layout()
+        return svg(made, key, f"Residual against {label}, before and after")
+
+
+def in_time(line: Lines, noise: float, unit: str, key: str, after: bool) -> Markup:
+    """Draw a few seconds of the residual before and after."""
+    t = line.rows.time
+    middle = 0.5 * (t[0] + t[-1])
+    shown = (t >= middle - 0.5 * SECONDS) & (t <= middle + 0.5 * SECONDS)
+    with style():
+        made = figure(2.1, CARD * 2)
+        axes = made.add_subplot()
+        axes.axhspan(-noise, noise, color=PALE, alpha=0.7, lw=0)
+        axes.plot(*gapped(t[shown], line.before[shown]), color=GREY, lw=1.1)
+        note(axes, 0.99, 0.97, "before", GREY)
+        if after:
+            axes.plot(*gapped(t[shown], line.after[shown]), color=BLUE, lw=1.1)
+            note(axes, 0.99, 0.84, "after", BLUE)
+        axes.set_xlabel("time in the record [s]")
+        axes.set_ylabel(f"residual [{unit}]")
+        made.tight_layout()
+        return svg(made, key, "Held-out residual in time, before and after")
+
+
+def over_noise(result: Trace) -> Markup:
+    """Draw every equation's held-out error over its noise floor, before and after."""
+    names = list(result.before)
+    with style():
+        made = figure(0.5 + 0.32 * len(names), CARD * 2)
+        axes = made.add_subplot()
+        for k, name in enumerate(reversed(names)):
+            floor = result.noise_floor.get(name, np.nan)
+            a, b = result.before[name] / floor, result.after.get(name, np.nan) / floor
+            axes.plot([a, b], [k, k], "-", color=PALE, lw=5, solid_capstyle="round", zorder=1)
+            axes.plot(a, k, "o", color=GREY, ms=6)
+            axes.plot(b, k, "o", color=BLUE, ms=6)
+        axes.axvline(1.0, color=INK, lw=0.8, ls="--")
+        axes.set_xscale("log")
+        axes.xaxis.set_major_formatter(lambda v, _: f"{v:g}")
+        axes.set_yticks(range(len(names)), list(reversed(names)))
+        axes.set_ylim(-0.6, len(names) - 0.4)
+        axes.set_xlabel("held-out error over the noise floor (grey before, blue after)")
+        made.tight_layout()
+        return svg(made, "overnoise", "Held-out error over the noise floor, before and after")
+
+
+def unit_of_variable(name: str) -> str:
+    """Return a variable's SI unit for an axis."""
+    try:
+        return unit_of(name)
+    except ValueError:
+        stem = name.rsplit("_", 1)[0]
+        return {
+            "velocity": "m/s", "acceleration": "m/s²", "pressure_difference": "Pa", "time": "s",
+        }.get(stem, "")  # fmt: skip
+
+
+def equation_of(
+    effect: Effect, rig: Rig, result: Trace, lines: Mapping[str, Sequence[Lines]]
+) -> str:
+    """Return the equation whose residual shows an effect best: most over its noise before."""
+    scene = next(iter(lines.values()))[0].scene
+    own = [e for e in effect.abscissa(rig, scene.signals) if e in lines]
+    if not own:
+        return loudest(result)
+    return max(own, key=lambda e: result.before[e] / max(result.noise_floor[e], 1e-30))
+
+
+def unit_of_equation(equation: str) -> str:
+    """Return the unit of an equation's residual."""
+    return UNITS.get(equation.rsplit("_", 1)[0], "")
+
+
+__all__ = [
+    "Lines", "abscissae", "against", "equation_of", "held_out", "in_time", "kind_of",
+    "over_noise", "unit_of_equation", "unit_of_variable",
+]  # fmt: skip

@@ -1,0 +1,229 @@
+"""Naming gates: significance is not naming, so a name must pass all of these.
+
+A deterministic misfit makes every correlated candidate significant. What tells the cause from its
+look-alikes is that it works on records of another excitation, at a physical size, with the same
+coefficient everywhere, whichever repeats are taken, and better than anything else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.effects.base import Effect
+from analysis.model import Estimate
+from analysis.solve import half_width
+from analysis.terms.base import Used
+from analysis.trace import inference
+from analysis.trace.board import Board
+from analysis.trace.held_out import left as held_left
+from analysis.trace.refine import shapes_of
+from analysis.trace.result import Found, Gate, Rival
+from analysis.trace.select import FORM
+from analysis.trace.shortlist import Listed, Shortlist, excess_of, parameter_values
+
+Array = NDArray[np.float64]
+Key = tuple[str, str]
+
+REMOVED = 0.5  # of the held-out energy above noise in the equations it touches
+CHOSEN = 0.9  # of half-samples
+P_LIMIT = 0.01
+TIE = 1.10  # held-out rms of a rival over the best's: below, the data do not tell them apart
+TIE_TRAINING = 1.25
+HELD_BAND = 1.5  # held-out rms after over the noise floor, per equation
+SHOWN = 4  # rivals in a result
+
+REMOVES, PHYSICAL, INVARIANT, STABLE, SIGNIFICANT, ALONE = (
+    "removes on held-out", "physical", "invariant", "stable", "significant", "no rival",
+)  # fmt: skip
+
+
+def stands(found: Found) -> bool:
+    """Tell whether an effect passes every gate but that of rivals, which makes it confounded."""
+    return all(gate.ok for gate in found.gates if gate.name != ALONE)
+
+
+def judge(
+    listed: Shortlist, winner: Listed, held: Board, rng: np.random.Generator
+) -> tuple[Found, ...]:
+    """Put every effect of the winner through the gates."""
+    stage = listed.stage
+    values = parameter_values(stage.rig, winner.fit.terms, dict(winner.fit.beta))
+    null = inference.null_maximum(listed.field, stage, _noise_like(stage), rng)
+    steady = inference.stability(listed, winner, rng)
+    after = held_left(held, winner.fit)
+    physical = listed.physical(winner)
+    out = []
+    for used in winner.effects:
+        assert isinstance(used.term, Effect)
+        key = (used.term.name, used.term.where)
+        rest = listed.exact(tuple(u for u in winner.effects if u is not used))
+        rivals = _rivals(listed, winner, key, held, after)
+        removed = _removed(held, rest, after, _touched(listed, winner, rest))
+        p = inference.p_value(rest.fit.energy - winner.fit.energy, null)
+        errors = inference.spread(stage, winner.fit, used, values)
+        share, others = steady[key]
+        differing = inference.invariance(stage, winner.fit, used, errors, _joint(used.term))
+        tied = [r for r in rivals if r.tied]
+        gates = (
+            Gate(REMOVES, removed >= REMOVED, f"{100 * removed:.0f} % of what repeats"),
+            Gate(PHYSICAL, not physical, physical or "sign and size are"),
+            Gate(INVARIANT, not differing, _differences(differing)),
+            Gate(STABLE, share >= CHOSEN or bool(tied), _chosen(share, others)),
+            Gate(SIGNIFICANT, p <= P_LIMIT, f"family-wise p = {p:.3g}"),
+            Gate(ALONE, not tied, _told_apart(rivals)),
+        )
+        out.append(
+            Found(
+                used.term.name, _place(used.term), _parameters(stage, used, errors), p, removed,
+                tuple(rivals), gates, used.term.variable,
+            )
+        )  # fmt: skip
+    return tuple(out)
+
+
+def explained(listed: Shortlist, winner: Listed, held: Board) -> bool:
+    """Tell whether what is left lies within the noise floor's band, on both sets of records."""
+    return not remaining(listed, winner, held)
+
+
+def remaining(listed: Shortlist, winner: Listed, held: Board) -> list[str]:
+    """Say which equations keep more than the noise floor's band, on which records."""
+    out = [
+        f"{e}: {100 * left / max(listed.empty.excess[e], 1e-30):.2g} % of what repeated stays, "
+        f"{left / listed.limits.band[e]:.2g} times the band"
+        for e, left in winner.excess.items()
+        if not listed.negligible(e, left)
+    ]
+    after = held_left(held, winner.fit)
+    start = excess_of(held, held_left(held, listed.empty.fit))
+    now = excess_of(held, after)
+    floor: dict[str, float] = {}
+    energy: dict[str, float] = {}
+    for s in held.segments:
+        count = (s.where.stop - s.where.start) * s.repeats
+        floor[s.equation] = floor.get(s.equation, 0.0) + count * s.noise**2
+        # Averaging has taken noise out: put back what a single record would show.
+        part = after[s.where]
+        found = float(part @ part) + count * (1 - 1 / s.repeats)
+        energy[s.equation] = energy.get(s.equation, 0.0) + found * s.noise**2
+    out += [
+        f"{e}: held-out error {np.sqrt(energy[e] / floor[e]):.2f} times the noise floor"
+        for e in floor
+        if energy[e] > HELD_BAND**2 * floor[e] and now[e] > 2 * FORM * start[e]
+    ]
+    return out
+
+
+def _noise_like(stage: Board) -> Array:
+    """Return the repeats' residuals without what repeats: (R, M), scaled to the full noise."""
+    out = stage.left.copy()
+    for s in stage.segments:
+        if s.repeats > 1:
+            part = out[: s.repeats, s.where]
+            scale = np.sqrt(s.repeats / (s.repeats - 1))
+            out[: s.repeats, s.where] = (part - part.mean(axis=0)) * scale
+    return out
+
+
+def _joint(effect: Effect) -> int | None:
+    words = effect.where.split()
+    return int(words[1]) - 1 if words[0] == "joint" else None
+
+
+def _place(effect: Effect) -> str:
+    return str(getattr(effect, "place", effect.where))
+
+
+def _touched(listed: Shortlist, winner: Listed, rest: Listed) -> set[str]:
+    """Return the equations in which an effect changes the training residual visibly."""
+    change = {e: rest.excess[e] - winner.excess[e] for e in rest.excess}
+    most = max(change.values())
+    return {e for e, v in change.items() if v > 0.05 * most}
+
+
+def _removed(held: Board, rest: Listed, after: Array, touched: set[str]) -> float:
+    before = excess_of(held, held_left(held, rest.fit))
+    now = excess_of(held, after)
+    start = sum(max(0.0, before[e]) for e in touched if e in before)
+    end = sum(max(0.0, now[e]) for e in touched if e in now)
+    return (start - end) / start if start > 0 else 0.0
+
+
+def _rivals(listed: Shortlist, winner: Listed, key: Key, held: Board, after: Array) -> list[Rival]:
+    """Return the sets that have another effect in place of one, those that leave least first."""
+    others = winner.keys - {key}
+    rest = listed.exact([u for u in winner.effects if (u.term.name, u.term.where) != key])
+    equations = _touched(listed, winner, rest)
+    out = []
+    mine = _energy(held, after)
+    own = _energy(listed.stage, winner.fit.left)
+    for one in listed.listed.values():
+        fresh = one.keys - winner.keys
+        if key in one.keys or not others <= one.keys or len(fresh) != 1:
+            continue
+        if one.size[1] > winner.size[1] or listed.physical(one):
+            continue
+        theirs = _energy(held, held_left(held, one.fit))
+        ratio = _ratio(theirs, mine, equations)
+        training = _ratio(_energy(listed.stage, one.fit.left), own, equations)
+        name, _ = next(iter(fresh))
+        tied = ratio < TIE and (training < TIE_TRAINING or ratio < 0.95)
+        place = next(_place(u.term) for u in one.effects if (u.term.name, u.term.where) in fresh)  # type: ignore[arg-type]
+        out.append(Rival(name, place, ratio, training, tied))
+    out.sort(key=lambda r: r.ratio)
+    return out[:SHOWN]
+
+
+def _energy(stage: Board, left: Array) -> dict[str, tuple[float, int]]:
+    out: dict[str, tuple[float, int]] = {}
+    for s in stage.segments:
+        part = left[s.where]
+        energy, rows = out.get(s.equation, (0.0, 0))
+        out[s.equation] = energy + float(part @ part), rows + len(part)
+    return out
+
+
+def _ratio(
+    one: Mapping[str, tuple[float, int]], other: Mapping[str, tuple[float, int]],
+    equations: set[str],
+) -> float:  # fmt: skip
+    shared = [e for e in one if e in equations and e in other]
+    above, below = sum(one[e][0] for e in shared), sum(other[e][0] for e in shared)
+    return float(np.sqrt(above / below)) if below > 0 else float("nan")
+
+
+def _parameters(stage: Board, used: Used, errors: inference.Spread) -> dict[str, Estimate]:
+    units = {c.parameter: c.unit for c in used.term.coefficients(stage.rig)}
+    units |= {s.parameter: s.unit for s in shapes_of(stage.rig, used)}
+    half = half_width(errors.std, np.full(len(errors.std), errors.dof))
+    return {
+        name: Estimate(float(v), units.get(name, ""), float(s), (float(v - h), float(v + h)))
+        for name, v, s, h in zip(errors.names, errors.value, errors.std, half, strict=True)
+    }
+
+
+def _differences(differing: Sequence[tuple[str, str, float, float]]) -> str:
+    if not differing:
+        return "the same in every step, half, direction and speed"
+    return "; ".join(
+        f"{name} = {value:.3g} ± {error:.2g} in {label}"
+        for label, name, value, error in differing[:3]
+    )
+
+
+def _chosen(share: float, others: Mapping[str, int]) -> str:
+    text = f"chosen in {100 * share:.0f} % of half-samples"
+    if share < CHOSEN and others:
+        text += "; else " + ", ".join(sorted(others, key=lambda k: -others[k])[:2])
+    return text
+
+
+def _told_apart(rivals: Sequence[Rival]) -> str:
+    if not rivals:
+        return "none came near"
+    nearest = rivals[0]
+    words = "cannot be told from" if nearest.tied else "the nearest is"
+    return f"{words} {nearest.name} at {nearest.where}: {nearest.ratio:.2f} times the held-out rms"

@@ -1,0 +1,283 @@
+"""How sure: sign flips for significance, half-samples for stability, subsets for invariance.
+
+The unit is the repeat. Under the null hypothesis a residual is noise, symmetric and independent
+from repeat to repeat, so that the signs of whole repeats may be flipped. With few repeats flips of
+whole records cannot give a small p (4 repeats: not below 1/8); then blocks of a record are
+flipped, each a whole period where the record holds several, else several of the longest excited
+wave: the noise that passes the row filter forgets itself within a tenth of a second.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.terms.base import Used
+from analysis.trace import select
+from analysis.trace.board import Board
+from analysis.trace.refine import Fit, jacobian, shapes_of, table
+from analysis.trace.select import Field, orthonormal
+from analysis.trace.shortlist import Listed, Shortlist, excess_of
+
+Array = NDArray[np.float64]
+
+FLIPS = 199
+ENOUGH_REPEATS = 8
+BLOCK = 2.0  # [s] at least, where a record is one period
+HALVES = 40
+TOLERANCE = 0.2  # relative disagreement that a catalogue's simpler form may cause
+DEVIATIONS = 3.5
+POWER = 0.25  # a subset judges a parameter that it knows this well, relative
+
+
+def blocks(stage: Board, seconds: float = BLOCK) -> NDArray[np.int64]:
+    """Return for each row of the board the number of its block within its record (M,)."""
+    out = np.zeros(stage.base.shape[0], dtype=np.int64)
+    index = {scene.group: k for k, scene in enumerate(stage.scenes)}
+    for segment in stage.segments:
+        if segment.repeats >= ENOUGH_REPEATS:
+            continue
+        scene = stage.scenes[index[segment.group]]
+        rate, period = scene.record.sample_rate, scene.record.period
+        time = stage.rows[index[segment.group]][segment.equation].time
+        length = seconds
+        if period and 3 * period <= scene.record.samples:
+            length = period / rate
+        out[segment.where] = np.floor((time - time[0]) / length).astype(np.int64)
+    return out
+
+
+def flipped(stage: Board, count: int, rng: np.random.Generator, left: Array) -> Array:
+    """Return residuals (M, count), averaged after random signs of every repeat's blocks."""
+    numbers = blocks(stage)
+    M = stage.base.shape[0]
+    out = np.zeros((M, count))
+    groups = sorted({s.group for s in stage.segments})
+    most = int(numbers.max()) + 1
+    for group in groups:
+        parts = [s for s in stage.segments if s.group == group]
+        signs = rng.choice([-1.0, 1.0], size=(parts[0].repeats, most, count))
+        for s in parts:
+            repeats = left[: s.repeats, s.where]
+            mixed = np.einsum("rm,rmc->mc", repeats, signs[:, numbers[s.where], :])
+            out[s.where] = mixed / np.sqrt(s.repeats)
+    return out
+
+
+def null_maximum(board: Field, stage: Board, left: Array, rng: np.random.Generator) -> Array:
+    """Return the largest gain of any candidate at any shape under each flip (FLIPS,)."""
+    r = flipped(stage, FLIPS, rng, left)
+    r = r - board.basis @ (board.basis.T @ r)
+    c = board.columns.T @ r
+    diagonal = np.diag(board.K)
+    shows = (diagonal > select.VISIBLE**2 * board.raw) & (board.raw > 0)
+    best = np.max(c[shows] ** 2 / diagonal[shows, None], axis=0) if shows.any() else np.zeros(FLIPS)
+    for group in board.groups:
+        j = [k for k in group if shows[k]]
+        if len(j) > 1:
+            inverse = np.linalg.pinv(board.K[np.ix_(j, j)], rcond=1e-6, hermitian=True)
+            best = np.maximum(best, np.einsum("ib,ij,jb->b", c[j], inverse, c[j]))
+    return np.asarray(best)
+
+
+def p_value(gain: float, null: Array) -> float:
+    """Return the family-wise p of a gain against the flips' largest gains."""
+    return float((1 + np.sum(null >= gain)) / (1 + len(null)))
+
+
+@dataclass(frozen=True)
+class Linear:
+    """A fitted set in first order: its tangent space's basis (M, k) and residual (M,)."""
+
+    one: Listed
+    basis: Array
+    left: Array
+
+
+def linear(stage: Board, one: Listed) -> Linear:
+    """Return the tangent of a set: columns of all coefficients and derivatives by the shapes."""
+    rows = table(stage, one.fit.terms)
+    extra = [jacobian(stage, one.fit, u)[1] for u in one.effects]
+    return Linear(one, orthonormal(np.column_stack([rows.matrix, *extra])), one.fit.left)
+
+
+def halves(
+    stage: Board, rng: np.random.Generator, count: int = HALVES
+) -> list[tuple[Array, float]]:
+    """Return changes (M,) of the averaged residual in random half-samples, and its noise energy.
+
+    Halves of the repeats of every step; of a step with one repeat, halves of its blocks.
+    """
+    numbers = blocks(stage)
+    mean = stage.mean
+    out = []
+    for _ in range(count):
+        r = np.zeros_like(mean)
+        noise = 1.0
+        for group in sorted({s.group for s in stage.segments}):
+            parts = [s for s in stage.segments if s.group == group]
+            R = parts[0].repeats
+            if R > 1:
+                picked = rng.choice(R, size=R // 2, replace=False)
+                noise = max(noise, R / len(picked))
+                for s in parts:
+                    r[s.where] = stage.left[picked, s.where].mean(axis=0) * np.sqrt(R)
+                continue
+            keep = rng.permutation(int(numbers.max()) + 1) % 2 == 0
+            for s in parts:
+                # The other half carries no weight: its rows take the kept ones' share.
+                r[s.where] = mean[s.where] * np.where(keep[numbers[s.where]], np.sqrt(2.0), 0.0)
+            noise = max(noise, 1.0)
+        out.append((r - mean, noise))
+    return out
+
+
+def stability(
+    listed: Shortlist, winner: Listed, rng: np.random.Generator
+) -> dict[tuple[str, str], tuple[float, dict[str, int]]]:
+    """Return, by effect, in which share of half-samples it is chosen, and who else was."""
+    stage = listed.stage
+    near = sorted(listed.listed.values(), key=lambda o: o.total)
+    near = [o for o in near if not listed.physical(o)][:12]
+    if winner.keys not in [o.keys for o in near]:
+        near.append(winner)
+    tangents = [linear(stage, o) for o in near]
+    counts = dict.fromkeys(winner.keys, 0)
+    others: dict[str, int] = {}
+    samples = halves(stage, rng)
+    for change, noise in samples:
+        refitted = []
+        for t in tangents:
+            r = t.left + change - t.basis @ (t.basis.T @ (t.left + change))
+            refitted.append(_again(stage, t.one, r, noise))
+        best = listed.best(refitted)
+        for key in winner.keys & best.keys:
+            counts[key] += 1
+        for name, where in best.keys - winner.keys:
+            label = f"{name} at {where}"
+            others[label] = others.get(label, 0) + 1
+    return {key: (count / len(samples), others) for key, count in counts.items()}
+
+
+def _again(stage: Board, one: Listed, left: Array, noise: float) -> Listed:
+    return Listed(one.effects, one.fit, excess_of(stage, left, noise), one.size)
+
+
+@dataclass(frozen=True)
+class Spread:
+    """An effect's parameters with standard errors over repeats, and the t distribution's dof."""
+
+    names: tuple[str, ...]
+    value: Array
+    std: Array
+    dof: float
+
+
+def spread(stage: Board, model: Fit, used: Used, values: Mapping[str, float]) -> Spread:
+    """Return an effect's parameters with errors from the scatter between repeats."""
+    names, J = jacobian(stage, model, used)
+    base = _others(stage, model, names)
+    J_p = J - base @ (base.T @ J)
+    pinv = np.linalg.pinv(J_p, rcond=1e-8)
+    variance, dof = np.zeros(len(names)), 0
+    for group in sorted({s.group for s in stage.segments}):
+        parts = [s for s in stage.segments if s.group == group]
+        R = parts[0].repeats
+        if R < 2:
+            variance += sum(np.sum(pinv[:, s.where] ** 2, axis=1) for s in parts)
+            continue
+        each = sum(pinv[:, s.where] @ stage.left[:R, s.where].T / np.sqrt(R) for s in parts)
+        variance += R * np.var(each, axis=1, ddof=1)
+        dof += R - 1
+    shapes = dict(zip(used.term.shape_names(), used.shape, strict=True))
+    value = np.array([values.get(n, shapes.get(n, np.nan)) for n in names])
+    return Spread(names, value, np.sqrt(variance), float(max(dof, 1)))
+
+
+def _others(stage: Board, model: Fit, own: Sequence[str]) -> Array:
+    """Return a basis of everything in the model but the named parameters, other shapes included."""
+    rows = table(stage, model.terms)
+    kept = [k for k, n in enumerate(rows.names) if n not in own]
+    extra = []
+    for other in model.terms:
+        if not other.shape:
+            continue
+        names, J = jacobian(stage, model, other)
+        picked = [k for k, n in enumerate(names) if n not in own and n not in rows.names]
+        extra.append(J[:, picked])
+    return orthonormal(np.column_stack([rows.matrix[:, kept], *extra]))
+
+
+def subsets(stage: Board, joint: int | None) -> dict[str, Array]:
+    """Return masks (M,) of rows: each step, each half of the records, each direction of motion."""
+    M = stage.base.shape[0]
+    out: dict[str, Array] = {}
+    index = {scene.group: k for k, scene in enumerate(stage.scenes)}
+    early, ahead = np.zeros(M, dtype=bool), np.zeros(M, dtype=bool)
+    outer = np.zeros(M, dtype=bool)
+    for s in stage.segments:
+        name = f"step {s.group[1]}"
+        out.setdefault(name, np.zeros(M, dtype=bool))[s.where] = True
+        scene = stage.scenes[index[s.group]]
+        time = stage.rows[index[s.group]][s.equation].time
+        early[s.where] = time < 0.5 * (time[0] + time[-1])
+        own = joint if joint is not None else int(s.equation.rsplit("_", 1)[1]) - 1
+        at = np.clip(
+            np.rint(time * scene.record.sample_rate).astype(int), 0, len(scene.signals.t) - 1
+        )
+        ahead[s.where] = scene.signals.sd[at, own] > 0
+        size = np.abs(scene.signals.sd[at, own])
+        outer[s.where] = size > np.median(size)
+    out |= {
+        "first half": early, "second half": ~early, "extending": ahead, "retracting": ~ahead,
+        "fast": outer, "slow": ~outer,
+    }  # fmt: skip
+    return out
+
+
+def invariance(
+    stage: Board, model: Fit, used: Used, value: Spread, joint: int | None
+) -> list[tuple[str, str, float, float]]:
+    """Return where a parameter disagrees with itself: (subset, parameter, value there, error)."""
+    names, J = jacobian(stage, model, used)
+    base = _others(stage, model, names)
+    left = model.left
+    # A shape such as the presliding distance is the form's, not the effect's size.
+    sizes = {c.parameter for c in used.term.coefficients(stage.rig)}
+    sizes |= {s.parameter for s in shapes_of(stage.rig, used) if s.neutral is not None}
+    units = {c.parameter: c.unit for c in used.term.coefficients(stage.rig)}
+    units |= {s.parameter: s.unit for s in shapes_of(stage.rig, used)}
+    nothing = {s.parameter: s.neutral or 0.0 for s in shapes_of(stage.rig, used)}
+    neutral = np.array([nothing.get(n, 0.0) for n in names])
+    out = []
+    for label, mask in subsets(stage, joint).items():
+        if not mask.any():
+            continue
+        B = orthonormal(base[mask])
+        J_s = J[mask] - B @ (B.T @ J[mask])
+        for k, name in enumerate(names):
+            if name not in sizes:
+                continue
+            if np.linalg.norm(J_s[:, k]) < 0.1 * np.linalg.norm(J[mask][:, k]):
+                continue
+            rest = np.delete(J_s, k, axis=1)
+            own = J_s[:, k]
+            if rest.shape[1]:
+                Q = orthonormal(rest)
+                own = own - Q @ (Q.T @ own)
+            size = float(own @ own)
+            if size <= 0 or not np.isfinite(value.value[k]):
+                continue
+            shift = float(own @ left[mask]) / size
+            error = 1.0 / np.sqrt(size)
+            # Two levels of one effect are judged by the larger: 2 N beside 100 N is a detail.
+            alike = [j for j, n in enumerate(names) if n in sizes and units[n] == units[name]]
+            full = float(np.max(np.abs(value.value[alike] - neutral[alike])))
+            if error > POWER * full:
+                continue
+            if abs(shift) > DEVIATIONS * np.hypot(error, TOLERANCE / DEVIATIONS * full):
+                out.append((label, name, float(value.value[k]) + shift, error))
+    return out

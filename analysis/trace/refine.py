@@ -1,0 +1,170 @@
+"""Refinement: a set of effects fitted exactly, shapes by variable projection.
+
+The rows of the averaged records are rebuilt at every shape, linear coefficients are solved for,
+and only the shapes are searched (Golub and Pereyra, 1973). An effect that rescales the right side
+(a sensor's gain) must not win by making everything small: rows are scaled back to the right
+side's size before the change.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares as search_shapes
+
+from analysis.effects.base import Effect, Shape
+from analysis.rows import Rows
+from analysis.terms.base import Used
+from analysis.trace.board import Board
+from analysis.trace.evidence import Scene, held, scene_rows
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+
+TOLERANCE = 1e-4
+MOST_STEPS = 10
+REMEMBERED = 150  # rows of scenes under a model, about 0.2 MB each
+
+
+@dataclass(frozen=True)
+class Table:
+    """Whitened rows of a model on a board: matrix (M, k) of `names`, right side (M,)."""
+
+    names: tuple[str, ...]
+    matrix: Array
+    rhs: Array
+
+    def left(self, beta: Mapping[str, float]) -> Array:
+        """Return the residual (M,) under coefficients of the rows."""
+        return np.asarray(self.rhs - self.matrix @ np.array([beta.get(n, 0.0) for n in self.names]))
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A model with shapes found: terms, the rows' coefficients, residual (M,) on the board."""
+
+    terms: tuple[Used, ...]
+    beta: Mapping[str, float]
+    left: Array
+
+    @property
+    def energy(self) -> float:
+        """Whitened energy of the residual."""
+        return float(self.left @ self.left)
+
+
+def table(stage: Board, terms: Sequence[Used]) -> Table:
+    """Return the whitened rows of a model on the stage's averaged records and instants.
+
+    Instants that the model masks become zero rows.
+    """
+    built = [_rows(stage, terms, scene) for scene in stage.scenes]
+    names = tuple(dict.fromkeys(c.parameter for u in terms for c in u.term.coefficients(stage.rig)))
+    M = stage.base.shape[0]
+    X, y = np.zeros((M, len(names))), np.zeros(M)
+    index = {scene.group: k for k, scene in enumerate(stage.scenes)}
+    for segment in stage.segments:
+        k = index[segment.group]
+        rows, before = built[k][segment.equation], stage.rows[k][segment.equation]
+        _, here, there = np.intersect1d(before.time, rows.time, return_indices=True)
+        size = np.linalg.norm(before.rhs[here]) / max(
+            float(np.linalg.norm(rows.rhs[there])), 1e-300
+        )
+        weight = np.sqrt(segment.repeats) / segment.noise * size
+        at = segment.where.start + here
+        columns = [names.index(n) for n in rows.names]
+        X[np.ix_(at, columns)] = rows.matrix[there] * weight
+        y[at] = rows.rhs[there] * weight
+    return Table(names, X, y)
+
+
+def _rows(stage: Board, terms: Sequence[Used], scene: Scene) -> dict[str, Rows]:
+    """Return a scene's rows, remembered: many sets share what acts on a scene."""
+    acting = tuple(u for u in terms if not held(u.term, scene))
+    key = (scene.group, acting)
+    if key not in stage.memo:
+        if len(stage.memo) >= REMEMBERED:
+            stage.memo.clear()
+        stage.memo[key] = scene_rows(stage.rig, acting, scene)
+    return stage.memo[key]
+
+
+def fit(stage: Board, terms: Sequence[Used]) -> Fit:
+    """Solve a model's coefficients on the board, shapes as they are."""
+    rows = table(stage, terms)
+    scale = np.linalg.norm(rows.matrix, axis=0)
+    scale[scale == 0] = 1.0
+    value = np.linalg.lstsq(rows.matrix / scale, rows.rhs, rcond=1e-6)[0] / scale
+    beta = dict(zip(rows.names, value, strict=True))
+    return Fit(tuple(terms), beta, rows.left(beta))
+
+
+def shapes_of(rig: Rig, used: Used) -> tuple[Shape, ...]:
+    """Return the shape parameters of a term, none for a term that is no effect."""
+    return used.term.shapes(rig) if isinstance(used.term, Effect) else ()
+
+
+def refine(stage: Board, terms: Sequence[Used], steps: int = MOST_STEPS) -> Fit:
+    """Search all shape parameters of a model on the board from where they are."""
+    free = [(k, j, s) for k, u in enumerate(terms) for j, s in enumerate(shapes_of(stage.rig, u))]
+    if not free:
+        return fit(stage, terms)
+    start = np.array([_to_unit(terms[k].shape[j], s) for k, j, s in free])
+
+    def at(x: Array) -> tuple[Used, ...]:
+        shapes = [list(u.shape) for u in terms]
+        for value, (k, j, s) in zip(x, free, strict=True):
+            shapes[k][j] = _from_unit(float(value), s)
+        return tuple(Used(u.term, tuple(v)) for u, v in zip(terms, shapes, strict=True))
+
+    found = search_shapes(
+        lambda x: fit(stage, at(x)).left, np.clip(start, 1e-6, 1 - 1e-6), bounds=(0.0, 1.0),
+        diff_step=1e-3, xtol=TOLERANCE, ftol=TOLERANCE, gtol=1e-12,
+        max_nfev=steps,
+    )  # fmt: skip
+    return fit(stage, at(found.x))
+
+
+def _logarithmic(shape: Shape) -> bool:
+    return shape.low > 0 and shape.high / shape.low > 20
+
+
+def _to_unit(value: float, shape: Shape) -> float:
+    """Map a shape parameter to 0..1 between its bounds, by its logarithm where these lie far."""
+    if _logarithmic(shape):
+        return float(np.log(value / shape.low) / np.log(shape.high / shape.low))
+    return (value - shape.low) / (shape.high - shape.low)
+
+
+def _from_unit(x: float, shape: Shape) -> float:
+    if _logarithmic(shape):
+        return float(shape.low * (shape.high / shape.low) ** x)
+    return shape.low + x * (shape.high - shape.low)
+
+
+def jacobian(stage: Board, model: Fit, used: Used) -> tuple[tuple[str, ...], Array]:
+    """Return names and whitened columns (M, p) of an effect's coefficients and shapes.
+
+    A column is what a unit more of the parameter adds to the model's side of the rows.
+    """
+    rows = table(stage, model.terms)
+    own = [c.parameter for c in used.term.coefficients(stage.rig)]
+    names, columns = list(own), [rows.matrix[:, rows.names.index(n)] for n in own]
+    for j, shape in enumerate(shapes_of(stage.rig, used)):
+        step = 1e-3 * (shape.high - shape.low)
+        if _logarithmic(shape):
+            step = 1e-2 * used.shape[j]
+        up = min(used.shape[j] + step, shape.high)
+        down = max(used.shape[j] - step, shape.low)
+        ends = []
+        for value in (up, down):
+            changed = Used(used.term, (*used.shape[:j], value, *used.shape[j + 1 :]))
+            terms = tuple(changed if u is used else u for u in model.terms)
+            ends.append(table(stage, terms).left(model.beta))
+        names.append(shape.parameter)
+        columns.append(-(ends[0] - ends[1]) / (up - down))
+    stack = np.column_stack(columns) if columns else np.zeros((len(model.left), 0))
+    return tuple(names), stack

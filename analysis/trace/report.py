@@ -1,0 +1,157 @@
+"""The trace's report: one HTML page whose pictures alone make the point."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, FunctionLoader, StrictUndefined
+from markupsafe import Markup
+
+from analysis import report_format as fm
+from analysis.effects.base import Effect
+from analysis.report import Provenance
+from analysis.trace import figures
+from analysis.trace.result import CLEAN, Found, Trace
+from analysis.trace.words import quantity
+from rig.model.parse import InputError
+from rig.model.records import Run
+from rig.model.rig import Rig
+
+TEMPLATE = "trace.html"
+TITLES = {
+    "clean": "Nothing above the noise",
+    "explained": "What the model lacked, named",
+    "confounded": "Two or more effects fit alike",
+    "unexplained": "Something the catalogue does not hold",
+}
+
+
+def write_trace_report(
+    path: Path, holdout: Sequence[Run], result: Trace, provenance: Provenance | None = None
+) -> None:
+    """Write the report as one HTML file; raises InputError where it cannot be written."""
+    page = render(holdout, result, provenance)
+    part = path.with_name(path.name + ".part")
+    try:
+        part.write_text(page, encoding="utf-8")
+        part.replace(path)
+    except OSError as error:
+        raise InputError(f"cannot write the report {path}: {error.strerror or error}") from error
+
+
+def render(holdout: Sequence[Run], result: Trace, provenance: Provenance | None = None) -> str:
+    """Return the report as HTML text."""
+    rig = result.model_before.rig
+    context = {
+        "title": TITLES[result.verdict],
+        "style": Markup(_read("report.css")),
+        "rig": rig,
+        "result": result,
+        "provenance": provenance or Provenance(),
+        "galleries": _pictures(rig, holdout, result),
+        "overview": figures.over_noise(result),
+        "errors": _errors(result),
+        "effects": [_effect(e) for e in result.effects],
+        "refused": [_effect(e) for e in result.refused],
+        "parameters": _parameters(result),
+        "fits": [
+            (name, fm.fit(value), fm.fit(result.fit_after.get(name)))
+            for name, value in result.fit_before.items()
+        ],
+        "floors": result.floors,
+        "fm": fm,
+    }
+    environment = Environment(
+        loader=FunctionLoader(_read), autoescape=True, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    return environment.get_template(TEMPLATE).render(context)
+
+
+def _read(name: str) -> str:
+    return (resources.files("analysis") / "templates" / name).read_text(encoding="utf-8")
+
+
+def _pictures(rig: Rig, holdout: Sequence[Run], result: Trace) -> list[dict[str, Any]]:
+    """Return per effect, else per clue, the residual against its variable and in time."""
+    lines = figures.held_out(rig, holdout, result)
+    out = []
+    effects = [u.term for u in result.model_after.terms if isinstance(u.term, Effect)]
+    for k, effect in enumerate(effects):
+        equation = figures.equation_of(effect, rig, result, lines)
+        heading = f"{effect.name.replace('_', ' ')} at {getattr(effect, 'place', effect.where)}"
+        out.append(_pair(rig, lines, result, effect, effect.variable, equation, heading, f"e{k}"))
+    for k, clue in enumerate(result.depends_on[:2]):
+        heading = f"what is left of {clue.equation} against {clue.variable}"
+        out.append(_pair(rig, lines, result, None, clue.variable, clue.equation, heading, f"c{k}"))
+    return out
+
+
+def _pair(
+    rig: Rig, lines: Mapping[str, list[figures.Lines]], result: Trace, effect: Effect | None,
+    variable: str, equation: str, heading: str, key: str,
+) -> dict[str, Any]:  # fmt: skip
+    here, unit = lines[equation], figures.unit_of_equation(equation)
+    noise = result.noise_floor[equation]
+    model = result.model_after
+    changed = model is not result.model_before
+    x = figures.abscissae(rig, here, effect, variable, equation, model)
+    label = variable
+    if effect is None:
+        label = f"{variable} [{figures.unit_of_variable(variable)}]"
+    longest = max(here, key=lambda line: float((line.before**2).mean()))
+    return {
+        "heading": heading,
+        "text": f"{equation}, held-out records; the band is ± one rms of noise, red the mean.",
+        "against": figures.against(x, here, noise, unit, label, f"{key}x", changed),
+        "time": figures.in_time(longest, noise, unit, f"{key}t", changed),
+        "record": longest.scene.record.name,
+    }
+
+
+def _errors(result: Trace) -> list[tuple[str, ...]]:
+    out: list[tuple[str, ...]] = []
+    for name, before in result.before.items():
+        floor, after = result.noise_floor.get(name, math.nan), result.after.get(name, math.nan)
+        out.append(
+            (
+                name, figures.unit_of_equation(name), fm.significant(floor),
+                fm.significant(before), fm.significant(after),
+                fm.significant(before / floor), fm.significant(after / floor),
+            )
+        )  # fmt: skip
+    return out
+
+
+def _effect(found: Found) -> dict[str, Any]:
+    return {
+        "name": found.name.replace("_", " "),
+        "where": found.where,
+        "values": [(n, quantity(e)) for n, e in found.parameters.items()],
+        "p": fm.significant(found.p_value),
+        "removed": fm.significant(100 * found.removed_fraction),
+        "gates": found.gates,
+        "rivals": [
+            (
+                r.name.replace("_", " "), r.where, fm.significant(r.ratio),
+                fm.significant(r.training_ratio), "cannot be told apart" if r.tied else "ruled out",
+            )
+            for r in found.rivals
+        ],
+    }  # fmt: skip
+
+
+def _parameters(result: Trace) -> list[tuple[str, ...]]:
+    if result.verdict == CLEAN or result.model_after is result.model_before:
+        return []
+    after = result.model_after.parameters
+    out: list[tuple[str, ...]] = []
+    for name, one in result.model_before.parameters.items():
+        if name in after and one.identified and after[name].identified:
+            change = 100 * (after[name].value / one.value - 1) if one.value else math.nan
+            out.append((name, quantity(one), quantity(after[name]), f"{change:+.1f} %"))
+    return out

@@ -1,0 +1,159 @@
+"""What a trace says, as data and as the contract's JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+from analysis.model import Estimate, Model, estimate_json, finite
+from analysis.trace.floor import Floor
+
+CLEAN: Final = "clean"
+EXPLAINED: Final = "explained"
+CONFOUNDED: Final = "confounded"
+UNEXPLAINED: Final = "unexplained"
+
+
+@dataclass(frozen=True)
+class Rival:
+    """Another effect in the same part: what it leaves on held-out records over what the best does.
+
+    `ratio` and `training_ratio` are of whitened rms; `tied` says that the data cannot tell it
+    from the best.
+    """
+
+    name: str
+    where: str
+    ratio: float
+    training_ratio: float
+    tied: bool
+
+
+@dataclass(frozen=True)
+class Gate:
+    """One condition for a name: its word, whether it holds, and the figures."""
+
+    name: str
+    ok: bool
+    detail: str
+
+
+@dataclass(frozen=True)
+class Found:
+    """An effect with its parameters, evidence and the gates it passed or not.
+
+    `removed_fraction` is the share of the repeatable energy on held-out records, in the equations
+    that the effect touches, which goes with it, the other effects kept.
+    """
+
+    name: str
+    where: str
+    parameters: Mapping[str, Estimate]
+    p_value: float
+    removed_fraction: float
+    rivals: tuple[Rival, ...]
+    gates: tuple[Gate, ...]
+    variable: str = ""
+
+    @property
+    def named(self) -> bool:
+        """Whether every gate holds."""
+        return all(gate.ok for gate in self.gates)
+
+
+@dataclass(frozen=True)
+class Dependence:
+    """A variable that what is left moves with, and the share of it that it carries held out."""
+
+    variable: str
+    share: float
+    equation: str
+
+
+@dataclass(frozen=True)
+class Trace:
+    """The whole result; every `error` and `fit` figure is of the held-out records, SI and percent.
+
+    `floors` are the training records' split residuals under the baseline, `notes` what a person
+    must know of the evidence's weakness; `refused` fitted best but did not pass the gates.
+    """
+
+    verdict: str
+    effects: tuple[Found, ...]
+    noise_floor: Mapping[str, float]
+    before: Mapping[str, float]
+    after: Mapping[str, float]
+    fit_before: Mapping[str, float]
+    fit_after: Mapping[str, float]
+    model_before: Model
+    model_after: Model
+    unexplained_fraction: float
+    depends_on: tuple[Dependence, ...]
+    next_experiment: Mapping[str, Any] | None
+    floors: tuple[Floor, ...]
+    notes: tuple[str, ...] = ()
+    sentence: str = ""
+    seconds: float = 0.0
+    refused: tuple[Found, ...] = ()
+
+
+def to_json(result: Trace) -> dict[str, Any]:
+    """Return the contract's JSON; `refused gates noise notes sentence seconds` are additions."""
+    return {
+        "verdict": result.verdict,
+        "effects": [_effect(e) for e in result.effects],
+        "refused": [_effect(e) for e in result.refused],
+        "error": {
+            "noise_floor": _numbers(result.noise_floor),
+            "before": _numbers(result.before),
+            "after": _numbers(result.after),
+        },
+        "fit": {"before": _numbers(result.fit_before), "after": _numbers(result.fit_after)},
+        "parameters": {
+            "before": _parameters(result.model_before),
+            "after": _parameters(result.model_after),
+        },
+        "unexplained": {
+            "fraction": finite(result.unexplained_fraction),
+            "depends_on": [d.variable for d in result.depends_on],
+            "shares": {d.variable: finite(d.share) for d in result.depends_on},
+        },
+        "next_experiment": dict(result.next_experiment) if result.next_experiment else None,
+        "noise": [
+            {
+                "step": f.group[1], "equation": f.equation, "noise": finite(f.noise),
+                "repeatable": finite(f.repeatable), "source": f.source, "count": f.count,
+            }
+            for f in result.floors
+        ],
+        "notes": list(result.notes),
+        "sentence": result.sentence,
+        "seconds": result.seconds,
+    }  # fmt: skip
+
+
+def _effect(found: Found) -> dict[str, Any]:
+    return {
+        "name": found.name,
+        "where": found.where,
+        "parameters": {n: estimate_json(e) for n, e in found.parameters.items()},
+        "p_value": finite(found.p_value),
+        "removed_fraction": finite(found.removed_fraction),
+        "rivals": [
+            {
+                "name": r.name, "where": r.where, "held_out_ratio": finite(r.ratio),
+                "training_ratio": finite(r.training_ratio), "tied": r.tied,
+            }
+            for r in found.rivals
+        ],
+        "gates": [{"name": g.name, "ok": g.ok, "detail": g.detail} for g in found.gates],
+    }  # fmt: skip
+
+
+def _numbers(values: Mapping[str, float]) -> dict[str, float | None]:
+    return {name: finite(value) for name, value in values.items()}
+
+
+def _parameters(model: Model) -> dict[str, Any]:
+    return {name: estimate_json(e) for name, e in model.parameters.items()}

@@ -1,0 +1,72 @@
+"""The trace's result in plain words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from analysis.model import Estimate
+from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, Found, Trace
+
+UNITS = {"torque": "N·m", "flow_cap": "m³/s", "flow_rod": "m³/s"}
+
+
+def sentence(result: Trace) -> str:
+    """Return one paragraph that a person can act on."""
+    if result.verdict == CLEAN:
+        return (
+            "Nothing stands above the noise: the baseline model explains these records, and there "
+            "is nothing to name."
+        )
+    named = "; ".join(_effect(e) for e in result.effects)
+    errors = _errors(result)
+    if result.verdict == EXPLAINED:
+        return f"{_moves(result.effects)}: {named}. {errors}"
+    if result.verdict == CONFOUNDED:
+        rivals = sorted(
+            {f"{r.name} at {r.where}" for e in result.effects for r in e.rivals if r.tied}
+        )
+        text = f"Best is {named}, but these records cannot tell it from {', '.join(rivals)}."
+        if result.next_experiment:
+            text += f" What would tell: {result.next_experiment['text']}."
+        return f"{text} {errors}"
+    found = f"Found so far: {named}. " if named else "No effect of the catalogue is named. "
+    clue = ", ".join(d.variable for d in result.depends_on[:2])
+    return (
+        f"{found}{100 * result.unexplained_fraction:.0f} % of what repeats stays unexplained"
+        + (f"; it moves with {clue}." if clue else ".")
+        + (f" {errors}" if named else "")
+    )
+
+
+def _moves(effects: tuple[Found, ...]) -> str:
+    variables = [e.variable for e in effects if e.variable]
+    return "The residual follows " + " and ".join(variables) if variables else "Explained"
+
+
+def _effect(found: Found) -> str:
+    values = ", ".join(f"{n} = {quantity(e)}" for n, e in found.parameters.items())
+    return f"{found.name.replace('_', ' ')} at {found.where} ({values})"
+
+
+def quantity(estimate: Estimate) -> str:
+    """Return value ± 95 % half-width with its unit."""
+    unit = estimate.unit.replace("*", "·").replace("^2", "²").replace("^3", "³")
+    half = 0.5 * (estimate.ci95[1] - estimate.ci95[0])
+    return f"{estimate.value:.3g} ± {half:.1g} {unit}".strip()
+
+
+def loudest(result: Trace) -> str:
+    """Return the equation whose error fell most, relative to its noise."""
+    floor: Mapping[str, float] = result.noise_floor
+    return max(result.before, key=lambda e: result.before[e] / max(floor.get(e, 1e-30), 1e-30))
+
+
+def _errors(result: Trace) -> str:
+    if not result.before:
+        return ""
+    e = loudest(result)
+    unit = UNITS.get(e.rsplit("_", 1)[0], "")
+    return (
+        f"Held-out error of {e}: {result.before[e]:.2g} → {result.after.get(e, float('nan')):.2g} "
+        f"{unit}, noise floor {result.noise_floor.get(e, float('nan')):.2g}."
+    )

@@ -1,0 +1,45 @@
+"""The `design` verb."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rig.cli.bench_commands import JsonOption, RigOption
+
+
+def design(
+    protocol: Annotated[str, typer.Argument(help="A shipped protocol's name, or a file.")],
+    rig: RigOption,
+    out: Annotated[Path, typer.Option(help="The protocol file to write.")],
+    criterion: Annotated[
+        str, typer.Option(help="D, E, or the name of the parameter to improve.")
+    ] = "E",
+    budget: Annotated[
+        int, typer.Option(min=1, max=5000, help="Simulations of a step on the twin.")
+    ] = 300,
+    seed: Annotated[int, typer.Option(min=0, help="Of the search; the same gives the same.")] = 0,
+    json: JsonOption = None,
+) -> None:
+    """Improve a protocol's multisines for what it identifies worst, within the rig's limits.
+
+    Example: bramah design lock-and-excite-multisine --rig shinshu-2dof --criterion b --out b.yaml
+    """
+    from rig.cli.foresight import design_json, design_protocol, design_text
+    from rig.cli.output import write_json
+
+    found = design_protocol(protocol, rig, criterion, budget, seed)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    part = out.with_name(out.name + ".part")
+    part.write_text(found.text, encoding="utf-8")
+    part.replace(out)
+    write_json(json, design_json(found))
+    if json != Path("-"):
+        typer.echo(design_text(found, out))
+
+
+def register(app: typer.Typer) -> None:
+    """Add this verb to the command line."""
+    app.command()(design)

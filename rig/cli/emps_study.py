@@ -1,0 +1,191 @@
+"""The measured positioning system (EMPS): models, filters and hold-outs, each as a table.
+
+Published least squares of the record: Janot, Gautier and Brunot, Data Set and Reference Models of
+EMPS, 2019.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.differentiate import butterworth, channel_filter, row_filter, row_step
+from analysis.effects.friction import TRANSITION
+from analysis.identify import Identification, identify
+from analysis.model import Model
+from analysis.rows import Filtering, default_filtering
+from analysis.terms import with_effects
+from analysis.terms.base import Used
+from analysis.validate import validate
+from rig.cli.output import table
+from rig.model.electric import drive_gains
+from rig.model.records import Record, Run
+from rig.services.importer import import_records
+from rig.services.store import load_run
+from rig.services.tables import read_table
+
+Array = NDArray[np.float64]
+
+PUBLISHED: Final = {"M1": 95.1089, "Fv1": 203.5034, "Fc1": 20.3935, "offset1": -3.1648}
+KP, KV = 160.18, 243.45  # [1/s], [V s/m] of the machine's own controller
+HALF = 12.42  # [s]
+COLUMNS: Final = """columns:
+  time: {column: t}
+  position_1: {column: qm}
+  drive_1: {column: vir}
+"""
+MODELS: Final[dict[str, tuple[str, ...]]] = {
+    "M Fv (textbook)": (),
+    "with Fc": ("coulomb_friction",),
+    "with offset": ("torque_offset",),
+    "with Fc and offset": ("coulomb_friction", "torque_offset"),
+}
+
+
+@dataclass(frozen=True)
+class Emps:
+    """The record as runs (whole, first and second half) and the controller's reference (n,)."""
+
+    whole: Run
+    first: Run
+    second: Run
+    reference: Array
+
+
+def load(file: Path) -> Emps:
+    """Import the MAT file as a whole and in halves; raises InputError."""
+    parts = {"whole": "", "first": f", end: {HALF} s", "second": f", begin: {HALF} s"}
+    runs = {}
+    with tempfile.TemporaryDirectory() as scratch:
+        for name, part in parts.items():
+            manifest = Path(scratch) / f"{name}.yaml"
+            entry = f"records:\n  - {{file: {str(file.resolve())!r}, step: {name}{part}}}\n"
+            manifest.write_text(f"rig: emps\n{entry}{COLUMNS}")
+            runs[name] = load_run(import_records(manifest, Path(scratch) / name).path)
+    return Emps(**runs, reference=read_table(file, ["qg"], ["qg"])["qg"])
+
+
+def fit(
+    run: Run,
+    effects: tuple[str, ...] = MODELS["with Fc and offset"],
+    filtering: Callable[[Record], Filtering] = default_filtering,
+) -> Identification:
+    """Identify the record with effects."""
+    terms = [Used(term) for term in with_effects(run.rig, effects)]
+    return identify([run], terms=terms, filtering=filtering)
+
+
+def open_loop(model: Model, run: Run) -> float:
+    """Return the RMSE [m] of the position that the measured drive gives the model."""
+    (result,) = validate(model, [run])
+    return result.rmse["position_1"]
+
+
+def models_table(data: Emps) -> str:
+    """Return what each model finds, and its open-loop errors on data of and not of the fit."""
+    rows = []
+    for name, effects in MODELS.items():
+        found = fit(data.whole, effects)
+        values = {n: e.value for n, e in found.estimates.items()}
+        errors = [
+            open_loop(found.model, data.whole),
+            open_loop(fit(data.first, effects).model, data.second),
+            open_loop(fit(data.second, effects).model, data.first),
+        ]
+        rows.append([name, *_values(values), *(f"{1e3 * e:.2f}" for e in errors)])
+    for name, half in (("1st half alone", data.first), ("2nd half alone", data.second)):
+        values = {n: e.value for n, e in fit(half).estimates.items()}
+        rows.append([name, *_values(values), "", "", ""])
+    rows.append(["published", *_values(PUBLISHED), "", "", ""])
+    head = ["model", "M [kg]", "Fv [N s/m]", "Fc [N]", "offset [N]"]
+    return table([*head, "whole [mm]", "1st on 2nd [mm]", "2nd on 1st [mm]"], rows)
+
+
+def _values(values: Mapping[str, float]) -> list[str]:
+    return [f"{values[n]:.4f}" if n in values else "—" for n in PUBLISHED]
+
+
+def filterings(rate: float) -> dict[str, Callable[[Record], Filtering]]:
+    """Return the filters to compare, by what they are."""
+
+    def rows_at(cutoff: float) -> Callable[[Record], Filtering]:
+        chosen = Filtering(channel_filter(rate), row_filter(rate, cutoff), row_step(rate, cutoff))
+        return lambda _: chosen
+
+    def every(step: int) -> Callable[[Record], Filtering]:
+        return lambda _: Filtering(butterworth(rate, 100.0), None, step)
+
+    return {
+        "default": default_filtering,
+        **{f"rows to {hz} Hz": rows_at(float(hz)) for hz in (8, 15, 60)},
+        "Butterworth 100 Hz, every row": every(1),
+        "the same, each 20th picked": every(20),
+    }
+
+
+def filters_table(data: Emps) -> str:
+    """Return the distance from the published values and the open-loop error for each filter."""
+    rows = []
+    for name, filtering in filterings(data.whole.rig.sample_rate).items():
+        found = fit(data.whole, filtering=filtering)
+        off = [100 * (found.estimates[n].value / known - 1) for n, known in PUBLISHED.items()]
+        error = open_loop(found.model, data.whole)
+        rows.append(
+            [
+                name,
+                str(found.rows["mechanical"]),
+                *(f"{v:+.2f} %" for v in off),
+                f"{1e3 * error:.2f}",
+            ]
+        )
+    return table(["filter", "rows", "M", "Fv", "Fc", "offset", "open loop [mm]"], rows)
+
+
+def closed_loop(values: Mapping[str, float], gain: float, data: Emps) -> tuple[Array, Array]:
+    """Return position [m] and drive [V] (n,) under vir = kv (kp (qg - q) - q').
+
+    Ten explicit steps a sample of M q'' + Fv q' + Fc tanh(q'/v) + offset = gain vir: separate from
+    the package's integrator.
+    """
+    n, steps = len(data.reference), 10
+    h = 1.0 / (data.whole.rig.sample_rate * steps)
+    position, drive = np.empty(n), np.empty(n)
+    measured = data.whole.records[0].channels["position_1"]
+    q, qd = float(measured[0]), float(measured[10] - measured[0]) * 100.0
+    mass, viscous = values["M1"], values["Fv1"]
+    dry, offset = values.get("Fc1", 0.0), values.get("offset1", 0.0)
+    for k in range(n):
+        v = min(max(KV * (KP * (float(data.reference[k]) - q) - qd), -10.0), 10.0)
+        position[k], drive[k] = q, v
+        for _ in range(steps):
+            force = gain * v - viscous * qd - dry * math.tanh(qd / TRANSITION) - offset
+            qd += h * force / mass
+            q += h * qd
+    return position, drive
+
+
+def closed_loop_table(data: Emps) -> str:
+    """Return what position and drive do under the machine's own controller."""
+    record, gain = data.whole.records[0], drive_gains(data.whole.rig)[0]
+    measured, drive = (np.asarray(record.channels[n]) for n in ("position_1", "drive_1"))
+    rows = []
+    for name, effects in MODELS.items():
+        values = {n: e.value for n, e in fit(data.whole, effects).estimates.items()}
+        q, v = closed_loop(values, gain, data)
+        relative = np.linalg.norm(v - drive) / np.linalg.norm(drive)
+        rms = 1e3 * np.sqrt(np.mean((q - measured) ** 2))
+        rows.append([name, f"{rms:.3f}", f"{100 * relative:.1f} %"])
+    return table(["closed loop", "position rmse [mm]", "drive error"], rows)
+
+
+def text(file: Path) -> str:
+    """Return all tables."""
+    data = load(file)
+    return "\n\n".join((models_table(data), filters_table(data), closed_loop_table(data)))

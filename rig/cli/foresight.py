@@ -1,0 +1,154 @@
+"""What an experiment will tell: the work of `check`'s second half and of `design`."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from analysis.design import Design, improve
+from analysis.prediction import Prediction, predict, to_json
+from analysis.twin import simulate_commands
+from protocols import library
+from protocols.check import check
+from protocols.check_report import CheckReport
+from protocols.plan import Overrides, Plan, resolve
+from protocols.write import protocol_text
+from rig.cli.output import progress, table
+from rig.cli.planned import designed_protocol, empty_lines, planned_steps
+from rig.model.parse import InputError
+from rig.model.rig import Rig
+from rig.services.rigs import load_bench
+
+
+@dataclass(frozen=True)
+class Foresight:
+    """A protocol's limits on the twin, and what it will tell (None, and why, where unknown)."""
+
+    limits: CheckReport
+    prediction: Prediction | None
+    why: str = ""
+
+
+def foresee(protocol: str, rig: str, overrides: Overrides) -> Foresight:
+    """Check a protocol's limits and predict its errors; raises InputError for bad files."""
+    bench = load_bench(rig)
+    plan = resolve(library.load(protocol), bench, overrides)
+    return of_plan(plan, bench)
+
+
+def of_plan(plan: Plan, rig: Rig) -> Foresight:
+    """Check and predict a plan; what cannot be predicted is said, the limits stand without it."""
+    limits = check(plan, rig, simulate_commands)
+    biases = {step.step: step.biases for step in limits.steps}
+    try:
+        return Foresight(limits, predict(rig, planned_steps(plan, biases)))
+    except InputError as error:
+        return Foresight(limits, None, str(error))
+
+
+def as_dict(found: Foresight) -> dict[str, Any]:
+    """Return the check as plain data, with the prediction, or why there is none."""
+    told: dict[str, Any] = {"impossible": found.why}
+    if found.prediction is not None:
+        told = to_json(found.prediction)
+    return {**found.limits.as_dict(), "identification": told}
+
+
+def percent(value: float) -> str:
+    """Return a relative figure as a percentage with three digits, or a dash."""
+    return f"{100.0 * value:.3g}" if math.isfinite(value) else "—"
+
+
+def prediction_text(found: Foresight) -> str:
+    """Return each parameter's predicted error, the conditioning, and what is not determined."""
+    p = found.prediction
+    if p is None:
+        return f"standard errors cannot be predicted: {found.why}"
+    rows = [
+        [name, f"{e.nominal:.4g}", percent(e.std), percent(e.half), percent(e.oil)]
+        for name, e in p.parameters.items()
+    ]
+    header = ["parameter", "nominal [SI]", "std. error %", "± 95 % %", "oil's swing %"]
+    lines = ["predicted from the stated sensor noise, relative to the nominal value:"]
+    lines.append(table(header, rows))
+    for family, (rank, size) in p.rank.items():
+        condition = p.condition[family]
+        lines.append(f"{family}: rank {rank} of {size}, condition number {condition:.1f}")
+    if p.masked_share > 0:
+        lines.append(f"{100 * p.masked_share:.2g} % of the rows would be masked")
+    lines += [f"NOT determined {n}: {e.note}" for n, e in p.parameters.items() if e.note]
+    lines.append(f"worst known: {p.worst}")
+    return "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class Designed:
+    """A designed protocol: its file's text, what was found, and both predictions of it."""
+
+    text: str
+    plan: Plan
+    design: Design
+    before: Foresight
+    after: Foresight
+
+
+def design_protocol(protocol: str, rig: str, criterion: str, budget: int, seed: int) -> Designed:
+    """Improve a protocol's multisines; raises InputError where that cannot be done."""
+    bench = load_bench(rig)
+    plan = resolve(library.load(protocol), bench)
+    before = of_plan(plan, bench)
+    biases = {step.step: step.biases for step in before.limits.steps}
+    design = improve(
+        bench, planned_steps(plan, biases), empty_lines(plan), criterion, budget,
+        np.random.default_rng(seed), progress,
+    )  # fmt: skip
+    better = designed_protocol(plan, design, criterion)
+    after_plan = resolve(better, bench)
+    after = of_plan(after_plan, bench)
+    after.limits.require()
+    command = (
+        f"bramah design {protocol} --rig {rig} --criterion {criterion} --budget {budget} "
+        f"--seed {seed}"
+    )
+    return Designed(protocol_text(better, f"Made by: {command}"), after_plan, design, before, after)
+
+
+def design_text(found: Designed, out: Path) -> str:
+    """Return the parameters before and after, and the limits that each step fills."""
+    before, after = found.before.prediction, found.after.prediction
+    assert before is not None  # the design itself needed it
+    assert after is not None
+    rows = []
+    for name, e in before.parameters.items():
+        later = after.parameters[name]
+        ratio = f"{later.std / e.std:.2f}" if e.std > 0 else "—"
+        rows.append([name, percent(e.std), percent(later.std), ratio])
+    lines = [table(["parameter", "before %", "after %", "ratio"], rows), ""]
+    for step, (share, limit) in found.design.shares_after.items():
+        was, which = found.design.shares_before[step]
+        lines.append(f"{limit} at {share:.0%} of its limit (before: {which} at {was:.0%})")
+    lines.append(f"{found.design.tried} trials, {found.design.kept} kept; written to {out}")
+    return "\n".join(lines)
+
+
+def design_json(found: Designed) -> dict[str, Any]:
+    """Return predicted relative standard errors before and after, and the shares of limits."""
+    before, after = found.before.prediction, found.after.prediction
+    assert before is not None
+    assert after is not None
+    return {
+        "parameters": {
+            name: {"before": e.std, "after": after.parameters[name].std}
+            for name, e in before.parameters.items()
+        },
+        "limits": {
+            step: {"limit": limit, "share": share}
+            for step, (share, limit) in found.design.shares_after.items()
+        },
+        "tried": found.design.tried,
+        "kept": found.design.kept,
+    }

@@ -1,0 +1,101 @@
+"""A page of words, tables and figures, written as Markdown or as text for a terminal."""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from rig.cli import output
+
+WIDTH = 100
+
+
+@dataclass(frozen=True)
+class Table:
+    """A caption, a header and rows of ready cells."""
+
+    caption: str
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure: the file's name, its <svg> as a report would hold it, its caption."""
+
+    file: str
+    svg: str
+    caption: str
+
+
+@dataclass(frozen=True)
+class Section:
+    """A heading and what stands under it, in order; a string is a paragraph."""
+
+    title: str
+    parts: Sequence[str | Table | Picture]
+
+
+def text(sections: Sequence[Section]) -> str:
+    """Return the page for a terminal: tables in columns, figures left out."""
+    lines: list[str] = []
+    for section in sections:
+        lines += [section.title, "=" * len(section.title), ""]
+        for part in section.parts:
+            if isinstance(part, Table):
+                lines += [part.caption, "", output.table(part.header, part.rows), ""]
+            elif isinstance(part, str):
+                lines += [textwrap.fill(part.replace("**", ""), WIDTH), ""]
+    return "\n".join(lines).rstrip()
+
+
+def markdown(title: str, sections: Sequence[Section], figures: str) -> str:
+    """Return the page as Markdown; figures are looked for in the folder `figures` beside it."""
+    lines = [f"# {title}", ""]
+    for section in sections:
+        if section.title:
+            lines += [f"## {section.title}", ""]
+        for part in section.parts:
+            if isinstance(part, Table):
+                lines += [f"**{part.caption}**", "", *_table(part), ""]
+            elif isinstance(part, Picture):
+                lines += [f"![{part.caption}]({figures}/{part.file})", "", f"*{part.caption}*", ""]
+            else:
+                lines += [part, ""]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _table(table: Table) -> list[str]:
+    def row(cells: Sequence[str]) -> str:
+        return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+    rule = "|:--" + "|--:" * (len(table.header) - 1) + "|"
+    return [row(table.header), rule, *(row(cells) for cells in table.rows)]
+
+
+def write_page(path: Path, title: str, sections: Sequence[Section]) -> None:
+    """Write the Markdown and, in a folder named after it, its figures."""
+    folder = path.parent / path.stem
+    for section in sections:
+        for part in section.parts:
+            if isinstance(part, Picture):
+                folder.mkdir(parents=True, exist_ok=True)
+                (folder / part.file).write_text(standalone(part.svg), encoding="utf-8")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(markdown(title, sections, path.stem), encoding="utf-8")
+
+
+_STYLE = (
+    "<style>*{stroke-linejoin:round;stroke-linecap:butt}"
+    "text{font-family:Helvetica,Arial,sans-serif}</style>"
+    '<rect width="100%" height="100%" fill="#ffffff"/>'
+)
+
+
+def standalone(svg: str) -> str:
+    """Return an <svg> made to stand within a page as a file of its own."""
+    opening = '<svg xmlns="http://www.w3.org/2000/svg"'
+    return re.sub(r"<svg([^>]*)>", rf"{opening}\1>{_STYLE}", svg, count=1) + "\n"

@@ -1,0 +1,38 @@
+"""`identify --physical`: the consistent parameters beside the free ones, and their price."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from analysis.consistent import Physical, physical, with_physics
+from analysis.consistent import to_json as physical_json
+from analysis.identify import Identification
+from analysis.identify import to_json as identification_json
+from rig.cli.output import table
+
+
+def make_physical(result: Identification) -> tuple[Identification, dict[str, Any], str]:
+    """Return the identification with consistent parameters, its JSON, and the comparison as text.
+
+    Raises InputError where a parameter is not identified.
+    """
+    found = physical(result)
+    given = with_physics(result, found)
+    told = {**identification_json(given), "physical": physical_json(found)}
+    return given, told, "\n\n" + physical_text(found)
+
+
+def physical_text(found: Physical) -> str:
+    """Return every parameter free and at each level, and which level was given out."""
+    header = ["parameter [SI]", "free", *(f"{level.name}" for level in found.levels)]
+    rows = []
+    for name, free in found.free.items():
+        cells = [name, f"{free.value:.5g}"]
+        for level in found.levels:
+            value = level.estimates[name].value
+            cells.append(f"{value:.5g} ({100 * (value / free.value - 1):+.2f} %)")
+        rows.append(cells)
+    level = found.levels[found.given]
+    more = found.levels[found.given + 1 :]
+    why = f"; '{more[0].name}' is rejected by the data" if more else ""
+    return f"{table(header, rows)}\ngiven out: '{level.name}'{why}"

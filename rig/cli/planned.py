@@ -1,0 +1,70 @@
+"""From a protocol's plan to what the analysis predicts from: the two packages do not meet."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from analysis.design import Design
+from analysis.prediction_twin import PlannedStep
+from protocols.excite import Waveform, chosen_lines
+from protocols.model import CLOSED, Protocol
+from protocols.plan import Plan, StepPlan
+
+
+def planned_steps(
+    plan: Plan, biases: Mapping[str, Mapping[int, float]] | None = None
+) -> list[PlannedStep]:
+    """Return a plan's steps in device terms; `biases` [V] by step and 1-based joint, if known."""
+    return [planned_step(step, (biases or {}).get(step.name, {})) for step in plan.steps]
+
+
+def planned_step(step: StepPlan, biases: Mapping[int, float]) -> PlannedStep:
+    """Return one step: waveforms repeated to the step's common period."""
+    return PlannedStep(
+        name=step.name,
+        waves={e.joint: np.resize(e.wave.samples, step.period) for e in step.excite},
+        lines=step.lines,
+        held={k.joint: k.piston for k in step.locks if k.at != CLOSED},
+        closed={k.joint: k.piston for k in step.locks if k.at == CLOSED},
+        centres={e.joint: e.centre for e in step.excite},
+        biases={joint - 1: bias for joint, bias in biases.items()},
+        samples=step.record,
+        repeats=step.repeats,
+        gives={k.joint: k.tolerance for k in step.locks if k.at == CLOSED},
+        offsets={e.joint: e.settings.centring.offset for e in step.excite},
+    )
+
+
+def empty_lines(plan: Plan) -> dict[tuple[str, int], tuple[int, ...]]:
+    """Return the detection lines of each step and joint, at the step's common period."""
+    return {
+        (step.name, e.joint): tuple(
+            k * (step.period // e.wave.period) for k in e.wave.detection_lines
+        )
+        for step in plan.steps
+        for e in step.excite
+    }
+
+
+def designed_protocol(plan: Plan, design: Design, criterion: str) -> Protocol:
+    """Return the plan's protocol with the designed lines in place of its signals."""
+    steps = []
+    for step, planned, tones in zip(plan.steps, design.steps, design.tones, strict=True):
+        source = next(s for s in plan.protocol.steps if s.name == step.name)
+        excite = []
+        for part in source.excite:
+            tone = tones[part.joint - 1]
+            wave = Waveform(planned.waves[part.joint - 1], tone.chosen, tone.empty)
+            signal = chosen_lines(wave, plan.sample_rate / step.period)
+            excite.append(part.model_copy(update={"signal": signal}))
+        # A record was one common period or several; written out, it stays so.
+        seconds = step.record / plan.sample_rate
+        steps.append(source.model_copy(update={"excite": tuple(excite), "duration": seconds}))
+    update = {
+        "name": f"{plan.protocol.name}-{criterion.lower().replace('_', '-')}",
+        "description": f"{plan.protocol.description}; designed for {criterion}",
+        "steps": tuple(steps),
+    }
+    return plan.protocol.model_copy(update=update)

@@ -1,0 +1,95 @@
+"""The `study` verbs: what the method is worth, measured on hundreds of simulated experiments."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from rig.cli.bench_commands import JsonOption
+from rig.cli.output import progress, write_json
+
+studies = typer.Typer(
+    name="study",
+    help="Measure the method itself: coverage of intervals, estimators under noise, filters.\n\n"
+    "Example: bramah study coverage --experiments 200",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+Workers = Annotated[int, typer.Option(min=1, help="Processes at once.")]
+
+
+@studies.command()
+def coverage(
+    experiments: Annotated[int, typer.Option(min=2, help="Of either kind.")] = 200,
+    estimator: Annotated[str, typer.Option(help="As `bramah identify --estimator`.")] = "ls",
+    kind: Annotated[str, typer.Option(help="model, plant, or both.")] = "both",
+    noise: Annotated[float, typer.Option(min=0.0, help="Times the sensors' stated noise.")] = 1.0,
+    repeats: Annotated[int, typer.Option(min=1, help="Of every step.")] = 4,
+    workers: Workers = 2,
+    json: JsonOption = None,
+) -> None:
+    """Count how often the 95 % intervals hold the truth, on fresh seeds.
+
+    Example: bramah study coverage --experiments 200 --json coverage.json
+    """
+    from rig.cli.studies import coverage_study, coverage_text
+    from rig.model.parse import InputError
+
+    if kind not in ("model", "plant", "both"):
+        raise InputError(f"--kind {kind}: expected model, plant or both")
+    kinds = ("model", "plant") if kind == "both" else (kind,)
+    found = coverage_study(kinds, experiments, estimator, noise, repeats, workers, progress)
+    write_json(json, found)
+    if json != Path("-"):
+        typer.echo(coverage_text(found))
+
+
+@studies.command()
+def estimators(
+    experiments: Annotated[int, typer.Option(min=2, help="Of either noise.")] = 20,
+    noise: Annotated[str, typer.Option(help="Times the sensors' stated noise.")] = "1 3 10",
+    which: Annotated[str, typer.Option(help="Estimators compared.")] = "ls wls iv output-error",
+    kind: Annotated[str, typer.Option(help="model or plant.")] = "plant",
+    workers: Workers = 2,
+    json: JsonOption = None,
+) -> None:
+    """Compare the estimators' bias and scatter as the sensors get noisier.
+
+    Example: bramah study estimators --noise "1 10" --experiments 10
+    """
+    from rig.cli.studies import estimator_study, estimator_text
+
+    levels = [float(word) for word in noise.split()]
+    found = estimator_study(tuple(which.split()), levels, experiments, kind, workers, progress)
+    write_json(json, found)
+    if json != Path("-"):
+        typer.echo(estimator_text(found))
+
+
+@studies.command()
+def differentiation(
+    seed: Annotated[int, typer.Option(min=0, help="Of excitation and noise.")] = 100,
+    rig: Annotated[str, typer.Option(help="A shipped rig's name, or a file.")] = "shinshu-2dof",
+    json: JsonOption = None,
+) -> None:
+    """Print bias and scatter of every parameter group for each way to differentiate.
+
+    Example: bramah study differentiation
+    """
+    import numpy as np
+
+    from analysis.differentiate_study import as_json, markdown, table
+    from rig.services.rigs import load_rig
+
+    entries = table(load_rig(rig), np.random.default_rng(seed))
+    data: list[dict[str, Any]] = as_json(entries)
+    write_json(json, data)
+    if json != Path("-"):
+        typer.echo(markdown(entries))
+
+
+def register(app: typer.Typer) -> None:
+    """Add these verbs to the command line."""
+    app.add_typer(studies)

@@ -1,0 +1,61 @@
+"""The `trace` verb: what the model lacks, named or refused, and the error before and after."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rig.cli.bench_commands import JsonOption
+from rig.cli.output import progress, write_json
+
+
+def trace(
+    runs: Annotated[list[Path], typer.Argument(help="Run folders that the fit may see.")],
+    holdout: Annotated[
+        list[Path] | None,
+        typer.Option("--holdout", help="A run folder that only judges; repeatable."),
+    ] = None,
+    json: JsonOption = None,
+    model: Annotated[
+        Path | None, typer.Option(help="Write the model file with the effects here.")
+    ] = None,
+    report: Annotated[Path | None, typer.Option(help="Write an HTML report here.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of half-samples and sign flips.")] = 0,
+) -> None:
+    """Say what the model lacks: effect, place, size, and the held-out error before and after.
+
+    The verdict is clean, explained, confounded or unexplained; the last two are answers as well.
+
+    Example: bramah trace runs/monday --holdout runs/tuesday --report trace.html
+    """
+    from analysis.model import save_model
+    from analysis.trace.engine import trace as trace_runs
+    from analysis.trace.result import to_json
+    from rig.cli.trace_text import trace_text
+    from rig.model.parse import InputError
+    from rig.services.store import load_run
+
+    if not holdout:
+        raise InputError(
+            "trace needs --holdout RUN: records of another excitation that the fit does not see; "
+            "an effect is only named where it explains those too"
+        )
+    loaded, judged = [load_run(f) for f in runs], [load_run(f) for f in holdout]
+    progress(f"tracing {sum(len(r.records) for r in loaded)} records")
+    result = trace_runs(loaded, judged, seed=seed)
+    write_json(json, to_json(result))
+    if model is not None:
+        save_model(result.model_after, model)
+    if report is not None:
+        from rig.cli.trace_reporting import write_trace
+
+        write_trace(report, judged, result)
+    if json != Path("-"):
+        typer.echo(trace_text(result))
+
+
+def register(app: typer.Typer) -> None:
+    """Add this verb to the command line."""
+    app.command()(trace)

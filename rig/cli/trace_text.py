@@ -1,0 +1,66 @@
+"""A trace as text for a terminal."""
+
+from __future__ import annotations
+
+import math
+
+from analysis.trace.result import Found, Trace
+from analysis.trace.words import UNITS, quantity
+from rig.cli.output import table
+
+
+def trace_text(result: Trace) -> str:
+    """Return verdict, effects with their gates, errors, what is left, and what to do next."""
+    lines = [f"verdict: {result.verdict}", "", result.sentence, ""]
+    for found in result.effects:
+        lines += _effect(found)
+    for found in result.refused:
+        lines += ["fitted best, but not named:", *_effect(found)]
+    rows = [
+        [
+            name, f"{result.noise_floor.get(name, math.nan):.2g}", f"{before:.2g}",
+            f"{result.after.get(name, math.nan):.2g}", UNITS.get(name.rsplit("_", 1)[0], ""),
+        ]
+        for name, before in result.before.items()
+    ]  # fmt: skip
+    lines += [table(["held-out error", "noise floor", "before", "after", "unit"], rows), ""]
+    fits = [
+        [name, f"{before:.1f} %", f"{result.fit_after.get(name, math.nan):.1f} %"]
+        for name, before in result.fit_before.items()
+    ]
+    if fits:
+        lines += [table(["held-out FIT", "before", "after"], fits), ""]
+    changed = _changed(result)
+    if changed:
+        lines += [table(["parameter", "before", "after", "change"], changed), ""]
+    if result.depends_on:
+        moves = ", ".join(f"{d.variable} ({100 * d.share:.0f} %)" for d in result.depends_on[:4])
+        lines.append(f"what is left moves with: {moves} (a clue, not a name)")
+    if result.next_experiment:
+        lines.append(f"next experiment: {result.next_experiment['text']}")
+    lines += [f"note: {note}" for note in result.notes]
+    lines.append(f"traced in {result.seconds:.1f} s")
+    return "\n".join(lines)
+
+
+def _effect(found: Found) -> list[str]:
+    values = ", ".join(f"{n} = {quantity(e)}" for n, e in found.parameters.items())
+    lines = [f"{found.name} at {found.where}: {values}"]
+    lines += [f"  {'ok    ' if g.ok else 'NOT OK'} {g.name}: {g.detail}" for g in found.gates]
+    lines += [
+        f"  rival {r.name} at {r.where}: {r.ratio:.2f} times the held-out rms"
+        + (" (cannot be told apart)" if r.tied else "")
+        for r in found.rivals
+    ]
+    return [*lines, ""]
+
+
+def _changed(result: Trace) -> list[list[str]]:
+    after = result.model_after.parameters
+    out = []
+    for name, one in result.model_before.parameters.items():
+        if result.model_after is result.model_before or name not in after:
+            continue
+        change = 100 * (after[name].value / one.value - 1) if one.value else math.nan
+        out.append([name, f"{one.value:.4g}", f"{after[name].value:.4g}", f"{change:+.1f} %"])
+    return out

@@ -1,0 +1,313 @@
+"""The catalogue as a whole: all names, rows against kernels, and what it refuses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from analysis.effects.base import Effect, ordered
+from analysis.effects.friction import contact_state
+from analysis.effects.measurement import Sensor
+from analysis.effects.payload import growth, payload_of_shift
+from analysis.effects_catalogue import FAMILIES, pages
+from analysis.identify import identify
+from analysis.signals import Signals
+from analysis.terms import base, baseline, known, make
+from analysis.terms.base import Used
+from rig.model.parameters import gain_names
+from rig.model.parse import InputError
+from rig.model.records import Run
+from rig.model.rig import Rig
+from tests.analysis.small_bench import TRUTH
+from tests.analysis.test_terms import signals_of
+
+CONTRACT = {
+    "coulomb_friction", "stribeck_friction", "asymmetric_friction", "pressure_dependent_friction",
+    "base_inclination", "payload", "joint_spring", "torque_offset",
+    "valve_deadband", "spool_offset", "underlap_leakage", "spool_lag",
+    "internal_leakage", "external_leakage", "supply_sag", "tank_pressure", "entrained_air",
+    "dead_volume", "channel_delay", "sensor_gain", "sensor_offset",
+}  # fmt: skip
+
+
+def effects(rig: Rig) -> list[Effect]:
+    kinds = [kind for kind in known().values() if issubclass(kind, Effect)]
+    return [kind(where) for kind in kinds for where in kind.places(rig)]
+
+
+def effect(name: str, where: str) -> Effect:
+    found = make(name, where)
+    assert isinstance(found, Effect)
+    return found
+
+
+def test_every_name_of_the_contract_is_an_effect_with_its_rivals_and_its_experiment() -> None:
+    kinds = {name: kind for name, kind in known().items() if issubclass(kind, Effect)}
+    assert set(kinds) >= CONTRACT
+    for name, kind in kinds.items():
+        said = (kind.family, kind.variable, kind.separated_by, kind.__doc__)
+        assert all(said), name
+        assert set(kind.confounders) <= set(kinds) - {name}, name
+
+
+def test_places_are_those_of_the_contract_and_every_candidate_has_its_own_parameters(
+    rig: Rig,
+) -> None:
+    allowed = {"bench", "joint 1", "joint 2"}
+    allowed |= {f"{joint} {side}" for joint in ("joint 1", "joint 2") for side in ("cap", "rod")}
+    every = effects(rig)
+    assert {e.place for e in every} <= allowed
+    shared = {name for i in (1, 2) for name in gain_names(i)}
+    owners: dict[str, tuple[str, str]] = {}
+    for e in every:
+        own = [c.parameter for c in e.coefficients(rig) if c.parameter not in shared]
+        own += [n for n in e.shape_names() if not n.startswith("presliding")]
+        assert len(e.shape_names()) <= 2
+        for name in own:
+            assert owners.setdefault(name, (e.name, e.where)) == (e.name, e.where)
+
+
+def test_shapes_are_looked_at_within_their_bounds(rig: Rig) -> None:
+    for e in effects(rig):
+        shapes = e.shapes(rig)
+        assert tuple(s.parameter for s in shapes) == e.shape_names()
+        for s in shapes:
+            assert all(s.low <= point <= s.high for point in s.grid), s.parameter
+            assert s.neutral is None or s.low <= s.neutral <= s.high
+
+
+@pytest.fixture
+def state(rig: Rig) -> Signals:
+    """A smooth motion with everything else at random, pressures between tank and supply."""
+    rng = np.random.default_rng(3)
+    t = np.arange(400) / 1000
+    phase = rng.uniform(0, 6, (2, 2))
+    middle = np.array([[1.13, -1.44]])
+    q = middle + 0.2 * np.sin(2 * np.pi * 3 * t[:, None] + phase[:1])
+    qd = 0.2 * 2 * np.pi * 3 * np.cos(2 * np.pi * 3 * t[:, None] + phase[:1])
+    qdd = -((2 * np.pi * 3) ** 2) * (q - middle)
+    return replace(signals_of(rig, q, qd, qdd, rng), t=t)
+
+
+def packed(e: Effect, rig: Rig, shape: tuple[float, ...]) -> tuple[dict[str, float], np.ndarray]:
+    values = {**TRUTH, **{c.parameter: TRUTH.get(c.parameter, 0.7) for c in e.coefficients(rig)}}
+    return values, e.pack(rig, values, shape)
+
+
+def observed(signals: Signals, k: int) -> tuple[np.ndarray, np.ndarray]:
+    """The simulation's view of one sample: `x` and `bench`."""
+    fields = ("q", "qd", "theta", "G", "s", "sd", "u", "p_cap", "p_rod", "V_cap", "V_rod")
+    x = np.array([getattr(signals, field)[k] for field in fields])
+    return x, np.array([0.0, signals.p_s[k], signals.p_tank[k], 40.0])
+
+
+def hidden_state(e: Effect, rig: Rig, signals: Signals, shape: tuple[float, ...]) -> np.ndarray:
+    """What the hidden state is at every sample, from the definition."""
+    if e.family == "friction":
+        return np.asarray(shape[-1] * contact_state(signals.s[:, e.joint], shape[-1]))
+    if e.name == "spool_lag":
+        return e.prepare(rig, signals, shape).u[:, e.joint]
+    return np.zeros(len(signals.t))
+
+
+def test_kernels_and_rows_are_the_same_equations(rig: Rig, state: Signals) -> None:
+    """What the simulation would integrate is, at any state, what the rows say."""
+    for e in effects(rig):
+        if isinstance(e, Sensor):
+            continue
+        shape = e.shape_of(rig, ())
+        signals = consistent(rig, state, e, shape) if e.stage == 4 else state
+        values, par = packed(e, rig, shape)
+        seen = e.prepare(rig, signals, shape)
+        columns = e.columns(rig, seen, shape)
+        memory = hidden_state(e, rig, signals, shape)
+        for k in range(40, 400, 17):
+            x, bench = observed(signals, k)
+            z, dz = np.full(e.hidden(rig), memory[k]), np.zeros(e.hidden(rig))
+            out, M = np.zeros((base.OUT_ROWS, 2)), np.zeros((2, 2))
+            phases = (base.PREPARE, base.CONTRIBUTE) if e.prepares else (base.CONTRIBUTE,)
+            for phase in phases:
+                e.kernel.function(phase, bench, x, z, par, out, M, dz)
+            wanted, wanted_bench = observed(seen, k)
+            assert x == pytest.approx(wanted, rel=1e-9, abs=1e-12), e
+            assert bench == pytest.approx(wanted_bench, rel=1e-6), e
+            for i in range(2):
+                rows = {
+                    "torque": M[i] @ signals.qdd[k] - out[base.TORQUE, i],
+                    "flow_cap": out[base.FLOW_CAP, i] - out[base.COMP_CAP, i] * seen.pd_cap[k, i],
+                    "flow_rod": out[base.FLOW_ROD, i] - out[base.COMP_ROD, i] * seen.pd_rod[k, i],
+                }
+                for kind, value in rows.items():
+                    here = columns.get(f"{kind}_{i + 1}", {})
+                    total = sum(values[name] * column[k] for name, column in here.items())
+                    assert value == pytest.approx(total, rel=1e-9, abs=1e-14), (e, kind)
+
+
+def consistent(rig: Rig, signals: Signals, e: Effect, shape: tuple[float, ...]) -> Signals:
+    """Pressure rates such that continuity holds: the kernels solve orifices, the rows measure."""
+    drawn = e.name == "supply_sag"
+    rig_flow, pd_cap, pd_rod = rig.supply.flow, signals.pd_cap.copy(), signals.pd_rod.copy()
+    for k in range(len(signals.t)):
+        low, high = 0.0, 1.0
+        for _ in range(80):  # bisection on the flow through the common line
+            Q = 0.5 * (low + high)
+            flows = edge_flows(rig, signals, k, e, shape, Q / rig_flow)
+            low, high = (Q, high) if sum(flows) > Q else (low, Q)
+        for i, flow in enumerate(flows):
+            c = rig.joints[i].cylinder
+            cap = (signals.u[k, i] > 0) == drawn
+            into = flow if drawn else -flow
+            b = rig.nominal["b"]
+            if cap:
+                pd_cap[k, i] = (into - c.cap_area * signals.sd[k, i]) * b / signals.V_cap[k, i]
+            else:
+                pd_rod[k, i] = (into + c.rod_area * signals.sd[k, i]) * b / signals.V_rod[k, i]
+    return replace(signals, pd_cap=pd_cap, pd_rod=pd_rod)
+
+
+def edge_flows(
+    rig: Rig, signals: Signals, k: int, e: Effect, shape: tuple[float, ...], ratio: float
+) -> list[float]:
+    out = []
+    for i in range(2):
+        u, cap, rod = signals.u[k, i], signals.p_cap[k, i], signals.p_rod[k, i]
+        pp, pm, mp, mm = (TRUTH[name] for name in gain_names(i + 1))
+        if e.name == "supply_sag":
+            port = signals.p_s[k] - shape[0] * ratio**2
+            drop, gain = (port - cap, pp) if u > 0 else (port - rod, mm)
+        else:
+            port = shape[0] + shape[1] * ratio**2
+            drop, gain = (rod - port, mp) if u > 0 else (cap - port, pm)
+        out.append(gain * abs(u) * np.sqrt(max(drop, 0.0)))
+    return out
+
+
+def test_hidden_states_move_as_the_rows_say(rig: Rig) -> None:
+    """Along a fine path the kernel's rate is the slope of what the rows compute."""
+    rate = 20_000.0
+    t = np.arange(6000) / rate
+    rng = np.random.default_rng(1)
+    q = np.array([1.13, -1.44]) + 0.02 * np.sin(2 * np.pi * 2 * t[:, None] + np.array([0.3, 1.0]))
+    qd = np.gradient(q, 1 / rate, axis=0)
+    signals = replace(signals_of(rig, q, qd, np.zeros_like(q), rng), t=t, rate=rate)
+    signals.u[:] = 0.1 * np.sin(2 * np.pi * 5 * t)[:, None]
+    for name in ("coulomb_friction", "spool_lag"):
+        e = effect(name, "joint 2")
+        shape = (1e-4,) if e.family == "friction" else (3e-3,)
+        memory = hidden_state(e, rig, signals, shape)
+        slope = np.gradient(memory, 1 / rate)
+        par = packed(e, rig, shape)[1]
+        scale = np.abs(slope).max()
+        for k in range(500, 5500, 97):
+            x, bench = observed(signals, k)
+            dz = np.zeros(1)
+            out, M = np.zeros((base.OUT_ROWS, 2)), np.zeros((2, 2))
+            phase = base.PREPARE if e.prepares else base.CONTRIBUTE
+            e.kernel.function(phase, bench, x, memory[k : k + 1].copy(), par, out, M, dz)
+            assert dz[0] == pytest.approx(slope[k], abs=0.03 * scale), (name, k)
+
+
+REFUSED = [
+    ("coulomb_friction", "joint 1", {"Fc1": -20.0}, (4e-5,)),
+    ("coulomb_friction", "joint 1", {"Fc1": 5000.0}, (4e-5,)),
+    ("stribeck_friction", "joint 2", {"Fs2": -20.0}, (0.03, 4e-5)),
+    ("stribeck_friction", "joint 2", {"Fs2": 50.0}, (0.24, 4e-5)),
+    ("asymmetric_friction", "joint 1", {"F_ext_1": 80.0, "F_ret_1": -30.0}, (4e-5,)),
+    ("asymmetric_friction", "joint 1", {"F_ext_1": 80.0, "F_ret_1": 79.0}, (4e-5,)),
+    ("pressure_dependent_friction", "joint 1", {"k_friction_1": -1e-5}, (4e-5,)),
+    ("base_inclination", "bench", {}, (0.35,)),
+    ("payload", "bench", {"m_payload": -1.0}, ()),
+    ("joint_spring", "joint 2", {"k_spring_2": -30.0}, (-1.44,)),
+    ("joint_spring", "joint 2", {"k_spring_2": 30.0}, (-0.96,)),
+    ("torque_offset", "joint 2", {"T_offset_2": 1e4}, ()),
+    ("valve_deadband", "joint 1", {}, (6e-3, 0.0)),
+    ("valve_deadband", "joint 1", {}, (0.56, 0.56)),
+    ("spool_offset", "joint 1", {}, (0.14,)),
+    ("underlap_leakage", "joint 1", {}, (0.14,)),
+    ("spool_lag", "joint 1", {}, (0.1,)),
+    ("internal_leakage", "joint 1", {"c_internal_1": -2e-12}, ()),
+    ("external_leakage", "joint 1 rod", {"c_external_1_rod": 1e-9}, ()),
+    ("supply_sag", "bench", {}, (6.3e6,)),
+    ("tank_pressure", "bench", {}, (0.0, 0.0)),
+    ("tank_pressure", "bench", {}, (2.8e6, 0.0)),
+    ("entrained_air", "bench", {"alpha_air": -0.01}, ()),
+    ("entrained_air", "bench", {"alpha_air": 0.5}, ()),
+    ("dead_volume", "joint 1 cap", {}, (7.9e-4,)),
+    ("channel_delay", "joint 1 piston", {}, (0.1,)),
+    ("sensor_gain", "joint 1 cap", {}, (1.5,)),
+    ("sensor_offset", "joint 1 cap", {}, (1.01e6,)),
+]
+
+
+@pytest.mark.parametrize(("name", "where", "values", "shape"), REFUSED)
+def test_the_unphysical_is_refused_in_words(
+    rig: Rig, name: str, where: str, values: dict[str, float], shape: tuple[float, ...]
+) -> None:
+    said = effect(name, where).problem(rig, TRUTH | values, shape)
+    assert said
+    assert "nan" not in said
+
+
+def test_every_effect_is_refused_somewhere(rig: Rig) -> None:
+    assert {case[0] for case in REFUSED} == CONTRACT
+
+
+def test_a_payload_is_absorbed_and_says_so(rig: Rig, multisine_run: Run) -> None:
+    """The rows cannot show it: its columns are a sum of the baseline's, and the solver sees it."""
+    payload = effect("payload", "bench")
+    assert "compare" in payload.absorbed(rig)
+    terms = (*(Used(t) for t in baseline()), Used(payload))
+    solution = identify([multisine_run], terms=terms).solutions["mechanical"]
+    assert "m_payload" in solution.unidentifiable
+
+
+def test_a_payload_is_weighed_against_a_reference(rig: Rig) -> None:
+    """NOTES: 6.5 kg at the tip; M2 grows by about 1.6, M1 by twice that."""
+    grown = growth(rig)
+    assert grown["M2"] * 6.5 == pytest.approx(1.6, rel=0.02)
+    assert grown["M1"] == pytest.approx(2 * grown["M2"])
+    found = {name: TRUTH[name] + 6.5 * share for name, share in grown.items()}
+    spread = np.diag([(0.01 * abs(TRUTH[name])) ** 2 for name in grown])
+    mass, error, misfit = payload_of_shift(rig, TRUTH, found, spread)
+    assert mass == pytest.approx(6.5)
+    assert error < 0.2
+    assert misfit < 1e-6
+    found["W1"] += 2.0
+    assert payload_of_shift(rig, TRUTH, found, spread)[2] > 10
+
+
+def test_effects_that_no_data_can_tell_apart_name_each_other(rig: Rig) -> None:
+    null = effect("spool_offset", "joint 2")
+    assert null.twins() == (("sensor_offset", "joint 2"),)
+    assert "joint 2 spool" not in type(effect("sensor_offset", "bench")).places(rig)
+    assert effect("sensor_gain", "joint 1 spool").absorbed(rig)
+    assert not effect("sensor_gain", "joint 1 cap").absorbed(rig)
+
+
+def test_sensors_are_put_right_before_the_valve_and_the_valve_in_its_own_order() -> None:
+    names = [("valve_deadband", "joint 1"), ("spool_lag", "joint 1"), ("spool_offset", "joint 1"),
+             ("channel_delay", "joint 1 spool"), ("supply_sag", "bench")]  # fmt: skip
+    terms = [Used(make(*which)) for which in names] + [Used(t) for t in baseline()]
+    order = [u.term.name for u in ordered(terms)]
+    assert order[:5] == [
+        "channel_delay", "spool_offset", "spool_lag", "valve_deadband", "supply_sag",
+    ]  # fmt: skip
+    assert order[5:] == [t.name for t in baseline()]
+
+
+def test_a_place_that_is_none_is_named() -> None:
+    with pytest.raises(InputError, match=r"coulomb_friction.*'bench'"):
+        _ = effect("coulomb_friction", "bench").joint
+
+
+def test_the_pages_are_those_of_the_classes(rig: Rig) -> None:
+    """`bramah effects --docs docs/` was run after the last change of the catalogue."""
+    docs = Path(__file__).parents[3] / "docs"
+    for name, text in pages(rig).items():
+        written = (docs / name).read_text(encoding="utf-8")
+        assert written.startswith(text), f"{name} is old: run bramah effects --docs docs/"
+    for family in FAMILIES:
+        assert (docs / "images" / f"effects-{family}.svg").stat().st_size < 200_000

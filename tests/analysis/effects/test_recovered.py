@@ -1,0 +1,163 @@
+"""Every effect, made by an independent bench, is found again: size, shape, held-out residual.
+
+And the model with the effect, run by the analysis's own integrator, follows that bench freely.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from analysis.differentiate import channel_filter
+from analysis.effects.base import Effect
+from analysis.effects.measurement import Sensor
+from analysis.signals import condition
+from analysis.simulate import State, drive_of, simulate
+from analysis.terms import make
+from analysis.terms.base import Used
+from analysis.validate import fit_percent
+from rig.model.rig import Rig
+from tests.analysis.effects import one_joint as bench
+from tests.analysis.effects.fitting import Data, fitted, model_of, residual
+from tests.analysis.small_bench import TRUTH
+
+TRAIN, HELD_OUT = (0.03, 1), (0.022, 2)
+
+
+@dataclass(frozen=True)
+class Case:
+    """An effect, what is wrong on the bench, what the fit must find and how closely."""
+
+    name: str
+    where: str
+    wrong: dict[str, float]
+    found: dict[str, float]
+    within: float = 0.05
+    left: float = 1.15  # held-out residual over the noise floor, at most
+    fit: float = 97.0  # free run, per cent, at least
+    shows: float = 1.3  # held-out residual without it over the noise floor, at least
+
+
+CASES = (
+    # Of noise of 10 um in a path of 40 um the contact's state keeps some.
+    Case("coulomb_friction", "joint 2", {"Fc": 60}, {"Fc2": 60, "presliding_2": 40e-6}, 0.12, 1.5),
+    Case("stribeck_friction", "joint 2", {"Fs": 50}, {"Fs2": 50, "v_stribeck_2": 0.03}, 0.1, 1.5),
+    Case(
+        "asymmetric_friction", "joint 2", {"F_ext": 70, "F_ret": 40},
+        {"F_ext_2": 70, "F_ret_2": 40}, 0.1, 1.5,
+    ),
+    Case(
+        "pressure_dependent_friction", "joint 2", {"k_friction": 8e-6}, {"k_friction_2": 8e-6},
+        0.05, 1.6,
+    ),
+    Case("base_inclination", "bench", {"inclination": 0.06}, {"inclination": 0.06}),
+    Case("joint_spring", "joint 2", {"k_spring": 25}, {"k_spring_2": 25, "rest_2": -1.35}, 0.1),
+    Case("torque_offset", "joint 2", {"T_offset": 3}, {"T_offset_2": 3}, 0.1),
+    Case(
+        "valve_deadband", "joint 2", {"w_ahead": 5e-3, "w_astern": 8e-3},
+        {"w_ahead_2": 5e-3, "w_astern_2": 8e-3}, 0.03, 1.3,
+    ),
+    Case("spool_offset", "joint 2", {"u_null": 3e-3}, {"u_null_2": 3e-3}, 0.03),
+    Case("underlap_leakage", "joint 2", {"w_underlap": 5e-3}, {"w_underlap_2": 5e-3}, 0.03, 1.3),
+    Case("spool_lag", "joint 2", {"tau_spool": 3e-3}, {"tau_spool_2": 3e-3}, 0.03),
+    Case("internal_leakage", "joint 2", {"c_internal": 2e-12}, {"c_internal_2": 2e-12}),
+    Case(
+        "external_leakage", "joint 2", {"c_cap": 2e-12, "c_rod": 2e-12}, {"c_external_2": 2e-12}
+    ),
+    Case("external_leakage", "joint 2 rod", {"c_rod": 2e-12}, {"c_external_2_rod": 2e-12}),
+    Case("supply_sag", "bench", {"dp_supply": 2e6}, {"dp_supply": 2e6}),
+    Case(
+        "tank_pressure", "bench", {"p_tank": 8e5, "p_back": 1e6},
+        {"p_tank": 8e5, "p_back": 1e6}, 0.15,
+    ),
+    # Least squares hides it nearly whole in b and the gains (NOTES, "Measured traps").
+    Case("entrained_air", "bench", {"alpha_air": 0.05}, {"alpha_air": 0.05}, 0.1, shows=1.1),
+    Case("dead_volume", "joint 2 cap", {"V_cap": 5e-5}, {"V_dead_2_cap": 5e-5}, 0.1),
+    Case("channel_delay", "joint 2 piston", {"delay_piston": 3e-3}, {"delay_piston_2": 3e-3}, 0.03),
+    Case(
+        "channel_delay", "joint 2 cap", {"delay_cap_pressure": 3e-3},
+        {"delay_cap_pressure_2": 3e-3}, 0.05,
+    ),
+    Case("channel_delay", "joint 2 spool", {"delay_spool": 3e-3}, {"delay_spool_2": 3e-3}, 0.05),
+    Case(
+        "sensor_gain", "joint 2 cap", {"gain_cap_pressure": 1.06},
+        {"gain_cap_pressure_2": 1.06}, 0.005,
+    ),
+    Case("sensor_gain", "joint 2 piston", {"gain_piston": 1.06}, {"gain_piston_2": 1.06}, 0.01),
+    Case(
+        "sensor_offset", "joint 2 rod", {"offset_rod_pressure": 2e5},
+        {"offset_rod_pressure_2": 2e5},
+    ),
+    Case("sensor_offset", "joint 2 piston", {"offset_piston": 2e-3}, {"offset_piston_2": 2e-3}),
+    Case(
+        "sensor_offset", "bench", {"offset_supply_pressure": 2e5},
+        {"offset_supply_pressure": 2e5},
+    ),
+)  # fmt: skip
+IDS = [f"{case.name} {case.where}" for case in CASES]
+
+
+@pytest.fixture(scope="module")
+def floor(rig: Rig) -> dict[str, float]:
+    """Held-out residual of the baseline on a bench with nothing wrong."""
+    train, held_out = (Data(bench.run(rig, bench.RIGHT, *which)) for which in (TRAIN, HELD_OUT))
+    return residual(held_out.rows([]), train.solved([]).values)
+
+
+@pytest.mark.parametrize("case", CASES, ids=IDS)
+def test_size_and_shape_come_back_and_nothing_is_left(
+    rig: Rig, floor: dict[str, float], case: Case
+) -> None:
+    effect = make(case.name, case.where)
+    assert isinstance(effect, Effect)
+    wrong = bench.Wrong.of(**case.wrong)
+    train, held_out = (Data(bench.run(rig, wrong, *which)) for which in (TRAIN, HELD_OUT))
+    without = residual(held_out.rows([]), train.solved([]).values)
+    fit = fitted(train, effect, floor)
+    for name, value in case.found.items():
+        assert fit.of(effect)[name] == pytest.approx(value, rel=case.within), name
+    assert effect.problem(rig, fit.values, fit.shape) == ""
+    after = residual(held_out.rows([Used(effect, fit.shape)]), fit.values)
+    seen = [name for name in floor if without[name] > case.shows * floor[name]]
+    assert {name: after[name] / floor[name] for name in floor if
+            after[name] > case.left * floor[name]} == {}  # fmt: skip
+    assert seen, f"the bench does not show {case.name}: {without} over {floor}"
+
+
+PLANT = [case for case in CASES if not case.name.startswith(("sensor", "channel"))]
+
+
+@pytest.mark.parametrize("case", PLANT, ids=[f"{c.name} {c.where}" for c in PLANT])
+def test_the_model_with_the_effect_follows_the_bench_freely(rig: Rig, case: Case) -> None:
+    effect = make(case.name, case.where)
+    assert isinstance(effect, Effect)
+    ideal = rig.model_copy(update={"sensors": rig.sensors.model_copy(update={"skew": 0.0})})
+    clean = bench.channels(ideal, bench.Wrong.of(**case.wrong), bench.excitation(*HELD_OUT), 3.0)
+    record = bench.record(ideal, clean, "free_r1", 0, noise=0.0)
+    signals = condition(ideal, record, channel_filter(1000.0), np.array([False, True]))
+    drive = drive_of(signals)
+    first = 100
+    start = State(signals.q[first], signals.qd[first], signals.p_cap[first], signals.p_rod[first])
+    shape = tuple(
+        {"presliding_2": 40e-6, **case.found}.get(s.parameter, 0.0) for s in effect.shapes(ideal)
+    )
+    model = model_of(ideal, effect, TRUTH | case.found, shape)
+    free = simulate(model, drive, start, first).channels()
+    for name in ("piston_2", "cap_pressure_2", "rod_pressure_2"):
+        assert fit_percent(clean[name][first:], free[name]) > case.fit, name
+
+
+def test_sensor_effects_make_the_simulation_comparable(rig: Rig) -> None:
+    """The model of the true plant fits channels that were corrected, not those that were read."""
+    clean = bench.channels(rig, bench.Wrong.of(delay_piston=4e-3), bench.excitation(*HELD_OUT), 3.0)
+    truth = bench.channels(rig, bench.RIGHT, bench.excitation(*HELD_OUT), 3.0)
+    effect = make("channel_delay", "joint 2 piston")
+    assert isinstance(effect, Sensor)
+    corrected = effect.correct(rig, clean, 1000.0, (4e-3,))
+    inner = slice(50, -50)
+    before = np.abs(clean["piston_2"] - truth["piston_2"])[inner].max()
+    after = np.abs(corrected["piston_2"] - truth["piston_2"])[inner].max()
+    assert after < 1e-2 * before
+    assert corrected["cap_pressure_2"] is clean["cap_pressure_2"]

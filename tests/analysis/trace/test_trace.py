@@ -1,0 +1,149 @@
+"""A person traces what a bench's model lacks: told right, told nothing, or told 'I do not know'."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from analysis.identify import identify
+from analysis.model import load_model, save_model
+from analysis.trace.engine import trace
+from analysis.trace.result import Trace, to_json
+from rig.model.parse import InputError
+from rig.model.records import Run
+from rig.model.rig import Rig
+from tests.analysis.trace.hidden import experiment, hardening, pair_of_runs
+
+
+def traced(rig: Rig, **wrong: float) -> Trace:
+    train, held_out = pair_of_runs(rig, **wrong)
+    return trace([train], [held_out])
+
+
+@pytest.fixture(scope="module")
+def quiet(rig: Rig) -> tuple[Run, Run]:
+    return pair_of_runs(rig)
+
+
+@pytest.fixture(scope="module")
+def leaking(rig: Rig) -> Trace:
+    return traced(rig, c_internal=2e-12)
+
+
+def test_a_bench_with_nothing_wrong_is_clean_and_nothing_is_named(quiet: tuple[Run, Run]) -> None:
+    result = trace([quiet[0]], [quiet[1]])
+    assert result.verdict == "clean"
+    assert result.effects == ()
+    assert result.after == result.before
+    for equation, error in result.after.items():
+        assert error < 1.2 * result.noise_floor[equation]
+
+
+def test_a_leak_is_named_with_place_and_size_and_its_error_falls_to_the_noise(
+    leaking: Trace,
+) -> None:
+    assert leaking.verdict == "explained"
+    (found,) = leaking.effects
+    assert (found.name, found.where) == ("internal_leakage", "joint 2")
+    assert found.parameters["c_internal_2"].value == pytest.approx(2e-12, rel=0.03)
+    assert found.removed_fraction > 0.95
+    assert found.p_value <= 0.01
+    assert leaking.before["flow_cap_2"] > 3 * leaking.noise_floor["flow_cap_2"]
+    assert leaking.after["flow_cap_2"] < 1.3 * leaking.noise_floor["flow_cap_2"]
+    assert "pressure difference" in leaking.sentence
+    assert all(rival.ratio > 1.1 for rival in found.rivals)
+
+
+def test_parameters_that_the_leak_had_biased_come_back(leaking: Trace) -> None:
+    from tests.analysis.small_bench import TRUTH
+
+    before, after = (m.values for m in (leaking.model_before, leaking.model_after))
+    off = {n: abs(m["b"] / TRUTH["b"] - 1) for n, m in (("before", before), ("after", after))}
+    assert off["after"] < 0.02 < off["before"]
+
+
+def test_the_extended_model_is_a_model_file_like_any_other(leaking: Trace, tmp_path: Path) -> None:
+    path = tmp_path / "model.json"
+    save_model(leaking.model_after, path)
+    again = load_model(path)
+    assert [u.term.name for u in again.terms][-1] == "internal_leakage"
+    assert again.values["c_internal_2"] == leaking.model_after.values["c_internal_2"]
+
+
+def test_the_result_has_the_contracts_keys(leaking: Trace) -> None:
+    data = json.loads(json.dumps(to_json(leaking), allow_nan=False))
+    assert {
+        "verdict", "effects", "error", "fit", "parameters", "unexplained", "next_experiment",
+    } <= set(data)  # fmt: skip
+    assert {"name", "where", "parameters", "p_value", "removed_fraction", "rivals"} <= set(
+        data["effects"][0]
+    )
+    assert {"noise_floor", "before", "after"} == set(data["error"])
+    assert {"fraction", "depends_on"} <= set(data["unexplained"])
+    assert set(data["error"]["after"]) == {"torque_2", "flow_cap_2", "flow_rod_2"}
+
+
+def test_friction_and_a_dead_band_at_once_are_both_named(rig: Rig) -> None:
+    result = traced(rig, Fc=60, w_ahead=8e-3, w_astern=8e-3)
+    assert result.verdict == "explained"
+    assert {(e.name, e.where) for e in result.effects} == {
+        ("coulomb_friction", "joint 2"), ("valve_deadband", "joint 2"),
+    }  # fmt: skip
+    sizes = {n: p.value for e in result.effects for n, p in e.parameters.items()}
+    assert sizes["Fc2"] == pytest.approx(60, rel=0.12)
+    assert sizes["w_ahead_2"] == pytest.approx(8e-3, rel=0.05)
+
+
+def test_what_the_catalogue_lacks_stays_unexplained_and_its_variable_is_told(
+    quiet: tuple[Run, Run],
+) -> None:
+    train, held_out = (hardening(run, 2.0e7) for run in quiet)
+    result = trace([train], [held_out])
+    assert result.verdict == "unexplained"
+    assert result.unexplained_fraction > 0.05
+    assert "piston_2" in [d.variable for d in result.depends_on[:2]]
+
+
+def test_one_repeat_says_what_it_costs(rig: Rig) -> None:
+    train = experiment(rig, repeats=1, c_internal=2e-12)
+    held_out = experiment(rig, repeats=1, seed=2, rms=0.02, c_internal=2e-12)
+    result = trace([train], [held_out])
+    assert any("one repeat" in note for note in result.notes)
+    assert result.verdict != "clean"
+
+
+@pytest.mark.parametrize("kept", [[], ["same"]])
+def test_held_out_records_must_exist_and_be_other_records(
+    quiet: tuple[Run, Run], kept: list[str]
+) -> None:
+    train = quiet[0]
+    renamed = replace(train, records=tuple(replace(r, name=f"x{r.name}") for r in train.records))
+    with pytest.raises(InputError, match="sample for sample" if kept else "no held-out"):
+        trace([train], [renamed] if kept else [])
+
+
+def test_records_too_short_are_refused_with_what_is_needed(quiet: tuple[Run, Run]) -> None:
+    short = replace(
+        quiet[0],
+        records=tuple(
+            replace(r, channels={k: np.asarray(v)[:1200] for k, v in r.channels.items()})
+            for r in quiet[0].records
+        ),
+    )
+    with pytest.raises(InputError, match=r"record longer|too short"):
+        trace([short], [quiet[1]])
+
+
+def test_runs_of_different_rigs_are_refused(quiet: tuple[Run, Run]) -> None:
+    other = replace(quiet[1], rig=quiet[1].rig.model_copy(update={"name": "another"}))
+    with pytest.raises(InputError, match="different rigs"):
+        trace([quiet[0]], [other])
+
+
+def test_the_baseline_before_is_what_identify_finds(leaking: Trace, rig: Rig) -> None:
+    alone = identify([experiment(rig, c_internal=2e-12)], estimator="plain").model
+    assert leaking.model_before.values == pytest.approx(alone.values, nan_ok=True)
