@@ -137,8 +137,8 @@ def test_output_error_needs_a_model_that_is_complete(multisine_run: Run) -> None
 
 def test_bootstrap_and_cluster_intervals_agree_on_clean_data(multisine_run: Run) -> None:
     cluster = identify([multisine_run], estimator="ls")
-    drawn = identify([multisine_run], estimator="ls", bootstrap=100, seed=1)
-    again = identify([multisine_run], estimator="ls", bootstrap=100, seed=1)
+    drawn = identify([multisine_run], estimator="ls", bootstrap=100, rng=np.random.default_rng(1))
+    again = identify([multisine_run], estimator="ls", bootstrap=100, rng=np.random.default_rng(1))
     ratios = []
     for name, p in drawn.estimates.items():
         assert p.value == cluster.estimates[name].value

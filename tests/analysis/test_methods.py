@@ -86,7 +86,7 @@ def test_each_steps_own_values_are_what_identifying_that_step_alone_gives(
 ) -> None:
     data = identify([drifting_run], "sequential").extra["sequential"]
     for step in ("step1", "step2", "step3"):
-        alone = identify([steps(drifting_run, step)]).estimates
+        alone = identify([steps(drifting_run, step)], estimator="plain").estimates
         for name, found in data["per_step"].items():
             for entry in found:
                 if entry["step"] == step:
@@ -217,13 +217,13 @@ def test_a_search_that_cannot_start_says_why(sine_run: Run, rig: Rig) -> None:
 
 def test_every_experiment_by_itself_scatters_about_all_of_them_together(sine_run: Run) -> None:
     each = experiments(sine_run)
-    together = identify([sine_run]).estimates
+    together = identify([sine_run], estimator="plain").estimates
     assert each.count == 4
     for name, found in each.spreads.items():
         assert found.low <= found.mean <= found.high
         assert found.mean == pytest.approx(together[name].value, rel=0.003)
     alone = [
-        identify([replace(sine_run, records=records)]).estimates["b"].value
+        identify([replace(sine_run, records=records)], estimator="plain").estimates["b"].value
         for k in (1, 2, 3, 4)
         for records in (tuple(r for r in sine_run.records if r.repeat == k),)
     ]

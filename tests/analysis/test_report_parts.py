@@ -168,7 +168,7 @@ def test_masked_rows_leave_the_scatter_where_it_was() -> None:
 
 
 def test_each_repeat_alone_gives_what_identifying_it_alone_gives(multisine_run: Run) -> None:
-    found = identify([multisine_run])
+    found = identify([multisine_run], estimator="plain")
     rows = build_rows(multisine_run.rig, [multisine_run], found.model.terms)
     scatter = per_repeat(found, rows)
     alone = [
@@ -177,7 +177,8 @@ def test_each_repeat_alone_gives_what_identifying_it_alone_gives(multisine_run: 
                 replace(
                     multisine_run, records=tuple(r for r in multisine_run.records if r.repeat == k)
                 )
-            ]
+            ],
+            estimator="plain",
         )
         for k in range(1, 5)
     ]
