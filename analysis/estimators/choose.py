@@ -168,8 +168,13 @@ def _prepare(job: Job, solutions: Mapping[str, Solution]) -> tuple[list[Prepared
             continue
         beside = [n for n in (nu.KAPPA, nu.TAU) if n in columns]
         prepared = _family(job, per_record, family, columns, mine, beside)
-        for belief in nu.beliefs(prepared.names, least_squares(prepared.blocks).beta):
+        for name in tuple(beside):
+            # Anew each time: one left out has taken its column with it.
             fit = least_squares(prepared.blocks)
+            found = {belief.name: belief for belief in nu.beliefs(prepared.names, fit.beta)}
+            if name not in found:
+                continue
+            belief = found[name]
             error = spread([pieces(fit)], fit.inverse)
             wrong = nu.implausible(belief, fit.beta, error.covariance)
             checks.append(nuisance_statement(belief, prepared.names, fit.beta, error, wrong))
