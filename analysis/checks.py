@@ -6,7 +6,7 @@ should know is a `Check`, ok or not, with the figures.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,13 +20,15 @@ from rig.model import channels as ch
 from rig.model.electric import position_limits
 from rig.model.parameters import gain_names, inertia_names
 from rig.model.parse import InputError
-from rig.model.records import Record, Run
+from rig.model.records import Record, RecordHead, Run
 from rig.model.rig import Rig
+from rig.services.stream import RunHead
 
 Array = NDArray[np.float64]
 
 MOVED = 50.0  # an excited piston travels at least this many times its sensor's noise
 CLIPPED_SHARE = 0.01
+LOST_SHARE = 0.01
 MASKED_SHARE = 0.2
 CONDITION_LIMIT = 200.0  # scaled columns; the paper's are 10 to 27
 BULK_RANGE = (5e7, 2.5e9)  # [Pa] hoses with air .. pure mineral oil with margin
@@ -43,7 +45,7 @@ class Check:
     detail: str
 
 
-def common_rig(runs: Sequence[Run]) -> Rig:
+def common_rig(runs: Sequence[Run] | Sequence[RunHead]) -> Rig:
     """Return the rig all runs share; raises InputError where they differ or hold no record."""
     if not runs or not any(run.records for run in runs):
         raise InputError("no records to work on: the run holds none (was it aborted at once?)")
@@ -63,22 +65,45 @@ def common_rig(runs: Sequence[Run]) -> Rig:
     return runs[0].rig
 
 
-def refuse_dead_channels(rig: Rig, record: Record) -> None:
-    """Raise InputError for an excited joint that never moved or a channel that stood still."""
+def spans_of(record: Record) -> dict[str, tuple[float, float]]:
+    """Return the smallest and largest sample of every channel; (inf, -inf) where all were lost."""
+    return {
+        name: (float(np.fmin.reduce(x, initial=np.inf)), float(np.fmax.reduce(x, initial=-np.inf)))
+        for name, x in record.channels.items()
+    }
+
+
+def refuse_dead_channels(
+    rig: Rig, record: Record | RecordHead, spans: Mapping[str, tuple[float, float]] | None = None
+) -> None:
+    """Raise InputError for an excited joint that never moved or a channel that stood still.
+
+    `spans` are the channels' extremes where the record is known by its head only.
+    """
+    if spans is None:
+        spans = spans_of(record) if isinstance(record, Record) else {}
     for i in range(1, len(rig.joints) + 1):
         if i in record.locked:
             continue
         for kind in rig.joint_kinds:
             name = ch.channel(kind, i)
-            if name in record.channels and np.ptp(record.channels[name]) == 0.0:
+            if name not in spans:
+                continue
+            low, high = spans[name]
+            if low > high:
                 raise InputError(
-                    f"record {record.name!r}, channel {name!r}: every sample is "
-                    f"{record.channels[name][0]:g}; is the sensor connected?"
+                    f"record {record.name!r}, channel {name!r}: every sample was lost; leave the "
+                    "record out"
+                )
+            if low == high:
+                raise InputError(
+                    f"record {record.name!r}, channel {name!r}: every sample is {low:g}; is the "
+                    "sensor connected?"
                 )
         place = ch.channel(rig.position_kind, i)
-        moved = np.asarray(record.channels.get(place, np.zeros(1)))
-        travel, noise = float(np.ptp(moved)), rig.sensors.of(rig.position_kind).noise
-        if moved.size > 1 and travel < MOVED * noise:
+        low, high = spans.get(place, (-np.inf, np.inf))
+        travel, noise = high - low, rig.sensors.of(rig.position_kind).noise
+        if travel < MOVED * noise:
             unit = "m" + rig.unit_of(place)
             raise InputError(
                 f"record {record.name!r}, channel {place!r}: joint {i} is not locked but moved "
@@ -87,30 +112,55 @@ def refuse_dead_channels(rig: Rig, record: Record) -> None:
             )
 
 
-def clipping(rig: Rig, runs: Sequence[Run]) -> list[Check]:
-    """State every sensor that touched an end of its range, by step, with the worst record."""
+def clipped_counts(rig: Rig, record: Record) -> dict[str, int]:
+    """Count, per channel that rows need, the samples at an end of their sensor's range."""
+    return {
+        name: int(mask.sum())
+        for name, mask in clipped_samples(rig, record).items()
+        if ch.kind_of(name)[1] not in record.locked or name.startswith(rig.position_kind)
+    }
+
+
+def clipping(
+    rig: Rig, found: Iterable[tuple[Record | RecordHead, Mapping[str, int]]]
+) -> list[Check]:
+    """State every sensor that touched an end of its range, by step, with the worst record.
+
+    `found` holds what `clipped_counts` says of every record.
+    """
     worst: dict[tuple[str, str], tuple[int, float, str]] = {}
-    for run in runs:
-        for record in run.records:
-            for name, mask in clipped_samples(rig, record).items():
-                joint = ch.kind_of(name)[1]
-                if joint in record.locked and not name.startswith(rig.position_kind):
-                    continue
-                found = (int(mask.sum()), float(mask.mean()), record.name)
-                worst[record.step, name] = max(found, worst.get((record.step, name), found))
+    for head, counts in found:
+        for name, count in counts.items():
+            share = (count, count / head.samples, head.name)
+            worst[head.step, name] = max(share, worst.get((head.step, name), share))
     out = []
-    for (_, name), (count, share, record_name) in worst.items():
+    for (_, name), (count, part, record_name) in worst.items():
         low, high = rig.sensors.of(ch.kind_of(name)[0]).range
         out.append(
             Check(
                 "clipped sensor",
-                share < CLIPPED_SHARE,
+                part < CLIPPED_SHARE,
                 f"record {record_name!r}, channel {name!r}: {count} samples "
-                f"({100 * share:.2g} %) at the end of {low:g}..{high:g} {rig.unit_of(name)}; "
+                f"({100 * part:.2g} %) at the end of {low:g}..{high:g} {rig.unit_of(name)}; "
                 "masked (the worst record of its step)",
             )
         )
     return out or [Check("clipped sensor", True, "no sensor reached the end of its range")]
+
+
+def lost_samples(found: Iterable[tuple[Record | RecordHead, int]]) -> Check:
+    """State how many samples never arrived, `found` being (record, its lost samples)."""
+    pairs = [(lost, head) for head, lost in found]
+    total = sum(lost for lost, _ in pairs)
+    if not total:
+        return Check("lost samples", True, "every sample arrived")
+    worst, head = max(pairs, key=lambda pair: pair[0])
+    return Check(
+        "lost samples",
+        total < LOST_SHARE * sum(head.samples for _, head in pairs),
+        f"{total} samples never arrived (most in record {head.name!r}: {worst} of "
+        f"{head.samples}); the rows whose filters reach them are masked",
+    )
 
 
 def repeats(strata: Mapping[tuple[int, str], int]) -> Check:
@@ -126,7 +176,7 @@ def repeats(strata: Mapping[tuple[int, str], int]) -> Check:
     return Check("repeats", True, f"{min(strata.values())} or more repeats of every step")
 
 
-def joints_excited(rig: Rig, records: Sequence[Record]) -> Check:
+def joints_excited(rig: Rig, records: Sequence[Record | RecordHead]) -> Check:
     """State joints that no record excites: their parameters cannot be identified."""
     still = [
         i for i in range(1, len(rig.joints) + 1) if all(i in record.locked for record in records)
@@ -187,7 +237,8 @@ def masked(rows: int, dropped: int) -> Check:
         "masked rows",
         share < MASKED_SHARE,
         f"{dropped} of {rows + dropped} rows ({100 * share:.2g} %) lie outside the model's "
-        "domain (chamber pressure below tank or above supply, clipped sensor) and were left out",
+        "domain (chamber pressure below tank or above supply, clipped sensor, lost samples) and "
+        "were left out",
     )
 
 

@@ -22,7 +22,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.design_limits import Spectrum, forecast_of, used
+from analysis.design_limits import forecast_of, used
+from analysis.design_moves import Tone, mutated, tilted, tone_of, with_tones
 from analysis.prediction import StepInformation, coefficients, covariance, information
 from analysis.prediction_twin import PlannedStep, Played, play
 from analysis.rows import parameters_of
@@ -35,42 +36,18 @@ Array = NDArray[np.float64]
 Lines = NDArray[np.int64]
 log = logging.getLogger(__name__)
 Say = Callable[[str], None]
+Passes = Callable[[PlannedStep, Mapping[int, Tone]], bool]
 
 FILL = 0.95  # share of the tightest limit that a design uses on the twin
 KEEP = 1.5  # times its first error is what a parameter may lose, or more while it stays better
 # than that which the criterion is about was at first
-WIDER = 1.6  # lines up to this times the highest of the protocol may be taken
-LOWER = 0.6  # and down to this times the lowest
 ROUNDS = 40  # of the search for phases, for each child
 NEAR = 0.93  # of the share to fill: a child that fills less is scaled up and played again
 TOO_FAR = 1.02  # of the share to fill: such a child is scaled down and played again
 LARGER = 3.0  # factor by which a spectrum is scaled at most, at once
-TILTS = (-0.8, 1.3)  # of new shapes, amplitudes f^-tilt
 GAIN_BAND = 0.2  # of the logarithm of a piston's gain, which the bench needs to centre it
-ANCHORS = 4  # lowest lines that a new shape keeps: they move the piston, and so centre it
 FIRST_TILTS = (0.0, 0.5, -0.5)  # tried on every tone before anything random
 EARLY_SHARE = 0.6  # of the budget
-KINDS = ("shape", "bump", "lines", "phases")
-EARLY, LATE = (0.6, 0.2, 0.1, 0.1), (0.15, 0.35, 0.25, 0.25)  # how often each
-FEWEST = 3  # lines of a tone
-
-
-@dataclass(frozen=True)
-class Tone:
-    """The lines that one joint of one step may use, and the amplitude and phase of each [V].
-
-    `empty` lines stay so; `spectrum` (lines,) is zero where a line is not used.
-    """
-
-    joint: int
-    lines: Lines
-    spectrum: Spectrum
-    empty: tuple[int, ...]
-
-    @property
-    def chosen(self) -> tuple[int, ...]:
-        """The lines in use."""
-        return tuple(int(k) for k in self.lines[np.abs(self.spectrum) > 0])
 
 
 @dataclass(frozen=True)
@@ -106,11 +83,13 @@ def improve(
     budget: int,
     rng: np.random.Generator,
     say: Say = log.info,
+    passes: Passes = lambda step, tones: True,
 ) -> Design:
     """Improve the steps' multisines with `budget` simulations of a step on the twin.
 
     `empty` names the detection lines of (step, 0-based joint) at the step's period; `criterion` is
-    D, E or a parameter. Raises InputError for an unknown one and where no step has a multisine.
+    D, E or a parameter; `passes` may refuse a step that is about to be kept. Raises InputError
+    for an unknown criterion and where no step has a multisine.
     """
     search = _Search(rig, criterion, rng)
     candidates = [search.first(step, empty) for step in steps]
@@ -137,7 +116,7 @@ def improve(
             continue
         trial = [*candidates[:s], child, *candidates[s + 1 :]]
         value = search.value([c.found for c in trial])
-        if value < best:
+        if value < best and passes(child.played.step, child.tones):
             candidates, best, kept = trial, value, kept + 1
             say(f"{plays:4d} of {budget}: {search.text(value)} ({child.limit} {child.share:.0%})")
     return Design(
@@ -256,7 +235,9 @@ class _Search:
         forecast is made anew from each play, because the twin is not linear.
         """
         tone = parent.tones[joint]
-        spectrum, plays = self.mutated(tone, early) if tilt is None else self.tilted(tone, tilt)
+        spectrum, plays = (
+            mutated(tone, early, self.rng) if tilt is None else tilted(tone, tilt, self.rng)
+        )
         base, found = parent, None
         for cost in range(1, plays + 1):
             known = forecast_of(self.rig, base.played, joint, tone.lines)
@@ -286,84 +267,3 @@ class _Search:
         played = candidate.played
         first = self.gains[played.step.name]
         return all(abs(math.log(k / first[j])) < GAIN_BAND for j, k in played.gains.items())
-
-    def mutated(self, tone: Tone, early: bool) -> tuple[Spectrum, int]:
-        """Return the tone's spectrum with one random change, and how many plays that is worth.
-
-        `early` in a search, large changes are more frequent.
-        """
-        size, level = np.abs(tone.spectrum), envelope(tone)
-        rng, many = self.rng, len(tone.lines)
-        kind = rng.choice(KINDS, p=EARLY if early else LATE)
-        x = np.log(tone.lines / tone.lines[0])
-        if kind == "phases":
-            spread = rng.uniform(0.1, np.pi)
-            turn = np.exp(1j * spread * rng.uniform(-1, 1, many))
-            return np.asarray(tone.spectrum * turn), 2
-        if kind == "bump":
-            middle, width = rng.uniform(x[0], x[-1]), rng.uniform(0.08, 0.6)
-            height = 0.7 * rng.standard_normal()
-            size = size * np.exp(height * np.exp(-0.5 * ((x - middle) / width) ** 2))
-        elif kind == "lines":
-            some = rng.random(many) < rng.uniform(0.03, 0.3)
-            size = np.where(some, np.where(size > 0, 0.0, level), size)
-        else:
-            size = self.reshaped(tone)
-        if np.count_nonzero(size) < FEWEST:
-            return tone.spectrum, 1
-        fresh = np.exp(2j * np.pi * rng.random(many))
-        turn = np.where(np.abs(tone.spectrum) > 0, np.exp(1j * np.angle(tone.spectrum)), fresh)
-        return np.asarray(size * turn), 4 if kind == "shape" else 3
-
-    def tilted(self, tone: Tone, tilt: float) -> tuple[Spectrum, int]:
-        """Return all lines with amplitudes f^-tilt, of the tone's power, and its worth in plays."""
-        size = tone.lines.astype(np.float64) ** -tilt
-        size *= np.linalg.norm(tone.spectrum) / np.linalg.norm(size)
-        return np.asarray(size * np.exp(2j * np.pi * self.rng.random(len(size)))), 4
-
-    def reshaped(self, tone: Tone) -> Array:
-        """Return amplitudes f^-tilt in a random band above the lowest lines, which stay."""
-        rng, size = self.rng, np.abs(tone.spectrum)
-        lowest = np.flatnonzero(size > 0)[:ANCHORS]
-        many, first = len(size), int(lowest[-1]) + 1
-        low, high = np.sort(rng.uniform(size=2) ** [2.0, 0.5]) * (many - first) + first
-        inside = (np.arange(many) >= low) & (np.arange(many) < high)
-        shape = tone.lines.astype(np.float64) ** -rng.uniform(*TILTS) * inside
-        power = np.linalg.norm(shape)
-        if power == 0:
-            return size
-        above = np.linalg.norm(size[first:]) or np.linalg.norm(size)
-        shape *= above / power * np.exp(0.6 * rng.standard_normal())
-        shape[lowest] = size[lowest]
-        return np.asarray(shape)
-
-
-def tone_of(joint: int, wave: Array, empty: Sequence[int]) -> Tone:
-    """Return the tone of one period of a command (n,), with the lines it may take."""
-    spectrum = np.fft.rfft(wave) * (2.0 / len(wave))
-    own = np.flatnonzero(np.abs(spectrum) > 1e-6 * np.abs(spectrum).max())
-    stride = int(np.gcd.reduce(np.diff(own))) if len(own) > 1 else 1
-    first = max(own[0] - stride * int((1 - LOWER) * own[0] / stride), 1)
-    last = own[-1] + stride * int((WIDER - 1) * own[-1] / stride) if len(own) > 1 else own[-1]
-    lines = np.setdiff1d(np.arange(first, last + 1, stride), np.array(empty, dtype=np.int64))
-    lines = np.union1d(lines, own)
-    values = np.where(np.isin(lines, own), spectrum[lines], 0.0)
-    return Tone(joint, lines.astype(np.int64), values, tuple(empty))
-
-
-def envelope(tone: Tone) -> Array:
-    """Return the amplitude (lines,) a line would have among its neighbours in use."""
-    size = np.abs(tone.spectrum)
-    in_use = size > 0
-    return np.asarray(np.interp(tone.lines, tone.lines[in_use], size[in_use]))
-
-
-def with_tones(step: PlannedStep, tones: Mapping[int, Tone]) -> PlannedStep:
-    """Return the step with the waves of these tones."""
-    n, waves, lines = step.period, dict(step.waves), set()
-    for joint, tone in tones.items():
-        full = np.zeros(n // 2 + 1, dtype=np.complex128)
-        full[tone.lines] = tone.spectrum * (n / 2.0)
-        waves[joint] = np.asarray(np.fft.irfft(full, n))
-        lines |= set(tone.chosen)
-    return replace(step, waves=waves, lines=tuple(sorted(lines)))

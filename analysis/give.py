@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from analysis.signals import Mask, gives
+from analysis.signals import Mask, bridged, gives
 from rig.model import channels as ch
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
@@ -23,20 +23,21 @@ def moving_by_step(rig: Rig, run: Run) -> dict[str, Mask]:
     steps: dict[str, list[Record]] = {}
     for record in run.records:
         steps.setdefault(record.step, []).append(record)
-    return {step: _moving(rig, records) for step, records in steps.items()}
+    return {step: moving_of(rig, records) for step, records in steps.items()}
 
 
-def _moving(rig: Rig, records: Sequence[Record]) -> Mask:
-    rate, noise = records[0].sample_rate, rig.sensors.piston.noise
+def moving_of(rig: Rig, records: Sequence[Record]) -> Mask:
+    """Return which joints (N,) move in the repeats of one step."""
+    rate, noise = records[0].sample_rate, rig.sensors.of(rig.position_kind).noise
     found = []
     for i in range(1, len(rig.joints) + 1):
-        name = ch.channel(ch.PISTON, i)
+        name = ch.channel(rig.position_kind, i)
         held = [r for r in records if i in r.locked and name in r.channels]
         if len(held) < len(records):
             found.append(True)
             continue
         length = min(r.samples for r in held)
-        every = np.array([np.asarray(r.channels[name])[:length] for r in held])
+        every = np.array([bridged(np.asarray(r.channels[name])[:length]) for r in held])
         mean = every.mean(axis=0)
         # Repeats that were not synchronised after all would cancel in the mean.
         found.append(

@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from analysis import checks as ck
 from analysis.advice import base_statements
 from analysis.checks import Check
-from analysis.estimators.choose import Job, refine, refuse_unknown
+from analysis.condense import SEGMENTS, Reduction, reduce_runs, solve_reductions
+from analysis.condense import repeats_of as reduced_repeats
+from analysis.estimators.choose import Job, Refined, refine, refuse_unknown
 from analysis.give import moving_by_step
 from analysis.model import Estimate, Model, estimate_json, finite
-from analysis.noise import noise_moments
 from analysis.reduce import reduced
 from analysis.rows import Filtering, Rows, default_filtering, parameters_of, record_rows
 from analysis.signals import condition
@@ -37,7 +38,12 @@ log = logging.getLogger(__name__)
 METHODS = ("coupled", "sequential", "simultaneous", "pso", "ga")
 PLAIN = "plain"  # least squares as in the paper: no nuisances, scatter between repeats only
 FEWEST_DRAWS = 100  # of a bootstrap
-SEGMENTS = 10  # of the only repeat of a step, where there are not more repeats
+_UNREFINED = Check(
+    "estimator",
+    True,
+    "plain: least squares with intervals from the scatter between repeats alone; what the other "
+    "estimators refine (every row in memory, parameters linear in them) was not applied",
+)
 
 
 @dataclass(frozen=True)
@@ -91,42 +97,60 @@ def identify(
     _refuse_estimator(estimator, bootstrap)
     rig = ck.common_rig(runs)
     used = tuple(terms) if terms is not None else tuple(map(Used, baseline_of(rig)))
-    estimator = _fitting_estimator(rig, estimator)
+    estimator = _fitting_estimator(rig, used, estimator, bootstrap)
     if method != "coupled":
         from analysis.methods import identify_by  # noqa: PLC0415 (which builds on this module)
 
         return identify_by(method, runs, used, filtering, reject_noise, rng, search)
-    per_record = build_rows(rig, runs, used, filtering)
-    # A stream of its own: the prediction of bias is the same every time.
-    noise = noise_moments(rig, runs, used, filtering, np.random.default_rng(0))
-    started = time.perf_counter()
-    solutions = solve_rows(rig, used, per_record, noise, reject_noise)
-    seconds = time.perf_counter() - started
-    more: tuple[Check, ...] = ()
-    if estimator != PLAIN:
+
+    def refined(solutions: Mapping[str, Solution]) -> Refined:
         job = Job(
             rig, runs, used, lambda extra: build_rows(rig, runs, (*used, *extra), filtering),
             estimator, bootstrap, rng or np.random.default_rng(0),
         )  # fmt: skip
-        refined = refine(job, solutions)
-        solutions, more = refined.solutions, refined.checks
+        return refine(job, solutions)
+
+    reductions = reduce_runs(rig, runs, used, filtering)
+    sources = [run.source for run in runs]
+    return conclude(
+        rig, sources, used, reductions, reject_noise, None if estimator == PLAIN else refined
+    )
+
+
+def conclude(
+    rig: Rig,
+    sources: Sequence[str],
+    used: tuple[Used, ...],
+    reductions: Sequence[Reduction],
+    reject_noise: bool,
+    refined: Callable[[Mapping[str, Solution]], Refined] | None = None,
+) -> Identification:
+    """Solve the reductions of all records of the runs `sources`, and judge what comes out."""
+    started = time.perf_counter()
+    solutions = solve_reductions(rig, used, reductions, reject_noise)
+    seconds = time.perf_counter() - started
+    found = Refined(solutions, (_UNREFINED,), PLAIN) if refined is None else refined(solutions)
+    solutions = found.solutions
     estimates, covariance = estimates_of(rig, used, solutions)
-    if bootstrap and estimator != PLAIN:
-        estimates = _with_ends(estimates, refined.bootstrap)
+    if found.bootstrap:
+        estimates = _with_ends(estimates, found.bootstrap)
     rows = {family: solution.rows for family, solution in solutions.items()}
-    masked = sum(r.masked for one in per_record for r in one.rows.values())
-    statements = _statements(rig, runs, per_record, solutions, estimates, rows, masked) + more
+    masked = sum(one.masked for one in reductions)
+    statements = (
+        *_statements(rig, reductions, solutions, estimates, rows, masked),
+        *found.checks,
+    )
     provenance = {
-        "method": method,
-        "estimator": estimator if estimator == PLAIN else refined.estimator,
-        "runs": [run.source for run in runs],
-        "records": [one.record for one in per_record],
+        "method": "coupled",
+        "estimator": found.estimator,
+        "runs": list(sources),
+        "records": [one.head.name for one in reductions],
         "rows": rows,
         "checks_failed": [c.name for c in statements if not c.ok],
     }
     model = Model(rig, used, estimates, covariance, provenance)
-    log.info("identified %d parameters from %d records", len(estimates), len(per_record))
-    return Identification(method, estimates, solutions, rows, masked, seconds, statements, model)
+    log.info("identified %d parameters from %d records", len(estimates), len(reductions))
+    return Identification("coupled", estimates, solutions, rows, masked, seconds, statements, model)
 
 
 def _refuse_method(method: str) -> None:
@@ -145,14 +169,22 @@ def _refuse_estimator(estimator: str, bootstrap: int) -> None:
         raise InputError(f"--bootstrap does not go with --estimator {estimator}; take ls or iv")
 
 
-def _fitting_estimator(rig: Rig, estimator: str) -> str:
-    """Return the estimator for a rig: what refines the fluid's rows has none on electric ones."""
-    if not rig.electric or estimator == PLAIN:
+def _fitting_estimator(rig: Rig, used: Sequence[Used], estimator: str, bootstrap: int) -> str:
+    """Return the estimator for a model: what refines the fluid's rows has none on electric rigs.
+
+    Nor are the others for parameters that are not linear in the rows (`Term.reduction`).
+    """
+    reducing = [one.term.name for one in used if one.term.reduction(rig) is not None]
+    if estimator == PLAIN or not (rig.electric or reducing):
         return estimator
-    if estimator != "ls":
-        raise InputError(
-            f"--estimator {estimator} is for hydraulic rigs; {rig.name!r} is electric: take ls"
+    if estimator != "ls" or bootstrap:
+        asked = f"--estimator {estimator}" if estimator != "ls" else "--bootstrap"
+        why = (
+            f"is for hydraulic rigs; {rig.name!r} is electric"
+            if rig.electric
+            else f"does not go with {' '.join(reducing)}, not linear in the rows"
         )
+        raise InputError(f"{asked} {why}: take ls without a bootstrap")
     return PLAIN
 
 
@@ -283,18 +315,17 @@ def _with_ends(
 
 def _statements(
     rig: Rig,
-    runs: Sequence[Run],
-    per_record: Sequence[RecordRows],
+    reductions: Sequence[Reduction],
     solutions: Mapping[str, Solution],
     estimates: Mapping[str, Estimate],
     rows: Mapping[str, int],
     masked: int,
 ) -> tuple[Check, ...]:
-    records = [record for run in runs for record in run.records]
     return (
-        ck.repeats(repeats_of(per_record)),
-        ck.joints_excited(rig, records),
-        *ck.clipping(rig, runs),
+        ck.repeats(reduced_repeats(reductions)),
+        ck.joints_excited(rig, [one.head for one in reductions]),
+        *ck.clipping(rig, [(one.head, one.clipped) for one in reductions]),
+        ck.lost_samples([(one.head, one.lost) for one in reductions]),
         ck.masked(sum(rows.values()), masked),
         *ck.identifiability(solutions),
         *base_statements(rig, solutions),

@@ -53,9 +53,8 @@ def noise_moments(
         for record in run.records:
             if record.step not in seen:
                 seen.add(record.step)
-                for family, moment in _moments(
-                    rig, record, terms, filtering, moving[record.step], rng
-                ).items():
+                moments = record_moments(rig, record, terms, filtering, moving[record.step], rng)
+                for family, moment in moments.items():
                     total[family] += counts[record.step] * moment
     return total
 
@@ -71,7 +70,7 @@ def disturbed(rig: Rig, record: Record, rng: np.random.Generator) -> Record:
     return replace(record, channels=channels)
 
 
-def _moments(
+def record_moments(
     rig: Rig,
     record: Record,
     terms: Sequence[Used],
@@ -79,6 +78,7 @@ def _moments(
     moving: Mask,
     rng: np.random.Generator,
 ) -> dict[str, Array]:
+    """Return N (k+1, k+1) of [X y] for each family of one record whose joints `moving` (N,)."""
     filters = filtering(record)
     before, after = (
         record_rows(rig, terms, condition(rig, r, filters.channels, moving), filters)

@@ -20,7 +20,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.identify import SEGMENTS, build_rows
+from analysis.condense import SEGMENTS
+from analysis.identify import build_rows
 from analysis.model import finite
 from analysis.noise import noise_moments
 from analysis.prediction_noise import score_covariance

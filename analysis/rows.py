@@ -8,7 +8,7 @@ Sum of columns times coefficients = right-hand side; units: torque_i [N m], flow
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -56,7 +56,7 @@ class Rows:
     """Rows of one equation of one record: matrix (m, k), rhs (m,), time [s] of each row (m,).
 
     `names` are the parameters of the columns; `masked` rows were dropped because a sample under
-    the filter lay outside the model or was clipped.
+    the filter lay outside the model, was clipped or was lost.
     """
 
     equation: str
@@ -128,9 +128,18 @@ def parameters_of(rig: Rig, terms: Sequence[Used], family: str) -> tuple[str, ..
 
 
 def record_rows(
-    rig: Rig, terms: Sequence[Used], signals: Signals, filtering: Filtering
+    rig: Rig,
+    terms: Sequence[Used],
+    signals: Signals,
+    filtering: Filtering,
+    families: Collection[str] = tuple(FAMILIES),
+    within: tuple[float, float] = (-np.inf, np.inf),
 ) -> dict[str, Rows]:
-    """Return the filtered rows of every equation of the excited joints of one record."""
+    """Return the filtered rows of every equation of the excited joints of one record.
+
+    Only those of `families`, and only rows whose time [s] lies `within` (from, before): a part of
+    a longer record yields the rows that are its own.
+    """
     for used in terms:
         signals = used.term.prepare(rig, signals, used.shape)
     columns: Columns = {}
@@ -142,23 +151,60 @@ def record_rows(
         for name, mask in used.term.valid(rig, signals, used.shape).items():
             valid[name] = valid.get(name, np.ones(len(mask), dtype=bool)) & mask
     sides = right_sides(rig, signals)
-    edges = filtering.channels.reach
     out = {}
     for family, kinds in FAMILIES.items():
+        if family not in families:
+            continue
         names = parameters_of(rig, terms, family)
         for i in map(int, np.flatnonzero(signals.excited)):
             # Inertia couples: a clipped piston of any joint spoils every torque row.
             whole = family == "mechanical"
             sensors = np.asarray(signals.valid.all(axis=1) if whole else signals.valid[:, i])
+            lost = _lost(signals, slice(None) if whole else slice(i, i + 1))
             for kind in kinds:
                 name = equation(kind, i)
                 if name not in sides:
                     continue
-                good = sensors & valid.get(name, sensors)
-                out[name] = _filtered(
-                    name, names, columns.get(name, {}), sides[name], good, signals, filtering, edges
+                masks = Masks(~(sensors & valid.get(name, sensors)), lost)
+                rows = _filtered(
+                    name, names, columns.get(name, {}), sides[name], masks, signals.t, filtering
                 )
+                out[name] = rows.kept(names, within)
     return out
+
+
+def _lost(signals: Signals, joints: slice) -> Mask:
+    if signals.lost is None:
+        return np.zeros(len(signals.t), dtype=bool)
+    return np.asarray(signals.lost[:, joints].any(axis=1))
+
+
+@dataclass(frozen=True)
+class Masks:
+    """Samples (n,) outside the model or clipped, and samples that never arrived."""
+
+    bad: Mask
+    lost: Mask
+
+
+@dataclass(frozen=True)
+class _Filtered:
+    """One equation's filtered columns and right side (m, filled + 1), before rows are dropped."""
+
+    equation: str
+    filled: list[int]
+    stack: Array
+    dropped: Mask
+    time: Array
+
+    def kept(self, names: tuple[str, ...], within: tuple[float, float]) -> Rows:
+        """Return the rows within a stretch of time, without the dropped ones."""
+        inside = (self.time >= within[0]) & (self.time < within[1])
+        kept = inside & ~self.dropped
+        matrix = np.zeros((int(kept.sum()), len(names)))
+        matrix[:, self.filled] = self.stack[kept, :-1]
+        masked = int((inside & self.dropped).sum())
+        return Rows(self.equation, names, matrix, self.stack[kept, -1], self.time[kept], masked)
 
 
 def _filtered(
@@ -166,40 +212,37 @@ def _filtered(
     names: tuple[str, ...],
     columns: dict[str, Array],
     side: Array,
-    good: Mask,
-    signals: Signals,
+    masks: Masks,
+    time: Array,
     filtering: Filtering,
-    edges: int,
-) -> Rows:
-    """Filter and decimate one equation's columns and right side together, dropping masked rows."""
+) -> _Filtered:
+    """Filter and decimate one equation's columns and right side together."""
+    edges = filtering.channels.reach
     inside = slice(edges, len(side) - edges)
     filled = [k for k, parameter in enumerate(names) if parameter in columns]
     stack = np.column_stack([*(columns[names[k]] for k in filled), side])[inside]
-    bad = ~good[inside]
-    time = signals.t[inside]
-    if filtering.rows is not None:
-        stack, dropped, time = _low_passed(stack, bad, time, filtering.rows, filtering.step)
-    else:
-        stack, dropped, time = (
-            stack[:: filtering.step],
-            bad[:: filtering.step],
-            time[:: filtering.step],
-        )
-    kept = ~dropped
-    matrix = np.zeros((int(kept.sum()), len(names)))
-    matrix[:, filled] = stack[kept, :-1]
-    return Rows(name, names, matrix, stack[kept, -1], time[kept], int(dropped.sum()))
+    masks, time = Masks(masks.bad[inside], masks.lost[inside]), time[inside]
+    if filtering.rows is None:
+        dropped, every = masks.bad | masks.lost, slice(None, None, filtering.step)
+        return _Filtered(name, filled, stack[every], dropped[every], time[every])
+    stack, dropped, time = _low_passed(stack, masks, time, filtering.rows, filtering.step)
+    return _Filtered(name, filled, stack, dropped, time)
 
 
 def _low_passed(
-    stack: Array, bad: Mask, time: Array, rows: FirSmoother, step: int
+    stack: Array, masks: Masks, time: Array, rows: FirSmoother, step: int
 ) -> tuple[Array, Mask, Array]:
     filtered = rows.decimate(stack, step)
-    first = -(-2 * rows.reach // step) * step - rows.reach
-    centres = first + step * np.arange(len(filtered))
-    if not bad.any():
-        return filtered, np.zeros(len(filtered), dtype=bool), time[centres]
-    weights = np.abs(rows.taps[0]) / np.abs(rows.taps[0]).sum()
-    share = upfirdn(weights, bad.astype(np.float64), 1, step)
     start = -(-2 * rows.reach // step)
-    return filtered, share[start : start + len(filtered)] > MASKED_SHARE, time[centres]
+    centres = start * step - rows.reach + step * np.arange(len(filtered))
+    dropped = np.zeros(len(filtered), dtype=bool)
+    weights = np.abs(rows.taps[0]) / np.abs(rows.taps[0]).sum()
+    # What stands for a lost sample is made up: not even the filter's tails may touch it.
+    for mask, taps, limit in (
+        (masks.bad, weights, MASKED_SHARE),
+        (masks.lost, np.ones(len(weights)), 0.5),
+    ):
+        if mask.any():
+            share = upfirdn(taps, mask.astype(np.float64), 1, step)
+            dropped |= share[start : start + len(filtered)] > limit
+    return filtered, dropped, time[centres]

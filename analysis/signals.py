@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.differentiate import Smoother, align, channel_filter, row_filter
+from analysis.differentiate import ALIGN_HALF_WIDTH, Smoother, align, channel_filter, row_filter
 from rig.model import channels as ch
 from rig.model.parse import InputError
 from rig.model.records import Record
@@ -37,6 +37,8 @@ class Signals:
 
     `excited` (N,) marks the joints whose rows may be used; `valid` (n, N) is false where a sensor
     of the joint was clipped within the filter's reach or the filter runs over the record's edge.
+    `lost` (n, N) is true where a sample of the joint that never arrived is within that reach: what
+    stands there was made up by a straight line, and no row may see it.
     """
 
     rate: float
@@ -60,6 +62,7 @@ class Signals:
     temperature: Array
     excited: Mask
     valid: Mask
+    lost: Mask | None = None
 
     @property
     def joints(self) -> int:
@@ -71,24 +74,69 @@ def aligned_channels(rig: Rig, record: Record) -> dict[str, Array]:
     """Return the record's measured channels moved to the tick's instant, each (n,).
 
     Channel k of the multiplexer is sampled k `skew` after the tick, and a sensor shows the world
-    `delay` late: x(t) = measured(t + delay - k skew).
+    `delay` late: x(t) = measured(t + delay - k skew). Lost samples (NaN) are bridged by a straight
+    line first; `lost_samples` tells where.
     """
-    moved = {}
-    for k, name in enumerate(rig.channels):
+    return {
+        name: align(bridged(np.asarray(record.channels[name], dtype=np.float64)), shift)
+        for name, shift in _shifts(rig, record.sample_rate).items()
+        if name in record.channels
+    }
+
+
+def _shifts(rig: Rig, rate: float) -> dict[str, float]:
+    """Return how many samples later each channel shows the instant of the tick."""
+    return {
+        name: (rig.sensors.of(ch.kind_of(name)[0]).delay - k * rig.sensors.skew) * rate
+        for k, name in enumerate(rig.channels)
+    }
+
+
+def align_reach(rig: Rig, rate: float) -> int:
+    """Return how many samples either side an aligned sample depends on."""
+    shifts = [abs(shift) for shift in _shifts(rig, rate).values()]
+    return ALIGN_HALF_WIDTH + int(np.floor(max(shifts, default=0.0) + 0.5))
+
+
+def bridged(x: Array) -> Array:
+    """Return x (n,) with a straight line over every gap of NaN, zeros if nothing is left of it."""
+    missing = np.isnan(x)
+    if not missing.any():
+        return x
+    if missing.all():
+        return np.zeros_like(x)
+    index = np.arange(len(x))
+    filled = x.copy()
+    filled[missing] = np.interp(index[missing], index[~missing], x[~missing])
+    return filled
+
+
+def lost_samples(rig: Rig, record: Record) -> Mask:
+    """Return where (n, N) a joint's sample, or one of the bench's, never arrived (NaN)."""
+    lost = np.zeros((record.samples, len(rig.joints)), dtype=bool)
+    for name in rig.channels:
         if name in record.channels:
-            sensor = rig.sensors.of(ch.kind_of(name)[0])
-            shift = (sensor.delay - k * rig.sensors.skew) * record.sample_rate
-            moved[name] = align(np.asarray(record.channels[name], dtype=np.float64), shift)
-    return moved
+            missing = np.isnan(record.channels[name])
+            kind, joint = ch.kind_of(name)
+            if joint is None:
+                lost |= missing[:, None]
+            elif joint not in record.locked or kind == rig.position_kind:
+                lost[:, joint - 1] |= missing
+    return lost
 
 
 def condition(
-    rig: Rig, record: Record, smoother: Smoother | None = None, moving: Mask | None = None
+    rig: Rig,
+    record: Record,
+    smoother: Smoother | None = None,
+    moving: Mask | None = None,
+    held: Array | None = None,
 ) -> Signals:
     """Turn a record into signals through one zero-phase filter (default `channel_filter`).
 
-    `moving` (N,) overrides `moving_joints`. Raises InputError naming record and channel where one
-    is missing or not a number.
+    `moving` (N,) overrides `moving_joints` and `held` (N,) [m] `held_pistons`, for a record that
+    is a part of a longer one. Lost samples (NaN) are marked in `Signals.lost`. Raises InputError
+    naming record and channel where one is missing or not finite.
     """
     smoother = smoother or channel_filter(record.sample_rate)
     joints = range(1, len(rig.joints) + 1)
@@ -107,7 +155,8 @@ def condition(
     raw_s, raw_p = stacked(rig.position_kind), (stacked(ch.CAP), stacked(ch.ROD))
     supply, oil = (0.0, 0.0) if rig.electric else (rig.supply.pressure, rig.oil.temperature)
     moving = moving_joints(rig, record) if moving is None else moving
-    s, sd, sdd = _motion(raw_s, moving, smoother)
+    held = held_pistons(rig, record) if held is None else held
+    s, sd, sdd = _motion(raw_s, moving, held, smoother)
     q, qd, qdd, G = _angles(rig, s, sd, sdd)
     volumes = [rig.chamber_volumes(i - 1, s[:, i - 1]) for i in joints]
     return Signals(
@@ -126,6 +175,7 @@ def condition(
         temperature=bench(ch.TEMPERATURE, oil),
         excited=excited,
         valid=_valid(rig, record, smoother.reach),
+        lost=_lost(rig, record, smoother.reach + align_reach(rig, record.sample_rate)),
     )  # fmt: skip
 
 
@@ -153,8 +203,9 @@ def _refuse_missing(rig: Rig, record: Record, excited: Mask) -> None:
                     f"record {record.name!r} has no channel {name!r}, needed because joint {i} is "
                     f"{'excited' if moves else 'locked'}; it has: {' '.join(record.channels)}"
                 )
-            if not np.isfinite(record.channels[name]).all():
-                row = int(np.flatnonzero(~np.isfinite(record.channels[name]))[0])
+            values = record.channels[name]
+            if np.isinf(values).any():
+                row = int(np.flatnonzero(np.isinf(values))[0])
                 raise InputError(
                     f"record {record.name!r}, channel {name!r}: sample {row} is not a finite "
                     "number; cut the record there or repair the file"
@@ -171,10 +222,22 @@ def moving_joints(rig: Rig, record: Record) -> Mask:
     return np.array(found)
 
 
-def _motion(raw: Array, moving: Mask, smoother: Smoother) -> tuple[Array, Array, Array]:
-    """Return filtered s, ds/dt, d2s/dt2 (n, N); a joint that does not move is held at its mean."""
+def held_pistons(rig: Rig, record: Record) -> Array:
+    """Return each piston's mean (N,) [m] (electric: q) over what arrived: where a lock holds it."""
+    means = []
+    for i in range(1, len(rig.joints) + 1):
+        place = np.asarray(record.channels[ch.channel(rig.position_kind, i)])
+        here = place[~np.isnan(place)]
+        means.append(float(here.mean()) if len(here) else 0.0)
+    return np.array(means)
+
+
+def _motion(
+    raw: Array, moving: Mask, held: Array, smoother: Smoother
+) -> tuple[Array, Array, Array]:
+    """Return filtered s, ds/dt, d2s/dt2 (n, N); a joint that does not move stands at `held`."""
     s, sd, sdd = (smoother.apply(raw, k) for k in range(3))
-    s[:, ~moving], sd[:, ~moving], sdd[:, ~moving] = raw[:, ~moving].mean(axis=0), 0.0, 0.0
+    s[:, ~moving], sd[:, ~moving], sdd[:, ~moving] = held[~moving], 0.0, 0.0
     return s, sd, sdd
 
 
@@ -183,7 +246,7 @@ def gives(piston: Array, rate: float, noise: float) -> bool:
     band = row_filter(rate, GIVE_BAND)
     if len(piston) <= 4 * band.reach:
         return False
-    inner = band.apply(piston, 2)[band.reach : -band.reach]
+    inner = band.apply(bridged(piston), 2)[band.reach : -band.reach]
     floor = noise * float(np.linalg.norm(band.taps[2]))
     return bool(np.std(inner) > GIVE_THRESHOLD * floor)
 
@@ -215,3 +278,12 @@ def _valid(rig: Rig, record: Record, reach: int) -> Mask:
     spread = np.apply_along_axis(np.convolve, 0, bad, np.ones(2 * reach + 1), "same") > 0.5
     spread[:reach] = spread[n - reach :] = True
     return np.asarray(~spread)
+
+
+def _lost(rig: Rig, record: Record, reach: int) -> Mask:
+    lost = lost_samples(rig, record)
+    if lost.any():
+        wide = np.ones(2 * reach + 1)
+        whole = np.apply_along_axis(np.convolve, 0, lost.astype(np.float64), wide)
+        lost = whole[reach : reach + record.samples] > 0.5
+    return lost

@@ -84,18 +84,20 @@ def solve(
     clusters: Sequence[Cluster],
     noise: Array | None = None,
     reject_noise: bool = True,
+    scatter: Sequence[Cluster] | None = None,
 ) -> Solution:
     """Solve all clusters at once; parameters that the rows do not determine come out as NaN.
 
     `noise` (k+1, k+1) is the part of [X y]'[X y] that sensors' noise makes
     (`analysis.noise`); with `reject_noise` a parameter that rests on it counts as undetermined.
+    The errors come from the clusters `scatter`, where those are others (`analysis.online`).
     """
     k = len(names)
     R = merge(c.triangle for c in clusters)
     X, y = R[:k, :k], R[:k, k]
     inverse, condition, lost = _pseudo_inverse(names, X)
     beta, bread = inverse @ y, inverse @ inverse.T
-    covariance, dof = _clustered(beta, bread, clusters)
+    covariance, dof = _clustered(beta, bread, clusters if scatter is None else scatter)
     noise_bias = np.full(k, np.nan)
     if noise is not None:
         noise_bias = -bread @ (noise[:k, :k] @ beta - noise[:k, k])

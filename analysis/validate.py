@@ -18,7 +18,7 @@ from analysis.differentiate import Smoother
 from analysis.effects.measurement import corrected_channels
 from analysis.model import Model, finite, refuse_other_rig
 from analysis.rows import Filtering, default_filtering
-from analysis.signals import Signals, aligned_channels, condition
+from analysis.signals import Mask, Signals, aligned_channels, condition, lost_samples
 from analysis.simulate import Simulation, State, compiled, drive_of, simulate, state_at
 from rig.model import channels as ch
 from rig.model.parse import InputError
@@ -30,6 +30,7 @@ Array = NDArray[np.float64]
 WINDOW = 0.25  # [s]
 START_SAMPLES = 0.04  # [s] of samples that the first state is fitted to
 START_DEGREE = 3
+GAP = 0.05  # [s] of lost samples that a simulation may bridge
 
 
 @dataclass(frozen=True)
@@ -82,6 +83,7 @@ def validate_record(
 ) -> RecordValidation:  # fmt: skip
     """Validate on one record (see `validate`)."""
     smoother = filtering(record).channels
+    here = arrived(rig, record)
     signals = _seen_by(model, rig, condition(rig, record, smoother))
     # A sensor that the model says is wrong is put right before anything is compared with it.
     channels = aligned_channels(rig, record)
@@ -93,6 +95,8 @@ def validate_record(
     windows = dict.fromkeys(measured, 0.0)
     count = 0
     for first, length in _windows(record, smoother):
+        if not here[first : first + length].all():
+            continue
         short = simulate(ready, drive, state_at(signals, first), first, length)
         stretch = short.channels()
         for name, y in measured.items():
@@ -102,8 +106,11 @@ def validate_record(
     return RecordValidation(
         record.name,
         record.step,
-        {name: fit_percent(y, simulated[name]) for name, y in measured.items()},
-        {name: float(np.sqrt(np.mean((y - simulated[name]) ** 2))) for name, y in measured.items()},
+        {name: fit_percent(y[here], simulated[name][here]) for name, y in measured.items()},
+        {
+            name: float(np.sqrt(np.mean((y - simulated[name])[here] ** 2)))
+            for name, y in measured.items()
+        },
         {name: float(np.sqrt(v / count)) if count else np.nan for name, v in windows.items()},
         free.failure,
         free.outside,
@@ -112,6 +119,22 @@ def validate_record(
         record.time,
         {name: rig.unit_of(name) for name in measured},
     )
+
+
+def arrived(rig: Rig, record: Record) -> Mask:
+    """Return which samples (n,) arrived; raises InputError for a gap too long to bridge.
+
+    The model is driven by the measured spool, which over a short gap is a straight line.
+    """
+    lost = lost_samples(rig, record).any(axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], lost, [False])).astype(np.int8)))
+    longest = int(np.max(edges[1::2] - edges[::2], initial=0))
+    if longest > GAP * record.sample_rate:
+        raise InputError(
+            f"record {record.name!r}: {longest} samples in a row were lost; a model cannot be "
+            f"simulated through more than {1000 * GAP:g} ms without its spool"
+        )
+    return np.asarray(~lost)
 
 
 def _seen_by(model: Model, rig: Rig, signals: Signals) -> Signals:

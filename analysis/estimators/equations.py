@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.rows import Rows
+from analysis.signals import bridged
 from analysis.terms.base import family_of
 from rig.model import channels as ch
 from rig.model.records import Record
@@ -243,8 +244,9 @@ def levelled(blocks: Sequence[Block], records: Mapping[tuple[int, str], Record])
 
 def _state(b: Block, record: Record) -> Array:
     kind, joint = b.equation.rsplit("_", 1)
-    channel = {"flow_cap": ch.CAP, "flow_rod": ch.ROD}.get(kind, ch.PISTON)
-    x = np.asarray(record.channels[ch.channel(channel, int(joint))], dtype=np.float64)
+    place = ch.POSITION if ch.channel(ch.POSITION, int(joint)) in record.channels else ch.PISTON
+    channel = {"flow_cap": ch.CAP, "flow_rod": ch.ROD}.get(kind, place)
+    x = bridged(np.asarray(record.channels[ch.channel(channel, int(joint))], dtype=np.float64))
     width = max(1, round(AVERAGED * record.sample_rate))
     smooth = np.convolve(x, np.full(width, 1.0 / width), mode="same")
     return np.asarray(np.interp(b.time, record.time, smooth))

@@ -102,6 +102,8 @@ class Windows:
             points = round(WINDOW * record.sample_rate) // (SAMPLES_PER_STEP * every)
             length = points * SAMPLES_PER_STEP * every
             good: Mask = np.asarray(signals.valid[:, free].all(axis=1))
+            if signals.lost is not None:  # of any joint: the locked ones drive the others
+                good = np.asarray(good & ~signals.lost.any(axis=1))
             firsts = self._fitting(good, length)
             chosen = firsts[:: max(1, -(-len(firsts) // most))][:most]
             measured = np.column_stack(
@@ -115,8 +117,8 @@ class Windows:
                 )  # fmt: skip
         if not self.stretches:
             raise InputError(
-                f"no record holds {WINDOW:g} s without a clipped sensor: output error has nothing "
-                "to simulate; use --estimator ls"
+                f"no record holds {WINDOW:g} s without a clipped sensor or a lost sample: output "
+                "error has nothing to simulate; use --estimator ls"
             )
 
     @staticmethod

@@ -22,9 +22,10 @@ from numpy.typing import NDArray
 
 from analysis.model import Estimate, Model
 from analysis.rows import Filtering
-from analysis.signals import aligned_channels, condition
+from analysis.signals import Mask, aligned_channels, condition
 from analysis.simulate import Drive, State, compiled, drive_of, simulate, state_at
 from analysis.terms.base import Used
+from analysis.validate import arrived
 from rig.model import channels as ch
 from rig.model.parameters import gain_names, inertia_names
 from rig.model.parse import InputError
@@ -65,13 +66,17 @@ class SearchOptions:
 
 @dataclass(frozen=True)
 class Window:
-    """A stretch of the record: where it starts, the state there, what was measured by channel."""
+    """A stretch of the record: where it starts, the state there, what was measured by channel.
+
+    `here` (samples,) is false where a sample was lost and nothing is compared.
+    """
 
     first: int
     samples: int
     start: State
     measured: Mapping[str, Array]
     spread: Mapping[str, float]
+    here: Mask
 
 
 @dataclass(frozen=True)
@@ -119,7 +124,10 @@ def step_one(runs: Sequence[Run]) -> Record:
 def make_task(
     rig: Rig, record: Record, terms: Sequence[Used], filtering: Filtering, options: SearchOptions
 ) -> Task:
-    """Lay out the search on one record; raises InputError for a rig without nominal values."""
+    """Lay out the search on one record; raises InputError for a rig without nominal values.
+
+    Also for a record with a gap of lost samples that a model cannot be simulated through.
+    """
     names = searched_names(rig)
     model = _template(rig, terms, names)
     nominal = np.array([rig.nominal[name] for name in names])
@@ -132,7 +140,7 @@ def make_task(
             f"record {record.name!r} of {record.samples / record.sample_rate:g} s is too short "
             f"for a window of {options.seconds:g} s"
         )
-    channels = aligned_channels(rig, record)
+    channels, every = aligned_channels(rig, record), arrived(rig, record)
     shown = [
         ch.channel(kind, i + 1)
         for i in map(int, np.flatnonzero(signals.excited))
@@ -141,9 +149,10 @@ def make_task(
     windows = []
     for first in np.unique(np.linspace(reach, reach + room, options.windows).astype(int)):
         measured = {name: channels[name][first : first + length] for name in shown}
-        spread = {name: float(np.sum((y - y.mean()) ** 2)) for name, y in measured.items()}
+        here = every[first : first + length]
+        spread = {n: float(here.sum() * y[here].var()) for n, y in measured.items()}
         start = state_at(signals, int(first))
-        windows.append(Window(int(first), length, start, measured, spread))
+        windows.append(Window(int(first), length, start, measured, spread, here))
     return Task(
         record.name, model, names, nominal / options.factor, nominal * options.factor,
         drive, tuple(windows),
@@ -203,7 +212,8 @@ def score(task: Task, values: Mapping[str, float]) -> Score:
         elif not fate:
             channels = found.channels()
             for name, y in window.measured.items():
-                total += float(np.sum((y - channels[name]) ** 2)) / window.spread[name]
+                off = (y - channels[name])[window.here]
+                total += float(np.sum(off**2)) / window.spread[name]
     if fate:
         return Score(DEAD * (1.0 + lost / samples), fate)
     return Score(total / (len(task.windows) * len(task.windows[0].measured)), "")

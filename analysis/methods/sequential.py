@@ -34,6 +34,7 @@ from analysis.methods.stages import Outcome, Stage, as_solution, solve_stages
 from analysis.model import Estimate, Model, estimate_json, finite
 from analysis.noise import noise_moments
 from analysis.rows import Filtering, parameters_of
+from analysis.signals import lost_samples
 from analysis.solve import Cluster
 from analysis.terms.base import FAMILIES, Used
 from rig.model.parse import InputError
@@ -65,11 +66,13 @@ def sequential(
     estimates, covariance = estimates_of(rig, terms, solutions)
     rows = {family: outcome.rows for family, outcome in outcomes.items()}
     shown = {name: _shown(rig, terms, outcomes, name) for name in estimates}
+    records = [record for run in runs for record in run.records]
     statements = (
         _uniqueness(shown),
         ck.repeats(_repeats(runs)),
-        ck.joints_excited(rig, [record for run in runs for record in run.records]),
-        *ck.clipping(rig, runs),
+        ck.joints_excited(rig, records),
+        *ck.clipping(rig, [(r, ck.clipped_counts(rig, r)) for r in records]),
+        ck.lost_samples([(r, int(lost_samples(rig, r).any(axis=1).sum())) for r in records]),
         ck.masked(sum(rows.values()), masked),
         *ck.consistency(rig, estimates),
     )

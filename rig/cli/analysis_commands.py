@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from rig.cli.bench_commands import JsonOption
 from rig.cli.output import progress, write_json
 from rig.model.parse import InputError
-from rig.model.records import Run
+from rig.model.records import Record, Run
+
+if TYPE_CHECKING:
+    from analysis.identify import Identification
+    from analysis.rows import Filtering
 
 RunsArgument = Annotated[list[Path], typer.Argument(help="Run folders.")]
 
@@ -38,6 +42,36 @@ def _load(folders: Sequence[Path]) -> list[Run]:
     return [load_run(folder) for folder in folders]
 
 
+def _refuse_unstreamed(option: str, method: str, estimator: str | None, bootstrap: int) -> None:
+    """Raise InputError for what needs the rows of all records in memory."""
+    for name, asked, wanted in (
+        ("--method", method, "coupled"),
+        ("--estimator", estimator or "plain", "plain"),
+        ("--bootstrap", str(bootstrap), "0"),
+    ):
+        if asked != wanted:
+            raise InputError(
+                f"{name} {asked} needs every row in memory and does not go with {option}: "
+                f"expected {name} {wanted}, or no {option}"
+            )
+
+
+def _streamed(
+    runs: Sequence[Path],
+    filtering: Callable[[Record], Filtering],
+    effects: Sequence[str],
+    cluster: str | None,
+) -> Identification:
+    from analysis.cluster import Cluster
+    from analysis.compute import Serial
+    from analysis.folders import identify_folders
+
+    with Serial() if cluster is None else Cluster(cluster) as pool:
+        return identify_folders(
+            [str(run) for run in runs], filtering=filtering, pool=pool, effects=effects
+        )
+
+
 def identify(
     runs: RunsArgument,
     method: Annotated[
@@ -50,8 +84,12 @@ def identify(
         ),
     ] = None,
     estimator: Annotated[
-        str, typer.Option(help="ls, wls, iv, robust, output-error; auto: ls or iv as checked.")
-    ] = "ls",
+        str | None,
+        typer.Option(
+            help="ls, wls, iv, robust, output-error; auto: ls or iv as checked; plain: the bare "
+            "solution.  [default: ls; plain with --stream or --cluster]"
+        ),
+    ] = None,
     bootstrap: Annotated[
         int, typer.Option(min=0, help="Draws of whole repeats for the intervals; 0: by repeat.")
     ] = 0,
@@ -71,6 +109,20 @@ def identify(
         int, typer.Option(min=4, help="Candidates that pso or ga may simulate.")
     ] = 2000,
     seed: Annotated[int, typer.Option(min=0, help="Of pso, ga and the bootstrap.")] = 0,
+    stream: Annotated[
+        bool,
+        typer.Option(
+            "--stream",
+            help="One record in memory at a time, for runs that do not fit: coupled and plain "
+            "only (an --estimator's refinements need all rows in memory).",
+        ),
+    ] = False,
+    cluster: Annotated[
+        str | None,
+        typer.Option(
+            help="tcp://HOST:PORT of a Dask scheduler: the work goes to its workers, as --stream."
+        ),
+    ] = None,
 ) -> None:
     """Identify every parameter from all records of the runs at once, or as others would.
 
@@ -88,20 +140,25 @@ def identify(
     from rig.cli.method_text import method_text
     from rig.cli.tables import identification_text, read_truth
 
-    loaded = _load(runs)
     if filtering not in FILTERINGS:
         raise InputError(f"--filtering {filtering}: expected one of: {' '.join(FILTERINGS)}")
-    terms = [Used(term) for term in with_effects(loaded[0].rig, effects)] if effects else None
-    result = identify_runs(
-        loaded,
-        method,
-        terms,
-        FILTERINGS[filtering],
-        estimator=estimator,
-        bootstrap=bootstrap,
-        rng=np.random.default_rng(seed),
-        search=SearchOptions(evaluations=evaluations),
-    )
+    filters = FILTERINGS[filtering]
+    if stream or cluster is not None:
+        _refuse_unstreamed("--cluster" if cluster else "--stream", method, estimator, bootstrap)
+        result = _streamed(runs, filters, effects or (), cluster)
+    else:
+        loaded = _load(runs)
+        terms = [Used(term) for term in with_effects(loaded[0].rig, effects)] if effects else None
+        result = identify_runs(
+            loaded,
+            method,
+            terms,
+            filters,
+            estimator=estimator or "ls",
+            bootstrap=bootstrap,
+            rng=np.random.default_rng(seed),
+            search=SearchOptions(evaluations=evaluations),
+        )
     told, more = to_json(result), method_text(result)
     if physical:
         from rig.cli.physical import make_physical
@@ -114,7 +171,7 @@ def identify(
     if report is not None:
         from rig.cli.reporting import write_identification
 
-        write_identification(report, loaded, result)
+        write_identification(report, _load(runs), result)
     if json != Path("-"):
         known = None if truth is None else read_truth(truth)
         typer.echo(identification_text(result, known) + more)

@@ -102,6 +102,12 @@ def run(
     operator: Annotated[
         str | None, typer.Option(help="Written into the run.  [default: you]")
     ] = None,
+    track: Annotated[
+        bool, typer.Option("--track", help="Follow b and the flow gains while it runs.")
+    ] = False,
+    memory: Annotated[
+        float, typer.Option(help="Of --track: forget with this time constant [s].")
+    ] = float("inf"),
 ) -> None:
     """Run a protocol unattended into a run folder; Ctrl-C zeroes the outputs and keeps the data.
 
@@ -110,7 +116,7 @@ def run(
     from rig.cli.running import Job, overridden, run_protocol
 
     changes = overridden(repeats, duration, amplitude_scale, wave_seed, step)
-    job = Job(protocol, rig, out, endpoint, changes, operator)
+    job = Job(protocol, rig, out, endpoint, changes, operator, track, memory)
     folder = run_protocol(job, progress)
     typer.echo(str(folder))
 

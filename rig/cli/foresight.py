@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,9 @@ from typing import Any
 import numpy as np
 
 from analysis.design import Design, improve
+from analysis.design_moves import Tone
 from analysis.prediction import Prediction, predict, to_json
+from analysis.prediction_twin import PlannedStep
 from analysis.twin import simulate_commands
 from protocols import library
 from protocols.check import check
@@ -18,7 +21,7 @@ from protocols.check_report import CheckReport
 from protocols.plan import Overrides, Plan, resolve
 from protocols.write import protocol_text
 from rig.cli.output import progress, table
-from rig.cli.planned import designed_protocol, empty_lines, planned_steps
+from rig.cli.planned import designed_protocol, designed_step, empty_lines, planned_steps
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 from rig.services.rigs import load_bench
@@ -64,7 +67,7 @@ def percent(value: float) -> str:
 
 
 def prediction_text(found: Foresight) -> str:
-    """Return each parameter's predicted error, the conditioning, and what is not determined."""
+    """Return each parameter's predicted error, conditioning, and what is not determined."""
     p = found.prediction
     if p is None:
         return f"standard errors cannot be predicted: {found.why}"
@@ -96,6 +99,20 @@ class Designed:
     after: Foresight
 
 
+def _checker(plan: Plan, rig: Rig) -> Callable[[PlannedStep, Mapping[int, Tone]], bool]:
+    """Return the test that `check` will make of a step in the end, centring from nothing."""
+
+    def passes(planned: PlannedStep, tones: Mapping[int, Tone]) -> bool:
+        alone = {"steps": (designed_step(plan, planned, tones),)}
+        try:
+            trial = resolve(plan.protocol.model_copy(update=alone), rig)
+            return check(trial, rig, simulate_commands).ok
+        except InputError:
+            return False
+
+    return passes
+
+
 def design_protocol(protocol: str, rig: str, criterion: str, budget: int, seed: int) -> Designed:
     """Improve a protocol's multisines; raises InputError where that cannot be done."""
     bench = load_bench(rig)
@@ -104,7 +121,7 @@ def design_protocol(protocol: str, rig: str, criterion: str, budget: int, seed: 
     biases = {step.step: step.biases for step in before.limits.steps}
     design = improve(
         bench, planned_steps(plan, biases), empty_lines(plan), criterion, budget,
-        np.random.default_rng(seed), progress,
+        np.random.default_rng(seed), progress, _checker(plan, bench),
     )  # fmt: skip
     better = designed_protocol(plan, design, criterion)
     after_plan = resolve(better, bench)

@@ -7,9 +7,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from analysis.design import Design
+from analysis.design_moves import Tone
 from analysis.prediction_twin import PlannedStep
 from protocols.excite import Waveform, chosen_lines
-from protocols.model import CLOSED, Protocol
+from protocols.model import CLOSED, Protocol, Step
 from protocols.plan import Plan, StepPlan
 
 
@@ -48,20 +49,27 @@ def empty_lines(plan: Plan) -> dict[tuple[str, int], tuple[int, ...]]:
     }
 
 
+def designed_step(plan: Plan, planned: PlannedStep, tones: Mapping[int, Tone]) -> Step:
+    """Return a protocol's step with the designed lines in place of its signals."""
+    step = next(s for s in plan.steps if s.name == planned.name)
+    source = next(s for s in plan.protocol.steps if s.name == planned.name)
+    excite = []
+    for part in source.excite:
+        tone = tones[part.joint - 1]
+        wave = Waveform(planned.waves[part.joint - 1], tone.chosen, tone.empty)
+        signal = chosen_lines(wave, plan.sample_rate / step.period)
+        excite.append(part.model_copy(update={"signal": signal}))
+    # A record was one common period or several; written out, it stays so.
+    seconds = step.record / plan.sample_rate
+    return source.model_copy(update={"excite": tuple(excite), "duration": seconds})
+
+
 def designed_protocol(plan: Plan, design: Design, criterion: str) -> Protocol:
-    """Return the plan's protocol with the designed lines in place of its signals."""
-    steps = []
-    for step, planned, tones in zip(plan.steps, design.steps, design.tones, strict=True):
-        source = next(s for s in plan.protocol.steps if s.name == step.name)
-        excite = []
-        for part in source.excite:
-            tone = tones[part.joint - 1]
-            wave = Waveform(planned.waves[part.joint - 1], tone.chosen, tone.empty)
-            signal = chosen_lines(wave, plan.sample_rate / step.period)
-            excite.append(part.model_copy(update={"signal": signal}))
-        # A record was one common period or several; written out, it stays so.
-        seconds = step.record / plan.sample_rate
-        steps.append(source.model_copy(update={"excite": tuple(excite), "duration": seconds}))
+    """Return the plan's protocol with all its steps as designed."""
+    steps = (
+        designed_step(plan, planned, tones)
+        for planned, tones in zip(design.steps, design.tones, strict=True)
+    )
     update = {
         "name": f"{plan.protocol.name}-{criterion.lower().replace('_', '-')}",
         "description": f"{plan.protocol.description}; designed for {criterion}",

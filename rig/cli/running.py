@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from drivers import make_driver
@@ -20,6 +22,9 @@ from rig.services.attach import AttachError, Publisher
 from rig.services.bench import Bench
 from rig.services.recorder import Recorder
 from rig.services.rigs import load_bench
+
+if TYPE_CHECKING:
+    from rig.cli.tracking import Tracking
 
 log = logging.getLogger(__name__)
 Say = Callable[[str], None]
@@ -35,6 +40,8 @@ class Job:
     endpoint: str | None = None
     overrides: Overrides = field(default_factory=Overrides)
     operator: str | None = None
+    track: bool = False
+    memory: float = math.inf
 
 
 def wire_at(endpoint: str, wire: Wire) -> Wire:
@@ -69,6 +76,7 @@ class _Story:
     def __init__(self, bench: Bench, plan: Plan, say: Say) -> None:
         self._bench, self._plan, self._say = bench, plan, say
         self._began: int | None = None  # the device's tick, known with its first block
+        self._message = ""
 
     def phase(self, step: str, phase: str, repeat: int, repeats: int, message: str) -> None:
         tick = self._bench.tick
@@ -76,6 +84,7 @@ class _Story:
             self._began = tick
         at = (tick - (self._began or tick)) / self._plan.sample_rate
         self._say(f"{at:8.1f} s  {step:10s} {phase:8s}  {message}")
+        self._message = message
         self._bench.event("phase", tick, step=step, phase=phase, message=message)
         self._bench.status(
             step=step,
@@ -86,6 +95,14 @@ class _Story:
             total_s=self._plan.seconds,
         )
 
+    def tracked(self, estimate: str) -> None:
+        """Show an estimate beside what the run does."""
+        self._bench.status(message=f"{self._message}; {estimate}")
+
+    def note(self, entry: dict[str, Any]) -> None:
+        """Keep the estimates at a record's end in the run's log."""
+        self._bench.event("tracked", self._bench.tick, **entry)
+
 
 def _publisher(rig: Rig, say: Say) -> Publisher | None:
     try:
@@ -94,6 +111,14 @@ def _publisher(rig: Rig, say: Say) -> Publisher | None:
         # A run must not fail for want of a screen.
         say(f"no screen can attach to this run: {error}")
         return None
+
+
+def _tracking(job: Job, rig: Rig, say: Say, stack: ExitStack) -> Tracking | None:
+    if not job.track:
+        return None
+    from rig.cli.tracking import Tracking
+
+    return stack.enter_context(Tracking(rig, job.out, say, job.memory))
 
 
 def run_protocol(job: Job, say: Say) -> Path:
@@ -113,9 +138,13 @@ def run_protocol(job: Job, say: Say) -> Path:
         job.out, rig, protocol=plan.protocol.model_dump(mode="json"), operator=job.operator
     )
     with ExitStack() as stack:
+        tracking = _tracking(job, rig, say, stack)
         publisher = _publisher(rig, say)
         bench = stack.enter_context(Bench(rig, make_driver(wire, rig), recorder, publisher))
         story = _Story(bench, plan, say)
+        if tracking is not None:
+            tracking.tell(story.note, story.tracked)
+            bench.observers.add(tracking)
         engine.run(plan, rig, bench, story.phase)
     return job.out
 

@@ -46,6 +46,39 @@ class Record:
 
 
 @dataclass(frozen=True)
+class RecordHead:
+    """What is known of a record without its samples; fields as in `Record`."""
+
+    name: str
+    step: str
+    locked: tuple[int, ...]
+    repeat: int
+    sample_rate: float
+    samples: int
+    channels: tuple[str, ...]
+    start: float = 0.0
+    period: int = 0
+    lines: tuple[int, ...] = ()
+    attributes: Mapping[str, str | float | int] = field(default_factory=dict)
+
+    def record(self, channels: Mapping[str, Array]) -> Record:
+        """Return a record of these channels, each (m,): the whole record or a part of it."""
+        return Record(
+            self.name, self.step, self.locked, self.repeat, self.sample_rate, channels,
+            self.start, self.period, self.lines, self.attributes,
+        )  # fmt: skip
+
+
+def head_of(record: Record) -> RecordHead:
+    """Return what is known of a record without its samples."""
+    return RecordHead(
+        record.name, record.step, record.locked, record.repeat, record.sample_rate,
+        record.samples, tuple(record.channels),
+        record.start, record.period, record.lines, record.attributes,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
 class Run:
     """A run folder's content: the rig it was taken on, its records, where it came from."""
 

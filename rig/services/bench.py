@@ -25,6 +25,7 @@ from rig.services.arrival import ArrivalClock
 from rig.services.attach import Publisher
 from rig.services.display import Display
 from rig.services.handles import RecordHandle
+from rig.services.observe import Observers
 from rig.services.outputs import Outputs
 from rig.services.recorder import Recorder, RecordMeta
 from rig.services.safety import Guard, GuardSettings, JointRole
@@ -59,6 +60,7 @@ class Bench:
     ) -> None:
         self.rig = rig
         self.recorder = recorder
+        self.observers = Observers()
         self.trip: SafetyTrip | None = None
         self.lost_samples = 0
         self.tick = 0
@@ -176,6 +178,7 @@ class Bench:
             self.zero_outputs()
             trip = self._latch(SafetyTrip(violation, self.rig))
         self._keep(block, late, lost)
+        self.observers.block(block)
         self._display.show(block, late or 0.0, self.lost_samples, self._guard.roles)
         if trip is not None:
             self._report(trip)

@@ -47,6 +47,7 @@ class RecordHandle:
         recorder = self._bench.recorder
         if recorder is not None:
             self._number = recorder.begin_record(self.meta, self.start_tick)
+        self._bench.observers.record_begins(self.meta, self.start_tick, self._ticks)
         return self
 
     def close(self, state: str = "complete") -> None:
@@ -54,6 +55,8 @@ class RecordHandle:
         recorder = self._bench.recorder
         if recorder is not None and self._number is not None and not self._closed:
             recorder.end_record(self._number, self.meta, self.ticks, state, self._more)
+        if not self._closed:
+            self._bench.observers.record_ends(self.meta, self.start_tick, self.ticks, state)
         self._closed = True
 
     def discard(self, reason: str) -> None:

@@ -7,16 +7,16 @@ import json
 import logging
 import os
 import socket
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from rig.model.parse import InputError, load_yaml
-from rig.model.records import Run
+from rig.model.records import Record, RecordHead, Run
 from rig.model.rig import Rig
 from rig.services.files import read_text, replace_text
 from rig.services.runstate import (
@@ -35,6 +35,7 @@ from rig.services.runstate import (
 from rig.services.versions import versions
 
 log = logging.getLogger(__name__)
+T = TypeVar("T", Record, RecordHead)
 
 ARCHIVE = "records.h5"
 _FORMAT = 1
@@ -154,13 +155,8 @@ def read_header(folder: Path) -> Header:
         raise InputError(f"{path}: {where}: {problem['msg']}") from error
 
 
-def load_run(path: str | Path, *, partial: bool = False) -> Run:
-    """Load a run's complete records, with `partial` the unfinished ones as well.
-
-    A sample lost on the wire is NaN in every channel (attribute `lost_samples` counts them).
-    Raises InputError with a one-line message for anything that cannot be read.
-    """
-    folder = Path(path)
+def finished(folder: Path) -> tuple[Header, str]:
+    """Return head and state of a run whose records can be read; raises InputError otherwise."""
     header = read_header(folder)
     state = read_state(folder)
     if state == RUNNING:
@@ -172,14 +168,31 @@ def load_run(path: str | Path, *, partial: bool = False) -> Run:
         raise InputError(
             f"{folder}: {state}, its records were not finalised; run `bramah recover {folder}`"
         )
-    from rig.services.archive import read_records  # noqa: PLC0415 - keeps this module light
+    return header, state
 
-    records = read_records(folder / ARCHIVE)
-    chosen = [r for r in records if partial or r.attributes["complete"]]
+
+def chosen_of(folder: Path, state: str, records: Sequence[T], partial: bool) -> tuple[T, ...]:
+    """Return the complete records, with `partial` all; raises InputError where there are none."""
+    chosen = tuple(r for r in records if partial or r.attributes["complete"])
     if not chosen:
         kept = f"; it keeps {len(records)} unfinished one(s)" if records else ""
         raise InputError(f"{folder}: {state} before any record was complete{kept}")
-    return Run(header.rig, tuple(chosen), source=str(folder), state=state)
+    return chosen
+
+
+def load_run(path: str | Path, *, partial: bool = False) -> Run:
+    """Load a run's complete records, with `partial` the unfinished ones as well.
+
+    A sample lost on the wire is NaN in every channel (attribute `lost_samples` counts them).
+    Raises InputError with a one-line message for anything that cannot be read.
+    `rig.services.stream` reads them one by one.
+    """
+    folder = Path(path)
+    header, state = finished(folder)
+    from rig.services.archive import read_records  # noqa: PLC0415 - keeps this module light
+
+    chosen = chosen_of(folder, state, read_records(folder / ARCHIVE), partial)
+    return Run(header.rig, chosen, source=str(folder), state=state)
 
 
 def summarise(folder: Path) -> RunSummary:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from analysis.design import FILL, KEEP, TOO_FAR, Design, improve, tone_of
+from analysis.design import FILL, KEEP, TOO_FAR, Design, improve
 from analysis.design_limits import bounds, forecast_of
+from analysis.design_moves import tone_of
 from analysis.prediction import predict
 from analysis.prediction_twin import play
 from rig.model.parse import InputError
@@ -40,10 +41,9 @@ def test_every_limit_is_kept_on_the_twin(rig: Rig, design: Design) -> None:
         motion = play(rig, step).motion
         for bound in bounds(rig, step, motion):
             assert bound.share <= 1.02 * FILL * TOO_FAR, (step.name, bound.name)
-    joint = rig.joints[0]
-    assert all(
-        np.abs(s.waves[j]).max() < joint.limits.command for s in design.steps for j in s.waves
-    )
+    for step in design.steps:
+        for joint, wave in step.waves.items():
+            assert np.abs(wave).max() < rig.joints[joint].limits.command
 
 
 def test_detection_lines_stay_empty(design: Design) -> None:

@@ -303,7 +303,7 @@ def test_a_missing_channel_is_named(multisine_run: Run) -> None:
 def test_a_sample_that_is_no_number_is_named(multisine_run: Run) -> None:
     record = only(multisine_run, "step2_r1").records[0]
     p = record.channels["cap_pressure_1"].copy()
-    p[17] = np.nan
+    p[17] = np.inf
     with pytest.raises(InputError, match="channel 'cap_pressure_1': sample 17 is not"):
         identify([replace(multisine_run, records=(changed(record, cap_pressure_1=p),))])
 

@@ -1,0 +1,162 @@
+"""One way to hand work out: here, to processes of this machine, or to a Dask cluster.
+
+A pool maps a plain function (importable by name, picklable, no state of its own) over items and
+yields the results in the items' order; what the function raises, `map` raises. Use it as a context
+manager: processes and connections end with it, whatever happens inside.
+
+    with local_pool(workers) as pool:
+        for result in pool.map(one_study, seeds): ...
+
+Randomness comes with the items (a seed, a `SeedSequence` child), never from the process. Work is
+handed out only a little ahead of what was taken, so items may be an endless generator.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing import get_context
+from types import TracebackType
+from typing import Any, Protocol, Self, TypeVar
+
+T = TypeVar("T")
+U = TypeVar("U")
+Reads = Callable[[T], str]
+
+AHEAD = 2  # items handed out per worker beyond the one waited for
+# Every library that multiplies matrices reads one of these when it is loaded.
+ONE_THREAD = dict.fromkeys(
+    ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1"
+)
+
+
+class Pool(Protocol):
+    """Something that maps functions over items; a context manager that ends what it started."""
+
+    @property
+    def workers(self) -> int:
+        """How many items are worked on at once."""
+
+    def map(
+        self, function: Callable[[T], U], items: Iterable[T], reads: Reads[T] | None = None
+    ) -> Iterator[U]:
+        """Yield function(item) in the items' order.
+
+        `reads` names the file or folder that an item needs; a pool across machines works on the
+        item where that exists, the others pay it no heed.
+        """
+
+    def __enter__(self) -> Self:
+        """Begin."""
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """End everything that was started."""
+
+
+class Serial:
+    """No other process at all: for tests, small work, and `--debug`."""
+
+    workers = 1
+
+    def map(
+        self, function: Callable[[T], U], items: Iterable[T], reads: Reads[T] | None = None
+    ) -> Iterator[U]:
+        """Yield function(item), each when it is asked for."""
+        return map(function, items)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+
+class Processes:
+    """Processes of this machine, started afresh (not forked), one BLAS thread each.
+
+    Started when the `with` block begins and ended with it; a process that dies ends the map with a
+    ChildProcessError. A script that uses it needs the usual ``if __name__ == "__main__":``.
+    """
+
+    def __init__(self, workers: int | None = None) -> None:
+        self.workers = max(1, workers or os.cpu_count() or 1)
+        self._executor: ProcessPoolExecutor | None = None
+
+    def __enter__(self) -> Self:
+        context = get_context("spawn")
+        self._executor = ProcessPoolExecutor(self.workers, mp_context=context)
+        with environment():
+            for _ in range(self.workers):  # each starts one process, which keeps this environment
+                self._executor.submit(_nothing)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._executor is not None:
+            self._executor.shutdown(wait=True, cancel_futures=True)
+            self._executor = None
+
+    def map(
+        self, function: Callable[[T], U], items: Iterable[T], reads: Reads[T] | None = None
+    ) -> Iterator[U]:
+        """Yield function(item) in the items' order."""
+        if self._executor is None:
+            raise ValueError("use the pool in a `with` block")
+        submit = self._executor.submit
+        try:
+            yield from in_order(lambda item: submit(function, item), items, self.workers)
+        except BrokenProcessPool as error:
+            raise ChildProcessError(
+                "a worker process died (out of memory, or killed); its work is lost"
+            ) from error
+
+
+def local_pool(workers: int | None = None) -> Pool:
+    """Return what Monte Carlo studies use: processes, or none for a single worker."""
+    count = workers or os.cpu_count() or 1
+    return Serial() if count == 1 else Processes(count)
+
+
+def in_order(submit: Callable[[T], Any], items: Iterable[T], workers: int) -> Iterator[Any]:
+    """Submit items a little ahead and yield their futures' results in order.
+
+    What is left is cancelled when the caller stops taking, or when one fails.
+    """
+    waiting: deque[Any] = deque()
+    try:
+        for item in items:
+            waiting.append(submit(item))
+            if len(waiting) > AHEAD * workers:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        for future in waiting:
+            future.cancel()
+
+
+@contextmanager
+def environment(changes: Mapping[str, str] = ONE_THREAD) -> Iterator[None]:
+    """Change what the processes that are started inside inherit; by default one BLAS thread."""
+    before = {key: os.environ.get(key) for key in changes}
+    os.environ.update(changes)
+    try:
+        yield
+    finally:
+        for key, value in before.items():
+            if value is None:
+                del os.environ[key]
+            else:
+                os.environ[key] = value
+
+
+def _nothing() -> None:
+    pass

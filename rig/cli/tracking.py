@@ -1,0 +1,265 @@
+"""`bramah run --track`: a process beside the run that follows b and the gains.
+
+The acquisition only hands blocks to a socket that never blocks (zmq, about 20 us a block); the
+estimates come back the same way. A tracker that falls behind, hangs or dies costs the run nothing:
+blocks it has no room for are lost samples to it.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import os
+import signal
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from multiprocessing import get_context, parent_process
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+import zmq
+
+from analysis.compute import environment
+from analysis.model import Estimate, estimate_json
+from analysis.online import Tracker
+from drivers.base import SampleBlock
+from rig.cli.following import Follower
+from rig.cli.output import write_json
+from rig.model.parse import InputError
+from rig.model.records import RecordHead
+from rig.model.rig import Rig
+from rig.services.recorder import RecordMeta
+
+log = logging.getLogger(__name__)
+Say = Callable[[str], None]
+
+NAME = "tracked.json"
+WAITING = 30_000  # messages that may wait for the tracker: five minutes of blocks, about 40 MB
+SAY_EVERY = 2.0  # [s] of wall time
+FINISH = 20.0  # [s] that the tracker may take to finish after the run
+NICE = 5
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the tracker is told at its start: `memory` [s], infinite for none."""
+
+    rig: Rig
+    memory: float
+    endpoint: str
+
+
+def summary(parameters: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return the bulk modulus and the gains in one line, '?' where nothing is known yet."""
+    parts = []
+    for name, found in parameters.items():
+        value, (low, high) = found["value"], found["ci95"]
+        scale, unit = (1e-6, " MPa") if name == "b" else (1e7, "")
+        text = "?" if value is None else f"{scale * value:.4g}"
+        if value is not None and low is not None and high is not None:
+            text += f"±{0.5 * scale * (high - low):.1g}"
+        parts.append(f"{name} {text}{unit}")
+    return "  ".join(parts)
+
+
+class Tracking:
+    """The run's side of the tracker: an observer of the bench, a context manager around it.
+
+    Enter it before the bench and leave it after, so that nothing waits while outputs are on.
+    """
+
+    def __init__(self, rig: Rig, out: Path, say: Say, memory: float = math.inf) -> None:
+        if not memory > 0.0:
+            raise InputError(f"--memory {memory:g}: expected more than 0 s")
+        self.parameters: dict[str, Any] = {}
+        self.worst_handover = 0.0
+        self._rig, self._out, self._say, self._memory = rig, out, say, memory
+        self._history: list[dict[str, Any]] = []
+        self._notes: list[Callable[[dict[str, Any]], None]] = []
+        self._shows: list[Callable[[str], None]] = []
+        self._dropped = 0
+        self._next_say = -math.inf
+
+    def tell(self, note: Callable[[dict[str, Any]], None], show: Callable[[str], None]) -> None:
+        """Say who notes the estimates at each record's end, and who shows the running ones."""
+        self._notes.append(note)
+        self._shows.append(show)
+
+    def __enter__(self) -> Self:
+        self._folder = tempfile.TemporaryDirectory(prefix="bramah-")  # only its owner may enter
+        endpoint = f"ipc://{self._folder.name}/track"
+        self._context = zmq.Context()
+        self._socket = self._context.socket(zmq.PAIR)
+        self._socket.set(zmq.SNDHWM, WAITING)
+        self._socket.set(zmq.LINGER, 0)
+        # The end that connects queues what it sends before the other is there.
+        self._socket.connect(endpoint)
+        settings = Settings(self._rig, self._memory, endpoint)
+        self._process = get_context("spawn").Process(target=work, args=(settings,), daemon=True)
+        with environment():
+            self._process.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        try:
+            if kind is None or issubclass(kind, Exception):
+                self._finish()
+        finally:
+            self._socket.close()
+            self._context.term()
+            self._process.join(1.0)
+            if self._process.is_alive():
+                self._process.kill()
+                self._process.join()
+            self._process.close()
+            self._folder.cleanup()
+
+    def _finish(self) -> None:
+        """Wait for the last estimates and write everything beside the records."""
+        self._send([b"stop"])
+        deadline = time.monotonic() + FINISH
+        ended = False
+        while not ended and self._process.is_alive() and time.monotonic() < deadline:
+            if self._socket.poll(100):
+                ended = self._hear()
+        if not self.parameters:
+            return
+        self._say(f"tracked: {summary(self.parameters)}")
+        if not ended:
+            self._say("the tracker did not finish; its last estimates stand")
+        memory = self._memory if math.isfinite(self._memory) else None
+        data = {"memory_s": memory, "parameters": self.parameters, "records": self._history}
+        if self._out.is_dir():
+            write_json(self._out / NAME, data)
+
+    # What the bench tells
+
+    def block(self, block: SampleBlock) -> None:
+        """Hand a block on, and hear what there is to hear; never waits."""
+        started = time.perf_counter()
+        tick = str(block.tick).encode()
+        self._send([b"block", tick, np.ascontiguousarray(block.data, dtype="<f8").tobytes()])
+        self._hear()
+        self.worst_handover = max(self.worst_handover, time.perf_counter() - started)
+
+    def record_begins(self, meta: RecordMeta, start: int, ticks: int | None) -> None:
+        """Announce a record."""
+        head = RecordHead(
+            meta.name, meta.step, meta.locked, meta.repeat, self._rig.sample_rate, 0,
+            tuple(self._rig.recorded), start / self._rig.sample_rate, meta.period, meta.lines,
+        )  # fmt: skip
+        place = json.dumps([start, ticks]).encode()
+        self._send([b"begin", place, json.dumps(asdict(head)).encode()])
+
+    def record_ends(self, meta: RecordMeta, start: int, ticks: int, state: str) -> None:
+        """Announce its end."""
+        words = [str(start), str(ticks), state, meta.name]
+        self._send([b"end", *(word.encode() for word in words)])
+
+    def _send(self, parts: list[bytes]) -> None:
+        try:
+            self._socket.send_multipart(parts, zmq.NOBLOCK)
+        except zmq.Again:
+            self._dropped += 1
+            if self._dropped == 1:
+                log.warning("the tracker does not keep up; it misses samples, the run does not")
+
+    def _hear(self) -> bool:
+        """Take what the tracker said; True if that was its last word."""
+        while True:
+            try:
+                reply = json.loads(self._socket.recv(zmq.NOBLOCK))
+            except zmq.Again:
+                return False
+            if reply["kind"] == "failed":
+                log.warning("the tracker stopped: %s", reply["message"])
+                return True
+            self.parameters = reply["parameters"] or self.parameters
+            if reply["kind"] == "last":
+                return True
+            if reply["kind"] == "record":
+                entry = {"record": reply["record"], "parameters": reply["parameters"]}
+                self._history.append(entry)
+                for note in self._notes:
+                    note(entry)
+            elif time.monotonic() >= self._next_say:
+                self._next_say = time.monotonic() + SAY_EVERY
+                line = summary(self.parameters)
+                self._say(f"           {line}")
+                for show in self._shows:
+                    show(line.split("  ")[0])
+
+
+# The tracker's side
+
+
+def work(settings: Settings) -> None:
+    """Follow what comes in until told to stop, or until the run's process is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run says when to stop
+    os.nice(NICE)  # the acquisition goes first
+    context = zmq.Context()
+    socket = context.socket(zmq.PAIR)
+    socket.set(zmq.RCVHWM, WAITING)
+    socket.set(zmq.LINGER, 2000)
+    socket.bind(settings.endpoint)
+    try:
+        _serve(settings, socket)
+    except InputError as error:
+        socket.send_string(json.dumps({"kind": "failed", "message": str(error)}))
+    finally:
+        socket.close()
+        context.term()
+
+
+def _serve(settings: Settings, socket: zmq.Socket[bytes]) -> None:
+    tracker = Tracker(settings.rig, memory=settings.memory)
+    follower = Follower(settings.rig, tracker)
+    width = len(settings.rig.recorded)
+    parent = parent_process()
+    while True:
+        if not socket.poll(1000):
+            if parent is not None and not parent.is_alive():
+                return
+            continue
+        kind, *words = socket.recv_multipart()
+        if kind == b"block":
+            data = np.frombuffer(words[1], dtype="<f8").reshape(-1, width)
+            if follower.block(int(words[0]), data):
+                _reply(socket, "now", tracker)
+        elif kind == b"begin":
+            follower.begins(_head(json.loads(words[1])), *json.loads(words[0]))
+        elif kind == b"end":
+            start, ticks, state, name = (word.decode() for word in words)
+            follower.ends(int(start), int(ticks), state == "complete")
+            if state == "complete":
+                _reply(socket, "record", tracker, record=name)
+        else:
+            _reply(socket, "last", tracker)
+            return
+
+
+def _head(data: dict[str, Any]) -> RecordHead:
+    lists = ("locked", "channels", "lines")
+    fields: dict[str, Any] = {k: tuple(v) if k in lists else v for k, v in data.items()}
+    return RecordHead(**fields)
+
+
+def _reply(socket: zmq.Socket[bytes], kind: str, tracker: Tracker, **more: str) -> None:
+    found: dict[str, Estimate] = tracker.estimates()
+    known = {name: estimate_json(e) for name, e in found.items()}
+    if all(e["value"] is None for e in known.values()):
+        known = {}
+    try:
+        socket.send_string(json.dumps({"kind": kind, "parameters": known, **more}), zmq.NOBLOCK)
+    except zmq.Again:
+        log.debug("nobody hears the estimates")

@@ -1,0 +1,192 @@
+"""Pools: the same results in the same order wherever the work is done, and nothing left behind."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from itertools import count, islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from analysis.cluster import Cluster
+from analysis.compute import Pool, Processes, Serial, local_pool
+from analysis.folders import identify_folders
+from analysis.identify import PLAIN, identify
+from rig.model.parse import InputError
+from rig.model.records import Run
+from rig.services.stream import write_run
+from tests.analysis.test_accumulate import assert_same
+
+END_SECONDS = 20.0
+
+
+def square(x: int) -> int:
+    return x * x
+
+
+def broken(x: int) -> int:
+    raise InputError(f"item {x} cannot be used")
+
+
+def about(_: int) -> tuple[int, str | None]:
+    return os.getpid(), os.environ.get("OPENBLAS_NUM_THREADS")
+
+
+def gone(_: int) -> None:
+    os._exit(1)
+
+
+def noise(seed: int) -> float:
+    return float(np.random.default_rng(seed).standard_normal())
+
+
+def alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+@pytest.fixture(scope="module")
+def processes() -> Iterator[Pool]:
+    with Processes(2) as pool:
+        yield pool
+
+
+def test_processes_give_what_this_process_gives(processes: Pool) -> None:
+    expected = list(Serial().map(noise, range(20)))
+    assert list(processes.map(noise, range(20))) == expected
+
+
+def test_items_may_be_endless(processes: Pool) -> None:
+    for pool in (Serial(), processes):
+        assert list(islice(pool.map(square, count()), 5)) == [0, 1, 4, 9, 16]
+
+
+def test_an_error_comes_back_as_it_was(processes: Pool) -> None:
+    for pool in (Serial(), processes):
+        with pytest.raises(InputError, match="item 3 cannot be used"):
+            list(pool.map(broken, [3, 4]))
+
+
+def test_processes_are_others_have_one_thread_each_and_end_with_the_block() -> None:
+    before = os.environ.get("OPENBLAS_NUM_THREADS")
+    with Processes(2) as pool:
+        found = list(pool.map(about, range(8)))
+    assert os.environ.get("OPENBLAS_NUM_THREADS") == before
+    pids = {pid for pid, _ in found}
+    assert os.getpid() not in pids
+    assert {threads for _, threads in found} == {"1"}
+    assert not any(alive(pid) for pid in pids)
+
+
+def test_a_process_that_dies_ends_the_work_with_a_reason() -> None:
+    with Processes(1) as pool, pytest.raises(ChildProcessError, match="a worker process died"):
+        list(pool.map(gone, [1]))
+
+
+def test_one_worker_needs_no_process() -> None:
+    assert isinstance(local_pool(1), Serial)
+    assert isinstance(local_pool(3), Processes)
+
+
+@contextmanager
+def dask(*words: object) -> Iterator[subprocess.Popen[bytes]]:
+    """A `dask` command as docs/scale.md starts it, ended by its own SIGTERM."""
+    line = [sys.executable, "-m", "dask", *map(str, words)]
+    quiet = subprocess.DEVNULL
+    with subprocess.Popen(line, stdin=quiet, stdout=quiet, stderr=quiet) as process:
+        try:
+            yield process
+        finally:
+            process.terminate()
+            try:
+                process.wait(END_SECONDS)
+            except subprocess.TimeoutExpired:
+                process.kill()
+
+
+def wait_for(what: Path, process: subprocess.Popen[bytes]) -> str:
+    deadline = time.monotonic() + 60.0
+    while time.monotonic() < deadline:
+        assert process.poll() is None, "dask ended by itself"
+        if what.exists() and what.read_text().strip():
+            return what.read_text()
+        time.sleep(0.05)
+    raise AssertionError(f"{what} never came")
+
+
+@pytest.fixture(scope="module")
+def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    import json
+
+    file = tmp_path_factory.mktemp("dask") / "scheduler.json"
+    place = ("--host", "127.0.0.1", "--port", 0, "--no-dashboard", "--scheduler-file", file)
+    with ExitStack() as stack:
+        process = stack.enter_context(dask("scheduler", *place))
+        wait_for(file, process)
+        address = json.loads(file.read_text())["address"]
+        limits = ("--nworkers", 1, "--nthreads", 1, "--no-dashboard", "--host", "127.0.0.1")
+        stack.enter_context(dask("worker", address, *limits))
+        deadline = time.monotonic() + 60.0
+        while True:
+            try:
+                with Cluster(address):
+                    break
+            except InputError:
+                assert time.monotonic() < deadline
+                time.sleep(0.1)
+        yield address
+
+
+def test_a_cluster_identifies_what_one_process_does(
+    scheduler: str, tmp_path: Path, multisine_run: Run
+) -> None:
+    folders = [str(write_run(tmp_path / name, multisine_run)) for name in ("monday", "tuesday")]
+    with Cluster(scheduler) as pool:
+        assert pool.workers == 1
+        both = identify([multisine_run, multisine_run], estimator=PLAIN)
+        assert_same(identify_folders(folders, pool=pool), both)
+        with pytest.raises(InputError, match="item 3 cannot be used"):
+            list(pool.map(broken, [3]))
+        with pytest.raises(InputError, match="wednesday: no worker of the cluster sees it"):
+            identify_folders([str(tmp_path / "wednesday")], pool=pool)
+
+
+def test_the_command_line_works_on_a_cluster(
+    scheduler: str, tmp_path: Path, multisine_run: Run
+) -> None:
+    folder = write_run(tmp_path / "monday", multisine_run)
+    line = [sys.executable, "-c", "from rig.cli.main import run; run()", "identify", str(folder)]
+    done = subprocess.run(
+        [*line, "--cluster", scheduler], capture_output=True, text=True, timeout=100, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "C_mm_2" in done.stdout
+
+
+def test_an_address_where_nobody_answers_is_said() -> None:
+    with socket.socket() as taken:  # bound, but not listening
+        taken.bind(("127.0.0.1", 0))
+        address = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
+        with pytest.raises(InputError, match=r"no scheduler answers within 0\.3 s"):
+            Cluster(address, timeout=0.3).__enter__()
+
+
+def test_an_address_of_another_kind_is_said() -> None:
+    with pytest.raises(InputError, match="expected one like tcp://"):
+        Cluster("here").__enter__()
+
+
+def test_without_dask_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(InputError, match=r"install bramah\[cluster\]"):
+        Cluster("tcp://127.0.0.1:1").__enter__()

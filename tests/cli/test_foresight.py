@@ -1,0 +1,99 @@
+"""What `check`, `design` and `identify --physical` tell a person."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from protocols import library
+from protocols.plan import resolve
+from rig.cli.main import run
+from rig.services.rigs import load_rig
+from tests.cli.bench import SHORT
+
+RIG = "shinshu-2dof"
+QUICK = """
+name: quick
+joints: 2
+steps:
+  - name: step1
+    lock: [{joint: 1, at: closed, tolerance: 5 mm}]
+    excite:
+      - joint: 2
+        signal: &wave {kind: multisine, base_frequency: 0.5 Hz, f_min: 0.5 Hz, f_max: 8.5 Hz,
+                       amplitude: 0.3 V, detection_fraction: 0.25, tilt: 0.3, seed: 1}
+        centring: &centring {drift: 4 mm, offset: 4 mm}
+    repeats: 2
+    duration: 4 s
+  - name: step2
+    lock: [{joint: 2, at: end_min}]
+    excite: [{joint: 1, signal: {<<: *wave, amplitude: 0.2 V, seed: 2}, centring: *centring}]
+    repeats: 2
+    duration: 4 s
+  - name: step3
+    lock: [{joint: 2, at: end_max}]
+    excite: [{joint: 1, signal: {<<: *wave, amplitude: 0.15 V, seed: 3}, centring: *centring}]
+    repeats: 2
+    duration: 4 s
+"""
+
+
+def bramah(*words: object) -> int:
+    with pytest.raises(SystemExit) as ended:
+        run([str(word) for word in words])
+    return int(ended.value.code or 0)
+
+
+def test_check_predicts_the_errors_and_names_what_a_protocol_leaves_open(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "short.yaml"
+    file.write_text(SHORT)
+    assert bramah("check", file, "--rig", RIG, "--json", tmp_path / "check.json") == 0
+    said = capsys.readouterr().out
+    assert "std. error %" in said
+    assert "NOT determined W1" in said
+    told = json.loads((tmp_path / "check.json").read_text())
+    assert told["ok"]
+    found = told["identification"]
+    assert found["parameters"]["W1"]["relative_std"] is None
+    assert 0 < found["parameters"]["b"]["relative_std"] < 0.1
+    assert found["rank"]["fluid"] == [5, 9]
+
+
+def test_a_designed_protocol_is_a_file_like_any_other(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source, out = tmp_path / "quick.yaml", tmp_path / "made" / "b.yaml"
+    source.write_text(QUICK)
+    told = tmp_path / "design.json"
+    line = ["design", source, "--rig", RIG, "--criterion", "b", "--budget", 8, "--out", out]
+    assert bramah(*line, "--json", told) == 0
+    assert f"written to {out}" in capsys.readouterr().out
+    text = out.read_text()
+    assert text.startswith("# Made by: bramah design ")
+    before, after = json.loads(told.read_text())["parameters"]["b"].values()
+    assert after < before
+    made = library.load(out)
+    plan = resolve(made, load_rig(RIG))
+    first = resolve(library.load(source), load_rig(RIG))
+    for ours, theirs in zip(plan.steps, first.steps, strict=True):
+        assert (ours.period, ours.record, ours.repeats) == (
+            theirs.period, theirs.record, theirs.repeats,
+        )  # fmt: skip
+        empty = theirs.excite[0].wave.detection_lines
+        assert empty == ours.excite[0].wave.detection_lines
+        assert not set(empty) & set(ours.lines)
+    assert bramah("check", out, "--rig", RIG) == 0
+
+
+def test_a_criterion_that_does_not_exist_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "no.yaml"
+    line = ["design", "lock-and-excite-multisine", "--rig", RIG, "--criterion", "c", "--out", out]
+    assert bramah(*line) == 2
+    assert "expected D, E or a parameter" in capsys.readouterr().err
+    assert not out.exists()

@@ -1,0 +1,204 @@
+"""Following b and the gains beside a run: right, and never in the run's way."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from analysis.folders import identify_folders
+from analysis.online import Tracker, track
+from drivers.base import SampleBlock
+from rig.cli.following import Follower
+from rig.cli.tracking import Tracking, summary
+from rig.model.records import Record, Run, head_of
+from rig.model.rig import Rig
+from rig.services.bench import Bench
+from rig.services.observe import Observers
+from rig.services.recorder import RecordMeta
+from rig.services.rigs import load_rig
+from rig.services.runstate import read_events
+from tests.analysis import small_bench
+from tests.cli.bench import SHORT, bramah, simulated
+from tests.services.fake_driver import FakeDriver
+
+RIG = "shinshu-2dof"
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return load_rig(RIG)
+
+
+@pytest.fixture(scope="module")
+def record(rig: Rig) -> Record:
+    step = small_bench.STEPS[0]
+    excitations = small_bench.default_excitations(1, 0.025)
+    run: Run = small_bench.experiment(rig, excitations, repeats=1, seed=1, steps=(step,))
+    return run.records[0]
+
+
+def blocks(rig: Rig, record: Record, first: int, size: int = 10) -> list[tuple[int, np.ndarray]]:
+    """The record's samples as a bench would send them, its first at tick `first`."""
+    fill = np.zeros(record.samples)
+    data = np.column_stack([record.channels.get(name, fill) for name in rig.recorded])
+    return [(first + k, data[k : k + size]) for k in range(0, record.samples, size)]
+
+
+def test_samples_and_records_meet_by_tick(rig: Rig, record: Record) -> None:
+    """Announced late, with samples before and after it, and blocks that got lost."""
+    tracker, plain = Tracker(rig), Tracker(rig)
+    follower = Follower(rig, tracker)
+    stream = blocks(rig, record, 5000)
+    for number, (tick, data) in enumerate(stream):
+        if number == 7:
+            follower.begins(head_of(record), 5003, 9000)
+        if 300 <= number < 303:
+            continue
+        follower.block(tick, data)
+    follower.ends(5003, 9000, complete=True)
+    channels = {name: x[3:9003].copy() for name, x in record.channels.items()}
+    for x in channels.values():
+        x[2997:3027] = np.nan
+    track(plain, replace(record, channels=channels))
+    found, expected = tracker.estimates(), plain.estimates()
+    assert found["b"].value == pytest.approx(expected["b"].value, rel=1e-9)
+    assert found["C_pp_2"].value == pytest.approx(expected["C_pp_2"].value, rel=1e-9)
+
+
+def block_of(rig: Rig, tick: int, data: np.ndarray) -> SampleBlock:
+    saturated = np.zeros((len(data), len(rig.channels)), dtype=bool)
+    return SampleBlock(0, tick, data, saturated, 0, False)
+
+
+def test_the_process_beside_the_run_finds_what_is_found_here(
+    rig: Rig, record: Record, tmp_path: Path
+) -> None:
+    said: list[str] = []
+    noted: list[dict[str, object]] = []
+    meta = RecordMeta("step1", 1, record.locked, record.period, record.lines)
+    with Tracking(rig, tmp_path, said.append) as tracking:
+        tracking.tell(noted.append, lambda _: None)
+        tracking.record_begins(meta, 100, None)
+        for tick, data in blocks(rig, record, 100):
+            tracking.block(block_of(rig, tick, data))
+        tracking.record_ends(meta, 100, record.samples, "complete")
+    here = Tracker(rig)
+    track(here, record)
+    kept = json.loads((tmp_path / "tracked.json").read_text())
+    assert kept["memory_s"] is None
+    assert [entry["record"] for entry in kept["records"]] == ["step1_r1"]
+    for name, estimate in here.estimates().items():
+        found = kept["parameters"][name]
+        if estimate.identified:
+            assert found["value"] == pytest.approx(estimate.value, rel=1e-12)
+            assert found["std"] == pytest.approx(estimate.std, rel=1e-6)
+        else:
+            assert found["value"] is None
+    assert said[-1].startswith("tracked: b 23")
+
+
+def test_a_tracker_that_dies_costs_the_run_nothing(
+    rig: Rig, record: Record, tmp_path: Path
+) -> None:
+    with Tracking(rig, tmp_path, lambda _: None) as tracking:
+        pid = tracking._process.pid
+        assert pid is not None
+        os.kill(pid, signal.SIGKILL)
+        tracking._process.join(20)
+        started = time.monotonic()
+        for tick, data in blocks(rig, record, 0):
+            tracking.block(block_of(rig, tick, data))
+        # A thousand blocks; anything that waits for the dead would take for ever.
+        assert time.monotonic() - started < 10
+    assert not (tmp_path / "tracked.json").exists()
+
+
+class Broken:
+    """An observer with a fault."""
+
+    calls = 0
+
+    def block(self, block: SampleBlock) -> None:
+        self.calls += 1
+        raise RuntimeError("a fault of the observer's")
+
+    def record_begins(self, meta: RecordMeta, start: int, ticks: int | None) -> None:
+        pass
+
+    def record_ends(self, meta: RecordMeta, start: int, ticks: int, state: str) -> None:
+        pass
+
+
+class Seeing:
+    """An observer that remembers."""
+
+    def __init__(self) -> None:
+        self.ticks: list[int] = []
+        self.heard: list[tuple[object, ...]] = []
+
+    def block(self, block: SampleBlock) -> None:
+        self.ticks.append(block.tick)
+
+    def record_begins(self, meta: RecordMeta, start: int, ticks: int | None) -> None:
+        self.heard.append(("begins", meta.name, start))
+
+    def record_ends(self, meta: RecordMeta, start: int, ticks: int, state: str) -> None:
+        self.heard.append(("ends", meta.name, start, ticks, state))
+
+
+def test_observers_see_all_and_one_with_a_fault_is_dismissed(
+    rig: Rig, caplog: pytest.LogCaptureFixture
+) -> None:
+    broken, seeing = Broken(), Seeing()
+    with Bench(rig, FakeDriver(rig), signals=False) as bench:
+        bench.observers.add(broken)
+        bench.observers.add(seeing)
+        bench.run_for(0.05)
+        with bench.record(step="step1", repeat=1):
+            bench.run_for(0.02)
+        with bench.record(step="step1", repeat=2) as other:
+            bench.run_for(0.02)
+            other.discard("disturbed")
+    assert broken.calls == 1
+    assert "Broken failed and sees no more" in caplog.text
+    assert seeing.ticks == list(range(0, 90, 10))
+    assert seeing.heard == [
+        ("begins", "step1_r1", 50),
+        ("ends", "step1_r1", 50, 20, "complete"),
+        ("begins", "step1_r2", 70),
+        ("ends", "step1_r2", 70, 20, "discarded"),
+    ]
+    assert isinstance(bench.observers, Observers)
+
+
+def test_a_run_is_tracked_to_what_identify_finds(tmp_path: Path) -> None:
+    protocol, run = tmp_path / "short.yaml", tmp_path / "monday"
+    protocol.write_text(SHORT)
+    with simulated("--seed", 5) as (endpoint, _):
+        done = bramah(
+            "run", protocol, "--rig", RIG, "--out", run, "--endpoint", endpoint, "--track"
+        )
+    assert done.returncode == 0, done.stderr
+    assert "tracked: b " in done.stderr
+    kept = json.loads((run / "tracked.json").read_text())["parameters"]
+    expected = identify_folders([str(run)], reject_noise=False).estimates
+    for name in ("b", "C_pp_2", "C_pm_2", "C_mp_2", "C_mm_2"):
+        assert kept[name]["value"] == pytest.approx(expected[name].value, rel=1e-9)
+    records = [e["record"] for e in read_events(run) if e["event"] == "tracked"]
+    assert records[:1] == ["step1_r1"]
+    wrong = bramah("run", protocol, "--rig", RIG, "--out", tmp_path / "x", "--track", "--memory", 0)
+    assert wrong.returncode == 2
+    assert "--memory 0: expected more than 0 s" in wrong.stderr
+
+
+def test_one_line_says_what_is_known() -> None:
+    known = {"value": 233.4e6, "ci95": [232.4e6, 234.4e6]}
+    unknown = {"value": None, "ci95": [None, None]}
+    assert summary({"b": known, "C_pp_1": unknown}) == "b 233.4±1 MPa  C_pp_1 ?"
