@@ -58,7 +58,7 @@ def _help(rig: Rig, family: str, found: Determined) -> list[str]:
 
 def _told(helps: Sequence[str]) -> str:
     if not helps:
-        return "Add a richer excitation; `bramah plan` lists the steps of this rig"
+        return "Add a richer excitation: other poses, other speeds"
     return "Add: " + ", and: ".join(helps)
 
 

@@ -7,10 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from analysis.advice import base_statements
 from analysis.base_parameters import determined
 from analysis.identify import Identification, identify
+from analysis.solve import Cluster, solve, triangle
 from rig.model.parse import InputError
 from rig.model.records import Run
+from rig.services.rigs import load_rig
 
 NAMES = ("R11", "R22", "R12", "W1", "Fv1")
 
@@ -81,6 +84,15 @@ def test_one_step_of_three_names_what_is_open_and_the_steps_to_add(multisine_run
 def test_all_steps_leave_nothing_to_say(multisine_run: Run) -> None:
     names = {check.name for check in identify([multisine_run]).checks}
     assert not any(name.startswith("base parameters") for name in names)
+
+
+def test_an_electric_robot_is_told_its_combinations_as_well() -> None:
+    robot = load_rig("electric-2dof")
+    X = np.array([[1.0, 1.0, 0.0], [2.0, 2.0, 1.0], [1.0, 1.0, 3.0]])
+    solution = solve(("M1", "M2", "W1"), [Cluster("s", 1, triangle(X, np.ones(3)), 3)])
+    (said,) = base_statements(robot, {"mechanical": solution})
+    assert not said.ok
+    assert "M1 + M2" in said.detail
 
 
 def test_records_in_which_nothing_moved_are_refused(multisine_run: Run) -> None:

@@ -86,8 +86,12 @@ def test_output_error_takes_out_what_noise_did_to_the_rows(rig: Rig) -> None:
     cut = windows(noisy, 0.6)
     refined, started = refine_free(described, rows, cut, scale)
     assert window_error(described, refined, started) == pytest.approx(2e-4, rel=0.05)
-    for name in ("M1", "M2", "R12", "W2"):
-        assert refined[name] == pytest.approx(values[name], rel=2e-3), name
+
+    def off(found: dict[str, float]) -> float:
+        return max(abs(found[name] / values[name] - 1) for name in ("M1", "M2", "R12", "W2"))
+
+    assert off(refined) < 5e-3
+    assert off(refined) < off(rows)
 
 
 def measured() -> Path:
