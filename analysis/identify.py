@@ -91,6 +91,7 @@ def identify(
     _refuse_estimator(estimator, bootstrap)
     rig = ck.common_rig(runs)
     used = tuple(terms) if terms is not None else tuple(map(Used, baseline_of(rig)))
+    estimator = _fitting_estimator(rig, estimator)
     if method != "coupled":
         from analysis.methods import identify_by  # noqa: PLC0415 (which builds on this module)
 
@@ -142,6 +143,17 @@ def _refuse_estimator(estimator: str, bootstrap: int) -> None:
         )
     if bootstrap and estimator in (PLAIN, "output-error"):
         raise InputError(f"--bootstrap does not go with --estimator {estimator}; take ls or iv")
+
+
+def _fitting_estimator(rig: Rig, estimator: str) -> str:
+    """Return the estimator for a rig: what refines the fluid's rows has none on electric ones."""
+    if not rig.electric or estimator == PLAIN:
+        return estimator
+    if estimator != "ls":
+        raise InputError(
+            f"--estimator {estimator} is for hydraulic rigs; {rig.name!r} is electric: take ls"
+        )
+    return PLAIN
 
 
 def build_rows(
@@ -264,9 +276,8 @@ def _with_ends(
     """Replace intervals by the bootstrap's; `ends` are of the rows' coefficients (1/b)."""
     out = dict(estimates)
     for name, (low, high) in ends.items():
-        if name == "b":
-            low, high = 1.0 / high, 1.0 / low
-        out[name] = replace(out[name], ci95=(low, high))
+        interval = (1.0 / high, 1.0 / low) if name == "b" else (low, high)
+        out[name] = replace(out[name], ci95=interval)
     return out
 
 

@@ -22,8 +22,14 @@ from analysis.estimators.equations import (
     levelled,
     pieces,
 )
-from analysis.estimators.instruments import Hausman, hausman, instrumental_variables
-from analysis.estimators.robust import outlying, robust
+from analysis.estimators.instruments import hausman, instrumental_variables
+from analysis.estimators.robust import robust
+from analysis.estimators.statements import (
+    Prepared,
+    noise_statement,
+    nuisance_statement,
+    outlier_statement,
+)
 from analysis.estimators.weighted import weighted_least_squares
 from analysis.rows import parameters_of
 from analysis.solve import Solution
@@ -37,8 +43,6 @@ log = logging.getLogger(__name__)
 
 ESTIMATORS = ("ls", "wls", "iv", "robust", "output-error", "auto")
 NEED_REPEATS = ("wls", "iv")
-MATTERS = 0.5  # standard errors: a bias of least squares below this is not worth another estimator
-FEW_OUTLIERS = 0.02
 
 _FITS: Mapping[str, Callable[[Sequence[Block]], Fit]] = {
     "ls": least_squares,
@@ -74,16 +78,6 @@ class Refined:
     checks: tuple[Check, ...]
     estimator: str
     bootstrap: dict[str, tuple[float, float]] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """A family's blocks, nuisance columns last, with the names of all columns."""
-
-    family: str
-    names: tuple[str, ...]
-    parameters: int
-    blocks: tuple[Block, ...]
 
 
 def refuse_unknown(estimator: str) -> None:
@@ -135,14 +129,15 @@ def refine(job: Job, solutions: Mapping[str, Solution]) -> Refined:
     new = dict(solutions)
     ends: dict[str, tuple[float, float]] = {}
     for p in prepared:
-        beta, error, fit = found[p.family]
-        new[p.family] = merged(solutions[p.family], p.names[: p.parameters], beta, error)
+        beta, total, fit = found[p.family]
+        new[p.family] = merged(solutions[p.family], p.names[: p.parameters], beta, total)
         if estimator == "robust":
-            checks.append(_outliers(p.family, fit))
+            checks.append(outlier_statement(p.family, fit))
         if job.bootstrap:
             rng = job.rng or np.random.default_rng(0)
             kind = _FITS[estimator]
-            drawn = bootstrap(p.blocks, lambda b, p=p, k=kind: _value(p, k(b)), job.bootstrap, rng)  # type: ignore[misc]
+            error = spread([pieces(fit)], fit.inverse)
+            drawn = bootstrap(p.blocks, _redo(p, kind, error), job.bootstrap, rng)
             for name, low, high in zip(p.names, drawn.low, drawn.high, strict=False):
                 ends[name] = (float(low), float(high))
     return Refined(new, tuple(checks), estimator, ends)
@@ -177,7 +172,7 @@ def _prepare(job: Job, solutions: Mapping[str, Solution]) -> tuple[list[Prepared
             fit = least_squares(prepared.blocks)
             error = spread([pieces(fit)], fit.inverse)
             wrong = nu.implausible(belief, fit.beta, error.covariance)
-            checks.append(_told(belief, prepared.names, fit.beta, error, wrong))
+            checks.append(nuisance_statement(belief, prepared.names, fit.beta, error, wrong))
             if wrong:
                 beside.remove(belief.name)
                 prepared = _family(job, per_record, family, columns, mine, beside)
@@ -204,35 +199,6 @@ def _family(
     return Prepared(family, names, len(mine), tuple(blocks))
 
 
-def _told(
-    belief: nu.Belief, names: Sequence[str], beta: Array, error: Spread, wrong: bool
-) -> Check:
-    i = list(names).index(belief.name)
-    value, std = float(beta[i]), float(np.sqrt(error.covariance[i, i]))
-    if belief.name == nu.KAPPA:
-        compliance = float(beta[list(names).index("b")])
-        alpha, spread_ = -100 * value / compliance, 100 * std / abs(compliance)
-        said = f"b changes by {alpha:.2f} +- {2 * spread_:.2f} % per kelvin by these records"
-        if spread_ > 100 * nu.SLOPE_STD:
-            said = (
-                "the oil's temperature hardly varied: its effect on b is taken as "
-                f"{100 * nu.SLOPE:.1f} +- {200 * nu.SLOPE_STD:.1f} % per kelvin"
-            )
-        if wrong:
-            said += ", which no oil does: b is that of the records' mean temperature"
-        else:
-            said += "; b is that of the rig's nominal oil temperature"
-        return Check("oil temperature", not wrong, said)
-    size = np.sqrt(max(value, 0.0) + 2 * std)
-    said = f"laminar below a drop of {size / 1e6:.2g} MPa at most by these records"
-    if wrong:
-        said = (
-            "the flow depends on the pressure drop in a way no orifice does (a tank pressure, a "
-            "sensor's offset, a leak?); the gains are those of the plain square root"
-        )
-    return Check("laminar transition", not wrong, said)
-
-
 def _solve(p: Prepared, estimator: str) -> tuple[Array, Spread, Fit]:
     fit = _FITS[estimator](p.blocks)
     error = spread([pieces(fit), pieces(fit, "level")], fit.inverse)
@@ -242,13 +208,18 @@ def _solve(p: Prepared, estimator: str) -> tuple[Array, Spread, Fit]:
     return beta[: p.parameters], _first(error, p.parameters), fit
 
 
-def _value(p: Prepared, fit: Fit) -> Array:
-    """Return the parameters of a fit with what is known beforehand, for resampled blocks."""
-    beta = fit.beta
-    error = spread([pieces(fit)], fit.inverse)
-    for belief in nu.beliefs(p.names, beta):
-        beta, error = nu.joined(beta, error, belief)
-    return beta[: p.parameters]
+def _redo(
+    p: Prepared, kind: Callable[[Sequence[Block]], Fit], error: Spread
+) -> Callable[[Sequence[Block]], Array]:
+    """Return the estimate of resampled blocks; what is known beforehand weighs as before."""
+
+    def estimate(blocks: Sequence[Block]) -> Array:
+        beta, after = kind(blocks).beta, error
+        for belief in nu.beliefs(p.names, beta):
+            beta, after = nu.joined(beta, after, belief)
+        return beta[: p.parameters]
+
+    return estimate
 
 
 def _first(s: Spread, k: int) -> Spread:
@@ -273,50 +244,3 @@ def merged(solution: Solution, names: Sequence[str], beta: Array, error: Spread)
     value[place], dof[place] = beta, error.dof
     covariance[np.ix_(place, place)] = error.covariance
     return replace(solution, value=value, covariance=covariance, dof=dof)
-
-
-def noise_statement(
-    prepared: Sequence[Prepared],
-    tests: Mapping[str, Hausman],
-    reference: Mapping[str, tuple[Array, Spread, Fit]],
-) -> Check:
-    """State whether noise in the regressors biases least squares (Hausman's test)."""
-    biased: list[tuple[float, str, float]] = []
-    largest = (0.0, "", 0.0)
-    for p in prepared:
-        test, k = tests[p.family], p.parameters
-        _, error, _ = reference[p.family]
-        matters = MATTERS * np.sqrt(np.diag(error.covariance))
-        hits = test.biased(np.concatenate((matters, np.full(len(p.names) - k, np.inf))))[:k]
-        for i, name in enumerate(p.names[:k]):
-            size = abs(float(test.relative[i]))
-            t = float(test.difference[i] / test.error[i]) if test.error[i] > 0 else 0.0
-            # The rows hold 1/b: what makes 1/b larger makes b smaller.
-            entry = (size, name, t)
-            if hits[i]:
-                biased.append(entry)
-            largest = max(largest, entry)
-    if biased:
-        size, name, t = max(biased)
-        return Check(
-            "noise in regressors", False,
-            f"least squares is biased by noise in the regressors, {name} most: by "
-            f"{100 * size:.2g} % against instruments from the other repeats ({abs(t):.0f} standard "
-            f"errors); so are {len(biased) - 1} others; use --estimator iv or output-error",
-        )  # fmt: skip
-    return Check(
-        "noise in regressors", True,
-        f"least squares and instruments from the other repeats agree: largest difference "
-        f"{100 * largest[0]:.2g} % ({largest[1]}, {abs(largest[2]):.1f} standard errors)",
-    )  # fmt: skip
-
-
-def _outliers(family: str, fit: Fit) -> Check:
-    shares = outlying(fit)
-    record, share = max(shares.items(), key=lambda item: item[1])
-    return Check(
-        f"outliers {family}",
-        share < FEW_OUTLIERS,
-        f"{100 * share:.2g} % of the rows of record {record!r} lie far outside the scatter and "
-        "were left out (the worst record)",
-    )

@@ -105,7 +105,7 @@ def lack_of_fit(pieces: Pieces, inverse: Array) -> Array:
 def by_parts(pieces: Pieces, inverse: Array) -> Spread:
     """Return the jackknife over the parts of the period, all repeats of a part together."""
     stratum, score, information = pieces.grouped(pieces.part)
-    A = np.linalg.inv(inverse)
+    A: Array = np.asarray(np.linalg.inv(inverse))
     left_out = np.array([_without(A, part, g) for part, g in zip(information, score, strict=True)])
     k = len(A)
     total, squares = np.zeros((k, k)), np.zeros(k)

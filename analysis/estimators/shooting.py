@@ -24,8 +24,7 @@ SAMPLES_PER_STEP = 2
 
 
 @njit(cache=True, error_model="numpy")
-def _shoot(addresses, ends, hidden_ends, prepares, pars, starts, inputs, rate, locked, geometry,
-           first, every, out, work):  # type: ignore[no-untyped-def]  # fmt: skip
+def _shoot(model, pars, starts, inputs, rate, locked, geometry, first, every, out, work):  # type: ignore[no-untyped-def]
     """Fill out (P, points, size); a point every `every` steps. Returns whether all went well."""
     trajectories, points, size = out.shape
     h = SAMPLES_PER_STEP / rate
@@ -33,7 +32,7 @@ def _shoot(addresses, ends, hidden_ends, prepares, pars, starts, inputs, rate, l
     trial = np.zeros(size)
     for p in range(trajectories):
         y = starts[p].copy()
-        model = (addresses, ends, hidden_ends, prepares, pars[p])
+        mine = (model[0], model[1], model[2], model[3], pars[p])
         out[p, 0] = y
         for point in range(1, points):
             for step in range(every):
@@ -43,7 +42,7 @@ def _shoot(addresses, ends, hidden_ends, prepares, pars, starts, inputs, rate, l
                     for j in range(size):
                         trial[j] = y[j] + (part * h * k[stage - 1, j] if stage else 0.0)
                     status = integrate.rates(
-                        t + part * h, trial, k[stage], inputs, rate, locked, geometry, model, work
+                        t + part * h, trial, k[stage], inputs, rate, locked, geometry, mine, work
                     )
                     if status != integrate.OK:
                         return False
@@ -80,8 +79,8 @@ def shoot(
         np.zeros(4), np.zeros((X_ROWS, N)), np.zeros((OUT_ROWS, N)), np.zeros((N, N)), np.zeros(N),
     )  # fmt: skip
     out = np.zeros((len(starts), window.points, starts.shape[1]))
+    model = (ready.addresses, ready.ends, ready.hidden_ends, ready.prepares)
     good = _shoot(
-        ready.addresses, ready.ends, ready.hidden_ends, ready.prepares, pars, starts, inputs, rate,
-        locked, ready.geometry, window.first, every, out, work,
-    )  # fmt: skip
+        model, pars, starts, inputs, rate, locked, ready.geometry, window.first, every, out, work
+    )
     return out if good else None

@@ -115,7 +115,9 @@ class DirectBench:
         ticks: int | None = None,
     ) -> _Handle:  # fmt: skip
         """Make a record of `ticks` samples from `start_tick`."""
-        assert meta is not None and start_tick is not None and ticks is not None
+        assert meta is not None
+        assert start_tick is not None
+        assert ticks is not None
         return _Handle(self, meta, start_tick, ticks)
 
     def keep(self, meta: RecordMeta, start: int, ticks: int, more: dict[str, Attribute]) -> None:

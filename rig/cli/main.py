@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import logging
+import os
 import pkgutil
 import sys
 from typing import Final
@@ -12,6 +13,9 @@ import typer
 
 import rig.cli
 from rig.cli.errors import guarded
+
+# Matrices here are tall and narrow, and there are many: BLAS threads get in each other's way.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # Shown first, in this order; every other module named *_command registers its verbs after them.
 FIRST: Final = ("demo_command", "bench_commands", "plan_command", "analysis_commands")

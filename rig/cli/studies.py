@@ -57,7 +57,8 @@ def coverage_text(found: dict[str, Any]) -> str:
     for kind, data in found["kinds"].items():
         lines += [
             f"{kind}: {data['experiments']} experiments on {_SAID[kind]}; "
-            f"estimator {found['estimator']}, noise x{found['noise']:g}, {found['repeats']} repeats",
+            f"estimator {found['estimator']}, noise x{found['noise']:g}, "
+            f"{found['repeats']} repeats",
             "",
             "| parameter | coverage % (95 % interval) | bias % | RSD % | half width % |",
             "|---|---|---|---|---|",

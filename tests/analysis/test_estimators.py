@@ -1,0 +1,215 @@
+"""Where least squares fails, and what the other estimators and their intervals make of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import t as student
+
+from analysis.checks import Check
+from analysis.estimators import coverage as cov
+from analysis.estimators.covariance import by_parts, lack_of_fit, spread
+from analysis.estimators.equations import Block, least_squares, pieces, segments
+from analysis.estimators.output_error import output_error
+from analysis.identify import Identification, identify, to_json
+from analysis.terms import baseline
+from analysis.terms.base import Used
+from rig.model.parse import InputError
+from rig.model.records import Run
+from tests.analysis import small_bench as bench
+from tests.analysis.small_bench import TRUTH
+
+
+def error(result: Identification, name: str) -> float:
+    return abs(result.estimates[name].value / TRUTH[name] - 1)
+
+
+def check(result: Identification, name: str) -> Check:
+    return next(c for c in result.checks if c.name == name)
+
+
+def inside(result: Identification, name: str) -> bool:
+    low, high = result.estimates[name].ci95
+    return low <= TRUTH[name] <= high
+
+
+@pytest.fixture(scope="module")
+def noisy_run(multisine_run: Run) -> Run:
+    """The same bench with sensors ten times as noisy."""
+    rng = np.random.default_rng(5)
+    records = tuple(
+        replace(r, channels=bench.with_noise(dict(r.channels), rng, np.sqrt(99.0)))
+        for r in multisine_run.records
+    )
+    return replace(multisine_run, records=records)
+
+
+@pytest.fixture(scope="module")
+def noisy(noisy_run: Run) -> Identification:
+    return identify([noisy_run], reject_noise=False)
+
+
+def test_clean_sensors_leave_nothing_for_instruments_to_mend(multisine_run: Run) -> None:
+    found = identify([multisine_run], estimator="auto")
+    assert check(found, "noise in regressors").ok
+    assert found.model.provenance["estimator"] == "ls"
+    assert to_json(found)["estimator"] == "ls"
+
+
+def test_ten_times_the_noise_biases_least_squares_and_the_check_says_so(
+    noisy: Identification,
+) -> None:
+    said = check(noisy, "noise in regressors")
+    assert not said.ok
+    assert "least squares is biased" in said.detail
+    assert error(noisy, "M2") > 0.01
+    assert not inside(noisy, "M2")
+
+
+def test_instruments_are_not_biased_and_auto_prefers_them(
+    noisy_run: Run, noisy: Identification
+) -> None:
+    iv = identify([noisy_run], reject_noise=False, estimator="iv")
+    auto = identify([noisy_run], reject_noise=False, estimator="auto")
+    assert error(iv, "M2") < 0.3 * error(noisy, "M2")
+    assert np.mean([inside(iv, name) for name in TRUTH]) > 0.8
+    assert auto.model.provenance["estimator"] == "iv"
+    assert auto.estimates["M2"].value == iv.estimates["M2"].value
+    assert "instrumental variables instead" in check(auto, "noise in regressors").detail
+
+
+def test_weights_from_measured_noise_do_not_move_what_is_right(multisine_run: Run) -> None:
+    found = identify([multisine_run], estimator="wls")
+    assert max(error(found, name) for name in TRUTH) < 0.004
+
+
+def test_copies_of_one_record_have_no_scatter_to_weigh_by(multisine_run: Run) -> None:
+    first = [r for r in multisine_run.records if r.repeat == 1]
+    copies = [replace(r, repeat=2, name=f"{r.step}_r2") for r in first]
+    with pytest.raises(InputError, match="are they copies of one record"):
+        identify([replace(multisine_run, records=(*first, *copies))], estimator="wls")
+
+
+def test_spikes_in_one_record_are_set_aside_by_the_robust_loss(multisine_run: Run) -> None:
+    rng = np.random.default_rng(8)
+    records = list(multisine_run.records)
+    k = next(i for i, r in enumerate(records) if r.name == "step2_r2")
+    channels = dict(records[k].channels)
+    for name, size in (("cap_pressure_1", 2e6), ("piston_1", 10e-3)):
+        x = channels[name].copy()
+        x[rng.integers(500, 9500, 30)] += size
+        channels[name] = x
+    records[k] = replace(records[k], channels=channels)
+    spoilt = replace(multisine_run, records=tuple(records))
+    plain, robust = (identify([spoilt], estimator=e) for e in ("ls", "robust"))
+    names = ("M1", "Fv1", "W1", "b", "C_pp_1", "C_mm_1")
+    assert max(error(robust, n) for n in names) < 0.004
+    assert max(error(plain, n) for n in names) > 5 * max(error(robust, n) for n in names)
+    said = check(robust, "outliers fluid")
+    assert not said.ok
+    assert "'step2_r2'" in said.detail
+
+
+def test_output_error_converges_from_a_start_five_percent_off(multisine_run: Run) -> None:
+    # One repeat: what instruments cannot do.
+    one = replace(multisine_run, records=tuple(r for r in multisine_run.records if r.repeat == 1))
+    signs = np.resize([1.0, -1.0], len(TRUTH))
+    start = {
+        n: (1.0 / v if n == "b" else v) * (1.0 + 0.05 * sign)
+        for (n, v), sign in zip(TRUTH.items(), signs, strict=True)
+    }
+    found = output_error(one.rig, [one], [Used(term) for term in baseline()], start)
+    assert found.check.ok, found.check.detail
+    value = dict(zip(found.names, found.value, strict=False))
+    off = {n: value[n] / (1.0 / v if n == "b" else v) - 1.0 for n, v in TRUTH.items()}
+    # One record a step: friction of the light joint is known to 2 % only.
+    assert max(abs(v) for v in off.values()) < 0.03
+    assert max(abs(v) for n, v in off.items() if n[0] in "bC") < 0.002
+
+
+def test_output_error_needs_a_model_that_is_complete(multisine_run: Run) -> None:
+    first = [r for r in multisine_run.records if r.step == "step1"]
+    with pytest.raises(InputError, match=r"does not determine .*C_pp_1"):
+        identify([replace(multisine_run, records=tuple(first))], estimator="output-error")
+
+
+def test_bootstrap_and_cluster_intervals_agree_on_clean_data(multisine_run: Run) -> None:
+    cluster = identify([multisine_run], estimator="ls")
+    drawn = identify([multisine_run], estimator="ls", bootstrap=100, seed=1)
+    again = identify([multisine_run], estimator="ls", bootstrap=100, seed=1)
+    ratios = []
+    for name, p in drawn.estimates.items():
+        assert p.value == cluster.estimates[name].value
+        assert p.ci95 == again.estimates[name].ci95
+        own = cluster.estimates[name].ci95
+        ratios.append((p.ci95[1] - p.ci95[0]) / (own[1] - own[0]))
+    assert 0.5 < np.median(ratios) < 1.5
+
+
+@pytest.mark.parametrize("estimator", ["iv", "wls"])
+def test_one_repeat_only_is_refused_with_what_to_do(multisine_run: Run, estimator: str) -> None:
+    single = replace(
+        multisine_run, records=tuple(r for r in multisine_run.records if r.repeat == 1)
+    )
+    with pytest.raises(InputError, match=r"step1 step2 step3\. Record more repeats"):
+        identify([single], estimator=estimator)
+    alone = identify([single], estimator="auto")
+    assert alone.model.provenance["estimator"] == "ls"
+    assert all(np.isfinite(p.std) for p in alone.estimates.values())
+
+
+def test_an_unknown_estimator_and_too_few_draws_are_refused(multisine_run: Run) -> None:
+    with pytest.raises(InputError, match="unknown estimator 'best'; known: ls wls iv"):
+        identify([multisine_run], estimator="best")
+    with pytest.raises(InputError, match="take 100 or more"):
+        identify([multisine_run], bootstrap=20)
+    with pytest.raises(InputError, match="does not go with --estimator output-error"):
+        identify([multisine_run], estimator="output-error", bootstrap=100)
+
+
+def line(rng: np.random.Generator, bend: float, repeats: int = 4) -> tuple[Block, ...]:
+    """Repeats of y = 2 x + bend x^3 + noise, which a straight line is fitted to."""
+    t = np.arange(400) / 100.0
+    x = np.sin(2 * np.pi * t / 4.0)
+    parts = segments(t, 4.0)
+    return tuple(
+        Block(0, "s", r, f"s_r{r}", "torque_1", x[:, None],
+              2 * x + bend * x**3 + 0.1 * rng.standard_normal(400), t, parts, parts)
+        for r in range(1, repeats + 1)
+    )  # fmt: skip
+
+
+def test_a_misfit_that_every_repeat_shares_widens_the_interval() -> None:
+    rng = np.random.default_rng(1)
+    straight, bent = (least_squares(line(rng, bend)) for bend in (0.0, 0.3))
+    assert not lack_of_fit(pieces(straight), straight.inverse).any()
+    found = spread([pieces(bent)], bent.inverse)
+    assert found.systematic[0] > 0.8
+    assert abs(bent.beta[0] - 2.0) > 0.2  # the slope at the origin is not what is found
+    assert np.sqrt(found.covariance[0, 0]) > 5 * np.sqrt(
+        spread([pieces(straight)], straight.inverse).covariance[0, 0]
+    )
+
+
+def test_intervals_of_a_single_repeat_hold_the_truth_as_often_as_they_say() -> None:
+    rng = np.random.default_rng(2)
+    hits = []
+    for _ in range(300):
+        fit = least_squares(line(rng, 0.0, repeats=1))
+        found = by_parts(pieces(fit), fit.inverse)
+        half = student.ppf(0.975, found.dof[0]) * np.sqrt(found.covariance[0, 0])
+        hits.append(abs(fit.beta[0] - 2.0) < half)
+    assert 0.90 < np.mean(hits) < 0.99
+
+
+def test_coverage_is_counted_with_its_own_uncertainty() -> None:
+    rng = np.random.default_rng(3)
+    z = 0.01 * rng.standard_normal(200)
+    trials = [cov.Trial({"b": e}, {"b": e - 0.0196}, {"b": e + 0.0196}) for e in z]
+    (row,) = cov.rows(trials)
+    assert row.coverage == np.mean(np.abs(z) < 0.0196)
+    assert row.coverage_low < 0.95 < row.coverage_high
+    assert row.bias == pytest.approx(z.mean())
+    assert cov.overall([row]) == row.coverage
