@@ -112,7 +112,7 @@ def family_page(family: str) -> str:
     kinds = [kind for kind in catalogue().values() if kind.family == family]
     modules = dict.fromkeys(inspect.getmodule(kind) for kind in kinds)
     for module in modules:
-        parts.append(_plain(inspect.getdoc(module) or ""))
+        parts.append(_plain(inspect.getdoc(module) or "") + "\n")
     parts.append(f"\n![signatures](images/effects-{family}.svg)\n")
     parts.append(
         "Residual of the baseline against each effect's own variable, on simulated benches that "

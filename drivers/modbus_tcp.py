@@ -28,6 +28,8 @@ from rig.model.rig import Rig, Wire
 
 logger = logging.getLogger(__name__)
 
+# Nothing moves in a virtual device while it thinks: a busy computer is no danger to it.
+VIRTUAL_PATIENCE = 10.0
 _TOLERANCE = 1e-6  # registers hold single precision
 
 
@@ -55,6 +57,8 @@ class ModbusTcpDriver:
         self._link.open()
         try:
             self.info = self._identify()
+            if self.info.virtual_time:
+                self._link.be_patient(VIRTUAL_PATIENCE)
             self._command(reg.CONTROL_WATCHDOG, round(self._wire.watchdog * 1e3))
             self._command(reg.CONTROL_ZERO, reg.ZERO_NOW)
             self._command(reg.CONTROL_STREAM, reg.STREAM_STOP)

@@ -88,6 +88,11 @@ class ModbusConnection:
         client.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._client = client
 
+    def be_patient(self, factor: float) -> None:
+        """Wait `factor` times as long for every answer of the open connection."""
+        if self._client is not None:
+            self._client.comm_params.timeout_connect = factor * self._timeout
+
     def close(self) -> None:
         """Close the connection if there is one."""
         client, self._client = self._client, None

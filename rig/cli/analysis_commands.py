@@ -61,6 +61,9 @@ def identify(
     json: JsonOption = None,
     model: Annotated[Path | None, typer.Option(help="Write the model file here.")] = None,
     report: Annotated[Path | None, typer.Option(help="Write an HTML report here.")] = None,
+    truth: Annotated[
+        Path | None, typer.Option(help="Compare with this file of `bramah sim --truth`.")
+    ] = None,
     physical: Annotated[
         bool, typer.Option("--physical", help="Only parameters that real bodies can have.")
     ] = False,
@@ -83,7 +86,7 @@ def identify(
     from analysis.terms import with_effects
     from analysis.terms.base import Used
     from rig.cli.method_text import method_text
-    from rig.cli.tables import identification_text
+    from rig.cli.tables import identification_text, read_truth
 
     loaded = _load(runs)
     if filtering not in FILTERINGS:
@@ -113,7 +116,8 @@ def identify(
 
         write_identification(report, loaded, result)
     if json != Path("-"):
-        typer.echo(identification_text(result) + more)
+        known = None if truth is None else read_truth(truth)
+        typer.echo(identification_text(result, known) + more)
 
 
 def validate(

@@ -83,7 +83,7 @@ def test_output_error_takes_out_what_noise_did_to_the_rows(rig: Rig) -> None:
     noisy = [Swing(s.rate, s.theta + 2e-4 * rng.standard_normal(s.theta.shape)) for s in swings]
     scale = Scale("W1", values["W1"])
     rows = identify_free(described, noisy, scale)
-    cut = windows(noisy, 1.0)
+    cut = windows(noisy, 0.6)
     refined, started = refine_free(described, rows, cut, scale)
     assert window_error(described, refined, started) == pytest.approx(2e-4, rel=0.05)
     for name in ("M1", "M2", "R12", "W2"):
