@@ -2,8 +2,8 @@
 
 Level 1, *signs*: friction, flow gains and 1/b are not negative, and the chain's R is positive
 semidefinite. M_ij(q) sums R_kl cos(theta_k - theta_l) (`terms.inertia`), and the cosines form a
-Gram matrix, so by Schur's product theorem M(q) is then so in every posture; R itself is M with all
-links in line, so nothing weaker would do.
+Gram matrix, so by Schur's product theorem M(q) is then so in every posture; with all links in line
+M(q) is made of R alone, so over all postures nothing weaker would do.
 Level 2, *rigid bodies*: R_ij = l_i W_j for i < j besides, l_i being the rig's link lengths (NOTES,
 "N DOF planar chain"). Both levels together say exactly that there are links with masses m_k > 0,
 first moments h_k and pseudo-inertias [[I_k, h_k], [h_k, m_k]] >= 0 behind the parameters:

@@ -14,7 +14,6 @@ from urllib.parse import urlsplit
 from drivers import make_driver
 from protocols import engine, library
 from protocols.check import check
-from protocols.check_report import CheckReport
 from protocols.plan import Overrides, Plan, resolve
 from rig.model.parse import InputError
 from rig.model.rig import Rig, Wire
@@ -60,14 +59,6 @@ def wire_at(endpoint: str, wire: Wire) -> Wire:
 def _plan(protocol: str, rig: str, overrides: Overrides) -> tuple[Rig, Plan]:
     bench = load_bench(rig)
     return bench, resolve(library.load(protocol), bench, overrides)
-
-
-def check_protocol(protocol: str, rig: str, overrides: Overrides) -> CheckReport:
-    """Prove a protocol against the rig's limits on the twin; raises InputError for bad files."""
-    from analysis.twin import simulate_commands
-
-    bench, plan = _plan(protocol, rig, overrides)
-    return check(plan, bench, simulate_commands)
 
 
 class _Story:
