@@ -17,7 +17,7 @@ from analysis.base_parameters import Determined, determined
 from analysis.checks import Check
 from analysis.proof import predicted_rows
 from analysis.solve import Solution
-from rig.model.parameters import gain_names
+from rig.model.parameters import gain_names, parameter_names
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
@@ -51,7 +51,10 @@ def base_statements(rig: Rig, solutions: Mapping[str, Solution]) -> list[Check]:
 
 
 def _help(rig: Rig, family: str, found: Determined) -> list[str]:
-    if rig.electric:  # its steps are not planned: no stroke says what motion is to be had
+    # The steps of electric rigs are not planned: no stroke says what motion is to be had. What an
+    # effect's own parameters need stands in the catalogue, not here.
+    known = parameter_names(len(rig.joints))
+    if rig.electric or any(name not in known for name in found.names):
         return []
     return mechanical_help(rig, found) if family == "mechanical" else fluid_help(rig, found)
 
