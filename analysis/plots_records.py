@@ -28,6 +28,7 @@ from analysis.plots import (
 )
 from analysis.report_format import display_unit, significant
 from analysis.report_residuals import Residual
+from analysis.signals import bridged
 from rig.model import channels as ch
 from rig.model.records import Record
 from rig.model.rig import Rig
@@ -70,7 +71,7 @@ def line_spectrum(record: Record, x: Array) -> Lines | None:
 def excitation(rig: Rig, record: Record, joint: int, key: str) -> Markup:
     """Draw command and spool of one joint in time, and the lines they hold."""
     gain = rig.joints[joint - 1].valve.spool_gain
-    spool = np.asarray(record.channels[ch.channel(ch.SPOOL, joint)])
+    spool = bridged(np.asarray(record.channels[ch.channel(ch.SPOOL, joint)]))
     command = record.channels.get(ch.channel(ch.COMMAND, joint))
     shown = slice(0, int(min(record.samples, SHOWN_SECONDS * record.sample_rate)))
     with style():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import resource
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.accumulate import Accumulator
-from analysis.analysis_bench import bench_run
 from analysis.cluster import Cluster
 from analysis.compute import ONE_THREAD, Processes, environment
 from analysis.folders import identify_folders
-from rig.model.rig import Rig
-from rig.services.stream import write_run
 
 Array = NDArray[np.float64]
 
@@ -100,21 +98,12 @@ def row_figures(folder: Path, rows: int = 10_000_000) -> dict[str, float]:
     }
 
 
-def write_archive(folder: Path, rig: Rig, runs: int, repeats: int, seconds: float) -> list[str]:
-    """Write run folders of synthetic records: `runs` times three steps times `repeats`."""
-    run = bench_run(rig, repeats=repeats, seconds=seconds)
-    return [str(write_run(folder / f"run-{number}", run)) for number in range(runs)]
-
-
-def cluster_figures(
-    folder: Path, rig: Rig, runs: int = 8, repeats: int = 6, seconds: float = 20.0, tries: int = 3
-) -> dict[str, float]:
-    """Return how much faster two Dask workers identify an archive than one, on this machine.
+def cluster_figures(folders: Sequence[str], tries: int = 3) -> dict[str, float]:
+    """Return how much faster two Dask workers identify run folders than one, on this machine.
 
     Each worker is a process with one thread. Raises ImportError without dask.distributed.
     """
     distributed: Any = importlib.import_module("distributed")
-    folders = write_archive(folder, rig, runs, repeats, seconds)
     best: dict[int, float] = {1: np.inf, 2: np.inf}
     busiest = dict(best)  # processor seconds of the worker that used most
     values = []
@@ -143,7 +132,6 @@ def cluster_figures(
     here = identify_folders(folders)
     expected = np.array([estimate.value for estimate in here.estimates.values()])
     return {
-        "records": float(runs * repeats * 3),
         "one_seconds": best[1],
         "two_seconds": best[2],
         "speedup": best[1] / best[2],

@@ -34,6 +34,7 @@ from rig.model.parse import InputError
 from rig.model.records import RecordHead
 from rig.model.rig import Rig
 from rig.services.recorder import RecordMeta
+from rig.services.runstate import EventLog
 
 log = logging.getLogger(__name__)
 Say = Callable[[str], None]
@@ -126,6 +127,8 @@ class Tracking:
 
     def _finish(self) -> None:
         """Wait for the last estimates and write everything beside the records."""
+        noted = len(self._history)
+        self._notes, self._shows = [], []  # the bench is closed
         self._send([b"stop"])
         deadline = time.monotonic() + FINISH
         ended = False
@@ -141,6 +144,10 @@ class Tracking:
         data = {"memory_s": memory, "parameters": self.parameters, "records": self._history}
         if self._out.is_dir():
             write_json(self._out / NAME, data)
+            events = EventLog(self._out)
+            for entry in self._history[noted:]:  # what a tracker that lagged had yet to say
+                events.append("tracked", None, entry)
+            events.close()
 
     # What the bench tells
 

@@ -16,6 +16,7 @@ from rig.services import store
 from rig.services.journal import Journal
 from rig.services.runstate import (
     ABORTED,
+    BETWEEN,
     JOURNAL,
     RUNNING,
     STATES,
@@ -23,7 +24,7 @@ from rig.services.runstate import (
     give_up_ownership,
     write_state,
 )
-from rig.services.sections import BETWEEN, Written
+from rig.services.sections import Written
 from rig.services.trips import RecordingFailed
 
 log = logging.getLogger(__name__)

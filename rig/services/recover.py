@@ -97,7 +97,7 @@ def _without_journal(folder: Path) -> RecoverReport:
         message = "nothing had been recorded"
         _note(folder, state, message)
         return _report(folder, state, Written(0, 0, 0, 0, 0), message)
-    from rig.services.archive import read_records  # noqa: PLC0415 - h5py loads slowly
+    from rig.services.archive_reader import read_records  # noqa: PLC0415 - h5py loads slowly
 
     records = read_records(archive)
     runstate.write_state(folder, state)

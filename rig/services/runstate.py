@@ -32,6 +32,7 @@ STATES: Final = (RUNNING, DONE, ABORTED, TRIPPED, INTERRUPTED)
 HEADER: Final = "run.yaml"
 JOURNAL: Final = "journal.sqlite"
 EVENTS: Final = "events.jsonl"
+BETWEEN: Final = "between"  # the group of records.h5 for samples outside of every record
 _STATE, _OWNER = "state", "owner.json"
 
 

@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.services.journal import Block, Journal, Mark, Spans
+from rig.services.runstate import BETWEEN
 
 Array = NDArray[np.float64]
-
-BETWEEN = "between"
 
 
 @dataclass(frozen=True)

@@ -189,7 +189,7 @@ def load_run(path: str | Path, *, partial: bool = False) -> Run:
     """
     folder = Path(path)
     header, state = finished(folder)
-    from rig.services.archive import read_records  # noqa: PLC0415 - keeps this module light
+    from rig.services.archive_reader import read_records  # noqa: PLC0415 - keeps this module light
 
     chosen = chosen_of(folder, state, read_records(folder / ARCHIVE), partial)
     return Run(header.rig, chosen, source=str(folder), state=state)

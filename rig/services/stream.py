@@ -1,7 +1,4 @@
-"""Runs read piece by piece: heads first, then one record, or a part of one, at a time.
-
-And written from records at hand, for archives that no bench recorded (studies, tests, figures).
-"""
+"""Runs read piece by piece: heads first, then one record, or a part of one, at a time."""
 
 from __future__ import annotations
 
@@ -12,10 +9,9 @@ from pathlib import Path
 
 import h5py
 
-from rig.model.records import Record, RecordHead, Run
+from rig.model.records import Record, RecordHead
 from rig.model.rig import Rig
-from rig.services import archive, store
-from rig.services.runstate import give_up_ownership
+from rig.services import archive_reader, store
 
 
 @dataclass(frozen=True)
@@ -38,8 +34,8 @@ class RecordReader:
 
     def read(self, first: int = 0, last: int | None = None) -> Record:
         """Return the samples [first, last) as a record of their own."""
-        with archive.readable(self._path):
-            return archive.samples_of(self._group, self.head, first, last)
+        with archive_reader.readable(self._path):
+            return archive_reader.samples_of(self._group, self.head, first, last)
 
 
 def read_run_head(path: str | Path, *, partial: bool = False) -> RunHead:
@@ -47,8 +43,8 @@ def read_run_head(path: str | Path, *, partial: bool = False) -> RunHead:
     folder = Path(path)
     header, state = store.finished(folder)
     file_path = folder / store.ARCHIVE
-    with archive.readable(file_path), archive.open_archive(file_path) as file:
-        heads = archive.read_heads(file, file_path)
+    with archive_reader.readable(file_path), archive_reader.open_archive(file_path) as file:
+        heads = archive_reader.read_heads(file, file_path)
     chosen = store.chosen_of(folder, state, heads, partial)
     return RunHead(header.rig, chosen, str(folder), state)
 
@@ -57,10 +53,10 @@ def read_run_head(path: str | Path, *, partial: bool = False) -> RunHead:
 def open_record(path: str | Path, name: str) -> Iterator[RecordReader]:
     """Open one record of a run for reading in parts; raises InputError."""
     file_path = Path(path) / store.ARCHIVE
-    with archive.open_archive(file_path) as file:
-        with archive.readable(file_path):
+    with archive_reader.open_archive(file_path) as file:
+        with archive_reader.readable(file_path):
             group = file[name]
-            head = archive.head_of(name, group, file_path)
+            head = archive_reader.head_of(name, group, file_path)
         yield RecordReader(file_path, group, head)
 
 
@@ -73,20 +69,3 @@ def iterate_records(path: str | Path, *, partial: bool = False) -> Iterator[Reco
         with open_record(path, head.name) as reader:
             record = reader.read()
         yield record
-
-
-def write_run(folder: str | Path, run: Run) -> Path:
-    """Write a finished run folder of records at hand; raises InputError if it is occupied."""
-    path = store.create_run(Path(folder), run.rig, source=run.source)
-    fresh = path / f"{archive.NAME}.tmp"
-    with archive.create(fresh, run.rig.name) as file:
-        for order, r in enumerate(run.records):
-            about = archive.record_attributes(
-                r.step, r.repeat, r.locked, r.sample_rate, r.start, r.period, r.lines, True
-            )
-            more = {**r.attributes, **about, "stream": order, "start_tick": 0}
-            archive.write_group(file, r.name, r.channels, more, run.rig.unit_of)
-    archive.put_in_place(fresh, path / archive.NAME)
-    store.mark_done(path)
-    give_up_ownership(path)
-    return path

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from scipy.linalg import lstsq
 
 from analysis.accumulate import Accumulator, accumulate
-from analysis.condense import InMemory, reduce_record, solve_reductions
+from analysis.condense import reduce_record, solve_reductions
 from analysis.folders import identify_folders
 from analysis.identify import (
     PLAIN,
@@ -25,13 +25,14 @@ from analysis.identify import (
 )
 from analysis.rows import default_filtering, paper_filtering
 from analysis.solve import triangle
-from analysis.stretches import locks_of, source_rows
+from analysis.stretches import InMemory, locks_of, source_rows
 from analysis.terms import baseline
 from analysis.terms.base import Used
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
+from rig.services.made import write_run
 from rig.services.store import load_run
-from rig.services.stream import iterate_records, open_record, read_run_head, write_run
+from rig.services.stream import iterate_records, open_record, read_run_head
 
 TERMS = tuple(Used(term) for term in baseline())
 

@@ -21,7 +21,7 @@ from analysis.folders import identify_folders
 from analysis.identify import PLAIN, identify
 from rig.model.parse import InputError
 from rig.model.records import Run
-from rig.services.stream import write_run
+from rig.services.made import write_run
 from tests.analysis.test_accumulate import assert_same
 
 END_SECONDS = 20.0

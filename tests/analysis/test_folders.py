@@ -14,8 +14,8 @@ from analysis.terms.base import Used
 from hil_sim import electric
 from rig.model.electric import ElectricRig
 from rig.model.records import Run
+from rig.services.made import write_run
 from rig.services.rigs import load_rig
-from rig.services.stream import write_run
 from tests.analysis.test_accumulate import assert_same
 from tests.analysis.test_lost_samples import with_lost
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from analysis.identify import build_rows, identify
 from analysis.model import Model
+from analysis.report import write_report
 from analysis.rows import default_filtering
 from analysis.terms import baseline
 from analysis.terms.base import Used
@@ -86,3 +88,9 @@ def test_the_model_is_not_judged_by_samples_that_were_made_up(
         assert holed.fit[name] == pytest.approx(fit, abs=0.5)
     with pytest.raises(InputError, match=r"'both_r1': 300 samples in a row were lost"):
         validate(model, [with_lost(both_run, (2000, 2300))])
+
+
+def test_a_report_can_be_made_of_records_with_gaps(multisine_run: Run, tmp_path: Path) -> None:
+    run = with_lost(multisine_run, (3000, 3020))
+    write_report(tmp_path / "report.html", runs=[run], identification=identify([run]))
+    assert "lost samples" in (tmp_path / "report.html").read_text()

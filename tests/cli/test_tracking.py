@@ -192,7 +192,7 @@ def test_a_run_is_tracked_to_what_identify_finds(tmp_path: Path) -> None:
     for name in ("b", "C_pp_2", "C_pm_2", "C_mp_2", "C_mm_2"):
         assert kept[name]["value"] == pytest.approx(expected[name].value, rel=1e-9)
     records = [e["record"] for e in read_events(run) if e["event"] == "tracked"]
-    assert records[:1] == ["step1_r1"]
+    assert records == ["step1_r1", "step1_r2"]
     wrong = bramah("run", protocol, "--rig", RIG, "--out", tmp_path / "x", "--track", "--memory", 0)
     assert wrong.returncode == 2
     assert "--memory 0: expected more than 0 s" in wrong.stderr
