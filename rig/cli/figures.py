@@ -146,9 +146,12 @@ def _quiet(_: str) -> None:
 
 def measure(minutes: float, seeds: int, only: str | None, say: Say) -> list[Figure]:
     """Measure all groups, or the one named; raises InputError for an unknown name."""
+    from rig.cli.figures_stream import stream_figures  # which takes Figure from here
+
     groups: Mapping[str, Callable[[Path, Say], list[Figure]]] = {
         "plant": plant_figures,
         "analysis": analysis_figures,
+        "stream": stream_figures,
         "demo": lambda folder, tell: demo_figures(folder, tell, seeds),
         "acquisition": lambda folder, tell: acquisition_figures(folder, tell, minutes),
     }
