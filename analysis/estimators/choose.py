@@ -17,6 +17,7 @@ from analysis.estimators.equations import (
     Block,
     Fit,
     HasRows,
+    Prepared,
     blocks_of,
     least_squares,
     levelled,
@@ -24,8 +25,8 @@ from analysis.estimators.equations import (
 )
 from analysis.estimators.instruments import hausman, instrumental_variables
 from analysis.estimators.robust import robust
+from analysis.estimators.shifts import certain_shift, including, shifts_of
 from analysis.estimators.statements import (
-    Prepared,
     noise_statement,
     nuisance_statement,
     outlier_statement,
@@ -43,6 +44,7 @@ log = logging.getLogger(__name__)
 
 ESTIMATORS = ("ls", "wls", "iv", "robust", "output-error", "auto")
 NEED_REPEATS = ("wls", "iv")
+UNBIASED = ("iv", "output-error")  # by noise in the regressors
 
 _FITS: Mapping[str, Callable[[Sequence[Block]], Fit]] = {
     "ls": least_squares,
@@ -107,7 +109,7 @@ def refine(job: Job, solutions: Mapping[str, Solution]) -> Refined:
              if estimator != "output-error"}  # fmt: skip
     if not single:
         reference = {p.family: _solve(p, "ls") for p in prepared}
-        statement = noise_statement(prepared, tests, reference)
+        statement = noise_statement(shifts_of(prepared, tests, reference))
         if estimator == "auto":
             estimator = "ls" if statement.ok else "iv"
             if not statement.ok:
@@ -130,6 +132,8 @@ def refine(job: Job, solutions: Mapping[str, Solution]) -> Refined:
     ends: dict[str, tuple[float, float]] = {}
     for p in prepared:
         beta, total, fit = found[p.family]
+        if estimator == "ls" and tests:
+            total = including(total, certain_shift(tests[p.family], p))
         new[p.family] = merged(solutions[p.family], p.names[: p.parameters], beta, total)
         if estimator == "robust":
             checks.append(outlier_statement(p.family, fit))
@@ -138,8 +142,11 @@ def refine(job: Job, solutions: Mapping[str, Solution]) -> Refined:
             kind = _FITS[estimator]
             error = spread([pieces(fit)], fit.inverse)
             drawn = bootstrap(p.blocks, _redo(p, kind, error), job.bootstrap, rng)
-            for name, low, high in zip(p.names, drawn.low, drawn.high, strict=False):
-                ends[name] = (float(low), float(high))
+            shift = certain_shift(tests[p.family], p) if estimator == "ls" and tests else 0.0
+            # Towards where instruments have it: what draws cannot show either.
+            low, high = drawn.low - np.maximum(shift, 0.0), drawn.high - np.minimum(shift, 0.0)
+            for i, name in enumerate(p.names[: p.parameters]):
+                ends[name] = (float(low[i]), float(high[i]))
     return Refined(new, tuple(checks), estimator, ends)
 
 

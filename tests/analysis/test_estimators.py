@@ -11,8 +11,11 @@ from scipy.stats import t as student
 from analysis.checks import Check
 from analysis.estimators import coverage as cov
 from analysis.estimators.covariance import by_parts, lack_of_fit, spread
-from analysis.estimators.equations import Block, least_squares, pieces, segments
+from analysis.estimators.equations import Block, Prepared, least_squares, pieces, segments
+from analysis.estimators.instruments import hausman
 from analysis.estimators.output_error import output_error
+from analysis.estimators.shifts import Shift, certain_shift, including, shifts_of
+from analysis.estimators.statements import noise_statement
 from analysis.identify import Identification, identify, to_json
 from analysis.terms import baseline
 from analysis.terms.base import Used
@@ -48,7 +51,7 @@ def noisy_run(multisine_run: Run) -> Run:
 
 @pytest.fixture(scope="module")
 def noisy(noisy_run: Run) -> Identification:
-    return identify([noisy_run], reject_noise=False)
+    return identify([noisy_run], reject_noise=False, estimator="ls")
 
 
 def test_clean_sensors_leave_nothing_for_instruments_to_mend(multisine_run: Run) -> None:
@@ -65,19 +68,27 @@ def test_ten_times_the_noise_biases_least_squares_and_the_check_says_so(
     assert not said.ok
     assert "least squares is biased" in said.detail
     assert error(noisy, "M2") > 0.01
-    assert not inside(noisy, "M2")
+    # Who insists on least squares gets its value, and an interval that knows of the bias.
+    assert inside(noisy, "M2")
+    low, high = noisy.estimates["M2"].ci95
+    assert high - low > 2 * error(noisy, "M2") * TRUTH["M2"]
 
 
-def test_instruments_are_not_biased_and_auto_prefers_them(
+def test_instruments_are_not_biased_and_the_tool_prefers_them_unasked(
     noisy_run: Run, noisy: Identification
 ) -> None:
     iv = identify([noisy_run], reject_noise=False, estimator="iv")
-    auto = identify([noisy_run], reject_noise=False, estimator="auto")
+    auto = identify([noisy_run], reject_noise=False)
     assert error(iv, "M2") < 0.3 * error(noisy, "M2")
+    assert error(auto, "M2") < 0.3 * error(noisy, "M2")
     assert np.mean([inside(iv, name) for name in TRUTH]) > 0.8
     assert auto.model.provenance["estimator"] == "iv"
     assert auto.estimates["M2"].value == iv.estimates["M2"].value
     assert "instrumental variables instead" in check(auto, "noise in regressors").detail
+    # Asked for a bootstrap of least squares, its interval knows of the bias as well.
+    drawn = identify([noisy_run], reject_noise=False, estimator="ls", bootstrap=100)
+    low, high = drawn.estimates["M2"].ci95
+    assert low < iv.estimates["M2"].value < high
 
 
 def test_weights_from_measured_noise_do_not_move_what_is_right(multisine_run: Run) -> None:
@@ -179,6 +190,55 @@ def line(rng: np.random.Generator, bend: float, repeats: int = 4) -> tuple[Block
               2 * x + bend * x**3 + 0.1 * rng.standard_normal(400), t, parts, parts)
         for r in range(1, repeats + 1)
     )  # fmt: skip
+
+
+CASES = {
+    # noise of the regressor, of the equation; is the shift certain, is it large
+    "certain and large": (0.2, 0.1, True, True),
+    "certain, but small": (0.04, 0.5, True, False),
+    "large, but maybe chance": (0.1, 10.0, False, True),
+    "neither": (0.002, 0.1, False, False),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_shift_must_be_certain_and_large_to_speak_against_least_squares(case: str) -> None:
+    blurred, noise, certain, large = CASES[case]
+    rng = np.random.default_rng(3)
+    blocks = tuple(
+        replace(
+            b,
+            X=b.X + blurred * rng.standard_normal(b.X.shape),
+            y=2 * b.X[:, 0] + noise * rng.standard_normal(len(b.y)),
+        )
+        for b in line(rng, 0.0)
+    )
+    p = Prepared("mechanical", ("M1",), 1, blocks)
+    fit, test = least_squares(blocks), hausman(blocks)
+    error = spread([pieces(fit)], fit.inverse)
+    (shift,) = shifts_of([p], {"mechanical": test}, {"mechanical": (fit.beta, error, fit)})
+    assert (shift.significant, shift.material) == (certain, large)
+    said = noise_statement([shift])
+    assert said.ok is not (certain and large)
+    for figure in (f"M1 by {100 * shift.relative:+.2g} %", f"({shift.t:.2g} of its standard err"):
+        assert figure in said.detail
+    assert ("too little to matter" in said.detail) is (certain and not large)
+    assert ("may be chance" in said.detail) is (large and not certain)
+    # Attenuation is 1/(1 + noise/signal); what is certain is in the interval.
+    if certain:
+        assert shift.relative == pytest.approx(-(blurred**2) / (0.5 + blurred**2), rel=0.3)
+        wide = including(error, certain_shift(test, p))
+        half = student.ppf(0.975, wide.dof[0]) * np.sqrt(wide.covariance[0, 0])
+        assert abs(fit.beta[0] - 2.0) < half
+
+
+def test_a_shift_nobody_would_notice_does_not_matter_however_narrow_the_interval() -> None:
+    assert not Shift("M2", -4e-5, 17.0, 3.0, True).material
+    assert Shift("M2", -1e-3, 17.0, 3.0, True).material
+    assert not Shift("M2", -1e-3, 17.0, 0.3, True).material
+    assert Shift("M2", -6e-3, 17.0, 0.3, True).material
+    assert not Shift("b", -6e-3, 17.0, 0.3, True).material
+    assert Shift("b", -3e-2, 17.0, 0.3, True).material
 
 
 def test_a_misfit_that_every_repeat_shares_widens_the_interval() -> None:
