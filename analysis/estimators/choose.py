@@ -45,6 +45,7 @@ log = logging.getLogger(__name__)
 ESTIMATORS = ("ls", "wls", "iv", "robust", "output-error", "auto")
 NEED_REPEATS = ("wls", "iv")
 UNBIASED = ("iv", "output-error")  # by noise in the regressors
+SAID = {"iv": "instrumental variables", "output-error": "output error"}
 
 _FITS: Mapping[str, Callable[[Sequence[Block]], Fit]] = {
     "ls": least_squares,
@@ -114,8 +115,9 @@ def refine(job: Job, solutions: Mapping[str, Solution]) -> Refined:
             estimator = "ls" if statement.ok else "iv"
             if not statement.ok:
                 found = {p.family: _solve(p, "iv") for p in prepared}
-                words = "; the values given are those of instrumental variables instead"
-                statement = replace(statement, ok=True, detail=statement.detail + words)
+        if not statement.ok and estimator in UNBIASED:
+            words = f"; the values given are those of {SAID[estimator]} instead"
+            statement = replace(statement, ok=True, detail=statement.detail + words)
         checks.append(statement)
     elif estimator == "auto":
         estimator = "ls"
@@ -132,22 +134,30 @@ def refine(job: Job, solutions: Mapping[str, Solution]) -> Refined:
     ends: dict[str, tuple[float, float]] = {}
     for p in prepared:
         beta, total, fit = found[p.family]
+        shift = np.zeros(p.parameters)
         if estimator == "ls" and tests:
-            total = including(total, certain_shift(tests[p.family], p))
+            shift = certain_shift(tests[p.family], p)
+        total = including(total, shift)
         new[p.family] = merged(solutions[p.family], p.names[: p.parameters], beta, total)
         if estimator == "robust":
             checks.append(outlier_statement(p.family, fit))
         if job.bootstrap:
-            rng = job.rng or np.random.default_rng(0)
-            kind = _FITS[estimator]
-            error = spread([pieces(fit)], fit.inverse)
-            drawn = bootstrap(p.blocks, _redo(p, kind, error), job.bootstrap, rng)
-            shift = certain_shift(tests[p.family], p) if estimator == "ls" and tests else 0.0
-            # Towards where instruments have it: what draws cannot show either.
-            low, high = drawn.low - np.maximum(shift, 0.0), drawn.high - np.minimum(shift, 0.0)
-            for i, name in enumerate(p.names[: p.parameters]):
-                ends[name] = (float(low[i]), float(high[i]))
+            ends |= _drawn(job, p, estimator, fit, shift)
     return Refined(new, tuple(checks), estimator, ends)
+
+
+def _drawn(
+    job: Job, p: Prepared, estimator: str, fit: Fit, shift: Array
+) -> dict[str, tuple[float, float]]:
+    """Return the bootstrap's intervals by name, extended by a shift (k,) that no draw can show."""
+    rng = job.rng or np.random.default_rng(0)
+    error = spread([pieces(fit)], fit.inverse)
+    drawn = bootstrap(p.blocks, _redo(p, _FITS[estimator], error), job.bootstrap, rng)
+    # Towards where instruments have it.
+    low = drawn.low[: p.parameters] - np.maximum(shift, 0.0)
+    high = drawn.high[: p.parameters] - np.minimum(shift, 0.0)
+    ends = zip(p.names, low, high, strict=False)
+    return {name: (float(a), float(b)) for name, a, b in ends}
 
 
 def _repeats(job: Job) -> dict[tuple[int, str], int]:

@@ -55,6 +55,8 @@ def noise_statement(shifts: Sequence[Shift]) -> Check:
 
     Not ok is a shift that is certain and matters; of any other the figures are said.
     """
+    if not shifts:
+        return Check(NOISE_CHECK, False, "nothing identified to judge")
     certain = [s for s in shifts if s.significant]
     biased = [s for s in certain if s.material]
     if biased:
@@ -62,7 +64,7 @@ def noise_statement(shifts: Sequence[Shift]) -> Check:
         return Check(
             NOISE_CHECK, False,
             f"least squares is biased by noise in the regressors, {_figures(worst)}; so are "
-            f"{len(biased) - 1} others; use --estimator auto, iv or output-error",
+            f"{len(biased) - 1} others; --estimator auto, iv or output-error is not",
         )  # fmt: skip
     if certain:
         worst = max(certain, key=lambda s: s.t)
