@@ -224,9 +224,9 @@ def _family(
 def _solve(p: Prepared, estimator: str) -> tuple[Array, Spread, Fit]:
     fit = _FITS[estimator](p.blocks)
     error = spread([pieces(fit), pieces(fit, "level")], fit.inverse)
-    beta = fit.beta
+    beta, inverse = fit.beta, fit.inverse
     for belief in nu.beliefs(p.names, beta):
-        beta, error = nu.joined(beta, error, belief)
+        beta, error, inverse = nu.joined(beta, error, belief, inverse)
     return beta[: p.parameters], _first(error, p.parameters), fit
 
 
@@ -236,9 +236,10 @@ def _redo(
     """Return the estimate of resampled blocks; what is known beforehand weighs as before."""
 
     def estimate(blocks: Sequence[Block]) -> Array:
-        beta, after = kind(blocks).beta, error
+        fit = kind(blocks)
+        beta, inverse, after = fit.beta, fit.inverse, error
         for belief in nu.beliefs(p.names, beta):
-            beta, after = nu.joined(beta, after, belief)
+            beta, after, inverse = nu.joined(beta, after, belief, inverse)
         return beta[: p.parameters]
 
     return estimate

@@ -21,7 +21,8 @@ class Trial:
 
     `error` is value/truth - 1, `low` and `high` the interval's ends likewise; NaN where a
     parameter was not identified. `flagged` says that a check found noise in the regressors, `used`
-    who estimated in the end, `seconds` the processor's time from records to parameters.
+    who estimated in the end, `seconds` the processor's time from records to parameters, `taking`
+    that which taking the records took.
     """
 
     error: Mapping[str, float]
@@ -30,6 +31,7 @@ class Trial:
     flagged: bool = False
     used: str = ""
     seconds: float = 0.0
+    taking: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,9 @@ class Row:
         return abs(self.bias) <= (MOST_BIAS_OF_B if self.name == "b" else MOST_BIAS)
 
 
-def trial(found: Identification, truth: Mapping[str, float], seconds: float = 0.0) -> Trial:
+def trial(
+    found: Identification, truth: Mapping[str, float], seconds: float = 0.0, taking: float = 0.0
+) -> Trial:
     """Return an identification seen from its truth."""
     known = {n: e for n, e in found.estimates.items() if n in truth}
     flagged = any(c.name == NOISE_CHECK and not c.ok for c in found.checks)
@@ -63,6 +67,7 @@ def trial(found: Identification, truth: Mapping[str, float], seconds: float = 0.
         flagged,
         str(found.model.provenance.get("estimator", "")),
         seconds,
+        taking,
     )
 
 

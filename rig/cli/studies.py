@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,27 +29,26 @@ def coverage_study(
     workers: int,
     say: Say,
     first: int = JUDGING_SEED,
+    folder: Path | None = None,
 ) -> dict[str, Any]:
     """Measure coverage on each kind; returns the table as JSON-ready data."""
     out: dict[str, Any] = {}
     for kind in kinds:
-        began = time.perf_counter()
         jobs = [
             Experiment(kind, first + k, (estimator,), noise, repeats) for k in range(experiments)
         ]
-        found = [by[estimator] for _, by in all_of(jobs, workers, say)]
+        found = [by[estimator] for _, by in all_of(jobs, workers, say, folder=folder)]
         out[kind] = {
             "experiments": len(found),
             "overall": overall(table := rows(found)),
             "used": _used(found),
-            "minutes": (time.perf_counter() - began) / 60.0,
+            "seconds": float(np.median([t.taking + t.seconds for t in found])),
             "parameters": {r.name: asdict(r) for r in table},
         }
     return {
         "estimator": estimator,
         "noise": noise,
         "repeats": repeats,
-        "workers": workers,
         "seeds": [first, first + experiments - 1],
         "goal": list(GOAL),
         "kinds": out,
@@ -69,7 +68,8 @@ def coverage_text(found: dict[str, Any]) -> str:
             f"**{kind}**: {data['experiments']} experiments on {_SAID[kind]}; seeds "
             f"{found['seeds'][0]} to {found['seeds'][1]}, estimator {found['estimator']} "
             f"({used}), noise x{found['noise']:g}, {found['repeats']} repeats; "
-            f"{data['minutes']:.0f} minutes on {found['workers']} process(es)",
+            f"{data['seconds']:.1f} s of processor time each, "
+            f"{data['experiments'] * data['seconds'] / 60.0:.0f} minutes in all",
             "",
             "| parameter | coverage % (95 % interval) | bias % | RSD % | half width % |",
             "|---|---|---|---|---|",
@@ -113,6 +113,7 @@ def estimator_study(
     workers: int,
     say: Say,
     first: int = JUDGING_SEED,
+    folder: Path | None = None,
 ) -> dict[str, Any]:
     """Measure bias, scatter and time of each estimator at each noise, all on the same records."""
     jobs = [
@@ -120,16 +121,14 @@ def estimator_study(
         for level in noise
         for k in range(experiments)
     ]
-    began = time.perf_counter()
     trials: dict[float, dict[str, list[Trial]]] = {n: {e: [] for e in estimators} for n in noise}
-    for experiment, found in all_of(jobs, workers, say):
+    for experiment, found in all_of(jobs, workers, say, folder=folder):
         for name, one in found.items():
             trials[experiment.noise][name].append(one)
     return {
         "kind": kind,
         "experiments": experiments,
         "seeds": [first, first + experiments - 1],
-        "workers": workers,
         "noise": [
             {
                 "noise": level,
@@ -144,13 +143,12 @@ def estimator_study(
             }
             for level, by in trials.items()
         ],
-        "minutes": (time.perf_counter() - began) / 60.0,
     }
 
 
 def estimator_text(found: dict[str, Any]) -> str:
     """Return bias / RSD [%] per parameter, a column per estimator, a table per noise."""
-    lines = [f"{found['minutes']:.0f} minutes on {found['workers']} process(es).", ""]
+    lines: list[str] = []
     for part in found["noise"]:
         names = list(part["estimators"])
         lines += [

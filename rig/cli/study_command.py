@@ -21,6 +21,10 @@ Workers = Annotated[int, typer.Option(min=1, help="Processes at once.")]
 FirstSeed = Annotated[
     int, typer.Option("--first-seed", min=0, help="Those below 100 served to find errors.")
 ]
+KeepOption = Annotated[
+    Path | None,
+    typer.Option(help="Keep what each experiment found here; a study begun again goes on from it."),
+]
 DocsOption = Annotated[
     Path | None, typer.Option(help="Also put the tables where this page has room for them.")
 ]
@@ -35,6 +39,7 @@ def coverage(
     repeats: Annotated[int, typer.Option(min=1, help="Of every step.")] = 4,
     first: FirstSeed = 100,
     workers: Workers = 2,
+    keep: KeepOption = None,
     json: JsonOption = None,
     docs: DocsOption = None,
 ) -> None:
@@ -50,7 +55,9 @@ def coverage(
     if estimator != "plain":
         refuse_unknown(estimator)
     kinds = ("model", "plant") if kind == "both" else (kind,)
-    found = coverage_study(kinds, experiments, estimator, noise, repeats, workers, progress, first)
+    found = coverage_study(
+        kinds, experiments, estimator, noise, repeats, workers, progress, first, keep
+    )
     write_json(json, found)
     if docs is not None:
         for one in kinds:
@@ -70,6 +77,7 @@ def estimators(
     kind: Annotated[str, typer.Option(help="model or plant.")] = "plant",
     first: FirstSeed = 100,
     workers: Workers = 2,
+    keep: KeepOption = None,
     json: JsonOption = None,
     docs: DocsOption = None,
 ) -> None:
@@ -86,7 +94,7 @@ def estimators(
     every = tuple(which.split())
     for name in every:
         refuse_unknown(name)
-    found = estimator_study(every, levels, experiments, kind, workers, progress, first)
+    found = estimator_study(every, levels, experiments, kind, workers, progress, first, keep)
     write_json(json, found)
     if docs is not None:
         replace_section(docs, "study estimators", estimator_text(found))

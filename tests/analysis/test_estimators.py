@@ -11,11 +11,8 @@ from scipy.stats import t as student
 from analysis.checks import Check
 from analysis.estimators import coverage as cov
 from analysis.estimators.covariance import by_parts, lack_of_fit, spread
-from analysis.estimators.equations import Block, Prepared, least_squares, pieces, segments
-from analysis.estimators.instruments import hausman
+from analysis.estimators.equations import least_squares, pieces
 from analysis.estimators.output_error import output_error
-from analysis.estimators.shifts import Shift, certain_shift, including, shifts_of
-from analysis.estimators.statements import noise_statement
 from analysis.identify import Identification, identify, to_json
 from analysis.terms import baseline
 from analysis.terms.base import Used
@@ -23,6 +20,7 @@ from rig.model.parse import InputError
 from rig.model.records import Run
 from tests.analysis import small_bench as bench
 from tests.analysis.small_bench import TRUTH
+from tests.analysis.straight_line import line
 
 
 def error(result: Identification, name: str) -> float:
@@ -180,67 +178,6 @@ def test_an_unknown_estimator_and_too_few_draws_are_refused(multisine_run: Run) 
         identify([multisine_run], bootstrap=20)
     with pytest.raises(InputError, match="does not go with --estimator output-error"):
         identify([multisine_run], estimator="output-error", bootstrap=100)
-
-
-def line(rng: np.random.Generator, bend: float, repeats: int = 4) -> tuple[Block, ...]:
-    """Repeats of y = 2 x + bend x^3 + noise, which a straight line is fitted to."""
-    t = np.arange(400) / 100.0
-    x = np.sin(2 * np.pi * t / 4.0)
-    parts = segments(t, 4.0)
-    return tuple(
-        Block(0, "s", r, f"s_r{r}", "torque_1", x[:, None],
-              2 * x + bend * x**3 + 0.1 * rng.standard_normal(400), t, parts, parts)
-        for r in range(1, repeats + 1)
-    )  # fmt: skip
-
-
-CASES = {
-    # noise of the regressor, of the equation; is the shift certain, is it large
-    "certain and large": (0.2, 0.1, True, True),
-    "certain, but small": (0.04, 0.5, True, False),
-    "large, but maybe chance": (0.1, 10.0, False, True),
-    "neither": (0.002, 0.1, False, False),
-}
-
-
-@pytest.mark.parametrize("case", CASES)
-def test_a_shift_must_be_certain_and_large_to_speak_against_least_squares(case: str) -> None:
-    blurred, noise, certain, large = CASES[case]
-    rng = np.random.default_rng(3)
-    blocks = tuple(
-        replace(
-            b,
-            X=b.X + blurred * rng.standard_normal(b.X.shape),
-            y=2 * b.X[:, 0] + noise * rng.standard_normal(len(b.y)),
-        )
-        for b in line(rng, 0.0)
-    )
-    p = Prepared("mechanical", ("M1",), 1, blocks)
-    fit, test = least_squares(blocks), hausman(blocks)
-    error = spread([pieces(fit)], fit.inverse)
-    (shift,) = shifts_of([p], {"mechanical": test}, {"mechanical": (fit.beta, error, fit)})
-    assert (shift.significant, shift.material) == (certain, large)
-    said = noise_statement([shift])
-    assert said.ok is not (certain and large)
-    for figure in (f"M1 by {100 * shift.relative:+.2g} %", f"({shift.t:.2g} of its standard err"):
-        assert figure in said.detail
-    assert ("too little to matter" in said.detail) is (certain and not large)
-    assert ("may be chance" in said.detail) is (large and not certain)
-    # Attenuation is 1/(1 + noise/signal); what is certain is in the interval.
-    if certain:
-        assert shift.relative == pytest.approx(-(blurred**2) / (0.5 + blurred**2), rel=0.3)
-        wide = including(error, certain_shift(test, p))
-        half = student.ppf(0.975, wide.dof[0]) * np.sqrt(wide.covariance[0, 0])
-        assert abs(fit.beta[0] - 2.0) < half
-
-
-def test_a_shift_nobody_would_notice_does_not_matter_however_narrow_the_interval() -> None:
-    assert not Shift("M2", -4e-5, 17.0, 3.0, True).material
-    assert Shift("M2", -1e-3, 17.0, 3.0, True).material
-    assert not Shift("M2", -1e-3, 17.0, 0.3, True).material
-    assert Shift("M2", -6e-3, 17.0, 0.3, True).material
-    assert not Shift("b", -6e-3, 17.0, 0.3, True).material
-    assert Shift("b", -3e-2, 17.0, 0.3, True).material
 
 
 def test_a_misfit_that_every_repeat_shares_widens_the_interval() -> None:

@@ -44,12 +44,12 @@ def test_the_models_own_data_are_estimated_without_bias_and_tables_say_it() -> N
     }  # fmt: skip
     off = {**row, "name": "M1", "bias": 0.006, "coverage": 1.0, "coverage_low": 0.981}
     data = {
-        "experiments": 2, "overall": 0.5, "used": {"ls": 2}, "minutes": 1.2,
+        "experiments": 2, "overall": 0.5, "used": {"ls": 2}, "seconds": 1.2,
         "parameters": {"b": row, "M1": off},
     }  # fmt: skip
     text = coverage_text(
         {"estimator": "auto", "noise": 1.0, "repeats": 4, "goal": [0.92, 0.98],
-         "seeds": [100, 101], "workers": 1, "kinds": {"model": data}}
+         "seeds": [100, 101], "kinds": {"model": data}}
     )  # fmt: skip
     assert "estimator auto (ls in 2)" in text
     assert "| b | 50.0 (10.0 to 90.0) | +1.0000" in text
@@ -61,8 +61,7 @@ def test_the_models_own_data_are_estimated_without_bias_and_tables_say_it() -> N
         "seconds": {"ls": 1.234, "iv": None},
     }  # fmt: skip
     shown = estimator_text(
-        {"kind": "plant", "experiments": 2, "seeds": [100, 101], "minutes": 3.0, "workers": 1,
-         "noise": [part]}
+        {"kind": "plant", "experiments": 2, "seeds": [100, 101], "noise": [part]}
     )  # fmt: skip
     assert "| b | +1.000 / 0.200 | — |" in shown
     assert "| processor's seconds, median | 1.2 | — |" in shown
