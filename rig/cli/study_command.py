@@ -62,7 +62,12 @@ def coverage(
     if docs is not None:
         for one in kinds:
             alone = {**found, "kinds": {one: found["kinds"][one]}}
-            replace_section(docs, f"study coverage {one}", coverage_text(alone))
+            made = (
+                f"bramah study coverage --kind {one} --experiments {experiments} --estimator "
+                f"{estimator} --noise {noise:g} --repeats {repeats} --first-seed {first} "
+                f"--docs {docs}"
+            )
+            replace_section(docs, f"study coverage {one}", _made(made, coverage_text(alone)))
     if json != Path("-"):
         typer.echo(coverage_text(found))
 
@@ -97,7 +102,11 @@ def estimators(
     found = estimator_study(every, levels, experiments, kind, workers, progress, first, keep)
     write_json(json, found)
     if docs is not None:
-        replace_section(docs, "study estimators", estimator_text(found))
+        made = (
+            f'bramah study estimators --kind {kind} --experiments {experiments} --noise "{noise}" '
+            f'--which "{which}" --first-seed {first} --docs {docs}'
+        )
+        replace_section(docs, "study estimators", _made(made, estimator_text(found)))
     if json != Path("-"):
         typer.echo(estimator_text(found))
 
@@ -122,6 +131,10 @@ def differentiation(
     write_json(json, data)
     if json != Path("-"):
         typer.echo(markdown(entries))
+
+
+def _made(command: str, table: str) -> str:
+    return f"```sh\n{command}\n```\n\n{table}"
 
 
 def _refuse_kind(kind: str, known: tuple[str, ...]) -> None:
