@@ -64,7 +64,7 @@ def noise_statement(shifts: Sequence[Shift]) -> Check:
         return Check(
             NOISE_CHECK, False,
             f"least squares is biased by noise in the regressors, {_figures(worst)}; so are "
-            f"{len(biased) - 1} others; --estimator auto, iv or output-error is not",
+            f"{len(biased) - 1} others; --estimator auto or iv is not",
         )  # fmt: skip
     if certain:
         worst = max(certain, key=lambda s: s.t)
