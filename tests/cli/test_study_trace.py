@@ -1,0 +1,85 @@
+"""A maintainer asks what the trace is worth: cases are drawn by seed, answers judged by a table."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+
+from hil_sim.scenario import parse_scenario
+from rig.cli import study_trace as st
+from rig.cli.study_trace_cases import NONE, OUTSIDE, PAIR, SINGLE, SINGLES, Case, cases
+from rig.cli.study_trace_text import text
+from rig.model.parse import InputError
+
+LEAK, SPRING = ("internal_leakage", "joint 2"), ("joint_spring", "joint 1")
+GAIN = ("sensor_gain", "joint 1 cap")
+
+
+def outcome(
+    kind: str, verdict: str, truth: tuple[tuple[str, str], ...] = (),
+    named: tuple[tuple[str, str], ...] = (), tied: tuple[tuple[str, str], ...] = (),
+    moves: str = "", depends_on: tuple[str, ...] = (), seed: int = 100,
+) -> st.Outcome:  # fmt: skip
+    case = Case(kind, "a case", "effects: []", truth, seed, (), moves)
+    return st.Outcome(
+        case, verdict, named, tied, (), 5.0, math.nan, 1.0, 0.01, 90.0, 99.0, depends_on, (), 3.0
+    )
+
+
+@pytest.mark.parametrize(
+    ("given", "judged"),
+    [
+        (outcome(NONE, "clean"), "right"),
+        (outcome(NONE, "explained", named=(LEAK,)), "false alarm"),
+        (outcome(NONE, "unexplained"), "abstained"),
+        (outcome(SINGLE, "explained", (LEAK,), (LEAK,)), "right"),
+        (outcome(SINGLE, "explained", (LEAK,), (SPRING,)), "wrong"),
+        (outcome(SINGLE, "explained", (LEAK,), (LEAK, SPRING)), "wrong"),
+        (outcome(SINGLE, "confounded", (LEAK,), (SPRING,), (LEAK,)), "in class"),
+        (outcome(SINGLE, "confounded", (LEAK,), (SPRING,), (GAIN,)), "wrong"),
+        (outcome(SINGLE, "unexplained", (LEAK,)), "abstained"),
+        (outcome(SINGLE, "clean", (LEAK,)), "quiet"),
+        (outcome(PAIR, "explained", (LEAK, SPRING), (LEAK,)), "partly"),
+        (outcome(PAIR, "explained", (LEAK, SPRING), (SPRING, LEAK)), "right"),
+        (outcome(OUTSIDE, "explained", named=(SPRING,), moves="piston"), "wrong"),
+        (outcome(OUTSIDE, "unexplained", moves="piston", depends_on=("piston_1",)), "right"),
+        (outcome(OUTSIDE, "unexplained", moves="piston", depends_on=("time",)), "no clue"),
+    ],
+)
+def test_an_answer_is_judged_by_what_was_hidden(given: st.Outcome, judged: str) -> None:
+    assert st.right(given) == judged
+    assert judged in text([given])
+
+
+def test_every_case_is_a_scenario_that_the_bench_reads_and_seeds_draw_it_again() -> None:
+    counts = {NONE: 2, SINGLE: 3, PAIR: 4, OUTSIDE: 4}
+    drawn = cases(counts, 100)
+    assert drawn == cases(counts, 100)
+    assert drawn != cases(counts, 200)
+    assert [c.seed for c in drawn] == list(range(100, 100 + len(drawn)))
+    assert len(drawn) == 2 + 3 * len(SINGLES) + 4 + 4
+    for case in drawn:
+        scenario = parse_scenario(case.scenario, case.label)
+        hidden = {one.name for one in scenario.effects}
+        if case.kind in (SINGLE, PAIR):
+            assert hidden == {name for name, _ in case.truth}
+        assert scenario.noise == case.noise
+    with pytest.raises(InputError, match="expected none, single, pair or outside"):
+        cases({"triple": 1}, 100)
+
+
+def test_a_study_that_was_ended_goes_on_from_what_it_kept(tmp_path: Path) -> None:
+    (case,) = cases({PAIR: 1}, 100)
+    kept = outcome(PAIR, "explained", case.truth, case.truth)
+    record = {**asdict(kept), "case": asdict(case)}
+    st._place(case, tmp_path).write_text(json.dumps(record), encoding="utf-8")
+    said: list[str] = []
+    (again,) = st.all_of([case], 1, said.append, tmp_path)
+    assert said == []  # nothing was simulated
+    assert again.case == case
+    assert again.named == case.truth
+    assert st.right(again) == "right"
