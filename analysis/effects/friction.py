@@ -67,6 +67,10 @@ class _Friction(Effect):
         """Return the presliding distance [m] (electric: in the joint's own unit)."""
         return (Shape(f"presliding_{self.joint + 1}", "m", *PRESLIDING_BOUNDS, PRESLIDING),)
 
+    def outside(self, rig: Rig, shape: Sequence[float]) -> str:
+        """Say which shape lies at its bounds; none is too short a way, which is Coulomb's law."""
+        return super().outside(rig, (*shape[:-1], max(shape[-1], PRESLIDING[0])))
+
     def tolerance(self, shape: Sequence[float]) -> float:
         """Return a fine one for the contact without memory: coarser, creep at rest is noise."""
         return self.rate_tolerance if len(shape) else 1e-3 * TRANSITION
@@ -201,7 +205,9 @@ class StribeckFriction(_Friction):
 class AsymmetricFriction(_Friction):
     """F_f = (F_ext [z > 0] + F_ret [z < 0]) z: seals that hold differently either way.
 
-    Source: Jelali and Kroll 2003 (different levels by direction of motion).
+    Source: Jelali and Kroll 2003 (different levels by direction of motion). On an electric joint
+    no lever tells it from `coulomb_friction` at (F_ext + F_ret)/2 with a `torque_offset` of
+    (F_ext - F_ret)/2: wherever it slides the two are the same, and the trace names those.
     """
 
     name: ClassVar[str] = "asymmetric_friction"
@@ -218,6 +224,11 @@ class AsymmetricFriction(_Friction):
 
     def _names(self) -> tuple[str, str]:
         return f"F_ext_{self.joint + 1}", f"F_ret_{self.joint + 1}"
+
+    @classmethod
+    def places(cls, rig: Rig) -> tuple[str, ...]:
+        """Return the hydraulic joints: on an electric one it is two simpler effects."""
+        return () if getattr(rig, "electric", False) else super().places(rig)
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return F_ext, F_ret [N]."""

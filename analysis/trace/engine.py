@@ -85,13 +85,17 @@ def trace(
         moves = [] if verdict in (CLEAN, EXPLAINED) else _moves(stage, judge, winner)
     after = _extended(runs, terms, winner, before)
     error = held_out.errors(rig, judged, before, after, judge)
-    fits = held_out.fits(rig, holdout, before, after)
+    runs_before, runs_after = held_out.free_runs(holdout, before, after)
     result = Trace(
-        verdict, found, error.noise, error.before, error.after, fits[0], fits[1], before, after,
+        verdict, found, error.noise, error.before, error.after,
+        runs_before.fit, runs_after.fit, before, after,
         _fraction(listed, winner), tuple(moves), _next(verdict, found, rig), stage.floors,
         tuple(notes), refused=refused, seconds=time.perf_counter() - started,
     )  # fmt: skip
-    return replace(result, sentence=sentence(result))
+    return replace(
+        result, sentence=sentence(result), size=held_out.sizes(rig, judged, listed.empty.fit),
+        rmse_before=runs_before.rmse, rmse_after=runs_after.rmse,
+    )  # fmt: skip
 
 
 def _refuse_same(runs: Sequence[Run], holdout: Sequence[Run]) -> None:

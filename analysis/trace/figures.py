@@ -21,8 +21,9 @@ from analysis.trace.clues import binned, variables
 from analysis.trace.evidence import Scene, filtered, prepared, residual, scene_rows, scenes
 from analysis.trace.held_out import row_coefficients
 from analysis.trace.result import Trace
-from analysis.trace.words import UNITS, loudest
-from rig.model.channels import kind_of, unit_of
+from analysis.trace.words import loudest
+from rig.model import channels as ch
+from rig.model.channels import kind_of
 from rig.model.records import Run
 from rig.model.rig import Rig
 
@@ -78,7 +79,7 @@ def abscissae(
             seen = prepared(rig, model.terms, line.scene)
             raw = effect.abscissa(rig, seen)[equation]
         else:
-            raw = variables(line.scene.signals, joint)[variable]
+            raw = variables(rig, line.scene.signals, joint)[variable]
         out.append(filtered({"x": np.asarray(raw)}, line.scene, line.rows)["x"])
     return np.concatenate(out)
 
@@ -154,15 +155,15 @@ def over_noise(result: Trace) -> Markup:
         return svg(made, "overnoise", "Held-out error over the noise floor, before and after")
 
 
-def unit_of_variable(name: str) -> str:
+def unit_of_variable(rig: Rig, name: str) -> str:
     """Return a variable's SI unit for an axis."""
-    try:
-        return unit_of(name)
-    except ValueError:
-        stem = name.rsplit("_", 1)[0]
-        return {
-            "velocity": "m/s", "acceleration": "m/s²", "pressure_difference": "Pa", "time": "s",
-        }.get(stem, "")  # fmt: skip
+    stem = name.rsplit("_", 1)[0]
+    way = rig.unit_of(ch.channel(rig.position_kind, 1))
+    made = {
+        "velocity": f"{way}/s", "acceleration": f"{way}/s²", "pressure_difference": "Pa",
+        "time": "s",
+    }  # fmt: skip
+    return made[stem] if stem in made else rig.unit_of(name)
 
 
 def equation_of(
@@ -176,12 +177,7 @@ def equation_of(
     return max(own, key=lambda e: result.before[e] / max(result.noise_floor[e], 1e-30))
 
 
-def unit_of_equation(equation: str) -> str:
-    """Return the unit of an equation's residual."""
-    return UNITS.get(equation.rsplit("_", 1)[0], "")
-
-
 __all__ = [
     "Lines", "abscissae", "against", "equation_of", "held_out", "in_time", "kind_of",
-    "over_noise", "unit_of_equation", "unit_of_variable",
+    "over_noise", "unit_of_variable",
 ]  # fmt: skip

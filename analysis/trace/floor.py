@@ -107,21 +107,29 @@ def repeats_of(
 
 
 def _periods(scene: Scene, rows: Rows, left: Array) -> Array | None:
-    """Cut a record's residual into whole periods of at least ten rows; None where there are < 3."""
+    """Cut a record's residual into whole periods, one under the other.
+
+    Of a record of less than three, what the first two have in common, if that is a quarter of a
+    period or more; None where there is less than that, or periods of fewer than five rows.
+    """
     period, step = scene.record.period, scene.filtering.step
     if not period or period % step:
         return None
     per = period // step
     index = np.rint((rows.time - rows.time[0]) * scene.record.sample_rate / step).astype(int)
     whole = (int(index[-1]) + 1) // per
-    if per < 5 or whole < 3:
+    if whole < 3:
+        least, whole = max(5, per // 4), 2
+    else:
+        least = 5
+    if per < 5:
         return None
     grid = np.full(whole * per, np.nan)
     inside = index < whole * per
     grid[index[inside]] = left[inside]
     table = grid.reshape(whole, per)
     table = table[:, np.isfinite(table).all(axis=0)]
-    return table if table.shape[1] >= 5 else None
+    return table if table.shape[1] >= least else None
 
 
 def stated_noise(

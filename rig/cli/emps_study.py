@@ -36,9 +36,8 @@ Array = NDArray[np.float64]
 PUBLISHED: Final = {"M1": 95.1089, "Fv1": 203.5034, "Fc1": 20.3935, "offset1": -3.1648}
 KP, KV = 160.18, 243.45  # [1/s], [V s/m] of the machine's own controller
 HALF = 12.42  # [s]
-CYCLE, CYCLES = 6.21, 4  # [s] the reference comes back
-LENGTH = 24.84  # [s]
-MARGIN = 0.1  # [s] beside a cycle, which the filters' edges take
+PERIOD = 6240  # samples after which the reference comes back
+CYCLE, LENGTH = 6.24, 24.84  # [s]
 COLUMNS: Final = """columns:
   time: {column: t}
   position_1: {column: qm}
@@ -64,22 +63,26 @@ class Emps:
     reference: Array
 
 
-def load(file: Path) -> Emps:
-    """Import the MAT file as a whole, in halves and by cycle; raises InputError."""
+def load(file: Path, period: int = 0) -> Emps:
+    """Import the MAT file as a whole, in halves and by cycle; raises InputError.
+
+    With a `period` [samples] the trace tells noise from what comes back.
+    """
     parts = {"whole": "", "first": f", end: {HALF} s", "second": f", begin: {HALF} s"}
-    for k in range(CYCLES):
-        begin, end = max(0.0, k * CYCLE - MARGIN), min((k + 1) * CYCLE + MARGIN, LENGTH)
-        parts[f"cycle {k + 1}"] = f", begin: {begin:.3f} s, end: {end:.3f} s"
+    cycles = [f"cycle {k + 1}" for k in range(round(LENGTH / CYCLE))]
+    for k, name in enumerate(cycles):
+        end = min((k + 1) * CYCLE, LENGTH)
+        parts[name] = f", begin: {k * CYCLE:.2f} s, end: {end:.2f} s"
     runs = {}
     with tempfile.TemporaryDirectory() as scratch:
         for name, part in parts.items():
             manifest = Path(scratch) / f"{name}.yaml"
-            entry = f"records:\n  - {{file: {str(file.resolve())!r}, step: {name}{part}}}\n"
+            entry = f"records:\n  - {{file: {str(file.resolve())!r}, step: {name}{part}, period: {period}}}\n"
             manifest.write_text(f"rig: emps\n{entry}{COLUMNS}")
             runs[name] = load_run(import_records(manifest, Path(scratch) / name).path)
-    cycles = tuple(runs[f"cycle {k + 1}"] for k in range(CYCLES))
     reference = read_table(file, ["qg"], ["qg"])["qg"]
-    return Emps(runs["whole"], runs["first"], runs["second"], cycles, reference)
+    each = tuple(runs[name] for name in cycles)
+    return Emps(runs["whole"], runs["first"], runs["second"], each, reference)
 
 
 def fit(

@@ -1,14 +1,15 @@
 """A carriage on a screw under its own position loop: what an electric joint's record looks like.
 
-M q'' = gain v - Fv q' - friction - offset by half-implicit steps of 0.1 ms, dry friction that holds
-(Karnopp) and that may fall with speed; nothing of it is shared with the analysis.
+M q'' = gain v - Fv q' - friction - offset by half-implicit steps of 0.1 ms, dry friction of bristles
+that bend and slip (LuGre) and that may fall with speed; nothing of it is shared with the analysis.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
+from numba import njit
 
 from rig.model.electric import drive_gains
 from rig.model.records import Record
@@ -16,6 +17,7 @@ from rig.model.rig import Rig
 
 KP, KV = 160.0, 240.0  # [1/s], [V s/m]
 FINE = 10  # steps a sample
+STIFFNESS, DAMPING = 1e6, 1e3  # [N/m], [N s/m] of the bristles
 
 
 @dataclass(frozen=True)
@@ -36,24 +38,36 @@ def moves(rate: float, seconds: float, amplitude: float, wave: float) -> np.ndar
     return 0.12 + amplitude * (swing - swing[0]) * np.clip(t, 0.0, 1.0)
 
 
+@njit(cache=True)
+def _run(reference, h, gain, par, q, v):  # type: ignore[no-untyped-def]
+    mass, viscous, dry, offset, breakaway = par
+    n = len(reference)
+    position, drive = np.empty(n), np.empty(n)
+    bend = 0.0
+    for k in range(n):
+        ahead = reference[min(k + 1, n - 1)] - reference[k]
+        for fine in range(FINE):
+            wanted = reference[k] + ahead * fine / FINE
+            u = min(max(KV * (KP * (wanted - q) - v), -10.0), 10.0)
+            if fine == 0:
+                position[k], drive[k] = q, u
+            level = dry + breakaway * np.exp(-((v / 0.02) ** 2))
+            bend_rate = v - abs(v) * bend * STIFFNESS / max(level, 1e-9)
+            friction = (STIFFNESS * bend + DAMPING * bend_rate) if level > 0 else 0.0
+            bend += h * bend_rate
+            v += h * (gain * u - offset - viscous * v - friction) / mass
+            q += h * v
+    return position, drive
+
+
 def record(
     rig: Rig, carriage: Carriage, reference: np.ndarray, rng: np.random.Generator, step: str,
     repeat: int = 1,
 ) -> Record:  # fmt: skip
     """Run it and measure with the rig's stated noise."""
     n, rate, gain = len(reference), rig.sample_rate, drive_gains(rig)[0]
-    h = 1.0 / (rate * FINE)
-    position, drive = np.empty(n), np.empty(n)
-    q, v = float(reference[0]), 0.0
-    for k in range(n):
-        u = float(np.clip(KV * (KP * (reference[k] - q) - v), -10.0, 10.0))
-        position[k], drive[k] = q, u
-        for _ in range(FINE):
-            level = carriage.dry + carriage.breakaway * np.exp(-((v / 0.02) ** 2))
-            free = v + h * (gain * u - carriage.offset - carriage.viscous * v) / carriage.mass
-            slowed = abs(free) - h * level / carriage.mass
-            v = float(np.sign(free)) * slowed if slowed > 0 else 0.0
-            q += h * v
+    par = np.array(astuple(carriage))
+    position, drive = _run(reference, 1.0 / (rate * FINE), gain, par, float(reference[0]), 0.0)
     noise = rig.sensors.position.noise, rig.sensors.drive.noise
     channels = {
         "position_1": position + noise[0] * rng.standard_normal(n),

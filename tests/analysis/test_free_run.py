@@ -49,7 +49,7 @@ def test_it_runs_nearer_than_least_squares_where_the_model_lacks_something(
     assert free.model.provenance["estimator"] == "output-error"
 
 
-def test_with_an_exact_model_it_finds_the_truth_within_its_intervals() -> None:
+def test_it_finds_the_truth_where_only_the_reversals_are_finer_than_the_model() -> None:
     rig, rng = load_rig("emps"), np.random.default_rng(4)
     truth = {"M1": 95.0, "Fv1": 200.0, "Fc1": 20.0, "offset1": -3.0}
     records = tuple(
@@ -58,7 +58,7 @@ def test_with_an_exact_model_it_finds_the_truth_within_its_intervals() -> None:
     )
     found = fitted(Run(rig, records), "output-error")
     for name, value in truth.items():
-        assert found.estimates[name].value == pytest.approx(value, rel=0.02), name
+        assert found.estimates[name].value == pytest.approx(value, rel=0.04), name
         assert found.estimates[name].std > 0
 
 
