@@ -77,8 +77,8 @@ def load(file: Path, period: int = 0) -> Emps:
     with tempfile.TemporaryDirectory() as scratch:
         for name, part in parts.items():
             manifest = Path(scratch) / f"{name}.yaml"
-            entry = f"records:\n  - {{file: {str(file.resolve())!r}, step: {name}{part}, period: {period}}}\n"
-            manifest.write_text(f"rig: emps\n{entry}{COLUMNS}")
+            entry = f"file: {str(file.resolve())!r}, step: {name}{part}, period: {period}"
+            manifest.write_text(f"rig: emps\nrecords:\n  - {{{entry}}}\n{COLUMNS}")
             runs[name] = load_run(import_records(manifest, Path(scratch) / name).path)
     reference = read_table(file, ["qg"], ["qg"])["qg"]
     each = tuple(runs[name] for name in cycles)

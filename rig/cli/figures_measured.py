@@ -24,7 +24,7 @@ def data_folder() -> Path:
 
 def measured_figures(_: Path, say: Say) -> list[Figure]:
     """Measure what the models do on machines that others have recorded."""
-    return emps_figures(say)
+    return [*emps_figures(say), *pendulum_figures(say)]
 
 
 def emps_figures(say: Say) -> list[Figure]:
@@ -43,3 +43,16 @@ def emps_figures(say: Say) -> list[Figure]:
         for name, error in zip(("1st half on 2nd", "2nd half on 1st"), errors, strict=True):
             out.append(Figure(GROUP, f"EMPS, {estimator}, {name}", 1e3 * error, "mm", limit))
     return out
+
+
+def pendulum_figures(say: Say) -> list[Figure]:
+    """Fit the double pendulum and compare its error on new segments with the authors'."""
+    from rig.cli import pendulum as study
+
+    folder = data_folder() / "multiarm_pendulum"
+    if not folder.is_dir():
+        say(f"measured: no {folder}, left out")
+        return []
+    found = study.compare(study.read_pendulum(folder), say)
+    name = "pendulum, error on new segments over the authors', largest"
+    return [Figure(GROUP, name, found.over_authors(), "", 1.0)]

@@ -1,7 +1,7 @@
 """A carriage on a screw under its own position loop: what an electric joint's record looks like.
 
-M q'' = gain v - Fv q' - friction - offset by half-implicit steps of 0.1 ms, dry friction of bristles
-that bend and slip (LuGre) and that may fall with speed; nothing of it is shared with the analysis.
+M q'' = gain v - Fv q' - friction - offset by half-implicit steps of 0.1 ms, dry friction of
+bristles that bend and slip (LuGre) and may fall with speed; nothing of it is the analysis' own.
 """
 
 from __future__ import annotations
