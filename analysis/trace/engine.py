@@ -17,7 +17,7 @@ from analysis.effects.base import Effect, ordered
 from analysis.identify import identify
 from analysis.model import Model
 from analysis.terms import baseline_of, known
-from analysis.terms.base import Used
+from analysis.terms.base import FAMILIES, Used
 from analysis.trace import clues, gates, held_out
 from analysis.trace.board import Board, board
 from analysis.trace.candidates import catalogue, variants
@@ -51,11 +51,14 @@ def trace(
     holdout: Sequence[Run],
     effects: Sequence[Effect] | None = None,
     seed: int = 0,
+    families: Sequence[str] = tuple(FAMILIES),
 ) -> Trace:
     """Say what the baseline lacks on `runs`, name it or refuse to, and judge it on `holdout`.
 
     `effects` are the candidates, by default the whole catalogue at every place. `seed` draws the
-    half-samples and sign flips. Raises InputError for records of different rigs, without held-out
+    half-samples and sign flips; `families` are the equations looked at, mechanical or fluid (they
+    share no parameter, so that what stays unexplained in one need not hide the other). Raises
+    InputError for records of different rigs, without held-out
     records, with held-out records that are training records, or too short to tell anything.
     """
     started = time.perf_counter()
@@ -63,7 +66,8 @@ def trace(
     _refuse_same(runs, holdout)
     rng = np.random.default_rng(seed)
     terms = tuple(map(Used, baseline_of(rig)))
-    train, judged = scenes(rig, runs), scenes(rig, holdout)
+    train = scenes(rig, runs, families=tuple(families))
+    judged = scenes(rig, holdout, families=tuple(families))
     stage = board(rig, terms, train)
     _refuse_short(stage, train)
     judge = board(rig, terms, judged, stage.beta)

@@ -17,6 +17,7 @@ from analysis.effects.base import Effect
 from analysis.model import Model
 from analysis.plots import BLUE, CARD, GREY, INK, MODEL, PALE, figure, gapped, note, style, svg
 from analysis.rows import Rows
+from analysis.terms.base import family_of
 from analysis.trace.clues import binned, variables
 from analysis.trace.evidence import Scene, filtered, prepared, residual, scene_rows, scenes
 from analysis.trace.held_out import row_coefficients
@@ -46,7 +47,8 @@ class Lines:
 def held_out(rig: Rig, holdout: Sequence[Run], result: Trace) -> dict[str, list[Lines]]:
     """Return, by equation, every held-out record's residual under both models."""
     out: dict[str, list[Lines]] = {}
-    for scene in scenes(rig, holdout):
+    families = tuple({family_of(e): None for e in result.before})
+    for scene in scenes(rig, holdout, families=families):
         before = _left(rig, scene, result.model_before)
         after = _left(rig, scene, result.model_after)
         for name, (rows, r) in before.items():

@@ -10,7 +10,7 @@ stands in: that sees no noise that the rig file does not state, and is said to b
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -144,7 +144,7 @@ def stated_noise(
     record = disturbed(rig, scene.record, rng)
     moving = moving_joints(rig, scene.record)
     signals = condition(rig, record, scene.filtering.channels, moving)
-    again = scene_rows(rig, terms, Scene(scene.run, record, signals, scene.filtering))
+    again = scene_rows(rig, terms, replace(scene, record=record, signals=signals))
     out = {}
     for name, before in rows.items():
         _, a, b = np.intersect1d(before.time, again[name].time, return_indices=True)

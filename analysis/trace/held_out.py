@@ -69,6 +69,15 @@ def errors(rig: Rig, members: Sequence[Scene], before: Model, after: Model, judg
     )
 
 
+def rms_of(judge: Board, model: Fit) -> dict[str, float]:
+    """Return the rms of every equation's held-out residual, SI, repeats averaged."""
+    rest = left(judge, model)
+    found: dict[str, list[Array]] = {}
+    for s in judge.segments:
+        found.setdefault(s.equation, []).append(rest[s.where] * s.noise / np.sqrt(s.repeats))
+    return {e: _rms(parts) for e, parts in sorted(found.items())}
+
+
 def sizes(rig: Rig, members: Sequence[Scene], model: Fit) -> dict[str, float]:
     """Return the rms of every equation's right side (torque, force or flow), SI."""
     found: dict[str, list[Array]] = {}

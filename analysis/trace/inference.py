@@ -19,6 +19,7 @@ from analysis.effects.base import Effect
 from analysis.terms.base import Used
 from analysis.trace import select
 from analysis.trace.board import Board
+from analysis.trace.floor import STATED
 from analysis.trace.refine import Fit, jacobian, shapes_of, table
 from analysis.trace.select import FORM, Field, orthonormal
 from analysis.trace.shortlist import Listed, Shortlist, excess_of
@@ -32,6 +33,7 @@ HALVES = 40
 ABOUT_TWO = 1.9  # periods that a record must hold to be halved by them: the last may be cut short
 TOLERANCE = 0.2  # relative disagreement that a catalogue's simpler form may cause
 DEVIATIONS = 3.5
+EDGE = 1e-3  # of its range: a shape nearer to its bound is at it
 POWER = 0.25  # a subset judges a parameter that it knows this well, relative
 
 
@@ -103,9 +105,20 @@ class Linear:
 
 
 def linear(stage: Board, one: Listed) -> Linear:
-    """Return the tangent of a set: columns of all coefficients and derivatives by the shapes."""
+    """Return the tangent of a set: columns of all coefficients and derivatives by the shapes.
+
+    A shape that lies at a bound cannot move freely, and counts as fixed.
+    """
     rows = table(stage, one.fit.terms)
-    extra = [jacobian(stage, one.fit, u)[1] for u in one.effects]
+    extra = []
+    for u in one.effects:
+        names, J = jacobian(stage, one.fit, u)
+        fixed = {
+            s.parameter
+            for s, v in zip(shapes_of(stage.rig, u), u.shape, strict=True)
+            if not s.low + EDGE * (s.high - s.low) < v < s.high - EDGE * (s.high - s.low)
+        }
+        extra.append(J[:, [k for k, n in enumerate(names) if n in rows.names or n not in fixed]])
     return Linear(one, orthonormal(np.column_stack([rows.matrix, *extra])), one.fit.left)
 
 
@@ -251,6 +264,25 @@ def subsets(stage: Board, joint: int | None) -> dict[str, Array]:
     return out
 
 
+def _unmeasured(stage: Board) -> NDArray[np.int64] | None:
+    """Return the block of every row (M,) where some floor is the stated noise alone, else None.
+
+    Then nobody has measured the noise, and what is left has to stand for it, block by block.
+    """
+    if all(floor.source != STATED for floor in stage.floors):
+        return None
+    numbers = blocks(stage)
+    for k, s in enumerate(stage.segments):
+        numbers[s.where] += (int(numbers.max()) + 1) * k
+    return numbers
+
+
+def _clustered(own: Array, left: Array, clusters: NDArray[np.int64]) -> float:
+    """Return the root of the sum over blocks of (own . left)^2."""
+    _, index = np.unique(clusters, return_inverse=True)
+    return float(np.linalg.norm(np.bincount(index, weights=own * left)))
+
+
 def _larger(model: Fit, stage: Board, used: Used, mask: Array) -> float:
     """Return the energy that the largest other effect has on a subset, 0 if none is larger.
 
@@ -284,6 +316,7 @@ def invariance(
     nothing = {s.parameter: s.neutral or 0.0 for s in shapes_of(stage.rig, used)}
     neutral = np.array([nothing.get(n, 0.0) for n in names])
     out = []
+    clusters = _unmeasured(stage)
     for label, mask in subsets(stage, joint).items():
         if not mask.any():
             continue
@@ -304,6 +337,9 @@ def invariance(
                 continue
             shift = float(own @ left[mask]) / size
             error = 1.0 / np.sqrt(size)
+            if clusters is not None:
+                rest_of = left[mask] - B @ (B.T @ left[mask]) - own * shift
+                error = max(error, _clustered(own, rest_of, clusters[mask]) / size)
             spill = np.sqrt(FORM * _larger(model, stage, used, mask) / size)
             # Two levels of one effect are judged by the larger: 2 N beside 100 N is a detail.
             alike = [j for j, n in enumerate(names) if n in sizes and units[n] == units[name]]
