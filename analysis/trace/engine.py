@@ -19,6 +19,7 @@ from analysis.model import Model
 from analysis.terms import baseline_of, known
 from analysis.terms.base import FAMILIES, Used
 from analysis.trace import clues, gates, held_out
+from analysis.trace.beside import beside, stripped
 from analysis.trace.board import Board, board
 from analysis.trace.candidates import catalogue, variants
 from analysis.trace.evidence import Scene, scenes
@@ -66,6 +67,7 @@ def trace(
     _refuse_same(runs, holdout)
     rng = np.random.default_rng(seed)
     terms = tuple(map(Used, baseline_of(rig)))
+    terms = (*terms, *beside(terms, [*runs, *holdout]))
     train = scenes(rig, runs, families=tuple(families))
     judged = scenes(rig, holdout, families=tuple(families))
     stage = board(rig, terms, train)
@@ -73,7 +75,7 @@ def trace(
     judge = board(rig, terms, judged, stage.beta)
     candidates = catalogue(rig) if effects is None else list(effects)
     listed = Shortlist(stage, variants(rig, candidates))
-    before = identify(runs, estimator=PLAIN).model
+    before = stripped(identify(runs, terms=terms, estimator=PLAIN).model)
     notes = _notes(stage, judge)
     if within(listed.empty.excess, listed.limits):
         found: tuple[Found, ...] = ()
@@ -88,13 +90,14 @@ def trace(
             notes += gates.remaining(listed, winner, judge)
         moves = [] if verdict in (CLEAN, EXPLAINED) else _moves(stage, judge, winner)
     after = _extended(runs, terms, winner, before)
-    error = held_out.errors(rig, judged, before, after, judge)
+    error = held_out.errors(rig, judged, listed.empty.fit, winner.fit)
     runs_before, runs_after = held_out.free_runs(holdout, before, after)
     result = Trace(
         verdict, found, error.noise, error.before, error.after,
         runs_before.fit, runs_after.fit, before, after,
         _fraction(listed, winner), tuple(moves), _next(verdict, found, rig), stage.floors,
-        tuple(notes), refused=refused, seconds=time.perf_counter() - started,
+        listed.empty.fit, winner.fit, tuple(notes), refused=refused,
+        seconds=time.perf_counter() - started,
     )  # fmt: skip
     return replace(
         result, sentence=sentence(result), size=held_out.sizes(rig, judged, listed.empty.fit),
@@ -208,7 +211,7 @@ def _extended(runs: Sequence[Run], terms: Sequence[Used], winner: Listed, before
     """Identify everything again together with the effects."""
     if not winner.effects:
         return before
-    return identify(runs, terms=ordered((*terms, *winner.effects)), estimator=PLAIN).model
+    return stripped(identify(runs, terms=ordered((*terms, *winner.effects)), estimator=PLAIN).model)
 
 
 def _next(verdict: str, found: Sequence[Found], rig: Rig) -> Mapping[str, Any] | None:

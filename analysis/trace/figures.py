@@ -20,7 +20,7 @@ from analysis.rows import Rows
 from analysis.terms.base import family_of
 from analysis.trace.clues import binned, variables
 from analysis.trace.evidence import Scene, filtered, prepared, residual, scene_rows, scenes
-from analysis.trace.held_out import row_coefficients
+from analysis.trace.refine import Fit
 from analysis.trace.result import Trace
 from analysis.trace.words import loudest
 from rig.model import channels as ch
@@ -49,8 +49,8 @@ def held_out(rig: Rig, holdout: Sequence[Run], result: Trace) -> dict[str, list[
     out: dict[str, list[Lines]] = {}
     families = tuple({family_of(e): None for e in result.before})
     for scene in scenes(rig, holdout, families=families):
-        before = _left(rig, scene, result.model_before)
-        after = _left(rig, scene, result.model_after)
+        before = _left(rig, scene, result.rows_before)
+        after = _left(rig, scene, result.rows_after)
         for name, (rows, r) in before.items():
             later, q = after[name]
             _, here, there = np.intersect1d(rows.time, later.time, return_indices=True)
@@ -59,10 +59,9 @@ def held_out(rig: Rig, holdout: Sequence[Run], result: Trace) -> dict[str, list[
     return out
 
 
-def _left(rig: Rig, scene: Scene, model: Model) -> dict[str, tuple[Rows, Array]]:
-    beta = row_coefficients(model)
+def _left(rig: Rig, scene: Scene, model: Fit) -> dict[str, tuple[Rows, Array]]:
     built = scene_rows(rig, model.terms, scene)
-    return {name: (rows, residual(rows, beta)) for name, rows in built.items()}
+    return {name: (rows, residual(rows, model.beta)) for name, rows in built.items()}
 
 
 def abscissae(

@@ -34,6 +34,7 @@ ABOUT_TWO = 1.9  # periods that a record must hold to be halved by them: the las
 TOLERANCE = 0.2  # relative disagreement that a catalogue's simpler form may cause
 DEVIATIONS = 3.5
 EDGE = 1e-3  # of its range: a shape nearer to its bound is at it
+TELLS = 0.05  # of a column's energy off the others': a subset with less says nothing of a size
 POWER = 0.25  # a subset judges a parameter that it knows this well, relative
 
 
@@ -301,6 +302,15 @@ def _larger(model: Fit, stage: Board, used: Used, mask: Array) -> float:
     return most if most > mine else 0.0
 
 
+def _alone(columns: Array, k: int) -> Array:
+    """Return column k (m,) without what the others say."""
+    rest, own = np.delete(columns, k, axis=1), columns[:, k]
+    if not rest.shape[1]:
+        return own
+    Q = orthonormal(rest)
+    return np.asarray(own - Q @ (Q.T @ own))
+
+
 def invariance(
     stage: Board, model: Fit, used: Used, value: Spread, joint: int | None
 ) -> list[tuple[str, str, float, float]]:
@@ -317,6 +327,8 @@ def invariance(
     neutral = np.array([nothing.get(n, 0.0) for n in names])
     out = []
     clusters = _unmeasured(stage)
+    J_all = J - base @ (base.T @ J)
+    whole = [float(np.sum(_alone(J_all, k) ** 2)) for k in range(len(names))]
     for label, mask in subsets(stage, joint).items():
         if not mask.any():
             continue
@@ -327,13 +339,10 @@ def invariance(
                 continue
             if np.linalg.norm(J_s[:, k]) < 0.1 * np.linalg.norm(J[mask][:, k]):
                 continue
-            rest = np.delete(J_s, k, axis=1)
-            own = J_s[:, k]
-            if rest.shape[1]:
-                Q = orthonormal(rest)
-                own = own - Q @ (Q.T @ own)
+            own = _alone(J_s, k)
             size = float(own @ own)
-            if size <= 0 or not np.isfinite(value.value[k]):
+            # What hardly acts there tells its form's tail, not its size.
+            if size < TELLS * whole[k] or size <= 0 or not np.isfinite(value.value[k]):
                 continue
             shift = float(own @ left[mask]) / size
             error = 1.0 / np.sqrt(size)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from analysis.effects.friction import AsymmetricFriction
+from analysis.effects.friction_levels import AsymmetricFriction
 from analysis.trace.candidates import catalogue
 from analysis.trace.engine import trace
 from analysis.trace.result import CLEAN, EXPLAINED, Trace, to_json
