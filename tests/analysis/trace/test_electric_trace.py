@@ -112,3 +112,17 @@ def test_on_the_measured_carriage_both_are_found(train: str, judge: str) -> None
     assert result.after["torque_1"] <= 0.05 * result.size["torque_1"]
     assert result.rmse_before["position_1"] > 35e-3
     assert result.rmse_after["position_1"] <= 8.5e-3
+
+
+def test_an_electric_rigs_identification_has_its_report(
+    two_hidden: tuple[Run, Run], tmp_path: Path
+) -> None:
+    run, page = str(write_run(tmp_path / "a", two_hidden[0])), tmp_path / "found.html"
+    words = ["identify", run, "--with", "coulomb_friction", "--with", "torque_offset"]
+    done = CliRunner().invoke(app, [*words, "--report", str(page)])
+    assert done.exit_code == 0, done.output
+    text = page.read_text()
+    assert "1 electric joint" in text
+    assert "35.1506 N/V" in text
+    assert "Drive and position of joint 1 in time" in text
+    assert "hydraulic joint" not in text
