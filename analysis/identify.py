@@ -105,6 +105,11 @@ def identify(
         return identify_by(method, runs, used, filtering, reject_noise, rng, search)
 
     def refined(solutions: Mapping[str, Solution]) -> Refined:
+        if rig.electric:
+            from analysis.estimators.free_run import free_run_fit  # noqa: PLC0415 - compiles
+
+            found, check = free_run_fit(rig, runs, used, solutions)
+            return Refined(found, (check,), estimator)
         job = Job(
             rig, runs, used, lambda extra: build_rows(rig, runs, (*used, *extra), filtering),
             estimator, bootstrap, rng or np.random.default_rng(0),
@@ -173,10 +178,13 @@ def _refuse_estimator(estimator: str, bootstrap: int) -> None:
 def _fitting_estimator(rig: Rig, used: Sequence[Used], estimator: str, bootstrap: int) -> str:
     """Return the estimator for a model: what refines the fluid's rows has none on electric rigs.
 
-    Nor are the others for parameters that are not linear in the rows (`Term.reduction`).
+    Those have plain least squares and output error. None but the plain one is for parameters that
+    are not linear in the rows (`Term.reduction`).
     """
     reducing = [one.term.name for one in used if one.term.reduction(rig) is not None]
     if estimator == PLAIN or not (rig.electric or reducing):
+        return estimator
+    if estimator == "output-error" and not reducing and not bootstrap:
         return estimator
     if estimator not in ("ls", "auto") or bootstrap:
         asked = "--bootstrap" if estimator in ("ls", "auto") else f"--estimator {estimator}"
@@ -185,7 +193,8 @@ def _fitting_estimator(rig: Rig, used: Sequence[Used], estimator: str, bootstrap
             if rig.electric
             else f"does not go with {' '.join(reducing)}, not linear in the rows"
         )
-        raise InputError(f"{asked} {why}: take ls without a bootstrap")
+        also = " or output-error" if rig.electric and not reducing else ""
+        raise InputError(f"{asked} {why}: take ls{also} without a bootstrap")
     return PLAIN
 
 

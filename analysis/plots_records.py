@@ -36,6 +36,7 @@ from rig.model.rig import Rig
 Array = NDArray[np.float64]
 
 SHOWN_SECONDS = 10.0
+ELECTRIC_SECONDS = 15.0  # an electric joint moves slowly
 SPAN = 500.0  # of a residual spectrum, largest over smallest
 FEWEST_LINES = 10  # of the period's multiples that a spectrum shows: a sine's harmonics too
 
@@ -92,6 +93,22 @@ def excitation(rig: Rig, record: Record, joint: int, key: str) -> Markup:
             note(top, 0.005, 0.99, "command", BLUE, ha="left")
         _spectrum(low, record, spool)
         return svg(made, key, f"Excitation of joint {joint} in time and frequency")
+
+
+def electric_excitation(rig: Rig, record: Record, joint: int, key: str) -> Markup:
+    """Draw drive and position of one electric joint in time."""
+    shown = slice(0, int(min(record.samples, ELECTRIC_SECONDS * record.sample_rate)))
+    with style():
+        made = figure(3.7)
+        for place, kind in enumerate((ch.DRIVE, ch.POSITION)):
+            axes = made.add_axes((0.15, 0.60 - 0.485 * place, 0.82, 0.33))
+            name = ch.channel(kind, joint)
+            x = bridged(np.asarray(record.channels[name]))
+            axes.plot(*thin(record.time[shown], x[shown]), color=INK, linewidth=0.7)
+            axes.margins(x=0, y=0.12)
+            axes.set_ylabel(f"{kind} [{rig.unit_of(name)}]")
+            axes.set_xlabel("time [s]", labelpad=1)
+        return svg(made, key, f"Drive and position of joint {joint} in time")
 
 
 def _spectrum(axes: Any, record: Record, spool: Array) -> None:

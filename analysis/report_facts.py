@@ -138,12 +138,13 @@ def sentences(
     """Say in plain sentences what was done and with what result."""
     records = records_of(runs)
     joints = len(rig.joints)
-    expected = parameter_names(joints)
+    expected = tuple(identification.estimates) if rig.electric else parameter_names(joints)
+    kind = "electric joint" if rig.electric else "hydraulic joint"
     found = [e for n, e in identification.estimates.items() if e.identified and n in expected]
     steps = len({(i, r.step) for i, run in enumerate(runs) for r in run.records})
     bench = "the simulated bench" if simulated else "the rig"
     first = (
-        f"On {bench} {rig.name} ({fm.count(joints, 'hydraulic joint')}), "
+        f"On {bench} {rig.name} ({fm.count(joints, kind)}), "
         f"{fm.count(len(records), 'record')} of {fm.count(steps, 'step')} were taken, "
         f"{minutes(duration(records))} of data; one {identification.method} least-squares solve "
         f"gives {len(found)} of the {len(expected)} parameters of the model."

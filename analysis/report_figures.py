@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,8 +62,10 @@ def parameters(
     return Gallery(tuple(found))
 
 
-def arm(rig: Rig) -> Shown:
-    """Return the drawing of the arm."""
+def arm(rig: Rig) -> Shown | None:
+    """Return the drawing of the arm; None of an electric one, which has no linkage to draw."""
+    if rig.electric:
+        return None
     return Shown(
         plots_rig.arm(rig), "The arm, from its linkage",
         "Pistons at mid-stroke; dashed, each joint alone at either end of its stroke. Angles are "
@@ -71,16 +73,24 @@ def arm(rig: Rig) -> Shown:
     )  # fmt: skip
 
 
+def _input(rig: Rig) -> str:
+    return ch.DRIVE if rig.electric else ch.SPOOL
+
+
+def _excitation(rig: Rig) -> Callable[[Rig, Record, int, str], Markup]:
+    return plots_records.electric_excitation if rig.electric else plots_records.excitation
+
+
 def excitations(rig: Rig, runs: Sequence[Run]) -> Gallery:
     """Return one figure per step and excited joint, of the step's first repeat."""
     wanted = [
         (step, joint) for step in steps(rig, runs) for joint in step.excited
-        if ch.channel(ch.SPOOL, joint) in step.records[0].channels
+        if ch.channel(_input(rig), joint) in step.records[0].channels
     ]  # fmt: skip
     return Gallery(
         tuple(
             Shown(
-                plots_records.excitation(rig, step.records[0], joint, f"exc{n}"),
+                _excitation(rig)(rig, step.records[0], joint, f"exc{n}"),
                 f"{step.name}, joint {joint}",
                 f"record {step.records[0].name}",
             )

@@ -10,6 +10,7 @@ import numpy as np
 from analysis import report_format as fm
 from analysis.plots_rig import angle_range
 from rig.model import channels as ch
+from rig.model.electric import ElectricRig
 from rig.model.records import Record, Run
 from rig.model.rig import Joint, Rig
 
@@ -22,6 +23,16 @@ LOCKS = {
 
 def bench_constants(rig: Rig) -> list[tuple[str, str]]:
     """Return (what, value with unit) of the bench as a whole."""
+    if isinstance(rig, ElectricRig):
+        p, d = rig.sensors.position, rig.sensors.drive
+        units = [rig.unit_of(ch.channel(kind, 1)) for kind in (ch.POSITION, ch.DRIVE)]
+        return [
+            ("gravity", f"{_n(rig.gravity)} m/s²"),
+            ("sampled at", f"{_n(rig.sample_rate)} Hz"),
+            ("sensor noise (1σ)", f"position {_n(p.noise)} {units[0]}, drive {_n(d.noise)} "
+                                  f"{units[1]}"),
+            ("sensor bits", f"position {p.bits}, drive {d.bits}"),
+        ]  # fmt: skip
     s = rig.sensors
     out = [
         ("supply", f"{_n(rig.supply.pressure / 1e6)} MPa, {_n(rig.supply.flow * 6e4)} L/min"),
@@ -48,6 +59,22 @@ def _n(value: float) -> str:
 
 def joint_constants(rig: Rig) -> list[tuple[str, list[str]]]:
     """Return (what and unit, one value per joint)."""
+
+    if isinstance(rig, ElectricRig):
+        each = rig.joints
+        return [
+            ("name", [j.name for j in each]),
+            ("kind", [j.kind for j in each]),
+            ("drive gain", [f"{_n(j.drive.gain)} {j.force_unit}/{j.drive.unit}" for j in each]),
+            ("limits: position", [
+                f"{_n(j.limits.position[0])} to {_n(j.limits.position[1])} {j.position_unit}"
+                for j in each
+            ]),
+            ("limits: speed, drive", [
+                f"{_n(j.limits.speed)} {j.position_unit}/s, {_n(j.limits.drive)} {j.drive.unit}"
+                for j in each
+            ]),
+        ]  # fmt: skip
 
     def row(text: str, value: object) -> tuple[str, list[str]]:
         return text, [value(k, joint) for k, joint in enumerate(rig.joints)]  # type: ignore[operator]

@@ -49,6 +49,8 @@ class AsymmetricFriction(Friction):
     off over the other's while it moves back (the contact's law of the module, direction by
     direction): extending da/ds = (1 - a)/d_ext, dr/ds = -r/d_ext; retracting, over the travel |s|,
     da = -a/d_ret, dr = (1 - r)/d_ret. Source: Jelali and Kroll 2003 (levels by direction).
+    On an electric joint no lever tells it from `coulomb_friction` at (F_ext + F_ret)/2 with a
+    `torque_offset` of (F_ext - F_ret)/2: wherever it slides they are the same, and named are those.
     """
 
     name: ClassVar[str] = "asymmetric_friction"
@@ -65,6 +67,11 @@ class AsymmetricFriction(Friction):
 
     def _names(self) -> tuple[str, str]:
         return f"F_ext_{self.joint + 1}", f"F_ret_{self.joint + 1}"
+
+    @classmethod
+    def places(cls, rig: Rig) -> tuple[str, ...]:
+        """Return the hydraulic joints: on an electric one it is two simpler effects."""
+        return () if getattr(rig, "electric", False) else super().places(rig)
 
     def shape_names(self) -> tuple[str, ...]:
         """Name the presliding distances of the two directions."""

@@ -22,6 +22,7 @@ from analysis.terms.base import (
     equation,
     kernel,
 )
+from rig.model.electric import UNKNOWN
 from rig.model.rig import Rig
 
 
@@ -60,8 +61,9 @@ class BaseInclination(Effect):
 
     @classmethod
     def places(cls, rig: Rig) -> tuple[str, ...]:
-        """Return the bench."""
-        return ("bench",)
+        """Return the bench, where gravity pulls at links whose base is not free already."""
+        free = getattr(rig, "inclination", 0.0) == UNKNOWN
+        return () if getattr(rig, "prismatic", False) or free or rig.gravity == 0 else ("bench",)
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return nothing: the angle is a shape."""

@@ -54,8 +54,8 @@ class Payload(Effect):
 
     @classmethod
     def places(cls, rig: Rig) -> tuple[str, ...]:
-        """Return the bench."""
-        return ("bench",)
+        """Return the bench, where it has links."""
+        return () if getattr(rig, "prismatic", False) else ("bench",)
 
     def absorbed(self, rig: Rig) -> str:
         """Say that the baseline's M, R and W take it all."""

@@ -95,7 +95,7 @@ def _average(rig: Rig, repeats: Sequence[Scene]) -> Scene:
     moving = np.any([moving_joints(rig, s.record) for s in repeats], axis=0)
     signals = condition(rig, record, first.filtering.channels, moving)
     valid = np.all([s.signals.valid[:n] for s in repeats], axis=0)
-    return Scene(first.run, record, replace(signals, valid=signals.valid & valid), first.filtering)
+    return replace(first, record=record, signals=replace(signals, valid=signals.valid & valid))
 
 
 def least_squares(rig: Rig, rows: Sequence[Mapping[str, Rows]]) -> dict[str, float]:

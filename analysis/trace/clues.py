@@ -20,6 +20,7 @@ from analysis.trace.evidence import Scene, filtered, prepared
 from analysis.trace.result import Dependence
 from analysis.trace.select import orthonormal
 from rig.model import channels as ch
+from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
@@ -29,9 +30,17 @@ LEAST = 0.05  # share below which a variable is no clue
 BENCH = (ch.SUPPLY, ch.TEMPERATURE, "time")
 
 
-def variables(signals: Signals, joint: int) -> dict[str, Array]:
+def variables(rig: Rig, signals: Signals, joint: int) -> dict[str, Array]:
     """Return the variables (n,) that a residual of a joint (0-based) may move with, by name."""
     i, cap, rod = joint, signals.p_cap[:, joint], signals.p_rod[:, joint]
+    if rig.electric:
+        return {
+            ch.channel(ch.POSITION, i + 1): signals.q[:, i],
+            f"velocity_{i + 1}": signals.qd[:, i],
+            f"acceleration_{i + 1}": signals.qdd[:, i],
+            ch.channel(ch.DRIVE, i + 1): signals.u[:, i],
+            "time": signals.t,
+        }
     return {
         ch.channel(ch.PISTON, i + 1): signals.s[:, i],
         f"velocity_{i + 1}": signals.sd[:, i],
@@ -70,7 +79,7 @@ def dependence(
     shares: dict[str, float] = {}
     for equation in equations:
         joint = int(equation.rsplit("_", 1)[1]) - 1
-        for name in variables(train.scenes[0].signals, joint):
+        for name in variables(train.rig, train.scenes[0].signals, joint):
             found = _share(train, left, judge, judge_left, equation, joint, name)
             shares[name] = shares.get(name, 0.0) + found * weight[equation] / total
             if name not in best or found > best[name].share:
@@ -104,7 +113,7 @@ def _share(
     A curve fitted to small motions says nothing of large ones; the other way round it does.
     """
     values = [
-        variables(scene.signals, joint)[name]
+        variables(stage.rig, scene.signals, joint)[name]
         for stage in (train, judge)
         for scene in stage.scenes
         if joint + 1 not in scene.record.locked
@@ -145,7 +154,7 @@ def _projected(
         scene: Scene = stage.scenes[index[s.group]]
         rows: Rows = stage.rows[index[s.group]][equation]
         seen = prepared(stage.rig, stage.terms, scene)
-        curve = hats(variables(seen, joint)[name], knots)
+        curve = hats(variables(stage.rig, seen, joint)[name], knots)
         found = filtered({str(k): curve[:, k] for k in range(curve.shape[1])}, scene, rows)
         stack = np.column_stack(list(found.values())) * np.sqrt(s.repeats) / s.noise
         columns.append(stack)
@@ -168,7 +177,7 @@ def curve_of(
         if s.equation == equation:
             scene = stage.scenes[index[s.group]]
             rows = stage.rows[index[s.group]][equation]
-            found = filtered({name: variables(scene.signals, joint)[name]}, scene, rows)
+            found = filtered({name: variables(stage.rig, scene.signals, joint)[name]}, scene, rows)
             x.append(found[name])
             y.append(left[s.where] * s.noise / np.sqrt(s.repeats))
     if not x:

@@ -17,7 +17,7 @@ from analysis.effects.base import Effect, ordered
 from analysis.identify import identify
 from analysis.model import Model
 from analysis.terms import baseline_of, known
-from analysis.terms.base import Used
+from analysis.terms.base import FAMILIES, Used
 from analysis.trace import clues, gates, held_out
 from analysis.trace.beside import beside, stripped
 from analysis.trace.board import Board, board
@@ -52,11 +52,14 @@ def trace(
     holdout: Sequence[Run],
     effects: Sequence[Effect] | None = None,
     seed: int = 0,
+    families: Sequence[str] = tuple(FAMILIES),
 ) -> Trace:
     """Say what the baseline lacks on `runs`, name it or refuse to, and judge it on `holdout`.
 
     `effects` are the candidates, by default the whole catalogue at every place. `seed` draws the
-    half-samples and sign flips. Raises InputError for records of different rigs, without held-out
+    half-samples and sign flips; `families` are the equations looked at, mechanical or fluid (they
+    share no parameter, so that what stays unexplained in one need not hide the other). Raises
+    InputError for records of different rigs, without held-out
     records, with held-out records that are training records, or too short to tell anything.
     """
     started = time.perf_counter()
@@ -65,7 +68,8 @@ def trace(
     rng = np.random.default_rng(seed)
     terms = tuple(map(Used, baseline_of(rig)))
     terms = (*terms, *beside(terms, [*runs, *holdout]))
-    train, judged = scenes(rig, runs), scenes(rig, holdout)
+    train = scenes(rig, runs, families=tuple(families))
+    judged = scenes(rig, holdout, families=tuple(families))
     stage = board(rig, terms, train)
     _refuse_short(stage, train)
     judge = board(rig, terms, judged, stage.beta)
@@ -87,14 +91,18 @@ def trace(
         moves = [] if verdict in (CLEAN, EXPLAINED) else _moves(stage, judge, winner)
     after = _extended(runs, terms, winner, before)
     error = held_out.errors(rig, judged, listed.empty.fit, winner.fit)
-    fits = held_out.fits(rig, holdout, before, after)
+    runs_before, runs_after = held_out.free_runs(holdout, before, after)
     result = Trace(
-        verdict, found, error.noise, error.before, error.after, fits[0], fits[1], before, after,
+        verdict, found, error.noise, error.before, error.after,
+        runs_before.fit, runs_after.fit, before, after,
         _fraction(listed, winner), tuple(moves), _next(verdict, found, rig), stage.floors,
         listed.empty.fit, winner.fit, tuple(notes), refused=refused,
         seconds=time.perf_counter() - started,
     )  # fmt: skip
-    return replace(result, sentence=sentence(result))
+    return replace(
+        result, sentence=sentence(result), size=held_out.sizes(rig, judged, listed.empty.fit),
+        rmse_before=runs_before.rmse, rmse_after=runs_after.rmse,
+    )  # fmt: skip
 
 
 def _refuse_same(runs: Sequence[Run], holdout: Sequence[Run]) -> None:

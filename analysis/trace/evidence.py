@@ -20,7 +20,7 @@ from analysis import checks as ck
 from analysis.effects.base import SENSOR, ordered
 from analysis.rows import Filtering, Rows, default_filtering, record_rows
 from analysis.signals import Signals, condition
-from analysis.terms.base import Columns, Term, Used
+from analysis.terms.base import FAMILIES, Columns, Term, Used
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
 
@@ -29,12 +29,16 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Scene:
-    """One record made ready: its signals under the channel filter, and its filters."""
+    """One record made ready: its signals under the channel filter, its filters, its equations.
+
+    `families` are the families of rows that are looked at, by default all.
+    """
 
     run: int
     record: Record
     signals: Signals
     filtering: Filtering
+    families: tuple[str, ...] = tuple(FAMILIES)
 
     @property
     def group(self) -> tuple[int, str]:
@@ -58,6 +62,7 @@ def scenes(
     rig: Rig,
     runs: Sequence[Run],
     filtering: Callable[[Record], Filtering] = trace_filtering,
+    families: tuple[str, ...] = tuple(FAMILIES),
 ) -> list[Scene]:
     """Condition every record of the runs; raises InputError for a record that cannot be used."""
     out = []
@@ -65,7 +70,8 @@ def scenes(
         for record in run.records:
             ck.refuse_dead_channels(rig, record)
             filters = filtering(record)
-            out.append(Scene(index, record, condition(rig, record, filters.channels), filters))
+            signals = condition(rig, record, filters.channels)
+            out.append(Scene(index, record, signals, filters, families))
     return out
 
 
@@ -88,7 +94,7 @@ def changes_signals(term: Term) -> bool:
 
 def scene_rows(rig: Rig, terms: Sequence[Used], scene: Scene) -> dict[str, Rows]:
     """Return the rows of one record under a model (see `analysis.rows.record_rows`)."""
-    return record_rows(rig, ordered(terms), scene.signals, scene.filtering)
+    return record_rows(rig, ordered(terms), scene.signals, scene.filtering, scene.families)
 
 
 def prepared(rig: Rig, terms: Sequence[Used], scene: Scene) -> Signals:

@@ -17,12 +17,14 @@ from analysis.effects.base import Effect
 from analysis.model import Model
 from analysis.plots import BLUE, CARD, GREY, INK, MODEL, PALE, figure, gapped, note, style, svg
 from analysis.rows import Rows
+from analysis.terms.base import family_of
 from analysis.trace.clues import binned, variables
 from analysis.trace.evidence import Scene, filtered, prepared, residual, scene_rows, scenes
 from analysis.trace.refine import Fit
 from analysis.trace.result import Trace
-from analysis.trace.words import UNITS, loudest
-from rig.model.channels import kind_of, unit_of
+from analysis.trace.words import loudest
+from rig.model import channels as ch
+from rig.model.channels import kind_of
 from rig.model.records import Run
 from rig.model.rig import Rig
 
@@ -45,7 +47,8 @@ class Lines:
 def held_out(rig: Rig, holdout: Sequence[Run], result: Trace) -> dict[str, list[Lines]]:
     """Return, by equation, every held-out record's residual under both models."""
     out: dict[str, list[Lines]] = {}
-    for scene in scenes(rig, holdout):
+    families = tuple({family_of(e): None for e in result.before})
+    for scene in scenes(rig, holdout, families=families):
         before = _left(rig, scene, result.rows_before)
         after = _left(rig, scene, result.rows_after)
         for name, (rows, r) in before.items():
@@ -77,7 +80,7 @@ def abscissae(
             seen = prepared(rig, model.terms, line.scene)
             raw = effect.abscissa(rig, seen)[equation]
         else:
-            raw = variables(line.scene.signals, joint)[variable]
+            raw = variables(rig, line.scene.signals, joint)[variable]
         out.append(filtered({"x": np.asarray(raw)}, line.scene, line.rows)["x"])
     return np.concatenate(out)
 
@@ -153,15 +156,15 @@ def over_noise(result: Trace) -> Markup:
         return svg(made, "overnoise", "Held-out error over the noise floor, before and after")
 
 
-def unit_of_variable(name: str) -> str:
+def unit_of_variable(rig: Rig, name: str) -> str:
     """Return a variable's SI unit for an axis."""
-    try:
-        return unit_of(name)
-    except ValueError:
-        stem = name.rsplit("_", 1)[0]
-        return {
-            "velocity": "m/s", "acceleration": "m/s²", "pressure_difference": "Pa", "time": "s",
-        }.get(stem, "")  # fmt: skip
+    stem = name.rsplit("_", 1)[0]
+    way = rig.unit_of(ch.channel(rig.position_kind, 1))
+    made = {
+        "velocity": f"{way}/s", "acceleration": f"{way}/s²", "pressure_difference": "Pa",
+        "time": "s",
+    }  # fmt: skip
+    return made[stem] if stem in made else rig.unit_of(name)
 
 
 def equation_of(
@@ -175,12 +178,7 @@ def equation_of(
     return max(own, key=lambda e: result.before[e] / max(result.noise_floor[e], 1e-30))
 
 
-def unit_of_equation(equation: str) -> str:
-    """Return the unit of an equation's residual."""
-    return UNITS.get(equation.rsplit("_", 1)[0], "")
-
-
 __all__ = [
     "Lines", "abscissae", "against", "equation_of", "held_out", "in_time", "kind_of",
-    "over_noise", "unit_of_equation", "unit_of_variable",
+    "over_noise", "unit_of_variable",
 ]  # fmt: skip

@@ -10,7 +10,7 @@ stands in: that sees no noise that the rig file does not state, and is said to b
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,21 +107,29 @@ def repeats_of(
 
 
 def _periods(scene: Scene, rows: Rows, left: Array) -> Array | None:
-    """Cut a record's residual into whole periods of at least ten rows; None where there are < 3."""
+    """Cut a record's residual into whole periods, one under the other.
+
+    Of a record of less than three, what the first two have in common, if that is a quarter of a
+    period or more; None where there is less than that, or periods of fewer than five rows.
+    """
     period, step = scene.record.period, scene.filtering.step
     if not period or period % step:
         return None
     per = period // step
     index = np.rint((rows.time - rows.time[0]) * scene.record.sample_rate / step).astype(int)
     whole = (int(index[-1]) + 1) // per
-    if per < 5 or whole < 3:
+    if whole < 3:
+        least, whole = max(5, per // 4), 2
+    else:
+        least = 5
+    if per < 5:
         return None
     grid = np.full(whole * per, np.nan)
     inside = index < whole * per
     grid[index[inside]] = left[inside]
     table = grid.reshape(whole, per)
     table = table[:, np.isfinite(table).all(axis=0)]
-    return table if table.shape[1] >= 5 else None
+    return table if table.shape[1] >= least else None
 
 
 def stated_noise(
@@ -136,7 +144,7 @@ def stated_noise(
     record = disturbed(rig, scene.record, rng)
     moving = moving_joints(rig, scene.record)
     signals = condition(rig, record, scene.filtering.channels, moving)
-    again = scene_rows(rig, terms, Scene(scene.run, record, signals, scene.filtering))
+    again = scene_rows(rig, terms, replace(scene, record=record, signals=signals))
     out = {}
     for name, before in rows.items():
         _, a, b = np.intersect1d(before.time, again[name].time, return_indices=True)

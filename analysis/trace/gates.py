@@ -52,7 +52,7 @@ def judge(
     """Put every effect of the winner through the gates."""
     stage = listed.stage
     values = parameter_values(stage.rig, winner.fit.terms, dict(winner.fit.beta))
-    null = inference.null_maximum(listed.field, stage, _noise_like(stage), rng)
+    null = inference.null_maximum(listed.field, stage, _noise_like(stage, winner.fit.left), rng)
     steady = inference.stability(listed, winner, rng)
     after = held_left(held, winner.fit)
     physical = listed.physical(winner)
@@ -119,14 +119,19 @@ def remaining(listed: Shortlist, winner: Listed, held: Board) -> list[str]:
     return out
 
 
-def _noise_like(stage: Board) -> Array:
-    """Return the repeats' residuals without what repeats: (R, M), scaled to the full noise."""
+def _noise_like(stage: Board, left: Array) -> Array:
+    """Return the repeats' residuals without what repeats: (R, M), scaled to the full noise.
+
+    Of a step with one repeat, what the winner leaves (M,).
+    """
     out = stage.left.copy()
     for s in stage.segments:
         if s.repeats > 1:
             part = out[: s.repeats, s.where]
             scale = np.sqrt(s.repeats / (s.repeats - 1))
             out[: s.repeats, s.where] = (part - part.mean(axis=0)) * scale
+        else:
+            out[0, s.where] = left[s.where]
     return out
 
 

@@ -67,26 +67,56 @@ def errors(rig: Rig, members: Sequence[Scene], before: Fit, after: Fit) -> Error
     )
 
 
+def rms_of(judge: Board, model: Fit) -> dict[str, float]:
+    """Return the rms of every equation's held-out residual, SI, repeats averaged."""
+    rest = left(judge, model)
+    found: dict[str, list[Array]] = {}
+    for s in judge.segments:
+        found.setdefault(s.equation, []).append(rest[s.where] * s.noise / np.sqrt(s.repeats))
+    return {e: _rms(parts) for e, parts in sorted(found.items())}
+
+
+def sizes(rig: Rig, members: Sequence[Scene], model: Fit) -> dict[str, float]:
+    """Return the rms of every equation's right side (torque, force or flow), SI."""
+    found: dict[str, list[Array]] = {}
+    for scene in members:
+        for equation, rows in scene_rows(rig, model.terms, scene).items():
+            found.setdefault(equation, []).append(rows.rhs)
+    return {e: _rms(parts) for e, parts in sorted(found.items())}
+
+
 def _rms(parts: Sequence[Array]) -> float:
     joined = np.concatenate(parts)
     return float(np.sqrt(np.mean(joined**2))) if len(joined) else float("nan")
 
 
-def fits(
-    rig: Rig, holdout: Sequence[Run], before: Model, after: Model
-) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the mean free-run FIT [%] of every channel under both models, NaN where it failed."""
-    one = _fit(holdout, before)
-    return one, one if after is before else _fit(holdout, after)
+@dataclass(frozen=True)
+class FreeRuns:
+    """Free runs over the held-out records, by channel: mean FIT [%], RMSE [SI]; NaN if failed."""
+
+    fit: Mapping[str, float]
+    rmse: Mapping[str, float]
 
 
-def _fit(holdout: Sequence[Run], model: Model) -> dict[str, float]:
+def free_runs(holdout: Sequence[Run], before: Model, after: Model) -> tuple[FreeRuns, FreeRuns]:
+    """Return the free runs of both models, driven by the measured spool or drive alone."""
+    one = _free_runs(holdout, before)
+    return one, one if after is before else _free_runs(holdout, after)
+
+
+def _free_runs(holdout: Sequence[Run], model: Model) -> FreeRuns:
     try:
         results = validate(model, holdout)
     except InputError:  # a parameter that is not identified: there is no simulation
-        return {}
-    values: dict[str, list[float]] = {}
+        return FreeRuns({}, {})
+    fits: dict[str, list[float]] = {}
+    squares: dict[str, list[float]] = {}
     for r in results:
-        for channel, fit in r.fit.items():
-            values.setdefault(channel, []).append(fit if not r.failure else float("nan"))
-    return {c: float(np.mean(v)) for c, v in sorted(values.items())}
+        for channel in r.fit:
+            lost = bool(r.failure)
+            fits.setdefault(channel, []).append(float("nan") if lost else r.fit[channel])
+            squares.setdefault(channel, []).append(float("nan") if lost else r.rmse[channel] ** 2)
+    return FreeRuns(
+        {c: float(np.mean(v)) for c, v in sorted(fits.items())},
+        {c: float(np.sqrt(np.mean(v))) for c, v in sorted(squares.items())},
+    )

@@ -15,11 +15,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.effects.base import Effect
 from analysis.terms.base import Used
 from analysis.trace import select
 from analysis.trace.board import Board
+from analysis.trace.floor import STATED
 from analysis.trace.refine import Fit, jacobian, shapes_of, table
-from analysis.trace.select import Field, orthonormal
+from analysis.trace.select import FORM, Field, orthonormal
 from analysis.trace.shortlist import Listed, Shortlist, excess_of
 
 Array = NDArray[np.float64]
@@ -28,14 +30,19 @@ FLIPS = 199
 ENOUGH_REPEATS = 8
 BLOCK = 2.0  # [s] at least, where a record is one period
 HALVES = 40
+ABOUT_TWO = 1.9  # periods that a record must hold to be halved by them: the last may be cut short
 TOLERANCE = 0.2  # relative disagreement that a catalogue's simpler form may cause
 DEVIATIONS = 3.5
+EDGE = 1e-3  # of its range: a shape nearer to its bound is at it
 TELLS = 0.05  # of a column's energy off the others': a subset with less says nothing of a size
 POWER = 0.25  # a subset judges a parameter that it knows this well, relative
 
 
-def blocks(stage: Board, seconds: float = BLOCK) -> NDArray[np.int64]:
-    """Return for each row of the board the number of its block within its record (M,)."""
+def blocks(stage: Board, seconds: float = BLOCK, fewest: float = 3.0) -> NDArray[np.int64]:
+    """Return for each row of the board the number of its block within its record (M,).
+
+    A block is a period of a record that holds the `fewest` of them.
+    """
     out = np.zeros(stage.base.shape[0], dtype=np.int64)
     index = {scene.group: k for k, scene in enumerate(stage.scenes)}
     for segment in stage.segments:
@@ -45,7 +52,7 @@ def blocks(stage: Board, seconds: float = BLOCK) -> NDArray[np.int64]:
         rate, period = scene.record.sample_rate, scene.record.period
         time = stage.rows[index[segment.group]][segment.equation].time
         length = seconds
-        if period and 3 * period <= scene.record.samples:
+        if period and fewest * period <= scene.record.samples:
             length = period / rate
         out[segment.where] = np.floor((time - time[0]) / length).astype(np.int64)
     return out
@@ -99,24 +106,37 @@ class Linear:
 
 
 def linear(stage: Board, one: Listed) -> Linear:
-    """Return the tangent of a set: columns of all coefficients and derivatives by the shapes."""
+    """Return the tangent of a set: columns of all coefficients and derivatives by the shapes.
+
+    A shape that lies at a bound cannot move freely, and counts as fixed.
+    """
     rows = table(stage, one.fit.terms)
-    extra = [jacobian(stage, one.fit, u)[1] for u in one.effects]
+    extra = []
+    for u in one.effects:
+        names, J = jacobian(stage, one.fit, u)
+        fixed = {
+            s.parameter
+            for s, v in zip(shapes_of(stage.rig, u), u.shape, strict=True)
+            if not s.low + EDGE * (s.high - s.low) < v < s.high - EDGE * (s.high - s.low)
+        }
+        extra.append(J[:, [k for k, n in enumerate(names) if n in rows.names or n not in fixed]])
     return Linear(one, orthonormal(np.column_stack([rows.matrix, *extra])), one.fit.left)
 
 
 def halves(
     stage: Board, rng: np.random.Generator, count: int = HALVES
-) -> list[tuple[Array, float]]:
-    """Return changes (M,) of the averaged residual in random half-samples, and its noise energy.
+) -> list[tuple[Array, Array, float]]:
+    """Return random half-samples: change (M,) of the averaged residual, weights (M,), noise energy.
 
-    Halves of the repeats of every step; of a step with one repeat, halves of its blocks.
+    Halves of the repeats of every step; of a step with one repeat, halves of its blocks, the
+    others without weight.
     """
-    numbers = blocks(stage)
+    # A part of a period may lack the very speeds that tell two effects apart.
+    numbers = blocks(stage, fewest=ABOUT_TWO)
     mean = stage.mean
     out = []
     for _ in range(count):
-        r = np.zeros_like(mean)
+        r, weight = mean.copy(), np.ones(len(mean))
         noise = 1.0
         for group in sorted({s.group for s in stage.segments}):
             parts = [s for s in stage.segments if s.group == group]
@@ -129,10 +149,9 @@ def halves(
                 continue
             keep = rng.permutation(int(numbers.max()) + 1) % 2 == 0
             for s in parts:
-                # The other half carries no weight: its rows take the kept ones' share.
-                r[s.where] = mean[s.where] * np.where(keep[numbers[s.where]], np.sqrt(2.0), 0.0)
-            noise = max(noise, 1.0)
-        out.append((r - mean, noise))
+                # The kept half takes the other's share.
+                weight[s.where] = np.where(keep[numbers[s.where]], np.sqrt(2.0), 0.0)
+        out.append((r - mean, weight, noise))
     return out
 
 
@@ -149,11 +168,8 @@ def stability(
     counts = dict.fromkeys(winner.keys, 0)
     others: dict[str, int] = {}
     samples = halves(stage, rng)
-    for change, noise in samples:
-        refitted = []
-        for t in tangents:
-            r = t.left + change - t.basis @ (t.basis.T @ (t.left + change))
-            refitted.append(_again(stage, t.one, r, noise))
+    for change, weight, noise in samples:
+        refitted = [_again(stage, t.one, _refitted(t, change, weight), noise) for t in tangents]
         best = listed.best(refitted)
         for key in winner.keys & best.keys:
             counts[key] += 1
@@ -161,6 +177,16 @@ def stability(
             label = f"{name} at {where}"
             others[label] = others.get(label, 0) + 1
     return {key: (count / len(samples), others) for key, count in counts.items()}
+
+
+def _refitted(one: Linear, change: Array, weight: Array) -> Array:
+    """Return the weighted residual (M,) of a set fitted again to a half-sample."""
+    r = weight * (one.left + change)
+    if np.all(weight == 1.0):
+        return np.asarray(r - one.basis @ (one.basis.T @ r))
+    basis = weight[:, None] * one.basis
+    inverse = np.linalg.pinv(basis.T @ basis, rcond=1e-10, hermitian=True)
+    return np.asarray(r - basis @ (inverse @ (basis.T @ r)))
 
 
 def _again(stage: Board, one: Listed, left: Array, noise: float) -> Listed:
@@ -239,6 +265,43 @@ def subsets(stage: Board, joint: int | None) -> dict[str, Array]:
     return out
 
 
+def _unmeasured(stage: Board) -> NDArray[np.int64] | None:
+    """Return the block of every row (M,) where some floor is the stated noise alone, else None.
+
+    Then nobody has measured the noise, and what is left has to stand for it, block by block.
+    """
+    if all(floor.source != STATED for floor in stage.floors):
+        return None
+    numbers = blocks(stage)
+    for k, s in enumerate(stage.segments):
+        numbers[s.where] += (int(numbers.max()) + 1) * k
+    return numbers
+
+
+def _clustered(own: Array, left: Array, clusters: NDArray[np.int64]) -> float:
+    """Return the root of the sum over blocks of (own . left)^2."""
+    _, index = np.unique(clusters, return_inverse=True)
+    return float(np.linalg.norm(np.bincount(index, weights=own * left)))
+
+
+def _larger(model: Fit, stage: Board, used: Used, mask: Array) -> float:
+    """Return the energy that the largest other effect has on a subset, 0 if none is larger.
+
+    What its catalogue form misses of it (`FORM`) spills onto a smaller effect's coefficient.
+    """
+    rows = table(stage, model.terms)
+    energy = {}
+    for u in model.terms:
+        if isinstance(u.term, Effect):
+            own = [rows.names.index(c.parameter) for c in u.term.coefficients(stage.rig)]
+            values = np.array([model.beta.get(rows.names[k], 0.0) for k in own])
+            part = rows.matrix[mask][:, own] @ values
+            energy[u.term.name, u.term.where] = float(part @ part)
+    mine = energy.pop((used.term.name, used.term.where), 0.0)
+    most = max(energy.values(), default=0.0)
+    return most if most > mine else 0.0
+
+
 def _alone(columns: Array, k: int) -> Array:
     """Return column k (m,) without what the others say."""
     rest, own = np.delete(columns, k, axis=1), columns[:, k]
@@ -263,6 +326,7 @@ def invariance(
     nothing = {s.parameter: s.neutral or 0.0 for s in shapes_of(stage.rig, used)}
     neutral = np.array([nothing.get(n, 0.0) for n in names])
     out = []
+    clusters = _unmeasured(stage)
     J_all = J - base @ (base.T @ J)
     whole = [float(np.sum(_alone(J_all, k) ** 2)) for k in range(len(names))]
     for label, mask in subsets(stage, joint).items():
@@ -282,11 +346,15 @@ def invariance(
                 continue
             shift = float(own @ left[mask]) / size
             error = 1.0 / np.sqrt(size)
+            if clusters is not None:
+                rest_of = left[mask] - B @ (B.T @ left[mask]) - own * shift
+                error = max(error, _clustered(own, rest_of, clusters[mask]) / size)
+            spill = np.sqrt(FORM * _larger(model, stage, used, mask) / size)
             # Two levels of one effect are judged by the larger: 2 N beside 100 N is a detail.
             alike = [j for j, n in enumerate(names) if n in sizes and units[n] == units[name]]
             full = float(np.max(np.abs(value.value[alike] - neutral[alike])))
             if error > POWER * full:
                 continue
-            if abs(shift) > DEVIATIONS * np.hypot(error, TOLERANCE / DEVIATIONS * full):
+            if abs(shift) > spill + DEVIATIONS * np.hypot(error, TOLERANCE / DEVIATIONS * full):
                 out.append((label, name, float(value.value[k]) + shift, error))
     return out

@@ -16,7 +16,7 @@ from analysis.effects.base import Effect
 from analysis.report import Provenance
 from analysis.trace import figures
 from analysis.trace.result import CLEAN, Found, Trace
-from analysis.trace.words import quantity
+from analysis.trace.words import quantity, unit_of_equation
 from rig.model.parse import InputError
 from rig.model.records import Run
 from rig.model.rig import Rig
@@ -59,7 +59,16 @@ def render(holdout: Sequence[Run], result: Trace, provenance: Provenance | None 
         "refused": [_effect(e) for e in result.refused],
         "parameters": _parameters(result),
         "fits": [
-            (name, fm.fit(value), fm.fit(result.fit_after.get(name)))
+            (
+                name,
+                fm.fit(value),
+                fm.fit(result.fit_after.get(name)),
+                *(
+                    fm.significant(errors.get(name, math.nan))
+                    for errors in (result.rmse_before, result.rmse_after)
+                ),
+                rig.unit_of(name),
+            )
             for name, value in result.fit_before.items()
         ],
         "floors": result.floors,
@@ -95,14 +104,14 @@ def _pair(
     rig: Rig, lines: Mapping[str, list[figures.Lines]], result: Trace, effect: Effect | None,
     variable: str, equation: str, heading: str, key: str,
 ) -> dict[str, Any]:  # fmt: skip
-    here, unit = lines[equation], figures.unit_of_equation(equation)
+    here, unit = lines[equation], unit_of_equation(rig, equation)
     noise = result.noise_floor[equation]
     model = result.model_after
     changed = model is not result.model_before
     x = figures.abscissae(rig, here, effect, variable, equation, model)
     label = variable
     if effect is None:
-        label = f"{variable} [{figures.unit_of_variable(variable)}]"
+        label = f"{variable} [{figures.unit_of_variable(rig, variable)}]"
     longest = max(here, key=lambda line: float((line.before**2).mean()))
     return {
         "heading": heading,
@@ -114,12 +123,13 @@ def _pair(
 
 
 def _errors(result: Trace) -> list[tuple[str, ...]]:
+    rig = result.model_before.rig
     out: list[tuple[str, ...]] = []
     for name, before in result.before.items():
         floor, after = result.noise_floor.get(name, math.nan), result.after.get(name, math.nan)
         out.append(
             (
-                name, figures.unit_of_equation(name), fm.significant(floor),
+                name, unit_of_equation(rig, name), fm.significant(floor),
                 fm.significant(before), fm.significant(after),
                 fm.significant(before / floor), fm.significant(after / floor),
             )

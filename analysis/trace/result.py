@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 from analysis.model import Estimate, Model, estimate_json, finite
@@ -74,7 +74,9 @@ class Dependence:
 
 @dataclass(frozen=True)
 class Trace:
-    """The whole result; every `error` and `fit` figure is of the held-out records, SI and percent.
+    """The whole result; every error, fit and rmse is of the held-out records, SI and percent.
+
+    `size` is the rms of each equation's right side, beside which an error is large or small.
 
     `floors` are the training records' split residuals under the baseline, `notes` what a person
     must know of the evidence's weakness; `refused` fitted best but did not pass the gates.
@@ -101,10 +103,13 @@ class Trace:
     sentence: str = ""
     seconds: float = 0.0
     refused: tuple[Found, ...] = ()
+    size: Mapping[str, float] = field(default_factory=dict)
+    rmse_before: Mapping[str, float] = field(default_factory=dict)
+    rmse_after: Mapping[str, float] = field(default_factory=dict)
 
 
 def to_json(result: Trace) -> dict[str, Any]:
-    """Return the contract's JSON; `refused gates noise notes sentence seconds` are additions."""
+    """Return the contract's JSON; `refused gates size rmse noise notes sentence seconds` added."""
     return {
         "verdict": result.verdict,
         "effects": [_effect(e) for e in result.effects],
@@ -115,6 +120,8 @@ def to_json(result: Trace) -> dict[str, Any]:
             "after": _numbers(result.after),
         },
         "fit": {"before": _numbers(result.fit_before), "after": _numbers(result.fit_after)},
+        "size": _numbers(result.size),
+        "rmse": {"before": _numbers(result.rmse_before), "after": _numbers(result.rmse_after)},
         "parameters": {
             "before": _parameters(result.model_before),
             "after": _parameters(result.model_after),

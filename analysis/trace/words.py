@@ -6,8 +6,17 @@ from collections.abc import Mapping
 
 from analysis.model import Estimate
 from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, Found, Trace
+from rig.model.rig import Rig
 
 UNITS = {"torque": "N·m", "flow_cap": "m³/s", "flow_rod": "m³/s"}
+
+
+def unit_of_equation(rig: Rig, equation: str) -> str:
+    """Return the unit of an equation's residual; the torque row of a sliding joint is a force."""
+    kind = equation.rsplit("_", 1)[0]
+    if kind == "torque" and getattr(rig, "prismatic", False):
+        return "N"
+    return UNITS.get(kind, "")
 
 
 def sentence(result: Trace) -> str:
@@ -39,8 +48,14 @@ def sentence(result: Trace) -> str:
 
 
 def _moves(effects: tuple[Found, ...]) -> str:
-    variables = [e.variable for e in effects if e.variable]
+    variables = [e.variable for e in effects if e.variable and not _constant(e.variable)]
+    if len(variables) < len(effects) and variables:
+        variables.append("a constant")
     return "The residual follows " + " and ".join(variables) if variables else "Explained"
+
+
+def _constant(variable: str) -> bool:
+    return variable.startswith("nothing")
 
 
 def _effect(found: Found) -> str:
@@ -65,7 +80,7 @@ def _errors(result: Trace) -> str:
     if not result.before:
         return ""
     e = loudest(result)
-    unit = UNITS.get(e.rsplit("_", 1)[0], "")
+    unit = unit_of_equation(result.model_before.rig, e)
     return (
         f"Held-out error of {e}: {result.before[e]:.2g} → {result.after.get(e, float('nan')):.2g} "
         f"{unit}, noise floor {result.noise_floor.get(e, float('nan')):.2g}."

@@ -36,11 +36,14 @@ Array = NDArray[np.float64]
 PUBLISHED: Final = {"M1": 95.1089, "Fv1": 203.5034, "Fc1": 20.3935, "offset1": -3.1648}
 KP, KV = 160.18, 243.45  # [1/s], [V s/m] of the machine's own controller
 HALF = 12.42  # [s]
+PERIOD = 6240  # samples after which the reference comes back
+CYCLE, LENGTH = 6.24, 24.84  # [s]
 COLUMNS: Final = """columns:
   time: {column: t}
   position_1: {column: qm}
   drive_1: {column: vir}
 """
+OUTPUT_ERROR: Final = "the same, output error"
 MODELS: Final[dict[str, tuple[str, ...]]] = {
     "M Fv (textbook)": (),
     "with Fc": ("coulomb_friction",),
@@ -51,35 +54,46 @@ MODELS: Final[dict[str, tuple[str, ...]]] = {
 
 @dataclass(frozen=True)
 class Emps:
-    """The record as runs (whole, first and second half) and the controller's reference (n,)."""
+    """The record as runs (whole, halves, cycles) and the controller's reference (n,)."""
 
     whole: Run
     first: Run
     second: Run
+    cycles: tuple[Run, ...]
     reference: Array
 
 
-def load(file: Path) -> Emps:
-    """Import the MAT file as a whole and in halves; raises InputError."""
+def load(file: Path, period: int = 0) -> Emps:
+    """Import the MAT file as a whole, in halves and by cycle; raises InputError.
+
+    With a `period` [samples] the trace tells noise from what comes back.
+    """
     parts = {"whole": "", "first": f", end: {HALF} s", "second": f", begin: {HALF} s"}
+    cycles = [f"cycle {k + 1}" for k in range(round(LENGTH / CYCLE))]
+    for k, name in enumerate(cycles):
+        end = min((k + 1) * CYCLE, LENGTH)
+        parts[name] = f", begin: {k * CYCLE:.2f} s, end: {end:.2f} s"
     runs = {}
     with tempfile.TemporaryDirectory() as scratch:
         for name, part in parts.items():
             manifest = Path(scratch) / f"{name}.yaml"
-            entry = f"records:\n  - {{file: {str(file.resolve())!r}, step: {name}{part}}}\n"
-            manifest.write_text(f"rig: emps\n{entry}{COLUMNS}")
+            entry = f"file: {str(file.resolve())!r}, step: {name}{part}, period: {period}"
+            manifest.write_text(f"rig: emps\nrecords:\n  - {{{entry}}}\n{COLUMNS}")
             runs[name] = load_run(import_records(manifest, Path(scratch) / name).path)
-    return Emps(**runs, reference=read_table(file, ["qg"], ["qg"])["qg"])
+    reference = read_table(file, ["qg"], ["qg"])["qg"]
+    each = tuple(runs[name] for name in cycles)
+    return Emps(runs["whole"], runs["first"], runs["second"], each, reference)
 
 
 def fit(
     run: Run,
     effects: tuple[str, ...] = MODELS["with Fc and offset"],
     filtering: Callable[[Record], Filtering] = default_filtering,
+    estimator: str = "ls",
 ) -> Identification:
     """Identify the record with effects."""
     terms = [Used(term) for term in with_effects(run.rig, effects)]
-    return identify([run], terms=terms, filtering=filtering)
+    return identify([run], terms=terms, filtering=filtering, estimator=estimator)
 
 
 def open_loop(model: Model, run: Run) -> float:
@@ -90,22 +104,37 @@ def open_loop(model: Model, run: Run) -> float:
 
 def models_table(data: Emps) -> str:
     """Return what each model finds, and its open-loop errors on data of and not of the fit."""
+    ways = {name: (effects, "ls") for name, effects in MODELS.items()}
+    ways[OUTPUT_ERROR] = (MODELS["with Fc and offset"], "output-error")
     rows = []
-    for name, effects in MODELS.items():
-        found = fit(data.whole, effects)
+    for name, (effects, estimator) in ways.items():
+        found = fit(data.whole, effects, estimator=estimator)
         values = {n: e.value for n, e in found.estimates.items()}
-        errors = [
-            open_loop(found.model, data.whole),
-            open_loop(fit(data.first, effects).model, data.second),
-            open_loop(fit(data.second, effects).model, data.first),
-        ]
+        errors = [open_loop(found.model, data.whole), *unseen(data, effects, estimator)]
         rows.append([name, *_values(values), *(f"{1e3 * e:.2f}" for e in errors)])
-    for name, half in (("1st half alone", data.first), ("2nd half alone", data.second)):
-        values = {n: e.value for n, e in fit(half).estimates.items()}
-        rows.append([name, *_values(values), "", "", ""])
+    for estimator in ("ls", "output-error"):
+        for name, half in (("1st half alone", data.first), ("2nd half alone", data.second)):
+            values = {n: e.value for n, e in fit(half, estimator=estimator).estimates.items()}
+            rows.append([f"{name}, {estimator}", *_values(values), "", "", ""])
     rows.append(["published", *_values(PUBLISHED), "", "", ""])
     head = ["model", "M [kg]", "Fv [N s/m]", "Fc [N]", "offset [N]"]
     return table([*head, "whole [mm]", "1st on 2nd [mm]", "2nd on 1st [mm]"], rows)
+
+
+def unseen(data: Emps, effects: tuple[str, ...], estimator: str) -> tuple[float, float]:
+    """Return the open-loop RMSE [m] of each half's model on the other half: 2nd, then 1st."""
+    first = fit(data.first, effects, estimator=estimator)
+    second = fit(data.second, effects, estimator=estimator)
+    return open_loop(first.model, data.second), open_loop(second.model, data.first)
+
+
+def cycles_table(data: Emps) -> str:
+    """Return what least squares finds in each cycle of the reference alone."""
+    rows = []
+    for k, run in enumerate(data.cycles):
+        values = {n: e.value for n, e in fit(run).estimates.items()}
+        rows.append([f"{k + 1}", *_values(values)])
+    return table(["cycle alone", "M [kg]", "Fv [N s/m]", "Fc [N]", "offset [N]"], rows)
 
 
 def _values(values: Mapping[str, float]) -> list[str]:
@@ -188,4 +217,5 @@ def closed_loop_table(data: Emps) -> str:
 def text(file: Path) -> str:
     """Return all tables."""
     data = load(file)
-    return "\n\n".join((models_table(data), filters_table(data), closed_loop_table(data)))
+    tables = (models_table, cycles_table, filters_table, closed_loop_table)
+    return "\n\n".join(one(data) for one in tables)

@@ -146,12 +146,14 @@ def _quiet(_: str) -> None:
 
 def measure(minutes: float, seeds: int, only: str | None, say: Say) -> list[Figure]:
     """Measure all groups, or the one named; raises InputError for an unknown name."""
-    from rig.cli.figures_stream import stream_figures  # which takes Figure from here
+    from rig.cli.figures_measured import measured_figures  # which take Figure from here
+    from rig.cli.figures_stream import stream_figures
 
     groups: Mapping[str, Callable[[Path, Say], list[Figure]]] = {
         "plant": plant_figures,
         "analysis": analysis_figures,
         "stream": stream_figures,
+        "measured": measured_figures,
         "demo": lambda folder, tell: demo_figures(folder, tell, seeds),
         "acquisition": lambda folder, tell: acquisition_figures(folder, tell, minutes),
     }
@@ -184,6 +186,8 @@ tune.
   free-run simulation of a validation record, as `bramah validate` does it.
 - **seed N**: a simulated bench started, run, identified and validated as in `bramah demo`; FIT
   is compared with every cell of the paper's Table IV.
+- **measured**: machines that others have recorded, where their data are at hand
+  (`BRAMAH_DATA`); see [emps.md](emps.md).
 - **acquisition**: every channel at 1 kHz in real time over the wire. Lateness is a block's arrival
   by the host's clock after the time of its last sample by the device's.
 """

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
 from rig.cli.bench_commands import JsonOption
 from rig.cli.output import progress, write_json
+
+FAMILIES_OF: Final = {
+    "all": ("mechanical", "fluid"), "torque": ("mechanical",), "flow": ("fluid",),
+}  # fmt: skip
 
 
 def trace(
@@ -22,6 +26,9 @@ def trace(
         Path | None, typer.Option(help="Write the model file with the effects here.")
     ] = None,
     report: Annotated[Path | None, typer.Option(help="Write an HTML report here.")] = None,
+    equations: Annotated[
+        str, typer.Option(help="all, torque or flow: where one hides what the other lacks.")
+    ] = "all",
     seed: Annotated[int, typer.Option(min=0, help="Of half-samples and sign flips.")] = 0,
 ) -> None:
     """Say what the model lacks: effect, place, size, and the held-out error before and after.
@@ -42,9 +49,11 @@ def trace(
             "trace needs --holdout RUN: records of another excitation that the fit does not see; "
             "an effect is only named where it explains those too"
         )
+    if equations not in FAMILIES_OF:
+        raise InputError(f"--equations {equations}: expected one of: {' '.join(FAMILIES_OF)}")
     loaded, judged = [load_run(f) for f in runs], [load_run(f) for f in holdout]
     progress(f"tracing {sum(len(r.records) for r in loaded)} records")
-    result = trace_runs(loaded, judged, seed=seed)
+    result = trace_runs(loaded, judged, seed=seed, families=FAMILIES_OF[equations])
     write_json(json, to_json(result))
     if model is not None:
         save_model(result.model_after, model)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from analysis.trace.result import Found, Trace
-from analysis.trace.words import UNITS, quantity
+from analysis.trace.words import quantity, unit_of_equation
 from rig.cli.output import table
 
 
@@ -16,20 +16,42 @@ def trace_text(result: Trace) -> str:
         lines += _effect(found)
     for found in result.refused:
         lines += ["fitted best, but not named:", *_effect(found)]
+    rig = result.model_before.rig
     rows = [
         [
             name, f"{result.noise_floor.get(name, math.nan):.2g}", f"{before:.2g}",
-            f"{result.after.get(name, math.nan):.2g}", UNITS.get(name.rsplit("_", 1)[0], ""),
+            f"{result.after.get(name, math.nan):.2g}", unit_of_equation(rig, name),
+            *(_share(errors.get(name), result.size.get(name)) for errors in (
+                result.before, result.after)),
         ]
         for name, before in result.before.items()
     ]  # fmt: skip
-    lines += [table(["held-out error", "noise floor", "before", "after", "unit"], rows), ""]
+    lines += [
+        table(
+            ["held-out error", "noise floor", "before", "after", "unit", "before", "after"], rows
+        ),
+        "",
+    ]
     fits = [
-        [name, f"{before:.1f} %", f"{result.fit_after.get(name, math.nan):.1f} %"]
+        [
+            name,
+            f"{before:.1f} %",
+            f"{result.fit_after.get(name, math.nan):.1f} %",
+            *(
+                f"{errors.get(name, math.nan):.3g}"
+                for errors in (result.rmse_before, result.rmse_after)
+            ),
+            rig.unit_of(name),
+        ]
         for name, before in result.fit_before.items()
     ]
     if fits:
-        lines += [table(["held-out FIT", "before", "after"], fits), ""]
+        lines += [
+            table(
+                ["held-out free run", "FIT before", "after", "RMSE before", "after", "unit"], fits
+            ),
+            "",
+        ]
     changed = _changed(result)
     if changed:
         lines += [table(["parameter", "before", "after", "change"], changed), ""]
@@ -41,6 +63,11 @@ def trace_text(result: Trace) -> str:
     lines += [f"note: {note}" for note in result.notes]
     lines.append(f"traced in {result.seconds:.1f} s")
     return "\n".join(lines)
+
+
+def _share(error: float | None, size: float | None) -> str:
+    """Return an error in percent of the equation's right side."""
+    return f"{100 * error / size:.1f} %" if error is not None and size else ""
 
 
 def _effect(found: Found) -> list[str]:

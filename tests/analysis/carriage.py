@@ -1,0 +1,76 @@
+"""A carriage on a screw under its own position loop: what an electric joint's record looks like.
+
+M q'' = gain v - Fv q' - friction - offset by half-implicit steps of 0.1 ms, dry friction of
+bristles that bend and slip (LuGre) and may fall with speed; nothing of it is the analysis' own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import astuple, dataclass
+
+import numpy as np
+from numba import njit
+
+from rig.model.electric import drive_gains
+from rig.model.records import Record
+from rig.model.rig import Rig
+
+KP, KV = 160.0, 240.0  # [1/s], [V s/m]
+FINE = 10  # steps a sample
+STIFFNESS, DAMPING = 1e6, 1e3  # [N/m], [N s/m] of the bristles
+
+
+@dataclass(frozen=True)
+class Carriage:
+    """Its parameters, SI; `breakaway` is how much more friction there is at rest [N]."""
+
+    mass: float = 95.0
+    viscous: float = 200.0
+    dry: float = 20.0
+    offset: float = -3.0
+    breakaway: float = 0.0
+
+
+def moves(rate: float, seconds: float, amplitude: float, wave: float) -> np.ndarray:
+    """Return a reference (n,) [m] about 0.12 m: two slow waves, speeds of all sizes."""
+    t = np.arange(round(seconds * rate)) / rate
+    swing = np.sin(2 * np.pi * wave * t) + 0.4 * np.sin(2 * np.pi * 2.6 * wave * t + 0.5)
+    return 0.12 + amplitude * (swing - swing[0]) * np.clip(t, 0.0, 1.0)
+
+
+@njit(cache=True)
+def _run(reference, h, gain, par, q, v):  # type: ignore[no-untyped-def]
+    mass, viscous, dry, offset, breakaway = par
+    n = len(reference)
+    position, drive = np.empty(n), np.empty(n)
+    bend = 0.0
+    for k in range(n):
+        ahead = reference[min(k + 1, n - 1)] - reference[k]
+        for fine in range(FINE):
+            wanted = reference[k] + ahead * fine / FINE
+            u = min(max(KV * (KP * (wanted - q) - v), -10.0), 10.0)
+            if fine == 0:
+                position[k], drive[k] = q, u
+            level = dry + breakaway * np.exp(-((v / 0.02) ** 2))
+            bend_rate = v - abs(v) * bend * STIFFNESS / max(level, 1e-9)
+            friction = (STIFFNESS * bend + DAMPING * bend_rate) if level > 0 else 0.0
+            bend += h * bend_rate
+            v += h * (gain * u - offset - viscous * v - friction) / mass
+            q += h * v
+    return position, drive
+
+
+def record(
+    rig: Rig, carriage: Carriage, reference: np.ndarray, rng: np.random.Generator, step: str,
+    repeat: int = 1,
+) -> Record:  # fmt: skip
+    """Run it and measure with the rig's stated noise."""
+    n, rate, gain = len(reference), rig.sample_rate, drive_gains(rig)[0]
+    par = np.array(astuple(carriage))
+    position, drive = _run(reference, 1.0 / (rate * FINE), gain, par, float(reference[0]), 0.0)
+    noise = rig.sensors.position.noise, rig.sensors.drive.noise
+    channels = {
+        "position_1": position + noise[0] * rng.standard_normal(n),
+        "drive_1": drive + noise[1] * rng.standard_normal(n),
+    }
+    return Record(f"{step}_r{repeat}", step, (), repeat, rate, channels)

@@ -1,0 +1,128 @@
+"""A carriage whose model lacks two effects at once: both are named, with nothing said of them."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from analysis.effects.friction_levels import AsymmetricFriction
+from analysis.trace.candidates import catalogue
+from analysis.trace.engine import trace
+from analysis.trace.result import CLEAN, EXPLAINED, Trace, to_json
+from rig.cli import emps_study as study
+from rig.cli.main import app
+from rig.model.records import Run
+from rig.services.made import write_run
+from rig.services.rigs import load_rig
+from tests.analysis.carriage import Carriage, moves, record
+
+PLACE = Path(os.environ.get("BRAMAH_DATA", Path(__file__).parents[4] / "shared" / "data"))
+FILE = PLACE / "emps" / "DATA_EMPS.mat"
+
+
+def experiment(carriage: Carriage, seed: int, amplitude: float, wave: float) -> Run:
+    rig, rng = load_rig("emps"), np.random.default_rng(seed)
+    reference = moves(rig.sample_rate, 12.0, amplitude, wave)
+    records = [record(rig, carriage, reference, rng, "moves", repeat) for repeat in (1, 2, 3, 4)]
+    return Run(rig, tuple(records))
+
+
+@pytest.fixture(scope="module")
+def two_hidden() -> tuple[Run, Run]:
+    machine = Carriage(dry=18.0, offset=-4.0)
+    return experiment(machine, 1, 0.05, 0.25), experiment(machine, 2, 0.07, 0.2)
+
+
+@pytest.fixture(scope="module")
+def found(two_hidden: tuple[Run, Run]) -> Trace:
+    return trace([two_hidden[0]], [two_hidden[1]])
+
+
+def named(result: Trace) -> set[tuple[str, str]]:
+    return {(e.name, e.where) for e in result.effects}
+
+
+BOTH = {("coulomb_friction", "joint 1"), ("torque_offset", "joint 1")}
+
+
+def test_both_hidden_effects_are_named_at_their_size(found: Trace) -> None:
+    assert found.verdict == EXPLAINED
+    assert named(found) == BOTH
+    values = {n: e.value for f in found.effects for n, e in f.parameters.items()}
+    assert values["Fc1"] == pytest.approx(18.0, rel=0.03)
+    assert values["offset1"] == pytest.approx(-4.0, rel=0.03)
+
+
+def test_force_and_free_run_are_far_better_on_records_not_seen(found: Trace) -> None:
+    assert found.before["torque_1"] / found.size["torque_1"] > 0.05
+    assert found.after["torque_1"] < 0.2 * found.before["torque_1"]
+    assert found.rmse_after["position_1"] < 0.05 * found.rmse_before["position_1"]
+    told = to_json(found)
+    assert told["rmse"]["after"]["position_1"] == found.rmse_after["position_1"]
+    assert "spool" not in json.dumps(told)
+    assert "N·m" not in told["sentence"]
+
+
+def test_a_machine_without_them_is_clean() -> None:
+    plain = Carriage(dry=0.0, offset=0.0)
+    result = trace([experiment(plain, 3, 0.05, 0.25)], [experiment(plain, 4, 0.07, 0.2)])
+    assert result.verdict == CLEAN
+
+
+def test_an_electric_joint_has_no_lever_to_tell_asymmetry_from_an_offset() -> None:
+    assert AsymmetricFriction.places(load_rig("emps")) == ()
+    names = {e.name for e in catalogue(load_rig("emps"))}
+    assert {"coulomb_friction", "stribeck_friction", "torque_offset"} <= names
+    assert not names & {"payload", "base_inclination", "valve_deadband"}
+    arm = {e.name for e in catalogue(load_rig("electric-2dof"))}
+    assert "payload" in arm
+    assert "base_inclination" not in arm  # that rig's inclination is a parameter already
+
+
+def test_the_same_command_writes_result_model_and_report(
+    two_hidden: tuple[Run, Run], tmp_path: Path
+) -> None:
+    train, judge = (
+        str(write_run(tmp_path / name, run)) for name, run in zip("ab", two_hidden, strict=True)
+    )
+    paths = {key: str(tmp_path / f"trace.{key}") for key in ("json", "model", "html")}
+    words = ["trace", train, "--holdout", judge, "--json", paths["json"], "--model"]
+    done = CliRunner().invoke(app, [*words, paths["model"], "--report", paths["html"]])
+    assert done.exit_code == 0, done.output
+    assert json.loads(Path(paths["json"]).read_text())["verdict"] == EXPLAINED
+    validated = CliRunner().invoke(app, ["validate", paths["model"], judge, "--json", "-"])
+    assert json.loads(validated.stdout)["records"][0]["rmse"]["position_1"] < 1e-3
+    page = Path(paths["html"]).read_text()
+    assert "coulomb friction" in page
+    assert "<svg" in page
+
+
+@pytest.mark.skipif(not FILE.exists(), reason=f"no measured record at {FILE}")
+@pytest.mark.parametrize(("train", "judge"), [("first", "second"), ("second", "first")])
+def test_on_the_measured_carriage_both_are_found(train: str, judge: str) -> None:
+    data = study.load(FILE, period=study.PERIOD)
+    result = trace([getattr(data, train)], [getattr(data, judge)])
+    assert named(result) == BOTH
+    assert result.before["torque_1"] > 0.17 * result.size["torque_1"]
+    assert result.after["torque_1"] <= 0.05 * result.size["torque_1"]
+    assert result.rmse_before["position_1"] > 35e-3
+    assert result.rmse_after["position_1"] <= 8.5e-3
+
+
+def test_an_electric_rigs_identification_has_its_report(
+    two_hidden: tuple[Run, Run], tmp_path: Path
+) -> None:
+    run, page = str(write_run(tmp_path / "a", two_hidden[0])), tmp_path / "found.html"
+    words = ["identify", run, "--with", "coulomb_friction", "--with", "torque_offset"]
+    done = CliRunner().invoke(app, [*words, "--report", str(page)])
+    assert done.exit_code == 0, done.output
+    text = page.read_text()
+    assert "1 electric joint" in text
+    assert "35.1506 N/V" in text
+    assert "Drive and position of joint 1 in time" in text
+    assert "hydraulic joint" not in text
