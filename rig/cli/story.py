@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 import shutil
 import time
@@ -21,6 +20,7 @@ from rig.cli.output import progress, write_json
 from rig.cli.running import Job, run_protocol
 from rig.cli.simulated import simulated_bench
 from rig.cli.tables import identification_text, validation_text
+from rig.cli.truth_file import read_truth
 from rig.model.records import Run
 from rig.services.store import load_run
 
@@ -55,7 +55,7 @@ def experiment(folder: Path, seed: int, overrides: Overrides, say: Say) -> Exper
     found = identify(runs)
     say("validating on the second, which the fit has not seen")
     results = validate(found.model, judged)
-    return Experiment(runs, judged, found, results, json.loads(truth.read_text()))
+    return Experiment(runs, judged, found, results, read_truth(truth))
 
 
 def tell(out: Path, seed: int, repeats: int | None) -> None:
