@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,10 +54,15 @@ class Hypothesis:
     beta: Mapping[str, float] = field(default_factory=dict)
 
     @property
-    def keys(self) -> tuple[dict[str, str], ...]:
-        """Names and places, for a result."""
+    def keys(self) -> tuple[dict[str, Any], ...]:
+        """Names and places for a result; `at` and `shape` as the catalogue has them."""
         return tuple(
-            {"name": u.term.name, "where": str(getattr(u.term, "place", u.term.where))}
+            {
+                "name": u.term.name,
+                "where": str(getattr(u.term, "place", u.term.where)),
+                "at": u.term.where,
+                "shape": list(u.shape),
+            }
             for u in self.effects
         )
 

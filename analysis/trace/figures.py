@@ -132,7 +132,7 @@ def in_time(line: Lines, noise: float, unit: str, key: str, after: bool) -> Mark
         return svg(made, key, "Held-out residual in time, before and after")
 
 
-def over_noise(result: Trace) -> Markup:
+def over_noise(result: Trace, key: str = "overnoise") -> Markup:
     """Draw every equation's held-out error over its noise floor, before and after."""
     names = list(result.before)
     with style():
@@ -151,7 +151,7 @@ def over_noise(result: Trace) -> Markup:
         axes.set_ylim(-0.6, len(names) - 0.4)
         axes.set_xlabel("held-out error over the noise floor (grey before, blue after)")
         made.tight_layout()
-        return svg(made, "overnoise", "Held-out error over the noise floor, before and after")
+        return svg(made, key, "Held-out error over the noise floor, before and after")
 
 
 def unit_of_variable(name: str) -> str:

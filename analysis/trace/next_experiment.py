@@ -230,8 +230,7 @@ def _told(
     stage: Board, kind: str, chosen: Sequence[ex.Excitation], answers: Sequence[Answer]
 ) -> Mapping[str, Any]:
     weakest = min(answers, key=lambda a: a.promised)
-    keys = [k for a in answers for h in (a.question.one, a.question.other) for k in h.keys]
-    separates = [k for i, k in enumerate(keys) if k not in keys[:i]]
+    separates = _names(answers)
     what = f"predicted separation {weakest.promised:.1f} times the noise, {weakest.present:.1f} now"
     if kind == SHOW:
         names = ", ".join(dict.fromkeys(k["name"].replace("_", " ") for k in separates))
@@ -254,6 +253,13 @@ def _told(
     }  # fmt: skip
 
 
+def _names(answers: Sequence[Answer]) -> list[dict[str, str]]:
+    """Return names and places of all effects in question, each once."""
+    keys = [k for a in answers for h in (a.question.one, a.question.other) for k in h.keys]
+    found = dict.fromkeys((k["name"], k["where"]) for k in keys)
+    return [{"name": name, "where": where} for name, where in found]
+
+
 def _protocols(stage: Board, chosen: Sequence[ex.Excitation]) -> dict[str, Any]:
     rng = np.random.default_rng([SEED, 1])
     return {
@@ -264,10 +270,9 @@ def _protocols(stage: Board, chosen: Sequence[ex.Excitation]) -> dict[str, Any]:
 
 def _in_words(winner: Listed, asked: Sequence[Answer]) -> Mapping[str, Any] | None:
     """Say what separates tied effects where no twin can try it: the rig has no nominal values."""
-    keys = [k for a in asked for h in (a.question.one, a.question.other) for k in h.keys]
     texts = [getattr(known()[u.term.name], "separated_by", "") for u in winner.effects]
     return {
         "kind": TELL,
-        "separates": [k for i, k in enumerate(keys) if k not in keys[:i]],
+        "separates": _names(asked),
         "text": next((t for t in texts if t), "another amplitude and frequency"),
     }
