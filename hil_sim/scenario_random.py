@@ -1,8 +1,7 @@
 """Scenarios drawn by a seed: what is wrong with a bench that nobody has told anything about.
 
 A draw is none, one or two effects of the simulator's list, or one that is made of its parts in a
-way no short formula describes (a spring that hardens steeply, seals as soft as a backlash, a
-return line that throttles). Places are even, sizes even in their logarithm over what such a bench
+way no short formula describes (a spring that hardens steeply, seals as soft as a backlash). Places are even, sizes even in their logarithm over what such a bench
 may show.
 """
 
@@ -29,7 +28,7 @@ Size = tuple[float, float]  # smallest and largest, SI
 
 @dataclass(frozen=True)
 class Kind:
-    """An effect that may be drawn: where it can be, keys with their ranges [SI], fixed keys.
+    """An effect that may be drawn: where it can be, keys with their ranges [SI].
 
     `place` is ``bench``, ``joint``, ``chamber`` or ``pressure`` (a pressure's channel); keys in
     `signed` are drawn either way.
@@ -39,7 +38,6 @@ class Kind:
     place: str
     sizes: Mapping[str, Size]
     signed: tuple[str, ...] = ()
-    fixed: Mapping[str, float] | None = None
 
 
 KINDS: Final = (
@@ -68,7 +66,6 @@ KINDS: Final = (
 STRANGERS: Final = (
     Kind("joint_spring", "joint", {"stiffness": (25.0, 40.0), "hardening": (30.0, 50.0)}),
     Kind("coulomb_friction", "joint", {"force": (90.0, 150.0), "presliding": (3e-3, 5e-3)}),
-    Kind("tank_pressure", "bench", {"back_pressure": (0.5e6, 1e6)}, fixed={"pressure": 0.0}),
 )
 
 
@@ -89,7 +86,7 @@ def draw(rig: Rig, seed: int) -> Scenario:
 
 
 def _effect(kind: Kind, rig: Rig, rng: np.random.Generator) -> dict[str, Any]:
-    out: dict[str, Any] = {"name": kind.name, **(kind.fixed or {})}
+    out: dict[str, Any] = {"name": kind.name}
     joint = int(rng.integers(1, len(rig.joints) + 1))
     if kind.place == "pressure":
         out["channel"] = ch.channel(str(rng.choice([ch.CAP, ch.ROD])), joint)
