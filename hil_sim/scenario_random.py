@@ -1,8 +1,8 @@
 """Scenarios drawn by a seed: what is wrong with a bench that nobody has told anything about.
 
 A draw is none, one or two effects of the simulator's list, or one that is made of its parts in a
-way no short formula describes (a spring that hardens steeply, seals as soft as a backlash). Places are even, sizes even in their logarithm over what such a bench
-may show.
+way no short formula describes (a spring that hardens steeply, seals as soft as a backlash).
+Places are even, sizes even in their logarithm over what such a bench may show.
 """
 
 from __future__ import annotations

@@ -147,6 +147,9 @@ def over_noise(result: Trace, key: str = "overnoise") -> Markup:
         axes.axvline(1.0, color=INK, lw=0.8, ls="--")
         axes.set_xscale("log")
         axes.xaxis.set_major_formatter(lambda v, _: f"{v:g}")
+        low, high = axes.get_xlim()
+        # Within one decade the ticks between are all there is.
+        axes.xaxis.set_minor_formatter(lambda v, _: f"{v:.1g}" if high < 10 * low else "")
         axes.set_yticks(range(len(names)), list(reversed(names)))
         axes.set_ylim(-0.6, len(names) - 0.4)
         axes.set_xlabel("held-out error over the noise floor (grey before, blue after)")

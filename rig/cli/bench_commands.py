@@ -40,7 +40,7 @@ def sim(
     wire: Annotated[str, typer.Option(help="Only modbus-tcp for now.")] = "modbus-tcp",
     scenario: Annotated[
         str | None,
-        typer.Option(help="A file of hidden effects, or random: drawn by the seed, told nobody."),
+        typer.Option(help="A file of hidden effects, worn-seal, or random: drawn by the seed."),
     ] = None,
     seed: Annotated[int, typer.Option(help="Of noise, temperature, and what is drawn.", min=0)] = 0,
     port: Annotated[

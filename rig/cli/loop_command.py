@@ -36,7 +36,7 @@ def loop(
         bool, typer.Option("--simulate", help="Start a simulated bench for it.")
     ] = False,
     scenario: Annotated[
-        str | None, typer.Option(help="Of --simulate: a file of hidden effects, or random.")
+        str | None, typer.Option(help="Of --simulate: as of sim, for example random.")
     ] = None,
     json: JsonOption = None,
     report: Annotated[

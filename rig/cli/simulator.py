@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hil_sim.plant import Plant
-from hil_sim.scenario import Scenario, parse_scenario
+from hil_sim.scenario import Scenario, load_shipped, parse_scenario, shipped_scenarios
 from hil_sim.scenario_random import RANDOM, draw
 from hil_sim.server import EndpointError, serve, warm_up
 from rig.cli.errors import WorkError
@@ -20,8 +20,8 @@ from rig.services.rigs import load_bench
 class Served:
     """What to serve and where.
 
-    `scenario` is a file of hidden effects or ``random``: drawn here, by `seed`; `truth` is a file
-    for the plant's true parameters and what it hides.
+    `scenario` is a file of hidden effects, a shipped one's name, or ``random``: drawn here, by
+    `seed`; `truth` is a file for the plant's true parameters and what it hides.
     """
 
     rig: str
@@ -44,6 +44,8 @@ def hidden(what: Served, rig: Rig) -> Scenario:
         return Scenario()
     if what.scenario == RANDOM:
         return draw(rig, what.seed)
+    if what.scenario in shipped_scenarios():
+        return load_shipped(what.scenario)
     return parse_scenario(read_text(Path(what.scenario), "a scenario"), what.scenario)
 
 
