@@ -37,9 +37,11 @@ AT_END = 2e-3  # [m] a locked piston so near to its end stands at it
 CLOSED_GIVES = 5e-3  # [m] of a joint behind a closed valve
 END_GIVES = 2e-3  # [m]
 OFFSET = 4e-3  # [m] that a record's centre may be off
-HELD_OUT = 0.7  # amplitude of the held-out variant
+# Amplitude of the held-out variant. What an experiment brings out at its limits is soon gone below.
+HELD_OUT = 0.85
 REPEATS = 4
-HELD_OUT_REPEATS = 2
+HELD_OUT_REPEATS = 3
+DRAWS = 40  # of its phases
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,8 @@ FAMILIES: Final = (
     Family("slow", "slowly over the whole stroke", 0.1, 0.1, 0.9, 0.5),
     Family("creep", "back and forth at creeping speed over the whole stroke", 0.1, 0.1, 0.3, 1.0),
     # Its few slow lines move the piston, which the bench needs to centre it.
-    Family("fast", "up to 20 Hz, the more the faster", 0.2, 0.6, 20.0, -0.4),
+    # Much faster, a joint that is held and one behind a closed valve resonate otherwise.
+    Family("fast", "up to 15 Hz, all frequencies alike", 0.2, 0.6, 15.0, 0.0),
     Family("small", "by small amplitudes about the valve's null", 0.1, 0.3, 5.0, 0.25, 0.12),
     Family(
         "out", "at all frequencies a quarter of the stroke out of its middle", 0.1, 0.5, 9.5, 0.25,
@@ -242,7 +245,8 @@ def _as_step(
     offset = f"{1e3 * OFFSET:g} mm"
     excite = []
     for j, tone in one.tones.items():
-        spectrum = _other_phases(tone.spectrum, rng) if rng is not None else tone.spectrum
+        n = one.step.period
+        spectrum = tone.spectrum if rng is None else _other_phases(tone, n, rng)
         excite.append(
             {
                 "joint": j + 1,
@@ -265,5 +269,15 @@ def _as_step(
     }
 
 
-def _other_phases(spectrum: Spectrum, rng: np.random.Generator) -> Spectrum:
-    return np.asarray(np.abs(spectrum) * np.exp(2j * np.pi * rng.random(len(spectrum))))
+def _other_phases(tone: Tone, n: int, rng: np.random.Generator) -> Spectrum:
+    """Return the tone's amplitudes with other phases: of some draws the flattest, n samples."""
+    size, best, least = np.abs(tone.spectrum), tone.spectrum, np.inf
+    for _ in range(DRAWS):
+        spectrum = size * np.exp(2j * np.pi * rng.random(len(size)))
+        full = np.zeros((2, n // 2 + 1), dtype=np.complex128)
+        full[0, tone.lines], full[1, tone.lines] = spectrum, spectrum / (1j * tone.lines)
+        # Of the command and of its integral, which the piston follows.
+        peak = float(np.prod(np.ptp(np.fft.irfft(full, n, axis=1), axis=1)))
+        if peak < least:
+            best, least = spectrum, peak
+    return best

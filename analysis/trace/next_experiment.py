@@ -33,7 +33,8 @@ from analysis.trace.discriminate import (
 from analysis.trace.interesting import smallest
 from analysis.trace.result import CLEAN, CONFOUNDED, UNEXPLAINED, Dependence, Found
 from analysis.trace.select import BAND
-from analysis.trace.shortlist import Listed, Shortlist
+from analysis.trace.shortlist import Listed, Shortlist, parameter_values
+from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
@@ -45,6 +46,7 @@ STEPS = 3  # of an experiment
 WORTH = 0.3  # that a further step must add to the sum over questions
 NEAR = 2.0  # times the energy that the best set leaves: another is still in question
 RIVALS = 3
+LIKELY = 2.0  # times its nominal value that a parameter may be
 SEED = 0  # of the excitations' phases
 SCALE = ex.HELD_OUT
 
@@ -79,7 +81,7 @@ def propose(
     if not questions and not moves:
         return None
     rng = np.random.default_rng(SEED)
-    tried = list(ex.excitations(stage.rig, stage.scenes, rng, families))
+    tried = list(ex.excitations(learned(stage), stage.scenes, rng, families))
     if not tried:
         return _in_words(winner, questions) if verdict == CONFOUNDED else None
     views = [view(stage, one) for one in tried]
@@ -90,6 +92,19 @@ def propose(
     if verdict == UNEXPLAINED and moves:
         return _covering(stage, winner, moves, tried, views)
     return None
+
+
+def learned(stage: Board) -> Rig:
+    """Return the rig with what the records say of its parameters: a twin that is nearer to it."""
+    found = parameter_values(stage.rig, stage.terms, dict(stage.beta))
+    before = stage.rig.nominal
+    likely = {
+        name: value
+        for name, value in found.items()
+        # A parameter that the records hardly move may come out as anything.
+        if name not in before or 1 / LIKELY < value / before[name] < LIKELY
+    }
+    return stage.rig.model_copy(update={"nominal": {**before, **likely}})
 
 
 def _questions(

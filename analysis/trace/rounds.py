@@ -13,11 +13,14 @@ from typing import Any
 
 import numpy as np
 
+from analysis.effects.base import Effect
 from analysis.terms import baseline_of, known
 from analysis.terms.base import Used
 from analysis.trace.board import Board, board
+from analysis.trace.discriminate import Ground, Hypothesis, Question, present
 from analysis.trace.evidence import scenes
-from analysis.trace.next_experiment import COVER, SHOW
+from analysis.trace.interesting import smallest
+from analysis.trace.next_experiment import SHOW
 from analysis.trace.refine import refine
 from analysis.trace.result import Trace, to_json
 from analysis.trace.shortlist import excess_of
@@ -58,14 +61,20 @@ class Round:
 def achieved(
     rig: Rig, before: Sequence[Run], new: Run, experiment: Mapping[str, Any]
 ) -> float | None:
-    """Return the separation [noise] that an experiment's records brought; None if it told nothing
-    apart (it covered or showed).
+    """Return the separation [noise] that an experiment's records brought, None if none was asked.
+
+    What it was to make visible is not there to be measured; then this is how large it would stand
+    on the records as they were taken.
     """
-    if experiment["kind"] in (COVER, SHOW) or not experiment.get("questions"):
+    if not experiment.get("questions"):
         return None
     terms = tuple(map(Used, baseline_of(rig)))
-    old = board(rig, terms, scenes(rig, before))
     both = board(rig, terms, scenes(rig, [*before, new]))
+    if experiment["kind"] == SHOW:
+        ground = Ground(both)
+        asked = [_small(q["one"], rig) for q in experiment["questions"]]
+        return min(present(q, ground) for q in asked)
+    old = board(rig, terms, scenes(rig, before))
     found = [
         _one(old, both, terms, len(before), q["one"], q["other"]) for q in experiment["questions"]
     ]
@@ -94,6 +103,12 @@ def _one(
         ),
         default=0.0,
     )
+
+
+def _small(one: Sequence[Mapping[str, Any]], rig: Rig) -> Question:
+    (used,) = effects_of(one)
+    assert isinstance(used.term, Effect)
+    return Question(smallest(used.term, rig) or Hypothesis((used,)), Hypothesis(), False)
 
 
 def effects_of(side: Sequence[Mapping[str, Any]]) -> list[Used]:

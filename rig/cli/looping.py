@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 PROTOCOL: Final = "lock-and-excite-multisine"
 HELD_OUT: Final = Overrides(amplitude_scale=0.7, seed=1007, repeats=2)
 SMALLER = 0.8  # an experiment that the bench or its twin refuses is tried again so much smaller
-TRIES = 3
+TRIES = 4
 
 FLOOR: Final = "what is left lies within the noise"
 NOTHING: Final = "no experiment within the limits promises more than noise"
