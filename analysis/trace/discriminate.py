@@ -38,6 +38,7 @@ from analysis.trace.evidence import (
     trace_filtering,
 )
 from analysis.trace.excitations import REPEATS, Excitation
+from analysis.trace.floor import stated_noise
 from analysis.trace.refine import shapes_of
 from rig.model.rig import Rig
 
@@ -103,18 +104,34 @@ class View:
         return float(np.sqrt(REPEATS) / max(self.noise[equation], 1e-30))
 
 
-def view(stage: Board, excitation: Excitation) -> View:
-    """Build the rows of an excitation as the trace would of its record."""
+def calibration(stage: Board) -> dict[str, float]:
+    """Return, by equation, the measured noise over what the rig's stated sensor noise would make.
+
+    A faster excitation is filtered wider and so is noisier: the stated noise tells by how much.
+    """
+    found: dict[str, list[float]] = {}
+    for scene, rows in zip(stage.scenes, stage.rows, strict=True):
+        stated = stated_noise(stage.rig, stage.terms, scene, rows, stage.beta)
+        for floor in stage.floors:
+            if floor.group == scene.group and stated.get(floor.equation, 0.0) > 0:
+                found.setdefault(floor.equation, []).append(floor.noise / stated[floor.equation])
+    return {e: float(np.sqrt(np.mean(np.square(v)))) for e, v in found.items()}
+
+
+def view(stage: Board, excitation: Excitation, measured: Mapping[str, float]) -> View:
+    """Build the rows of an excitation as the trace would of its record.
+
+    `measured` is the board's `calibration`; of other equations nothing can be said: their joint
+    has never moved.
+    """
     rig = ideal(stage.rig)
     record = excitation.played.record
     filters = trace_filtering(record)
     scene = Scene(-1, record, condition(rig, record, filters.channels), filters)
-    squares: dict[str, list[float]] = {}
-    for floor in stage.floors:
-        squares.setdefault(floor.equation, []).append(floor.noise**2)
-    noise = {e: float(np.sqrt(np.mean(v))) for e, v in squares.items()}
-    # Without a noise floor nothing can be said of an equation: its joint has never moved.
-    rows = {e: r for e, r in scene_rows(rig, stage.terms, scene).items() if e in noise}
+    every = scene_rows(rig, stage.terms, scene)
+    rows = {e: r for e, r in every.items() if e in measured and len(r.rhs)}
+    stated = stated_noise(rig, stage.terms, scene, rows, stage.beta)
+    noise = {e: measured[e] * stated[e] for e in rows}
     seen = prepared(rig, stage.terms, scene)
     return View(rig, tuple(stage.terms), stage.beta, scene, seen, rows, noise)
 
@@ -213,7 +230,6 @@ def separation(question: Question, old: Ground, new: Ground) -> tuple[float, str
         by_equation = {
             e: float(np.sqrt(max(0.0, after[e] - before.get(e, 0.0)) / (REPEATS * len(r.rhs))))
             for e, r in new.seen.rows.items()
-            if len(r.rhs)
         }
         loudest = max(by_equation, key=lambda e: by_equation[e], default="")
         found.append((by_equation.get(loudest, 0.0), loudest))

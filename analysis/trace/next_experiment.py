@@ -25,6 +25,7 @@ from analysis.trace.discriminate import (
     Hypothesis,
     Question,
     View,
+    calibration,
     loudest,
     present,
     separation,
@@ -84,7 +85,8 @@ def propose(
     tried = list(ex.excitations(learned(stage), stage.scenes, rng, families))
     if not tried:
         return _in_words(winner, questions) if verdict == CONFOUNDED else None
-    views = [view(stage, one) for one in tried]
+    measured = calibration(stage)
+    views = [view(stage, one, measured) for one in tried]
     kind = SHOW if verdict == CLEAN else TELL
     best = _choose(questions, tried, views, old)
     if best is not None:

@@ -53,7 +53,7 @@ def loop(
     Example: bramah loop --rig shinshu-2dof --out loops/monday --unattended
     """
     from protocols.plan import Overrides
-    from rig.cli.looping import Loop, Wanted
+    from rig.cli.looping import Loop, Wanted, refuse_taken
     from rig.cli.simulated import simulated_bench
     from rig.model.parse import InputError
 
@@ -66,6 +66,7 @@ def loop(
             "loop asks before each experiment that it designs; give --unattended where nobody "
             "can answer"
         )
+    refuse_taken(out)
     with ExitStack() as stack:
         if simulate:
             # The truth stays with the simulator: the loop does not look at it.

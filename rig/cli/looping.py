@@ -63,13 +63,18 @@ class Wanted:
     ask: Callable[[Mapping[str, Any]], bool] = lambda experiment: True
 
 
+def refuse_taken(out: Path) -> None:
+    """Raise InputError where a loop has been in this folder before."""
+    taken = out / "run-1"
+    if taken.exists():
+        raise InputError(f"--out {out}: {taken} is there already; name another folder")
+
+
 class Loop:
     """A loop under way: `rounds` so far, `stopped` why it ended ('' while it has not)."""
 
     def __init__(self, wanted: Wanted, say: Callable[[str], None]) -> None:
-        taken = wanted.out / "run-1"
-        if taken.exists():
-            raise InputError(f"--out {wanted.out}: {taken} is there already; name another folder")
+        refuse_taken(wanted.out)
         self.wanted, self.say = wanted, say
         self.rig: Rig = load_bench(wanted.rig)
         self.rounds: list[Round] = []

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from hil_sim.scenario import Scenario, parse_scenario
-from protocols.plan import Overrides
-from rig.cli.direct_bench import simulated_run
+from protocols import engine, library
+from protocols.plan import Overrides, resolve
+from rig.cli.direct_bench import DirectBench
 from rig.cli.looping import Loop, Wanted
 from rig.model.records import Run
 
@@ -45,16 +46,22 @@ steps:
 
 
 class Inside(Loop):
-    """A loop on a plant of this process that hides a scenario; every run has its own noise."""
+    """A loop on a plant of this process that hides a scenario and lives through all its runs.
+
+    Its oil keeps its temperature: what that does to b is no part of these stories.
+    """
 
     def __init__(self, wanted: Wanted, hidden: Scenario) -> None:
         self.said: list[str] = []
         super().__init__(wanted, self.said.append)
-        self._hidden, self._seed = hidden, 40
+        steady = self.rig.oil.model_copy(update={"temperature_band": 0.0})
+        self.rig = self.rig.model_copy(update={"oil": steady})
+        self._bench = DirectBench(self.rig, hidden, 41)
 
     def _run(self, name: str, protocol: str, sizes: Overrides) -> Run:
-        self._seed += 1
-        return simulated_run(self.rig, protocol, self._seed, self._hidden, sizes)[0]
+        before = len(self._bench.records)
+        engine.run(resolve(library.load(protocol), self.rig, sizes), self.rig, self._bench)
+        return Run(self.rig, tuple(self._bench.records[before:]), name)
 
 
 def looped(
