@@ -16,7 +16,7 @@ from analysis.advice import base_statements
 from analysis.checks import Check
 from analysis.condense import SEGMENTS, Reduction, reduce_runs, solve_reductions
 from analysis.condense import repeats_of as reduced_repeats
-from analysis.estimators.choose import Job, Refined, refine, refuse_unknown
+from analysis.estimators.choose import UNBIASED, Job, Refined, refine, refuse_unknown
 from analysis.give import moving_by_step
 from analysis.model import Estimate, Model, estimate_json, finite
 from analysis.reduce import reduced
@@ -78,7 +78,7 @@ def identify(
     terms: Sequence[Used] | None = None,
     filtering: Callable[[Record], Filtering] = default_filtering,
     reject_noise: bool = True,
-    estimator: str = "ls",
+    estimator: str = "auto",
     bootstrap: int = 0,
     rng: np.random.Generator | None = None,
     search: SearchOptions | None = None,
@@ -88,7 +88,8 @@ def identify(
     `terms` defaults to the paper's model. `reject_noise` False gives out parameters that rest on
     sensor noise as well, for studies of just that. Another `method` is `analysis.methods`' work,
     `search` being for those that search. `estimator` is one of
-    `analysis.estimators.choose.ESTIMATORS`, "plain" the bare solution without nuisances;
+    `analysis.estimators.choose.ESTIMATORS` ("auto": least squares, or instruments where noise in
+    the regressors biases it and that matters), "plain" the bare solution without nuisances;
     `bootstrap` draws of whole repeats replace the intervals; `rng` is for what is drawn (default:
     seed 0). Raises InputError for another method or estimator, for runs
     of different rigs and for records that cannot be used, naming record and channel.
@@ -137,7 +138,7 @@ def conclude(
     rows = {family: solution.rows for family, solution in solutions.items()}
     masked = sum(one.masked for one in reductions)
     statements = (
-        *_statements(rig, reductions, solutions, estimates, rows, masked),
+        *_statements(rig, reductions, found, estimates, rows, masked),
         *found.checks,
     )
     provenance = {
@@ -177,8 +178,8 @@ def _fitting_estimator(rig: Rig, used: Sequence[Used], estimator: str, bootstrap
     reducing = [one.term.name for one in used if one.term.reduction(rig) is not None]
     if estimator == PLAIN or not (rig.electric or reducing):
         return estimator
-    if estimator != "ls" or bootstrap:
-        asked = f"--estimator {estimator}" if estimator != "ls" else "--bootstrap"
+    if estimator not in ("ls", "auto") or bootstrap:
+        asked = "--bootstrap" if estimator in ("ls", "auto") else f"--estimator {estimator}"
         why = (
             f"is for hydraulic rigs; {rig.name!r} is electric"
             if rig.electric
@@ -316,7 +317,7 @@ def _with_ends(
 def _statements(
     rig: Rig,
     reductions: Sequence[Reduction],
-    solutions: Mapping[str, Solution],
+    found: Refined,
     estimates: Mapping[str, Estimate],
     rows: Mapping[str, int],
     masked: int,
@@ -327,9 +328,9 @@ def _statements(
         *ck.clipping(rig, [(one.head, one.clipped) for one in reductions]),
         ck.lost_samples([(one.head, one.lost) for one in reductions]),
         ck.masked(sum(rows.values()), masked),
-        *ck.identifiability(solutions),
-        *base_statements(rig, solutions),
-        ck.noise_bias(solutions),
+        *ck.identifiability(found.solutions),
+        *base_statements(rig, found.solutions),
+        ck.noise_bias(found.solutions, found.estimator in UNBIASED),
         *ck.consistency(rig, estimates),
     )
 

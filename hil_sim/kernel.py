@@ -65,11 +65,14 @@ def orifice(drop: float, laminar: float) -> float:
 
 @jit
 def opening(travel: float, lap: float, rounding: float) -> float:
-    """Return one edge's opening [V]; sharp at zero rounding, lap > 0 overlaps, < 0 underlaps."""
+    """Return one edge's opening [V]; sharp at zero rounding, lap > 0 overlaps, < 0 underlaps.
+
+    A corner worn round over +- rounding of travel: a parabola there that meets both straight lines.
+    """
     past = travel - lap
-    if rounding == 0.0:
+    if abs(past) >= rounding:
         return max(past, 0.0)
-    return 0.5 * (past + sqrt(past * past + rounding * rounding))
+    return (past + rounding) * (past + rounding) / (4.0 * rounding)
 
 
 @jit

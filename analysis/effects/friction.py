@@ -27,8 +27,6 @@ from analysis.effects.base import Array, Effect, Shape, beyond
 from analysis.signals import Signals
 from analysis.terms.base import (
     CONTRIBUTE,
-    P_CAP,
-    P_ROD,
     SD,
     TORQUE,
     Coefficient,
@@ -48,12 +46,11 @@ FASTEST: Final = 3e3  # [1/s] relaxation in simulation; faster changes nothing t
 # On the measured positioning system 0.01 mm/s and 0.1 mm/s give the same parameters to 0.4 %,
 # 1 mm/s does not (2 %).
 TRANSITION: Final = 1e-4
-DIFFERENCE: Final = 0.1  # of the mean level: with less between directions it is not asymmetric
 
 
 @dataclass(frozen=True)
-class _Friction(Effect):
-    """What the four forms share: joint, presliding distance and the state z of the contact."""
+class Friction(Effect):
+    """What the four forms share: joint, presliding distance, the state z of the contact."""
 
     family: ClassVar[str] = "friction"
     per_joint: ClassVar[bool] = True
@@ -70,6 +67,14 @@ class _Friction(Effect):
     def tolerance(self, shape: Sequence[float]) -> float:
         """Return a fine one for the contact without memory: coarser, creep at rest is noise."""
         return self.rate_tolerance if len(shape) else 1e-3 * TRANSITION
+
+    def outside(self, rig: Rig, shape: Sequence[float]) -> str:
+        """As every effect's; a contact stiffer than the sensors resolve is no contradiction."""
+        floored = [
+            max(v, s.grid[0]) if s.parameter.startswith("presliding") else v
+            for s, v in zip(self.shapes(rig), shape, strict=True)
+        ]
+        return super().outside(rig, floored)
 
     def hidden(self, rig: Rig) -> int:
         """Return 1: the deflection y = d z."""
@@ -111,7 +116,7 @@ def force_unit(rig: Rig, joint: int) -> str:
 
 
 @dataclass(frozen=True)
-class CoulombFriction(_Friction):
+class CoulombFriction(Friction):
     """F_f = Fc z: dry friction of one level (Coulomb 1785; the contact's state z, see the module).
 
     Hides in the viscous friction: 80 N on the seed bench make Fv2 110 % too large (NOTES).
@@ -149,7 +154,7 @@ class CoulombFriction(_Friction):
 
 
 @dataclass(frozen=True)
-class StribeckFriction(_Friction):
+class StribeckFriction(Friction):
     """F_f = Fs exp(-(s'/vs)^2) z: breakaway above Coulomb's level (Armstrong-Helouvry et al. 1994).
 
     Falls off over the Stribeck speed vs (shape). Alone it is the part that vanishes with speed;
@@ -197,93 +202,6 @@ class StribeckFriction(_Friction):
         return found or Effect.outside(self, rig, (shape[0], self.shapes(rig)[1].grid[1]))
 
 
-@dataclass(frozen=True)
-class AsymmetricFriction(_Friction):
-    """F_f = (F_ext [z > 0] + F_ret [z < 0]) z: seals that hold differently either way.
-
-    Source: Jelali and Kroll 2003 (different levels by direction of motion).
-    """
-
-    name: ClassVar[str] = "asymmetric_friction"
-    variable: ClassVar[str] = "the direction of the piston's motion"
-    confounders: ClassVar[tuple[str, ...]] = ("coulomb_friction", "torque_offset")
-    separated_by: ClassVar[str] = (
-        "motion about several places of the stroke: an offset torque does not go with G"
-    )
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled contribution."""
-        return _asymmetric
-
-    def _names(self) -> tuple[str, str]:
-        return f"F_ext_{self.joint + 1}", f"F_ret_{self.joint + 1}"
-
-    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
-        """Return F_ext, F_ret [N]."""
-        unit = force_unit(rig, self.joint)
-        return tuple(Coefficient(name, unit, "mechanical") for name in self._names())
-
-    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
-        """Return G max(z, 0) and G min(z, 0)."""
-        z, lever = self.contact(rig, signals, shape), signals.G[:, self.joint]
-        levels = (lever * np.maximum(z, 0.0), lever * np.minimum(z, 0.0))
-        return self.row(dict(zip(self._names(), levels, strict=True)))
-
-    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Refuse a driving direction, too much, and directions that do not differ."""
-        limit = force_limit(rig, self.joint)
-        levels = [values[name] for name in self._names()]
-        mean = 0.5 * sum(levels)
-        for name, level in zip(self._names(), levels, strict=True):
-            found = beyond(name, level, "N", limit, -DIFFERENCE * abs(mean))
-            if found:
-                return found
-        if abs(levels[0] - levels[1]) < DIFFERENCE * mean:
-            return "the two directions differ by less than a tenth: this is coulomb_friction"
-        return ""
-
-
-@dataclass(frozen=True)
-class PressureDependentFriction(_Friction):
-    """F_f = k (p_cap + p_rod) z: seals pressed on by the oil (Jelali and Kroll 2003).
-
-    k [m^2] is the friction coefficient times the seals' area under pressure.
-    """
-
-    name: ClassVar[str] = "pressure_dependent_friction"
-    variable: ClassVar[str] = "the sum of the chamber pressures, with the velocity's sign"
-    confounders: ClassVar[tuple[str, ...]] = ("coulomb_friction", "asymmetric_friction")
-    separated_by: ClassVar[str] = (
-        "the same motion at two levels of chamber pressure (supply setting, load or inclination)"
-    )
-
-    @property
-    def kernel(self) -> Kernel:
-        """The compiled contribution."""
-        return _by_pressure
-
-    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
-        """Return k [m^2]."""
-        return (Coefficient(f"k_friction_{self.joint + 1}", "m^2", "mechanical"),)
-
-    @classmethod
-    def places(cls, rig: Rig) -> tuple[str, ...]:
-        """Return the hydraulic joints."""
-        return () if getattr(rig, "electric", False) else super().places(rig)
-
-    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
-        """Return G max(p_cap + p_rod, 0) z."""
-        i = self.joint
-        load = signals.G[:, i] * np.maximum(signals.p_cap[:, i] + signals.p_rod[:, i], 0.0)
-        return self.row({f"k_friction_{i + 1}": load * self.contact(rig, signals, shape)})
-
-    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Refuse friction that drives, and more than half of the cylinder's force."""
-        name = f"k_friction_{self.joint + 1}"
-        return beyond(name, values[name], "m^2", 0.5 * rig.joints[self.joint].cylinder.cap_area)
-
-
 @njit(cache=True, error_model="numpy")
 def contact_state(s, distance):  # type: ignore[no-untyped-def]
     """Return z (n,) of the path s (n,) [m]: exact over every step, which is taken as monotone."""
@@ -321,22 +239,4 @@ def _stribeck(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-d
         out[TORQUE, i] -= par[1] * math.exp(-ratio * ratio) * x[G, i] * state
 
 
-@kernel
-def _asymmetric(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    if phase == CONTRIBUTE:
-        i = int(par[0])
-        state, dz[0] = slide(x[SD, i], z[0], par[3])
-        level = par[1] if state > 0.0 else par[2]
-        out[TORQUE, i] -= level * x[G, i] * state
-
-
-@kernel
-def _by_pressure(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    if phase == CONTRIBUTE:
-        i = int(par[0])
-        state, dz[0] = slide(x[SD, i], z[0], par[2])
-        load = max(x[P_CAP, i] + x[P_ROD, i], 0.0)
-        out[TORQUE, i] -= par[1] * load * x[G, i] * state
-
-
-TERMS = (CoulombFriction, StribeckFriction, AsymmetricFriction, PressureDependentFriction)
+TERMS = (CoulombFriction, StribeckFriction)

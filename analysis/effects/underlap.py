@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 
 from analysis.effects.base import Array, Shape
-from analysis.effects.valve import ValveEffect
+from analysis.effects.valve import ValveEffect, edge, opened, rounding
 from analysis.signals import Signals
 from analysis.terms.base import (
     CONTRIBUTE,
@@ -37,8 +37,9 @@ class UnderlapLeakage(ValveEffect):
     """Edges open by w at the null: opening max(w + u, 0) ahead and max(w - u, 0) astern, at once.
 
     What is added to the zero-lap orifice: ahead edges d+ = max(u + w, 0) - max(u, 0), astern edges
-    d- = max(w - u, 0) - max(-u, 0), each times its own gain and root (Merritt 1967, chapter 5,
-    open-centre valve). The gains are the orifices' own: the columns add to theirs.
+    d- = max(w - u, 0) - max(-u, 0), edges rounded as those of `valve_deadband`, each times its own
+    gain and root (Merritt 1967, chapter 5, open-centre valve). The gains are the orifices' own: the
+    columns add to theirs.
     """
 
     name: ClassVar[str] = "underlap_leakage"
@@ -64,14 +65,15 @@ class UnderlapLeakage(ValveEffect):
         return tuple(Coefficient(name, parameter_unit(name), "fluid") for name in names)
 
     def shape_names(self) -> tuple[str, ...]:
-        """Name the underlap."""
-        return (f"w_underlap_{self.joint + 1}",)
+        """Name the underlap and the edges' rounding."""
+        return f"w_underlap_{self.joint + 1}", f"rounding_{self.joint + 1}"
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return the underlap [V], up to a tenth of the spool's stroke."""
+        """Return the underlap [V], up to a tenth of the spool's stroke, and rounding [V]."""
         stroke = rig.joints[self.joint].valve.spool_stroke
         grid = (0.002 * stroke, 0.006 * stroke, 0.02 * stroke)
-        return (Shape(self.shape_names()[0], "V", 0.0, 0.1 * stroke, grid, 0.0),)
+        own = Shape(self.shape_names()[0], "V", 0.0, 0.1 * stroke, grid, 0.0)
+        return own, rounding(self.joint, stroke)
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Return the signals unchanged."""
@@ -81,9 +83,9 @@ class UnderlapLeakage(ValveEffect):
         """Return the additional openings times the roots, under the orifices' own names."""
         i = self.joint
         pp, pm, mp, mm = gain_names(i + 1)
-        u, w = signals.u[:, i], self.shape_of(rig, shape)[0]
-        ahead = np.maximum(u + w, 0.0) - np.maximum(u, 0.0)
-        astern = np.maximum(w - u, 0.0) - np.maximum(-u, 0.0)
+        u, (w, r) = signals.u[:, i], self.shape_of(rig, shape)
+        ahead = opened(u + w, r) - np.maximum(u, 0.0)
+        astern = opened(w - u, r) - np.maximum(-u, 0.0)
         cap, rod, p_s, p_t = signals.p_cap[:, i], signals.p_rod[:, i], signals.p_s, signals.p_tank
         return {
             equation("flow_cap", i): {pp: ahead * _root(p_s - cap), pm: -astern * _root(cap - p_t)},
@@ -91,9 +93,9 @@ class UnderlapLeakage(ValveEffect):
         }
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
-        """Return joint, gains, underlap."""
+        """Return joint, gains, underlap, rounding."""
         gains = [values[name] for name in gain_names(self.joint + 1)]
-        return np.array([self.joint, *gains, self.shape_of(rig, shape)[0]])
+        return np.array([self.joint, *gains, *self.shape_of(rig, shape)])
 
 
 def _root(drop: Array) -> Array:
@@ -111,8 +113,8 @@ def _underlap(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-d
         return
     i = int(par[0])
     u, w = x[U, i], par[5]
-    ahead = max(u + w, 0.0) - max(u, 0.0)
-    astern = max(w - u, 0.0) - max(-u, 0.0)
+    ahead = edge(u + w, par[6]) - max(u, 0.0)
+    astern = edge(w - u, par[6]) - max(-u, 0.0)
     cap, rod, p_s, p_t = x[P_CAP, i], x[P_ROD, i], bench[P_S], bench[P_TANK]
     out[FLOW_CAP, i] += par[1] * ahead * _signed(p_s - cap) - par[2] * astern * _signed(cap - p_t)
     out[FLOW_ROD, i] += par[4] * astern * _signed(p_s - rod) - par[3] * ahead * _signed(rod - p_t)

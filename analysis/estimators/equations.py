@@ -78,6 +78,16 @@ class Block:
 
 
 @dataclass(frozen=True)
+class Prepared:
+    """A family's blocks, nuisance columns last, with the names of all columns."""
+
+    family: str
+    names: tuple[str, ...]
+    parameters: int
+    blocks: tuple[Block, ...]
+
+
+@dataclass(frozen=True)
 class Fit:
     """A solution beta (k,) with A^-1 (k, k), and the instruments and weights that made it."""
 

@@ -34,14 +34,10 @@ class Hausman:
     p: Array
     relative: Array
 
-    def worst(self) -> int:
-        """Return the index of the parameter whose difference is the most certain to be one."""
-        return int(np.argmax(np.abs(self.difference) / np.maximum(self.error, 1e-300)))
-
-    def biased(self, matters: Array) -> NDArray[np.bool_]:
-        """Return where (k,) least squares is biased, by the test and by more than `matters`."""
-        found = self.p < LEVEL / len(self.p)
-        return np.asarray(found & (np.abs(self.difference) > matters))
+    @property
+    def certain(self) -> NDArray[np.bool_]:
+        """Where (k,) the difference is more than chance."""
+        return np.asarray(self.p < LEVEL / len(self.p))
 
 
 def instrumental_variables(blocks: Sequence[Block]) -> Fit:

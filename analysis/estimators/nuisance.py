@@ -144,13 +144,28 @@ def implausible(belief: Belief, beta: Array, covariance: Array) -> bool:
     return bool(abs(belief.h @ beta) > IMPLAUSIBLE * np.sqrt(variance))
 
 
-def joined(beta: Array, spread: Spread, belief: Belief) -> tuple[Array, Spread]:
-    """Join one observation into beta (k,) and its spread (Kalman's update)."""
+def joined(
+    beta: Array, spread: Spread, belief: Belief, inverse: Array
+) -> tuple[Array, Spread, Array]:
+    """Join one observation into beta (k,), its spread and its A^-1 (k, k), which is `inverse`.
+
+    The gain g of Kalman's update is taken from A^-1, sized to the spread V:
+     g = P h / (h'P h + s^2),  P = A^-1 (h'V h) / (h'A^-1 h).
+    V itself rests on a few repeats: a gain from it would follow their noise and promise (1 - r^2)
+    of a variance with an r^2 that is too large. What an estimate with any gain scatters is
+     (I - g h') V (I - g h')' + g s^2 g'  (Joseph's form).
+    """
     V, h = spread.covariance, belief.h
-    Vh = V @ h
-    gain = Vh / (h @ Vh + belief.std**2)
-    after = V - np.outer(gain, Vh)
-    before = np.diag(V)
-    share = np.clip(np.diag(after) / np.where(before > 0, before, 1.0), 1e-6, 1.0)
-    # What is known beforehand needs no repeats: with it the degrees of freedom grow.
-    return beta - gain * (h @ beta), Spread(after, spread.dof / share**2, spread.systematic)
+    shape = 0.5 * (inverse + inverse.T)
+    P = shape * (h @ V @ h) / (h @ shape @ h)
+    gain = P @ h / (h @ P @ h + belief.std**2)
+    move = np.eye(len(h)) - np.outer(gain, h)
+    scatter = move @ V @ move.T
+    after = scatter + belief.std**2 * np.outer(gain, gain)
+    left = np.diag(scatter)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # What is known beforehand needs no repeats: its part of the variance counts as known.
+        grown = np.where(left > 0, np.minimum(np.diag(after) / left, 1e3), 1.0)
+        systematic = np.minimum(spread.systematic, 1.0) / grown
+    new = Spread(after, spread.dof * grown**2, systematic)
+    return beta - gain * (h @ beta), new, move @ inverse

@@ -93,6 +93,5 @@ def leverage_weights(blocks: Sequence[Block]) -> list[Array]:
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = np.nanmax(np.where(usual > 0, off / usual, 0.0), axis=2)
         for n, (i, at) in enumerate(zip(members, places, strict=True)):
-            ratio = LEVERAGE / np.maximum(distance[n, at], 1e-300)
-            out[i] = np.where(ratio < 1.0, ratio**4, 1.0)
+            out[i] = (LEVERAGE / np.maximum(distance[n, at], LEVERAGE)) ** 4
     return out

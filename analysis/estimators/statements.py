@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,24 +10,14 @@ from numpy.typing import NDArray
 from analysis.checks import Check
 from analysis.estimators import nuisance as nu
 from analysis.estimators.covariance import Spread
-from analysis.estimators.equations import Block, Fit
-from analysis.estimators.instruments import Hausman
+from analysis.estimators.equations import Fit
 from analysis.estimators.robust import outlying
+from analysis.estimators.shifts import LEAST, SHARE, Shift
 
 Array = NDArray[np.float64]
 
-MATTERS = 0.5  # standard errors: a bias of least squares below this is not worth another estimator
 FEW_OUTLIERS = 0.02
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """A family's blocks, nuisance columns last, with the names of all columns."""
-
-    family: str
-    names: tuple[str, ...]
-    parameters: int
-    blocks: tuple[Block, ...]
+NOISE_CHECK = "noise in regressors"
 
 
 def nuisance_statement(
@@ -61,40 +50,53 @@ def nuisance_statement(
     return Check("laminar transition", not wrong, said)
 
 
-def noise_statement(
-    prepared: Sequence[Prepared],
-    tests: Mapping[str, Hausman],
-    reference: Mapping[str, tuple[Array, Spread, Fit]],
-) -> Check:
-    """State whether noise in the regressors biases least squares (Hausman's test)."""
-    biased: list[tuple[float, str, float]] = []
-    largest = (0.0, "", 0.0)
-    for p in prepared:
-        test, k = tests[p.family], p.parameters
-        _, error, _ = reference[p.family]
-        matters = MATTERS * np.sqrt(np.diag(error.covariance))
-        hits = test.biased(np.concatenate((matters, np.full(len(p.names) - k, np.inf))))[:k]
-        for i, name in enumerate(p.names[:k]):
-            size = abs(float(test.relative[i]))
-            t = float(test.difference[i] / test.error[i]) if test.error[i] > 0 else 0.0
-            # The rows hold 1/b: what makes 1/b larger makes b smaller.
-            entry = (size, name, t)
-            if hits[i]:
-                biased.append(entry)
-            largest = max(largest, entry)
+def noise_statement(shifts: Sequence[Shift]) -> Check:
+    """State whether noise in the regressors biases least squares (Hausman's test), and if so much.
+
+    Not ok is a shift that is certain and matters; of any other the figures are said.
+    """
+    if not shifts:
+        return Check(NOISE_CHECK, False, "nothing identified to judge")
+    certain = [s for s in shifts if s.significant]
+    biased = [s for s in certain if s.material]
     if biased:
-        size, name, t = max(biased)
+        worst = max(biased, key=lambda s: abs(s.relative))
         return Check(
-            "noise in regressors", False,
-            f"least squares is biased by noise in the regressors, {name} most: by "
-            f"{100 * size:.2g} % against instruments from the other repeats ({abs(t):.0f} standard "
-            f"errors); so are {len(biased) - 1} others; use --estimator iv or output-error",
+            NOISE_CHECK, False,
+            f"least squares is biased by noise in the regressors, {_figures(worst)}; so are "
+            f"{len(biased) - 1} others; --estimator auto or iv is not",
         )  # fmt: skip
+    if certain:
+        worst = max(certain, key=lambda s: s.t)
+        return Check(
+            NOISE_CHECK, True,
+            f"noise in the regressors moves least squares, but too little to matter: most "
+            f"certainly {_figures(worst)}; {_bounds(worst)}; the intervals include it",
+        )  # fmt: skip
+    worst = max(shifts, key=lambda s: abs(s.relative))
+    chance = (
+        ", which would matter but may be chance: more repeats would tell" if worst.material else ""
+    )
     return Check(
-        "noise in regressors", True,
-        f"least squares and instruments from the other repeats agree: largest difference "
-        f"{100 * largest[0]:.2g} % ({largest[1]}, {abs(largest[2]):.1f} standard errors)",
+        NOISE_CHECK, True,
+        f"least squares and instruments from the other repeats agree within their scatter: "
+        f"largest difference {_figures(worst)}{chance}",
     )  # fmt: skip
+
+
+def _figures(s: Shift) -> str:
+    return (
+        f"{s.name} by {100 * s.relative:+.2g} % against instruments from the other repeats "
+        f"({s.t:.2g} of its standard errors, {s.of_half_width:.2g} of the 95 % interval's half "
+        "width)"
+    )
+
+
+def _bounds(s: Shift) -> str:
+    return (
+        f"it would matter beyond {100 * s.limit:g} %, or beyond {SHARE:g} of the half width and "
+        f"{100 * LEAST * s.limit:g} %"
+    )
 
 
 def outlier_statement(family: str, fit: Fit) -> Check:

@@ -38,7 +38,8 @@ def simultaneous(
             f"once; in the steps {steps} a joint is locked (`bramah run validate` records some)"
         )
     chosen = [run for run in kept if run.records]
-    result = identify(chosen, "coupled", terms, filtering, reject_noise)
+    # Least squares as in the paper, whatever noise makes of it: that is what is compared.
+    result = identify(chosen, "coupled", terms, filtering, reject_noise, estimator="ls")
     statements = (
         Check(
             "records used", used == every,

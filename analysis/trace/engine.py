@@ -18,6 +18,7 @@ from analysis.model import Model
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from analysis.trace import clues, gates, held_out
+from analysis.trace.beside import beside, stripped
 from analysis.trace.board import Board, board
 from analysis.trace.candidates import catalogue, variants
 from analysis.trace.evidence import Scene, scenes
@@ -64,13 +65,14 @@ def trace(
     _refuse_same(runs, holdout)
     rng = np.random.default_rng(seed)
     terms = tuple(map(Used, baseline_of(rig)))
+    terms = (*terms, *beside(terms, [*runs, *holdout]))
     train, judged = scenes(rig, runs), scenes(rig, holdout)
     stage = board(rig, terms, train)
     _refuse_short(stage, train)
     judge = board(rig, terms, judged, stage.beta)
     candidates = catalogue(rig) if effects is None else list(effects)
     listed = Shortlist(stage, variants(rig, candidates))
-    before = identify(runs, estimator=PLAIN).model
+    before = stripped(identify(runs, terms=terms, estimator=PLAIN).model)
     notes = _notes(stage, judge)
     if within(listed.empty.excess, listed.limits):
         found: tuple[Found, ...] = ()
@@ -86,12 +88,13 @@ def trace(
         moves = [] if verdict in (CLEAN, EXPLAINED) else _moves(stage, judge, winner)
     further = propose(listed, winner, found, verdict, moves) if look_ahead else None
     after = _extended(runs, terms, winner, before)
-    error = held_out.errors(rig, judged, before, after, judge)
+    error = held_out.errors(rig, judged, listed.empty.fit, winner.fit)
     fits = held_out.fits(rig, holdout, before, after)
     result = Trace(
         verdict, found, error.noise, error.before, error.after, fits[0], fits[1], before, after,
         _fraction(listed, winner), tuple(moves), further, stage.floors,
-        tuple(notes), refused=refused, seconds=time.perf_counter() - started,
+        listed.empty.fit, winner.fit, tuple(notes), refused=refused,
+        seconds=time.perf_counter() - started,
     )  # fmt: skip
     return replace(result, sentence=sentence(result))
 
@@ -202,4 +205,4 @@ def _extended(runs: Sequence[Run], terms: Sequence[Used], winner: Listed, before
     """Identify everything again together with the effects."""
     if not winner.effects:
         return before
-    return identify(runs, terms=ordered((*terms, *winner.effects)), estimator=PLAIN).model
+    return stripped(identify(runs, terms=ordered((*terms, *winner.effects)), estimator=PLAIN).model)

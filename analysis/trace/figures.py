@@ -19,7 +19,7 @@ from analysis.plots import BLUE, CARD, GREY, INK, MODEL, PALE, figure, gapped, n
 from analysis.rows import Rows
 from analysis.trace.clues import binned, variables
 from analysis.trace.evidence import Scene, filtered, prepared, residual, scene_rows, scenes
-from analysis.trace.held_out import row_coefficients
+from analysis.trace.refine import Fit
 from analysis.trace.result import Trace
 from analysis.trace.words import UNITS, loudest
 from rig.model.channels import kind_of, unit_of
@@ -46,8 +46,8 @@ def held_out(rig: Rig, holdout: Sequence[Run], result: Trace) -> dict[str, list[
     """Return, by equation, every held-out record's residual under both models."""
     out: dict[str, list[Lines]] = {}
     for scene in scenes(rig, holdout):
-        before = _left(rig, scene, result.model_before)
-        after = _left(rig, scene, result.model_after)
+        before = _left(rig, scene, result.rows_before)
+        after = _left(rig, scene, result.rows_after)
         for name, (rows, r) in before.items():
             later, q = after[name]
             _, here, there = np.intersect1d(rows.time, later.time, return_indices=True)
@@ -56,10 +56,9 @@ def held_out(rig: Rig, holdout: Sequence[Run], result: Trace) -> dict[str, list[
     return out
 
 
-def _left(rig: Rig, scene: Scene, model: Model) -> dict[str, tuple[Rows, Array]]:
-    beta = row_coefficients(model)
+def _left(rig: Rig, scene: Scene, model: Fit) -> dict[str, tuple[Rows, Array]]:
     built = scene_rows(rig, model.terms, scene)
-    return {name: (rows, residual(rows, beta)) for name, rows in built.items()}
+    return {name: (rows, residual(rows, model.beta)) for name, rows in built.items()}
 
 
 def abscissae(
@@ -148,6 +147,8 @@ def over_noise(result: Trace, key: str = "overnoise") -> Markup:
         axes.set_xscale("log")
         axes.xaxis.set_major_formatter(lambda v, _: f"{v:g}")
         low, high = axes.get_xlim()
+        low, high = min(low, 0.8), max(high, 2.2)  # else noise would look like a difference
+        axes.set_xlim(low, high)
         # Within one decade the ticks between are all there is.
         axes.xaxis.set_minor_formatter(lambda v, _: f"{v:.1g}" if high < 10 * low else "")
         axes.set_yticks(range(len(names)), list(reversed(names)))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from analysis.model import Model
 from analysis.trace.board import Board
 from analysis.trace.evidence import Scene, residual, scene_rows
+from analysis.trace.floor import floors
 from analysis.trace.refine import Fit, table
 from analysis.validate import validate
 from rig.model.parse import InputError
@@ -34,31 +35,28 @@ def left(judge: Board, model: Fit) -> Array:
     return table(judge, model.terms).left(model.beta)
 
 
-def row_coefficients(model: Model) -> dict[str, float]:
-    """Return a model's parameters as the rows' coefficients (1/b for b); unknown ones are zero."""
-    out = {}
-    for used in model.terms:
-        for c in used.term.coefficients(model.rig):
-            value = model.parameters[c.parameter].value
-            known = np.isfinite(value) and (value != 0 or not c.reciprocal)
-            out[c.parameter] = (1.0 / value if c.reciprocal else value) if known else 0.0
-    return out
+def errors(rig: Rig, members: Sequence[Scene], before: Fit, after: Fit) -> Errors:
+    """Return every equation's error under both models, and the noise floor, over all records.
 
-
-def errors(rig: Rig, members: Sequence[Scene], before: Model, after: Model, judge: Board) -> Errors:
-    """Return every equation's error under both models, and the noise floor, over all records."""
+    The floor is what does not repeat under the model after: its columns carry the sensors' noise
+    into the residual as the baseline's do.
+    """
+    found: dict[str, dict[str, list[Array]]] = {}
+    built = {}
+    for label, model in (("before", before), ("after", after)):
+        built[label] = [scene_rows(rig, model.terms, scene) for scene in members]
+        found[label] = {}
+        for rows_of in built[label]:
+            for equation, rows in rows_of.items():
+                found[label].setdefault(equation, []).append(residual(rows, model.beta))
+    split = floors(rig, after.terms, members, built["after"], after.beta)
+    floor = {(f.group, f.equation): f.noise for f in split}
     noise: dict[str, list[float]] = {}
     counts: dict[str, list[int]] = {}
-    found: dict[str, dict[str, list[Array]]] = {"before": {}, "after": {}}
-    floor = {(f.group, f.equation): f.noise for f in judge.floors}
-    for scene in members:
-        for label, model in (("before", before), ("after", after)):
-            beta = row_coefficients(model)
-            for equation, rows in scene_rows(rig, model.terms, scene).items():
-                found[label].setdefault(equation, []).append(residual(rows, beta))
-                if label == "before":
-                    noise.setdefault(equation, []).append(floor[scene.group, equation])
-                    counts.setdefault(equation, []).append(len(rows.rhs))
+    for scene, rows_of in zip(members, built["after"], strict=True):
+        for equation, rows in rows_of.items():
+            noise.setdefault(equation, []).append(floor[scene.group, equation])
+            counts.setdefault(equation, []).append(len(rows.rhs))
     return Errors(
         {
             e: float(np.sqrt(np.average(np.square(noise[e]), weights=np.maximum(counts[e], 1))))

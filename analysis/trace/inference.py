@@ -30,6 +30,7 @@ BLOCK = 2.0  # [s] at least, where a record is one period
 HALVES = 40
 TOLERANCE = 0.2  # relative disagreement that a catalogue's simpler form may cause
 DEVIATIONS = 3.5
+TELLS = 0.05  # of a column's energy off the others': a subset with less says nothing of a size
 POWER = 0.25  # a subset judges a parameter that it knows this well, relative
 
 
@@ -238,6 +239,15 @@ def subsets(stage: Board, joint: int | None) -> dict[str, Array]:
     return out
 
 
+def _alone(columns: Array, k: int) -> Array:
+    """Return column k (m,) without what the others say."""
+    rest, own = np.delete(columns, k, axis=1), columns[:, k]
+    if not rest.shape[1]:
+        return own
+    Q = orthonormal(rest)
+    return np.asarray(own - Q @ (Q.T @ own))
+
+
 def invariance(
     stage: Board, model: Fit, used: Used, value: Spread, joint: int | None
 ) -> list[tuple[str, str, float, float]]:
@@ -253,6 +263,8 @@ def invariance(
     nothing = {s.parameter: s.neutral or 0.0 for s in shapes_of(stage.rig, used)}
     neutral = np.array([nothing.get(n, 0.0) for n in names])
     out = []
+    J_all = J - base @ (base.T @ J)
+    whole = [float(np.sum(_alone(J_all, k) ** 2)) for k in range(len(names))]
     for label, mask in subsets(stage, joint).items():
         if not mask.any():
             continue
@@ -263,13 +275,10 @@ def invariance(
                 continue
             if np.linalg.norm(J_s[:, k]) < 0.1 * np.linalg.norm(J[mask][:, k]):
                 continue
-            rest = np.delete(J_s, k, axis=1)
-            own = J_s[:, k]
-            if rest.shape[1]:
-                Q = orthonormal(rest)
-                own = own - Q @ (Q.T @ own)
+            own = _alone(J_s, k)
             size = float(own @ own)
-            if size <= 0 or not np.isfinite(value.value[k]):
+            # What hardly acts there tells its form's tail, not its size.
+            if size < TELLS * whole[k] or size <= 0 or not np.isfinite(value.value[k]):
                 continue
             shift = float(own @ left[mask]) / size
             error = 1.0 / np.sqrt(size)

@@ -46,7 +46,8 @@ def smallest(effect: Effect, rig: Rig) -> Hypothesis | None:
     """Return an effect at its smallest interesting size, None where it has none or cannot show."""
     if effect.absorbed(rig):
         return None
-    shape = SHAPES.get(effect.name, effect.shape_of(rig, ()))
+    usual, own = effect.shape_of(rig, ()), SHAPES.get(effect.name, ())
+    shape = (*own, *usual[len(own) :])
     if effect.name == "sensor_gain":
         shape = (GAIN,)
     elif effect.name == "sensor_offset":

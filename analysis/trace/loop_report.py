@@ -94,6 +94,7 @@ def worth(rounds: Sequence[Round]) -> Markup | None:
             if r.achieved is not None:
                 axes.bar(r.number + 0.18, r.achieved, 0.32, color=BLUE)
         axes.axhline(1.0, color=INK, lw=0.8, ls="--")
+        axes.set_ylim(0.0, 1.2 * axes.get_ylim()[1])  # room for the words
         axes.set_xticks([r.number for r in rounds[1:]])
         axes.set_xlim(1.4, len(rounds) + 0.6)
         axes.set_xlabel("round")
@@ -107,7 +108,7 @@ def worth(rounds: Sequence[Round]) -> Markup | None:
         axes.plot(numbers, after, "o-", color=BLUE)
         axes.axhline(1.0, color=INK, lw=0.8, ls="--")
         axes.set_xticks(numbers)
-        axes.set_ylim(0.0, None)
+        axes.set_ylim(0.0, 1.2 * axes.get_ylim()[1])
         axes.set_xlabel("round")
         axes.set_ylabel("worst held-out error over noise")
         note(axes, 0.98, 0.98, "grey without, blue with what was found", INK)

@@ -16,7 +16,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.terms import known
+from analysis.terms import baseline_of, known
+from analysis.terms.base import Used
 from analysis.trace import excitations as ex
 from analysis.trace.board import Board
 from analysis.trace.clues import variables
@@ -98,13 +99,14 @@ def propose(
 
 def learned(stage: Board) -> Rig:
     """Return the rig with what the records say of its parameters: a twin that is nearer to it."""
-    found = parameter_values(stage.rig, stage.terms, dict(stage.beta))
+    plain = tuple(map(Used, baseline_of(stage.rig)))
+    found = parameter_values(stage.rig, plain, dict(stage.beta))
     before = stage.rig.nominal
     likely = {
         name: value
         for name, value in found.items()
         # A parameter that the records hardly move may come out as anything.
-        if name not in before or 1 / LIKELY < value / before[name] < LIKELY
+        if name in before and 1 / LIKELY < value / before[name] < LIKELY
     }
     return stage.rig.model_copy(update={"nominal": {**before, **likely}})
 

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 from analysis.model import Estimate, Model, estimate_json, finite
 from analysis.trace.floor import Floor
+from analysis.trace.refine import Fit
 
 CLEAN: Final = "clean"
 EXPLAINED: Final = "explained"
@@ -77,6 +78,8 @@ class Trace:
 
     `floors` are the training records' split residuals under the baseline, `notes` what a person
     must know of the evidence's weakness; `refused` fitted best but did not pass the gates.
+    `rows_before` and `rows_after` are the fits behind the errors, what acts beside the baseline
+    included; the models are at the rig's nominal temperature.
     """
 
     verdict: str
@@ -92,6 +95,8 @@ class Trace:
     depends_on: tuple[Dependence, ...]
     next_experiment: Mapping[str, Any] | None
     floors: tuple[Floor, ...]
+    rows_before: Fit
+    rows_after: Fit
     notes: tuple[str, ...] = ()
     sentence: str = ""
     seconds: float = 0.0

@@ -26,6 +26,7 @@ LEFT = 1.0  # repeatable rms over noise that an explanation may leave
 FORM = 0.02  # of the energy before: what the catalogue's form of an effect may miss of the real one
 ADD_SHARE = 0.3  # of what is left in the equations it touches: less does not earn a place
 AS_GOOD = 1.25  # what a simpler candidate may leave over the best, before noise counts
+CHANCE = 20.0  # energy that each further free number must take: ten times what noise gives it
 VISIBLE = 0.03  # of a column's length must stand out of the baseline's columns
 LARGEST = 4  # effects in a set
 STARTS = 10  # single candidates from which pairs are tried

@@ -140,7 +140,7 @@ class Shortlist:
 
     def better(self, one: Listed, other: Listed) -> bool:
         """Tell whether `one` is to be preferred: much less left, or as little and simpler."""
-        slack = 0.1 * self.limits.total
+        slack = select.CHANCE * max(1, abs(one.size[1] - other.size[1]))
         if one.size < other.size:
             return one.total <= max(select.AS_GOOD * other.total, other.total + slack)
         if one.size > other.size:
@@ -153,8 +153,7 @@ class Shortlist:
         if not allowed:
             return self.empty
         least = min(allowed, key=lambda o: o.total)
-        limit = max(select.AS_GOOD * least.total, least.total + 0.1 * self.limits.total)
-        near = [o for o in allowed if o.total <= limit]
+        near = [o for o in allowed if o is least or self.better(o, least)]
         return min(near, key=lambda o: (o.size[1], o.size[0], o.total))
 
     def run(self) -> Listed:

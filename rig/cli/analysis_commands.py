@@ -86,8 +86,9 @@ def identify(
     estimator: Annotated[
         str | None,
         typer.Option(
-            help="ls, wls, iv, robust, output-error; auto: ls or iv as checked; plain: the bare "
-            "solution.  [default: ls; plain with --stream or --cluster]"
+            help="ls, wls, iv, robust, output-error; auto: ls, or iv where noise in the "
+            "regressors biases ls and it matters; plain: the bare solution.  "
+            "[default: auto; plain with --stream or --cluster]"
         ),
     ] = None,
     bootstrap: Annotated[
@@ -155,7 +156,7 @@ def identify(
             method,
             terms,
             filters,
-            estimator=estimator or "ls",
+            estimator=estimator or "auto",
             bootstrap=bootstrap,
             rng=np.random.default_rng(seed),
             search=SearchOptions(evaluations=evaluations),

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rig.cli import output
+from rig.model.parse import InputError
 
 WIDTH = 100
 
@@ -86,6 +87,20 @@ def write_page(path: Path, title: str, sections: Sequence[Section]) -> None:
                 (folder / part.file).write_text(standalone(part.svg), encoding="utf-8")
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(markdown(title, sections, path.stem), encoding="utf-8")
+
+
+def replace_section(path: Path, name: str, body: str) -> None:
+    """Put `body` between the lines `<!-- NAME -->` and `<!-- end of NAME -->` of a page.
+
+    Raises InputError where the page is not there or has no such lines.
+    """
+    first, last = f"<!-- {name} -->", f"<!-- end of {name} -->"
+    old = path.read_text(encoding="utf-8") if path.is_file() else ""
+    before, found, rest = old.partition(first)
+    _, ended, after = rest.partition(last)
+    if not (found and ended):
+        raise InputError(f"{path}: expected a page with the lines {first} and {last}")
+    path.write_text(f"{before}{first}\n{body.strip()}\n{last}{after}", encoding="utf-8")
 
 
 _STYLE = (

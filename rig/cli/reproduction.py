@@ -138,7 +138,7 @@ def _record(folder: Path, seed: int, scale: Scale, say: Say) -> Runs:
 def analyse(runs: Runs, seed: int, scale: Scale, say: Say) -> Reproduction:
     """Identify by every method, validate, and compare."""
     say("identifying by coupling, every experiment by itself and all of them")
-    coupled = identify([runs.steps])
+    coupled = identify([runs.steps], estimator="ls")  # the paper's
     say("validating on new data")
     validation = validate(coupled.model, [runs.judged])
     say("identifying step by step, then from both joints at once")
@@ -152,7 +152,7 @@ def analyse(runs: Runs, seed: int, scale: Scale, say: Say) -> Reproduction:
         experiments(runs.steps),
         experiments(runs.steps, paper_filtering),
         validation,
-        payload_response(runs.steps.rig, PAYLOAD, coupled, identify([runs.loaded])),
+        payload_response(runs.steps.rig, PAYLOAD, coupled, identify([runs.loaded], estimator="ls")),
         sequential,
         validate(sequential.model, [runs.judged]),
         _simultaneous(runs, default_filtering),

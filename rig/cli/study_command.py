@@ -18,30 +18,56 @@ studies = typer.Typer(
     rich_markup_mode=None,
 )
 Workers = Annotated[int, typer.Option(min=1, help="Processes at once.")]
+FirstSeed = Annotated[
+    int, typer.Option("--first-seed", min=0, help="Those below 100 served to find errors.")
+]
+KeepOption = Annotated[
+    Path | None,
+    typer.Option(help="Keep what each experiment found here; a study begun again goes on from it."),
+]
+DocsOption = Annotated[
+    Path | None, typer.Option(help="Also put the tables where this page has room for them.")
+]
 
 
 @studies.command()
 def coverage(
     experiments: Annotated[int, typer.Option(min=2, help="Of either kind.")] = 200,
-    estimator: Annotated[str, typer.Option(help="As `bramah identify --estimator`.")] = "ls",
+    estimator: Annotated[str, typer.Option(help="As `bramah identify --estimator`.")] = "auto",
     kind: Annotated[str, typer.Option(help="model, plant, or both.")] = "both",
     noise: Annotated[float, typer.Option(min=0.0, help="Times the sensors' stated noise.")] = 1.0,
     repeats: Annotated[int, typer.Option(min=1, help="Of every step.")] = 4,
+    first: FirstSeed = 100,
     workers: Workers = 2,
+    keep: KeepOption = None,
     json: JsonOption = None,
+    docs: DocsOption = None,
 ) -> None:
-    """Count how often the 95 % intervals hold the truth, on fresh seeds.
+    """Count how often the 95 % intervals hold the truth, and how large the bias is.
 
     Example: bramah study coverage --experiments 200 --json coverage.json
     """
+    from analysis.estimators.choose import refuse_unknown
+    from rig.cli.pages import replace_section
     from rig.cli.studies import coverage_study, coverage_text
-    from rig.model.parse import InputError
 
-    if kind not in ("model", "plant", "both"):
-        raise InputError(f"--kind {kind}: expected model, plant or both")
+    _refuse_kind(kind, ("model", "plant", "both"))
+    if estimator != "plain":
+        refuse_unknown(estimator)
     kinds = ("model", "plant") if kind == "both" else (kind,)
-    found = coverage_study(kinds, experiments, estimator, noise, repeats, workers, progress)
+    found = coverage_study(
+        kinds, experiments, estimator, noise, repeats, workers, progress, first, keep
+    )
     write_json(json, found)
+    if docs is not None:
+        for one in kinds:
+            alone = {**found, "kinds": {one: found["kinds"][one]}}
+            made = (
+                f"bramah study coverage --kind {one} --experiments {experiments} --estimator "
+                f"{estimator} --noise {noise:g} --repeats {repeats} --first-seed {first} "
+                f"--docs {docs}"
+            )
+            replace_section(docs, f"study coverage {one}", _made(made, coverage_text(alone)))
     if json != Path("-"):
         typer.echo(coverage_text(found))
 
@@ -50,20 +76,37 @@ def coverage(
 def estimators(
     experiments: Annotated[int, typer.Option(min=2, help="Of either noise.")] = 20,
     noise: Annotated[str, typer.Option(help="Times the sensors' stated noise.")] = "1 3 10",
-    which: Annotated[str, typer.Option(help="Estimators compared.")] = "ls wls iv output-error",
+    which: Annotated[
+        str, typer.Option(help="Estimators compared.")
+    ] = "ls wls iv robust output-error auto",
     kind: Annotated[str, typer.Option(help="model or plant.")] = "plant",
+    first: FirstSeed = 100,
     workers: Workers = 2,
+    keep: KeepOption = None,
     json: JsonOption = None,
+    docs: DocsOption = None,
 ) -> None:
-    """Compare the estimators' bias and scatter as the sensors get noisier.
+    """Compare the estimators' bias, scatter and time as the sensors get noisier.
 
     Example: bramah study estimators --noise "1 10" --experiments 10
     """
+    from analysis.estimators.choose import refuse_unknown
+    from rig.cli.pages import replace_section
     from rig.cli.studies import estimator_study, estimator_text
 
+    _refuse_kind(kind, ("model", "plant"))
     levels = [float(word) for word in noise.split()]
-    found = estimator_study(tuple(which.split()), levels, experiments, kind, workers, progress)
+    every = tuple(which.split())
+    for name in every:
+        refuse_unknown(name)
+    found = estimator_study(every, levels, experiments, kind, workers, progress, first, keep)
     write_json(json, found)
+    if docs is not None:
+        made = (
+            f'bramah study estimators --kind {kind} --experiments {experiments} --noise "{noise}" '
+            f'--which "{which}" --first-seed {first} --docs {docs}'
+        )
+        replace_section(docs, "study estimators", _made(made, estimator_text(found)))
     if json != Path("-"):
         typer.echo(estimator_text(found))
 
@@ -88,6 +131,17 @@ def differentiation(
     write_json(json, data)
     if json != Path("-"):
         typer.echo(markdown(entries))
+
+
+def _made(command: str, table: str) -> str:
+    return f"```sh\n{command}\n```\n\n{table}"
+
+
+def _refuse_kind(kind: str, known: tuple[str, ...]) -> None:
+    from rig.model.parse import InputError
+
+    if kind not in known:
+        raise InputError(f"--kind {kind}: expected {', '.join(known[:-1])} or {known[-1]}")
 
 
 def register(app: typer.Typer) -> None:

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import multiprocessing
+import os
+import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -58,11 +63,41 @@ def perform(experiment: Experiment) -> dict[str, Trial]:
 
     Parameters that rest on noise are judged as well: hiding them would flatter the figures.
     """
+    began = time.process_time()
     run, truth = records_of(experiment)
-    return {
-        name: trial(identify([run], estimator=name, reject_noise=False), truth)
-        for name in experiment.estimators
-    }
+    taking = time.process_time() - began
+    out = {}
+    for name in experiment.estimators:
+        began = time.process_time()
+        found = identify([run], estimator=name, reject_noise=False)
+        out[name] = trial(found, truth, time.process_time() - began, taking)
+    return out
+
+
+def _place(experiment: Experiment, folder: Path) -> Path:
+    e = experiment
+    words = (e.kind, e.rig, e.protocol, "-".join(e.estimators), f"x{e.noise:g}", f"n{e.repeats}")
+    return folder / f"{' '.join(words)} {e.seed}.json"
+
+
+def _kept(experiment: Experiment, folder: Path) -> dict[str, Trial] | None:
+    """Return what a study ended before its time had found, if it had."""
+    place = _place(experiment, folder)
+    if not place.is_file():
+        return None
+    return {name: Trial(**one) for name, one in json.loads(place.read_text("utf-8")).items()}
+
+
+def _end_with_parent() -> None:
+    """See to it that this process does not outlive a study that was killed."""
+    parent = multiprocessing.parent_process()
+
+    def wait() -> None:
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 def all_of(
@@ -70,19 +105,35 @@ def all_of(
     workers: int,
     say: Callable[[str], None],
     job: Callable[[Experiment], dict[str, Trial]] = perform,
+    folder: Path | None = None,
 ) -> Iterator[tuple[Experiment, dict[str, Trial]]]:
     """Perform experiments on `workers` processes, in the order they end.
 
     One that fails (a simulated bench whose piston would leave its limits) is told and left out.
+    What is found is kept in `folder`, if given, and what is there already is not done again.
     """
+    left = []
+    for experiment in experiments:
+        known = _kept(experiment, folder) if folder is not None else None
+        if known is None:
+            left.append(experiment)
+        else:
+            yield experiment, known
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+        say(f"{len(experiments) - len(left)} of {len(experiments)} experiments are in {folder}")
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context) as pool:
-        waiting = {pool.submit(job, e): e for e in experiments}
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=_end_with_parent) as pool:
+        waiting = {pool.submit(job, e): e for e in left}
         for done, future in enumerate(as_completed(waiting), start=1):
             if done % 10 == 0 or done == len(waiting):
                 say(f"{done} of {len(waiting)} experiments")
             experiment = waiting[future]
             try:
-                yield experiment, future.result()
+                found = future.result()
+                if folder is not None:
+                    text = json.dumps({name: asdict(one) for name, one in found.items()})
+                    _place(experiment, folder).write_text(text, encoding="utf-8")
+                yield experiment, found
             except (InputError, RuntimeError) as error:
                 say(f"seed {experiment.seed} failed and is left out: {error}")

@@ -63,6 +63,8 @@ def identification_text(result: Identification, truth: Mapping[str, float] | Non
             f"{solution.condition_number:.1f}"
         )
     lines.append(f"masked rows: {result.masked_rows}; solved in {result.solve_seconds:.3f} s")
+    if (estimator := result.model.provenance.get("estimator")) is not None:
+        lines.append(f"estimator: {estimator}")
     lines += [
         f"{'ok    ' if check.ok else 'NOT OK'} {check.name}: {check.detail}"
         for check in result.checks

@@ -11,7 +11,7 @@ from scipy.stats import t as student
 from analysis.checks import Check
 from analysis.estimators import coverage as cov
 from analysis.estimators.covariance import by_parts, lack_of_fit, spread
-from analysis.estimators.equations import Block, least_squares, pieces, segments
+from analysis.estimators.equations import least_squares, pieces
 from analysis.estimators.output_error import output_error
 from analysis.identify import Identification, identify, to_json
 from analysis.terms import baseline
@@ -20,6 +20,7 @@ from rig.model.parse import InputError
 from rig.model.records import Run
 from tests.analysis import small_bench as bench
 from tests.analysis.small_bench import TRUTH
+from tests.analysis.straight_line import line
 
 
 def error(result: Identification, name: str) -> float:
@@ -48,7 +49,7 @@ def noisy_run(multisine_run: Run) -> Run:
 
 @pytest.fixture(scope="module")
 def noisy(noisy_run: Run) -> Identification:
-    return identify([noisy_run], reject_noise=False)
+    return identify([noisy_run], reject_noise=False, estimator="ls")
 
 
 def test_clean_sensors_leave_nothing_for_instruments_to_mend(multisine_run: Run) -> None:
@@ -65,19 +66,29 @@ def test_ten_times_the_noise_biases_least_squares_and_the_check_says_so(
     assert not said.ok
     assert "least squares is biased" in said.detail
     assert error(noisy, "M2") > 0.01
-    assert not inside(noisy, "M2")
+    # Who insists on least squares gets its value, and an interval that knows of the bias.
+    assert inside(noisy, "M2")
+    low, high = noisy.estimates["M2"].ci95
+    assert high - low > 2 * error(noisy, "M2") * TRUTH["M2"]
 
 
-def test_instruments_are_not_biased_and_auto_prefers_them(
+def test_instruments_are_not_biased_and_the_tool_prefers_them_unasked(
     noisy_run: Run, noisy: Identification
 ) -> None:
     iv = identify([noisy_run], reject_noise=False, estimator="iv")
-    auto = identify([noisy_run], reject_noise=False, estimator="auto")
+    auto = identify([noisy_run], reject_noise=False)
     assert error(iv, "M2") < 0.3 * error(noisy, "M2")
+    assert error(auto, "M2") < 0.3 * error(noisy, "M2")
     assert np.mean([inside(iv, name) for name in TRUTH]) > 0.8
     assert auto.model.provenance["estimator"] == "iv"
     assert auto.estimates["M2"].value == iv.estimates["M2"].value
-    assert "instrumental variables instead" in check(auto, "noise in regressors").detail
+    for one in (iv, auto):
+        assert check(one, "noise in regressors").ok
+        assert "instrumental variables instead" in check(one, "noise in regressors").detail
+    # Asked for a bootstrap of least squares, its interval knows of the bias as well.
+    drawn = identify([noisy_run], reject_noise=False, estimator="ls", bootstrap=100)
+    low, high = drawn.estimates["M2"].ci95
+    assert low < iv.estimates["M2"].value < high
 
 
 def test_weights_from_measured_noise_do_not_move_what_is_right(multisine_run: Run) -> None:
@@ -167,18 +178,6 @@ def test_an_unknown_estimator_and_too_few_draws_are_refused(multisine_run: Run) 
         identify([multisine_run], bootstrap=20)
     with pytest.raises(InputError, match="does not go with --estimator output-error"):
         identify([multisine_run], estimator="output-error", bootstrap=100)
-
-
-def line(rng: np.random.Generator, bend: float, repeats: int = 4) -> tuple[Block, ...]:
-    """Repeats of y = 2 x + bend x^3 + noise, which a straight line is fitted to."""
-    t = np.arange(400) / 100.0
-    x = np.sin(2 * np.pi * t / 4.0)
-    parts = segments(t, 4.0)
-    return tuple(
-        Block(0, "s", r, f"s_r{r}", "torque_1", x[:, None],
-              2 * x + bend * x**3 + 0.1 * rng.standard_normal(400), t, parts, parts)
-        for r in range(1, repeats + 1)
-    )  # fmt: skip
 
 
 def test_a_misfit_that_every_repeat_shares_widens_the_interval() -> None:

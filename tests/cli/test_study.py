@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
+import pytest
 
 from analysis.identify import identify
+from rig.cli.pages import replace_section
 from rig.cli.studies import coverage_text, estimator_text
 from rig.cli.study_jobs import MODEL, PLANT, Experiment, perform, records_of
+from rig.model.parse import InputError
 from tests.cli.bench import bramah
 
 
@@ -37,17 +42,41 @@ def test_the_models_own_data_are_estimated_without_bias_and_tables_say_it() -> N
         "name": "b", "count": 2, "coverage": 0.5, "coverage_low": 0.1, "coverage_high": 0.9,
         "bias": 0.01, "bias_error": 0.001, "rsd": 0.002, "half_width": 0.004,
     }  # fmt: skip
-    data = {"experiments": 2, "overall": 0.5, "parameters": {"b": row}}
+    off = {**row, "name": "M1", "bias": 0.006, "coverage": 1.0, "coverage_low": 0.981}
+    data = {
+        "experiments": 2, "overall": 0.5, "used": {"ls": 2}, "seconds": 1.2,
+        "parameters": {"b": row, "M1": off},
+    }  # fmt: skip
     text = coverage_text(
-        {"estimator": "ls", "noise": 1.0, "repeats": 4, "goal": [0.92, 0.98],
-         "kinds": {"model": data}}
+        {"estimator": "auto", "noise": 1.0, "repeats": 4, "goal": [0.92, 0.98],
+         "seeds": [100, 101], "kinds": {"model": data}}
     )  # fmt: skip
+    assert "estimator auto (ls in 2)" in text
     assert "| b | 50.0 (10.0 to 90.0) | +1.0000" in text
-    assert "outside of that by themselves: b" in text
-    part = {"noise": 10.0, "flagged": 2, "estimators": {"ls": {"b": row}, "iv": {}}}
-    assert "| b | +1.000 / 0.200 | — |" in estimator_text(
-        {"kind": "plant", "experiments": 2, "noise": [part]}
-    )
+    assert "by themselves: b (50.0, too narrow), M1 (100.0, cautious)" in text
+    # 1 % is allowed for b, 0.6 % is not for an inertia.
+    assert "(b: 2 %): M1 (+0.600 %)" in text
+    part = {
+        "noise": 10.0, "used": {"auto": {"iv": 2}}, "estimators": {"ls": {"b": row}, "iv": {}},
+        "seconds": {"ls": 1.234, "iv": None},
+    }  # fmt: skip
+    shown = estimator_text(
+        {"kind": "plant", "experiments": 2, "seeds": [100, 101], "noise": [part]}
+    )  # fmt: skip
+    assert "| b | +1.000 / 0.200 | — |" in shown
+    assert "| processor's seconds, median | 1.2 | — |" in shown
+    assert "instruments in 2 of 2" in shown
+
+
+def test_a_studys_tables_take_their_place_on_a_page_that_has_one(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("words\n<!-- study x -->\nold\n<!-- end of study x -->\nmore\n")
+    replace_section(page, "study x", "new\n")
+    replace_section(page, "study x", "newer\n")
+    assert page.read_text() == "words\n<!-- study x -->\nnewer\n<!-- end of study x -->\nmore\n"
+    for name in ("study y", "study x"):
+        with pytest.raises(InputError, match=f"expected a page with the lines <!-- {name} -->"):
+            replace_section(page if name == "study y" else tmp_path / "none.md", name, "")
 
 
 def test_the_verbs_tell_how_they_are_used() -> None:

@@ -48,9 +48,9 @@ CASES = (
         "asymmetric_friction", "joint 2", {"F_ext": 70, "F_ret": 40},
         {"F_ext_2": 70, "F_ret_2": 40}, 0.1, 1.5,
     ),
-    Case(
+    Case(  # this bench's contact gets stiffer under load, the catalogue's does not
         "pressure_dependent_friction", "joint 2", {"k_friction": 8e-6}, {"k_friction_2": 8e-6},
-        0.05, 1.6,
+        0.05, 1.7,
     ),
     Case("base_inclination", "bench", {"inclination": 0.06}, {"inclination": 0.06}),
     Case("joint_spring", "joint 2", {"k_spring": 25}, {"k_spring_2": 25, "rest_2": -1.35}, 0.1),
@@ -141,7 +141,8 @@ def test_the_model_with_the_effect_follows_the_bench_freely(rig: Rig, case: Case
     first = 100
     start = State(signals.q[first], signals.qd[first], signals.p_cap[first], signals.p_rod[first])
     shape = tuple(
-        {"presliding_2": 40e-6, **case.found}.get(s.parameter, 0.0) for s in effect.shapes(ideal)
+        case.found.get(s.parameter, 40e-6 if s.parameter.startswith("presliding") else 0.0)
+        for s in effect.shapes(ideal)
     )
     model = model_of(ideal, effect, TRUTH | case.found, shape)
     free = simulate(model, drive, start, first).channels()

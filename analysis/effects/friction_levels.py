@@ -1,0 +1,224 @@
+"""Dry friction whose level depends on the direction of motion, or on what the seals hold back.
+
+The contact's law is that of `friction` (Dahl 1968), with a level that changes along the path.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Final
+
+import numpy as np
+from numba import njit
+
+from analysis.effects.base import Array, Shape, beyond
+from analysis.effects.friction import (
+    FASTEST,
+    PRESLIDING,
+    PRESLIDING_BOUNDS,
+    TRANSITION,
+    Friction,
+    force_limit,
+    force_unit,
+)
+from analysis.signals import Signals
+from analysis.terms.base import (
+    CONTRIBUTE,
+    P_CAP,
+    P_ROD,
+    SD,
+    TORQUE,
+    Coefficient,
+    Columns,
+    G,
+    Kernel,
+    kernel,
+)
+from rig.model.rig import Rig
+
+DIFFERENCE: Final = 0.1  # of the mean level: with less between directions it is not asymmetric
+
+
+@dataclass(frozen=True)
+class AsymmetricFriction(Friction):
+    """F_f = F_ext a - F_ret r: seals that hold differently either way.
+
+    Each level builds up over its own presliding distance while the piston moves its way and falls
+    off over the other's while it moves back (the contact's law of the module, direction by
+    direction): extending da/ds = (1 - a)/d_ext, dr/ds = -r/d_ext; retracting, over the travel |s|,
+    da = -a/d_ret, dr = (1 - r)/d_ret. Source: Jelali and Kroll 2003 (levels by direction).
+    """
+
+    name: ClassVar[str] = "asymmetric_friction"
+    variable: ClassVar[str] = "the direction of the piston's motion"
+    confounders: ClassVar[tuple[str, ...]] = ("coulomb_friction", "torque_offset")
+    separated_by: ClassVar[str] = (
+        "motion about several places of the stroke: an offset torque does not go with G"
+    )
+
+    @property
+    def kernel(self) -> Kernel:
+        """The compiled contribution."""
+        return _asymmetric
+
+    def _names(self) -> tuple[str, str]:
+        return f"F_ext_{self.joint + 1}", f"F_ret_{self.joint + 1}"
+
+    def shape_names(self) -> tuple[str, ...]:
+        """Name the presliding distances of the two directions."""
+        return f"presliding_ext_{self.joint + 1}", f"presliding_ret_{self.joint + 1}"
+
+    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
+        """Return the presliding distances [m] (electric: in the joint's own unit)."""
+        return tuple(Shape(n, "m", *PRESLIDING_BOUNDS, PRESLIDING) for n in self.shape_names())
+
+    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
+        """Return F_ext, F_ret [N]."""
+        unit = force_unit(rig, self.joint)
+        return tuple(Coefficient(name, unit, "mechanical") for name in self._names())
+
+    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
+        """Return G a and -G r."""
+        lever = signals.G[:, self.joint]
+        if len(shape):
+            s = np.ascontiguousarray(signals.s[:, self.joint])
+            ahead, back = contact_levels(s, shape[0], shape[1])
+        else:
+            z = self.contact(rig, signals, ())
+            ahead, back = np.maximum(z, 0.0), np.maximum(-z, 0.0)
+        return self.row(dict(zip(self._names(), (lever * ahead, -lever * back), strict=True)))
+
+    def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
+        """Return joint (0-based), levels, presliding distances, 0 where none are given."""
+        linear = [values[name] for name in self._names()]
+        return np.array([self.joint, *linear, *(shape if len(shape) else (0.0, 0.0))])
+
+    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
+        """Refuse a driving direction, too much, and directions that do not differ."""
+        limit = force_limit(rig, self.joint)
+        levels = [values[name] for name in self._names()]
+        mean = 0.5 * sum(levels)
+        for name, level in zip(self._names(), levels, strict=True):
+            found = beyond(name, level, "N", limit, -DIFFERENCE * abs(mean))
+            if found:
+                return found
+        if abs(levels[0] - levels[1]) < DIFFERENCE * mean:
+            return "the two directions differ by less than a tenth: this is coulomb_friction"
+        return ""
+
+
+@dataclass(frozen=True)
+class PressureDependentFriction(Friction):
+    """F_f = k w: seals pressed on by the oil (Jelali and Kroll 2003).
+
+    k [m^2] is the friction coefficient times the seals' area under pressure. w [Pa] builds up to
+    the load p_cap + p_rod at a contact stiffness that does not depend on it (Dahl 1968):
+    dw/ds = (p_S / d) (sign(s') - w / (p_cap + p_rod)), d the presliding
+    distance at supply pressure.
+    """
+
+    name: ClassVar[str] = "pressure_dependent_friction"
+    variable: ClassVar[str] = "the sum of the chamber pressures, with the velocity's sign"
+    confounders: ClassVar[tuple[str, ...]] = ("coulomb_friction", "asymmetric_friction")
+    separated_by: ClassVar[str] = (
+        "the same motion at two levels of chamber pressure (supply setting, load or inclination)"
+    )
+
+    @property
+    def kernel(self) -> Kernel:
+        """The compiled contribution."""
+        return _by_pressure
+
+    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
+        """Return k [m^2]."""
+        return (Coefficient(f"k_friction_{self.joint + 1}", "m^2", "mechanical"),)
+
+    @classmethod
+    def places(cls, rig: Rig) -> tuple[str, ...]:
+        """Return the hydraulic joints."""
+        return () if getattr(rig, "electric", False) else super().places(rig)
+
+    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
+        """Return G w."""
+        i = self.joint
+        load = np.maximum(signals.p_cap[:, i] + signals.p_rod[:, i], 0.0)
+        if len(shape):
+            s = np.ascontiguousarray(signals.s[:, i])
+            level = contact_under_load(s, load, rig.supply.pressure / shape[-1])
+        else:
+            level = load * self.contact(rig, signals, ())
+        return self.row({f"k_friction_{i + 1}": signals.G[:, i] * level})
+
+    def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
+        """Return joint (0-based), k, presliding distance (0 where none is given), p_S."""
+        k = values[f"k_friction_{self.joint + 1}"]
+        return np.array([self.joint, k, shape[-1] if len(shape) else 0.0, rig.supply.pressure])
+
+    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
+        """Refuse friction that drives, and more than half of the cylinder's force."""
+        name = f"k_friction_{self.joint + 1}"
+        return beyond(name, values[name], "m^2", 0.5 * rig.joints[self.joint].cylinder.cap_area)
+
+
+@njit(cache=True, error_model="numpy")
+def contact_levels(s, extending, retracting):  # type: ignore[no-untyped-def]
+    """Return the shares a, r (n,) of the two levels along the path s (n,) [m], exact per step."""
+    a, r = np.zeros(len(s)), np.zeros(len(s))
+    for k in range(1, len(s)):
+        step = s[k] - s[k - 1]
+        if step > 0.0:
+            keep = math.exp(-step / extending)
+            a[k], r[k] = 1.0 + (a[k - 1] - 1.0) * keep, r[k - 1] * keep
+        else:
+            keep = math.exp(step / retracting)
+            a[k], r[k] = a[k - 1] * keep, 1.0 + (r[k - 1] - 1.0) * keep
+    return a, r
+
+
+@njit(cache=True, error_model="numpy")
+def contact_under_load(s, load, stiffness):  # type: ignore[no-untyped-def]
+    """Return w (n,) [Pa] along the path s (n,) [m] under a load (n,) [Pa], exact per step."""
+    w = np.zeros(len(s))
+    for k in range(1, len(s)):
+        step = s[k] - s[k - 1]
+        level = load[k] if step > 0.0 else -load[k]
+        keep = math.exp(-abs(step) * stiffness / load[k]) if load[k] > 0.0 else 0.0
+        w[k] = level + (w[k - 1] - level) * keep
+    return w
+
+
+@kernel
+def _asymmetric(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    # The hidden state is the force over the sum of both levels, times the first distance [m].
+    if phase == CONTRIBUTE:
+        i = int(par[0])
+        v = x[SD, i]
+        if par[3] <= 0.0:
+            state = math.tanh(v / TRANSITION)
+            out[TORQUE, i] -= (par[1] if state > 0.0 else par[2]) * x[G, i] * state
+            return
+        scale = (par[1] + par[2]) / par[3]
+        level, distance = (par[1], par[3]) if v > 0.0 else (-par[2], par[4])
+        relax = abs(v) / distance
+        dz[0] = relax * (level / scale - z[0]) / (1.0 + relax / FASTEST)
+        out[TORQUE, i] -= scale * z[0] * x[G, i]
+
+
+@kernel
+def _by_pressure(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    # The hidden state is w times d over p_S [m].
+    if phase == CONTRIBUTE:
+        i = int(par[0])
+        v, load = x[SD, i], max(x[P_CAP, i] + x[P_ROD, i], 0.0)
+        if par[2] <= 0.0:
+            out[TORQUE, i] -= par[1] * load * x[G, i] * math.tanh(v / TRANSITION)
+            return
+        stiffness = par[3] / par[2]
+        relax = abs(v) * stiffness / max(load, 1.0)
+        dz[0] = (v - relax * z[0]) / (1.0 + relax / FASTEST)
+        out[TORQUE, i] -= par[1] * stiffness * z[0] * x[G, i]
+
+
+TERMS = (AsymmetricFriction, PressureDependentFriction)

@@ -1,0 +1,96 @@
+"""What noise in the regressors, and what is known beforehand, do to least squares."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import t as student
+
+from analysis.estimators.covariance import spread
+from analysis.estimators.equations import Block, Prepared, least_squares, pieces
+from analysis.estimators.instruments import hausman
+from analysis.estimators.nuisance import Belief, joined
+from analysis.estimators.shifts import Shift, certain_shift, including, shifts_of
+from analysis.estimators.statements import noise_statement
+from tests.analysis.straight_line import line
+
+CASES = {
+    # noise of the regressor, of the equation; is the shift certain, is it large
+    "certain and large": (0.2, 0.1, True, True),
+    "certain, but small": (0.04, 0.5, True, False),
+    "large, but maybe chance": (0.1, 10.0, False, True),
+    "neither": (0.002, 0.1, False, False),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_shift_must_be_certain_and_large_to_speak_against_least_squares(case: str) -> None:
+    blurred, noise, certain, large = CASES[case]
+    rng = np.random.default_rng(3)
+    blocks = tuple(
+        replace(
+            b,
+            X=b.X + blurred * rng.standard_normal(b.X.shape),
+            y=2 * b.X[:, 0] + noise * rng.standard_normal(len(b.y)),
+        )
+        for b in line(rng, 0.0)
+    )
+    p = Prepared("mechanical", ("M1",), 1, blocks)
+    fit, test = least_squares(blocks), hausman(blocks)
+    error = spread([pieces(fit)], fit.inverse)
+    (shift,) = shifts_of([p], {"mechanical": test}, {"mechanical": (fit.beta, error, fit)})
+    assert (shift.significant, shift.material) == (certain, large)
+    said = noise_statement([shift])
+    assert said.ok is not (certain and large)
+    for figure in (f"M1 by {100 * shift.relative:+.2g} %", f"({shift.t:.2g} of its standard err"):
+        assert figure in said.detail
+    assert ("too little to matter" in said.detail) is (certain and not large)
+    assert ("may be chance" in said.detail) is (large and not certain)
+    # Attenuation is 1/(1 + noise/signal); what is certain is in the interval.
+    if certain:
+        assert shift.relative == pytest.approx(-(blurred**2) / (0.5 + blurred**2), rel=0.3)
+        wide = including(error, certain_shift(test, p))
+        half = student.ppf(0.975, wide.dof[0]) * np.sqrt(wide.covariance[0, 0])
+        assert abs(fit.beta[0] - 2.0) < half
+
+
+def test_a_shift_nobody_would_notice_does_not_matter_however_narrow_the_interval() -> None:
+    assert not Shift("M2", -4e-5, 17.0, 3.0, True).material
+    assert Shift("M2", -1e-3, 17.0, 3.0, True).material
+    assert not Shift("M2", -1e-3, 17.0, 0.3, True).material
+    assert Shift("M2", -6e-3, 17.0, 0.3, True).material
+    assert not Shift("b", -6e-3, 17.0, 0.3, True).material
+    assert Shift("b", -3e-2, 17.0, 0.3, True).material
+
+
+def test_nothing_identified_is_not_called_free_of_bias() -> None:
+    assert not noise_statement([]).ok
+
+
+@pytest.mark.parametrize("known", [0.02, 0.05])
+def test_what_is_known_beforehand_narrows_intervals_no_more_than_it_may(known: float) -> None:
+    """A second column much like the first, its size known to +- `known`; two steps, 4 repeats."""
+    rng = np.random.default_rng(4)
+    t = np.arange(200) / 100.0
+    x = np.sin(np.pi * t)
+    X = np.column_stack((x, 0.5 * x + 0.5 * x * np.abs(x) + 0.15 * np.cos(6 * np.pi * t)))
+    parts = np.arange(200) // 25
+    hits, narrower = [], []
+    for _ in range(400):
+        truth = np.array([1.0, known * rng.standard_normal()])
+        blocks = [
+            Block(0, step, r, f"{step}_r{r}", "flow_cap_1", X,
+                  X @ truth + size * np.repeat(rng.standard_normal(40), 5), t, parts, parts)
+            for step, size in (("a", 0.5), ("b", 0.35)) for r in range(4)
+        ]  # fmt: skip
+        fit = least_squares(blocks)
+        alone = spread([pieces(fit)], fit.inverse)
+        belief = Belief("second", np.array([0.0, 1.0]), known)
+        beta, both, _ = joined(fit.beta, alone, belief, fit.inverse)
+        half = student.ppf(0.975, both.dof[0]) * np.sqrt(both.covariance[0, 0])
+        hits.append(abs(beta[0] - 1.0) < half)
+        narrower.append(both.covariance[0, 0] / alone.covariance[0, 0])
+    assert 0.92 < np.mean(hits) < 0.98
+    assert np.median(narrower) < 0.3
