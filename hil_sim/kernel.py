@@ -88,7 +88,7 @@ def contact(s: float, v: float, joint: Any) -> float:
 
 
 @jit
-def bristle(deflection: float, v: float, p_cap: float, p_rod: float, joint: Any) -> Any:
+def bristle(deflection: float, s: float, v: float, p_cap: float, p_rod: float, joint: Any) -> Any:
     """Return (seal friction [N], bristle rate [m/s]) after LuGre (Canudas de Wit 1995).
 
     Its relaxation rate |v| sigma0 / g is bounded at `bristle_limit`, so that the fixed step holds
@@ -98,7 +98,7 @@ def bristle(deflection: float, v: float, p_cap: float, p_rod: float, joint: Any)
     ratio = v / joint.stribeck_speed
     level += joint.stribeck * exp(-ratio * ratio)
     level += joint.friction_pressure * max(p_cap + p_rod, 0.0)
-    level = max(level, 1e-3 * joint.friction_scale)
+    level = max(level * (1.0 + joint.friction_taper * s), 1e-3 * joint.friction_scale)
     relax = abs(v) * joint.bristle_stiffness / level
     rate = (v - relax * deflection) / (1.0 + relax / joint.bristle_limit)
     return joint.bristle_stiffness * deflection + joint.bristle_damping * rate, rate
@@ -115,14 +115,15 @@ def relief(p: float, bench: Any) -> float:
 
 @jit
 def port_flows(
-    x: float, p_cap: float, p_rod: float, port: float, tank: float, j: Any, lam: float
+    x: float, s: float, p_cap: float, p_rod: float, port: float, tank: float, j: Any, lam: float
 ) -> Any:
     """Return the flows [m^3/s] into cap and rod, out of the supply and into the tank line.
 
     C x sqrt(dp) on every open edge (NOTES, "Fluid", with a laminar region), and the leaks.
     """
     across = p_rod - p_cap
-    q_cap = j.leak_internal * across * (1.0 + LEAK_WIDENING * abs(across))
+    worn = s / j.leak_length
+    q_cap = j.leak_internal * exp(-worn * worn) * across * (1.0 + LEAK_WIDENING * abs(across))
     q_rod = -q_cap - j.leak_rod * (p_rod - tank)
     q_cap -= j.leak_cap * (p_cap - tank)
     demand, returned = 0.0, 0.0
@@ -222,7 +223,7 @@ def rates(
         p_cap, p_rod = pressure(y[2 * n + i], bench), pressure(y[3 * n + i], bench)
 
         q_cap, q_rod, taken, given = port_flows(
-            spool[i], p_cap, p_rod, port, tank, j, bench.laminar
+            spool[i], s, p_cap, p_rod, port, tank, j, bench.laminar
         )
         demand, returned = demand + taken, returned + given
         stiff = softening(y[2 * n + i], warmth, bench)
@@ -233,7 +234,7 @@ def rates(
         force = j.cap_area * p_cap - j.rod_area * p_rod - contact(s, v, j)
         dy[4 * n + i] = 0.0
         if j.bristle_stiffness > 0.0:
-            friction, dy[4 * n + i] = bristle(y[4 * n + i], v, p_cap, p_rod, j)
+            friction, dy[4 * n + i] = bristle(y[4 * n + i], s, v, p_cap, p_rod, j)
             force -= friction
         twist = y[i] - j.spring_rest
         spring = j.spring * twist * (1.0 + j.spring_hardening * twist * twist)

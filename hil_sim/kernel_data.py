@@ -40,14 +40,14 @@ JOINT: Final = _records(
     "pins product mid_length half_stroke offset sin_offset cos_offset "
     # volumes are those at mid-stroke, dead volume included
     "cap_area rod_area cap_volume rod_volume c_pp c_pm c_mp c_mm "
-    "leak_internal leak_cap leak_rod "
+    "leak_internal leak_length leak_cap leak_rod "
     # spool and its edges
     "omega zeta spool_stroke spool_rate spool_gain null opening_rate lap_ahead lap_astern rounding "
     # mechanics: weight is W g
     "viscous weight spring spring_rest spring_hardening torque_offset "
     "contact_stiffness contact_damping "
     "friction_plus friction_minus stribeck stribeck_speed friction_pressure friction_scale "
-    "bristle_stiffness bristle_damping bristle_limit "
+    "friction_taper bristle_stiffness bristle_damping bristle_limit "
     "output_top output_range",
 )
 BENCH: Final = _records(

@@ -31,6 +31,7 @@ class Tables:
 def _coulomb(t: Tables, e: fx.CoulombFriction) -> None:
     t.joints["friction_plus"][e.joint] += e.force
     t.joints["friction_minus"][e.joint] += e.force
+    t.joints["friction_taper"][e.joint] += e.taper
     _bristles(t, e.joint, e.force, e.presliding)
 
 
@@ -107,6 +108,7 @@ def _lag(t: Tables, e: fx.SpoolLag) -> None:
 
 def _internal(t: Tables, e: fx.InternalLeakage) -> None:
     t.joints["leak_internal"][e.joint] += e.conductance
+    t.joints["leak_length"][e.joint] = e.worn or math.inf
 
 
 def _external(t: Tables, e: fx.ExternalLeakage) -> None:

@@ -96,6 +96,7 @@ def _fill_joint(table: Table, i: int, joint: Joint, rig: Rig, machine: Machine) 
         "viscous": true[f"Fv{i + 1}"],
         "weight": true[f"W{i + 1}"] * rig.gravity,
         "stribeck_speed": 1.0,
+        "leak_length": math.inf,
         "contact_stiffness": constants.contact_stiffness,
         "contact_damping": constants.contact_damping,
         "output_top": (1 << (valve.command_bits - 1)) - 1,

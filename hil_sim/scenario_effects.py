@@ -28,6 +28,7 @@ Mass = Annotated[float, in_unit("kg")]
 SpringRate = Annotated[float, in_unit("N*m/rad")]
 ForcePerPressure = Annotated[float, in_unit("N/Pa")]
 Conductance = Annotated[float, in_unit("m^3/(s*Pa)")]
+PerLength = Annotated[float, in_unit("m^-1")]
 
 _WHERE = re.compile(r"^(?:bench|joint (?P<joint>[1-9])(?: (?P<chamber>cap|rod))?)$")
 _FORMS = {"bench": "bench", "joint": "joint I", "chamber": "joint I cap|rod"}
@@ -74,10 +75,11 @@ class _Friction(_Effect):
 
 
 class CoulombFriction(_Friction):
-    """Dry friction of the cylinder's seals."""
+    """Dry friction of the cylinder's seals; in a tapered bore it grows along the stroke."""
 
     name: Literal["coulomb_friction"]
     force: Force = Field(gt=0)
+    taper: PerLength = Field(default=0.0, description="growth from mid-stroke [1/m]")
 
 
 class StribeckFriction(_Friction):
@@ -181,11 +183,12 @@ class SpoolLag(_Effect):
 
 
 class InternalLeakage(_Effect):
-    """Past the piston, cap to rod."""
+    """Past the piston, cap to rod; in a bore worn about its middle, only there."""
 
     name: Literal["internal_leakage"]
     where: str
     conductance: Conductance = Field(gt=0)
+    worn: Length | None = Field(default=None, gt=0, description="half length of the wear [m]")
 
 
 class ExternalLeakage(_Effect):

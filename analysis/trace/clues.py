@@ -24,6 +24,7 @@ from rig.model import channels as ch
 Array = NDArray[np.float64]
 
 KNOTS = 9
+ANSWER = 0.6  # weight of a variable that only answers
 LEAST = 0.05  # share below which a variable is no clue
 BENCH = (ch.SUPPLY, ch.TEMPERATURE, "time")
 
@@ -79,7 +80,12 @@ def dependence(
         for name, share in shares.items()
         if share >= LEAST
     ]
-    return sorted(out, key=lambda d: -d.share)
+    return sorted(out, key=lambda d: -d.share * (ANSWER if _answers(d) else 1.0))
+
+
+def _answers(found: Dependence) -> bool:
+    """Tell whether a variable answers its equation: pressures balance any torque that acts."""
+    return found.equation.startswith("torque") and "pressure" in found.variable
 
 
 def _energy(stage: Board, left: Array, equation: str) -> float:
@@ -93,7 +99,10 @@ def _energy(stage: Board, left: Array, equation: str) -> float:
 def _share(
     train: Board, left: Array, judge: Board, judge_left: Array, equation: str, joint: int, name: str
 ) -> float:
-    """Fit a curve on each set of records and judge it on the other; the mean share, >= 0."""
+    """Fit a curve on each set of records and judge it on the other; the larger share, >= 0.
+
+    A curve fitted to small motions says nothing of large ones; the other way round it does.
+    """
     values = [
         variables(scene.signals, joint)[name]
         for stage in (train, judge)
@@ -110,8 +119,7 @@ def _share(
     second = _projected(judge, judge_left, equation, joint, name, knots)
     if first is None or second is None:
         return 0.0
-    forward, back = _judged(first, second), _judged(second, first)
-    return max(0.0, forward if forward < back else 0.5 * (forward + back))
+    return max(0.0, _judged(first, second), _judged(second, first))
 
 
 def _judged(fitted: tuple[Array, Array], on: tuple[Array, Array]) -> float:

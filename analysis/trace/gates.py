@@ -32,6 +32,7 @@ CHOSEN = 0.9  # of half-samples
 P_LIMIT = 0.01
 TIE = 1.10  # held-out rms of a rival over the best's: below, the data do not tell them apart
 TIE_TRAINING = 1.25
+HARM = 1.2  # energy above noise in an equation over that before: a cause does not make it worse
 HELD_BAND = 1.5  # held-out rms after over the noise floor, per equation
 SHOWN = 4  # rivals in a result
 
@@ -62,13 +63,14 @@ def judge(
         rest = listed.exact(tuple(u for u in winner.effects if u is not used))
         rivals = _rivals(listed, winner, key, held, after)
         removed = _removed(held, rest, after, _touched(listed, winner, rest))
+        worse = _worse(listed, winner, rest)
         p = inference.p_value(rest.fit.energy - winner.fit.energy, null)
         errors = inference.spread(stage, winner.fit, used, values)
         share, others = steady[key]
         differing = inference.invariance(stage, winner.fit, used, errors, _joint(used.term))
         tied = [r for r in rivals if r.tied]
         gates = (
-            Gate(REMOVES, removed >= REMOVED, f"{100 * removed:.0f} % of what repeats"),
+            Gate(REMOVES, removed >= REMOVED and not worse, _taken(removed, worse)),
             Gate(PHYSICAL, not physical, physical or "sign and size are"),
             Gate(INVARIANT, not differing, _differences(differing)),
             Gate(STABLE, share >= CHOSEN or bool(tied), _chosen(share, others)),
@@ -142,6 +144,22 @@ def _touched(listed: Shortlist, winner: Listed, rest: Listed) -> set[str]:
     change = {e: rest.excess[e] - winner.excess[e] for e in rest.excess}
     most = max(change.values())
     return {e for e, v in change.items() if v > 0.05 * most}
+
+
+def _worse(listed: Shortlist, winner: Listed, rest: Listed) -> list[str]:
+    """Return equations that were quieter under the baseline and that this effect disturbs."""
+    return [
+        e
+        for e, now in winner.excess.items()
+        if not listed.negligible(e, now)
+        and now > HARM * max(0.0, listed.empty.excess[e])
+        and now > rest.excess[e]
+    ]
+
+
+def _taken(removed: float, worse: Sequence[str]) -> str:
+    text = f"{100 * removed:.0f} % of what repeats"
+    return f"{text}, but more is left of {' '.join(worse)} than before" if worse else text
 
 
 def _removed(held: Board, rest: Listed, after: Array, touched: set[str]) -> float:

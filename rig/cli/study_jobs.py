@@ -88,7 +88,7 @@ def _kept(experiment: Experiment, folder: Path) -> dict[str, Trial] | None:
     return {name: Trial(**one) for name, one in json.loads(place.read_text("utf-8")).items()}
 
 
-def _end_with_parent() -> None:
+def end_with_parent() -> None:
     """See to it that this process does not outlive a study that was killed."""
     parent = multiprocessing.parent_process()
 
@@ -123,7 +123,7 @@ def all_of(
         folder.mkdir(parents=True, exist_ok=True)
         say(f"{len(experiments) - len(left)} of {len(experiments)} experiments are in {folder}")
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context, initializer=_end_with_parent) as pool:
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=end_with_parent) as pool:
         waiting = {pool.submit(job, e): e for e in left}
         for done, future in enumerate(as_completed(waiting), start=1):
             if done % 10 == 0 or done == len(waiting):

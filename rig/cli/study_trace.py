@@ -6,95 +6,26 @@ those below 100; figures that judge come from 100 on.
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 import multiprocessing
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from protocols.plan import Overrides
-from rig.model.parse import InputError
+from rig.cli.study_jobs import end_with_parent
+from rig.cli.study_trace_cases import NONE, OUTSIDE, SIZE_OF, Case
 from rig.model.rig import Rig
 
-JUDGING_SEED: Final = 100
-NONE, SINGLE, PAIR, OUTSIDE = "none", "single", "pair", "outside"
 TRAIN, JUDGE = "lock-and-excite-multisine", "validate"
 JUDGE_STEPS: Final = ("step1_1hz", "step2_3hz", "step3_1hz", "both_1hz")
-LOUD = 3.0  # repeatable residual over the noise from which an effect must be found
-
-# name, where (the scenario's), key of the size, small, medium and large size, other keys
-Sizes = tuple[str, str, str, tuple[str, str, str], str]
-SINGLES: Final[tuple[Sizes, ...]] = (
-    ("coulomb_friction", "joint {j}", "force", ("15 N", "40 N", "100 N"), ""),
-    ("stribeck_friction", "joint {j}", "force", ("30 N", "60 N", "120 N"), "speed: 20 mm/s"),
-    (
-        "asymmetric_friction", "joint {j}", "extending", ("30 N", "60 N", "120 N"),
-        "retracting: 10 N",
-    ),
-    (
-        "pressure_dependent_friction", "joint {j}", "coefficient",
-        ("5e-6 N/Pa", "1e-5 N/Pa", "3e-5 N/Pa"), "",
-    ),
-    ("base_inclination", "bench", "angle", ("1 deg", "2 deg", "4 deg"), ""),
-    ("joint_spring", "joint {j}", "stiffness", ("20 N*m/rad", "60 N*m/rad", "150 N*m/rad"), ""),
-    ("torque_offset", "joint {j}", "torque", ("2 N*m", "6 N*m", "15 N*m"), ""),
-    ("valve_deadband", "joint {j}", "width", ("2 mV", "8 mV", "20 mV"), ""),
-    ("spool_offset", "joint {j}", "voltage", ("1 mV", "4 mV", "10 mV"), ""),
-    ("underlap_leakage", "joint {j}", "width", ("4 mV", "8 mV", "15 mV"), ""),
-    ("spool_lag", "joint {j}", "time", ("1 ms", "2 ms", "5 ms"), ""),
-    (
-        "internal_leakage", "joint {j}", "conductance",
-        ("3e-13 m^3/(s*Pa)", "1e-12 m^3/(s*Pa)", "3e-12 m^3/(s*Pa)"), "",
-    ),
-    (
-        "external_leakage", "joint {j} cap", "conductance",
-        ("3e-13 m^3/(s*Pa)", "1e-12 m^3/(s*Pa)", "3e-12 m^3/(s*Pa)"), "",
-    ),
-    ("supply_sag", "bench", "line_drop", ("0.2 MPa", "0.5 MPa", "1 MPa"), ""),
-    ("tank_pressure", "bench", "pressure", ("0.1 MPa", "0.2 MPa", "0.4 MPa"), ""),
-    ("entrained_air", "bench", "fraction", ("0.3 %", "1 %", "3 %"), ""),
-    ("dead_volume", "joint {j} cap", "volume", ("20 cm^3", "50 cm^3", "100 cm^3"), ""),
-    ("channel_delay", "channel cap_pressure_{j}", "time", ("1 ms", "3 ms", "6 ms"), ""),
-    ("sensor_gain", "channel cap_pressure_{j}", "gain", ("1.01", "1.03", "1.08"), ""),
-    (
-        "sensor_offset", "channel rod_pressure_{j}", "offset",
-        ("0.03 MPa", "0.1 MPa", "0.2 MPa"), "",
-    ),
-)  # fmt: skip
-# Things the catalogue has no entry for: a spring that hardens, seals soft as a backlash.
-STRANGERS: Final = (
-    ("hardening spring", "piston",
-     "{name: joint_spring, where: joint %d, stiffness: 30 N*m/rad, hardening: 40 rad^-2}"),
-    ("backlash of soft seals", "piston velocity",
-     "{name: coulomb_friction, where: joint %d, force: 120 N, presliding: 4 mm}"),
-)  # fmt: skip
-# Where the scenario's size stands in the trace's result: parameter and factor.
-SIZE_OF: Final[Mapping[str, tuple[str, float]]] = {
-    "coulomb_friction": ("Fc", 1.0), "base_inclination": ("", 1.0),
-    "joint_spring": ("k_spring", 1.0), "torque_offset": ("", 1.0),
-    "spool_offset": ("u_null", 1.0), "internal_leakage": ("c_internal", 1.0),
-    "external_leakage": ("", 1.0), "tank_pressure": ("p_tank", 1.0),
-    "valve_deadband": ("w_ahead", 1.0), "spool_lag": ("", 1.0), "sensor_gain": ("", 1.0),
-    "sensor_offset": ("", 1.0), "channel_delay": ("", 1.0), "dead_volume": ("", 1.0),
-    "pressure_dependent_friction": ("k_friction", 1.0),
-}  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Case:
-    """One experiment: scenario text, its kind, the right names and places, the seed."""
-
-    kind: str
-    label: str
-    scenario: str
-    truth: tuple[tuple[str, str], ...]
-    seed: int
-    sizes: tuple[float, ...] = ()
-    moves: str = ""
 
 
 @dataclass(frozen=True)
@@ -115,95 +46,6 @@ class Outcome:
     depends_on: tuple[str, ...]
     notes: tuple[str, ...]
     seconds: float
-
-
-def place_of(where: str) -> str:
-    """Return the trace's place of a scenario's place or channel (`joint 1 cap`, `bench`)."""
-    if not where.startswith("channel "):
-        return where
-    kind, joint = where.removeprefix("channel ").rsplit("_", 1)
-    side = {"cap_pressure": " cap", "rod_pressure": " rod"}.get(kind, "")
-    return f"joint {joint}{side}"
-
-
-def effect_text(sizes: Sizes, joint: int, level: int) -> tuple[str, tuple[str, str], float]:
-    """Return the scenario's text of one effect, its name and place, and its size in SI."""
-
-    name, where, key, levels, other = sizes
-    place = where.format(j=joint)
-    at = (
-        f"channel: {place.removeprefix('channel ')}"
-        if place.startswith("channel ")
-        else (f"where: {place}")
-    )
-    text = f"{{name: {name}, {at}, {key}: {levels[level]}" + (f", {other}" if other else "") + "}"
-    return text, (name, place_of(place)), si_size(levels[level])
-
-
-def si_size(text: str) -> float:
-    """Return the SI value of a size such as ``8 mV`` or ``1.03``."""
-    from rig.model.quantity import unit_map
-
-    number, _, unit = text.partition(" ")
-    base = {
-        "N": "N", "N/Pa": "N/Pa", "deg": "rad", "N*m/rad": "N*m/rad", "N*m": "N*m", "mV": "V",
-        "ms": "s", "m^3/(s*Pa)": "m^3/(s*Pa)", "MPa": "Pa", "%": "", "cm^3": "m^3", "": "",
-    }[unit]  # fmt: skip
-    if unit == "%":
-        return float(number) / 100
-    scale = unit_map(unit, base)[0] if unit and unit != base else 1.0
-    return float(number) * scale
-
-
-def cases(
-    kinds: Sequence[str], seed: int, count: int, only: Sequence[str] = (), level: int | None = None
-) -> list[Case]:
-    """Return the cases of each kind: seeds run on from `seed`; sizes and places are drawn by it."""
-    out: list[Case] = []
-    number = seed
-    for kind in kinds:
-        rng = np.random.default_rng([seed, len(kind)])
-        if kind == NONE:
-            out += [Case(NONE, "none", "effects: []", (), number + k) for k in range(count)]
-            number += count
-        elif kind == SINGLE:
-            for sizes in SINGLES:
-                if only and sizes[0] not in only:
-                    continue
-                for k in range(count):
-                    size = level if level is not None else 2 - k % 3
-                    out.append(_case(SINGLE, [(sizes, int(rng.integers(1, 3)), size)], number))
-                    number += 1
-        elif kind == PAIR:
-            loud = [
-                s for s in SINGLES if s[0] not in ("entrained_air", "dead_volume", "supply_sag")
-            ]
-            for _ in range(count):
-                one, two = rng.choice(len(loud), size=2, replace=False)
-                members = [(loud[int(i)], int(rng.integers(1, 3)), 2) for i in (one, two)]
-                out.append(_case(PAIR, members, number))
-                number += 1
-        elif kind == OUTSIDE:
-            for k in range(count):
-                label, moves, text = STRANGERS[k % len(STRANGERS)]
-                scenario = "effects: [" + text % int(rng.integers(1, 3)) + "]"
-                out.append(Case(OUTSIDE, label, scenario, (), number, (), moves))
-                number += 1
-        else:
-            raise InputError(f"kind {kind!r}: expected none, single, pair or outside")
-    return out
-
-
-def _case(kind: str, members: Sequence[tuple[Sizes, int, int]], seed: int) -> Case:
-    built = [effect_text(*m) for m in members]
-    scenario = "effects: [" + ", ".join(text for text, _, _ in built) + "]"
-    label = " + ".join(
-        f"{m[0][3][m[2]]} {key[0]} at {key[1]}"
-        for m, (_, key, _) in zip(members, built, strict=True)
-    )
-    return Case(
-        kind, label, scenario, tuple(k for _, k, _ in built), seed, tuple(s for *_, s in built)
-    )
 
 
 def perform(case: Case) -> Outcome:
@@ -259,20 +101,50 @@ def _size_error(case: Case, effects: Sequence[Any]) -> float:
     return max(errors) if errors else math.nan
 
 
-def all_of(work: Sequence[Case], workers: int, say: Callable[[str], None]) -> Iterator[Outcome]:
-    """Perform the cases on `workers` processes, in the order they end; one that fails is told."""
+def all_of(
+    work: Sequence[Case], workers: int, say: Callable[[str], None], folder: Path | None = None
+) -> Iterator[Outcome]:
+    """Perform the cases on `workers` processes, in the order they end; one that fails is told.
+
+    With a `folder` every outcome is kept there, and a study that was ended goes on from it.
+    """
+    left = []
+    for case in work:
+        kept = _kept(case, folder) if folder else None
+        if kept is None:
+            left.append(case)
+        else:
+            yield kept
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context) as pool:
-        waiting = {pool.submit(perform, case): case for case in work}
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=end_with_parent) as pool:
+        waiting = {pool.submit(perform, case): case for case in left}
         for k, done in enumerate(as_completed(waiting), start=1):
             case = waiting[done]
             try:
                 outcome = done.result()
             except Exception as error:  # a plant that leaves its limits is no result
-                say(f"{k}/{len(work)} {case.label}, seed {case.seed}: no records ({error})")
+                say(f"{k}/{len(left)} {case.label}, seed {case.seed}: no records ({error})")
                 continue
-            say(f"{k}/{len(work)} {line_of(outcome)}")
+            say(f"{k}/{len(left)} {line_of(outcome)}")
+            if folder:
+                _place(case, folder).write_text(json.dumps(asdict(outcome)), encoding="utf-8")
             yield outcome
+
+
+def _place(case: Case, folder: Path) -> Path:
+    """Return the file of a case's outcome; whatever the case is made of is in its name."""
+    text = json.dumps(asdict(case), sort_keys=True)
+    return folder / f"{case.kind} {case.seed} {hashlib.sha256(text.encode()).hexdigest()[:8]}.json"
+
+
+def _kept(case: Case, folder: Path) -> Outcome | None:
+    place = _place(case, folder)
+    if not place.is_file():
+        return None
+    data = json.loads(place.read_text(encoding="utf-8"))
+    pairs = {key: tuple(tuple(one) for one in data[key]) for key in ("named", "tied", "refused")}
+    plain = {key: tuple(data[key]) for key in ("depends_on", "notes")}
+    return Outcome(**{**data, **pairs, **plain, "case": case})
 
 
 def line_of(o: Outcome) -> str:
@@ -307,6 +179,6 @@ def right(o: Outcome) -> str:  # noqa: PLR0911  a table of answers
         return "right"
     if o.verdict == "confounded" and truth <= named | set(o.tied):
         return "in class"
-    if o.verdict == "explained":
-        return "wrong"
+    if o.verdict in ("explained", "confounded"):
+        return "partly" if named < truth else "wrong"
     return "partly" if named and named <= truth else "abstained"

@@ -16,35 +16,50 @@ Workers = Annotated[int, typer.Option(min=1, help="Processes at once.")]
 
 def trace(
     quick: Annotated[bool, typer.Option("--quick", help="A few cases of each kind.")] = False,
-    kinds: Annotated[str, typer.Option(help="Of none, single, pair, outside.")] = (
-        "none single pair outside"
-    ),
+    clean: Annotated[int, typer.Option(min=0, help="Benches with nothing hidden.")] = 300,
+    single: Annotated[int, typer.Option(min=0, help="Benches for each effect alone.")] = 3,
+    pairs: Annotated[int, typer.Option(min=0, help="Benches with two effects.")] = 20,
+    outside: Annotated[
+        int, typer.Option(min=0, help="Benches with what the catalogue does not have.")
+    ] = 12,
     seed: Annotated[int, typer.Option(min=0, help="First seed; below 100 is for tuning.")] = 100,
-    count: Annotated[
-        int, typer.Option(min=1, help="Cases of each kind, and of each effect alone.")
-    ] = 3,
     only: Annotated[str, typer.Option(help="Only these effects alone, by name.")] = "",
     level: Annotated[
         int | None, typer.Option(min=0, max=2, help="Only this size: 0 small .. 2 large.")
     ] = None,
     workers: Workers = 2,
     json: JsonOption = None,
+    keep: Annotated[
+        Path | None, typer.Option(help="Folder of single outcomes, to go on from later.")
+    ] = None,
+    docs: Annotated[
+        Path | None, typer.Option(help="Fill this page's section with command and tables.")
+    ] = None,
 ) -> None:
     """Hide effects in simulated benches and count what the trace makes of them.
 
     Example: bramah study trace --quick
     """
-    from rig.cli.study_trace import all_of, cases
+    from rig.cli.pages import replace_section
+    from rig.cli.study_trace import all_of
+    from rig.cli.study_trace_cases import NONE, OUTSIDE, PAIR, SINGLE, cases
     from rig.cli.study_trace_text import as_json, text
 
     names = tuple(only.split())
+    counts = {NONE: clean, SINGLE: single, PAIR: pairs, OUTSIDE: outside}
     if quick:
+        counts = {NONE: 4, SINGLE: 1, PAIR: 1, OUTSIDE: 2}
         names = names or ("coulomb_friction", "internal_leakage", "valve_deadband", "torque_offset")
-        work = cases(tuple(kinds.split()), seed, 2, names, level if level is not None else 2)
-    else:
-        work = cases(tuple(kinds.split()), seed, count, names, level)
-    outcomes = list(all_of(work, workers, progress))
+    if keep is not None:
+        keep.mkdir(parents=True, exist_ok=True)
+    outcomes = list(all_of(cases(counts, seed, names, level), workers, progress, keep))
     write_json(json, as_json(outcomes))
+    if docs is not None:
+        words = "".join(f" --{name} {n}" for name, n in (
+            ("clean", clean), ("single", single), ("pairs", pairs), ("outside", outside),
+        ))  # fmt: skip
+        made = f"bramah study trace{words} --seed {seed} --docs {docs}"
+        replace_section(docs, "study trace", f"```sh\n{made}\n```\n\n```\n{text(outcomes)}\n```")
     if json != Path("-"):
         typer.echo(text(outcomes))
 

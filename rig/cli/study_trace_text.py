@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from rig.cli.output import table
-from rig.cli.study_trace import LOUD, NONE, OUTSIDE, PAIR, SINGLE, Outcome, right
+from rig.cli.study_trace import Outcome, right
+from rig.cli.study_trace_cases import LOUD, NONE, OUTSIDE, PAIR, SINGLE
 
 WORDS = (
     "right", "in class", "partly", "abstained", "quiet", "no clue", "wrong", "false alarm",

@@ -10,6 +10,7 @@ import pytest
 
 from analysis.effects.base import Effect, ordered
 from analysis.effects.friction import contact_state
+from analysis.effects.friction_levels import contact_levels, contact_under_load
 from analysis.effects.measurement import Sensor
 from analysis.effects.payload import growth, payload_of_shift
 from analysis.effects_catalogue import FAMILIES, pages
@@ -107,8 +108,16 @@ def observed(signals: Signals, k: int) -> tuple[np.ndarray, np.ndarray]:
 
 def hidden_state(e: Effect, rig: Rig, signals: Signals, shape: tuple[float, ...]) -> np.ndarray:
     """What the hidden state is at every sample, from the definition."""
+    s = signals.s[:, e.joint] if e.where.startswith("joint") else np.zeros(len(signals.t))
+    if e.name == "asymmetric_friction":  # both levels are equal here
+        ahead, back = contact_levels(s, *shape)
+        return np.asarray(0.5 * (ahead - back) * shape[0])
+    if e.name == "pressure_dependent_friction":
+        load = signals.p_cap[:, e.joint] + signals.p_rod[:, e.joint]
+        stiffness = rig.supply.pressure / shape[-1]
+        return np.asarray(contact_under_load(s, load, stiffness) / stiffness)
     if e.family == "friction":
-        return np.asarray(shape[-1] * contact_state(signals.s[:, e.joint], shape[-1]))
+        return np.asarray(shape[-1] * contact_state(s, shape[-1]))
     if e.name == "spool_lag":
         return e.prepare(rig, signals, shape).u[:, e.joint]
     return np.zeros(len(signals.t))
