@@ -13,6 +13,7 @@ here are the simulator's own (LuGre, rounded edges, lagging supply), finer than 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib import resources
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
@@ -55,6 +56,19 @@ def _unit_of(name: str) -> str:
     if name != "b" and not name.startswith(("C_", "Fv", "M", "R", "W")):
         raise ValueError(f"{name!r} is no parameter; expected one like M1 R12 Fv1 W1 b C_pp_1")
     return parameter_unit(name)
+
+
+def shipped_scenarios() -> tuple[str, ...]:
+    """Name the scenarios that come with the simulator."""
+    folder = resources.files("hil_sim") / "scenarios"
+    return tuple(sorted(f.name[:-5] for f in folder.iterdir() if f.name.endswith(".yaml")))
+
+
+def load_shipped(name: str) -> Scenario:
+    """Return a scenario that comes with the simulator."""
+    source = f"{name}.yaml"
+    path = resources.files("hil_sim") / "scenarios" / source
+    return parse_scenario(path.read_text(encoding="utf-8"), source)
 
 
 def parse_scenario(text: str, source: str) -> Scenario:

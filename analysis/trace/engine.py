@@ -5,9 +5,8 @@ from __future__ import annotations
 import hashlib
 import logging
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,7 @@ from analysis import checks as ck
 from analysis.effects.base import Effect, ordered
 from analysis.identify import identify
 from analysis.model import Model
-from analysis.terms import baseline_of, known
+from analysis.terms import baseline_of
 from analysis.terms.base import FAMILIES, Used
 from analysis.trace import clues, gates, held_out
 from analysis.trace.beside import beside, stripped
@@ -24,6 +23,7 @@ from analysis.trace.board import Board, board
 from analysis.trace.candidates import catalogue, variants
 from analysis.trace.evidence import Scene, scenes
 from analysis.trace.floor import STATED
+from analysis.trace.next_experiment import propose
 from analysis.trace.result import (
     CLEAN,
     CONFOUNDED,
@@ -37,7 +37,6 @@ from analysis.trace.shortlist import Listed, Shortlist, rebased, within
 from analysis.trace.words import sentence
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
-from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
@@ -53,13 +52,14 @@ def trace(
     effects: Sequence[Effect] | None = None,
     seed: int = 0,
     families: Sequence[str] = tuple(FAMILIES),
+    look_ahead: bool = True,
 ) -> Trace:
     """Say what the baseline lacks on `runs`, name it or refuse to, and judge it on `holdout`.
 
     `effects` are the candidates, by default the whole catalogue at every place. `seed` draws the
     half-samples and sign flips; `families` are the equations looked at, mechanical or fluid (they
-    share no parameter, so that what stays unexplained in one need not hide the other). Raises
-    InputError for records of different rigs, without held-out
+    share no parameter, so that what stays unexplained in one need not hide the other); `look_ahead`
+    designs the next experiment. Raises InputError for records of different rigs, without held-out
     records, with held-out records that are training records, or too short to tell anything.
     """
     started = time.perf_counter()
@@ -89,13 +89,14 @@ def trace(
         if verdict == UNEXPLAINED and found:
             notes += gates.remaining(listed, winner, judge)
         moves = [] if verdict in (CLEAN, EXPLAINED) else _moves(stage, judge, winner)
+    further = propose(listed, winner, found, verdict, moves) if look_ahead else None
     after = _extended(runs, terms, winner, before)
     error = held_out.errors(rig, judged, listed.empty.fit, winner.fit)
     runs_before, runs_after = held_out.free_runs(holdout, before, after)
     result = Trace(
         verdict, found, error.noise, error.before, error.after,
         runs_before.fit, runs_after.fit, before, after,
-        _fraction(listed, winner), tuple(moves), _next(verdict, found, rig), stage.floors,
+        _fraction(listed, winner), tuple(moves), further, stage.floors,
         listed.empty.fit, winner.fit, tuple(notes), refused=refused,
         seconds=time.perf_counter() - started,
     )  # fmt: skip
@@ -212,22 +213,3 @@ def _extended(runs: Sequence[Run], terms: Sequence[Used], winner: Listed, before
     if not winner.effects:
         return before
     return stripped(identify(runs, terms=ordered((*terms, *winner.effects)), estimator=PLAIN).model)
-
-
-def _next(verdict: str, found: Sequence[Found], rig: Rig) -> Mapping[str, Any] | None:
-    """Return the experiment that would tell tied effects apart."""
-    if verdict != CONFOUNDED:
-        return None
-    for effect in found:
-        tied = [r for r in effect.rivals if r.tied]
-        if not tied:
-            continue
-        texts = [getattr(known()[n], "separated_by", "") for n in (effect.name, tied[0].name)]
-        return {
-            "separates": [
-                {"name": n, "where": w}
-                for n, w in ((effect.name, effect.where), *((r.name, r.where) for r in tied))
-            ],
-            "text": next((t for t in texts if t), "another amplitude and frequency"),
-        }
-    return None

@@ -134,7 +134,7 @@ def in_time(line: Lines, noise: float, unit: str, key: str, after: bool) -> Mark
         return svg(made, key, "Held-out residual in time, before and after")
 
 
-def over_noise(result: Trace) -> Markup:
+def over_noise(result: Trace, key: str = "overnoise") -> Markup:
     """Draw every equation's held-out error over its noise floor, before and after."""
     names = list(result.before)
     with style():
@@ -149,11 +149,16 @@ def over_noise(result: Trace) -> Markup:
         axes.axvline(1.0, color=INK, lw=0.8, ls="--")
         axes.set_xscale("log")
         axes.xaxis.set_major_formatter(lambda v, _: f"{v:g}")
+        low, high = axes.get_xlim()
+        low, high = min(low, 0.8), max(high, 2.2)  # else noise would look like a difference
+        axes.set_xlim(low, high)
+        # Within one decade the ticks between are all there is.
+        axes.xaxis.set_minor_formatter(lambda v, _: f"{v:.1g}" if high < 10 * low else "")
         axes.set_yticks(range(len(names)), list(reversed(names)))
         axes.set_ylim(-0.6, len(names) - 0.4)
         axes.set_xlabel("held-out error over the noise floor (grey before, blue after)")
         made.tight_layout()
-        return svg(made, "overnoise", "Held-out error over the noise floor, before and after")
+        return svg(made, key, "Held-out error over the noise floor, before and after")
 
 
 def unit_of_variable(rig: Rig, name: str) -> str:

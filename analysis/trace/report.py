@@ -34,7 +34,11 @@ def write_trace_report(
     path: Path, holdout: Sequence[Run], result: Trace, provenance: Provenance | None = None
 ) -> None:
     """Write the report as one HTML file; raises InputError where it cannot be written."""
-    page = render(holdout, result, provenance)
+    write(path, render(holdout, result, provenance))
+
+
+def write(path: Path, page: str) -> None:
+    """Write a page whole or not at all; raises InputError where it cannot be written."""
     part = path.with_name(path.name + ".part")
     try:
         part.write_text(page, encoding="utf-8")
@@ -45,8 +49,15 @@ def write_trace_report(
 
 def render(holdout: Sequence[Run], result: Trace, provenance: Provenance | None = None) -> str:
     """Return the report as HTML text."""
+    return page(TEMPLATE, body(holdout, result, provenance))
+
+
+def body(
+    holdout: Sequence[Run], result: Trace, provenance: Provenance | None = None
+) -> dict[str, Any]:
+    """Return what the pages of a trace show, for `page`."""
     rig = result.model_before.rig
-    context = {
+    return {
         "title": TITLES[result.verdict],
         "style": Markup(_read("report.css")),
         "rig": rig,
@@ -74,11 +85,15 @@ def render(holdout: Sequence[Run], result: Trace, provenance: Provenance | None 
         "floors": result.floors,
         "fm": fm,
     }
+
+
+def page(template: str, context: Mapping[str, Any]) -> str:
+    """Return a template of `analysis/templates` filled in."""
     environment = Environment(
         loader=FunctionLoader(_read), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    return environment.get_template(TEMPLATE).render(context)
+    return environment.get_template(template).render(context)
 
 
 def _read(name: str) -> str:

@@ -139,7 +139,8 @@ def identify(
     from analysis.terms import with_effects
     from analysis.terms.base import Used
     from rig.cli.method_text import method_text
-    from rig.cli.tables import identification_text, read_truth
+    from rig.cli.tables import identification_text
+    from rig.cli.truth_file import read_truth
 
     if filtering not in FILTERINGS:
         raise InputError(f"--filtering {filtering}: expected one of: {' '.join(FILTERINGS)}")

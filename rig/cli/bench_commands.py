@@ -39,9 +39,10 @@ def sim(
     rig: RigOption,
     wire: Annotated[str, typer.Option(help="Only modbus-tcp for now.")] = "modbus-tcp",
     scenario: Annotated[
-        Path | None, typer.Option(help="A file of hidden effects; none: what every bench has.")
+        str | None,
+        typer.Option(help="A file of hidden effects, worn-seal, or random: drawn by the seed."),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Of noise, temperature and the like.", min=0)] = 0,
+    seed: Annotated[int, typer.Option(help="Of noise, temperature, and what is drawn.", min=0)] = 0,
     port: Annotated[
         int | None, typer.Option(help="0 takes a free one.  [default: the rig's]", min=0, max=65535)
     ] = None,
@@ -49,7 +50,8 @@ def sim(
         bool, typer.Option("--real-time", help="Keep pace with the clock on the wall.")
     ] = False,
     truth: Annotated[
-        Path | None, typer.Option(help="Write the plant's true parameters to this JSON file.")
+        Path | None,
+        typer.Option(help="Write true parameters and what is hidden to this JSON file."),
     ] = None,
     parent: Annotated[int | None, typer.Option(hidden=True)] = None,
 ) -> None:

@@ -15,7 +15,7 @@ def demo(
     seed: Annotated[int, typer.Option(min=0, help="Of the simulated bench.")] = 0,
     repeats: Annotated[int | None, typer.Option(min=1, help="Instead of the protocol's.")] = None,
 ) -> None:
-    """Run the whole loop on a simulated bench: protocol, records, parameters, report.
+    """Run the whole loop on a simulated bench: protocol, records, parameters, trace, report.
 
     Example: bramah demo --out demo-out
     """

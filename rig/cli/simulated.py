@@ -22,7 +22,7 @@ def simulated_bench(
     seed: int,
     truth: Path | None = None,
     real_time: bool = False,
-    scenario: Path | None = None,
+    scenario: Path | str | None = None,
 ) -> Iterator[str]:
     """Start `bramah sim` on a free port, yield its endpoint, end it; raises WorkError if it fails.
 

@@ -6,21 +6,27 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hil_sim.plant import Plant
-from hil_sim.scenario import Scenario, parse_scenario
+from hil_sim.scenario import Scenario, load_shipped, parse_scenario, shipped_scenarios
+from hil_sim.scenario_random import RANDOM, draw
 from hil_sim.server import EndpointError, serve, warm_up
 from rig.cli.errors import WorkError
-from rig.cli.output import write_json
+from rig.cli.truth_file import write_truth
+from rig.model.rig import Rig
 from rig.services.files import read_text
 from rig.services.rigs import load_bench
 
 
 @dataclass(frozen=True)
 class Served:
-    """What to serve and where; `truth` is a file for the plant's true parameters."""
+    """What to serve and where.
+
+    `scenario` is a file of hidden effects, a shipped one's name, or ``random``: drawn here, by
+    `seed`; `truth` is a file for the plant's true parameters and what it hides.
+    """
 
     rig: str
     seed: int = 0
-    scenario: Path | None = None
+    scenario: str | None = None
     port: int | None = None
     real_time: bool = False
     truth: Path | None = None
@@ -32,16 +38,25 @@ def _endpoint_first(endpoint: str) -> None:
     print(endpoint, flush=True)
 
 
+def hidden(what: Served, rig: Rig) -> Scenario:
+    """Return the scenario that a bench hides; raises InputError for a bad file."""
+    if what.scenario is None:
+        return Scenario()
+    if what.scenario == RANDOM:
+        return draw(rig, what.seed)
+    if what.scenario in shipped_scenarios():
+        return load_shipped(what.scenario)
+    return parse_scenario(read_text(Path(what.scenario), "a scenario"), what.scenario)
+
+
 def serve_bench(what: Served) -> None:
     """Serve a simulated bench; raises InputError for bad files, WorkError for a busy port."""
     rig = load_bench(what.rig)
-    scenario = Scenario()
-    if what.scenario is not None:
-        scenario = parse_scenario(read_text(what.scenario, "a scenario"), str(what.scenario))
+    scenario = hidden(what, rig)
     plant = Plant(rig, scenario, what.seed)
     # Compiled before anybody waits for an answer, on a spare so that this one starts at rest.
     warm_up(rig, Plant(rig, scenario, what.seed))
-    write_json(what.truth, plant.truth())
+    write_truth(what.truth, plant.truth(), scenario.model_dump(mode="json"))
     port = rig.wire.port if what.port is None else what.port
     try:
         serve(

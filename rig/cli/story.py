@@ -1,8 +1,7 @@
-"""The whole loop on a simulated bench: start it, run, record, identify, validate, report."""
+"""The whole loop on a simulated bench: run, record, identify, validate, trace, report."""
 
 from __future__ import annotations
 
-import json
 import shlex
 import shutil
 import time
@@ -14,67 +13,99 @@ from pathlib import Path
 from analysis.identify import Identification, identify
 from analysis.identify import to_json as identification_json
 from analysis.model import save_model
+from analysis.trace.engine import trace
+from analysis.trace.result import to_json as trace_json
 from analysis.validate import RecordValidation, validate
 from analysis.validate import to_json as validation_json
 from protocols.plan import Overrides
 from rig.cli.output import progress, write_json
 from rig.cli.running import Job, run_protocol
 from rig.cli.simulated import simulated_bench
-from rig.cli.tables import identification_text, validation_text
+from rig.cli.tables import identification_text, parameter_table, validation_text
+from rig.cli.truth_file import read_truth
 from rig.model.records import Run
 from rig.services.store import load_run
 
 IDENTIFY = "lock-and-excite-multisine"
 VALIDATE = "validate"
 RIG = "shinshu-2dof"
+HELD_OUT = Overrides(amplitude_scale=0.7, seed=1007, repeats=2)
+HIDDEN = "worn-seal"  # what the demo's bench hides; the analysis is not told
 Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """Two runs of one simulated bench and what they say; `truth` is the bench's own."""
+    """Runs of one simulated bench and what they say; `truth` is the bench's own.
+
+    `judged` are those that the model is validated on, `unseen` others that the fit does not see.
+    """
 
     runs: tuple[Run, ...]
     judged: tuple[Run, ...]
+    unseen: tuple[Run, ...]
     identification: Identification
     validation: Sequence[RecordValidation]
     truth: Mapping[str, float]
 
 
-def experiment(folder: Path, seed: int, overrides: Overrides, say: Say) -> Experiment:
-    """Run the demo's protocols on a simulated bench of `seed` into `folder`, and analyse them."""
+def experiment(
+    folder: Path, seed: int, overrides: Overrides, say: Say, scenario: str | None = None
+) -> Experiment:
+    """Run the demo's protocols on a simulated bench of `seed` into `folder`, and analyse them.
+
+    `scenario` is what the bench hides, told to the bench alone; with one there is a third run, of
+    another wave and size, to judge by what is traced.
+    """
     folder.mkdir(parents=True)
     truth = folder / "truth.json"
     say(f"starting the simulated bench {RIG}, seed {seed}")
-    with simulated_bench(RIG, seed=seed, truth=truth) as endpoint:
+    with simulated_bench(RIG, seed=seed, truth=truth, scenario=scenario) as endpoint:
         say(f"it listens on {endpoint}")
         first = run_protocol(Job(IDENTIFY, RIG, folder / "identify", endpoint, overrides), say)
         second = run_protocol(Job(VALIDATE, RIG, folder / "validate", endpoint), say)
+        unseen: tuple[Path, ...] = ()
+        if scenario is not None:
+            third = Job(IDENTIFY, RIG, folder / "other-wave", endpoint, HELD_OUT)
+            unseen = (run_protocol(third, say),)
     runs, judged = (load_run(first),), (load_run(second),)
     say("identifying from the first run")
     found = identify(runs)
     say("validating on the second, which the fit has not seen")
     results = validate(found.model, judged)
-    return Experiment(runs, judged, found, results, json.loads(truth.read_text()))
+    return Experiment(runs, judged, tuple(map(load_run, unseen)), found, results, read_truth(truth))
 
 
 def tell(out: Path, seed: int, repeats: int | None) -> None:
-    """Run the demo into a new folder of `out`, print its results and write its report."""
+    """Run the demo into a new folder of `out`, print its results and write its reports."""
     from rig.cli.reporting import write_experiment
+    from rig.cli.trace_reporting import write_trace
 
     started = time.monotonic()
     folder = out / datetime.now().strftime("%Y-%m-%dT%H-%M-%S")
-    done = experiment(folder, seed, Overrides(repeats=repeats), progress)
+    done = experiment(folder, seed, Overrides(repeats=repeats), progress, HIDDEN)
     write_json(folder / "identify.json", identification_json(done.identification))
     write_json(folder / "validate.json", validation_json(done.validation))
-    save_model(done.identification.model, folder / "model.json")
+    progress("tracing what the model lacks, judged on runs that the fit has not seen")
+    held_out = (*done.unseen, *done.judged)
+    found = trace(done.runs, held_out, seed=seed)
+    write_json(folder / "trace.json", trace_json(found))
+    save_model(found.model_after, folder / "model.json")
     command = f"bramah demo --out {shlex.quote(str(out))} --seed {seed}"
     write_experiment(folder / "report.html", done, command, seed)
-    shutil.copyfile(folder / "report.html", out / "report.html")
+    write_trace(folder / "trace.html", held_out, found)
+    for name in ("report.html", "trace.html"):
+        shutil.copyfile(folder / name, out / name)
     print(identification_text(done.identification, done.truth))
     print()
     print(validation_text(done.validation))
     print()
+    print(f"trace: {found.verdict}. {found.sentence}")
+    print()
+    print("parameters, identified again with what was found:")
+    print(parameter_table(found.model_after.parameters, done.truth))
+    print()
     print(f"runs, model and results: {folder}")
     print(f"report: {out / 'report.html'}")
+    print(f"trace: {out / 'trace.html'}")
     progress(f"the whole loop took {time.monotonic() - started:.0f} s")

@@ -64,7 +64,7 @@ def perform(case: Case) -> Outcome:
     )  # fmt: skip
     judge, _ = simulated_run(rig, JUDGE, case.seed + 90_000, scenario, Overrides(steps=JUDGE_STEPS))
     started = time.process_time()
-    found = trace([train], [other, judge])
+    found = trace([train], [other, judge], look_ahead=False)
     seconds = time.process_time() - started
     named = tuple((e.name, e.where) for e in found.effects)
     ratio = max(found.after[e] / found.noise_floor[e] for e in found.after)

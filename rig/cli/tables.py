@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 from analysis.identify import Identification
 from analysis.model import Estimate
 from analysis.validate import RecordValidation
 from rig.cli.output import table
-from rig.model.parse import InputError
 from rig.model.quantity import unit_map
 
 # SI unit of a parameter -> the unit it is shown in
@@ -53,18 +50,6 @@ def parameter_table(
             ]
         rows.append(row)
     return table(header + ([] if truth is None else ["truth", "error"]), rows)
-
-
-def read_truth(path: Path) -> dict[str, float]:
-    """Read the parameters that `bramah sim --truth` wrote; raises InputError for another file."""
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        return {str(name): float(value) for name, value in found.items()}
-    except (OSError, ValueError, TypeError, AttributeError) as error:
-        raise InputError(
-            f"{path} cannot be read as true parameters ({error}); expected the JSON file that "
-            "`bramah sim --truth` writes"
-        ) from error
 
 
 def identification_text(result: Identification, truth: Mapping[str, float] | None = None) -> str:

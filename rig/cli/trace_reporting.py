@@ -9,16 +9,27 @@ from datetime import datetime
 from pathlib import Path
 
 from analysis.report import Provenance
+from analysis.trace.loop_report import write_loop_report
 from analysis.trace.report import write_trace_report
 from analysis.trace.result import Trace
+from analysis.trace.rounds import Round
 from rig.model.records import Run
 from rig.services.versions import versions
 
 
 def write_trace(path: Path, holdout: Sequence[Run], result: Trace) -> None:
     """Write the trace's report."""
+    write_trace_report(path, holdout, result, _provenance())
+
+
+def write_story(
+    path: Path, train: Sequence[Run], holdout: Sequence[Run], rounds: Sequence[Round], stopped: str
+) -> None:
+    """Write the report of a whole loop."""
+    write_loop_report(path, train, holdout, rounds, stopped, _provenance())
+
+
+def _provenance() -> Provenance:
     line = shlex.join(["bramah", *sys.argv[1:]])
     date = datetime.now().astimezone().strftime("%Y-%m-%d %H:%M")
-    write_trace_report(
-        path, holdout, result, Provenance(date=date, commands=(line,), versions=versions())
-    )
+    return Provenance(date=date, commands=(line,), versions=versions())

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from analysis.trace.result import Found, Trace
+from analysis.trace.rounds import Round
 from analysis.trace.words import quantity, unit_of_equation
 from rig.cli.output import table
 
@@ -91,3 +93,31 @@ def _changed(result: Trace) -> list[list[str]]:
         change = 100 * (after[name].value / one.value - 1) if one.value else math.nan
         out.append([name, f"{one.value:.4g}", f"{after[name].value:.4g}", f"{change:+.1f} %"])
     return out
+
+
+def story_text(rounds: Sequence[Round], stopped: str) -> str:
+    """Return a loop's rounds as a table, the last trace, and why it stopped."""
+    rows = [
+        [
+            str(r.number), r.result.verdict, named(r.result), _figure(r.predicted),
+            _figure(r.achieved), f"{r.loudest:.2g}", f"{r.left:.2g}",
+        ]
+        for r in rounds
+    ]  # fmt: skip
+    header = [
+        "round", "verdict", "named", "predicted", "achieved", "residual/noise", "held-out/noise",
+    ]  # fmt: skip
+    lines = [trace_text(rounds[-1].result), "", table(header, rows), "", f"stopped: {stopped}"]
+    return "\n".join(lines)
+
+
+def named(result: Trace) -> str:
+    """Return the effects of a trace in a few words, the tied ones too."""
+    found = [f"{e.name} at {e.where}" for e in result.effects]
+    tied = sorted({f"{r.name} at {r.where}" for e in result.effects for r in e.rivals if r.tied})
+    words = ", ".join(found) or "nothing"
+    return words + (f" (or {', '.join(tied)})" if tied else "")
+
+
+def _figure(value: float | None) -> str:
+    return "—" if value is None else f"{value:.2g}"

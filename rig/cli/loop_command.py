@@ -1,0 +1,115 @@
+"""The `loop` verb: run, identify, trace, design the next excitation, run it, until only noise."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from rig.cli.bench_commands import EndpointOption, JsonOption, RepeatsOption, RigOption, ScaleOption
+from rig.cli.output import progress, write_json
+
+
+def loop(
+    rig: RigOption,
+    out: Annotated[Path, typer.Option(help="A folder for the runs and the story, made if needed.")],
+    endpoint: EndpointOption = None,
+    unattended: Annotated[
+        bool, typer.Option("--unattended", help="Run designed experiments without asking.")
+    ] = False,
+    rounds: Annotated[int, typer.Option(min=0, help="Designed experiments at most.")] = 4,
+    protocol: Annotated[str, typer.Option(help="Of the first run.")] = "lock-and-excite-multisine",
+    repeats: RepeatsOption = None,
+    amplitude_scale: ScaleOption = 1.0,
+    until_visible: Annotated[
+        bool,
+        typer.Option(
+            "--until-visible", help="Go on after clean while a small effect could not have shown."
+        ),
+    ] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Of the trace, and of --simulate.")] = 0,
+    simulate: Annotated[
+        bool, typer.Option("--simulate", help="Start a simulated bench for it.")
+    ] = False,
+    scenario: Annotated[
+        str | None, typer.Option(help="Of --simulate: as of sim, for example random.")
+    ] = None,
+    json: JsonOption = None,
+    report: Annotated[
+        Path | None, typer.Option(help="The whole story.  [default: OUT/loop.html]")
+    ] = None,
+    operator: Annotated[
+        str | None, typer.Option(help="Written into the runs.  [default: you]")
+    ] = None,
+) -> None:
+    """Close the loop: run, trace, design the experiment that would tell, run it, trace again.
+
+    It stops when what is left is noise, or when no experiment promises more than noise.
+
+    Example: bramah loop --rig shinshu-2dof --out loops/monday --unattended
+    """
+    from protocols.plan import Overrides
+    from rig.cli.looping import Loop, Wanted, refuse_taken
+    from rig.cli.simulated import simulated_bench
+    from rig.model.parse import InputError
+
+    if simulate and endpoint is not None:
+        raise InputError("--simulate starts a bench of its own: leave --endpoint away, or it")
+    if scenario is not None and not simulate:
+        raise InputError("--scenario is of --simulate: a bench that runs already has its own")
+    if not unattended and not sys.stdin.isatty():
+        raise InputError(
+            "loop asks before each experiment that it designs; give --unattended where nobody "
+            "can answer"
+        )
+    refuse_taken(out)
+    with ExitStack() as stack:
+        if simulate:
+            # The truth stays with the simulator: the loop does not look at it.
+            endpoint = stack.enter_context(simulated_bench(rig, seed=seed, scenario=scenario))
+        ask = (lambda experiment: True) if unattended else _asked
+        sizes = Overrides(repeats=repeats, amplitude_scale=amplitude_scale)
+        wanted = Wanted(
+            rig, out, endpoint, protocol, sizes, rounds, seed, until_visible, operator, ask
+        )
+        going = Loop(wanted, progress)
+        try:
+            going.close()
+        except BaseException as error:
+            going.stopped = f"{type(error).__name__}: {error}"
+            raise
+        finally:
+            _tell(going, json, report or out / "loop.html")
+
+
+def _asked(experiment: Mapping[str, Any]) -> bool:
+    return typer.confirm(f"Run the next experiment ({experiment['text']})?", err=True)
+
+
+def _tell(going: Any, json: Path | None, report: Path) -> None:
+    from analysis.model import save_model
+    from analysis.trace.rounds import story_json
+    from rig.cli.trace_reporting import write_story
+    from rig.cli.trace_text import story_text
+
+    if not going.rounds and not going.wanted.out.is_dir():
+        return  # ended before anything was taken
+    told = story_json(going.rounds, going.stopped)
+    write_json(going.wanted.out / "loop.json", told)
+    write_json(json, told)
+    if going.rounds:
+        report.parent.mkdir(parents=True, exist_ok=True)
+        write_story(report, going.train, going.judge, going.rounds, going.stopped)
+        save_model(going.rounds[-1].result.model_after, going.wanted.out / "model.json")
+        if json != Path("-"):
+            typer.echo(story_text(going.rounds, going.stopped))
+            typer.echo(f"report: {report}")
+
+
+def register(app: typer.Typer) -> None:
+    """Add this verb to the command line."""
+    app.command()(loop)

@@ -1,0 +1,176 @@
+"""The `loop` verb's work: run, trace, design what would tell, run that, until nothing is left.
+
+Every run is a folder of its own under one: `run-1`, `holdout-1`, then `run-2` from the protocol
+`next-2.yaml`, and so on; each could be traced again without this. What ends a run (a trip, a lost
+device, Ctrl-C) ends the loop as well, with what it knew until then written down.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import yaml
+
+from analysis.trace.engine import trace
+from analysis.trace.result import CLEAN, EXPLAINED
+from analysis.trace.rounds import Round, achieved
+from analysis.twin import simulate_commands
+from protocols import library
+from protocols.check import check
+from protocols.errors import ProtocolAborted
+from protocols.plan import Overrides, resolve
+from rig.cli.running import Job, run_protocol
+from rig.model.parse import InputError
+from rig.model.records import Run
+from rig.model.rig import Rig
+from rig.services.rigs import load_bench
+from rig.services.store import load_run
+
+log = logging.getLogger(__name__)
+
+PROTOCOL: Final = "lock-and-excite-multisine"
+HELD_OUT: Final = Overrides(amplitude_scale=0.7, seed=1007, repeats=2)
+SMALLER = 0.8  # an experiment that the bench or its twin refuses is tried again so much smaller
+TRIES = 4
+
+FLOOR: Final = "what is left lies within the noise"
+NOTHING: Final = "no experiment within the limits promises more than noise"
+ROUNDS: Final = "as many experiments as were asked for"
+DECLINED: Final = "the operator did not want the next experiment"
+REFUSED: Final = "the bench refused the next experiment"
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What to do: `rounds` counts designed experiments, `ask` is given each before it runs.
+
+    `closer` goes on after `clean` while an effect of interesting size could not have shown.
+    """
+
+    rig: str
+    out: Path
+    endpoint: str | None = None
+    protocol: str = PROTOCOL
+    overrides: Overrides = field(default_factory=Overrides)
+    rounds: int = 4
+    seed: int = 0
+    closer: bool = False
+    operator: str | None = None
+    ask: Callable[[Mapping[str, Any]], bool] = lambda experiment: True
+
+
+def refuse_taken(out: Path) -> None:
+    """Raise InputError where a loop has been in this folder before."""
+    taken = out / "run-1"
+    if taken.exists():
+        raise InputError(f"--out {out}: {taken} is there already; name another folder")
+
+
+class Loop:
+    """A loop under way: `rounds` so far, `stopped` why it ended ('' while it has not)."""
+
+    def __init__(self, wanted: Wanted, say: Callable[[str], None]) -> None:
+        refuse_taken(wanted.out)
+        self.wanted, self.say = wanted, say
+        self.rig: Rig = load_bench(wanted.rig)
+        self.rounds: list[Round] = []
+        self.stopped = ""
+        self.train: list[Run] = []
+        self.judge: list[Run] = []
+
+    def close(self) -> None:
+        """Go round until there is nothing more to learn; raises what ends a run."""
+        self._take(1, self.wanted.protocol, self.wanted.overrides, HELD_OUT)
+        self._trace(1, None)
+        while not self.stopped:
+            number = len(self.rounds) + 1
+            experiment = self._next()
+            if experiment is None:
+                return
+            self.say(f"round {number}: {experiment['text']}")
+            if not self.wanted.ask(experiment):
+                self.stopped = DECLINED
+            elif not self._perform(number, experiment):
+                self.stopped = REFUSED
+            else:
+                self._trace(number, experiment)
+
+    def _next(self) -> Mapping[str, Any] | None:
+        """Return the experiment to run now; None, and why in `stopped`, where there is none."""
+        last = self.rounds[-1].result
+        if last.verdict == EXPLAINED or (last.verdict == CLEAN and not self.wanted.closer):
+            self.stopped = FLOOR
+        elif last.next_experiment is None or "protocol" not in last.next_experiment:
+            self.stopped = FLOOR if last.verdict == CLEAN else NOTHING
+        elif len(self.rounds) > self.wanted.rounds:
+            self.stopped = ROUNDS
+        return None if self.stopped else last.next_experiment
+
+    def _trace(self, number: int, experiment: Mapping[str, Any] | None) -> None:
+        self.say(f"round {number}: tracing {sum(len(r.records) for r in self.train)} records")
+        result = trace(self.train, self.judge, seed=self.wanted.seed)
+        worth = None
+        if experiment is not None:
+            worth = achieved(self.rig, self.train[:-1], self.train[-1], experiment)
+        names = tuple(f"{kind}-{number}" for kind in ("run", "holdout"))
+        self.rounds.append(Round(number, names, experiment, result, worth))
+        self.say(f"round {number}: {result.verdict}: {result.sentence}")
+
+    def _perform(self, number: int, experiment: Mapping[str, Any]) -> bool:
+        """Run an experiment and its held-out variant; False where the bench refuses both sizes."""
+        files = {kind: self.wanted.out / f"{kind}-{number}.yaml" for kind in ("next", "judge")}
+        for path, key in ((files["next"], "protocol"), (files["judge"], "holdout")):
+            text = yaml.safe_dump(dict(experiment[key]), sort_keys=False, allow_unicode=True)
+            path.write_text(text, encoding="utf-8")
+        scale = 1.0
+        for _ in range(TRIES):
+            sizes = Overrides(amplitude_scale=scale)
+            if all(self._within(path, sizes) for path in files.values()):
+                try:
+                    self._take(number, str(files["next"]), sizes, sizes, str(files["judge"]))
+                    return True
+                except ProtocolAborted as error:
+                    self.say(f"round {number}: {error}")
+                    self._set_aside(number)
+            scale *= SMALLER
+            self.say(f"round {number}: tried again {scale:.2f} times as large")
+        return False
+
+    def _within(self, path: Path, sizes: Overrides) -> bool:
+        try:
+            plan = resolve(library.load(path), self.rig, sizes)
+            return check(plan, self.rig, simulate_commands).ok
+        except InputError as error:
+            log.info("%s at %.2f: %s", path, sizes.amplitude_scale, error)
+            return False
+
+    def _take(
+        self, number: int, protocol: str, sizes: Overrides, held_out: Overrides,
+        other: str | None = None,
+    ) -> None:  # fmt: skip
+        """Take the records of a round, then those that will only judge."""
+        first = self._run(f"run-{number}", protocol, sizes)
+        second = self._run(f"holdout-{number}", other or protocol, held_out)
+        self.train.append(first)
+        self.judge.append(second)
+
+    def _run(self, name: str, protocol: str, sizes: Overrides) -> Run:
+        w = self.wanted
+        self.say(f"{name}: {protocol}")
+        return load_run(
+            run_protocol(
+                Job(protocol, w.rig, w.out / name, w.endpoint, sizes, w.operator), self.say
+            )
+        )
+
+    def _set_aside(self, number: int) -> None:
+        """Keep an aborted run under another name, so that the next try has its own."""
+        for kind in ("run", "holdout"):
+            folder = self.wanted.out / f"{kind}-{number}"
+            if folder.exists():
+                k = sum(1 for _ in self.wanted.out.glob(f"{folder.name}-aborted-*")) + 1
+                folder.rename(folder.with_name(f"{folder.name}-aborted-{k}"))

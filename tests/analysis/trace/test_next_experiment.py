@@ -1,0 +1,135 @@
+"""What an experiment is worth before it is run: told from the rows alone, and checked by hand."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from analysis.terms import baseline_of, known
+from analysis.terms.base import Used
+from analysis.trace.board import Board, board
+from analysis.trace.candidates import catalogue
+from analysis.trace.discriminate import (
+    Ground,
+    Hypothesis,
+    Question,
+    calibration,
+    loudest,
+    present,
+    separation,
+    view,
+)
+from analysis.trace.evidence import scenes
+from analysis.trace.excitations import FAMILIES, Setting, excitation, protocol, settings
+from analysis.trace.interesting import smallest
+from hil_sim.scenario import Scenario
+from protocols.plan import Overrides
+from rig.cli.direct_bench import simulated_run
+from rig.model.rig import Rig
+from rig.services.rigs import load_rig
+
+FAST = next(f for f in FAMILIES if f.name == "fast")
+AIR = Hypothesis((Used(known()["entrained_air"]("bench")),), {"alpha_air": 3e-3})
+LEAK = Hypothesis((Used(known()["internal_leakage"]("joint 2")),), {"c_internal_2": 1e-12})
+
+
+@cache
+def sine() -> tuple[Rig, Board]:
+    """Three records of the paper's first step on a bench with nothing wrong, laid out."""
+    rig = load_rig("shinshu-2dof")
+    change = Overrides(repeats=3, duration=5.0, steps=("step1",))
+    run, _ = simulated_run(rig, "lock-and-excite", 5, Scenario(), change)
+    return rig, board(rig, tuple(map(Used, baseline_of(rig))), scenes(rig, [run]))
+
+
+@cache
+def grounds(family: str = "fast") -> tuple[Ground, Ground]:
+    rig, stage = sine()
+    chosen = next(f for f in FAMILIES if f.name == family)
+    found = excitation(rig, settings(rig, stage.scenes)[0], chosen, np.random.default_rng(1))
+    assert found is not None
+    old = Ground(stage)
+    return old, Ground(stage, view(stage, found, calibration(stage)), old)
+
+
+def test_how_the_joints_stood_is_read_from_the_records() -> None:
+    rig, stage = sine()
+    assert settings(rig, stage.scenes) == [Setting({0: 0.0}, {}), Setting({}, {})]
+
+
+def test_what_an_explanation_can_imitate_is_no_separation() -> None:
+    old, new = grounds()
+    half = Hypothesis(LEAK.effects, {"c_internal_2": 5e-13})
+    assert separation(Question(LEAK, half), old, new)[0] < 1e-3
+    # Against the baseline alone the same leak stands out far above the noise.
+    assert separation(Question(LEAK, Hypothesis(), False), old, new)[0] > 3.0
+
+
+def test_the_separation_is_the_rms_that_stands_out_of_the_new_rows() -> None:
+    """By hand: whiten, project with a QR of one's own, count energy per row and repeat."""
+    old, new = grounds()
+    question = Question(AIR, LEAK, False)
+    assert new.seen is not None
+    energy = []
+    for ground in (old, new):
+        X = np.column_stack([ground.base, *ground.columns(LEAK.effects[0]).values()])
+        X = X[:, np.linalg.norm(X, axis=0) > 0]
+        y = ground.columns(AIR.effects[0])["alpha_air"] * 3e-3
+        Q, _ = np.linalg.qr(X / np.linalg.norm(X, axis=0))
+        r = y - Q @ (Q.T @ y)
+        energy.append({e: float(np.sum(r[ground.equation == e] ** 2)) for e in new.seen.rows})
+    expected = {
+        e: np.sqrt(max(0.0, energy[1][e] - energy[0][e]) / (4 * len(rows.rhs)))
+        for e, rows in new.seen.rows.items()
+    }
+    figure, equation = separation(question, old, new)
+    assert figure == pytest.approx(max(expected.values()), rel=0.02)
+    assert equation == max(expected, key=lambda e: expected[e])
+
+
+def test_air_hardly_shows_on_the_sine_and_shows_on_fast_lines() -> None:
+    old, new = grounds()
+    question = Question(AIR, Hypothesis(), False)
+    assert present(question, old) < 0.5
+    assert separation(question, old, new)[0] > 2 * present(question, old)
+    _, small = grounds("small")
+    assert separation(question, old, small)[0] < separation(question, old, new)[0]
+
+
+def test_faster_lines_are_noisier_than_the_sine_and_it_is_foreseen() -> None:
+    old, new = grounds()
+    assert new.seen is not None
+    floor = {f.equation: f.noise for f in old.stage.floors}
+    assert all(new.seen.noise[e] > 1.5 * floor[e] for e in new.seen.rows)
+
+
+def test_an_excitation_fills_its_share_of_the_limits_and_is_a_protocol() -> None:
+    rig, stage = sine()
+    one = excitation(rig, settings(rig, stage.scenes)[0], FAST, np.random.default_rng(2))
+    assert one is not None
+    piston = one.played.motion["piston"][:, 1]
+    low, high = rig.joints[1].limits.piston
+    assert low < piston.min() < piston.max() < high
+    made = protocol(rig, [one], "next")
+    (step,) = made["steps"]
+    assert step["lock"] == [{"joint": 1, "at": "closed", "piston": "0 mm", "tolerance": "5 mm"}]
+    amplitudes = [float(a.split()[0]) for a in step["excite"][0]["signal"]["amplitudes"]]
+    rms = np.sqrt(np.sum(np.square(amplitudes)) / 2)
+    assert rms == pytest.approx(np.sqrt(np.mean(one.step.waves[1] ** 2)), rel=1e-3)
+
+
+def test_a_rig_without_a_twin_offers_nothing() -> None:
+    rig, stage = sine()
+    blind = rig.model_copy(update={"nominal": {}})
+    where = settings(rig, stage.scenes)[0]
+    assert excitation(blind, where, FAST, np.random.default_rng(0)) is None
+
+
+def test_every_effect_that_can_show_has_a_size_worth_knowing() -> None:
+    rig, stage = sine()
+    without = [e for e in catalogue(rig) if smallest(e, rig) is None]
+    assert "payload" in {e.name for e in without}
+    assert all(e.absorbed(rig) for e in without)
+    assert loudest(stage, np.zeros(stage.base.shape[0])) == 0.0

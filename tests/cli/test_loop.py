@@ -1,0 +1,187 @@
+"""A person lets the loop run: what one experiment cannot show the next one does, or it says why."""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from analysis.trace.candidates import catalogue
+from analysis.trace.engine import trace
+from analysis.trace.loop_report import render
+from analysis.trace.rounds import Round, story_json
+from analysis.twin import simulate_commands
+from protocols import library
+from protocols.check import check
+from protocols.plan import resolve
+from rig.cli import looping
+from rig.cli.looping import DECLINED, FLOOR, NOTHING, REFUSED, ROUNDS, Loop, Wanted
+from rig.cli.trace_text import story_text
+from rig.services.rigs import load_rig
+from tests.analysis.page import Page
+from tests.cli.bench import bramah
+from tests.cli.loops import SINE, WAVES, Inside, looped
+
+RIG = "shinshu-2dof"
+FEW = ("coulomb_friction", "dead_volume", "entrained_air", "internal_leakage", "tank_pressure")
+
+
+@pytest.fixture(scope="module")
+def air(tmp_path_factory: pytest.TempPathFactory) -> Inside:
+    """A bench with 1 % of air in its oil, first moved by a sine; few candidates, to be quick."""
+    few = functools.partial(trace, effects=catalogue(load_rig(RIG), FEW))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(looping, "trace", few)
+        return looped(
+            tmp_path_factory.mktemp("air"), SINE, "{name: entrained_air, fraction: 1 %}",
+            closer=True,
+        )  # fmt: skip
+
+
+def test_air_that_a_sine_cannot_show_is_brought_to_light_and_named(air: Inside) -> None:
+    first, second = air.rounds
+    assert first.result.verdict == "clean"
+    assert second.experiment is not None
+    assert {"name": "entrained_air", "where": "bench"} in second.experiment["separates"]
+    assert second.result.verdict == "explained"
+    (found,) = second.result.effects
+    assert (found.name, found.where) == ("entrained_air", "bench")
+    assert found.parameters["alpha_air"].value == pytest.approx(0.01, rel=0.1)
+    assert second.left < 1.3
+    assert air.stopped == FLOOR
+
+
+def test_an_experiment_brings_about_what_it_promised(air: Inside) -> None:
+    second = air.rounds[1]
+    assert second.experiment is not None
+    assert second.predicted is not None
+    assert second.achieved is not None
+    assert second.predicted > max(0.7, 1.3 * second.experiment["present"])
+    assert second.achieved == pytest.approx(second.predicted, rel=0.5)
+
+
+def test_the_designed_protocol_is_one_that_run_takes_and_the_twin_proves(air: Inside) -> None:
+    rig = load_rig(RIG)
+    for name in ("next-2.yaml", "judge-2.yaml"):
+        plan = resolve(library.load(air.wanted.out / name), rig)
+        assert check(plan, rig, simulate_commands).ok
+    train, judge = (library.load(air.wanted.out / f"{n}-2.yaml") for n in ("next", "judge"))
+    assert train.steps[0].excite[0].signal != judge.steps[0].excite[0].signal
+
+
+def test_the_story_is_told_in_json_in_words_and_on_one_page(air: Inside) -> None:
+    told = json.loads(json.dumps(story_json(air.rounds, air.stopped), allow_nan=False))
+    assert told["verdict"] == "explained"
+    assert [r["trace"]["verdict"] for r in told["rounds"]] == ["clean", "explained"]
+    assert told["rounds"][1]["runs"] == ["run-2", "holdout-2"]
+    text = story_text(air.rounds, air.stopped)
+    assert f"stopped: {FLOOR}" in text
+    page = Page(render(air.train, air.judge, air.rounds, air.stopped))
+    for words in ("Round 1: clean", "Round 2: explained", "entrained air", FLOOR):
+        assert words in page.text
+
+
+class Replayed(Loop):
+    """A loop whose traces are those of another; nothing is moved."""
+
+    def __init__(self, wanted: Wanted, rounds: Sequence[Round], takes: bool = True) -> None:
+        super().__init__(wanted, lambda line: None)
+        self._others, self._takes = list(rounds), takes
+
+    def _take(self, *arguments: object) -> None:
+        pass
+
+    def _trace(self, number: int, experiment: object) -> None:
+        self.rounds.append(self._others[min(number, len(self._others)) - 1])
+
+    def _within(self, path: Path, sizes: object) -> bool:
+        return self._takes
+
+
+@pytest.mark.parametrize(
+    ("changes", "takes", "why", "count"),
+    [
+        ({"closer": False}, True, FLOOR, 1),
+        ({"ask": lambda experiment: False}, True, DECLINED, 1),
+        ({"rounds": 0}, True, ROUNDS, 1),
+        ({"rounds": 2}, True, ROUNDS, 3),
+        ({}, False, REFUSED, 1),
+    ],
+)
+def test_it_stops_where_it_should_and_says_why(
+    air: Inside, tmp_path: Path, changes: dict[str, object], takes: bool, why: str, count: int
+) -> None:
+    wanted = Wanted(RIG, tmp_path, **({"closer": True, **changes}))  # type: ignore[arg-type]
+    going = Replayed(wanted, air.rounds[:1], takes)
+    going.close()
+    assert going.stopped == why
+    assert len(going.rounds) == count
+
+
+def test_a_leak_is_traced_over_the_wire_into_folders_of_its_own(tmp_path: Path) -> None:
+    protocol, out = tmp_path / "waves.yaml", tmp_path / "monday"
+    protocol.write_text(WAVES)
+    done = bramah(
+        "loop", "--rig", RIG, "--out", out, "--protocol", protocol, "--unattended", "--simulate",
+        "--scenario", "worn-seal", "--seed", 3,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    told = json.loads((out / "loop.json").read_text())
+    assert told["verdict"] == "explained"
+    assert [(e["name"], e["where"]) for e in told["effects"]] == [("internal_leakage", "joint 2")]
+    assert f"stopped: {FLOOR}" in done.stdout
+    for part in ("run-1/records.h5", "holdout-1/records.h5", "model.json", "loop.html"):
+        assert (out / part).is_file(), part
+    again = bramah(
+        "loop", "--rig", RIG, "--out", out, "--protocol", protocol, "--unattended", "--simulate"
+    )
+    assert again.returncode == 2
+    assert "run-1" in again.stderr
+
+
+def test_a_trip_ends_the_loop_with_its_code_and_what_was_known(tmp_path: Path) -> None:
+    scenario, protocol, out = tmp_path / "bad.yaml", tmp_path / "waves.yaml", tmp_path / "monday"
+    scenario.write_text(
+        "effects: [{name: sensor_offset, channel: cap_pressure_2, offset: 6 MPa}]\n"
+    )
+    protocol.write_text(WAVES)
+    done = bramah(
+        "loop", "--rig", RIG, "--out", out, "--protocol", protocol, "--unattended", "--simulate",
+        "--scenario", scenario,
+    )  # fmt: skip
+    assert done.returncode == 3, done.stderr
+    assert "cap_pressure_2" in done.stderr.strip().splitlines()[-1]
+    told = json.loads((out / "loop.json").read_text())
+    assert told["rounds"] == []
+    assert "SafetyTrip" in told["stopped"]
+    assert (out / "run-1" / "state").read_text().strip() == "tripped"
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        ((), "--unattended"),
+        (("--unattended", "--scenario", "random"), "--simulate"),
+        (("--unattended", "--simulate", "--endpoint", "modbus-tcp://127.0.0.1:1"), "--endpoint"),
+    ],
+)
+def test_what_does_not_go_together_is_said(
+    more: tuple[str, ...], words: str, tmp_path: Path
+) -> None:
+    done = bramah("loop", "--rig", RIG, "--out", tmp_path / "x", *more)
+    assert done.returncode == 2
+    assert words in done.stderr
+    assert not (tmp_path / "x").exists()
+
+
+def test_nothing_to_gain_is_a_reason_to_stop(air: Inside, tmp_path: Path) -> None:
+    from dataclasses import replace
+
+    one = air.rounds[0]
+    puzzled = replace(one, result=replace(one.result, verdict="unexplained", next_experiment=None))
+    going = Replayed(Wanted(RIG, tmp_path), [puzzled])
+    going.close()
+    assert going.stopped == NOTHING
