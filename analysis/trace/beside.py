@@ -8,12 +8,18 @@ the same equations could not be taken to the noise floor.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from analysis.estimators.nuisance import KAPPA, BulkTemperature
+from analysis.estimators.nuisance import (
+    IMPLAUSIBLE,
+    KAPPA,
+    SLOPE,
+    SLOPE_STD,
+    BulkTemperature,
+)
 from analysis.model import Model
 from analysis.terms.base import Used
 from rig.model import channels as ch
@@ -31,6 +37,13 @@ def beside(terms: Sequence[Used], runs: Sequence[Run]) -> tuple[Used, ...]:
         return ()
     means = [float(np.nanmean(np.asarray(record.channels[ch.TEMPERATURE]))) for record in records]
     return (Used(BulkTemperature()),) if np.ptp(means) > LEAST_SPAN else ()
+
+
+def plausible(kappa: float, beta: Mapping[str, float]) -> float:
+    """Return 1/b's change per kelvin [1/(Pa K)], held to what oil and hoses can do."""
+    size = abs(beta.get("b", 0.0))  # of the rows: 1/b
+    low, high = (-(SLOPE + sign * IMPLAUSIBLE * SLOPE_STD) * size for sign in (1.0, -1.0))
+    return float(np.clip(kappa, low, high))
 
 
 def stripped(model: Model) -> Model:

@@ -91,17 +91,18 @@ def trace(
         moves = [] if verdict in (CLEAN, EXPLAINED) else _moves(stage, judge, winner)
     further = propose(listed, winner, found, verdict, moves) if look_ahead else None
     after = _extended(runs, terms, winner, before)
-    error = held_out.errors(rig, judged, listed.empty.fit, winner.fit)
+    first, last = held_out.settled(judge, listed.empty.fit), held_out.settled(judge, winner.fit)
+    error = held_out.errors(rig, judged, first, last)
     runs_before, runs_after = held_out.free_runs(holdout, before, after)
     result = Trace(
         verdict, found, error.noise, error.before, error.after,
         runs_before.fit, runs_after.fit, before, after,
         _fraction(listed, winner), tuple(moves), further, stage.floors,
-        listed.empty.fit, winner.fit, tuple(notes), refused=refused,
+        first, last, tuple(notes), refused=refused,
         seconds=time.perf_counter() - started,
     )  # fmt: skip
     return replace(
-        result, sentence=sentence(result), size=held_out.sizes(rig, judged, listed.empty.fit),
+        result, sentence=sentence(result), size=held_out.sizes(rig, judged, first),
         rmse_before=runs_before.rmse, rmse_after=runs_after.rmse,
     )  # fmt: skip
 

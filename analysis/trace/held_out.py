@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.estimators.nuisance import KAPPA
 from analysis.model import Model
+from analysis.trace.beside import plausible
 from analysis.trace.board import Board
 from analysis.trace.evidence import Scene, residual, scene_rows
 from analysis.trace.floor import floors
@@ -32,7 +34,23 @@ class Errors:
 
 def left(judge: Board, model: Fit) -> Array:
     """Return the whitened held-out residual (M,) of a model fitted to other records."""
-    return table(judge, model.terms).left(model.beta)
+    return table(judge, model.terms).left(settled(judge, model).beta)
+
+
+def settled(judge: Board, model: Fit) -> Fit:
+    """Return the model with the oil's temperature part of 1/b as the held-out records have it.
+
+    Records at one temperature say nothing of it, and others then warm up: it is no parameter of
+    the model and no effect, so that one number may be fitted on either side.
+    """
+    rows = table(judge, model.terms)
+    if KAPPA not in rows.names:
+        return model
+    column = rows.matrix[:, rows.names.index(KAPPA)]
+    size = float(column @ column)
+    step = float(column @ rows.left(model.beta)) / size if size > 0 else 0.0
+    kappa = plausible(model.beta.get(KAPPA, 0.0) + step, model.beta)
+    return replace(model, beta={**model.beta, KAPPA: kappa})
 
 
 def errors(rig: Rig, members: Sequence[Scene], before: Fit, after: Fit) -> Errors:

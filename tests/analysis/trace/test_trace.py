@@ -21,7 +21,7 @@ from tests.analysis.trace.hidden import experiment, hardening, pair_of_runs
 
 def traced(rig: Rig, **wrong: float) -> Trace:
     train, held_out = pair_of_runs(rig, **wrong)
-    return trace([train], [held_out])
+    return trace([train], [held_out], look_ahead=False)
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def leaking(rig: Rig) -> Trace:
 
 
 def test_a_bench_with_nothing_wrong_is_clean_and_nothing_is_named(quiet: tuple[Run, Run]) -> None:
-    result = trace([quiet[0]], [quiet[1]])
+    result = trace([quiet[0]], [quiet[1]], look_ahead=False)
     assert result.verdict == "clean"
     assert result.effects == ()
     assert result.after == result.before
@@ -102,7 +102,7 @@ def test_what_the_catalogue_lacks_stays_unexplained_and_its_variable_is_told(
     quiet: tuple[Run, Run],
 ) -> None:
     train, held_out = (hardening(run, 2.0e7) for run in quiet)
-    result = trace([train], [held_out])
+    result = trace([train], [held_out], look_ahead=False)
     assert result.verdict == "unexplained"
     assert result.unexplained_fraction > 0.05
     assert "piston_2" in [d.variable for d in result.depends_on[:2]]
@@ -111,7 +111,7 @@ def test_what_the_catalogue_lacks_stays_unexplained_and_its_variable_is_told(
 def test_one_repeat_says_what_it_costs(rig: Rig) -> None:
     train = experiment(rig, repeats=1, c_internal=2e-12)
     held_out = experiment(rig, repeats=1, seed=2, rms=0.02, c_internal=2e-12)
-    result = trace([train], [held_out])
+    result = trace([train], [held_out], look_ahead=False)
     assert any("one repeat" in note for note in result.notes)
     assert result.verdict != "clean"
 
@@ -135,13 +135,13 @@ def test_records_too_short_are_refused_with_what_is_needed(quiet: tuple[Run, Run
         ),
     )
     with pytest.raises(InputError, match=r"record longer|too short"):
-        trace([short], [quiet[1]])
+        trace([short], [quiet[1]], look_ahead=False)
 
 
 def test_runs_of_different_rigs_are_refused(quiet: tuple[Run, Run]) -> None:
     other = replace(quiet[1], rig=quiet[1].rig.model_copy(update={"name": "another"}))
     with pytest.raises(InputError, match="different rigs"):
-        trace([quiet[0]], [other])
+        trace([quiet[0]], [other], look_ahead=False)
 
 
 def test_the_baseline_before_is_what_identify_finds(leaking: Trace, rig: Rig) -> None:
