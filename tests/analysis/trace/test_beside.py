@@ -1,0 +1,87 @@
+"""The oil warms up between two days: that is no effect, and must not pass for one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from analysis.identify import identify
+from analysis.synthetic import multisine, synthetic_run
+from analysis.terms import baseline_of
+from analysis.terms.base import Used
+from analysis.trace import held_out
+from analysis.trace.beside import beside, plausible, stripped
+from analysis.trace.board import board
+from analysis.trace.evidence import scenes
+from analysis.trace.refine import fit
+from rig.model.records import Run
+from rig.model.rig import Rig
+
+
+def day(rig: Rig, seed: int, kelvin: float, rms: float = 0.025) -> Run:
+    """A day's records with the oil `kelvin` warmer, and softer by 0.4 % for each."""
+    rng = np.random.default_rng([seed, 7])
+    wave = multisine(np.random.default_rng(seed), rig.sample_rate, 4.0, 9.5)
+    soft = {**rig.nominal, "b": rig.nominal["b"] * (1 - 0.004 * kelvin)}
+    run = synthetic_run(rig.model_copy(update={"nominal": soft}), rng, wave, rms=rms, repeats=2)
+    warm = rig.oil.temperature + kelvin
+    records = tuple(
+        replace(r, channels={**r.channels, "oil_temperature": np.full(r.samples, warm)})
+        for r in run.records
+    )
+    return Run(rig, records, f"day {seed}")
+
+
+@pytest.fixture(scope="module")
+def days(rig: Rig) -> tuple[Run, Run]:
+    return day(rig, 1, 0.0), day(rig, 2, 6.0, 0.02)
+
+
+def test_the_column_is_there_where_temperature_was_measured_and_moved(
+    rig: Rig, days: tuple[Run, Run]
+) -> None:
+    terms = tuple(map(Used, baseline_of(rig)))
+    assert [u.term.name for u in beside(terms, days)] == ["bulk_temperature_nuisance"]
+    assert beside(terms, days[:1]) == ()
+    blind = [
+        replace(run, records=tuple(
+            replace(r, channels={k: v for k, v in r.channels.items() if k != "oil_temperature"})
+            for r in run.records
+        ))
+        for run in days
+    ]  # fmt: skip
+    assert beside(terms, blind) == ()
+
+
+def test_a_warmer_day_is_judged_at_its_own_temperature(rig: Rig, days: tuple[Run, Run]) -> None:
+    terms = tuple(map(Used, baseline_of(rig)))
+    train, judged = (scenes(rig, [run]) for run in days)
+    found = {}
+    for label, extra in (("without", ()), ("with", beside(terms, days))):
+        stage = board(rig, (*terms, *extra), train)
+        judge = board(rig, (*terms, *extra), judged, stage.beta)
+        model = held_out.settled(judge, fit(stage, stage.terms))
+        found[label] = held_out.errors(rig, judged, model, model)
+    floor = found["with"].noise
+    assert found["without"].after["flow_cap_2"] > 1.3 * floor["flow_cap_2"]
+    for equation, error in found["with"].after.items():
+        assert error < 1.15 * floor[equation], equation
+
+
+def test_oil_can_do_only_so_much() -> None:
+    beta = {"b": 1e-9}  # 1/b of the rows
+    assert plausible(4e-12, beta) == 4e-12  # 0.4 % per kelvin
+    assert plausible(1.0, beta) == pytest.approx(15e-12)
+    assert plausible(-1.0, beta) == pytest.approx(-9e-12)
+
+
+def test_the_model_file_is_that_of_the_rigs_temperature(rig: Rig, days: tuple[Run, Run]) -> None:
+    terms = tuple(map(Used, baseline_of(rig)))
+    full = identify(days, terms=(*terms, *beside(terms, days)), estimator="plain").model
+    kept = stripped(full)
+    assert set(full.parameters) - set(kept.parameters) == {"1/b per kelvin"}
+    assert kept.parameters["b"].value == pytest.approx(rig.nominal["b"], rel=0.01)
+    assert kept.covariance.shape == (len(kept.parameters),) * 2
+    assert stripped(kept) is kept
