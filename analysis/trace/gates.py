@@ -69,18 +69,19 @@ def judge(
         share, others = steady[key]
         differing = inference.invariance(stage, winner.fit, used, errors, _joint(used.term))
         tied = [r for r in rivals if r.tied]
+        twins = [Rival(name, where, 1.0, 1.0, True) for name, where in used.term.twins()]
         gates = (
             Gate(REMOVES, removed >= REMOVED and not worse, _taken(removed, worse)),
             Gate(PHYSICAL, not physical, physical or "sign and size are"),
             Gate(INVARIANT, not differing, _differences(differing)),
             Gate(STABLE, share >= CHOSEN or bool(tied), _chosen(share, others)),
             Gate(SIGNIFICANT, p <= P_LIMIT, f"family-wise p = {p:.3g}"),
-            Gate(ALONE, not tied, _told_apart(rivals)),
+            Gate(ALONE, not (tied or twins), _told_apart([*twins, *rivals])),
         )
         out.append(
             Found(
                 used.term.name, _place(used.term), _parameters(stage, used, errors), p, removed,
-                tuple(rivals), gates, used.term.variable,
+                (*twins, *rivals), gates, used.term.variable,
             )
         )  # fmt: skip
     return tuple(out)

@@ -80,7 +80,7 @@ def propose(
     stage = listed.stage
     old = Ground(stage)
     questions = _questions(listed, winner, found, verdict, old)
-    if not questions and not moves:
+    if not questions and not (verdict == UNEXPLAINED and moves):
         return None
     rng = np.random.default_rng(SEED)
     tried = list(ex.excitations(learned(stage), stage.scenes, rng, families))

@@ -147,3 +147,14 @@ def test_runs_of_different_rigs_are_refused(quiet: tuple[Run, Run]) -> None:
 def test_the_baseline_before_is_what_identify_finds(leaking: Trace, rig: Rig) -> None:
     alone = identify([experiment(rig, c_internal=2e-12)], estimator="plain").model
     assert leaking.model_before.values == pytest.approx(alone.values, nan_ok=True)
+
+
+def test_a_null_that_may_be_the_sensors_own_is_confounded_with_it(rig: Rig) -> None:
+    train, held_out = pair_of_runs(rig, u_null=3e-3)
+    result = trace([train], [held_out])
+    assert result.verdict == "confounded"
+    (found,) = result.effects
+    assert (found.name, found.where) == ("spool_offset", "joint 2")
+    assert found.parameters["u_null_2"].value == pytest.approx(3e-3, rel=0.05)
+    assert ("sensor_offset", "joint 2") in [(r.name, r.where) for r in found.rivals if r.tied]
+    assert result.next_experiment is None  # no data of this rig can tell them apart
