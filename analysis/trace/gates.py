@@ -19,6 +19,7 @@ from analysis.terms.base import Used
 from analysis.trace import inference
 from analysis.trace.board import Board
 from analysis.trace.held_out import left as held_left
+from analysis.trace.invariance import invariance
 from analysis.trace.refine import shapes_of
 from analysis.trace.result import Found, Gate, Rival
 from analysis.trace.select import FORM
@@ -67,7 +68,7 @@ def judge(
         p = inference.p_value(rest.fit.energy - winner.fit.energy, null)
         errors = inference.spread(stage, winner.fit, used, values)
         share, others = steady[key]
-        differing = inference.invariance(stage, winner.fit, used, errors, _joint(used.term))
+        differing = invariance(stage, winner.fit, used, errors, _joint(used.term))
         tied = [r for r in rivals if r.tied]
         twins = [Rival(name, where, 1.0, 1.0, True) for name, where in used.term.twins()]
         gates = (

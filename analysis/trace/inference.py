@@ -1,4 +1,4 @@
-"""How sure: sign flips for significance, half-samples for stability, subsets for invariance.
+"""How sure: sign flips for significance, half-samples for stability, repeats for errors.
 
 The unit is the repeat. Under the null hypothesis a residual is noise, symmetric and independent
 from repeat to repeat, so that the signs of whole repeats may be flipped. With few repeats flips of
@@ -15,13 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.effects.base import Effect
 from analysis.terms.base import Used
 from analysis.trace import select
 from analysis.trace.board import Board
-from analysis.trace.floor import STATED
 from analysis.trace.refine import Fit, jacobian, shapes_of, table
-from analysis.trace.select import FORM, Field, orthonormal
+from analysis.trace.select import Field, orthonormal
 from analysis.trace.shortlist import Listed, Shortlist, excess_of
 
 Array = NDArray[np.float64]
@@ -31,11 +29,7 @@ ENOUGH_REPEATS = 8
 BLOCK = 2.0  # [s] at least, where a record is one period
 HALVES = 40
 ABOUT_TWO = 1.9  # periods that a record must hold to be halved by them: the last may be cut short
-TOLERANCE = 0.2  # relative disagreement that a catalogue's simpler form may cause
-DEVIATIONS = 3.5
 EDGE = 1e-3  # of its range: a shape nearer to its bound is at it
-TELLS = 0.05  # of a column's energy off the others': a subset with less says nothing of a size
-POWER = 0.25  # a subset judges a parameter that it knows this well, relative
 
 
 def blocks(stage: Board, seconds: float = BLOCK, fewest: float = 3.0) -> NDArray[np.int64]:
@@ -206,7 +200,7 @@ class Spread:
 def spread(stage: Board, model: Fit, used: Used, values: Mapping[str, float]) -> Spread:
     """Return an effect's parameters with errors from the scatter between repeats."""
     names, J = jacobian(stage, model, used)
-    base = _others(stage, model, names)
+    base = others(stage, model, names)
     J_p = J - base @ (base.T @ J)
     pinv = np.linalg.pinv(J_p, rcond=1e-8)
     variance, dof = np.zeros(len(names)), 0
@@ -224,7 +218,7 @@ def spread(stage: Board, model: Fit, used: Used, values: Mapping[str, float]) ->
     return Spread(names, value, np.sqrt(variance), float(max(dof, 1)))
 
 
-def _others(stage: Board, model: Fit, own: Sequence[str]) -> Array:
+def others(stage: Board, model: Fit, own: Sequence[str]) -> Array:
     """Return a basis of everything in the model but the named parameters, other shapes included."""
     rows = table(stage, model.terms)
     kept = [k for k, n in enumerate(rows.names) if n not in own]
@@ -236,125 +230,3 @@ def _others(stage: Board, model: Fit, own: Sequence[str]) -> Array:
         picked = [k for k, n in enumerate(names) if n not in own and n not in rows.names]
         extra.append(J[:, picked])
     return orthonormal(np.column_stack([rows.matrix[:, kept], *extra]))
-
-
-def subsets(stage: Board, joint: int | None) -> dict[str, Array]:
-    """Return masks (M,) of rows: each step, each half of the records, each direction of motion."""
-    M = stage.base.shape[0]
-    out: dict[str, Array] = {}
-    index = {scene.group: k for k, scene in enumerate(stage.scenes)}
-    early, ahead = np.zeros(M, dtype=bool), np.zeros(M, dtype=bool)
-    outer = np.zeros(M, dtype=bool)
-    for s in stage.segments:
-        name = f"step {s.group[1]}"
-        out.setdefault(name, np.zeros(M, dtype=bool))[s.where] = True
-        scene = stage.scenes[index[s.group]]
-        time = stage.rows[index[s.group]][s.equation].time
-        early[s.where] = time < 0.5 * (time[0] + time[-1])
-        own = joint if joint is not None else int(s.equation.rsplit("_", 1)[1]) - 1
-        at = np.clip(
-            np.rint(time * scene.record.sample_rate).astype(int), 0, len(scene.signals.t) - 1
-        )
-        ahead[s.where] = scene.signals.sd[at, own] > 0
-        size = np.abs(scene.signals.sd[at, own])
-        outer[s.where] = size > np.median(size)
-    out |= {
-        "first half": early, "second half": ~early, "extending": ahead, "retracting": ~ahead,
-        "fast": outer, "slow": ~outer,
-    }  # fmt: skip
-    return out
-
-
-def _unmeasured(stage: Board) -> NDArray[np.int64] | None:
-    """Return the block of every row (M,) where some floor is the stated noise alone, else None.
-
-    Then nobody has measured the noise, and what is left has to stand for it, block by block.
-    """
-    if all(floor.source != STATED for floor in stage.floors):
-        return None
-    numbers = blocks(stage)
-    for k, s in enumerate(stage.segments):
-        numbers[s.where] += (int(numbers.max()) + 1) * k
-    return numbers
-
-
-def _clustered(own: Array, left: Array, clusters: NDArray[np.int64]) -> float:
-    """Return the root of the sum over blocks of (own . left)^2."""
-    _, index = np.unique(clusters, return_inverse=True)
-    return float(np.linalg.norm(np.bincount(index, weights=own * left)))
-
-
-def _larger(model: Fit, stage: Board, used: Used, mask: Array) -> float:
-    """Return the energy that the largest other effect has on a subset, 0 if none is larger.
-
-    What its catalogue form misses of it (`FORM`) spills onto a smaller effect's coefficient.
-    """
-    rows = table(stage, model.terms)
-    energy = {}
-    for u in model.terms:
-        if isinstance(u.term, Effect):
-            own = [rows.names.index(c.parameter) for c in u.term.coefficients(stage.rig)]
-            values = np.array([model.beta.get(rows.names[k], 0.0) for k in own])
-            part = rows.matrix[mask][:, own] @ values
-            energy[u.term.name, u.term.where] = float(part @ part)
-    mine = energy.pop((used.term.name, used.term.where), 0.0)
-    most = max(energy.values(), default=0.0)
-    return most if most > mine else 0.0
-
-
-def _alone(columns: Array, k: int) -> Array:
-    """Return column k (m,) without what the others say."""
-    rest, own = np.delete(columns, k, axis=1), columns[:, k]
-    if not rest.shape[1]:
-        return own
-    Q = orthonormal(rest)
-    return np.asarray(own - Q @ (Q.T @ own))
-
-
-def invariance(
-    stage: Board, model: Fit, used: Used, value: Spread, joint: int | None
-) -> list[tuple[str, str, float, float]]:
-    """Return where a parameter disagrees with itself: (subset, parameter, value there, error)."""
-    names, J = jacobian(stage, model, used)
-    base = _others(stage, model, names)
-    left = model.left
-    # A shape such as the presliding distance is the form's, not the effect's size.
-    sizes = {c.parameter for c in used.term.coefficients(stage.rig)}
-    sizes |= {s.parameter for s in shapes_of(stage.rig, used) if s.neutral is not None}
-    units = {c.parameter: c.unit for c in used.term.coefficients(stage.rig)}
-    units |= {s.parameter: s.unit for s in shapes_of(stage.rig, used)}
-    nothing = {s.parameter: s.neutral or 0.0 for s in shapes_of(stage.rig, used)}
-    neutral = np.array([nothing.get(n, 0.0) for n in names])
-    out = []
-    clusters = _unmeasured(stage)
-    J_all = J - base @ (base.T @ J)
-    whole = [float(np.sum(_alone(J_all, k) ** 2)) for k in range(len(names))]
-    for label, mask in subsets(stage, joint).items():
-        if not mask.any():
-            continue
-        B = orthonormal(base[mask])
-        J_s = J[mask] - B @ (B.T @ J[mask])
-        for k, name in enumerate(names):
-            if name not in sizes:
-                continue
-            if np.linalg.norm(J_s[:, k]) < 0.1 * np.linalg.norm(J[mask][:, k]):
-                continue
-            own = _alone(J_s, k)
-            size = float(own @ own)
-            # What hardly acts there tells its form's tail, not its size.
-            if size < TELLS * whole[k] or size <= 0 or not np.isfinite(value.value[k]):
-                continue
-            shift = float(own @ left[mask]) / size
-            error = 1.0 / np.sqrt(size)
-            if clusters is not None:
-                rest_of = left[mask] - B @ (B.T @ left[mask]) - own * shift
-                error = max(error, _clustered(own, rest_of, clusters[mask]) / size)
-            spill = np.sqrt(FORM * _larger(model, stage, used, mask) / size)
-            # Two levels of one effect are judged by the larger: 2 N beside 100 N is a detail.
-            alike = [j for j, n in enumerate(names) if n in sizes and units[n] == units[name]]
-            full = float(np.max(np.abs(value.value[alike] - neutral[alike])))
-            if error > POWER * full:
-                continue
-            if abs(shift) > spill + DEVIATIONS * np.hypot(error, TOLERANCE / DEVIATIONS * full):
-                out.append((label, name, float(value.value[k]) + shift, error))
-    return out
