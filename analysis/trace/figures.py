@@ -148,6 +148,8 @@ def over_noise(result: Trace, key: str = "overnoise") -> Markup:
             axes.plot(b, k, "o", color=BLUE, ms=6)
         axes.axvline(1.0, color=INK, lw=0.8, ls="--")
         axes.set_xscale("log")
+        low, high = axes.get_xlim()
+        axes.set_xlim(min(low, 0.8), max(high, 2.5))  # less than an octave leaves no ticks to read
         axes.xaxis.set_major_formatter(lambda v, _: f"{v:g}")
         low, high = axes.get_xlim()
         low, high = min(low, 0.8), max(high, 2.2)  # else noise would look like a difference
