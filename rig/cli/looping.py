@@ -16,7 +16,7 @@ from typing import Any, Final
 import yaml
 
 from analysis.trace.engine import trace
-from analysis.trace.result import CLEAN, EXPLAINED
+from analysis.trace.result import CLEAN, EXPLAINED, UNEXPLAINED
 from analysis.trace.rounds import Round, achieved
 from analysis.twin import simulate_commands
 from protocols import library
@@ -126,7 +126,8 @@ class Loop:
         for path, key in ((files["next"], "protocol"), (files["judge"], "holdout")):
             text = yaml.safe_dump(dict(experiment[key]), sort_keys=False, allow_unicode=True)
             path.write_text(text, encoding="utf-8")
-        scale = 1.0
+        # A twin that lacks something does not know how far the bench will go: leave it room.
+        scale = SMALLER if self.rounds[-1].result.verdict == UNEXPLAINED else 1.0
         for _ in range(TRIES):
             sizes = Overrides(amplitude_scale=scale)
             if all(self._within(path, sizes) for path in files.values()):
