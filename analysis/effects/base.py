@@ -29,7 +29,8 @@ SENSOR, NULL, LAG, EDGES, SUPPLY, PLANT = range(6)
 class Shape:
     """A shape parameter: its parameter name, SI unit, physical bounds and points of first look.
 
-    At `neutral` the effect is not there; None where its size is a linear coefficient.
+    At `neutral` the effect is not there; None where its size is a linear coefficient. With
+    `resolution` the low bound is only what data resolve: to lie there contradicts nothing.
     """
 
     parameter: str
@@ -38,6 +39,7 @@ class Shape:
     high: float
     grid: tuple[float, ...]
     neutral: float | None = None
+    resolution: bool = False
 
 
 @dataclass(frozen=True)
@@ -117,7 +119,8 @@ class Effect(Term):
         """Say which shape parameter lies on or beyond its physical bounds ('' if none)."""
         for s, value in zip(self.shapes(rig), shape, strict=True):
             margin = 1e-3 * (s.high - s.low)
-            low = s.low + (margin if s.neutral is None or s.neutral != s.low else 0.0)
+            allowed = s.resolution or s.neutral == s.low
+            low = s.low if allowed else s.low + margin
             if not low <= value <= s.high - margin:
                 return (
                     f"{s.parameter} = {value:.4g} {s.unit} lies at the edge of what is physical, "

@@ -62,19 +62,11 @@ class Friction(Effect):
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
         """Return the presliding distance [m] (electric: in the joint's own unit)."""
-        return (Shape(f"presliding_{self.joint + 1}", "m", *PRESLIDING_BOUNDS, PRESLIDING),)
+        return (presliding(f"presliding_{self.joint + 1}"),)
 
     def tolerance(self, shape: Sequence[float]) -> float:
         """Return a fine one for the contact without memory: coarser, creep at rest is noise."""
         return self.rate_tolerance if len(shape) else 1e-3 * TRANSITION
-
-    def outside(self, rig: Rig, shape: Sequence[float]) -> str:
-        """As every effect's; a contact stiffer than the sensors resolve is no contradiction."""
-        floored = [
-            max(v, s.grid[0]) if s.parameter.startswith("presliding") else v
-            for s, v in zip(self.shapes(rig), shape, strict=True)
-        ]
-        return super().outside(rig, floored)
 
     def hidden(self, rig: Rig) -> int:
         """Return 1: the deflection y = d z."""
@@ -100,6 +92,11 @@ class Friction(Effect):
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return the piston's speed [m/s]."""
         return {equation("torque", self.joint): signals.sd[:, self.joint]}
+
+
+def presliding(name: str) -> Shape:
+    """Return a presliding distance's shape [m]; a contact may be stiffer than sensors resolve."""
+    return Shape(name, "m", *PRESLIDING_BOUNDS, PRESLIDING, resolution=True)
 
 
 def force_limit(rig: Rig, joint: int) -> float:

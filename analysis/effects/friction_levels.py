@@ -16,12 +16,11 @@ from numba import njit
 from analysis.effects.base import Array, Shape, beyond
 from analysis.effects.friction import (
     FASTEST,
-    PRESLIDING,
-    PRESLIDING_BOUNDS,
     TRANSITION,
     Friction,
     force_limit,
     force_unit,
+    presliding,
 )
 from analysis.signals import Signals
 from analysis.terms.base import (
@@ -79,7 +78,7 @@ class AsymmetricFriction(Friction):
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
         """Return the presliding distances [m] (electric: in the joint's own unit)."""
-        return tuple(Shape(n, "m", *PRESLIDING_BOUNDS, PRESLIDING) for n in self.shape_names())
+        return tuple(map(presliding, self.shape_names()))
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return F_ext, F_ret [N]."""

@@ -60,14 +60,6 @@ class ValveEffect(Effect):
         """Return joint, shape."""
         return np.array([self.joint, *self.shape_of(rig, shape)], dtype=np.float64)
 
-    def outside(self, rig: Rig, shape: Sequence[float]) -> str:
-        """As every effect's; an edge sharper than what the data resolve is no contradiction."""
-        floored = [
-            max(v, s.grid[0]) if s.parameter.startswith("rounding") else v
-            for s, v in zip(self.shapes(rig), shape, strict=True)
-        ]
-        return super().outside(rig, floored)
-
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Refuse a shape at its bounds."""
         return self.outside(rig, shape)
@@ -221,7 +213,9 @@ def rounding(joint: int, stroke: float) -> Shape:
 
     Clearances of some micrometres on a stroke of some tenths of a millimetre.
     """
-    return Shape(f"rounding_{joint + 1}", "V", 0.0, 0.03 * stroke, (0.002 * stroke,))
+    return Shape(
+        f"rounding_{joint + 1}", "V", 0.0, 0.03 * stroke, (0.002 * stroke,), resolution=True
+    )
 
 
 def opened(x: Array, r: float) -> Array:
