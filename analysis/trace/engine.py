@@ -98,13 +98,11 @@ def trace(
         verdict, found, error.noise, error.before, error.after,
         runs_before.fit, runs_after.fit, before, after,
         _fraction(listed, winner), tuple(moves), further, stage.floors,
-        first, last, tuple(notes), refused=refused,
+        first, last, tuple(notes), refused=refused, size=error.size,
+        rmse_before=runs_before.rmse, rmse_after=runs_after.rmse,
         seconds=time.perf_counter() - started,
     )  # fmt: skip
-    return replace(
-        result, sentence=sentence(result), size=held_out.sizes(rig, judged, first),
-        rmse_before=runs_before.rmse, rmse_after=runs_after.rmse,
-    )  # fmt: skip
+    return replace(result, sentence=sentence(result))
 
 
 def _refuse_same(runs: Sequence[Run], holdout: Sequence[Run]) -> None:

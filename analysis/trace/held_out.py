@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from analysis.estimators.nuisance import KAPPA
 from analysis.model import Model
+from analysis.rows import Rows
 from analysis.trace.beside import plausible
 from analysis.trace.board import Board
 from analysis.trace.evidence import Scene, residual, scene_rows
 from analysis.trace.floor import floors
-from analysis.trace.refine import Fit, table
+from analysis.trace.refine import Fit, Table, table
 from analysis.validate import validate
 from rig.model.parse import InputError
 from rig.model.records import Run
@@ -25,16 +26,21 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Errors:
-    """RMS of each equation's residual over the held-out records, SI, beside its noise floor."""
+    """RMS of each equation's residual over the held-out records, SI, beside its noise floor.
+
+    `size` is the rms of the equation's right side (torque, force or flow) under the model before.
+    """
 
     noise: Mapping[str, float]
+    size: Mapping[str, float]
     before: Mapping[str, float]
     after: Mapping[str, float]
 
 
 def left(judge: Board, model: Fit) -> Array:
     """Return the whitened held-out residual (M,) of a model fitted to other records."""
-    return table(judge, model.terms).left(settled(judge, model).beta)
+    rows = table(judge, model.terms)
+    return rows.left(_settled(rows, model).beta)
 
 
 def settled(judge: Board, model: Fit) -> Fit:
@@ -43,7 +49,10 @@ def settled(judge: Board, model: Fit) -> Fit:
     Records at one temperature say nothing of it, and others then warm up: it is no parameter of
     the model and no effect, so that one number may be fitted on either side.
     """
-    rows = table(judge, model.terms)
+    return _settled(table(judge, model.terms), model)
+
+
+def _settled(rows: Table, model: Fit) -> Fit:
     if KAPPA not in rows.names:
         return model
     column = rows.matrix[:, rows.names.index(KAPPA)]
@@ -54,24 +63,19 @@ def settled(judge: Board, model: Fit) -> Fit:
 
 
 def errors(rig: Rig, members: Sequence[Scene], before: Fit, after: Fit) -> Errors:
-    """Return every equation's error under both models, and the noise floor, over all records.
+    """Return every equation's error under both models, its size and noise floor, over all records.
 
     The floor is what does not repeat under the model after: its columns carry the sensors' noise
     into the residual as the baseline's do.
     """
-    found: dict[str, dict[str, list[Array]]] = {}
-    built = {}
-    for label, model in (("before", before), ("after", after)):
-        built[label] = [scene_rows(rig, model.terms, scene) for scene in members]
-        found[label] = {}
-        for rows_of in built[label]:
-            for equation, rows in rows_of.items():
-                found[label].setdefault(equation, []).append(residual(rows, model.beta))
-    split = floors(rig, after.terms, members, built["after"], after.beta)
+    one, other = (
+        [scene_rows(rig, model.terms, scene) for scene in members] for model in (before, after)
+    )
+    split = floors(rig, after.terms, members, other, after.beta)
     floor = {(f.group, f.equation): f.noise for f in split}
     noise: dict[str, list[float]] = {}
     counts: dict[str, list[int]] = {}
-    for scene, rows_of in zip(members, built["after"], strict=True):
+    for scene, rows_of in zip(members, other, strict=True):
         for equation, rows in rows_of.items():
             noise.setdefault(equation, []).append(floor[scene.group, equation])
             counts.setdefault(equation, []).append(len(rows.rhs))
@@ -80,9 +84,21 @@ def errors(rig: Rig, members: Sequence[Scene], before: Fit, after: Fit) -> Error
             e: float(np.sqrt(np.average(np.square(noise[e]), weights=np.maximum(counts[e], 1))))
             for e in sorted(noise)
         },
-        {e: _rms(found["before"][e]) for e in sorted(found["before"])},
-        {e: _rms(found["after"][e]) for e in sorted(found["after"])},
+        _by_equation(one, lambda rows: rows.rhs),
+        _by_equation(one, lambda rows: residual(rows, before.beta)),
+        _by_equation(other, lambda rows: residual(rows, after.beta)),
     )
+
+
+def _by_equation(
+    built: Sequence[Mapping[str, Rows]], part: Callable[[Rows], Array]
+) -> dict[str, float]:
+    """Return the rms of a part of every equation's rows over all records."""
+    found: dict[str, list[Array]] = {}
+    for rows_of in built:
+        for equation, rows in rows_of.items():
+            found.setdefault(equation, []).append(part(rows))
+    return {e: _rms(parts) for e, parts in sorted(found.items())}
 
 
 def rms_of(judge: Board, model: Fit) -> dict[str, float]:
@@ -91,15 +107,6 @@ def rms_of(judge: Board, model: Fit) -> dict[str, float]:
     found: dict[str, list[Array]] = {}
     for s in judge.segments:
         found.setdefault(s.equation, []).append(rest[s.where] * s.noise / np.sqrt(s.repeats))
-    return {e: _rms(parts) for e, parts in sorted(found.items())}
-
-
-def sizes(rig: Rig, members: Sequence[Scene], model: Fit) -> dict[str, float]:
-    """Return the rms of every equation's right side (torque, force or flow), SI."""
-    found: dict[str, list[Array]] = {}
-    for scene in members:
-        for equation, rows in scene_rows(rig, model.terms, scene).items():
-            found.setdefault(equation, []).append(rows.rhs)
     return {e: _rms(parts) for e, parts in sorted(found.items())}
 
 

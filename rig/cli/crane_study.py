@@ -117,7 +117,7 @@ def effects_table(
     stage = board(rig, terms, train)
     listed = Shortlist(stage, ())
     bench = board(rig, terms, judged, stage.beta)
-    size = held_out.sizes(rig, judged, listed.empty.fit)
+    size = held_out.errors(rig, judged, listed.empty.fit, listed.empty.fit).size
     rows = []
     one = listed.empty
     for name, where in (("", ""), *chain):
