@@ -14,7 +14,6 @@ from analysis.plots import BLUE, CARD, GREY, INK, PALE, figure, note, style, svg
 from analysis.report import Provenance
 from analysis.trace import figures
 from analysis.trace.report import body, page, write
-from analysis.trace.result import Trace
 from analysis.trace.rounds import Round
 from rig.model import channels as ch
 from rig.model.records import Record, Run
@@ -55,13 +54,11 @@ def _round(r: Round, run: Run | None, last: bool) -> dict[str, Any]:
         "number": r.number,
         "verdict": result.verdict,
         "named": _names((e.name, e.where) for e in result.effects),
-        "tied": _names(sorted({(x.name, x.where) for e in result.effects for x in e.rivals
-                               if x.tied})),
+        "tied": _names(result.tied),
         "predicted": fm.significant(r.predicted),
         "achieved": fm.significant(r.achieved),
         "loudest": fm.significant(r.loudest),
         "left": fm.significant(r.left),
-        "heading": result.verdict,
         "did": "The protocol as it was given." if r.experiment is None
         else f"{_capital(str(r.experiment['text']))}.",
         "runs": " and ".join(r.runs),
@@ -102,10 +99,9 @@ def worth(rounds: Sequence[Round]) -> Markup | None:
         note(axes, 0.02, 0.98, "pale promised, blue achieved", INK, ha="left")
         axes = made.add_subplot(1, 2, 2)
         numbers = [r.number for r in rounds]
-        before = [_worst(r.result, r.result.before) for r in rounds]
-        after = [_worst(r.result, r.result.after) for r in rounds]
+        before = [r.result.worst(r.result.before) for r in rounds]
         axes.plot(numbers, before, "o-", color=GREY)
-        axes.plot(numbers, after, "o-", color=BLUE)
+        axes.plot(numbers, [r.left for r in rounds], "o-", color=BLUE)
         axes.axhline(1.0, color=INK, lw=0.8, ls="--")
         axes.set_xticks(numbers)
         axes.set_ylim(0.0, 1.2 * axes.get_ylim()[1])
@@ -114,11 +110,6 @@ def worth(rounds: Sequence[Round]) -> Markup | None:
         note(axes, 0.98, 0.98, "grey without, blue with what was found", INK)
         made.tight_layout()
         return svg(made, "worth", "What each experiment promised and brought, by round")
-
-
-def _worst(result: Trace, error: Any) -> float:
-    floor = result.noise_floor
-    return float(np.nanmax([error[e] / max(floor[e], 1e-30) for e in error]))
 
 
 def excited(run: Run, number: int) -> Markup | None:

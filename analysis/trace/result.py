@@ -107,6 +107,15 @@ class Trace:
     rmse_before: Mapping[str, float] = field(default_factory=dict)
     rmse_after: Mapping[str, float] = field(default_factory=dict)
 
+    @property
+    def tied(self) -> list[tuple[str, str]]:
+        """Name and place of the rivals that the data cannot tell from an effect named."""
+        return sorted({(r.name, r.where) for e in self.effects for r in e.rivals if r.tied})
+
+    def worst(self, error: Mapping[str, float]) -> float:
+        """Return the largest of the held-out errors, `before` or `after`, over its noise floor."""
+        return max(error[e] / max(self.noise_floor[e], 1e-30) for e in error)
+
 
 def to_json(result: Trace) -> dict[str, Any]:
     """Return the contract's JSON; `refused gates size rmse noise notes sentence seconds` added."""

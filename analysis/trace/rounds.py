@@ -55,8 +55,7 @@ class Round:
     @property
     def left(self) -> float:
         """The largest held-out error over its noise floor, with what was found."""
-        floor = self.result.noise_floor
-        return max(self.result.after[e] / max(floor[e], 1e-30) for e in self.result.after)
+        return self.result.worst(self.result.after)
 
 
 def achieved(

@@ -31,10 +31,8 @@ def sentence(result: Trace) -> str:
     if result.verdict == EXPLAINED:
         return f"{_moves(result.effects)}: {named}. {errors}"
     if result.verdict == CONFOUNDED:
-        rivals = sorted(
-            {f"{r.name} at {r.where}" for e in result.effects for r in e.rivals if r.tied}
-        )
-        text = f"Best is {named}, but these records cannot tell it from {', '.join(rivals)}."
+        rivals = ", ".join(f"{name} at {where}" for name, where in result.tied)
+        text = f"Best is {named}, but these records cannot tell it from {rivals}."
         if result.next_experiment:
             text += f" What would tell: {result.next_experiment['text']}."
         return f"{text} {errors}"

@@ -67,18 +67,17 @@ def perform(case: Case) -> Outcome:
     found = trace([train], held_out, look_ahead=False)
     seconds = time.process_time() - started
     named = tuple((e.name, e.where) for e in found.effects)
-    ratio = max(found.after[e] / found.noise_floor[e] for e in found.after)
     after = found.model_after.parameters
     off = [abs(after[n].value / truth[n] - 1) for n in truth if n in after and truth[n]]
     return Outcome(
-        case, found.verdict, named,
-        tuple((r.name, r.where) for e in found.effects for r in e.rivals if r.tied),
+        case, found.verdict, named, tuple(found.tied),
         tuple(
             (e.name, e.where, "; ".join(f"{g.name}: {g.detail}" for g in e.gates if not g.ok))
             for e in found.refused
         ),
-        max(f.ratio for f in found.floors), _size_error(case, found.effects), ratio,
-        float(np.max(off)) if off else math.nan, _mean(found.fit_before), _mean(found.fit_after),
+        max(f.ratio for f in found.floors), _size_error(case, found.effects),
+        found.worst(found.after), float(np.max(off)) if off else math.nan,
+        _mean(found.fit_before), _mean(found.fit_after),
         tuple(d.variable for d in found.depends_on), found.notes, seconds,
     )  # fmt: skip
 

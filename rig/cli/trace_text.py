@@ -114,9 +114,8 @@ def story_text(rounds: Sequence[Round], stopped: str) -> str:
 def named(result: Trace) -> str:
     """Return the effects of a trace in a few words, the tied ones too."""
     found = [f"{e.name} at {e.where}" for e in result.effects]
-    tied = sorted({f"{r.name} at {r.where}" for e in result.effects for r in e.rivals if r.tied})
-    words = ", ".join(found) or "nothing"
-    return words + (f" (or {', '.join(tied)})" if tied else "")
+    tied = ", ".join(f"{name} at {where}" for name, where in result.tied)
+    return (", ".join(found) or "nothing") + (f" (or {tied})" if tied else "")
 
 
 def _figure(value: float | None) -> str:
