@@ -21,11 +21,19 @@ from analysis.estimators.nuisance import (
     BulkTemperature,
 )
 from analysis.model import Model
+from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from rig.model import channels as ch
 from rig.model.records import Run
+from rig.model.rig import Rig
 
 LEAST_SPAN = 0.05  # [K] between all records: less moves b by a fraction of 0.001
+
+
+def base_terms(rig: Rig, runs: Sequence[Run]) -> tuple[Used, ...]:
+    """Return the rig's baseline terms with those that belong beside them on these records."""
+    terms = tuple(map(Used, baseline_of(rig)))
+    return (*terms, *beside(terms, runs))
 
 
 def beside(terms: Sequence[Used], runs: Sequence[Run]) -> tuple[Used, ...]:

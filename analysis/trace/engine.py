@@ -15,10 +15,9 @@ from analysis import checks as ck
 from analysis.effects.base import Effect, ordered
 from analysis.identify import identify
 from analysis.model import Model
-from analysis.terms import baseline_of
 from analysis.terms.base import FAMILIES, Used
 from analysis.trace import clues, gates, held_out
-from analysis.trace.beside import beside, stripped
+from analysis.trace.beside import base_terms, stripped
 from analysis.trace.board import Board, board
 from analysis.trace.candidates import catalogue, variants
 from analysis.trace.evidence import Scene, scenes
@@ -66,8 +65,7 @@ def trace(
     rig = ck.common_rig([*runs, *holdout])
     _refuse_same(runs, holdout)
     rng = np.random.default_rng(seed)
-    terms = tuple(map(Used, baseline_of(rig)))
-    terms = (*terms, *beside(terms, [*runs, *holdout]))
+    terms = base_terms(rig, [*runs, *holdout])
     train = scenes(rig, runs, families=tuple(families))
     judged = scenes(rig, holdout, families=tuple(families))
     stage = board(rig, terms, train)

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from analysis.effects.base import Effect
-from analysis.terms import baseline_of, known
+from analysis.terms import known
 from analysis.terms.base import Used
-from analysis.trace.beside import beside
+from analysis.trace.beside import base_terms
 from analysis.trace.board import Board, board
 from analysis.trace.discriminate import Ground, Hypothesis, Question, present
 from analysis.trace.evidence import scenes
@@ -68,8 +68,7 @@ def achieved(
     """
     if not experiment.get("questions"):
         return None
-    terms = tuple(map(Used, baseline_of(rig)))
-    terms = (*terms, *beside(terms, [*before, new]))
+    terms = base_terms(rig, [*before, new])
     both = board(rig, terms, scenes(rig, [*before, new]))
     if experiment["kind"] == SHOW:
         ground = Ground(both)
