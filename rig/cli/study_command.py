@@ -17,7 +17,7 @@ studies = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode=None,
 )
-Workers = Annotated[int, typer.Option(min=1, help="Processes at once.")]
+WorkersOption = Annotated[int, typer.Option(min=1, help="Processes at once.")]
 FirstSeed = Annotated[
     int, typer.Option("--first-seed", min=0, help="Those below 100 served to find errors.")
 ]
@@ -38,7 +38,7 @@ def coverage(
     noise: Annotated[float, typer.Option(min=0.0, help="Times the sensors' stated noise.")] = 1.0,
     repeats: Annotated[int, typer.Option(min=1, help="Of every step.")] = 4,
     first: FirstSeed = 100,
-    workers: Workers = 2,
+    workers: WorkersOption = 2,
     keep: KeepOption = None,
     json: JsonOption = None,
     docs: DocsOption = None,
@@ -67,7 +67,7 @@ def coverage(
                 f"{estimator} --noise {noise:g} --repeats {repeats} --first-seed {first} "
                 f"--docs {docs}"
             )
-            replace_section(docs, f"study coverage {one}", _made(made, coverage_text(alone)))
+            replace_section(docs, f"study coverage {one}", in_section(made, coverage_text(alone)))
     if json != Path("-"):
         typer.echo(coverage_text(found))
 
@@ -81,7 +81,7 @@ def estimators(
     ] = "ls wls iv robust output-error auto",
     kind: Annotated[str, typer.Option(help="model or plant.")] = "plant",
     first: FirstSeed = 100,
-    workers: Workers = 2,
+    workers: WorkersOption = 2,
     keep: KeepOption = None,
     json: JsonOption = None,
     docs: DocsOption = None,
@@ -106,7 +106,7 @@ def estimators(
             f'bramah study estimators --kind {kind} --experiments {experiments} --noise "{noise}" '
             f'--which "{which}" --first-seed {first} --docs {docs}'
         )
-        replace_section(docs, "study estimators", _made(made, estimator_text(found)))
+        replace_section(docs, "study estimators", in_section(made, estimator_text(found)))
     if json != Path("-"):
         typer.echo(estimator_text(found))
 
@@ -133,7 +133,8 @@ def differentiation(
         typer.echo(markdown(entries))
 
 
-def _made(command: str, table: str) -> str:
+def in_section(command: str, table: str) -> str:
+    """Return what a page shows of a study: the command that makes it again, and its tables."""
     return f"```sh\n{command}\n```\n\n{table}"
 
 

@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import json
-import multiprocessing
-import os
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -17,7 +12,7 @@ import numpy as np
 from analysis.estimators.coverage import Trial, trial
 from analysis.identify import identify
 from analysis.synthetic import multisine, synthetic_run
-from rig.model.parse import InputError
+from rig.cli.study_pool import Kept, performed
 from rig.model.records import Run
 from rig.services.rigs import load_rig
 
@@ -74,37 +69,15 @@ def perform(experiment: Experiment) -> dict[str, Trial]:
     return out
 
 
-def _place(experiment: Experiment, folder: Path) -> Path:
-    e = experiment
+def _name(e: Experiment) -> str:
     words = (e.kind, e.rig, e.protocol, "-".join(e.estimators), f"x{e.noise:g}", f"n{e.repeats}")
-    return folder / f"{' '.join(words)} {e.seed}.json"
-
-
-def _kept(experiment: Experiment, folder: Path) -> dict[str, Trial] | None:
-    """Return what a study ended before its time had found, if it had."""
-    place = _place(experiment, folder)
-    if not place.is_file():
-        return None
-    return {name: Trial(**one) for name, one in json.loads(place.read_text("utf-8")).items()}
-
-
-def end_with_parent() -> None:
-    """See to it that this process does not outlive a study that was killed."""
-    parent = multiprocessing.parent_process()
-
-    def wait() -> None:
-        if parent is not None:
-            parent.join()
-            os._exit(1)
-
-    threading.Thread(target=wait, daemon=True).start()
+    return f"{' '.join(words)} {e.seed}.json"
 
 
 def all_of(
     experiments: Sequence[Experiment],
     workers: int,
     say: Callable[[str], None],
-    job: Callable[[Experiment], dict[str, Trial]] = perform,
     folder: Path | None = None,
 ) -> Iterator[tuple[Experiment, dict[str, Trial]]]:
     """Perform experiments on `workers` processes, in the order they end.
@@ -112,28 +85,21 @@ def all_of(
     One that fails (a simulated bench whose piston would leave its limits) is told and left out.
     What is found is kept in `folder`, if given, and what is there already is not done again.
     """
-    left = []
-    for experiment in experiments:
-        known = _kept(experiment, folder) if folder is not None else None
-        if known is None:
-            left.append(experiment)
-        else:
-            yield experiment, known
+    kept = None
     if folder is not None:
-        folder.mkdir(parents=True, exist_ok=True)
-        say(f"{len(experiments) - len(left)} of {len(experiments)} experiments are in {folder}")
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context, initializer=end_with_parent) as pool:
-        waiting = {pool.submit(job, e): e for e in left}
-        for done, future in enumerate(as_completed(waiting), start=1):
-            if done % 10 == 0 or done == len(waiting):
-                say(f"{done} of {len(waiting)} experiments")
-            experiment = waiting[future]
-            try:
-                found = future.result()
-                if folder is not None:
-                    text = json.dumps({name: asdict(one) for name, one in found.items()})
-                    _place(experiment, folder).write_text(text, encoding="utf-8")
-                yield experiment, found
-            except (InputError, RuntimeError) as error:
-                say(f"seed {experiment.seed} failed and is left out: {error}")
+        kept = Kept(
+            folder,
+            _name,
+            lambda found: {name: asdict(one) for name, one in found.items()},
+            lambda _, data: {name: Trial(**one) for name, one in data.items()},
+        )
+        there = sum(e in kept for e in experiments)
+        say(f"{there} of {len(experiments)} experiments are in {folder}")
+
+    def tell(done: int, of: int, e: Experiment, found: dict[str, Trial] | Exception) -> None:
+        if done % 10 == 0 or done == of:
+            say(f"{done} of {of} experiments")
+        if isinstance(found, Exception):
+            say(f"seed {e.seed} failed and is left out: {found}")
+
+    return performed(experiments, perform, workers, tell, kept)

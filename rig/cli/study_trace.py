@@ -9,10 +9,8 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import multiprocessing
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -20,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 
 from protocols.plan import Overrides
-from rig.cli.study_jobs import end_with_parent
+from rig.cli.study_pool import Kept, performed
 from rig.cli.study_trace_cases import NONE, OUTSIDE, SIZE_OF, Case
 from rig.model.rig import Rig
 
@@ -107,40 +105,25 @@ def all_of(
 
     With a `folder` every outcome is kept there, and a study that was ended goes on from it.
     """
-    left = []
-    for case in work:
-        kept = _kept(case, folder) if folder else None
-        if kept is None:
-            left.append(case)
+
+    def tell(done: int, of: int, case: Case, found: Outcome | Exception) -> None:
+        if isinstance(found, Exception):  # a plant that leaves its limits is no result
+            say(f"{done}/{of} {case.label}, seed {case.seed}: no records ({found})")
         else:
-            yield kept
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context, initializer=end_with_parent) as pool:
-        waiting = {pool.submit(perform, case): case for case in left}
-        for k, done in enumerate(as_completed(waiting), start=1):
-            case = waiting[done]
-            try:
-                outcome = done.result()
-            except Exception as error:  # a plant that leaves its limits is no result
-                say(f"{k}/{len(left)} {case.label}, seed {case.seed}: no records ({error})")
-                continue
-            say(f"{k}/{len(left)} {line_of(outcome)}")
-            if folder:
-                _place(case, folder).write_text(json.dumps(asdict(outcome)), encoding="utf-8")
-            yield outcome
+            say(f"{done}/{of} {line_of(found)}")
+
+    kept = Kept(folder, name_of, asdict, _outcome) if folder else None
+    done = performed(work, perform, workers, tell, kept, left_out=(Exception,))
+    return (outcome for _, outcome in done)
 
 
-def _place(case: Case, folder: Path) -> Path:
-    """Return the file of a case's outcome; whatever the case is made of is in its name."""
+def name_of(case: Case) -> str:
+    """Return the name of the file of a case's outcome: whatever the case is made of is in it."""
     text = json.dumps(asdict(case), sort_keys=True)
-    return folder / f"{case.kind} {case.seed} {hashlib.sha256(text.encode()).hexdigest()[:8]}.json"
+    return f"{case.kind} {case.seed} {hashlib.sha256(text.encode()).hexdigest()[:8]}.json"
 
 
-def _kept(case: Case, folder: Path) -> Outcome | None:
-    place = _place(case, folder)
-    if not place.is_file():
-        return None
-    data = json.loads(place.read_text(encoding="utf-8"))
+def _outcome(case: Case, data: Mapping[str, Any]) -> Outcome:
     pairs = {key: tuple(tuple(one) for one in data[key]) for key in ("named", "tied", "refused")}
     plain = {key: tuple(data[key]) for key in ("depends_on", "notes")}
     return Outcome(**{**data, **pairs, **plain, "case": case})

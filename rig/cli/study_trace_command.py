@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -9,9 +11,13 @@ import typer
 
 from rig.cli.bench_commands import JsonOption
 from rig.cli.output import progress, write_json
-from rig.cli.study_command import studies
-
-Workers = Annotated[int, typer.Option(min=1, help="Processes at once.")]
+from rig.cli.study_command import (
+    DocsOption,
+    KeepOption,
+    WorkersOption,
+    in_section,
+    studies,
+)
 
 
 def trace(
@@ -27,14 +33,10 @@ def trace(
     level: Annotated[
         int | None, typer.Option(min=0, max=2, help="Only this size: 0 small .. 2 large.")
     ] = None,
-    workers: Workers = 2,
+    workers: WorkersOption = 2,
     json: JsonOption = None,
-    keep: Annotated[
-        Path | None, typer.Option(help="Folder of single outcomes, to go on from later.")
-    ] = None,
-    docs: Annotated[
-        Path | None, typer.Option(help="Fill this page's section with command and tables.")
-    ] = None,
+    keep: KeepOption = None,
+    docs: DocsOption = None,
 ) -> None:
     """Hide effects in simulated benches and count what the trace makes of them.
 
@@ -50,18 +52,27 @@ def trace(
     if quick:
         counts = {NONE: 4, SINGLE: 1, PAIR: 1, OUTSIDE: 2}
         names = names or ("coulomb_friction", "internal_leakage", "valve_deadband", "torque_offset")
-    if keep is not None:
-        keep.mkdir(parents=True, exist_ok=True)
     outcomes = list(all_of(cases(counts, seed, names, level), workers, progress, keep))
     write_json(json, as_json(outcomes))
     if docs is not None:
-        words = "".join(f" --{name} {n}" for name, n in (
-            ("clean", clean), ("single", single), ("pairs", pairs), ("outside", outside),
-        ))  # fmt: skip
-        made = f"bramah study trace{words} --seed {seed} --docs {docs}"
-        replace_section(docs, "study trace", f"```sh\n{made}\n```\n\n```\n{text(outcomes)}\n```")
+        asked = {"--clean": clean, "--single": single, "--pairs": pairs, "--outside": outside}
+        made = command_of(asked, seed, docs, quick, only, level)
+        replace_section(docs, "study trace", in_section(made, f"```\n{text(outcomes)}\n```"))
     if json != Path("-"):
         typer.echo(text(outcomes))
+
+
+def command_of(
+    counts: Mapping[str, int], seed: int, docs: Path, quick: bool = False, only: str = "",
+    level: int | None = None,
+) -> str:  # fmt: skip
+    """Return the line that draws the same cases again: --quick has its own `counts`."""
+    words = ["bramah", "study", "trace"]
+    words += ["--quick"] if quick else [w for name, n in counts.items() for w in (name, str(n))]
+    words += ["--seed", str(seed)]
+    words += ["--only", only] if only else []
+    words += [] if level is None else ["--level", str(level)]
+    return shlex.join([*words, "--docs", str(docs)])
 
 
 def register(app: typer.Typer) -> None:

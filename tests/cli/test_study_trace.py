@@ -12,6 +12,7 @@ import pytest
 from hil_sim.scenario import parse_scenario
 from rig.cli import study_trace as st
 from rig.cli.study_trace_cases import NONE, OUTSIDE, PAIR, SINGLE, SINGLES, Case, cases
+from rig.cli.study_trace_command import command_of
 from rig.cli.study_trace_text import text
 from rig.model.parse import InputError
 
@@ -76,10 +77,22 @@ def test_a_study_that_was_ended_goes_on_from_what_it_kept(tmp_path: Path) -> Non
     (case,) = cases({PAIR: 1}, 100)
     kept = outcome(PAIR, "explained", case.truth, case.truth)
     record = {**asdict(kept), "case": asdict(case)}
-    st._place(case, tmp_path).write_text(json.dumps(record), encoding="utf-8")
+    (tmp_path / st.name_of(case)).write_text(json.dumps(record), encoding="utf-8")
     said: list[str] = []
     (again,) = st.all_of([case], 1, said.append, tmp_path)
     assert said == []  # nothing was simulated
     assert again.case == case
     assert again.named == case.truth
     assert st.right(again) == "right"
+
+
+def test_the_command_beside_the_tables_is_the_one_that_makes_them_again() -> None:
+    counts, page = {"--clean": 300, "--single": 3}, Path("docs/trace.md")
+    assert command_of(counts, 100, page) == (
+        "bramah study trace --clean 300 --single 3 --seed 100 --docs docs/trace.md"
+    )
+    assert command_of(counts, 7, page, quick=True, level=0) == (
+        "bramah study trace --quick --seed 7 --level 0 --docs docs/trace.md"
+    )
+    few = command_of({"--clean": 0}, 100, page, only="joint_spring backlash")
+    assert "--clean 0 --seed 100 --only 'joint_spring backlash' --docs" in few
