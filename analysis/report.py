@@ -9,18 +9,15 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib import resources
 from pathlib import Path
 from typing import Any
-
-from jinja2 import Environment, FunctionLoader, StrictUndefined
-from markupsafe import Markup
 
 from analysis import paper_tables as paper
 from analysis import report_facts, report_figures, report_rig, report_tables
 from analysis import report_format as fm
 from analysis.identify import Identification, RecordRows, build_rows
 from analysis.model import Model, rig_difference
+from analysis.report_page import page, write
 from analysis.report_residuals import per_repeat, residuals
 from analysis.validate import RecordValidation
 from rig.model.parse import InputError
@@ -72,17 +69,12 @@ def write_report(
 
     See `render_report` for the arguments; raises InputError where the file cannot be written.
     """
-    page = render_report(
+    text = render_report(
         runs=runs, identification=identification, model=model, validation=validation,
         validation_runs=validation_runs, truth=truth, title=title, provenance=provenance, rows=rows,
     )  # fmt: skip
-    part = path.with_name(path.name + ".part")
-    try:
-        part.write_text(page, encoding="utf-8")
-        part.replace(path)
-    except OSError as error:
-        raise InputError(f"cannot write the report {path}: {error.strerror or error}") from error
-    log.info("wrote %s, %d kB", path, len(page) // 1000)
+    write(path, text)
+    log.info("wrote %s, %d kB", path, len(text) // 1000)
 
 
 def render_report(
@@ -113,7 +105,6 @@ def render_report(
         rows = build_rows(rig, runs, identification.model.terms)
     context = {
         "title": title,
-        "style": Markup(_read("report.css")),
         "rig": rig,
         "simulated": bool(truth),
         "provenance": provenance or Provenance(),
@@ -123,18 +114,7 @@ def render_report(
         **_bench(rig, runs, identification, truth),
         **_validated(rig, validation, validation_runs),
     }
-    return _environment().get_template(TEMPLATE).render(context)
-
-
-def _read(name: str) -> str:
-    return (resources.files("analysis") / "templates" / name).read_text(encoding="utf-8")
-
-
-def _environment() -> Environment:
-    return Environment(
-        loader=FunctionLoader(_read), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
+    return page(TEMPLATE, context)
 
 
 def _headline(

@@ -12,8 +12,9 @@ from markupsafe import Markup
 from analysis import report_format as fm
 from analysis.plots import BLUE, CARD, GREY, INK, PALE, figure, note, style, svg
 from analysis.report import Provenance
+from analysis.report_page import page, write
 from analysis.trace import figures
-from analysis.trace.report import body, page, write
+from analysis.trace.report import body
 from analysis.trace.rounds import Round
 from rig.model import channels as ch
 from rig.model.records import Record, Run

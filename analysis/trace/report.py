@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from importlib import resources
 from pathlib import Path
 from typing import Any
-
-from jinja2 import Environment, FunctionLoader, StrictUndefined
-from markupsafe import Markup
 
 from analysis import report_format as fm
 from analysis.effects.base import Effect
 from analysis.report import Provenance
+from analysis.report_page import page, write
 from analysis.trace import figures
 from analysis.trace.result import CLEAN, Found, Trace
 from analysis.trace.words import quantity, unit_of_equation
-from rig.model.parse import InputError
 from rig.model.records import Run
 from rig.model.rig import Rig
 
@@ -37,16 +33,6 @@ def write_trace_report(
     write(path, render(holdout, result, provenance))
 
 
-def write(path: Path, page: str) -> None:
-    """Write a page whole or not at all; raises InputError where it cannot be written."""
-    part = path.with_name(path.name + ".part")
-    try:
-        part.write_text(page, encoding="utf-8")
-        part.replace(path)
-    except OSError as error:
-        raise InputError(f"cannot write the report {path}: {error.strerror or error}") from error
-
-
 def render(holdout: Sequence[Run], result: Trace, provenance: Provenance | None = None) -> str:
     """Return the report as HTML text."""
     return page(TEMPLATE, body(holdout, result, provenance))
@@ -55,11 +41,10 @@ def render(holdout: Sequence[Run], result: Trace, provenance: Provenance | None 
 def body(
     holdout: Sequence[Run], result: Trace, provenance: Provenance | None = None
 ) -> dict[str, Any]:
-    """Return what the pages of a trace show, for `page`."""
+    """Return what the pages of a trace show, for `analysis.report_page.page`."""
     rig = result.model_before.rig
     return {
         "title": TITLES[result.verdict],
-        "style": Markup(_read("report.css")),
         "rig": rig,
         "result": result,
         "provenance": provenance or Provenance(),
@@ -85,19 +70,6 @@ def body(
         "floors": result.floors,
         "fm": fm,
     }
-
-
-def page(template: str, context: Mapping[str, Any]) -> str:
-    """Return a template of `analysis/templates` filled in."""
-    environment = Environment(
-        loader=FunctionLoader(_read), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    return environment.get_template(template).render(context)
-
-
-def _read(name: str) -> str:
-    return (resources.files("analysis") / "templates" / name).read_text(encoding="utf-8")
 
 
 def _pictures(rig: Rig, holdout: Sequence[Run], result: Trace) -> list[dict[str, Any]]:
