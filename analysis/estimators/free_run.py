@@ -16,6 +16,7 @@ from __future__ import annotations
 import itertools
 import logging
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ from scipy.optimize import OptimizeResult, least_squares
 from analysis.checks import Check
 from analysis.estimators.covariance import spread
 from analysis.estimators.equations import SEGMENTS, Pieces
+from analysis.estimators.output_error import refuse_undetermined
 from analysis.model import Estimate, Model
 from analysis.rows import default_filtering
 from analysis.signals import Mask, aligned_channels, condition
@@ -32,7 +34,6 @@ from analysis.solve import Solution
 from analysis.terms.base import Used
 from analysis.validate import arrived, first_state
 from rig.model import channels as ch
-from rig.model.parse import InputError
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
 
@@ -94,12 +95,7 @@ def free_run_fit(
     not linear in the rows.
     """
     (solution,) = solutions.values()
-    missing = list(solution.unidentifiable)
-    if missing:
-        raise InputError(
-            f"--estimator output-error simulates the whole model, but least squares does not "
-            f"determine {' '.join(missing)}: add records that excite them, or use another estimator"
-        )
+    refuse_undetermined(list(solution.unidentifiable))
     ready = FreeRuns(rig, runs, terms)
     scale = np.abs(solution.value)
 
@@ -122,11 +118,7 @@ def free_run_fit(
         f"{before:.3g} {unit} rms with least squares, {after:.3g} {unit} with these parameters"
         + ("" if found.success else f"; not settled after {found.nfev} steps"),
     )
-    new = Solution(
-        solution.names, found.x * scale, error.covariance, error.dof, solution.condition_number,
-        solution.rows, solution.residual_rms, solution.noise_bias, solution.unidentifiable,
-        solution.triangle, solution.noise,
-    )  # fmt: skip
+    new = replace(solution, value=found.x * scale, covariance=error.covariance, dof=error.dof)
     return dict.fromkeys(solutions, new), check
 
 

@@ -66,14 +66,18 @@ def output_error(
     Raises InputError for a start that is incomplete or that cannot be simulated at all.
     """
     names = tuple(c.parameter for used in terms for c in used.term.coefficients(rig))
-    missing = [n for n in names if not np.isfinite(start.get(n, np.nan))]
+    refuse_undetermined([n for n in names if not np.isfinite(start.get(n, np.nan))])
+    search = _Search(Windows(rig, runs, tuple(terms), names))
+    return search.run(np.array([*(start[n] for n in names), start.get(nu.KAPPA, 0.0)]))
+
+
+def refuse_undetermined(missing: Sequence[str]) -> None:
+    """Raise InputError if least squares left any parameter of the model without a value."""
     if missing:
         raise InputError(
             f"--estimator output-error simulates the whole model, but least squares does not "
             f"determine {' '.join(missing)}: add records that excite them, or use another estimator"
         )
-    search = _Search(Windows(rig, runs, tuple(terms), names))
-    return search.run(np.array([*(start[n] for n in names), start.get(nu.KAPPA, 0.0)]))
 
 
 class _Search:

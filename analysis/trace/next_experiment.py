@@ -50,7 +50,6 @@ NEAR = 2.0  # times the energy that the best set leaves: another is still in que
 RIVALS = 3
 LIKELY = 2.0  # times its nominal value that a parameter may be
 SEED = 0  # of the excitations' phases
-SCALE = ex.HELD_OUT
 
 
 @dataclass(frozen=True)
@@ -283,7 +282,7 @@ def _protocols(stage: Board, chosen: Sequence[ex.Excitation]) -> dict[str, Any]:
     rng = np.random.default_rng([SEED, 1])
     return {
         "protocol": ex.protocol(stage.rig, chosen, "next"),
-        "holdout": ex.protocol(stage.rig, chosen, "next-holdout", SCALE, rng),
+        "holdout": ex.protocol(stage.rig, chosen, "next-holdout", ex.HELD_OUT, rng),
     }
 
 

@@ -101,7 +101,6 @@ def place_of(where: str) -> str:
 
 def effect_text(sizes: Sizes, joint: int, level: int) -> tuple[str, tuple[str, str], float]:
     """Return the scenario's text of one effect, its name and place, and its size in SI."""
-
     name, where, key, levels, other = sizes
     place = where.format(j=joint)
     at = (
