@@ -28,7 +28,8 @@ from analysis.signals import Mask, Signals
 from analysis.terms.base import Used, family_of
 from rig.model import channels as ch
 from rig.model.parse import InputError
-from rig.model.rig import AnySensor, Rig
+from rig.model.parts import AnySensor
+from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 

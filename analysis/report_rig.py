@@ -11,8 +11,9 @@ from analysis import report_format as fm
 from analysis.plots_rig import angle_range
 from rig.model import channels as ch
 from rig.model.electric import ElectricRig
+from rig.model.parts import Joint
 from rig.model.records import Record, Run
-from rig.model.rig import Joint, Rig
+from rig.model.rig import Rig
 
 LOCKS = {
     "closed": "valve closed",

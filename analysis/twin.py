@@ -15,7 +15,8 @@ from analysis.simulate import Drive, State, simulate
 from analysis.terms import baseline
 from analysis.terms.base import Used
 from rig.model.parse import InputError
-from rig.model.rig import Rig, Valve
+from rig.model.parts import Valve
+from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)

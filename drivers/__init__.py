@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from drivers.base import Driver
-from rig.model.rig import Rig, Wire
+from rig.model.parts import Wire
+from rig.model.rig import Rig
 
 
 def make_driver(wire: Wire, rig: Rig) -> Driver:

@@ -23,8 +23,9 @@ from drivers.modbus_blocks import BlockDecoder, unwrap
 from drivers.modbus_transport import DeviceRefused, DeviceSilent, ModbusConnection, unpack
 from rig.model import registers as reg
 from rig.model.codes import encode_output
+from rig.model.parts import Wire
 from rig.model.registers import Refusal, Status, TripCause
-from rig.model.rig import Rig, Wire
+from rig.model.rig import Rig
 
 logger = logging.getLogger(__name__)
 

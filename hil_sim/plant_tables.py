@@ -13,7 +13,8 @@ from hil_sim.scenario import Scenario, check_fits
 from hil_sim.sensors import channel_table
 from hil_sim.truth import Constants, Machine
 from rig.model.parse import InputError
-from rig.model.rig import Joint, Rig
+from rig.model.parts import Joint
+from rig.model.rig import Rig
 
 
 def inertia_matrix(parameters: Mapping[str, float], joints: int) -> Table:

@@ -16,7 +16,8 @@ from protocols import engine, library
 from protocols.check import check
 from protocols.plan import Overrides, Plan, resolve
 from rig.model.parse import InputError
-from rig.model.rig import Rig, Wire
+from rig.model.parts import Wire
+from rig.model.rig import Rig
 from rig.services.attach import AttachError, Publisher
 from rig.services.bench import Bench
 from rig.services.recorder import Recorder

@@ -15,6 +15,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 from rig.model import channels as ch
 from rig.model.parameters import inertia_names, parameter_unit
 from rig.model.parse import InputError
+from rig.model.parts import Array, Oil, Part, Supply
 from rig.model.quantity import (
     Acceleration,
     Angle,
@@ -23,7 +24,7 @@ from rig.model.quantity import (
     UnitError,
     parse_quantity,
 )
-from rig.model.rig import Array, Oil, Rig, Supply, _Part
+from rig.model.rig import Rig
 
 UNKNOWN = "unknown"
 INCLINATION = "base_inclination"
@@ -45,14 +46,14 @@ def _pair(value: Any, si: str, info: ValidationInfo) -> Any:
     return [_si(v, si, info) for v in value] if isinstance(value, list | tuple) else value
 
 
-class Drive(_Part):
+class Drive(Part):
     """What turns the drive's signal into a torque or force: `gain` times the signal."""
 
     unit: Literal["V", "A", "N", "N*m"]
     gain: float = Field(description="force or torque per unit of drive [N/unit or N*m/unit]")
 
 
-class ElectricLimits(_Part):
+class ElectricLimits(Part):
     """What may not be passed during a run."""
 
     position: tuple[float, float] = Field(description="allowed positions [rad or m]")
@@ -60,7 +61,7 @@ class ElectricLimits(_Part):
     drive: float = Field(gt=0, description="largest drive either way, in the drive's unit")
 
 
-class ElectricJoint(_Part):
+class ElectricJoint(Part):
     """One electric joint: revolute about, or prismatic along, its axis."""
 
     type: Literal["electric"]
@@ -125,7 +126,7 @@ class ElectricJoint(_Part):
         return super().__getattr__(name)  # type: ignore[misc]
 
 
-class ElectricSensor(_Part):
+class ElectricSensor(Part):
     """A position encoder or a drive's read-back; ranges in the joint's and the drive's unit."""
 
     range: tuple[float, float]
@@ -140,7 +141,7 @@ class ElectricSensor(_Part):
         return self
 
 
-class ElectricSensors(_Part):
+class ElectricSensors(Part):
     """One description per kind of channel."""
 
     position: ElectricSensor

@@ -1,0 +1,251 @@
+"""What a bench is made of: frozen models that hold data in SI and refuse what cannot be built.
+
+Source of the geometry and constants: NOTES of the method, "Linkage" and "Bench constants".
+"""
+
+from __future__ import annotations
+
+from typing import Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from rig.model import channels as ch
+from rig.model import linkage
+from rig.model.quantity import (
+    Angle,
+    Area,
+    Density,
+    Flow,
+    Frequency,
+    Length,
+    Pressure,
+    PressureRate,
+    Speed,
+    Temperature,
+    TemperatureDifference,
+    Time,
+    Voltage,
+    Volume,
+)
+
+Array = linkage.Array
+
+
+class Part(BaseModel):
+    """A piece of a description: frozen, no unknown keys, finite numbers."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Linkage(Part):
+    """Two pins and a cylinder: (lc + s)^2 = a^2 + c^2 - 2 a c cos(q + offset)."""
+
+    base_pin: Length = Field(gt=0, description="a: joint to the pin on the inner link [m]")
+    arm_pin: Length = Field(gt=0, description="c: joint to the pin on the outer link [m]")
+    mid_length: Length = Field(gt=0, description="lc: pin to pin at mid-stroke [m]")
+    offset: Angle = Field(default=0.0, description="beta - q [rad]")
+
+    def angle(self, piston: Array | float) -> Array:
+        """Return the joint angle q [rad] of piston displacement s [m]."""
+        return linkage.angle_from_piston(
+            piston, self.base_pin, self.arm_pin, self.mid_length, self.offset
+        )
+
+    def piston(self, q: Array | float) -> Array:
+        """Return the piston displacement s [m] of joint angle q [rad]."""
+        return linkage.piston_from_angle(
+            q, self.base_pin, self.arm_pin, self.mid_length, self.offset
+        )
+
+    def jacobian(self, q: Array | float) -> Array:
+        """Return G = ds/dq [m]."""
+        return linkage.jacobian(q, self.base_pin, self.arm_pin, self.mid_length, self.offset)
+
+    def jacobian_rate(self, q: Array | float) -> Array:
+        """Return dG/dq [m/rad]."""
+        return linkage.jacobian_rate(q, self.base_pin, self.arm_pin, self.mid_length, self.offset)
+
+
+class Cylinder(Part):
+    """An asymmetric cylinder with the volumes of its two lines."""
+
+    stroke: Length = Field(gt=0, description="L: full stroke, s runs from -L/2 to +L/2 [m]")
+    cap_area: Area = Field(gt=0)
+    rod_area: Area = Field(gt=0)
+    cap_pipe_volume: Volume = Field(gt=0, description="V0 of the cap side [m^3]")
+    rod_pipe_volume: Volume = Field(gt=0, description="V0 of the rod side [m^3]")
+
+    @model_validator(mode="after")
+    def _rod_is_smaller(self) -> Self:
+        if self.rod_area > self.cap_area:
+            raise ValueError(
+                f"rod_area {self.rod_area:g} m^2 exceeds cap_area {self.cap_area:g} m^2; "
+                "the rod side cannot be the larger one (swapped?)"
+            )
+        return self
+
+
+class Valve(Part):
+    """A proportional valve: the command the device puts out and the spool it moves."""
+
+    command_range: Voltage = Field(gt=0, description="outputs run from -range to +range [V]")
+    command_bits: int = Field(ge=8, le=16)
+    spool_gain: float = Field(gt=0, description="spool LVDT volts per command volt [V/V]")
+    spool_stroke: Voltage = Field(gt=0, description="spool travel either way, in LVDT volts [V]")
+    natural_frequency: Frequency = Field(default=100.0, gt=0)
+    damping_ratio: float = Field(default=0.8, gt=0)
+
+
+class Limits(Part):
+    """What may not be passed during a run; crossing one zeroes the outputs and latches a trip."""
+
+    piston: tuple[Length, Length] = Field(description="allowed piston positions, excited [m]")
+    speed: Speed = Field(gt=0, description="piston speed either way [m/s]")
+    pressure: tuple[Pressure, Pressure] = Field(description="allowed chamber pressure [Pa gauge]")
+    pressure_rate: PressureRate = Field(gt=0)
+    command: Voltage = Field(gt=0, description="largest command either way [V]")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        for name in ("piston", "pressure"):
+            low, high = getattr(self, name)
+            if not low < high:
+                raise ValueError(f"limits {name}: lower {low:g} is not below upper {high:g}")
+        return self
+
+
+class Joint(Part):
+    """One hydraulic joint: link, linkage, cylinder, valve and its limits."""
+
+    type: Literal["hydraulic"] = "hydraulic"
+    name: str = Field(min_length=1)
+    link_length: Length = Field(gt=0)
+    linkage: Linkage
+    cylinder: Cylinder
+    valve: Valve
+    limits: Limits
+
+    @model_validator(mode="after")
+    def _triangle_closes(self) -> Self:
+        a, c = self.linkage.base_pin, self.linkage.arm_pin
+        half = self.cylinder.stroke / 2
+        for end, length in (
+            ("retracted", self.linkage.mid_length - half),
+            ("extended", self.linkage.mid_length + half),
+        ):
+            if not abs(a - c) < length < a + c:
+                raise ValueError(
+                    f"joint {self.name!r}: with the cylinder {end} its length is {length:.4g} m, "
+                    f"but pins at {a:g} and {c:g} m close a triangle only between "
+                    f"{abs(a - c):.4g} and {a + c:.4g} m; check base_pin, arm_pin, mid_length "
+                    "(at MID-stroke) and stroke"
+                )
+        low, high = self.limits.piston
+        if low < -half or high > half:
+            raise ValueError(
+                f"joint {self.name!r}: limits piston {low:g}..{high:g} m reach past the stroke "
+                f"-{half:g}..{half:g} m"
+            )
+        if self.limits.command > self.valve.command_range:
+            raise ValueError(
+                f"joint {self.name!r}: limits command {self.limits.command:g} V is above the "
+                f"valve's command_range {self.valve.command_range:g} V"
+            )
+        return self
+
+
+class _Sensor(Part):
+    bits: int = Field(ge=8, le=16)
+    delay: Time = Field(default=0.0, ge=0, description="the channel lags the world by this [s]")
+
+
+class SpoolSensor(_Sensor):
+    """The spool's LVDT."""
+
+    range: tuple[Voltage, Voltage]
+    noise: Voltage = Field(ge=0, description="one standard deviation [V]")
+
+
+class PistonSensor(_Sensor):
+    """The piston's position sensor."""
+
+    range: tuple[Length, Length]
+    noise: Length = Field(ge=0)
+
+
+class PressureSensor(_Sensor):
+    """A pressure sensor."""
+
+    range: tuple[Pressure, Pressure]
+    noise: Pressure = Field(ge=0)
+
+
+class TemperatureSensor(_Sensor):
+    """The oil's thermometer."""
+
+    range: tuple[Temperature, Temperature]
+    noise: TemperatureDifference = Field(ge=0)
+
+
+AnySensor = SpoolSensor | PistonSensor | PressureSensor | TemperatureSensor
+
+
+class Sensors(Part):
+    """One description per kind of channel; those of the bench are optional."""
+
+    spool: SpoolSensor
+    piston: PistonSensor
+    chamber_pressure: PressureSensor
+    supply_pressure: PressureSensor | None = None
+    oil_temperature: TemperatureSensor | None = None
+    skew: Time = Field(default=0.0, ge=0, description="between neighbours in the multiplexer [s]")
+
+    @model_validator(mode="after")
+    def _ranges(self) -> Self:
+        for name in type(self).model_fields:
+            sensor = getattr(self, name)
+            if isinstance(sensor, _Sensor):
+                low, high = sensor.range  # type: ignore[attr-defined]
+                if not low < high:
+                    raise ValueError(f"sensors {name}: range {low:g}..{high:g} is empty")
+        return self
+
+    def of(self, kind: str) -> AnySensor:
+        """Return the sensor of a channel kind; raises KeyError where the rig has none."""
+        found = {
+            ch.SPOOL: self.spool,
+            ch.PISTON: self.piston,
+            ch.CAP: self.chamber_pressure,
+            ch.ROD: self.chamber_pressure,
+            ch.SUPPLY: self.supply_pressure,
+            ch.TEMPERATURE: self.oil_temperature,
+        }[kind]
+        if found is None:
+            raise KeyError(f"this rig has no sensor for {kind!r}")
+        return found
+
+
+class Supply(Part):
+    """The pump: set pressure and flow limit."""
+
+    pressure: Pressure = Field(gt=0)
+    flow: Flow = Field(gt=0)
+
+
+class Oil(Part):
+    """The working fluid."""
+
+    name: str
+    density: Density = Field(gt=0)
+    temperature: Temperature
+    temperature_band: TemperatureDifference = Field(default=2.0, ge=0)
+
+
+class Wire(Part):
+    """How the bench is reached."""
+
+    kind: Literal["modbus-tcp"] = "modbus-tcp"
+    host: str = "127.0.0.1"
+    port: int = Field(default=5020, ge=0, le=65535)
+    timeout: Time = Field(default=1.0, gt=0, description="answer expected within [s]")
+    watchdog: Time = Field(default=0.5, gt=0, description="host silence after which outputs zero")
