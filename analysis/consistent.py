@@ -29,7 +29,8 @@ from scipy.stats import f as fisher
 
 from analysis.checks import Check
 from analysis.constrained import Feasible, Minimum, minimise
-from analysis.identify import Identification, estimates_of
+from analysis.estimates import estimates_of
+from analysis.identify import Identification
 from analysis.model import Estimate, estimate_json, finite
 from analysis.solve import Solution
 from analysis.terms.inertia import chain_matrix, inertia_map

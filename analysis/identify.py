@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,15 +16,17 @@ from analysis.advice import base_statements
 from analysis.checks import Check
 from analysis.condense import SEGMENTS, Reduction, reduce_runs, solve_reductions
 from analysis.condense import repeats_of as reduced_repeats
+from analysis.estimates import estimates_of, with_ends
 from analysis.estimators.choose import UNBIASED, Job, Refined, refine, refuse_unknown
 from analysis.give import moving_by_step
 from analysis.model import Estimate, Model, estimate_json, finite
+from analysis.plausibility import consistency
 from analysis.reduce import reduced
 from analysis.rows import Filtering, Rows, default_filtering, parameters_of, record_rows
 from analysis.signals import condition
-from analysis.solve import Cluster, Solution, half_width, solve, triangle
+from analysis.solve import Cluster, Solution, solve, triangle
 from analysis.terms import baseline_of
-from analysis.terms.base import FAMILIES, Coefficient, Used, family_of
+from analysis.terms.base import FAMILIES, Used, family_of
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
@@ -139,7 +141,7 @@ def conclude(
     solutions = found.solutions
     estimates, covariance = estimates_of(rig, used, solutions)
     if found.bootstrap:
-        estimates = _with_ends(estimates, found.bootstrap)
+        estimates = with_ends(estimates, found.bootstrap)
     rows = {family: solution.rows for family, solution in solutions.items()}
     masked = sum(one.masked for one in reductions)
     statements = (
@@ -271,58 +273,6 @@ def _piece(rows: Rows, piece: int, pieces: int) -> tuple[Array, Array]:
     return rows.matrix[inside], rows.rhs[inside]
 
 
-def estimates_of(
-    rig: Rig, terms: Sequence[Used], solutions: Mapping[str, Solution]
-) -> tuple[dict[str, Estimate], Array]:
-    """Turn the rows' coefficients into parameters (b = 1/coefficient) with intervals."""
-    coefficients = {c.parameter: c for used in terms for c in used.term.parameters(rig)}
-    found: dict[str, Estimate] = {}
-    blocks = []
-    for solution in solutions.values():
-        std = np.sqrt(np.diag(solution.covariance))
-        half = half_width(std, solution.dof)
-        slopes = np.ones(len(std))
-        for i, name in enumerate(solution.names):
-            c = coefficients[name]
-            note = solution.unidentifiable.get(name, "")
-            found[name], slopes[i] = _estimate(c, solution.value[i], std[i], half[i], note)
-        blocks.append(solution.covariance * np.outer(slopes, slopes))
-    names = list(found)
-    covariance = np.zeros((len(names), len(names)))
-    start = 0
-    for block in blocks:
-        covariance[start : start + len(block), start : start + len(block)] = block
-        start += len(block)
-    return found, covariance
-
-
-def _estimate(
-    c: Coefficient, value: float, std: float, half: float, note: str
-) -> tuple[Estimate, float]:
-    """Return the parameter's estimate and d parameter / d coefficient."""
-    low, high = value - half, value + half
-    if not c.reciprocal:
-        return Estimate(float(value), c.unit, float(std), (float(low), float(high)), note), 1.0
-    if value == 0:
-        return Estimate(np.nan, c.unit, np.nan, (np.nan, np.nan), "its row came out zero"), np.nan
-    slope = -1.0 / value**2
-    # An interval of 1/b that reaches zero leaves b unbounded above.
-    ends = (1.0 / high, 1.0 / low if low > 0 else np.inf) if value > 0 else (np.nan, np.nan)
-    estimate = Estimate(float(1.0 / value), c.unit, float(abs(slope) * std), ends, note)
-    return estimate, float(slope)
-
-
-def _with_ends(
-    estimates: Mapping[str, Estimate], ends: Mapping[str, tuple[float, float]]
-) -> dict[str, Estimate]:
-    """Replace intervals by the bootstrap's; `ends` are of the rows' coefficients (1/b)."""
-    out = dict(estimates)
-    for name, (low, high) in ends.items():
-        interval = (1.0 / high, 1.0 / low) if name == "b" else (low, high)
-        out[name] = replace(out[name], ci95=interval)
-    return out
-
-
 def _statements(
     rig: Rig,
     reductions: Sequence[Reduction],
@@ -340,7 +290,7 @@ def _statements(
         *ck.identifiability(found.solutions),
         *base_statements(rig, found.solutions),
         ck.noise_bias(found.solutions, found.estimator in UNBIASED),
-        *ck.consistency(rig, estimates),
+        *consistency(rig, estimates),
     )
 
 

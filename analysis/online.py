@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.accumulate import Accumulator
-from analysis.identify import estimates_of
+from analysis.estimates import estimates_of
 from analysis.model import Estimate
 from analysis.rows import Filtering, Rows, default_filtering, parameters_of
 from analysis.solve import Cluster, Solution, merge, solve

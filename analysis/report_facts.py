@@ -11,9 +11,10 @@ import numpy as np
 
 from analysis import paper_tables as paper
 from analysis import report_format as fm
-from analysis.checks import LENGTH_TOLERANCE, Check
+from analysis.checks import Check
 from analysis.identify import Identification
 from analysis.model import Estimate
+from analysis.plausibility import LENGTH_TOLERANCE
 from analysis.plots_parameters import relative_half_width
 from analysis.report_tables import Table4, worst_fit
 from analysis.validate import RecordValidation

@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from analysis.estimates import estimates_of
 from analysis.identify import (
     Identification,
     build_rows,
     clusters_of,
-    estimates_of,
     repeats_of,
 )
 from analysis.methods.search import with_values

@@ -22,17 +22,18 @@ import numpy as np
 
 from analysis import checks as ck
 from analysis.checks import Check
+from analysis.estimates import estimates_of
 from analysis.identify import (
     Identification,
     RecordRows,
     build_rows,
     clusters_of,
-    estimates_of,
     repeats_of,
 )
 from analysis.methods.stages import Outcome, Stage, as_solution, solve_stages
 from analysis.model import Estimate, Model, estimate_json, finite
 from analysis.noise import noise_moments
+from analysis.plausibility import consistency
 from analysis.rows import Filtering, parameters_of
 from analysis.signals import lost_samples
 from analysis.solve import Cluster
@@ -74,7 +75,7 @@ def sequential(
         *ck.clipping(rig, [(r, ck.clipped_counts(rig, r)) for r in records]),
         ck.lost_samples([(r, int(lost_samples(rig, r).any(axis=1).sum())) for r in records]),
         ck.masked(sum(rows.values()), masked),
-        *ck.consistency(rig, estimates),
+        *consistency(rig, estimates),
     )
     provenance = {
         "method": "sequential",

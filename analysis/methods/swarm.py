@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 
 from analysis import checks as ck
 from analysis.checks import Check
-from analysis.identify import Identification, estimates_of
+from analysis.estimates import estimates_of
+from analysis.identify import Identification
 from analysis.methods.search import (
     COMPLEX,
     DEAD,
