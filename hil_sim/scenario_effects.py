@@ -6,18 +6,16 @@ What each does to the plant stands in `plant_effects`.
 
 from __future__ import annotations
 
-import re
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
-    BaseModel,
-    ConfigDict,
     Field,
     ValidationInfo,
     field_validator,
     model_validator,
 )
 
+from hil_sim.effect_base import Effect
 from hil_sim.truth import in_unit, read_with_unit
 from rig.model.channels import kind_of, unit_of
 from rig.model.quantity import Angle, Flow, Length, Pressure, Ratio, Speed, Time, Voltage, Volume
@@ -30,46 +28,8 @@ ForcePerPressure = Annotated[float, in_unit("N/Pa")]
 Conductance = Annotated[float, in_unit("m^3/(s*Pa)")]
 PerLength = Annotated[float, in_unit("m^-1")]
 
-_WHERE = re.compile(r"^(?:bench|joint (?P<joint>[1-9])(?: (?P<chamber>cap|rod))?)$")
-_FORMS = {"bench": "bench", "joint": "joint I", "chamber": "joint I cap|rod"}
 
-
-class _Effect(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-    places: ClassVar[tuple[str, ...]] = ("joint",)
-
-    @property
-    def place(self) -> str:
-        """Where it is, as text."""
-        return str(getattr(self, "where", None) or getattr(self, "channel", ""))
-
-    @property
-    def joint(self) -> int | None:
-        """Its joint, 0-based; None for the bench."""
-        match = _WHERE.match(self.place)
-        return int(match["joint"]) - 1 if match and match["joint"] else None
-
-    @property
-    def chamber(self) -> str | None:
-        """``cap``, ``rod`` or None for both or neither."""
-        match = _WHERE.match(self.place)
-        return match["chamber"] if match else None
-
-    @field_validator("where", check_fields=False)
-    @classmethod
-    def _known_place(cls, value: str) -> str:
-        match = _WHERE.match(value)
-        form = None
-        if match is not None:
-            form = "chamber" if match["chamber"] else "joint" if match["joint"] else "bench"
-        if form not in cls.places:
-            expected = " or ".join(f"'{_FORMS[place]}'" for place in cls.places)
-            raise ValueError(f"{value!r} is not where this effect can be; expected {expected}")
-        return value
-
-
-class _Friction(_Effect):
+class _Friction(Effect):
     where: str
     presliding: Length = Field(default=40e-6, gt=0, description="bristle deflection at slip [m]")
 
@@ -111,7 +71,7 @@ class PressureDependentFriction(_Friction):
     coefficient: ForcePerPressure = Field(gt=0)
 
 
-class BaseInclination(_Effect):
+class BaseInclination(Effect):
     """The base tilts about the joints' axis; positive adds to the first angle."""
 
     places = ("bench",)
@@ -120,7 +80,7 @@ class BaseInclination(_Effect):
     angle: Angle
 
 
-class Payload(_Effect):
+class Payload(Effect):
     """A mass at the tip of the last link."""
 
     places = ("bench",)
@@ -129,7 +89,7 @@ class Payload(_Effect):
     mass: Mass = Field(gt=0)
 
 
-class JointSpring(_Effect):
+class JointSpring(Effect):
     """A hose that pulls the joint back to `rest` (default: mid-stroke), hardening [1/rad^2]."""
 
     name: Literal["joint_spring"]
@@ -139,7 +99,7 @@ class JointSpring(_Effect):
     hardening: Annotated[float, in_unit("rad^-2")] = Field(default=0.25, ge=0)
 
 
-class TorqueOffset(_Effect):
+class TorqueOffset(Effect):
     """A constant torque, positive opening."""
 
     name: Literal["torque_offset"]
@@ -147,7 +107,7 @@ class TorqueOffset(_Effect):
     torque: Torque
 
 
-class ValveDeadband(_Effect):
+class ValveDeadband(Effect):
     """Overlapped edges: `width` either way (`astern`: the other way, if it differs), rounded."""
 
     name: Literal["valve_deadband"]
@@ -157,7 +117,7 @@ class ValveDeadband(_Effect):
     rounding: Voltage | None = Field(default=None, gt=0, description="default: a fifth of width")
 
 
-class UnderlapLeakage(_Effect):
+class UnderlapLeakage(Effect):
     """Underlapped edges: near the null both pass oil, from pump to tank as well."""
 
     name: Literal["underlap_leakage"]
@@ -166,7 +126,7 @@ class UnderlapLeakage(_Effect):
     rounding: Voltage | None = Field(default=None, gt=0, description="default: half of width")
 
 
-class SpoolOffset(_Effect):
+class SpoolOffset(Effect):
     """The edges' null lies at this LVDT voltage."""
 
     name: Literal["spool_offset"]
@@ -174,7 +134,7 @@ class SpoolOffset(_Effect):
     voltage: Voltage
 
 
-class SpoolLag(_Effect):
+class SpoolLag(Effect):
     """The metered opening follows the LVDT with this time constant."""
 
     name: Literal["spool_lag"]
@@ -182,7 +142,7 @@ class SpoolLag(_Effect):
     time: Time = Field(ge=2e-4)
 
 
-class InternalLeakage(_Effect):
+class InternalLeakage(Effect):
     """Past the piston, cap to rod; in a bore worn about its middle, only there."""
 
     name: Literal["internal_leakage"]
@@ -191,7 +151,7 @@ class InternalLeakage(_Effect):
     worn: Length | None = Field(default=None, gt=0, description="half length of the wear [m]")
 
 
-class ExternalLeakage(_Effect):
+class ExternalLeakage(Effect):
     """From one chamber, or both, to tank."""
 
     places = ("joint", "chamber")
@@ -200,7 +160,7 @@ class ExternalLeakage(_Effect):
     conductance: Conductance = Field(gt=0)
 
 
-class SupplySag(_Effect):
+class SupplySag(Effect):
     """A worse supply: less pump flow, a softer relief valve, a line that drops pressure."""
 
     places = ("bench",)
@@ -220,7 +180,7 @@ class SupplySag(_Effect):
         return self
 
 
-class TankPressure(_Effect):
+class TankPressure(Effect):
     """Return pressure: a constant part and one that follows the returned flow's square."""
 
     places = ("bench",)
@@ -231,7 +191,7 @@ class TankPressure(_Effect):
     lag: Time = Field(default=5e-3, ge=5e-4)
 
 
-class EntrainedAir(_Effect):
+class EntrainedAir(Effect):
     """Free air by volume at atmospheric pressure; it dissolves over `dissolution`."""
 
     places = ("bench",)
@@ -241,7 +201,7 @@ class EntrainedAir(_Effect):
     dissolution: Pressure = Field(default=10e6, gt=0)
 
 
-class DeadVolume(_Effect):
+class DeadVolume(Effect):
     """Oil between valve and chamber that the rig file does not know."""
 
     places = ("chamber",)
@@ -250,7 +210,7 @@ class DeadVolume(_Effect):
     volume: Volume = Field(gt=0)
 
 
-class _Sensor(_Effect):
+class _Sensor(Effect):
     channel: str
 
     @field_validator("channel")
