@@ -67,7 +67,7 @@ def trace(
     _refuse_same(runs, holdout)
     rng = np.random.default_rng(seed)
     terms = tuple(map(Used, baseline_of(rig)))
-    terms = (*terms, *beside(terms, [*runs, *holdout]))
+    terms = (*terms, *beside(terms, runs, holdout))
     train = scenes(rig, runs, families=tuple(families))
     judged = scenes(rig, holdout, families=tuple(families))
     stage = board(rig, terms, train)
