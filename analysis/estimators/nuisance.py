@@ -46,9 +46,13 @@ KAPPA, TAU = "1/b per kelvin", "transition pressure squared"
 
 @dataclass(frozen=True)
 class BulkTemperature(Term):
-    """- V dp/dt (T - T0) in the flow rows: the temperature part of 1/b."""
+    """- V dp/dt (T - T0) in the flow rows: the temperature part of 1/b.
+
+    T0 is `reference` [degC], the rig's nominal temperature where it is None.
+    """
 
     name: ClassVar[str] = "bulk_temperature_nuisance"
+    reference: float | None = None
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return kappa [1/(Pa K)]."""
@@ -56,7 +60,8 @@ class BulkTemperature(Term):
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return the column of each chamber."""
-        kelvin = signals.temperature - rig.oil.temperature
+        reference = rig.oil.temperature if self.reference is None else self.reference
+        kelvin = signals.temperature - reference
         out: Columns = {}
         for i in range(signals.joints):
             out[equation("flow_cap", i)] = {KAPPA: -signals.V_cap[:, i] * signals.pd_cap[:, i]}

@@ -8,6 +8,7 @@ the same equations could not be taken to the noise floor.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -20,31 +21,48 @@ from analysis.estimators.nuisance import (
     SLOPE_STD,
     BulkTemperature,
 )
-from analysis.model import Model
+from analysis.model import Estimate, Model
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from rig.model import channels as ch
 from rig.model.records import Run
 from rig.model.rig import Rig
 
-LEAST_SPAN = 0.05  # [K] between all records: less moves b by a fraction of 0.001
+LEAST = 0.05  # [K] between all records: less moves b by a fraction of 0.001
 
 
-def base_terms(rig: Rig, runs: Sequence[Run]) -> tuple[Used, ...]:
+def base_terms(rig: Rig, runs: Sequence[Run], holdout: Sequence[Run] = ()) -> tuple[Used, ...]:
     """Return the rig's baseline terms with those that belong beside them on these records."""
     terms = tuple(map(Used, baseline_of(rig)))
-    return (*terms, *beside(terms, runs))
+    return (*terms, *beside(terms, runs, holdout))
 
 
-def beside(terms: Sequence[Used], runs: Sequence[Run]) -> tuple[Used, ...]:
-    """Return the terms that belong beside the baseline on these records, held-out ones included."""
+def beside(
+    terms: Sequence[Used], runs: Sequence[Run], holdout: Sequence[Run] = ()
+) -> tuple[Used, ...]:
+    """Return the terms that belong beside the baseline on these records, held-out ones included.
+
+    Their b is that of the mean temperature of `runs`: what these records know best, and what a
+    change of temperature in others turns about.
+    """
     if "compressibility" not in {used.term.name for used in terms}:
         return ()
-    records = [record for run in runs for record in run.records]
-    if not records or any(ch.TEMPERATURE not in record.channels for record in records):
+    train, judge = (_temperatures(x) for x in (runs, holdout))
+    every = [*train, *judge]
+    if not train or None in every or np.ptp(known := [t for t in every if t is not None]) < LEAST:
         return ()
-    means = [float(np.nanmean(np.asarray(record.channels[ch.TEMPERATURE]))) for record in records]
-    return (Used(BulkTemperature()),) if np.ptp(means) > LEAST_SPAN else ()
+    return (Used(BulkTemperature(reference=float(np.mean(known[: len(train)])))),)
+
+
+def _temperatures(runs: Sequence[Run]) -> list[float | None]:
+    """Return each record's mean oil temperature [degC], None where it was not measured."""
+    return [
+        float(np.nanmean(np.asarray(r.channels[ch.TEMPERATURE])))
+        if ch.TEMPERATURE in r.channels
+        else None
+        for run in runs
+        for r in run.records
+    ]
 
 
 def plausible(kappa: float, beta: Mapping[str, float]) -> float:
@@ -56,13 +74,37 @@ def plausible(kappa: float, beta: Mapping[str, float]) -> float:
 
 def stripped(model: Model) -> Model:
     """Return the model at the rig's nominal temperature: the parameters without the nuisance."""
+    (term,) = [u.term for u in model.terms if isinstance(u.term, BulkTemperature)] or (None,)
     names = list(model.parameters)
-    if KAPPA not in names:
+    if term is None or KAPPA not in names:
         return model
-    kept = [k for k, name in enumerate(names) if name != KAPPA]
+    b, kappa = names.index("b"), names.index(KAPPA)
+    found = model.parameters["b"]
+    covariance = model.covariance.copy()
+    if found.identified and term.reference is not None:
+        kelvin = model.rig.oil.temperature - term.reference
+        found, more = _at(found, model.parameters[KAPPA], kelvin)
+        covariance[b, b] += more
+    kept = [k for k in range(len(names)) if k != kappa]
     return replace(
         model,
         terms=tuple(u for u in model.terms if not isinstance(u.term, BulkTemperature)),
-        parameters={names[k]: model.parameters[names[k]] for k in kept},
-        covariance=model.covariance[np.ix_(kept, kept)],
+        parameters={n: found if n == "b" else model.parameters[n] for n in names if n != KAPPA},
+        covariance=covariance[np.ix_(kept, kept)],
     )
+
+
+def _at(b: Estimate, kappa: Estimate, kelvin: float) -> tuple[Estimate, float]:
+    """Return b `kelvin` warmer, and by how much its variance grows.
+
+    1/b(T) = 1/b + kappa (T - T0); kappa is the records' joined to what is known beforehand.
+    """
+    believed, spread = -SLOPE / b.value, SLOPE_STD / b.value
+    own = kappa.std if math.isfinite(kappa.std) else math.inf
+    weight = spread**2 / (spread**2 + own**2) if math.isfinite(kappa.value) else 0.0
+    slope = weight * kappa.value + (1.0 - weight) * believed if weight else believed
+    value = b.value / (1.0 + b.value * slope * kelvin)
+    more = (value**2 * kelvin * spread) ** 2 * (1.0 - weight)
+    std = math.hypot(b.std, math.sqrt(more))
+    half = 0.5 * (b.ci95[1] - b.ci95[0]) * (std / b.std if b.std > 0 else 1.0)
+    return replace(b, value=value, std=std, ci95=(value - half, value + half)), more

@@ -3,12 +3,15 @@
 For each variable v the residual's equation gets a free curve of v (hat functions over quantiles,
 filtered like any column, projected off the model's own columns) on one set of records, and is
 judged on the other: the share of the energy above noise that the curve takes from records it was
-not fitted to. Friedman's partial dependence, with the held-out record as its referee.
+not fitted to. Friedman's partial dependence, with the held-out record as its referee. The curve
+may also be the slope of another variable (Hastie and Tibshirani's varying coefficients): the
+direction of motion, with and without memory, the velocity, the pressure difference, the spool.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +19,7 @@ from numpy.typing import NDArray
 from analysis.rows import Rows
 from analysis.signals import Signals
 from analysis.trace.board import Board
+from analysis.trace.clue_variables import factor_of, factors, variables
 from analysis.trace.evidence import Scene, filtered, prepared
 from analysis.trace.result import Dependence
 from analysis.trace.select import orthonormal
@@ -25,34 +29,12 @@ from rig.model.rig import Rig
 Array = NDArray[np.float64]
 
 KNOTS = 9
-ANSWER = 0.6  # weight of a variable that only answers
 LEAST = 0.05  # share below which a variable is no clue
-BENCH = (ch.SUPPLY, ch.TEMPERATURE, "time")
-
-
-def variables(rig: Rig, signals: Signals, joint: int) -> dict[str, Array]:
-    """Return the variables (n,) that a residual of a joint (0-based) may move with, by name."""
-    i, cap, rod = joint, signals.p_cap[:, joint], signals.p_rod[:, joint]
-    if rig.electric:
-        return {
-            ch.channel(ch.POSITION, i + 1): signals.q[:, i],
-            f"velocity_{i + 1}": signals.qd[:, i],
-            f"acceleration_{i + 1}": signals.qdd[:, i],
-            ch.channel(ch.DRIVE, i + 1): signals.u[:, i],
-            "time": signals.t,
-        }
-    return {
-        ch.channel(ch.PISTON, i + 1): signals.s[:, i],
-        f"velocity_{i + 1}": signals.sd[:, i],
-        f"acceleration_{i + 1}": np.gradient(signals.sd[:, i]) * signals.rate,
-        ch.channel(ch.CAP, i + 1): cap,
-        ch.channel(ch.ROD, i + 1): rod,
-        f"pressure_difference_{i + 1}": cap - rod,
-        ch.channel(ch.SPOOL, i + 1): signals.u[:, i],
-        ch.SUPPLY: signals.p_s,
-        ch.TEMPERATURE: signals.temperature,
-        "time": signals.t,
-    }
+# An equation's own balance makes these follow whatever it lacks: they answer and tell nothing.
+ANSWERS = {"torque": ("pressure", ch.DRIVE), "flow": ("velocity",)}
+ANSWER = 0.3  # weight of a variable that only answers
+THROUGH = 0.6  # weight of the spool in a torque: it acts through the pressures
+MORE = 0.05  # share that a product must take beyond either of its parts
 
 
 def hats(v: Array, knots: Array) -> Array:
@@ -69,32 +51,50 @@ def hats(v: Array, knots: Array) -> Array:
 def dependence(
     train: Board, left: Array, judge: Board, judge_left: Array, equations: Sequence[str]
 ) -> list[Dependence]:
-    """Return the variables by what share of the energy above noise they carry, largest first.
+    """Return what the residual moves with by share of the energy above noise, most telling first.
 
     `left` (M,) and `judge_left` are residuals under the model of `train` (rebased to it).
     """
-    best: dict[str, Dependence] = {}
     weight = {e: _energy(train, left, e) for e in equations}
     total = sum(weight.values()) or 1.0
-    shares: dict[str, float] = {}
+    found: dict[tuple[str, str], dict[str, float]] = {}
     for equation in equations:
-        joint = int(equation.rsplit("_", 1)[1]) - 1
-        for name in variables(train.rig, train.scenes[0].signals, joint):
-            found = _share(train, left, judge, judge_left, equation, joint, name)
-            shares[name] = shares.get(name, 0.0) + found * weight[equation] / total
-            if name not in best or found > best[name].share:
-                best[name] = Dependence(name, found, equation)
-    out = [
-        Dependence(name, share, best[name].equation)
-        for name, share in shares.items()
-        if share >= LEAST
-    ]
-    return sorted(out, key=lambda d: -d.share * (ANSWER if _answers(d) else 1.0))
+        sides = _side(train, left, equation), _side(judge, judge_left, equation)
+        for key, share in _shares(train.rig, equation, *sides).items():
+            found.setdefault(key, {})[equation] = share
+    sums = {k: sum(s * weight[e] / total for e, s in by.items()) for k, by in found.items()}
+    out: list[tuple[float, Dependence]] = []
+    for (name, factor), by in found.items():
+        share = sums[name, factor]
+        parts = [sums.get(part, 0.0) for part in ((name, ""), ("", factor))]
+        if share < LEAST or (name and factor and share < max(parts) + MORE):
+            continue
+        equation = max(by, key=lambda e: by[e])
+        told = 1.0 if factor else _telling(name, equation)
+        out.append((share * told, _dependence(name, factor, share, equation)))
+    best: dict[str, Dependence] = {}
+    for _, clue in sorted(out, key=lambda pair: -pair[0]):
+        best.setdefault(clue.variable, clue)
+    return list(best.values())
 
 
-def _answers(found: Dependence) -> bool:
-    """Tell whether a variable answers its equation: pressures balance any torque that acts."""
-    return found.equation.startswith("torque") and "pressure" in found.variable
+def _dependence(name: str, factor: str, share: float, equation: str) -> Dependence:
+    if not factor:
+        answers = _telling(name, equation) == ANSWER
+        words = f"{name} by balance" if answers else ""
+        return Dependence(name, share, equation, words=words)
+    by = factors(equation)[factor]
+    if not name:
+        return Dependence(by.variable, share, equation, words=by.words)
+    return Dependence(name, share, equation, by.variable, f"{name} times {by.words}")
+
+
+def _telling(name: str, equation: str) -> float:
+    """Return a variable's weight: what an equation's balance makes follow tells little."""
+    kind = equation.split("_", 1)[0]
+    if any(word in name for word in ANSWERS[kind]):
+        return ANSWER
+    return THROUGH if kind == "torque" and name.startswith(ch.SPOOL) else 1.0
 
 
 def _energy(stage: Board, left: Array, equation: str) -> float:
@@ -105,93 +105,110 @@ def _energy(stage: Board, left: Array, equation: str) -> float:
     return max(found, 0.0)
 
 
-def _share(
-    train: Board, left: Array, judge: Board, judge_left: Array, equation: str, joint: int, name: str
-) -> float:
-    """Fit a curve on each set of records and judge it on the other; the larger share, >= 0.
+@dataclass(frozen=True)
+class _Part:
+    """A record's rows of one equation: signals as the model's terms prepare them, and weight."""
 
-    A curve fitted to small motions says nothing of large ones; the other way round it does.
-    """
-    values = [
-        variables(stage.rig, scene.signals, joint)[name]
-        for stage in (train, judge)
-        for scene in stage.scenes
-        if joint + 1 not in scene.record.locked
-    ]
-    if not values:
-        return 0.0
-    everything = np.concatenate(values)
-    knots = np.unique(np.quantile(everything, np.linspace(0.005, 0.995, KNOTS)))
-    if len(knots) < 3 or np.ptp(knots) <= 1e-9 * max(1e-300, float(np.max(np.abs(knots)))):
-        return 0.0
-    first = _projected(train, left, equation, joint, name, knots)
-    second = _projected(judge, judge_left, equation, joint, name, knots)
-    if first is None or second is None:
-        return 0.0
-    return max(0.0, _judged(first, second), _judged(second, first))
+    scene: Scene
+    rows: Rows
+    seen: Signals
+    weight: float
 
 
-def _judged(fitted: tuple[Array, Array], on: tuple[Array, Array]) -> float:
-    D, r = fitted
-    scale = np.linalg.norm(D, axis=0)
-    scale[scale == 0] = 1.0
-    curve = np.linalg.lstsq(D / scale, r, rcond=1e-2)[0] / scale
-    E, q = on
-    before = float(q @ q) - len(q)
-    after = float(np.sum((q - E @ curve) ** 2)) - len(q)
-    return (before - after) / before if before > 0 else 0.0
+@dataclass(frozen=True)
+class _Side:
+    """One set of records' rows of one equation: residual (m,) off the model's `base` (m, r)."""
+
+    parts: tuple[_Part, ...]
+    rest: Array
+    base: Array
 
 
-def _projected(
-    stage: Board, left: Array, equation: str, joint: int, name: str, knots: Array
-) -> tuple[Array, Array] | None:
-    """Return the curve's columns and the residual on one equation's rows, off the model's own."""
-    columns, rest, base = [], [], []
+def _side(stage: Board, left: Array, equation: str) -> _Side | None:
     index = {scene.group: k for k, scene in enumerate(stage.scenes)}
+    parts, rest, base = [], [], []
     for s in stage.segments:
         if s.equation != equation:
             continue
-        scene: Scene = stage.scenes[index[s.group]]
-        rows: Rows = stage.rows[index[s.group]][equation]
-        seen = prepared(stage.rig, stage.terms, scene)
-        curve = hats(variables(stage.rig, seen, joint)[name], knots)
-        found = filtered({str(k): curve[:, k] for k in range(curve.shape[1])}, scene, rows)
-        stack = np.column_stack(list(found.values())) * np.sqrt(s.repeats) / s.noise
-        columns.append(stack)
+        k = index[s.group]
+        seen = prepared(stage.rig, stage.terms, stage.scenes[k])
+        weight = float(np.sqrt(s.repeats)) / s.noise
+        parts.append(_Part(stage.scenes[k], stage.rows[k][equation], seen, weight))
         rest.append(left[s.where])
         base.append(stage.base[s.where])
-    if not columns:
+    if not parts:
         return None
-    D, r, B = np.concatenate(columns), np.concatenate(rest), orthonormal(np.concatenate(base))
-    return D - B @ (B.T @ D), r - B @ (B.T @ r)
+    B = orthonormal(np.concatenate(base))
+    r = np.concatenate(rest)
+    return _Side(tuple(parts), r - B @ (B.T @ r), B)
 
 
-def curve_of(
-    stage: Board, left: Array, equation: str, name: str, count: int = 24
-) -> Mapping[str, Array]:
-    """Return the residual of an equation binned over a variable: `x`, `mean`, `low`, `high`."""
+def _shares(
+    rig: Rig, equation: str, first: _Side | None, second: _Side | None
+) -> dict[tuple[str, str], float]:
+    """Return the share of every curve alone, factor alone (variable ''), and product of both.
+
+    Each is fitted on either side and judged on the other; the larger counts: a curve fitted to
+    small motions says nothing of large ones, the other way round it does.
+    """
+    if first is None or second is None:
+        return {}
     joint = int(equation.rsplit("_", 1)[1]) - 1
-    x, y = [], []
-    index = {scene.group: k for k, scene in enumerate(stage.scenes)}
-    for s in stage.segments:
-        if s.equation == equation:
-            scene = stage.scenes[index[s.group]]
-            rows = stage.rows[index[s.group]][equation]
-            found = filtered({name: variables(stage.rig, scene.signals, joint)[name]}, scene, rows)
-            x.append(found[name])
-            y.append(left[s.where] * s.noise / np.sqrt(s.repeats))
-    if not x:
-        return {k: np.zeros(0) for k in ("x", "mean", "low", "high")}
-    return binned(np.concatenate(x), np.concatenate(y), count)
+    every = [*first.parts, *second.parts]
+    travel = max(float(np.ptp(p.scene.signals.s[:, joint])) for p in every)
+    values = [variables(rig, p.seen, joint) for p in every]
+    by = ["", *factors(equation)]
+    scales = [
+        {f: factor_of(f, p.seen, joint, travel) if f else np.ones(len(p.seen.t)) for f in by}
+        for p in every
+    ]
+    curves: dict[str, list[Array]] = {"": [np.ones((len(p.seen.t), 1)) for p in every]}
+    for name in values[0]:
+        moving = [v[name] for v, p in zip(values, every, strict=True) if _moves(p, joint)]
+        knots = _knots(np.concatenate(moving)) if moving else None
+        if knots is not None:
+            curves[name] = [hats(v[name], knots) for v in values]
+    count = len(first.parts)
+    out = {}
+    for name, curve in curves.items():
+        for factor in by:
+            if not name and not factor:
+                continue
+            made = [c * s[factor][:, None] for c, s in zip(curve, scales, strict=True)]
+            one, two = _columns(first, made[:count]), _columns(second, made[count:])
+            out[name, factor] = max(
+                0.0, _judged(one, first, two, second), _judged(two, second, one, first)
+            )
+    return out
 
 
-def binned(x: Array, y: Array, count: int = 24) -> dict[str, Array]:
-    """Return mean and quartiles of y in bins of equally many x."""
-    order = np.argsort(x)
-    parts = [p for p in np.array_split(order, min(count, max(1, len(x) // 5))) if len(p)]
-    return {
-        "x": np.array([x[p].mean() for p in parts]),
-        "mean": np.array([y[p].mean() for p in parts]),
-        "low": np.array([np.quantile(y[p], 0.25) for p in parts]),
-        "high": np.array([np.quantile(y[p], 0.75) for p in parts]),
-    }
+def _moves(part: _Part, joint: int) -> bool:
+    return joint + 1 not in part.scene.record.locked
+
+
+def _knots(values: Array) -> Array | None:
+    knots = np.unique(np.quantile(values, np.linspace(0.005, 0.995, KNOTS)))
+    if len(knots) < 3 or np.ptp(knots) <= 1e-9 * max(1e-300, float(np.max(np.abs(knots)))):
+        return None
+    return np.asarray(knots)
+
+
+def _columns(side: _Side, made: Sequence[Array]) -> Array:
+    """Return columns (m, k) filtered as the rows are, whitened, off the model's own."""
+    stack = []
+    for part, columns in zip(side.parts, made, strict=True):
+        named = {str(k): columns[:, k] for k in range(columns.shape[1])}
+        found = filtered(named, part.scene, part.rows)
+        stack.append(np.column_stack(list(found.values())) * part.weight)
+    D = np.concatenate(stack)
+    return np.asarray(D - side.base @ (side.base.T @ D))
+
+
+def _judged(fitted: Array, side: _Side, judging: Array, other: _Side) -> float:
+    scale = np.linalg.norm(fitted, axis=0)
+    scale[scale == 0] = 1.0
+    curve = np.linalg.lstsq(fitted / scale, side.rest, rcond=1e-2)[0] / scale
+    q = other.rest
+    before = float(q @ q) - len(q)
+    after = float(np.sum((q - judging @ curve) ** 2)) - len(q)
+    return min(1.0, (before - after) / before) if before > 0 else 0.0

@@ -65,7 +65,7 @@ def trace(
     rig = ck.common_rig([*runs, *holdout])
     _refuse_same(runs, holdout)
     rng = np.random.default_rng(seed)
-    terms = base_terms(rig, [*runs, *holdout])
+    terms = base_terms(rig, runs, holdout)
     train = scenes(rig, runs, families=tuple(families))
     judged = scenes(rig, holdout, families=tuple(families))
     stage = board(rig, terms, train)

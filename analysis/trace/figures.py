@@ -18,7 +18,7 @@ from analysis.model import Model
 from analysis.plots import BLUE, CARD, GREY, INK, MODEL, PALE, figure, gapped, note, style, svg
 from analysis.rows import Rows
 from analysis.terms.base import family_of
-from analysis.trace.clues import binned, variables
+from analysis.trace.clue_variables import variables
 from analysis.trace.evidence import Scene, filtered, prepared, residual, scene_rows, scenes
 from analysis.trace.refine import Fit
 from analysis.trace.result import Trace
@@ -161,6 +161,18 @@ def over_noise(result: Trace, key: str = "overnoise") -> Markup:
         axes.set_xlabel("held-out error over the noise floor (grey before, blue after)")
         made.tight_layout()
         return svg(made, key, "Held-out error over the noise floor, before and after")
+
+
+def binned(x: Array, y: Array, count: int = 24) -> dict[str, Array]:
+    """Return mean and quartiles of y in bins of equally many x."""
+    order = np.argsort(x)
+    parts = [p for p in np.array_split(order, min(count, max(1, len(x) // 5))) if len(p)]
+    return {
+        "x": np.array([x[p].mean() for p in parts]),
+        "mean": np.array([y[p].mean() for p in parts]),
+        "low": np.array([np.quantile(y[p], 0.25) for p in parts]),
+        "high": np.array([np.quantile(y[p], 0.75) for p in parts]),
+    }
 
 
 def unit_of_variable(rig: Rig, name: str) -> str:

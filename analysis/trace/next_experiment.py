@@ -20,7 +20,7 @@ from analysis.terms import baseline_of, known
 from analysis.terms.base import Used
 from analysis.trace import excitations as ex
 from analysis.trace.board import Board
-from analysis.trace.clues import variables
+from analysis.trace.clue_variables import variables
 from analysis.trace.discriminate import (
     Ground,
     Hypothesis,

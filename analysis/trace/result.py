@@ -65,11 +65,21 @@ class Found:
 
 @dataclass(frozen=True)
 class Dependence:
-    """A variable that what is left moves with, and the share of it that it carries held out."""
+    """A variable that what is left moves with, and the share of it that it carries held out.
+
+    Its curve may multiply another variable, `by`; `words` say so where it is more than a curve.
+    """
 
     variable: str
     share: float
     equation: str
+    by: str = ""
+    words: str = ""
+
+    @property
+    def text(self) -> str:
+        """What it moves with, in words."""
+        return self.words or self.variable
 
 
 @dataclass(frozen=True)
@@ -116,6 +126,12 @@ class Trace:
         """Return the largest of the held-out errors, `before` or `after`, over its noise floor."""
         return max(error[e] / max(self.noise_floor[e], 1e-30) for e in error)
 
+    @property
+    def moves_with(self) -> tuple[str, ...]:
+        """The variables that what is left moves with, most telling first, each once."""
+        names = [name for d in self.depends_on for name in (d.variable, d.by) if name]
+        return tuple(dict.fromkeys(names))
+
 
 def to_json(result: Trace) -> dict[str, Any]:
     """Return the contract's JSON; `refused gates size rmse noise notes sentence seconds` added."""
@@ -137,8 +153,8 @@ def to_json(result: Trace) -> dict[str, Any]:
         },
         "unexplained": {
             "fraction": finite(result.unexplained_fraction),
-            "depends_on": [d.variable for d in result.depends_on],
-            "shares": {d.variable: finite(d.share) for d in result.depends_on},
+            "depends_on": list(result.moves_with),
+            "shares": {d.text: finite(d.share) for d in result.depends_on},
         },
         "next_experiment": dict(result.next_experiment) if result.next_experiment else None,
         "noise": [

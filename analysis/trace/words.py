@@ -37,7 +37,7 @@ def sentence(result: Trace) -> str:
             text += f" What would tell: {result.next_experiment['text']}."
         return f"{text} {errors}"
     found = f"Found so far: {named}. " if named else "No effect of the catalogue is named. "
-    clue = ", ".join(d.variable for d in result.depends_on[:2])
+    clue = ", ".join(d.text for d in result.depends_on[:2])
     return (
         f"{found}{100 * result.unexplained_fraction:.0f} % of what repeats stays unexplained"
         + (f"; it moves with {clue}." if clue else ".")

@@ -76,7 +76,7 @@ def perform(case: Case) -> Outcome:
         max(f.ratio for f in found.floors), _size_error(case, found.effects),
         found.worst(found.after), float(np.max(off)) if off else math.nan,
         _mean(found.fit_before), _mean(found.fit_after),
-        tuple(d.variable for d in found.depends_on), found.notes, seconds,
+        found.moves_with, found.notes, seconds,
     )  # fmt: skip
 
 

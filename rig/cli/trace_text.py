@@ -58,7 +58,7 @@ def trace_text(result: Trace) -> str:
     if changed:
         lines += [table(["parameter", "before", "after", "change"], changed), ""]
     if result.depends_on:
-        moves = ", ".join(f"{d.variable} ({100 * d.share:.0f} %)" for d in result.depends_on[:4])
+        moves = ", ".join(f"{d.text} ({100 * d.share:.0f} %)" for d in result.depends_on[:4])
         lines.append(f"what is left moves with: {moves} (a clue, not a name)")
     if result.next_experiment:
         lines.append(f"next experiment: {result.next_experiment['text']}")

@@ -59,7 +59,7 @@ def test_a_warmer_day_is_judged_at_its_own_temperature(rig: Rig, days: tuple[Run
     terms = tuple(map(Used, baseline_of(rig)))
     train, judged = (scenes(rig, [run]) for run in days)
     found = {}
-    for label, extra in (("without", ()), ("with", beside(terms, days))):
+    for label, extra in (("without", ()), ("with", beside(terms, days[:1], days[1:]))):
         stage = board(rig, (*terms, *extra), train)
         judge = board(rig, (*terms, *extra), judged, stage.beta)
         model = held_out.settled(judge, fit(stage, stage.terms))
@@ -68,6 +68,23 @@ def test_a_warmer_day_is_judged_at_its_own_temperature(rig: Rig, days: tuple[Run
     assert found["without"].after["flow_cap_2"] > 1.3 * floor["flow_cap_2"]
     for equation, error in found["with"].after.items():
         assert error < 1.15 * floor[equation], equation
+
+
+def test_a_cold_morning_is_judged_though_the_fit_knows_warm_oil_alone(rig: Rig) -> None:
+    terms = tuple(map(Used, baseline_of(rig)))
+    warm = [day(rig, 1, 6.0), day(rig, 2, 6.2)]  # a fifth of a kelvin says nothing of the slope
+    cold = [day(rig, 3, 0.0, 0.02)]
+    every = (*terms, *beside(terms, warm, cold))
+    train, judged = (scenes(rig, runs) for runs in (warm, cold))
+    stage = board(rig, every, train)
+    judge = board(rig, every, judged, stage.beta)
+    model = held_out.settled(judge, fit(stage, stage.terms))
+    found = held_out.errors(rig, judged, model, model)
+    for equation, error in found.after.items():
+        assert error < 1.15 * found.noise[equation], equation
+    known = stripped(identify(warm, terms=every, estimator="plain").model).parameters["b"]
+    assert known.value == pytest.approx(rig.nominal["b"], rel=0.01)
+    assert known.ci95[0] < rig.nominal["b"] < known.ci95[1]
 
 
 def test_oil_can_do_only_so_much() -> None:

@@ -1,0 +1,109 @@
+"""A person asks what an unexplained residual moves with: one variable, a product, or a memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from analysis.signals import Signals
+from analysis.terms import baseline_of
+from analysis.terms.base import Used
+from analysis.trace.board import Board, board
+from analysis.trace.clue_variables import factor_of
+from analysis.trace.clues import dependence
+from analysis.trace.evidence import filtered, prepared, scenes
+from analysis.trace.result import Dependence
+from rig.model.rig import Rig
+from tests.analysis.trace.hidden import pair_of_runs
+
+Array = NDArray[np.float64]
+Force = Callable[[Signals], Array]
+
+
+@pytest.fixture(scope="module")
+def boards(rig: Rig) -> tuple[Board, Board]:
+    train, held_out = pair_of_runs(rig)
+    terms = tuple(map(Used, baseline_of(rig)))
+    stage = board(rig, terms, scenes(rig, [train]))
+    return stage, board(rig, terms, scenes(rig, [held_out]), stage.beta)
+
+
+def left(stage: Board, equation: str, force: Force, rng: np.random.Generator) -> Array:
+    """Return a whitened residual of noise, and of `force` [SI] in one equation."""
+    out = rng.normal(size=stage.base.shape[0])
+    index = {scene.group: k for k, scene in enumerate(stage.scenes)}
+    for s in stage.segments:
+        if s.equation == equation:
+            k = index[s.group]
+            scene, rows = stage.scenes[k], stage.rows[k][equation]
+            raw = force(prepared(stage.rig, stage.terms, scene))
+            found = filtered({"x": raw}, scene, rows)["x"]
+            out[s.where] += np.sqrt(s.repeats) / s.noise * found
+    return out
+
+
+def clues(boards: tuple[Board, Board], equation: str, force: Force) -> list[Dependence]:
+    rng = np.random.default_rng(3)
+    one, other = (left(b, equation, force, rng) for b in boards)
+    return dependence(boards[0], one, boards[1], other, [equation])
+
+
+def test_a_spring_that_hardens_moves_with_the_piston_alone(boards: tuple[Board, Board]) -> None:
+    best, *_ = clues(boards, "torque_2", lambda x: 4e5 * x.s[:, 1] ** 3)
+    assert (best.variable, best.by) == ("piston_2", "")
+    assert best.share > 0.5
+
+
+def test_friction_that_grows_along_the_bore_is_a_product(boards: tuple[Board, Board]) -> None:
+    best, *_ = clues(
+        boards, "torque_2", lambda x: 5.0 * (1 + 60 * x.s[:, 1]) * np.tanh(x.sd[:, 1] / 2e-3)
+    )
+    assert (best.variable, best.by) == ("piston_2", "velocity_2")
+    assert best.text == "piston_2 times the direction of velocity_2"
+    assert best.share > 0.8
+
+
+def test_a_contact_that_gives_before_it_slides_has_a_memory(boards: tuple[Board, Board]) -> None:
+    def force(x: Signals) -> Array:  # of Coulomb springs in parallel (Iwan 1966), no Dahl state
+        s = x.s[:, 1]
+        out = np.zeros(len(s))
+        for give in (1e-3, 2e-3, 3e-3):
+            held = 0.0
+            for k in range(1, len(s)):
+                held = float(np.clip(held + s[k] - s[k - 1], -give, give))
+                out[k] += 4.0 * held / give
+        return out
+
+    found = clues(boards, "torque_2", force)
+    assert found[0].variable == "velocity_2"
+    assert "memory" in found[0].text
+    # Pressures balance whatever acts: they follow the residual as well and tell nothing.
+    assert any(d.variable.startswith(("pressure", "rod", "cap")) for d in found[1:])
+
+
+def test_a_leak_past_a_worn_place_is_a_product_in_the_flow(boards: tuple[Board, Board]) -> None:
+    found = clues(
+        boards, "flow_cap_2",
+        lambda x: 3e-12 * (x.p_cap[:, 1] - x.p_rod[:, 1]) * np.exp(-((x.s[:, 1] / 8e-3) ** 2)),
+    )  # fmt: skip
+    assert (found[0].variable, found[0].by) == ("piston_2", "pressure_difference_2")
+
+
+def test_noise_alone_gives_no_clue(boards: tuple[Board, Board]) -> None:
+    assert clues(boards, "torque_2", lambda x: np.zeros(len(x.t))) == []
+
+
+def test_the_memory_of_direction_is_dahls_exponential_in_the_way_gone() -> None:
+    there, back = np.linspace(0.0, 0.05, 4001), np.linspace(0.05, 0.03, 1601)
+    s = np.concatenate((there, back[1:]))[:, None]
+    still = np.zeros_like(s)
+    signals = Signals.__new__(Signals)
+    object.__setattr__(signals, "s", s)
+    object.__setattr__(signals, "sd", still)
+    z = factor_of("memory", signals, 0, travel=0.05)  # gives over a tenth of it: 5 mm
+    way = 0.05 - s[4001:, 0]
+    assert z[4000] == pytest.approx(1.0, abs=1e-3)
+    assert z[4001:] == pytest.approx(2.0 * np.exp(-way / 0.005) - 1.0, abs=5e-3)
