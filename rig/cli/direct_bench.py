@@ -17,6 +17,7 @@ from drivers.base import DeviceInfo, OutputLaw, SampleBlock
 from hil_sim.plant import Law, Plant
 from hil_sim.scenario import Scenario
 from protocols import engine, library
+from protocols.model import Protocol
 from protocols.plan import Overrides, resolve
 from rig.model import channels as ch
 from rig.model.codes import decode_input, decode_output
@@ -137,16 +138,17 @@ class DirectBench:
 
 def simulated_run(
     rig: Rig,
-    protocol: str,
+    protocol: str | Protocol,
     seed: int,
     scenario: Scenario | None = None,
     overrides: Overrides | None = None,
 ) -> tuple[Run, dict[str, float]]:
-    """Run a protocol on a plant of this process; returns its records and the plant's truth.
+    """Run a protocol (or the one so called) on a plant of this process; returns records and truth.
 
     Raises ProtocolAborted where the plant does not do what the protocol needs.
     """
-    plan = resolve(library.load(protocol), rig, overrides or Overrides())
+    one = library.load(protocol) if isinstance(protocol, str) else protocol
+    plan = resolve(one, rig, overrides or Overrides())
     bench = DirectBench(rig, scenario or Scenario(), seed)
     engine.run(plan, rig, bench)
-    return Run(rig, tuple(bench.records), f"{protocol}, seed {seed}"), bench.plant.truth()
+    return Run(rig, tuple(bench.records), f"{one.name}, seed {seed}"), bench.plant.truth()

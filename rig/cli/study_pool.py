@@ -7,7 +7,7 @@ import multiprocessing
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -68,6 +68,8 @@ def performed(
             job = waiting[future]
             try:
                 found = future.result()
+            except BrokenExecutor:  # a RuntimeError, but of the machine and not of this job
+                raise
             except left_out as error:
                 tell(done, len(left), job, error)
                 continue

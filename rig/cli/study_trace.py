@@ -20,7 +20,7 @@ import numpy as np
 from protocols.plan import Overrides
 from rig.cli.study_pool import Kept, performed
 from rig.cli.study_trace_cases import NONE, OUTSIDE, SIZE_OF, Case
-from rig.model.rig import Rig
+from rig.model.records import Run
 
 TRAIN, JUDGE = "lock-and-excite-multisine", "validate"
 JUDGE_STEPS: Final = ("step1_1hz", "step2_3hz", "step3_1hz", "both_1hz")
@@ -49,18 +49,8 @@ class Outcome:
 def perform(case: Case) -> Outcome:
     """Take a case's records on a plant of this process and trace them."""
     from analysis.trace.engine import trace
-    from hil_sim.scenario import parse_scenario
-    from rig.cli.direct_bench import simulated_run
-    from rig.services.rigs import load_rig
 
-    rig: Rig = load_rig("shinshu-2dof")
-    scenario = parse_scenario(case.scenario, case.label)
-    train, truth = simulated_run(rig, TRAIN, case.seed, scenario)
-    judge, _ = simulated_run(rig, JUDGE, case.seed + 90_000, scenario, Overrides(steps=JUDGE_STEPS))
-    held_out = [judge]
-    if case.kind != NONE:  # whether a bench is clean is told from the training records alone
-        sizes = Overrides(seed=1000 + case.seed, amplitude_scale=0.7, repeats=2)
-        held_out.insert(0, simulated_run(rig, TRAIN, case.seed + 50_000, scenario, sizes)[0])
+    train, held_out, truth = records_of(case)
     started = time.process_time()
     found = trace([train], held_out, look_ahead=False)
     seconds = time.process_time() - started
@@ -78,6 +68,28 @@ def perform(case: Case) -> Outcome:
         _mean(found.fit_before), _mean(found.fit_after),
         found.moves_with, found.notes, seconds,
     )  # fmt: skip
+
+
+def records_of(case: Case) -> tuple[Run, list[Run], Mapping[str, float]]:
+    """Return a case's training records, its held-out ones, and the true parameters."""
+    from hil_sim.scenario import parse_scenario
+    from rig.cli import study_machines as machines
+    from rig.cli.direct_bench import simulated_run
+    from rig.services.rigs import load_rig
+
+    if case.machine:
+        rig = machines.machine(case.seed)
+        scenario = machines.scenario_of(rig, case.seed, case.noise)
+        return machines.records_of(rig, scenario, case.seed)
+    rig = load_rig("shinshu-2dof")
+    scenario = parse_scenario(case.scenario, case.label)
+    train, truth = simulated_run(rig, TRAIN, case.seed, scenario)
+    judge, _ = simulated_run(rig, JUDGE, case.seed + 90_000, scenario, Overrides(steps=JUDGE_STEPS))
+    held_out = [judge]
+    if case.kind != NONE:  # whether a bench is clean is told from the training records alone
+        sizes = Overrides(seed=1000 + case.seed, amplitude_scale=0.7, repeats=2)
+        held_out.insert(0, simulated_run(rig, TRAIN, case.seed + 50_000, scenario, sizes)[0])
+    return train, held_out, truth
 
 
 def _mean(values: Mapping[str, float]) -> float:

@@ -78,7 +78,10 @@ SIZE_OF: Final[Mapping[str, tuple[str, float]]] = {
 
 @dataclass(frozen=True)
 class Case:
-    """One experiment: scenario text, its kind, the right names and places, the seed."""
+    """One experiment: scenario text, its kind, the right names and places, the seed.
+
+    With `machine` the bench and what it hides are drawn by the seed (`study_machines`).
+    """
 
     kind: str
     label: str
@@ -88,6 +91,7 @@ class Case:
     sizes: tuple[float, ...] = ()
     moves: str = ""
     noise: float = 1.0
+    machine: bool = False
 
 
 def place_of(where: str) -> str:

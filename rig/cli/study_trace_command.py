@@ -28,6 +28,9 @@ def trace(
     outside: Annotated[
         int, typer.Option(min=0, help="Benches with what the catalogue does not have.")
     ] = 12,
+    machines: Annotated[
+        int, typer.Option(min=0, help="Other machines, each with something drawn or nothing.")
+    ] = 40,
     seed: Annotated[int, typer.Option(min=0, help="First seed; below 100 is for tuning.")] = 100,
     only: Annotated[str, typer.Option(help="Only these effects alone, by name.")] = "",
     level: Annotated[
@@ -43,6 +46,7 @@ def trace(
     Example: bramah study trace --quick
     """
     from rig.cli.pages import replace_section
+    from rig.cli.study_machines import cases_of
     from rig.cli.study_trace import all_of
     from rig.cli.study_trace_cases import NONE, OUTSIDE, PAIR, SINGLE, cases
     from rig.cli.study_trace_text import as_json, text
@@ -50,12 +54,14 @@ def trace(
     names = tuple(only.split())
     counts = {NONE: clean, SINGLE: single, PAIR: pairs, OUTSIDE: outside}
     if quick:
-        counts = {NONE: 4, SINGLE: 1, PAIR: 1, OUTSIDE: 2}
+        counts, machines = {NONE: 4, SINGLE: 1, PAIR: 1, OUTSIDE: 2}, 2
         names = names or ("coulomb_friction", "internal_leakage", "valve_deadband", "torque_offset")
-    outcomes = list(all_of(cases(counts, seed, names, level), workers, progress, keep))
+    work = [*cases(counts, seed, names, level), *cases_of(machines, seed)]
+    outcomes = list(all_of(work, workers, progress, keep))
     write_json(json, as_json(outcomes))
     if docs is not None:
-        asked = {"--clean": clean, "--single": single, "--pairs": pairs, "--outside": outside}
+        asked = {"--clean": clean, "--single": single, "--pairs": pairs, "--outside": outside,
+                 "--machines": machines}  # fmt: skip
         made = command_of(asked, seed, docs, quick, only, level)
         replace_section(docs, "study trace", in_section(made, f"```\n{text(outcomes)}\n```"))
     if json != Path("-"):

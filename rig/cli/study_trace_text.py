@@ -37,10 +37,11 @@ def text(outcomes: Sequence[Outcome]) -> str:
 
 def _counts(outcomes: Sequence[Outcome]) -> str:
     rows = []
-    for kind in (NONE, SINGLE, PAIR, OUTSIDE):
-        here = [o for o in outcomes if o.case.kind == kind]
+    for other, kind in itertools.product((False, True), (NONE, SINGLE, PAIR, OUTSIDE)):
+        here = [o for o in outcomes if (o.case.machine, o.case.kind) == (other, kind)]
         loud = [o for o in here if o.loudness >= LOUD]
-        for label, part in ((kind, here), (f"{kind}, loud", loud)):
+        name = f"other machines, {kind}" if other else kind
+        for label, part in ((name, here), (f"{name}, loud", loud)):
             if not part or (kind == NONE and part is loud):
                 continue
             count = Counter(right(o) for o in part)

@@ -11,6 +11,7 @@ import pytest
 
 from hil_sim.scenario import parse_scenario
 from rig.cli import study_trace as st
+from rig.cli.study_machines import cases_of, machine, scenario_of
 from rig.cli.study_trace_cases import NONE, OUTSIDE, PAIR, SINGLE, SINGLES, Case, cases
 from rig.cli.study_trace_command import command_of
 from rig.cli.study_trace_text import text
@@ -96,3 +97,26 @@ def test_the_command_beside_the_tables_is_the_one_that_makes_them_again() -> Non
     )
     few = command_of({"--clean": 0}, 100, page, only="joint_spring backlash")
     assert "--clean 0 --seed 100 --only 'joint_spring backlash' --docs" in few
+
+
+def test_a_machine_of_the_study_is_drawn_by_its_seed_and_can_be_built() -> None:
+    for seed in range(6):
+        rig = machine(seed)
+        assert rig == machine(seed)
+        # What was scaled is a rig that a file could describe: every check of the reader holds.
+        assert type(rig).model_validate(rig.model_dump()) == rig
+        truth = scenario_of(rig, seed, 1.0).parameters
+        assert set(truth) == set(rig.nominal)
+        apart = [truth[n] / rig.nominal[n] for n in truth]
+        assert 0.8 < min(apart) < max(apart) < 1.25
+
+
+def test_what_a_machine_hides_is_judged_by_name_place_and_size() -> None:
+    cases = cases_of(40, 100)
+    assert {c.kind for c in cases} == {NONE, SINGLE, PAIR, OUTSIDE}
+    for case in cases:
+        assert case.machine
+        assert len(case.truth) == {NONE: 0, SINGLE: 1, PAIR: 2, OUTSIDE: 0}[case.kind]
+        assert len(case.sizes) == len(case.truth)
+        assert ("payload", "bench") not in case.truth  # mass of the last link to any record
+        assert bool(case.moves) == (case.kind == OUTSIDE)
