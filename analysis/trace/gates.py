@@ -34,6 +34,7 @@ P_LIMIT = 0.01
 TIE = 1.10  # held-out rms of a rival over the best's: below, the data do not tell them apart
 TIE_TRAINING = 1.25
 HARM = 1.2  # energy above noise in an equation over that before: a cause does not make it worse
+HELD_FORM, HELD_QUIET = 0.05, 1.2  # share that may stay where the held-out error is this small
 HELD_BAND = 1.5  # held-out rms after over the noise floor, per equation
 SHOWN = 4  # rivals in a result
 
@@ -94,31 +95,44 @@ def explained(listed: Shortlist, winner: Listed, held: Board) -> bool:
 
 
 def remaining(listed: Shortlist, winner: Listed, held: Board) -> list[str]:
-    """Say which equations keep more than the noise floor's band, on which records."""
-    out = [
-        f"{e}: {100 * left / max(listed.empty.excess[e], 1e-30):.2g} % of what repeated stays, "
-        f"{left / listed.limits.band[e]:.2g} times the band"
-        for e, left in winner.excess.items()
-        if not listed.negligible(e, left)
-    ]
+    """Say which equations keep more than the noise floor's band, on which records.
+
+    What a catalogue's simpler form leaves in the training records may be somewhat more where the
+    held-out error of that equation is the noise's.
+    """
     after = held_left(held, winner.fit)
     start = excess_of(held, held_left(held, listed.empty.fit))
     now = excess_of(held, after)
+    ratio = _held_ratio(held, after)
+    out = []
+    for e, left in winner.excess.items():
+        share = left / max(listed.empty.excess[e], 1e-30)
+        quiet = share <= HELD_FORM and ratio.get(e, np.inf) <= HELD_QUIET
+        if not (quiet or listed.negligible(e, left)):
+            times = left / listed.limits.band[e]
+            out.append(
+                f"{e}: {100 * share:.2g} % of what repeated stays, {times:.2g} times the band"
+            )
+    out += [
+        f"{e}: held-out error {r:.2f} times the noise floor"
+        for e, r in ratio.items()
+        if r > HELD_BAND and now[e] > 2 * FORM * start[e]
+    ]
+    return out
+
+
+def _held_ratio(held: Board, left: Array) -> dict[str, float]:
+    """Return the held-out error of single records over the noise floor, by equation."""
     floor: dict[str, float] = {}
     energy: dict[str, float] = {}
     for s in held.segments:
         count = (s.where.stop - s.where.start) * s.repeats
         floor[s.equation] = floor.get(s.equation, 0.0) + count * s.noise**2
         # Averaging has taken noise out: put back what a single record would show.
-        part = after[s.where]
+        part = left[s.where]
         found = float(part @ part) + count * (1 - 1 / s.repeats)
         energy[s.equation] = energy.get(s.equation, 0.0) + found * s.noise**2
-    out += [
-        f"{e}: held-out error {np.sqrt(energy[e] / floor[e]):.2f} times the noise floor"
-        for e in floor
-        if energy[e] > HELD_BAND**2 * floor[e] and now[e] > 2 * FORM * start[e]
-    ]
-    return out
+    return {e: float(np.sqrt(energy[e] / floor[e])) for e in floor}
 
 
 def _noise_like(stage: Board, left: Array) -> Array:
