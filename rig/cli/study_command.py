@@ -10,13 +10,7 @@ import typer
 from rig.cli.bench_commands import JsonOption
 from rig.cli.output import progress, write_json
 
-studies = typer.Typer(
-    name="study",
-    help="Measure the method itself: coverage of intervals, estimators under noise, filters.\n\n"
-    "Example: bramah study coverage --experiments 200",
-    no_args_is_help=True,
-    rich_markup_mode=None,
-)
+studies = typer.Typer(name="study", rich_markup_mode=None)
 WorkersOption = Annotated[int, typer.Option(min=1, help="Processes at once.")]
 FirstSeed = Annotated[
     int, typer.Option("--first-seed", min=0, help="Those below 100 served to find errors.")

@@ -81,6 +81,31 @@ def command_of(
     return shlex.join([*words, "--docs", str(docs)])
 
 
+def study(
+    context: typer.Context,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="The trace's study in short: a few cases of each kind.")
+    ] = False,
+    seed: Annotated[int, typer.Option(min=0, help="First seed of --quick.")] = 100,
+    workers: WorkersOption = 2,
+    json: JsonOption = None,
+) -> None:
+    """Measure the method itself: the trace's answers, coverage of intervals, estimators, filters.
+
+    Example: bramah study --quick
+    """
+    from rig.model.parse import InputError
+
+    if context.invoked_subcommand is not None:
+        if quick:
+            raise InputError("--quick stands for a study of its own: leave the other one away")
+    elif quick:
+        trace(quick=True, seed=seed, workers=workers, json=json)
+    else:
+        typer.echo(context.get_help())
+
+
 def register(app: typer.Typer) -> None:
-    """Add this verb to the studies."""
+    """Add this verb to the studies, and `study --quick`, which is it in short."""
     studies.command()(trace)
+    studies.callback(invoke_without_command=True)(study)

@@ -87,3 +87,13 @@ def test_the_verbs_tell_how_they_are_used() -> None:
     wrong = bramah("study", "coverage", "--kind", "moon")
     assert wrong.returncode == 2
     assert "expected model, plant or both" in wrong.stderr
+
+
+def test_quick_is_a_study_of_its_own_and_without_a_word_study_tells_what_there_is() -> None:
+    shown = bramah("study")
+    assert shown.returncode == 0
+    assert "--quick" in shown.stdout
+    assert "coverage" in shown.stdout
+    wrong = bramah("study", "--quick", "coverage")
+    assert wrong.returncode == 2
+    assert "leave the other one away" in wrong.stderr
