@@ -11,6 +11,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from drivers.modbus_tcp import ModbusTcpDriver
+from rig.cli.running import wire_at
+from rig.services.rigs import load_rig
+
 START = "from rig.cli.main import run; run()"
 LONG = 120.0  # [s] nothing here takes it; a hang ends in an error that says so
 
@@ -86,3 +90,16 @@ def wait_for(what: str, process: subprocess.Popen[str], seen: Sequence[str] = ()
         assert time.monotonic() < deadline, lines
         lines.append(line)
     return lines
+
+
+def outputs_are_zero(endpoint: str, rig_name: str = "shinshu-2dof") -> bool:
+    """Ask the device itself, over a connection of one's own."""
+    rig = load_rig(rig_name)
+    driver = ModbusTcpDriver(wire_at(endpoint, rig.wire), rig)
+    try:
+        driver.connect()
+        driver.start()
+        commands = driver.read_block().data[:, -len(rig.joints) :]
+        return bool((commands == 0.0).all())
+    finally:
+        driver.close()

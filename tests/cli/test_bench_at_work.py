@@ -10,11 +10,17 @@ from pathlib import Path
 
 import pytest
 
-from drivers.modbus_tcp import ModbusTcpDriver
-from rig.cli.running import wire_at
-from rig.services.rigs import load_rig
 from rig.services.store import load_run
-from tests.cli.bench import ENDLESS, LONG, SHORT, bramah, simulated, started, wait_for
+from tests.cli.bench import (
+    ENDLESS,
+    LONG,
+    SHORT,
+    bramah,
+    outputs_are_zero,
+    simulated,
+    started,
+    wait_for,
+)
 
 RIG = "shinshu-2dof"
 
@@ -31,19 +37,6 @@ def endless(tmp_path: Path) -> Path:
     path = tmp_path / "endless.yaml"
     path.write_text(ENDLESS)
     return path
-
-
-def outputs_are_zero(endpoint: str) -> bool:
-    """Ask the device itself, over a connection of one's own."""
-    rig = load_rig(RIG)
-    driver = ModbusTcpDriver(wire_at(endpoint, rig.wire), rig)
-    try:
-        driver.connect()
-        driver.start()
-        commands = driver.read_block().data[:, -len(rig.joints) :]
-        return bool((commands == 0.0).all())
-    finally:
-        driver.close()
 
 
 def test_a_protocol_is_checked_run_listed_and_identified(short: Path, tmp_path: Path) -> None:
