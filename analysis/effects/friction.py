@@ -46,6 +46,7 @@ FASTEST: Final = 3e3  # [1/s] relaxation in simulation; faster changes nothing t
 # On the measured positioning system 0.01 mm/s and 0.1 mm/s give the same parameters to 0.4 %,
 # 1 mm/s does not (2 %).
 TRANSITION: Final = 1e-4
+LEAST_LEVEL: Final = 1e-6  # of the breakaway, where it has long vanished: no division by zero
 
 
 @dataclass(frozen=True)
@@ -152,10 +153,12 @@ class CoulombFriction(Friction):
 
 @dataclass(frozen=True)
 class StribeckFriction(Friction):
-    """F_f = Fs exp(-(s'/vs)^2) z: breakaway above Coulomb's level (Armstrong-Helouvry et al. 1994).
+    """F_f = Fs w: breakaway above Coulomb's level (Armstrong-Helouvry et al. 1994).
 
-    Falls off over the Stribeck speed vs (shape). Alone it is the part that vanishes with speed;
-    with `coulomb_friction` beside it it is the whole Stribeck curve.
+    The level e = exp(-(s'/vs)^2) falls off over the Stribeck speed vs (shape); w builds up to it
+    at a contact stiffness that does not depend on it (Dahl 1968): dw/ds = (sign(s') - w / e) / d.
+    Alone it is the part that vanishes with speed; with `coulomb_friction` beside it it is the whole
+    Stribeck curve.
     """
 
     name: ClassVar[str] = "stribeck_friction"
@@ -187,10 +190,15 @@ class StribeckFriction(Friction):
         return (own, *super().shapes(rig))
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
-        """Return G exp(-(s'/vs)^2) z."""
+        """Return G w."""
         ratio = signals.sd[:, self.joint] / self.shape_of(rig, shape)[0]
-        level = signals.G[:, self.joint] * np.exp(-(ratio**2))
-        return self.row({f"Fs{self.joint + 1}": level * self.contact(rig, signals, shape)})
+        level = np.exp(-(ratio**2))
+        if len(shape):
+            s = np.ascontiguousarray(signals.s[:, self.joint])
+            w = contact_under_load(s, level, 1.0 / shape[-1])
+        else:
+            w = level * self.contact(rig, signals, ())
+        return self.row({f"Fs{self.joint + 1}": signals.G[:, self.joint] * w})
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Refuse a breakaway below Coulomb's level, too much of it, and a speed at its bounds."""
@@ -208,6 +216,22 @@ def contact_state(s, distance):  # type: ignore[no-untyped-def]
         side = 1.0 if step > 0.0 else -1.0
         z[k] = side + (z[k - 1] - side) * math.exp(-abs(step) / distance)
     return z
+
+
+@njit(cache=True, error_model="numpy")
+def contact_under_load(s, levels, stiffness):  # type: ignore[no-untyped-def]
+    """Return the force w (n,) of a contact along the path s (n,) [m], exact over every step.
+
+    Its level (n,) changes, its stiffness [unit of level / m] does not:
+    dw/ds = stiffness (sign(s') - w / level) (Dahl 1968).
+    """
+    w = np.zeros(len(s))
+    for k in range(1, len(s)):
+        step = s[k] - s[k - 1]
+        level = levels[k] if step > 0.0 else -levels[k]
+        keep = math.exp(-abs(step) * stiffness / levels[k]) if levels[k] > 0.0 else 0.0
+        w[k] = level + (w[k - 1] - level) * keep
+    return w
 
 
 @njit(cache=True, error_model="numpy")
@@ -229,11 +253,17 @@ def _coulomb(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-de
 
 @kernel
 def _stribeck(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    # The hidden state is w times d [m].
     if phase == CONTRIBUTE:
         i = int(par[0])
-        state, dz[0] = slide(x[SD, i], z[0], par[3])
-        ratio = x[SD, i] / par[2]
-        out[TORQUE, i] -= par[1] * math.exp(-ratio * ratio) * x[G, i] * state
+        v, distance = x[SD, i], par[3]
+        level = max(math.exp(-((v / par[2]) ** 2)), LEAST_LEVEL)
+        if distance <= 0.0:
+            out[TORQUE, i] -= par[1] * level * x[G, i] * math.tanh(v / TRANSITION)
+            return
+        relax = abs(v) / (distance * level)
+        dz[0] = (v - relax * z[0]) / (1.0 + relax / FASTEST)
+        out[TORQUE, i] -= par[1] * x[G, i] * z[0] / distance
 
 
 TERMS = (CoulombFriction, StribeckFriction)

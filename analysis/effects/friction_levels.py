@@ -18,6 +18,7 @@ from analysis.effects.friction import (
     FASTEST,
     TRANSITION,
     Friction,
+    contact_under_load,
     force_limit,
     force_unit,
     presliding,
@@ -181,18 +182,6 @@ def contact_levels(s, extending, retracting):  # type: ignore[no-untyped-def]
             keep = math.exp(step / retracting)
             a[k], r[k] = a[k - 1] * keep, 1.0 + (r[k - 1] - 1.0) * keep
     return a, r
-
-
-@njit(cache=True, error_model="numpy")
-def contact_under_load(s, load, stiffness):  # type: ignore[no-untyped-def]
-    """Return w (n,) [Pa] along the path s (n,) [m] under a load (n,) [Pa], exact per step."""
-    w = np.zeros(len(s))
-    for k in range(1, len(s)):
-        step = s[k] - s[k - 1]
-        level = load[k] if step > 0.0 else -load[k]
-        keep = math.exp(-abs(step) * stiffness / load[k]) if load[k] > 0.0 else 0.0
-        w[k] = level + (w[k - 1] - level) * keep
-    return w
 
 
 @kernel

@@ -137,7 +137,9 @@ NOISE: Final = (1.0, 0.5, 1.0, 2.0)  # times the rig's stated sensor noise, in t
 def cases(
     counts: Mapping[str, int], seed: int, only: Sequence[str] = (), level: int | None = None
 ) -> list[Case]:
-    """Return `counts[kind]` cases of each kind (of single: of each effect), seeds on from `seed`.
+    """Return `counts[kind]` cases of each kind (of single: of each effect).
+
+    The seeds of each kind go on from `seed`, so that more of one kind leave the others as they are.
 
     Places and partners are drawn by `seed`, sizes and noise go in turn. Raises InputError for a
     kind that does not exist.
@@ -157,7 +159,7 @@ def cases(
             scenario = f"effects: [{text}]\nnoise: {noise:g}"
             truth = tuple(key for _, key, _ in members)
             sizes = tuple(size for *_, size in members)
-            out.append(Case(kind, label, scenario, truth, seed + len(out), sizes, moves, noise))
+            out.append(Case(kind, label, scenario, truth, seed + k, sizes, moves, noise))
     return out
 
 

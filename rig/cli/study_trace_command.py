@@ -56,7 +56,8 @@ def trace(
     if quick:
         counts, machines = {NONE: 4, SINGLE: 1, PAIR: 1, OUTSIDE: 2}, 2
         names = names or ("coulomb_friction", "internal_leakage", "valve_deadband", "torque_offset")
-    work = [*cases(counts, seed, names, level), *cases_of(machines, seed)]
+    # Those that take long first: the last to end are then short ones.
+    work = [*cases_of(machines, seed), *cases(counts, seed, names, level)[::-1]]
     outcomes = list(all_of(work, workers, progress, keep))
     write_json(json, as_json(outcomes))
     if docs is not None:

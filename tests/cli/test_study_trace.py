@@ -62,7 +62,11 @@ def test_every_case_is_a_scenario_that_the_bench_reads_and_seeds_draw_it_again()
     drawn = cases(counts, 100)
     assert drawn == cases(counts, 100)
     assert drawn != cases(counts, 200)
-    assert [c.seed for c in drawn] == list(range(100, 100 + len(drawn)))
+    for kind in counts:
+        seeds = [c.seed for c in drawn if c.kind == kind]
+        assert seeds == list(range(100, 100 + len(seeds)))
+    # More of one kind leaves the others as they are: a study can be enlarged.
+    assert {c.label for c in drawn} <= {c.label for c in cases({**counts, NONE: 9}, 100)}
     assert len(drawn) == 2 + 3 * len(SINGLES) + 4 + 4
     for case in drawn:
         scenario = parse_scenario(case.scenario, case.label)

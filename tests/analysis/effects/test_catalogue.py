@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from analysis.effects.base import Effect, ordered
-from analysis.effects.friction import contact_state
-from analysis.effects.friction_levels import contact_levels, contact_under_load
+from analysis.effects.friction import contact_state, contact_under_load
+from analysis.effects.friction_levels import contact_levels
 from analysis.effects.measurement import Sensor
 from analysis.effects.payload import growth, payload_of_shift
 from analysis.effects_catalogue import FAMILIES, pages
@@ -116,6 +116,9 @@ def hidden_state(e: Effect, rig: Rig, signals: Signals, shape: tuple[float, ...]
         load = signals.p_cap[:, e.joint] + signals.p_rod[:, e.joint]
         stiffness = rig.supply.pressure / shape[-1]
         return np.asarray(contact_under_load(s, load, stiffness) / stiffness)
+    if e.name == "stribeck_friction":
+        level = np.exp(-((signals.sd[:, e.joint] / shape[0]) ** 2))
+        return np.asarray(contact_under_load(s, level, 1.0 / shape[-1]) * shape[-1])
     if e.family == "friction":
         return np.asarray(shape[-1] * contact_state(s, shape[-1]))
     if e.name == "spool_lag":
