@@ -52,9 +52,6 @@ def loop(
 
     Example: bramah loop --rig shinshu-2dof --out loops/monday --unattended
     """
-    from protocols.plan import Overrides
-    from rig.cli.looping import Loop, Wanted, refuse_taken
-    from rig.cli.simulated import simulated_bench
     from rig.model.parse import InputError
 
     if simulate and endpoint is not None:
@@ -66,6 +63,11 @@ def loop(
             "loop asks before each experiment that it designs; give --unattended where nobody "
             "can answer"
         )
+    # What loads the analysis comes after what can be refused without it.
+    from protocols.plan import Overrides
+    from rig.cli.looping import Loop, Wanted, refuse_taken
+    from rig.cli.simulated import simulated_bench
+
     refuse_taken(out)
     with ExitStack() as stack:
         if simulate:

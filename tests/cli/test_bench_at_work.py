@@ -9,7 +9,9 @@ import socket
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
+from rig.cli.main import app
 from rig.services.store import load_run
 from tests.cli.bench import (
     ENDLESS,
@@ -204,6 +206,6 @@ def test_every_verb_explains_itself_with_an_example() -> None:
     verbs = [line.split()[0] for line in top.stdout.split("Commands:")[1].splitlines() if line]
     assert {"demo", "sim", "check", "run", "monitor", "runs", "recover", "import"} <= set(verbs)
     for verb in verbs:
-        shown = bramah(verb, "--help")
-        assert shown.returncode == 0
+        shown = CliRunner().invoke(app, [verb, "--help"])
+        assert shown.exit_code == 0
         assert f"Example: bramah {verb}" in " ".join(shown.stdout.split())
