@@ -97,8 +97,9 @@ def _by_temperature(done: Reproduction) -> str:
     slope = 100.0 * float(np.polyfit(t, b, 1)[0]) / float(b.mean())
     return (
         f"The oil was at {', '.join(f'{x:.1f}' for x in t)} °C in these steps: b moves by "
-        f"{slope:+.2f} % a kelvin, so that each step's value may be right for its own oil. None "
-        "of the methods models that; the coupled one gives the one value that fits all rows best. "
+        f"{slope:+.2f} % a kelvin, so that each step's value may be right for its own oil. E1 "
+        "and E2 do not model that; the coupled solution does beside its parameters, and its b is "
+        "that of the rig's nominal temperature. "
     )
 
 
