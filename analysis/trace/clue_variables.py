@@ -33,7 +33,7 @@ def factors(equation: str) -> dict[str, Factor]:
     if kind == "torque":
         return {
             "direction": Factor(velocity, f"the direction of {velocity}"),
-            "memory": Factor(velocity, f"the direction of {velocity}, with memory"),
+            "memory": Factor(velocity, f"the direction of {velocity} with memory"),
             "velocity": Factor(velocity, velocity),
         }
     difference, spool = f"pressure_difference_{number}", ch.channel(ch.SPOOL, int(number))
