@@ -20,7 +20,8 @@ def bench(
         int, typer.Option(min=1, help="Simulated benches to identify, from seed 100 on.")
     ] = 10,
     only: Annotated[
-        str | None, typer.Option(help="One of: plant, analysis, stream, demo, acquisition.")
+        str | None,
+        typer.Option(help="One of: plant, analysis, stream, demo, acquisition, measured."),
     ] = None,
     docs: Annotated[Path | None, typer.Option(help="Also write the table as a page.")] = None,
 ) -> None:
