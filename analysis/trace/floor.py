@@ -5,6 +5,10 @@ With n repeats r_k(t) of one excitation,
 A record that is the only repeat of its step is cut into its periods, which repeat one another as
 records do. Where there is neither, the rig's stated sensor noise, put through the same rows,
 stands in: that sees no noise that the rig file does not state, and is said to be weaker.
+
+The floor lies no lower than `LEAST` of the stated noise: with sensors so much better than their
+data sheet (or simulated without noise) repeats tell apart what no bench would ask about, and a
+clean one would never be clean.
 """
 
 from __future__ import annotations
@@ -26,6 +30,7 @@ Array = NDArray[np.float64]
 
 REPEATS, PERIODS, STATED = "repeats", "periods", "stated noise"
 Group = tuple[int, str]
+LEAST = 0.2  # of the noise that the rig file states
 
 
 @dataclass(frozen=True)
@@ -70,7 +75,7 @@ def floors(
         groups.setdefault(scene.group, []).append(index)
     out = []
     for group, indices in groups.items():
-        stated: dict[str, float] | None = None
+        stated = stated_noise(rig, terms, members[indices[0]], rows[indices[0]], beta)
         for equation in rows[indices[0]]:
             parts = [rows[i][equation] for i in indices if equation in rows[i]]
             left = [residual(r, beta) for r in parts]
@@ -78,10 +83,9 @@ def floors(
             table, source = repeats_of(members[indices[0]], parts, left)
             if table is not None:
                 noise, repeatable = split(table)
+                noise = max(noise, LEAST * stated[equation])
                 out.append(Floor(group, equation, noise, repeatable, total, len(table), source))
                 continue
-            if stated is None:
-                stated = stated_noise(rig, terms, members[indices[0]], rows[indices[0]], beta)
             noise = stated[equation]
             rest = float(np.sqrt(max(0.0, total**2 - noise**2)))
             out.append(Floor(group, equation, noise, rest, total, 1, STATED))

@@ -1,0 +1,41 @@
+"""The noise floor is what repeats do not share, but no lower than a data sheet has a meaning."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from analysis.synthetic import multisine, synthetic_run
+from analysis.terms import baseline_of
+from analysis.terms.base import Used
+from analysis.trace.board import board
+from analysis.trace.evidence import scenes
+from analysis.trace.floor import LEAST, stated_noise
+from rig.model.rig import Rig
+
+
+def floor_over_stated(rig: Rig, noise: float) -> dict[str, float]:
+    """Return each equation's floor over the stated noise, with sensors of `noise` times it."""
+    wave = multisine(np.random.default_rng(1), rig.sample_rate, 4.0, 9.5)
+    run = synthetic_run(rig, np.random.default_rng(2), wave, rms=0.025, repeats=4, noise=noise)
+    stage = board(rig, tuple(map(Used, baseline_of(rig))), scenes(rig, [run]))
+    found = {(f.group, f.equation): f.noise for f in stage.floors}
+    out: dict[str, float] = {}
+    for scene, rows in zip(stage.scenes, stage.rows, strict=True):
+        if scene.record.repeat == 1:
+            stated = stated_noise(rig, stage.terms, scene, rows, stage.beta)
+            for e in rows:
+                out[f"{scene.group[1]} {e}"] = found[scene.group, e] / stated[e]
+    return out
+
+
+def test_sensors_as_stated_give_the_floor_that_their_data_sheet_says(rig: Rig) -> None:
+    for name, ratio in floor_over_stated(rig, 1.0).items():
+        assert 0.7 < ratio < 1.4, name  # a few hundred filtered rows know it to some tenths
+
+
+def test_sensors_far_better_than_stated_do_not_make_a_floor_of_nothing(rig: Rig) -> None:
+    ratios = floor_over_stated(rig, 0.0)
+    assert ratios
+    for name, ratio in ratios.items():
+        assert ratio == pytest.approx(LEAST, rel=1e-6), name
