@@ -68,7 +68,8 @@ def _confusion(outcomes: Sequence[Outcome]) -> str:
     for o in outcomes:
         if len(o.case.truth) > 1:
             continue
-        hidden = o.case.truth[0][0] if o.case.truth else o.case.label
+        # A machine's label begins with its name; what is left of it is what it hides.
+        hidden = o.case.truth[0][0] if o.case.truth else o.case.label.rpartition(": ")[2] or NONE
         named = " + ".join(sorted({n for n, _ in o.named})) or o.verdict
         if o.verdict == "unexplained" and o.named:
             named += " (and more)"
