@@ -27,7 +27,7 @@ T = TypeVar("T")
 U = TypeVar("U")
 Reads = Callable[[T], str]
 
-AHEAD = 2  # items handed out per worker beyond the one waited for
+AHEAD = 8  # items handed out per worker beyond the one waited for: one that lags stops no other
 # Every library that multiplies matrices reads one of these when it is loaded.
 ONE_THREAD = dict.fromkeys(
     ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1"
