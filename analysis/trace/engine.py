@@ -171,20 +171,23 @@ def _named(
     """Put the winner through the gates; returns what stands, the set that stands, the verdict."""
     if not winner.effects:
         return (), winner, UNEXPLAINED
-    found = gates.judge(listed, winner, judge, rng)
-    tied = any(r.tied for f in found for r in f.rivals)
-    keep = [f for f in found if gates.stands(f)]
-    if len(keep) < len(found):
-        kept = {(f.name, f.where) for f in keep}
-        smaller = tuple(u for u in winner.effects if (u.term.name, u.term.where) in kept)
-        refused = tuple(f for f in found if f not in keep)
+    refused: tuple[Found, ...] = ()
+    # What stands beside others may fall without them: judged again until all that is left stands.
+    while True:
+        found = gates.judge(listed, winner, judge, rng)
+        fallen = tuple(f for f in found if not gates.stands(f))
+        if not fallen:
+            break
+        refused += fallen
+        smaller = [u for u, f in zip(winner.effects, found, strict=True) if gates.stands(f)]
         if not smaller:
             return refused, listed.empty, UNEXPLAINED
         winner = listed.exact(smaller)
-        found = gates.judge(listed, winner, judge, rng)
+    if refused:
         return (*found, *refused), winner, UNEXPLAINED
     if not gates.explained(listed, winner, judge):
         return found, winner, UNEXPLAINED
+    tied = any(r.tied for f in found for r in f.rivals)
     return found, winner, CONFOUNDED if tied else EXPLAINED
 
 

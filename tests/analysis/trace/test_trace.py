@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from analysis.effects.base import Effect
 from analysis.identify import identify
 from analysis.model import load_model, save_model
 from analysis.trace.engine import trace
@@ -106,6 +107,9 @@ def test_what_the_catalogue_lacks_stays_unexplained_and_its_variable_is_told(
     assert result.verdict == "unexplained"
     assert result.unexplained_fraction > 0.05
     assert "piston_2" in [d.variable for d in result.depends_on[:2]]
+    # What was refused is in no model that leaves the house.
+    kept = [u.term.name for u in result.model_after.terms if isinstance(u.term, Effect)]
+    assert kept == [e.name for e in result.effects]
 
 
 def test_one_repeat_says_what_it_costs(rig: Rig) -> None:
