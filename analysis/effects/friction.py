@@ -256,14 +256,10 @@ def _stribeck(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-d
     # The hidden state is w times d [m].
     if phase == CONTRIBUTE:
         i = int(par[0])
-        v, distance = x[SD, i], par[3]
-        level = max(math.exp(-((v / par[2]) ** 2)), LEAST_LEVEL)
-        if distance <= 0.0:
-            out[TORQUE, i] -= par[1] * level * x[G, i] * math.tanh(v / TRANSITION)
-            return
-        relax = abs(v) / (distance * level)
-        dz[0] = (v - relax * z[0]) / (1.0 + relax / FASTEST)
-        out[TORQUE, i] -= par[1] * x[G, i] * z[0] / distance
+        level = max(math.exp(-((x[SD, i] / par[2]) ** 2)), LEAST_LEVEL)
+        # At a constant stiffness the distance goes with the level.
+        state, dz[0] = slide(x[SD, i], z[0], par[3] * level)
+        out[TORQUE, i] -= par[1] * level * x[G, i] * state
 
 
 TERMS = (CoulombFriction, StribeckFriction)

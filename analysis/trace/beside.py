@@ -48,18 +48,17 @@ def beside(
     if "compressibility" not in {used.term.name for used in terms}:
         return ()
     train, judge = (_temperatures(x) for x in (runs, holdout))
-    every = [*train, *judge]
-    if not train or None in every or np.ptp(known := [t for t in every if t is not None]) < LEAST:
+    if not train or not np.ptp([*train, *judge]) >= LEAST:  # nor where one was not measured
         return ()
-    return (Used(BulkTemperature(reference=float(np.mean(known[: len(train)])))),)
+    return (Used(BulkTemperature(reference=float(np.mean(train)))),)
 
 
-def _temperatures(runs: Sequence[Run]) -> list[float | None]:
-    """Return each record's mean oil temperature [degC], None where it was not measured."""
+def _temperatures(runs: Sequence[Run]) -> list[float]:
+    """Return each record's mean oil temperature [degC], NaN where it was not measured."""
     return [
         float(np.nanmean(np.asarray(r.channels[ch.TEMPERATURE])))
         if ch.TEMPERATURE in r.channels
-        else None
+        else np.nan
         for run in runs
         for r in run.records
     ]

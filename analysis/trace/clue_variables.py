@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from analysis.effects.friction import contact_state
 from analysis.signals import Signals
 from rig.model import channels as ch
 from rig.model.rig import Rig
@@ -27,43 +27,27 @@ class Factor:
 
 
 def factors(equation: str) -> dict[str, Factor]:
-    """Return the factors of an equation's curves by name."""
+    """Return the factors of an equation's curves by name: variables, and what is made of one."""
     kind, number = equation.rsplit("_", 1)
     velocity = f"velocity_{number}"
     if kind == "torque":
         return {
             "direction": Factor(velocity, f"the direction of {velocity}"),
             "memory": Factor(velocity, f"the direction of {velocity} with memory"),
-            "velocity": Factor(velocity, velocity),
+            velocity: Factor(velocity, velocity),
         }
     difference, spool = f"pressure_difference_{number}", ch.channel(ch.SPOOL, int(number))
-    return {"difference": Factor(difference, difference), "spool": Factor(spool, spool)}
+    return {name: Factor(name, name) for name in (difference, spool)}
 
 
 def factor_of(name: str, signals: Signals, joint: int, travel: float) -> Array:
-    """Return a factor (n,); `travel` is the joint's largest on all records [m, rad]."""
-    speed = signals.sd[:, joint]
+    """Return a factor (n,) that is no variable; `travel` is the joint's largest [m, rad]."""
     if name == "direction":
+        speed = signals.sd[:, joint]
         rms = float(np.sqrt(np.mean(speed**2)))
         return np.asarray(np.tanh(speed / max(SLOW * rms, 1e-12)))
-    if name == "memory":
-        place = np.ascontiguousarray(signals.s[:, joint])
-        return np.asarray(_memory(place, max(MEMORY * travel, 1e-12)))
-    if name == "velocity":
-        return speed
-    if name == "difference":
-        return np.asarray(signals.p_cap[:, joint] - signals.p_rod[:, joint])
-    return signals.u[:, joint]
-
-
-@njit(cache=True)
-def _memory(s, distance):  # type: ignore[no-untyped-def]
-    # Dahl 1968: dz = (1 - z sign(ds)) ds / distance.
-    z = np.zeros_like(s)
-    for k in range(1, len(s)):
-        step = s[k] - s[k - 1]
-        z[k] = min(max(z[k - 1] + (1.0 - z[k - 1] * np.sign(step)) * step / distance, -1.0), 1.0)
-    return z
+    place = np.ascontiguousarray(signals.s[:, joint])
+    return np.asarray(contact_state(place, max(MEMORY * travel, 1e-12)))
 
 
 def variables(rig: Rig, signals: Signals, joint: int) -> dict[str, Array]:

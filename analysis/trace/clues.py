@@ -23,6 +23,7 @@ from analysis.trace.clue_variables import factor_of, factors, variables
 from analysis.trace.evidence import Scene, filtered, prepared
 from analysis.trace.result import Dependence
 from analysis.trace.select import orthonormal
+from analysis.trace.shortlist import excess_of
 from rig.model import channels as ch
 from rig.model.rig import Rig
 
@@ -55,7 +56,7 @@ def dependence(
 
     `left` (M,) and `judge_left` are residuals under the model of `train` (rebased to it).
     """
-    weight = {e: _energy(train, left, e) for e in equations}
+    weight = {e: max(0.0, v) for e, v in excess_of(train, left).items() if e in equations}
     total = sum(weight.values()) or 1.0
     found: dict[tuple[str, str], dict[str, float]] = {}
     for equation in equations:
@@ -95,14 +96,6 @@ def _telling(name: str, equation: str) -> float:
     if any(word in name for word in ANSWERS[kind]):
         return ANSWER
     return THROUGH if kind == "torque" and name.startswith(ch.SPOOL) else 1.0
-
-
-def _energy(stage: Board, left: Array, equation: str) -> float:
-    found = 0.0
-    for s in stage.segments:
-        if s.equation == equation:
-            found += float(left[s.where] @ left[s.where]) - (s.where.stop - s.where.start)
-    return max(found, 0.0)
 
 
 @dataclass(frozen=True)
@@ -157,10 +150,10 @@ def _shares(
     every = [*first.parts, *second.parts]
     travel = max(float(np.ptp(p.scene.signals.s[:, joint])) for p in every)
     values = [variables(rig, p.seen, joint) for p in every]
-    by = ["", *factors(equation)]
+    by = factors(equation)
     scales = [
-        {f: factor_of(f, p.seen, joint, travel) if f else np.ones(len(p.seen.t)) for f in by}
-        for p in every
+        {f: v[f] if f in v else factor_of(f, p.seen, joint, travel) for f in by}
+        for v, p in zip(values, every, strict=True)
     ]
     curves: dict[str, list[Array]] = {"": [np.ones((len(p.seen.t), 1)) for p in every]}
     for name in values[0]:
@@ -171,10 +164,12 @@ def _shares(
     count = len(first.parts)
     out = {}
     for name, curve in curves.items():
-        for factor in by:
-            if not name and not factor:
-                continue
-            made = [c * s[factor][:, None] for c, s in zip(curve, scales, strict=True)]
+        for factor in ("", *by) if name else by:
+            made = (
+                [c * s[factor][:, None] for c, s in zip(curve, scales, strict=True)]
+                if factor
+                else curve
+            )
             one, two = _columns(first, made[:count]), _columns(second, made[count:])
             out[name, factor] = max(
                 0.0, _judged(one, first, two, second), _judged(two, second, one, first)

@@ -149,11 +149,10 @@ def over_noise(result: Trace, key: str = "overnoise") -> Markup:
         axes.axvline(1.0, color=INK, lw=0.8, ls="--")
         axes.set_xscale("log")
         low, high = axes.get_xlim()
-        axes.set_xlim(min(low, 0.8), max(high, 2.5))  # less than an octave leaves no ticks to read
-        axes.xaxis.set_major_formatter(lambda v, _: f"{v:g}")
-        low, high = axes.get_xlim()
-        low, high = min(low, 0.8), max(high, 2.2)  # else noise would look like a difference
+        # Less than an octave leaves no ticks to read, and noise would look like a difference.
+        low, high = min(low, 0.8), max(high, 2.5)
         axes.set_xlim(low, high)
+        axes.xaxis.set_major_formatter(lambda v, _: f"{v:g}")
         # Within one decade the ticks between are all there is.
         axes.xaxis.set_minor_formatter(lambda v, _: f"{v:.1g}" if high < 10 * low else "")
         axes.set_yticks(range(len(names)), list(reversed(names)))

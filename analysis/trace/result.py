@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+import numpy as np
+
 from analysis.model import Estimate, Model, estimate_json, finite
 from analysis.trace.floor import Floor
 from analysis.trace.refine import Fit
@@ -124,7 +126,7 @@ class Trace:
 
     def worst(self, error: Mapping[str, float]) -> float:
         """Return the largest of the held-out errors, `before` or `after`, over its noise floor."""
-        return max(error[e] / max(self.noise_floor[e], 1e-30) for e in error)
+        return float(np.nanmax([error[e] / max(self.noise_floor[e], 1e-30) for e in error]))
 
     @property
     def moves_with(self) -> tuple[str, ...]:

@@ -13,11 +13,9 @@ import numpy as np
 
 from hil_sim.scenario import Scenario
 from hil_sim.scenario_random import KINDS, STRANGE, draw
-from protocols.plan import Overrides
-from rig.cli.direct_bench import simulated_run
+from protocols.model import Protocol
 from rig.cli.study_trace_cases import NOISE, NONE, OUTSIDE, PAIR, SINGLE, Case, place_of
 from rig.model.parts import Joint
-from rig.model.records import Run
 from rig.model.rig import Rig
 from rig.services.rigs import load_rig
 
@@ -133,10 +131,10 @@ def _size(effect: Any) -> float:
     return float(getattr(effect, next(iter(kind.sizes))))
 
 
-def records_of(rig: Rig, scenario: Scenario, seed: int) -> tuple[Run, list[Run], dict[str, float]]:
-    """Return training records, held-out records and the truth, by protocols made for the rig.
+def protocols_of(rig: Rig) -> tuple[Protocol, Protocol]:
+    """Return the protocols made for a rig: to identify it, and to judge what was identified.
 
-    Raises InputError or ProtocolAborted where the machine cannot run what was planned for it.
+    Raises InputError where nothing can be planned for it.
     """
     from protocols.generate import generate
     from protocols.judging import validation
@@ -144,11 +142,4 @@ def records_of(rig: Rig, scenario: Scenario, seed: int) -> tuple[Run, list[Run],
 
     tools = predictor()
     plan = generate(rig, tools, f"lock-and-excite-{rig.name}").protocol
-    judge = validation(rig, tools.twin, f"validate-{rig.name}")
-    other = Overrides(seed=1000 + seed, amplitude_scale=0.7, repeats=2)
-    train, truth = simulated_run(rig, plan, seed, scenario)
-    held_out = [
-        simulated_run(rig, plan, seed + 50_000, scenario, other)[0],
-        simulated_run(rig, judge, seed + 90_000, scenario)[0],
-    ]
-    return train, held_out, truth
+    return plan, validation(rig, tools.twin, f"validate-{rig.name}")

@@ -17,6 +17,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from protocols.model import Protocol
 from protocols.plan import Overrides
 from rig.cli.study_pool import Kept, performed
 from rig.cli.study_trace_cases import NONE, OUTSIDE, SIZE_OF, Case
@@ -71,24 +72,31 @@ def perform(case: Case) -> Outcome:
 
 
 def records_of(case: Case) -> tuple[Run, list[Run], Mapping[str, float]]:
-    """Return a case's training records, its held-out ones, and the true parameters."""
+    """Return a case's training records, its held-out ones, and the true parameters.
+
+    Raises InputError or ProtocolAborted where a machine cannot run what was planned for it.
+    """
     from hil_sim.scenario import parse_scenario
     from rig.cli import study_machines as machines
     from rig.cli.direct_bench import simulated_run
     from rig.services.rigs import load_rig
 
+    plan: str | Protocol
+    judging: str | Protocol
     if case.machine:
         rig = machines.machine(case.seed)
         scenario = machines.scenario_of(rig, case.seed, case.noise)
-        return machines.records_of(rig, scenario, case.seed)
-    rig = load_rig("shinshu-2dof")
-    scenario = parse_scenario(case.scenario, case.label)
-    train, truth = simulated_run(rig, TRAIN, case.seed, scenario)
-    judge, _ = simulated_run(rig, JUDGE, case.seed + 90_000, scenario, Overrides(steps=JUDGE_STEPS))
+        (plan, judging), steps = machines.protocols_of(rig), None
+    else:
+        rig = load_rig("shinshu-2dof")
+        scenario = parse_scenario(case.scenario, case.label)
+        plan, judging, steps = TRAIN, JUDGE, JUDGE_STEPS
+    train, truth = simulated_run(rig, plan, case.seed, scenario)
+    judge, _ = simulated_run(rig, judging, case.seed + 90_000, scenario, Overrides(steps=steps))
     held_out = [judge]
-    if case.kind != NONE:  # whether a bench is clean is told from the training records alone
+    if case.machine or case.kind != NONE:  # the shipped rig: its training records tell it clean
         sizes = Overrides(seed=1000 + case.seed, amplitude_scale=0.7, repeats=2)
-        held_out.insert(0, simulated_run(rig, TRAIN, case.seed + 50_000, scenario, sizes)[0])
+        held_out.insert(0, simulated_run(rig, plan, case.seed + 50_000, scenario, sizes)[0])
     return train, held_out, truth
 
 

@@ -13,7 +13,6 @@ from analysis.checks import Check
 from analysis.identify import Identification, identify
 from analysis.model import Model
 from analysis.report import Provenance, render_report, write_report
-from analysis.report_page import write
 from analysis.validate import RecordValidation, validate
 from rig.model.parse import InputError
 from rig.model.records import Run
@@ -302,10 +301,10 @@ def test_one_joint_alone(multisine_run: Run) -> None:
 def test_a_report_is_written_whole_and_one_that_cannot_be_says_where(
     tmp_path: Path, multisine_run: Run, found: Identification
 ) -> None:
-    with pytest.raises(InputError, match=re.escape("cannot write the report")):
-        write(tmp_path / "no" / "r.html", "<!DOCTYPE html>")
     path = tmp_path / "r.html"
     write_report(path, runs=[multisine_run], identification=found)
+    with pytest.raises(InputError, match=re.escape("cannot write the report")):
+        write_report(tmp_path / "no" / "r.html", runs=[multisine_run], identification=found)
     assert path.read_text(encoding="utf-8").lstrip().startswith("<!DOCTYPE html>")
     assert [p.name for p in tmp_path.iterdir()] == ["r.html"]
 

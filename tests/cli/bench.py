@@ -92,9 +92,9 @@ def wait_for(what: str, process: subprocess.Popen[str], seen: Sequence[str] = ()
     return lines
 
 
-def outputs_are_zero(endpoint: str, rig_name: str = "shinshu-2dof") -> bool:
+def outputs_are_zero(endpoint: str) -> bool:
     """Ask the device itself, over a connection of one's own."""
-    rig = load_rig(rig_name)
+    rig = load_rig("shinshu-2dof")
     driver = ModbusTcpDriver(wire_at(endpoint, rig.wire), rig)
     try:
         driver.connect()
