@@ -34,6 +34,7 @@ from rig.model.parameters import gain_names
 from rig.model.rig import Rig
 
 NEWTON: Final = 12  # steps; the equation is monotone and smooth but for u = 0
+LONGEST: Final = 5.0  # [s] of the pump's flow: the most oil between supply sensor and valves
 
 
 @dataclass(frozen=True)
@@ -79,11 +80,14 @@ def port_flow(rig: Rig, signals: Signals, drawn: bool) -> Array:
 
 @dataclass(frozen=True)
 class SupplySag(_PortEffect):
-    """The valves see less than the measured or nominal supply: p_s - dp (Q / Q_pump)^n.
+    """The valves see less than the supply: p_s - dp r (r^3 + r_t^3)^(1/3), r = Q / Q_pump.
 
-    Where the rig measures its supply, what can be missing is the line between sensor and valves,
-    turbulent, n = 2 (Merritt 1967, chapter 3); where it does not, the pressure-compensated pump
-    or relief valve gives way in proportion to the flow taken, n = 1. dp is a shape.
+    Where the rig measures its supply, what can be missing is the line between sensor and valves:
+    laminar below the share r_t of the pump's flow, turbulent above (Merritt 1967, chapter 3; the
+    two asymptotes joined as in Churchill and Usagi 1972). Where it does not, pump or relief valve
+    give way nearly in proportion to the flow. A sudden demand is met by the oil V_supply between
+    sensor and valves until the line follows: dQ/dt = (Q_drawn - Q) b / (V_supply d dp/dQ); the
+    simulation leaves that out. dp, r_t and V_supply are shapes.
     """
 
     name: ClassVar[str] = "supply_sag"
@@ -98,30 +102,32 @@ class SupplySag(_PortEffect):
         """The compiled preparation."""
         return _sag
 
-    def exponent(self, rig: Rig) -> float:
-        """Return n."""
-        return 2.0 if rig.sensors.supply_pressure is not None else 1.0
-
     def shape_names(self) -> tuple[str, ...]:
-        """Name the drop."""
-        return ("dp_supply",)
+        """Name the drop, where it turns turbulent, and the oil between."""
+        return ("dp_supply", "laminar_share", "V_supply")
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return the drop at the pump's whole flow [Pa]."""
-        p = rig.supply.pressure
-        return (Shape("dp_supply", "Pa", 0.0, 0.9 * p, (0.05 * p, 0.2 * p), 0.0),)
+        """Return the turbulent drop at the pump's whole flow [Pa], r_t and the volume [m^3]."""
+        p, most = rig.supply.pressure, LONGEST * rig.supply.flow
+        return (
+            Shape("dp_supply", "Pa", 0.0, 0.9 * p, (0.05 * p, 0.2 * p), 0.0),
+            Shape("laminar_share", "", 0.0, 1.5, (0.1, 0.3), resolution=True),
+            Shape("V_supply", "m^3", 0.0, most, (0.1 * most,), resolution=True),
+        )
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Take the drop from the supply pressure."""
-        ratio = port_flow(rig, signals, drawn=True) / rig.supply.flow
-        drop = self.shape_of(rig, shape)[0] * ratio ** self.exponent(rig)
+        dp, share, volume = self.shape_of(rig, shape)
+        ratio = np.ascontiguousarray(port_flow(rig, signals, drawn=True) / rig.supply.flow)
+        capacity = volume / (rig.nominal["b"] * rig.supply.flow) if "b" in rig.nominal else 0.0
+        drop = _line(ratio, 1.0 / signals.rate, dp, share, capacity)
         return replace(signals, p_s=signals.p_s - drop)
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
-        """Return dp / Q_pump^n, n, then C_pp and C_mm of each joint."""
-        n = self.exponent(rig)
-        gains = _gains(rig, values, (0, 3))
-        return np.array([self.shape_of(rig, shape)[0] / rig.supply.flow**n, n, *gains])
+        """Return dp / Q_pump^2, the flow where it turns turbulent, C_pp and C_mm of each joint."""
+        dp, share, _ = self.shape_of(rig, shape)
+        flow = rig.supply.flow
+        return np.array([dp / flow**2, share * flow, *_gains(rig, values, (0, 3))])
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return the flow drawn [m^3/s]."""
@@ -205,26 +211,52 @@ def _everywhere(signals: Signals, variable: Array) -> dict[str, Array]:
 
 
 @njit(cache=True, error_model="numpy")
-def _valve_flow(x, level, sign, resistance, power, par, drawn):  # type: ignore[no-untyped-def]
-    """Solve Q = sum C |u| sqrt(dp_i - resistance Q^n) for the common flow Q [m^3/s], by Newton.
+def lost(Q, turbulent, turning):  # type: ignore[no-untyped-def]
+    """Return drop and slope of turbulent Q (Q^3 + turning^3)^(1/3) for a flow Q >= 0."""
+    inner = Q**3 + turning**3
+    if inner <= 0.0:
+        return 0.0, 0.0
+    root = inner ** (1.0 / 3.0)
+    return turbulent * Q * root, turbulent * (root + Q**3 / root**2)
+
+
+@njit(cache=True)
+def _line(ratio, step, dp, share, capacity):  # type: ignore[no-untyped-def]
+    # Between two samples the demand is a straight line and the time constant stands still.
+    drop = np.zeros_like(ratio)
+    through = ratio[0]
+    for k in range(len(ratio)):
+        if k and capacity > 0.0:
+            late = max(capacity * lost(through, dp, share)[1], 1e-9)
+            kept = math.exp(-step / late)
+            rise = ratio[k] - ratio[k - 1]
+            through = ratio[k] - rise * (1 - kept) * late / step + kept * (through - ratio[k - 1])
+        else:
+            through = ratio[k]
+        drop[k] = lost(max(through, 0.0), dp, share)[0]
+    return drop
+
+
+@njit(cache=True, error_model="numpy")
+def _valve_flow(x, level, sign, turbulent, turning, par, drawn):  # type: ignore[no-untyped-def]
+    """Solve Q = sum C |u| sqrt(dp_i - lost(Q)) for the common flow Q [m^3/s], by Newton.
 
     dp_i is what each open edge has across it at Q = 0; the left grows and the right falls with Q.
     """
     Q = 0.0
     for _ in range(NEWTON):
-        lost = resistance * Q**power
-        slope_lost = resistance * power * Q ** (power - 1.0)
+        drop, slope_drop = lost(Q, turbulent, turning)
         given, slope = 0.0, 0.0
         for i in range(x.shape[1]):
             u = x[U, i]
             ahead = (u > 0.0) == drawn  # the cap's edge is the open one
             p = x[P_CAP, i] if ahead else x[P_ROD, i]
             gain = par[2 + 2 * i] if u > 0.0 else par[3 + 2 * i]
-            left = sign * (level - p) - lost
+            left = sign * (level - p) - drop
             if left > 0.0 and u != 0.0:
                 root = gain * abs(u) * math.sqrt(left)
                 given += root
-                slope -= 0.5 * root / left * slope_lost
+                slope -= 0.5 * root / left * slope_drop
         step = (given - Q) / (1.0 - slope)
         Q = max(Q + step, 0.0)
         if abs(step) < 1e-10:
@@ -236,7 +268,7 @@ def _valve_flow(x, level, sign, resistance, power, par, drawn):  # type: ignore[
 def _sag(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
     if phase == PREPARE and par[0] > 0.0:
         Q = _valve_flow(x, bench[P_S], 1.0, par[0], par[1], par, True)
-        bench[P_S] -= par[0] * Q ** par[1]
+        bench[P_S] -= lost(Q, par[0], par[1])[0]
 
 
 @kernel
@@ -244,7 +276,7 @@ def _tank(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
     if phase == PREPARE:
         bench[P_TANK] += par[0]
         if par[1] > 0.0:
-            Q = _valve_flow(x, bench[P_TANK], -1.0, par[1], 2.0, par, False)
+            Q = _valve_flow(x, bench[P_TANK], -1.0, par[1], 0.0, par, False)
             bench[P_TANK] += par[1] * Q * Q
 
 

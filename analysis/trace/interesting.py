@@ -33,7 +33,7 @@ SHAPES: Final[Mapping[str, tuple[float, ...]]] = {
     "dead_volume": (20e-6,),  # m^3
     "spool_lag": (1e-3,),  # s
     "spool_offset": (1e-3,),  # V
-    "supply_sag": (0.2e6,),  # Pa at the rated flow
+    "supply_sag": (0.2e6, 0.0, 0.0),  # Pa at the rated flow
     "tank_pressure": (0.1e6, 0.0),  # Pa
     "underlap_leakage": (4e-3,),  # V
     "valve_deadband": (2e-3, 2e-3),  # V

@@ -1,0 +1,80 @@
+"""A line between supply sensor and valves: what it drops, and how late, by another route."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+
+from analysis.effects.supply import SupplySag
+from analysis.signals import Signals
+from rig.model.rig import Rig
+from tests.analysis.test_terms import signals_of
+
+DROP, SHARE, VOLUME = 0.8e6, 0.3, 0.4e-3  # Pa at the pump's flow, of that flow, m^3
+
+
+@pytest.fixture
+def lifting(rig: Rig) -> Signals:
+    """Joint 1 lifts at a speed that swings, fast enough for the line to lag; nothing else moves."""
+    t = np.arange(800) / 1000.0
+    still = np.zeros((len(t), 2))
+    signals = signals_of(rig, still + np.array([1.1, -1.4]), still, still, np.random.default_rng(0))
+    flow = rig.supply.flow * (0.35 - 0.25 * np.cos(2 * np.pi * 12 * t))
+    speed = np.column_stack((flow / rig.joints[0].cylinder.cap_area, np.zeros(len(t))))
+    opening = still + np.array([0.05, 0.0])
+    return replace(signals, t=t, rate=1000.0, sd=speed, u=opening, pd_cap=still, pd_rod=still)
+
+
+def dropped(rig: Rig, signals: Signals, volume: float) -> np.ndarray:
+    seen = SupplySag("bench").prepare(rig, signals, (DROP, SHARE, volume))
+    return np.asarray(signals.p_s - seen.p_s)
+
+
+def through(drop: float, flow: float) -> float:
+    """The line's flow at a drop, from its law by a root finder."""
+    law = lambda Q: DROP * (Q / flow) * np.cbrt((Q / flow) ** 3 + SHARE**3) - drop  # noqa: E731
+    return float(brentq(law, 0.0, 10 * flow)) if drop > 0 else 0.0
+
+
+def test_without_oil_between_the_drop_is_that_of_the_flow_at_each_instant(
+    rig: Rig, lifting: Signals
+) -> None:
+    flow = lifting.sd[:, 0] * rig.joints[0].cylinder.cap_area
+    drop = dropped(rig, lifting, 0.0)
+    back = [through(d, rig.supply.flow) for d in drop[::50]]
+    assert back == pytest.approx(flow[::50], rel=1e-6)
+    small = replace(lifting, sd=0.01 * lifting.sd)
+    tenfold = replace(lifting, sd=0.1 * lifting.sd)
+    assert dropped(rig, tenfold, 0.0).max() == pytest.approx(
+        10 * dropped(rig, small, 0.0).max(), rel=0.01
+    )  # laminar: as the flow
+    huge, more = (replace(lifting, sd=k * lifting.sd) for k in (10.0, 20.0))
+    assert dropped(rig, more, 0.0).max() == pytest.approx(
+        4 * dropped(rig, huge, 0.0).max(), rel=0.01
+    )  # turbulent: as its square
+
+
+def test_the_oil_between_sensor_and_valves_is_continuity_in_its_volume(
+    rig: Rig, lifting: Signals
+) -> None:
+    """V / b d(drop)/dt = Q drawn - Q of the line, by an integrator of its own."""
+    flow = lifting.sd[:, 0] * rig.joints[0].cylinder.cap_area
+    stiffness = rig.nominal["b"] / VOLUME
+
+    def rate(t: float, drop: np.ndarray) -> list[float]:
+        drawn = float(np.interp(t, lifting.t, flow))
+        return [stiffness * (drawn - through(float(drop[0]), rig.supply.flow))]
+
+    ours = dropped(rig, lifting, VOLUME)
+    theirs = solve_ivp(
+        rate, (0.0, lifting.t[-1]), ours[:1], t_eval=lifting.t, method="LSODA",
+        rtol=1e-6, atol=1.0, max_step=2e-3,
+    ).y[0]  # fmt: skip
+    settled = slice(200, None)
+    swing = np.ptp(theirs[settled])
+    assert np.abs(ours - theirs)[settled].max() < 0.02 * swing
+    assert np.abs(dropped(rig, lifting, 0.0) - theirs)[settled].max() > 0.1 * swing
