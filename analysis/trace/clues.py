@@ -21,9 +21,9 @@ from analysis.signals import Signals
 from analysis.trace.board import Board
 from analysis.trace.clue_variables import factor_of, factors, variables
 from analysis.trace.evidence import Scene, filtered, prepared
+from analysis.trace.listed import excess_of
 from analysis.trace.result import Dependence
 from analysis.trace.select import orthonormal
-from analysis.trace.shortlist import excess_of
 from rig.model import channels as ch
 from rig.model.rig import Rig
 

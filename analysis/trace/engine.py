@@ -22,7 +22,9 @@ from analysis.trace.board import Board, board
 from analysis.trace.candidates import catalogue, variants
 from analysis.trace.evidence import Scene, scenes
 from analysis.trace.floor import STATED
+from analysis.trace.listed import Listed, within
 from analysis.trace.next_experiment import propose
+from analysis.trace.refine import rebased
 from analysis.trace.result import (
     CLEAN,
     CONFOUNDED,
@@ -32,7 +34,7 @@ from analysis.trace.result import (
     Found,
     Trace,
 )
-from analysis.trace.shortlist import Listed, Shortlist, rebased, within
+from analysis.trace.shortlist import Shortlist
 from analysis.trace.words import sentence
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
@@ -85,7 +87,7 @@ def trace(
         refused = tuple(f for f in found if not gates.stands(f))
         found = tuple(f for f in found if gates.stands(f))
         if verdict == UNEXPLAINED and found:
-            notes += gates.remaining(listed, winner, judge)
+            notes += [f"{e}: {words}" for e, words in gates.remaining(listed, winner, judge)]
         moves = [] if verdict in (CLEAN, EXPLAINED) else _moves(stage, judge, winner)
     further = propose(listed, winner, found, verdict, moves) if look_ahead else None
     after = _extended(runs, terms, winner, before)
@@ -183,10 +185,15 @@ def _named(
         if not smaller:
             return refused, listed.empty, UNEXPLAINED
         winner = listed.exact(smaller)
-    if refused:
-        return (*found, *refused), winner, UNEXPLAINED
-    if not gates.explained(listed, winner, judge):
-        return found, winner, UNEXPLAINED
+    while rest := gates.remaining(listed, winner, judge):
+        more = listed.closer(winner, {equation for equation, _ in rest})
+        if more is None:
+            return (*found, *refused), winner, UNEXPLAINED
+        wider = gates.judge(listed, more, judge, rng)
+        less = len(gates.remaining(listed, more, judge)) < len(rest)
+        if not (less and all(map(gates.stands, wider))):
+            return (*found, *refused), winner, UNEXPLAINED
+        found, winner = wider, more
     tied = any(r.tied for f in found for r in f.rivals)
     return found, winner, CONFOUNDED if tied else EXPLAINED
 

@@ -20,10 +20,11 @@ from analysis.trace import inference
 from analysis.trace.board import Board
 from analysis.trace.held_out import left as held_left
 from analysis.trace.invariance import invariance
+from analysis.trace.listed import Listed, excess_of, parameter_values
 from analysis.trace.refine import shapes_of
 from analysis.trace.result import Found, Gate, Rival
 from analysis.trace.select import FORM
-from analysis.trace.shortlist import Listed, Shortlist, excess_of, parameter_values
+from analysis.trace.shortlist import Shortlist
 
 Array = NDArray[np.float64]
 Key = tuple[str, str]
@@ -89,13 +90,8 @@ def judge(
     return tuple(out)
 
 
-def explained(listed: Shortlist, winner: Listed, held: Board) -> bool:
-    """Tell whether what is left lies within the noise floor's band, on both sets of records."""
-    return not remaining(listed, winner, held)
-
-
-def remaining(listed: Shortlist, winner: Listed, held: Board) -> list[str]:
-    """Say which equations keep more than the noise floor's band, on which records.
+def remaining(listed: Shortlist, winner: Listed, held: Board) -> list[tuple[str, str]]:
+    """Return the equations that keep more than the noise floor's band, and say on which records.
 
     What a catalogue's simpler form leaves in the training records may be somewhat more where the
     held-out error of that equation is the noise's.
@@ -111,10 +107,10 @@ def remaining(listed: Shortlist, winner: Listed, held: Board) -> list[str]:
         if not (quiet or listed.negligible(e, left)):
             times = left / listed.limits.band[e]
             out.append(
-                f"{e}: {100 * share:.2g} % of what repeated stays, {times:.2g} times the band"
+                (e, f"{100 * share:.2g} % of what repeated stays, {times:.2g} times the band")
             )
     out += [
-        f"{e}: held-out error {r:.2f} times the noise floor"
+        (e, f"held-out error {r:.2f} times the noise floor")
         for e, r in ratio.items()
         if r > HELD_BAND and now[e] > 2 * FORM * start[e]
     ]

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from analysis.terms.base import Used
 from analysis.trace import select
 from analysis.trace.board import Board
+from analysis.trace.listed import Listed, excess_of
 from analysis.trace.refine import Fit, jacobian, shapes_of, table
 from analysis.trace.select import Field, orthonormal
-from analysis.trace.shortlist import Listed, Shortlist, excess_of
+from analysis.trace.shortlist import Shortlist
 
 Array = NDArray[np.float64]
 

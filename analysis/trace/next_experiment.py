@@ -33,9 +33,10 @@ from analysis.trace.discriminate import (
     view,
 )
 from analysis.trace.interesting import smallest
+from analysis.trace.listed import Listed, parameter_values
 from analysis.trace.result import CLEAN, CONFOUNDED, UNEXPLAINED, Dependence, Found
 from analysis.trace.select import BAND
-from analysis.trace.shortlist import Listed, Shortlist, parameter_values
+from analysis.trace.shortlist import Shortlist
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]

@@ -9,7 +9,7 @@ side's size before the change.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -168,3 +168,23 @@ def jacobian(stage: Board, model: Fit, used: Used) -> tuple[tuple[str, ...], Arr
         columns.append(-(ends[0] - ends[1]) / (up - down))
     stack = np.column_stack(columns) if columns else np.zeros((len(model.left), 0))
     return tuple(names), stack
+
+
+def rebased(stage: Board, model: Fit) -> Board:
+    """Return the stage with a fitted model in place of its own."""
+    rows = table(stage, model.terms)
+    built = []
+    for scene, before in zip(stage.scenes, stage.rows, strict=True):
+        now = scene_rows(stage.rig, model.terms, scene)
+        kept = {}
+        for equation, old in before.items():
+            _, here, there = np.intersect1d(old.time, now[equation].time, return_indices=True)
+            matrix = np.zeros((len(old.rhs), len(now[equation].names)))
+            rhs = np.zeros(len(old.rhs))
+            matrix[here], rhs[here] = now[equation].matrix[there], now[equation].rhs[there]
+            kept[equation] = replace(now[equation], matrix=matrix, rhs=rhs, time=old.time)
+        built.append(kept)
+    return replace(
+        stage, terms=model.terms, beta=dict(model.beta), names=rows.names, base=rows.matrix,
+        rows=tuple(built),
+    )  # fmt: skip

@@ -21,10 +21,10 @@ from analysis.trace.board import Board, board
 from analysis.trace.discriminate import Ground, Hypothesis, Question, present
 from analysis.trace.evidence import scenes
 from analysis.trace.interesting import smallest
+from analysis.trace.listed import excess_of
 from analysis.trace.next_experiment import SHOW
 from analysis.trace.refine import refine
 from analysis.trace.result import Trace, to_json
-from analysis.trace.shortlist import excess_of
 from rig.model.records import Run
 from rig.model.rig import Rig
 

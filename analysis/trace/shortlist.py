@@ -8,8 +8,7 @@ on the list: the rivals of the winner come from it.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,12 +18,10 @@ from analysis.terms.base import Used
 from analysis.trace import select
 from analysis.trace.board import Board, Entry, entries
 from analysis.trace.candidates import Variant, complexity
-from analysis.trace.evidence import scene_rows
-from analysis.trace.refine import Fit, fit, refine, table
-from rig.model.rig import Rig
+from analysis.trace.listed import Key, Listed, excess_of, limits, parameter_values, within
+from analysis.trace.refine import Fit, fit, rebased, refine
 
 Array = NDArray[np.float64]
-Key = tuple[str, str]
 log = logging.getLogger(__name__)
 
 SINGLES = 14  # refined exactly, best first
@@ -32,74 +29,6 @@ PAIRS = 6
 NEAR = 0.25  # of the best gain: a single candidate with less is no rival
 NEXT = 6  # extensions of a set that are refined exactly
 DEEPEST = 3  # effects in a set found by extension
-
-
-@dataclass(frozen=True)
-class Listed:
-    """A set of effects on the list: its exact fit and energy above noise by equation."""
-
-    effects: tuple[Used, ...]
-    fit: Fit
-    excess: dict[str, float]
-    size: tuple[int, int]
-
-    @property
-    def keys(self) -> frozenset[Key]:
-        """Names and places of its effects."""
-        return frozenset((u.term.name, u.term.where) for u in self.effects)
-
-    @property
-    def total(self) -> float:
-        """All energy left above noise, not below zero in any equation."""
-        return sum(max(0.0, e) for e in self.excess.values())
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Energy that counts as nothing, by equation, on a stage."""
-
-    band: dict[str, float]
-
-    @property
-    def total(self) -> float:
-        """The sum over equations."""
-        return sum(self.band.values())
-
-
-def parameter_values(rig: Rig, terms: Sequence[Used], beta: dict[str, float]) -> dict[str, float]:
-    """Return parameters from the rows' coefficients (b from 1/b)."""
-    out = {}
-    for used in terms:
-        for c in used.term.coefficients(rig):
-            value = float(beta.get(c.parameter, np.nan))
-            out[c.parameter] = 1.0 / value if c.reciprocal and value else value
-    return out
-
-
-def excess_of(stage: Board, left: Array, noise: float = 1.0) -> dict[str, float]:
-    """Return the energy above noise that a residual (M,) has in each equation of a stage."""
-    out: dict[str, float] = {}
-    for segment in stage.segments:
-        part = left[segment.where]
-        found = float(part @ part) - noise * len(part)
-        out[segment.equation] = out.get(segment.equation, 0.0) + found
-    return out
-
-
-def limits(stage: Board) -> Limits:
-    """Return the band of every equation (`select.BAND` times the noise, and chance)."""
-    band: dict[str, float] = {}
-    rows: dict[str, int] = {}
-    for s in stage.segments:
-        count = s.where.stop - s.where.start
-        band[s.equation] = band.get(s.equation, 0.0) + select.BAND**2 * s.repeats * count
-        rows[s.equation] = rows.get(s.equation, 0) + count
-    return Limits({e: max(v, 4 * np.sqrt(2 * rows[e])) for e, v in band.items()})
-
-
-def within(excess: dict[str, float], limit: Limits) -> bool:
-    """Tell whether nothing is left above the band in any equation."""
-    return all(value <= limit.band[e] for e, value in excess.items())
 
 
 class Shortlist:
@@ -197,7 +126,7 @@ class Shortlist:
         best = self.best(more) if more else now
         return best if best.effects and self.prune(best).keys == best.keys else now
 
-    def _field(self, found: Sequence[Entry]) -> select.Field:
+    def _field(self, found: Sequence[Entry], mask: Array | None = None) -> select.Field:
         rig = self.stage.rig
         values = parameter_values(rig, self.stage.terms, dict(self.stage.beta))
 
@@ -213,7 +142,7 @@ class Shortlist:
         def size(entry: Entry) -> int:
             return complexity(rig, [entry.variant.used])[1]
 
-        return select.field(self.stage, found, size, allowed)
+        return select.field(self.stage, found, size, allowed, mask)
 
     def _singles(self, field: select.Field, r: Array) -> list[tuple[Used, ...]]:
         g = select.gains(field.K, field.columns.T @ r, field.groups, field.raw)
@@ -240,13 +169,20 @@ class Shortlist:
         ]
         return [effects for effects in out if len(effects) > 1]
 
-    def extensions(self, now: Listed) -> list[Listed]:
-        """Return sets with one more effect, found on a board that has the set in its model."""
+    def extensions(self, now: Listed, equations: Collection[str] = ()) -> list[Listed]:
+        """Return sets with one more effect, found on a board that has the set in its model.
+
+        With `equations` the search looks at these alone.
+        """
         stage = rebased(self.stage, now.fit)
         taken = now.keys
         found = entries(stage, [v for v in self.variants if v.key not in taken])
-        field = self._field_of(stage, found)
-        r = now.fit.left - field.basis @ (field.basis.T @ now.fit.left)
+        mask = np.ones(len(now.fit.left))
+        for s in stage.segments if equations else ():
+            mask[s.where] = float(s.equation in equations)
+        field = self._field_of(stage, found, mask)
+        r = now.fit.left * mask
+        r = r - field.basis @ (field.basis.T @ r)
         more = select.options(field, (), r, 1.0)
         out: list[Listed] = []
         seen: set[Key] = set()
@@ -257,10 +193,35 @@ class Shortlist:
                 out.append(self.exact((*now.effects, variant.used)))
         return out
 
-    def _field_of(self, stage: Board, found: Sequence[Entry]) -> select.Field:
+    def closer(self, now: Listed, equations: Collection[str]) -> Listed | None:
+        """Return the set with the effect added that some equations ask for, None where none is.
+
+        What is left of a loud equation, the form of its effect, hides what a quiet one lacks as
+        long as all are counted together.
+        """
+        if len(now.effects) >= DEEPEST:
+            return None
+
+        def left(one: Listed) -> float:
+            return sum(one.excess[e] for e in equations)
+
+        def earned(one: Listed) -> bool:
+            drop, start = left(now) - left(one), max(0.0, left(now))
+            least = select.CHANCE * (one.size[1] - now.size[1])
+            return drop > max(least, select.ADD_SHARE * start)
+
+        more = [o for o in self.extensions(now, equations) if earned(o) and not self.physical(o)]
+        if not more:
+            return None
+        best = min(map(left, more))
+        slack = max((select.AS_GOOD - 1.0) * max(0.0, best), select.CHANCE)
+        near = [o for o in more if left(o) <= best + slack]
+        return min(near, key=lambda o: (o.size[1], left(o)))
+
+    def _field_of(self, stage: Board, found: Sequence[Entry], mask: Array) -> select.Field:
         keep, self.stage = self.stage, stage
         try:
-            return self._field(found)
+            return self._field(found, mask)
         finally:
             self.stage = keep
 
@@ -281,23 +242,3 @@ class Shortlist:
         """Tell whether the effect that `without` lacks takes too small a share away."""
         drop = without.total - one.total
         return drop < select.ADD_SHARE * without.total
-
-
-def rebased(stage: Board, model: Fit) -> Board:
-    """Return the stage with a fitted model in place of its own."""
-    rows = table(stage, model.terms)
-    built = []
-    for scene, before in zip(stage.scenes, stage.rows, strict=True):
-        now = scene_rows(stage.rig, model.terms, scene)
-        kept = {}
-        for equation, old in before.items():
-            _, here, there = np.intersect1d(old.time, now[equation].time, return_indices=True)
-            matrix = np.zeros((len(old.rhs), len(now[equation].names)))
-            rhs = np.zeros(len(old.rhs))
-            matrix[here], rhs[here] = now[equation].matrix[there], now[equation].rhs[there]
-            kept[equation] = replace(now[equation], matrix=matrix, rhs=rhs, time=old.time)
-        built.append(kept)
-    return replace(
-        stage, terms=model.terms, beta=dict(model.beta), names=rows.names, base=rows.matrix,
-        rows=tuple(built),
-    )  # fmt: skip

@@ -23,7 +23,8 @@ from analysis.trace import held_out
 from analysis.trace.board import board
 from analysis.trace.engine import trace
 from analysis.trace.evidence import scenes
-from analysis.trace.shortlist import Listed, Shortlist
+from analysis.trace.listed import Listed
+from analysis.trace.shortlist import Shortlist
 from rig.cli.output import table
 from rig.cli.trace_text import trace_text
 from rig.model.parse import InputError

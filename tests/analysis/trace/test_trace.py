@@ -99,6 +99,15 @@ def test_friction_and_a_dead_band_at_once_are_both_named(rig: Rig) -> None:
     assert sizes["w_ahead_2"] == pytest.approx(8e-3, rel=0.05)
 
 
+def test_a_quiet_effect_is_found_beside_a_loud_one_of_other_equations(rig: Rig) -> None:
+    """Beside so wide a dead band hardly anything hangs on which friction it is."""
+    result = traced(rig, w_ahead=2e-2, w_astern=2e-2, Fs=15)
+    assert result.verdict == "explained"
+    assert {e.name for e in result.effects} == {"stribeck_friction", "valve_deadband"}
+    assert result.refused == ()
+    assert result.worst(result.after) < 1.3
+
+
 def test_what_the_catalogue_lacks_stays_unexplained_and_its_variable_is_told(
     quiet: tuple[Run, Run],
 ) -> None:
