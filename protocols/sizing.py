@@ -24,8 +24,13 @@ SPARE = {"pump flow": 0.03, "cap_pressure (cavitation, supply)": 0.1,
          "rod_pressure (cavitation, supply)": 0.1, "piston": 0.05}  # fmt: skip
 
 
-def motion_within(step: Step, rig: Rig, twin: Twin) -> Mapping[str, Array] | None:
-    """Return one period of a step's motion on the twin, None where a limit would be passed."""
+def motion_within(
+    step: Step, rig: Rig, twin: Twin, spare: Mapping[str, float] = SPARE
+) -> Mapping[str, Array] | None:
+    """Return one period of a step's motion on the twin, None where a limit would be passed.
+
+    `spare` is the share of a quantity's range that must stay free.
+    """
     try:
         alone = Protocol(name="candidate", joints=len(rig.joints), steps=(step,))
         planned = resolve(alone, rig).steps[0]
@@ -34,7 +39,7 @@ def motion_within(step: Step, rig: Rig, twin: Twin) -> Mapping[str, Array] | Non
         log.debug("%s", error)
         return None
     lines = judge_motion(planned, rig, biases, moved).predictions
-    return moved if all(_kept(line) for line in lines) else None
+    return moved if all(_kept(line, spare) for line in lines) else None
 
 
 def sized(step: Step, seed: int, rig: Rig, twin: Twin) -> tuple[Step, Mapping[str, Array]] | None:
@@ -61,7 +66,7 @@ def sized(step: Step, seed: int, rig: Rig, twin: Twin) -> tuple[Step, Mapping[st
     return found[max(found)]
 
 
-def _kept(line: Prediction) -> bool:
-    spare = SPARE.get(line.quantity, 0.0) * (line.allowed_high - line.allowed_low)
+def _kept(line: Prediction, spare: Mapping[str, float]) -> bool:
+    least = spare.get(line.quantity, 0.0) * (line.allowed_high - line.allowed_low)
     room = line.margin if line.joint is not None else line.allowed_high - line.high
-    return room >= spare
+    return room >= least

@@ -31,6 +31,7 @@ Array = NDArray[np.float64]
 REPEATS, PERIODS, STATED = "repeats", "periods", "stated noise"
 Group = tuple[int, str]
 LEAST = 0.2  # of the noise that the rig file states
+NO_ROWS = 1e-30  # SI: where every row is masked nothing is weighed by it
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,8 @@ def floors(
         for equation in rows[indices[0]]:
             parts = [rows[i][equation] for i in indices if equation in rows[i]]
             left = [residual(r, beta) for r in parts]
-            total = float(np.sqrt(np.mean(np.concatenate(left) ** 2))) if left else 0.0
+            every = np.concatenate(left)
+            total = float(np.sqrt(np.mean(every**2))) if len(every) else 0.0  # all rows masked
             table, source = repeats_of(members[indices[0]], parts, left)
             if table is not None:
                 noise, repeatable = split(table)
@@ -117,7 +119,7 @@ def _periods(scene: Scene, rows: Rows, left: Array) -> Array | None:
     period or more; None where there is less than that, or periods of fewer than five rows.
     """
     period, step = scene.record.period, scene.filtering.step
-    if not period or period % step:
+    if not period or period % step or not len(rows.time):
         return None
     per = period // step
     index = np.rint((rows.time - rows.time[0]) * scene.record.sample_rate / step).astype(int)
@@ -153,5 +155,5 @@ def stated_noise(
     for name, before in rows.items():
         _, a, b = np.intersect1d(before.time, again[name].time, return_indices=True)
         change = residual(again[name], beta)[b] - residual(before, beta)[a]
-        out[name] = float(np.sqrt(np.mean(change**2)))
+        out[name] = float(np.sqrt(np.mean(change**2))) if len(change) else NO_ROWS
     return out

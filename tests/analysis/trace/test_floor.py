@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,7 @@ from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from analysis.trace.board import board
 from analysis.trace.evidence import scenes
-from analysis.trace.floor import LEAST, stated_noise
+from analysis.trace.floor import LEAST, STATED, floors, stated_noise
 from rig.model.rig import Rig
 
 
@@ -39,3 +41,21 @@ def test_sensors_far_better_than_stated_do_not_make_a_floor_of_nothing(rig: Rig)
     assert ratios
     for name, ratio in ratios.items():
         assert ratio == pytest.approx(LEAST, rel=1e-6), name
+
+
+def test_a_record_whose_rows_are_all_masked_has_the_stated_floor_and_nothing_left(rig: Rig) -> None:
+    """A chamber below tank pressure throughout: the rows of its flow are gone."""
+    wave = multisine(np.random.default_rng(1), rig.sample_rate, 4.0, 9.5)
+    run = synthetic_run(rig, np.random.default_rng(2), wave, rms=0.025, repeats=1)
+    terms = tuple(map(Used, baseline_of(rig)))
+    stage = board(rig, terms, scenes(rig, [run]))
+    none = [
+        {
+            e: replace(r, matrix=r.matrix[:0], rhs=r.rhs[:0], time=r.time[:0])
+            for e, r in rows.items()
+        }
+        for rows in stage.rows
+    ]
+    for floor in floors(rig, terms, stage.scenes, none, stage.beta):
+        assert (floor.total, floor.repeatable, floor.source) == (0.0, 0.0, STATED)
+        assert floor.noise > 0.0
