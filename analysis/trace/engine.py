@@ -45,6 +45,10 @@ log = logging.getLogger(__name__)
 # The other estimators add small faults of sensors of their own accord: here they are candidates.
 PLAIN = "plain"
 LEAST_ROWS = 40  # of an equation's rows in one record
+ELSEWHERE = (
+    "the training records are met to within the noise, the held-out ones are not: train on "
+    "records that excite as much as these do"
+)
 
 
 def trace(
@@ -77,7 +81,8 @@ def trace(
     listed = Shortlist(stage, variants(rig, candidates))
     before = stripped(identify(runs, terms=terms, estimator=PLAIN).model)
     notes = _notes(stage, judge)
-    if within(listed.empty.excess, listed.limits):
+    quiet = within(listed.empty.excess, listed.limits)
+    if quiet and not gates.remaining(listed, listed.empty, judge):
         found: tuple[Found, ...] = ()
         refused: tuple[Found, ...] = ()
         winner, verdict, moves = listed.empty, CLEAN, []
@@ -86,7 +91,9 @@ def trace(
         found, winner, verdict = _named(listed, winner, judge, rng)
         refused = tuple(f for f in found if not gates.stands(f))
         found = tuple(f for f in found if gates.stands(f))
-        if verdict == UNEXPLAINED and found:
+        if quiet and verdict == UNEXPLAINED:
+            notes.append(ELSEWHERE)
+        if verdict == UNEXPLAINED and (found or quiet):
             notes += [f"{e}: {words}" for e, words in gates.remaining(listed, winner, judge)]
         moves = [] if verdict in (CLEAN, EXPLAINED) else _moves(stage, judge, winner)
     further = propose(listed, winner, found, verdict, moves) if look_ahead else None
@@ -171,11 +178,10 @@ def _named(
     listed: Shortlist, winner: Listed, judge: Board, rng: np.random.Generator
 ) -> tuple[tuple[Found, ...], Listed, str]:
     """Put the winner through the gates; returns what stands, the set that stands, the verdict."""
-    if not winner.effects:
-        return (), winner, UNEXPLAINED
+    found: tuple[Found, ...] = ()
     refused: tuple[Found, ...] = ()
     # What stands beside others may fall without them: judged again until all that is left stands.
-    while True:
+    while winner.effects:
         found = gates.judge(listed, winner, judge, rng)
         fallen = tuple(f for f in found if not gates.stands(f))
         if not fallen:

@@ -99,6 +99,15 @@ def test_friction_and_a_dead_band_at_once_are_both_named(rig: Rig) -> None:
     assert sizes["w_ahead_2"] == pytest.approx(8e-3, rel=0.05)
 
 
+def test_what_only_the_held_out_records_show_is_not_called_clean(rig: Rig) -> None:
+    """At a third of the size the supply's line drops a tenth: too little to be seen in training."""
+    train = experiment(rig, rms=0.012, dp_supply=4e5)
+    held_out = experiment(rig, repeats=2, seed=2, rms=0.04, dp_supply=4e5)
+    result = trace([train], [held_out], look_ahead=False)
+    assert (result.verdict, result.effects) == ("unexplained", ())
+    assert any("train on records that excite as much" in note for note in result.notes)
+
+
 def test_a_quiet_effect_is_found_beside_a_loud_one_of_other_equations(rig: Rig) -> None:
     """Beside so wide a dead band hardly anything hangs on which friction it is."""
     result = traced(rig, w_ahead=2e-2, w_astern=2e-2, Fs=15)
