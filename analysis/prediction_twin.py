@@ -38,7 +38,8 @@ class PlannedStep:
     are multiples of 1/period; `held` maps a joint at an end stop, `closed` one behind a closed
     valve, to its piston [m]; `centres` and `biases` [V] belong to the excited joints; `samples`
     are those of one record. A closed joint may give by `gives` [m]; an excited one is centred to
-    within `offsets` [m]; `strokes` are the pistons [m] it starts from, where not its centres.
+    within `offsets` [m], by a loop of `loops` [V/m] before the records; `strokes` are the pistons
+    [m] it starts from, where not its centres.
     """
 
     name: str
@@ -53,6 +54,7 @@ class PlannedStep:
     strokes: Mapping[int, float] = field(default_factory=dict)
     gives: Mapping[int, float] = field(default_factory=dict)
     offsets: Mapping[int, float] = field(default_factory=dict)
+    loops: Mapping[int, float] = field(default_factory=dict)
 
     @property
     def period(self) -> int:

@@ -94,6 +94,17 @@ def recentring(moved: Motion, centre: float, seconds: float, cap: float) -> floa
     return -float(np.clip(RECENTRE * (moved.ends - centre), -cap, cap)) / seconds
 
 
+def under_loop(piston: Array, pull: float, rate: float) -> Array:
+    """Return a period (n,) of the piston, about zero, while a position loop centres it.
+
+    `pull` [1/s] is the loop's gain times the piston's speed per volt; a line at w goes by
+    j w / (j w + pull). Slow lines shrink, but turn against the others: the peaks may grow.
+    """
+    w = 2 * np.pi * np.fft.rfftfreq(len(piston), 1.0 / rate)
+    lines = np.fft.rfft(piston) * 1j * w / (1j * w + pull)
+    return np.fft.irfft(lines, len(piston))
+
+
 def trim(bias: float, drift: float, wanted: float, gain: float) -> float:
     """Return the bias [V] that changes the drift [m/s] into the one wanted: v + (w - d) / k."""
     return bias + (wanted - drift) / gain

@@ -15,7 +15,7 @@ from typing import Protocol
 
 import numpy as np
 
-from protocols.centring import Array, follow
+from protocols.centring import Array, follow, under_loop
 from protocols.check_report import CheckReport, Prediction, StepCheck
 from protocols.plan import ExcitePlan, Plan, StepPlan
 from rig.model.parse import InputError
@@ -28,6 +28,7 @@ SEEK_SECONDS = 3.0  # of simulation behind each bias but the last
 RAMP_SECONDS = 1.0  # in which the waveform grows on the twin
 SETTLE_SECONDS = 2.0  # simulated before the period that is judged
 DRIFT_LEFT = 0.2  # of the drift that the protocol allows
+WIDER = 1.05  # swing under the centring loop over the free one: told from there on
 
 
 class Twin(Protocol):
@@ -154,6 +155,13 @@ def _joint_lines(
         _either_way("piston speed", name, moved["speed"][:, j], limits.speed, "m/s"),
         _either_way("command", name, part.wave.samples + bias, limits.command, "V"),
     ]
+    loop = part.settings.centring.position_gain
+    wave = np.resize(part.wave.samples, len(piston)) + bias
+    pull = loop * max(follow(wave, piston, rig.sample_rate).gain, 1e-6)
+    looped = under_loop(piston, pull, rig.sample_rate) + part.centre
+    if np.ptp(looped) > WIDER * np.ptp(piston):
+        low, high = float(looped.min()) - offset, float(looped.max()) + offset
+        lines.append(Prediction("piston under the loop", name, low, high, *limits.piston, "m"))
     for chamber in ("cap_pressure", "rod_pressure"):
         pressure = moved[chamber][:, j]
         span = float(pressure.min()), float(pressure.max())

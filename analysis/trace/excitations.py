@@ -37,6 +37,7 @@ AT_END = 2e-3  # [m] a locked piston so near to its end stands at it
 CLOSED_GIVES = 5e-3  # [m] of a joint behind a closed valve
 END_GIVES = 2e-3  # [m]
 OFFSET = 4e-3  # [m] that a record's centre may be off
+LOOP = 2.0  # [V/m] of the loop that centres before the records
 # Amplitude of the held-out variant. What an experiment brings out at its limits is soon gone below.
 HELD_OUT = 0.85
 REPEATS = 4
@@ -214,6 +215,7 @@ def _step(
         repeats=REPEATS,
         gives=dict.fromkeys(setting.closed, CLOSED_GIVES),
         offsets=dict.fromkeys(tones, OFFSET),
+        loops=dict.fromkeys(tones, LOOP),
     )
 
 
@@ -258,7 +260,13 @@ def _as_step(
                     "phases": [f"{np.angle(a):.5g} rad" for a in spectrum],
                 },
                 "centre": f"{1e3 * one.step.centres[j]:.6g} mm",
-                "centring": {"mode": "open-loop", "drift": offset, "offset": offset, "tries": 6},
+                "centring": {
+                    "mode": "open-loop",
+                    "position_gain": f"{LOOP:g} V/m",
+                    "drift": offset,
+                    "offset": offset,
+                    "tries": 6,
+                },
             }
         )
     return {
