@@ -94,6 +94,13 @@ def recentring(moved: Motion, centre: float, seconds: float, cap: float) -> floa
     return -float(np.clip(RECENTRE * (moved.ends - centre), -cap, cap)) / seconds
 
 
+def free_path(wave: Array, period: int, gain: float, rate: float) -> Array:
+    """Return the way (period,) [m] of a piston about its mean that goes by `gain` [m/(s V)]."""
+    command = np.resize(wave, period)
+    way = np.cumsum(command - command.mean()) * gain / rate
+    return np.asarray(way - way.mean())
+
+
 def under_loop(piston: Array, pull: float, rate: float) -> Array:
     """Return a period (n,) of the piston, about zero, while a position loop centres it.
 

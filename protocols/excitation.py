@@ -12,7 +12,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from drivers.base import OutputLaw
-from protocols.centring import Array, Motion, follow, motion, moved_by
+from protocols.centring import Array, Motion, follow, free_path, motion, moved_by
 from protocols.driven import (
     Driven,
     check_swing,
@@ -36,6 +36,7 @@ WARM_UPS = 3  # at most; more than one only if the first left the piston off cen
 LOOSER = 0.8  # factor between two position gains while the loop is loosened
 RAMP_DOWN = 0.5  # [s] a moving arm is not stopped by closing its valve at once
 LOOK_AHEAD = 0.1  # [s] between two forecasts
+RELEASED = 0.25  # of the offset allowed: so near its free way a piston is let go
 
 
 class Excitation:
@@ -95,6 +96,7 @@ class Excitation:
         Raises ProtocolAborted after as many tries as the protocol allows.
         """
         record = self.step.record / self.session.rate
+        self._release()
         for _ in range(self.step.tries + 1):
             self._play()
             moved = self._stretch(self.step.trial)
@@ -108,6 +110,44 @@ class Excitation:
                 return
         worst = max(self.joints, key=lambda d: abs(d.moved.ends - d.plan.centre))
         raise not_centred(worst, record, self.step.tries + 1, self.step.name)
+
+    def _release(self) -> None:
+        """Let go of the slow loop, each joint where the free waveform would have its piston.
+
+        From elsewhere it would go the same way off centre: for a slow waveform, whose phase a loop
+        turns by a quarter, by as much as its whole swing. A fast one has no way to be off.
+        """
+        period, rate = self.step.period, self.session.rate
+        paths = {
+            d.joint: free_path(d.plan.wave.samples, period, d.gain, rate) + d.plan.centre
+            for d in self.joints
+            if d.loop == 0.0 and self.session.laws[d.joint].position_gain > 0.0
+        }
+        before = {d.joint: self._off_path(d.joint, paths) for d in self.joints if d.joint in paths}
+        allowed = {d.joint: RELEASED * d.centring.offset for d in self.joints}
+        if all(abs(off) <= 2 * allowed[j] for j, off in before.items()):
+            return
+        laws = {d.joint: self._law(d, 1.0, 0.0) for d in self.joints}
+        while before and self.session.now < self.at + period:
+            self._go_on(RAMP_STEP)
+            for j, off in list(before.items()):
+                now = self._off_path(j, paths)
+                if abs(now) <= allowed[j] or now * off < 0.0:
+                    self.session.apply({j: laws[j]})
+                    del before[j]
+        self.session.apply({j: laws[j] for j in before})
+        self._advance(math.ceil((self.session.now - self.at) / period) * period)
+        self._references = [
+            paths.get(d.joint, reference)
+            for d, reference in zip(self.joints, self._references, strict=True)
+        ]
+
+    def _off_path(self, joint: int, paths: Mapping[int, Array]) -> float:
+        """Return how far [m] a piston is from its free way, at the last sample read."""
+        now = self.session.now
+        (piston,) = self.session.piston(joint, now - 1, now)
+        path = paths[joint]
+        return float(piston - path[(now - 1 - self.start) % len(path)])
 
     def record(self) -> bool:
         """Play one record from the boundary reached; False if it had to be disturbed.

@@ -219,3 +219,35 @@ def test_a_spool_off_its_null_is_found_and_countered(offset: float, rig: Rig) ->
         assert float(record.attributes["lock_gain_v_per_m_1"]) > 0.0
         assert float(record.attributes["lock_give_m_1"]) < 2e-3
         assert float(record.attributes["bias_v_2"]) == pytest.approx(-offset, abs=5e-3)
+
+
+SLOW = """
+name: slow
+joints: 2
+steps:
+  - name: slow
+    repeats: 2
+    lock: [{joint: 2, at: end_min}]
+    excite:
+      - joint: 1
+        signal:
+          kind: lines
+          base_frequency: 0.1 Hz
+          lines: [1, 3, 5, 7, 9]
+          amplitudes: [0.1 V, 0.058 V, 0.045 V, 0.038 V, 0.034 V]
+          phases: [-0.2 rad, -0.73 rad, -1.76 rad, -2.7 rad, 2.75 rad]
+        centring: {drift: 4 mm, offset: 4 mm, tries: 6}
+"""
+
+
+def test_a_slow_wave_is_let_go_where_it_goes_on_centred(rig: Rig) -> None:
+    """A swing of 23 mm in ten seconds, whose phase the centring loop had turned."""
+    bench = LittleBench(rig, default_cylinders())
+    run(resolve(parse_model(Protocol, SLOW, "slow.yaml"), rig), rig, bench)  # raises at a limit
+    assert len(bench.complete) == 2
+    for record in bench.complete:
+        piston = bench.channel("piston_1", record.start, record.ticks)
+        assert np.ptp(piston) > 0.045
+        assert abs(piston.mean()) < 4e-3
+    # From wherever a boundary finds it, it would go out to 35.8 mm before it is caught.
+    assert np.abs(bench.channel("piston_1")).max() < 33e-3
