@@ -48,14 +48,16 @@ class Effect(Term):
 
     `variable` names in plain words what the effect's contribution moves with; `confounders` are
     effects whose columns look alike on poor excitation, `separated_by` the excitation that tells
-    them apart. `stage` orders the terms' `prepare` (see `ordered`): what a sensor distorts is
-    undone first, then comes what acts on the spool, in the oil's own order.
+    them apart; `includes` names effects that it becomes at a limit of its own numbers. `stage`
+    orders the terms' `prepare` (see `ordered`): what a sensor distorts is undone first, then comes
+    what acts on the spool, in the oil's own order.
     """
 
     family: ClassVar[str] = ""
     variable: ClassVar[str] = ""
     confounders: ClassVar[tuple[str, ...]] = ()
     separated_by: ClassVar[str] = ""
+    includes: ClassVar[tuple[str, ...]] = ()
     stage: ClassVar[int] = PLANT
 
     @property

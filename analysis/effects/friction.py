@@ -164,6 +164,7 @@ class StribeckFriction(Friction):
     name: ClassVar[str] = "stribeck_friction"
     variable: ClassVar[str] = "the piston's velocity near zero"
     confounders: ClassVar[tuple[str, ...]] = ("coulomb_friction", "asymmetric_friction")
+    includes: ClassVar[tuple[str, ...]] = ("coulomb_friction",)  # at a high Stribeck speed
     separated_by: ClassVar[str] = (
         "slow sweeps through zero velocity beside fast ones: it is gone above the Stribeck speed"
     )

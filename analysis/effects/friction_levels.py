@@ -56,6 +56,7 @@ class AsymmetricFriction(Friction):
     name: ClassVar[str] = "asymmetric_friction"
     variable: ClassVar[str] = "the direction of the piston's motion"
     confounders: ClassVar[tuple[str, ...]] = ("coulomb_friction", "torque_offset")
+    includes: ClassVar[tuple[str, ...]] = ("coulomb_friction",)  # where both levels are equal
     separated_by: ClassVar[str] = (
         "motion about several places of the stroke: an offset torque does not go with G"
     )

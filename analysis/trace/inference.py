@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.terms import known
 from analysis.terms.base import Used
 from analysis.trace import select
 from analysis.trace.board import Board
@@ -166,12 +167,21 @@ def stability(
     for change, weight, noise in samples:
         refitted = [_again(stage, t.one, _refitted(t, change, weight), noise) for t in tangents]
         best = listed.best(refitted)
-        for key in winner.keys & best.keys:
+        said = best.keys | _included(best)
+        for key in winner.keys & said:
             counts[key] += 1
         for name, where in best.keys - winner.keys:
             label = f"{name} at {where}"
             others[label] = others.get(label, 0) + 1
     return {key: (count / len(samples), others) for key, count in counts.items()}
+
+
+def _included(one: Listed) -> set[tuple[str, str]]:
+    """Return what a set says beside its own names: an effect with more numbers includes another."""
+    kinds = known()
+    return {
+        (name, where) for kind, where in one.keys for name in getattr(kinds[kind], "includes", ())
+    }
 
 
 def _refitted(one: Linear, change: Array, weight: Array) -> Array:
