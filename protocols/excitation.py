@@ -123,7 +123,7 @@ class Excitation:
             for d in self.joints
             if d.loop == 0.0 and self.session.laws[d.joint].position_gain > 0.0
         }
-        before = {d.joint: self._off_path(d.joint, paths) for d in self.joints if d.joint in paths}
+        before = {j: self._off_path(j, path) for j, path in paths.items()}
         allowed = {d.joint: RELEASED * d.centring.offset for d in self.joints}
         if all(abs(off) <= 2 * allowed[j] for j, off in before.items()):
             return
@@ -131,7 +131,7 @@ class Excitation:
         while before and self.session.now < self.at + period:
             self._go_on(RAMP_STEP)
             for j, off in list(before.items()):
-                now = self._off_path(j, paths)
+                now = self._off_path(j, paths[j])
                 if abs(now) <= allowed[j] or now * off < 0.0:
                     self.session.apply({j: laws[j]})
                     del before[j]
@@ -142,11 +142,10 @@ class Excitation:
             for d, reference in zip(self.joints, self._references, strict=True)
         ]
 
-    def _off_path(self, joint: int, paths: Mapping[int, Array]) -> float:
+    def _off_path(self, joint: int, path: Array) -> float:
         """Return how far [m] a piston is from its free way, at the last sample read."""
         now = self.session.now
         (piston,) = self.session.piston(joint, now - 1, now)
-        path = paths[joint]
         return float(piston - path[(now - 1 - self.start) % len(path)])
 
     def record(self) -> bool:

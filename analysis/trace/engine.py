@@ -191,15 +191,14 @@ def _named(
         if not smaller:
             return refused, listed.empty, UNEXPLAINED
         winner = listed.exact(smaller)
-    while rest := gates.remaining(listed, winner, judge):
+    rest = gates.remaining(listed, winner, judge)
+    while rest:
         more = listed.closer(winner, {equation for equation, _ in rest})
-        if more is None:
+        wider = gates.judge(listed, more, judge, rng) if more else ()
+        later = gates.remaining(listed, more, judge) if more else rest
+        if more is None or len(later) >= len(rest) or not all(map(gates.stands, wider)):
             return (*found, *refused), winner, UNEXPLAINED
-        wider = gates.judge(listed, more, judge, rng)
-        less = len(gates.remaining(listed, more, judge)) < len(rest)
-        if not (less and all(map(gates.stands, wider))):
-            return (*found, *refused), winner, UNEXPLAINED
-        found, winner = wider, more
+        found, winner, rest = wider, more, later
     tied = any(r.tied for f in found for r in f.rivals)
     return found, winner, CONFOUNDED if tied else EXPLAINED
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.terms import known
+from analysis.effects.base import Effect
 from analysis.terms.base import Used
 from analysis.trace import select
 from analysis.trace.board import Board
@@ -178,10 +178,8 @@ def stability(
 
 def _included(one: Listed) -> set[tuple[str, str]]:
     """Return what a set says beside its own names: an effect with more numbers includes another."""
-    kinds = known()
-    return {
-        (name, where) for kind, where in one.keys for name in getattr(kinds[kind], "includes", ())
-    }
+    effects = [u.term for u in one.effects if isinstance(u.term, Effect)]
+    return {(name, effect.where) for effect in effects for name in effect.includes}
 
 
 def _refitted(one: Linear, change: Array, weight: Array) -> Array:

@@ -88,7 +88,7 @@ class Shortlist:
     def run(self) -> Listed:
         """Search: singles and pairs from the first board, then extensions; returns the winner."""
         found = entries(self.stage, self.variants)
-        field = self._field(found)
+        field = self._field(self.stage, found)
         r = self.stage.mean
         r = r - field.basis @ (field.basis.T @ r)
         self.field, self.projected = field, r
@@ -126,9 +126,11 @@ class Shortlist:
         best = self.best(more) if more else now
         return best if best.effects and self.prune(best).keys == best.keys else now
 
-    def _field(self, found: Sequence[Entry], mask: Array | None = None) -> select.Field:
-        rig = self.stage.rig
-        values = parameter_values(rig, self.stage.terms, dict(self.stage.beta))
+    def _field(
+        self, stage: Board, found: Sequence[Entry], mask: Array | None = None
+    ) -> select.Field:
+        rig = stage.rig
+        values = parameter_values(rig, stage.terms, dict(stage.beta))
 
         def allowed(entry: Entry, coefficients: Array) -> bool:
             own = dict(zip(entry.names, map(float, coefficients), strict=True))
@@ -142,7 +144,7 @@ class Shortlist:
         def size(entry: Entry) -> int:
             return complexity(rig, [entry.variant.used])[1]
 
-        return select.field(self.stage, found, size, allowed, mask)
+        return select.field(stage, found, size, allowed, mask)
 
     def _singles(self, field: select.Field, r: Array) -> list[tuple[Used, ...]]:
         g = select.gains(field.K, field.columns.T @ r, field.groups, field.raw)
@@ -178,9 +180,9 @@ class Shortlist:
         taken = now.keys
         found = entries(stage, [v for v in self.variants if v.key not in taken])
         mask = np.ones(len(now.fit.left))
-        for s in stage.segments if equations else ():
-            mask[s.where] = float(s.equation in equations)
-        field = self._field_of(stage, found, mask)
+        for s in stage.segments:
+            mask[s.where] = not equations or s.equation in equations
+        field = self._field(stage, found, mask)
         r = now.fit.left * mask
         r = r - field.basis @ (field.basis.T @ r)
         more = select.options(field, (), r, 1.0)
@@ -217,13 +219,6 @@ class Shortlist:
         slack = max((select.AS_GOOD - 1.0) * max(0.0, best), select.CHANCE)
         near = [o for o in more if left(o) <= best + slack]
         return min(near, key=lambda o: (o.size[1], left(o)))
-
-    def _field_of(self, stage: Board, found: Sequence[Entry], mask: Array) -> select.Field:
-        keep, self.stage = self.stage, stage
-        try:
-            return self._field(found, mask)
-        finally:
-            self.stage = keep
 
     def prune(self, one: Listed) -> Listed:
         """Drop effects without which about as little is left."""
