@@ -22,6 +22,7 @@ from analysis.trace.board import Board, board
 from analysis.trace.candidates import catalogue, variants
 from analysis.trace.evidence import Scene, scenes
 from analysis.trace.floor import STATED
+from analysis.trace.lines import lines
 from analysis.trace.listed import Listed, within
 from analysis.trace.next_experiment import propose
 from analysis.trace.refine import rebased
@@ -107,6 +108,7 @@ def trace(
         _fraction(listed, winner), tuple(moves), further, stage.floors,
         first, last, tuple(notes), refused=refused, size=error.size,
         rmse_before=runs_before.rmse, rmse_after=runs_after.rmse,
+        lines=lines(stage, winner.fit.left),
         seconds=time.perf_counter() - started,
     )  # fmt: skip
     return replace(result, sentence=sentence(result))

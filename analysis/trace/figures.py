@@ -20,6 +20,7 @@ from analysis.rows import Rows
 from analysis.terms.base import family_of
 from analysis.trace.clue_variables import variables
 from analysis.trace.evidence import Scene, filtered, prepared, residual, scene_rows, scenes
+from analysis.trace.lines import Lines as Spectrum
 from analysis.trace.refine import Fit
 from analysis.trace.result import Trace
 from analysis.trace.words import loudest
@@ -162,6 +163,41 @@ def over_noise(result: Trace, key: str = "overnoise") -> Markup:
         return svg(made, key, "Held-out error over the noise floor, before and after")
 
 
+def spectrum(one: Spectrum, unit: str, key: str, after: bool) -> Markup:
+    """Draw the lines of a residual by kind, before beside after, over the noise of one repeat."""
+    number = np.arange(len(one.frequency))
+    kinds = (
+        ("excited", one.excited, "o", INK, 4.0),
+        ("odd, left empty", (number % 2 == 1) & ~one.excited, "s", MODEL, 3.2),
+        ("even", number % 2 == 0, "^", BLUE, 3.0),
+    )
+    noise = np.sqrt(one.noise)
+    low = 0.2 * float(np.median(noise))
+    top = 2.0 * float(np.sqrt(max(one.repeatable.max(), one.noise.max())))
+    with style():
+        made = figure(2.6, CARD * (2 if after else 1))
+        for k, word in enumerate(("before", "after") if after else ("before",)):
+            axes = made.add_subplot(1, 2 if after else 1, k + 1)
+            power = one.after if k else one.repeatable
+            axes.fill_between(one.frequency, low, np.maximum(noise, low), color=PALE, lw=0)
+            for label, members, marker, colour, size in kinds:
+                y = np.sqrt(np.maximum(power[members], 0.0))
+                axes.plot(
+                    one.frequency[members], np.where(y > low, y, np.nan), marker, color=colour,
+                    ms=size, mew=0, label=label,
+                )  # fmt: skip
+            axes.set_yscale("log")
+            axes.set_ylim(low, top)
+            axes.yaxis.set_major_formatter(lambda v, _: f"{v:g}")
+            axes.set_xlabel("frequency [Hz]")
+            if not k:
+                axes.set_ylabel(f"repeats, rms per line [{unit}]")
+                axes.legend(loc="lower left", fontsize=7, ncols=3, handletextpad=0.2, frameon=False)
+            note(axes, 0.98, 0.98, word, INK)
+        made.tight_layout()
+        return svg(made, key, "Lines of the residual, before and after")
+
+
 def binned(x: Array, y: Array, count: int = 24) -> dict[str, Array]:
     """Return mean and quartiles of y in bins of equally many x."""
     order = np.argsort(x)
@@ -198,5 +234,5 @@ def equation_of(
 
 __all__ = [
     "Lines", "abscissae", "against", "equation_of", "held_out", "in_time", "kind_of",
-    "over_noise", "unit_of_variable",
+    "over_noise", "spectrum", "unit_of_variable",
 ]  # fmt: skip

@@ -12,6 +12,7 @@ from analysis.effects.base import Effect
 from analysis.report import Provenance
 from analysis.report_page import page, write
 from analysis.trace import figures
+from analysis.trace.lines import loudest
 from analysis.trace.result import CLEAN, Found, Trace
 from analysis.trace.words import quantity, unit_of_equation
 from rig.model.records import Run
@@ -68,6 +69,7 @@ def body(
             for name, value in result.fit_before.items()
         ],
         "floors": result.floors,
+        "spectra": _spectra(rig, result),
         "fm": fm,
     }
 
@@ -107,6 +109,18 @@ def _pair(
         "time": figures.in_time(longest, noise, unit, f"{key}t", changed),
         "record": longest.scene.record.name,
     }
+
+
+def _spectra(rig: Rig, result: Trace) -> list[dict[str, Any]]:
+    """Return the lines of the loudest residuals: picture and words."""
+    changed = result.model_after is not result.model_before
+    return [
+        {
+            "text": one.text,
+            "figure": figures.spectrum(one, unit_of_equation(rig, one.equation), f"l{k}", changed),
+        }
+        for k, one in enumerate(loudest(result.lines))
+    ]
 
 
 def _errors(result: Trace) -> list[tuple[str, ...]]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from analysis.model import Estimate, Model, estimate_json, finite
 from analysis.trace.floor import Floor
+from analysis.trace.lines import Lines
 from analysis.trace.refine import Fit
 
 CLEAN: Final = "clean"
@@ -92,6 +93,7 @@ class Trace:
 
     `floors` are the training records' split residuals under the baseline, `notes` what a person
     must know of the evidence's weakness; `refused` fitted best but did not pass the gates.
+    `lines` are the training residual's, the loudest first.
     `rows_before` and `rows_after` are the fits behind the errors, what acts beside the baseline
     included; the models are at the rig's nominal temperature.
     """
@@ -118,6 +120,7 @@ class Trace:
     size: Mapping[str, float] = field(default_factory=dict)
     rmse_before: Mapping[str, float] = field(default_factory=dict)
     rmse_after: Mapping[str, float] = field(default_factory=dict)
+    lines: tuple[Lines, ...] = ()
 
     @property
     def tied(self) -> list[tuple[str, str]]:
@@ -136,7 +139,10 @@ class Trace:
 
 
 def to_json(result: Trace) -> dict[str, Any]:
-    """Return the contract's JSON; `refused gates size rmse noise notes sentence seconds` added."""
+    """Return the contract's JSON.
+
+    Added to it are `refused gates size rmse noise lines notes sentence seconds`.
+    """
     return {
         "verdict": result.verdict,
         "effects": [_effect(e) for e in result.effects],
@@ -166,6 +172,7 @@ def to_json(result: Trace) -> dict[str, Any]:
             }
             for f in result.floors
         ],
+        "lines": [_lines(one) for one in result.lines],
         "notes": list(result.notes),
         "sentence": result.sentence,
         "seconds": result.seconds,
@@ -187,6 +194,14 @@ def _effect(found: Found) -> dict[str, Any]:
             for r in found.rivals
         ],
         "gates": [{"name": g.name, "ok": g.ok, "detail": g.detail} for g in found.gates],
+    }  # fmt: skip
+
+
+def _lines(one: Lines) -> dict[str, Any]:
+    return {
+        "step": one.group[1], "equation": one.equation, "above_noise": finite(one.loud),
+        "shares": _numbers(one.shares), "shares_after": _numbers(one.shares_after),
+        "text": one.text,
     }  # fmt: skip
 
 

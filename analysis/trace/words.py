@@ -40,9 +40,18 @@ def sentence(result: Trace) -> str:
     clue = ", ".join(d.text for d in result.depends_on[:2])
     return (
         f"{found}{100 * result.unexplained_fraction:.0f} % of what repeats stays unexplained"
-        + (f"; it moves with {clue}." if clue else ".")
-        + (f" {errors}" if named else "")
+        + (f"; it moves with {clue}" if clue else "")
+        + _symmetry(result)
+        + (f". {errors}" if named else ".")
     )
+
+
+def _symmetry(result: Trace) -> str:
+    """Say what the lines of the loudest remainder tell of its cause ('' without such lines)."""
+    loud = max(result.lines, key=lambda one: one.loud_after, default=None)
+    if loud is None or loud.loud_after < 1.0:
+        return ""
+    return f"; by its lines in {loud.equation} it is {loud.meaning_after}"
 
 
 def _moves(effects: tuple[Found, ...]) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from analysis.trace.lines import loudest
 from analysis.trace.result import Found, Trace
 from analysis.trace.rounds import Round
 from analysis.trace.words import quantity, unit_of_equation
@@ -57,6 +58,7 @@ def trace_text(result: Trace) -> str:
     changed = _changed(result)
     if changed:
         lines += [table(["parameter", "before", "after", "change"], changed), ""]
+    lines += [f"lines: {one.text}" for one in loudest(result.lines)]
     if result.depends_on:
         moves = ", ".join(f"{d.text} ({100 * d.share:.0f} %)" for d in result.depends_on[:4])
         lines.append(f"what is left moves with: {moves} (a clue, not a name)")
