@@ -49,12 +49,17 @@ class Drive:
 
 @dataclass(frozen=True)
 class State:
-    """State at one instant: q [rad], qd [rad/s], p_cap, p_rod [Pa], each (N,)."""
+    """State at one instant: q [rad], qd [rad/s], p_cap, p_rod [Pa], each (N,).
+
+    `hidden` (h,) are the terms' own states in the model's order (see `hidden_paths`); none of them
+    given means all at zero, as after a long rest.
+    """
 
     q: Array
     qd: Array
     p_cap: Array
     p_rod: Array
+    hidden: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -173,6 +178,8 @@ def simulate(
     hidden = int(ready.hidden_ends[-1])
     ys = np.zeros((samples, 4 * N + hidden))
     ys[0, : 4 * N] = np.concatenate((start.q, start.qd, start.p_cap, start.p_rod))
+    if start.hidden is not None:
+        ys[0, 4 * N :] = start.hidden
     inputs = _inputs(drive)[first : first + samples]
     atol = np.repeat(
         [ATOL_ANGLE, ready.rate_tolerance, ATOL_PRESSURE, ATOL_PRESSURE, ATOL_HIDDEN],
@@ -248,3 +255,17 @@ def state_at(signals: Signals, sample: int) -> State:
     return State(
         signals.q[sample], signals.qd[sample], signals.p_cap[sample], signals.p_rod[sample]
     )
+
+
+def hidden_paths(model: Model, signals: Signals) -> Array:
+    """Return the terms' own states (n, h) along measured signals, in the model's order.
+
+    Every term sees the signals as those before it prepared them, as in simulation. `signals` are
+    free of what sensors distort.
+    """
+    values, out = model.values, [np.zeros((len(signals.t), 0))]
+    for used in model.terms:
+        out.append(used.term.hidden_path(model.rig, signals, values, used.shape))
+        if used.term.prepares:
+            signals = used.term.prepare(model.rig, signals, used.shape)
+    return np.concatenate(out, axis=1)

@@ -19,7 +19,15 @@ from analysis.effects.measurement import corrected_channels
 from analysis.model import Model, finite, refuse_other_rig
 from analysis.rows import Filtering, default_filtering
 from analysis.signals import Mask, Signals, aligned_channels, condition, lost_samples
-from analysis.simulate import Simulation, State, compiled, drive_of, simulate, state_at
+from analysis.simulate import (
+    Simulation,
+    State,
+    compiled,
+    drive_of,
+    hidden_paths,
+    simulate,
+    state_at,
+)
 from rig.model import channels as ch
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
@@ -90,14 +98,17 @@ def validate_record(
     channels = corrected_channels(rig, model.terms, channels, record.sample_rate)
     measured = _compared(rig, channels, signals)
     ready, drive = compiled(model), drive_of(signals)
-    free = simulate(ready, drive, first_state(rig, record, signals, channels))
+    hidden = hidden_paths(model, signals)
+    first_of_all = first_state(rig, record, signals, channels)
+    free = simulate(ready, drive, replace(first_of_all, hidden=hidden[0]))
     simulated = free.channels()
     windows = dict.fromkeys(measured, 0.0)
     count = 0
     for first, length in _windows(record, smoother):
         if not here[first : first + length].all():
             continue
-        short = simulate(ready, drive, state_at(signals, first), first, length)
+        start = replace(state_at(signals, first), hidden=hidden[first])
+        short = simulate(ready, drive, start, first, length)
         stretch = short.channels()
         for name, y in measured.items():
             error = stretch[name] - y[first : first + length]

@@ -73,6 +73,10 @@ class Friction(Effect):
         """Return 1: the deflection y = d z."""
         return 1
 
+    def fastest(self, shape: Sequence[float]) -> float:
+        """Return the bound of the contact's relaxation."""
+        return FASTEST
+
     def contact(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Array:
         """Return z (n,) along the measured path."""
         if not len(shape):
@@ -145,6 +149,14 @@ class CoulombFriction(Friction):
         z = self.contact(rig, signals, shape)
         return self.row({f"Fc{self.joint + 1}": signals.G[:, self.joint] * z})
 
+    def hidden_path(
+        self, rig: Rig, signals: Signals, values: Mapping[str, float], shape: Sequence[float]
+    ) -> Array:
+        """Return the deflection (n, 1) [m]."""
+        if not len(shape):
+            return super().hidden_path(rig, signals, values, shape)
+        return shape[-1] * self.contact(rig, signals, shape)[:, None]
+
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Refuse friction that drives, and more than half of the cylinder's force."""
         name = f"Fc{self.joint + 1}"
@@ -192,14 +204,26 @@ class StribeckFriction(Friction):
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return G w."""
-        ratio = signals.sd[:, self.joint] / self.shape_of(rig, shape)[0]
-        level = np.exp(-(ratio**2))
         if len(shape):
-            s = np.ascontiguousarray(signals.s[:, self.joint])
-            w = contact_under_load(s, level, 1.0 / shape[-1])
+            w = self.hidden_path(rig, signals, {}, shape)[:, 0] / shape[-1]
         else:
-            w = level * self.contact(rig, signals, ())
+            w = self._level(rig, signals, shape) * self.contact(rig, signals, ())
         return self.row({f"Fs{self.joint + 1}": signals.G[:, self.joint] * w})
+
+    def _level(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Array:
+        """Return exp(-(s'/vs)^2) (n,)."""
+        ratio = signals.sd[:, self.joint] / self.shape_of(rig, shape)[0]
+        return np.asarray(np.exp(-(ratio**2)))
+
+    def hidden_path(
+        self, rig: Rig, signals: Signals, values: Mapping[str, float], shape: Sequence[float]
+    ) -> Array:
+        """Return w d (n, 1) [m]."""
+        if not len(shape):
+            return super().hidden_path(rig, signals, values, shape)
+        s = np.ascontiguousarray(signals.s[:, self.joint])
+        w = contact_under_load(s, self._level(rig, signals, shape), 1.0 / shape[-1])
+        return np.asarray(shape[-1] * w[:, None])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Refuse a breakaway below Coulomb's level, too much of it, and a speed at its bounds."""

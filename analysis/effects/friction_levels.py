@@ -90,13 +90,28 @@ class AsymmetricFriction(Friction):
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return G a and -G r."""
         lever = signals.G[:, self.joint]
+        ahead, back = self._shares(rig, signals, shape)
+        return self.row(dict(zip(self._names(), (lever * ahead, -lever * back), strict=True)))
+
+    def _shares(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> tuple[Array, Array]:
+        """Return the shares (n,) of the two levels along the measured path."""
         if len(shape):
             s = np.ascontiguousarray(signals.s[:, self.joint])
             ahead, back = contact_levels(s, shape[0], shape[1])
-        else:
-            z = self.contact(rig, signals, ())
-            ahead, back = np.maximum(z, 0.0), np.maximum(-z, 0.0)
-        return self.row(dict(zip(self._names(), (lever * ahead, -lever * back), strict=True)))
+            return ahead, back
+        z = self.contact(rig, signals, ())
+        return np.maximum(z, 0.0), np.maximum(-z, 0.0)
+
+    def hidden_path(
+        self, rig: Rig, signals: Signals, values: Mapping[str, float], shape: Sequence[float]
+    ) -> Array:
+        """Return the force over the sum of both levels, times the first distance (n, 1) [m]."""
+        if not len(shape):
+            return super().hidden_path(rig, signals, values, shape)
+        ahead, back = self._shares(rig, signals, shape)
+        extending, retracting = (values[name] for name in self._names())
+        force = extending * ahead - retracting * back
+        return (shape[0] * force / (extending + retracting))[:, None]
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
         """Return joint (0-based), levels, presliding distances, 0 where none are given."""
@@ -151,13 +166,28 @@ class PressureDependentFriction(Friction):
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return G w."""
         i = self.joint
-        load = np.maximum(signals.p_cap[:, i] + signals.p_rod[:, i], 0.0)
+        level = self._load(signals) * self.contact(rig, signals, ())
         if len(shape):
-            s = np.ascontiguousarray(signals.s[:, i])
-            level = contact_under_load(s, load, rig.supply.pressure / shape[-1])
-        else:
-            level = load * self.contact(rig, signals, ())
+            path = self.hidden_path(rig, signals, {}, shape)[:, 0]
+            level = path * rig.supply.pressure / shape[-1]
         return self.row({f"k_friction_{i + 1}": signals.G[:, i] * level})
+
+    def _load(self, signals: Signals) -> Array:
+        """Return p_cap + p_rod (n,) [Pa], never below zero."""
+        i = self.joint
+        return np.asarray(np.maximum(signals.p_cap[:, i] + signals.p_rod[:, i], 0.0))
+
+    def hidden_path(
+        self, rig: Rig, signals: Signals, values: Mapping[str, float], shape: Sequence[float]
+    ) -> Array:
+        """Return w d / p_S (n, 1) [m]."""
+        if not len(shape):
+            return super().hidden_path(rig, signals, values, shape)
+        stiffness = rig.supply.pressure / shape[-1]
+        s = np.ascontiguousarray(signals.s[:, self.joint])
+        return (
+            np.asarray(contact_under_load(s, self._load(signals), stiffness)[:, None]) / stiffness
+        )
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
         """Return joint (0-based), k, presliding distance (0 where none is given), p_S."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import ClassVar, Final
 
 import numpy as np
 from numba import njit
@@ -159,6 +159,9 @@ class SpoolOffset(ValveEffect):
         return (("sensor_offset", f"joint {self.joint + 1}"),)
 
 
+QUICKEST: Final = 1e-4  # [s] time constant that the integrator can follow
+
+
 @dataclass(frozen=True)
 class SpoolLag(ValveEffect):
     """The opening follows the LVDT: tau dx/dt = u - x (Jelali and Kroll 2003).
@@ -194,13 +197,22 @@ class SpoolLag(ValveEffect):
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Let the spool's signal lag."""
-        tau = self.shape_of(rig, shape)[0]
+        return self.with_opening(signals, self.hidden_path(rig, signals, {}, shape)[:, 0])
+
+    def hidden_path(
+        self, rig: Rig, signals: Signals, values: Mapping[str, float], shape: Sequence[float]
+    ) -> Array:
+        """Return the opening (n, 1) [V]."""
         u = np.ascontiguousarray(signals.u[:, self.joint])
-        return self.with_opening(signals, lagged(u, tau * signals.rate))
+        return lagged(u, self.shape_of(rig, shape)[0] * signals.rate)[:, None]
+
+    def fastest(self, shape: Sequence[float]) -> float:
+        """Return 1 / tau, as simulated."""
+        return 1.0 / max(shape[0], QUICKEST) if len(shape) else 0.0
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
         """Return joint, time constant, kept above what the integrator can follow."""
-        return np.array([self.joint, max(self.shape_of(rig, shape)[0], 1e-4)])
+        return np.array([self.joint, max(self.shape_of(rig, shape)[0], QUICKEST)])
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return the spool's velocity [V/s]."""

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analysis.differentiate import channel_filter
+from analysis.effects.base import ordered
 from analysis.estimators import nuisance as nu
-from analysis.estimators.shooting import SAMPLES_PER_STEP, Window, shoot
+from analysis.estimators.shooting import SAMPLES_PER_STEP, Window, parts_of, shoot
 from analysis.model import Estimate, Model
 from analysis.rows import default_filtering
 from analysis.signals import Mask, Signals, condition
-from analysis.simulate import Compiled, compiled, drive_of
+from analysis.simulate import Compiled, compiled, drive_of, hidden_paths
 from analysis.terms.base import Used
 from rig.model import channels as ch
 from rig.model.parse import InputError
@@ -46,7 +47,10 @@ class Stretch:
 
 @dataclass(frozen=True)
 class Source:
-    """One record: signals and inputs of the integrator, oil temperature less nominal [K]."""
+    """One record: signals and inputs of the integrator, oil temperature less nominal [K].
+
+    The signals are free of what the model says of sensors.
+    """
 
     signals: Signals
     inputs: Array
@@ -56,23 +60,52 @@ class Source:
 
 @dataclass(frozen=True)
 class Reduced:
-    """A window after its start was eliminated: score, information, cost, and how to get back."""
+    """A window after its start was eliminated: score, information, cost, and how to get back.
+
+    `rest` is the cost that the best start leaves.
+    """
 
     score: Array
     information: Array
     cost: float
+    rest: float
     back: Array
     offset: Array
     residual: Array
 
 
+@dataclass(frozen=True)
+class Nudged:
+    """The model of one record: as it is, and `pars` (1 + k, parameters) with every nudge.
+
+    `sizes` (k,) are the nudges, `hidden` the terms' own states (n, h) along the record for each.
+    """
+
+    ready: Compiled
+    pars: Array
+    sizes: Array
+    hidden: tuple[Array, ...]
+
+
 class Windows:
-    """The data of one fit by windows, and the simulations of them."""
+    """The data of one fit by windows, and the simulations of them.
+
+    `names` are the terms' coefficients; `shapes` further free parameters: shapes of the terms.
+    At most `seconds` of data are used.
+    """
 
     def __init__(
-        self, rig: Rig, runs: Sequence[Run], terms: tuple[Used, ...], names: tuple[str, ...]
-    ) -> None:
-        self.rig, self.terms = rig, terms
+        self, rig: Rig, runs: Sequence[Run], terms: tuple[Used, ...], names: tuple[str, ...],
+        shapes: tuple[str, ...] = (), seconds: float = MOST_SECONDS,
+    ) -> None:  # fmt: skip
+        self.rig, self.terms, self.seconds = rig, ordered(terms), seconds
+        self.places = {
+            name: (k, j)
+            for k, used in enumerate(self.terms)
+            for j, name in enumerate(used.term.shape_names())
+            if name in shapes
+        }
+        names = (*names, *shapes)
         self.reciprocal = {
             c.parameter for used in terms for c in used.term.coefficients(rig) if c.reciprocal
         }
@@ -88,9 +121,12 @@ class Windows:
     def _cut(self, runs: Sequence[Run]) -> None:
         records = [(i, r) for i, run in enumerate(runs) for r in run.records]
         strata = {s: k for k, s in enumerate(sorted({(i, r.step) for i, r in records}))}
-        most = max(1, round(MOST_SECONDS / WINDOW) // len(records))
+        most = max(1, round(self.seconds / WINDOW) // len(records))
         for i, record in records:
             signals = condition(self.rig, record, default_filtering(record).channels)
+            for used in self.terms:
+                if not used.term.prepares:  # what simulation does not do itself: put sensors right
+                    signals = used.term.prepare(self.rig, signals, used.shape)
             drive = drive_of(signals)
             inputs = np.column_stack(
                 (drive.p_s, drive.temperature, drive.u, drive.q, drive.qd, drive.qdd)
@@ -138,6 +174,11 @@ class Windows:
         """Steps between two points compared."""
         return max(1, round(self.rig.sample_rate / POINT_RATE / SAMPLES_PER_STEP))
 
+    @property
+    def parts(self) -> int:
+        """Steps into which two samples are cut."""
+        return parts_of(self.terms, self.rig.sample_rate)
+
     def sigma(self) -> dict[int, Array]:
         """Return the outputs' noise by step, (3 F,): the sensors' stated, behind the filter."""
         sensors = self.rig.sensors
@@ -170,18 +211,30 @@ class Windows:
         moved[self._state_places(stretch)] += change
         return moved
 
-    def _pars(self, theta: Array, kelvin: float) -> tuple[Compiled, Array, Array]:
-        """Return the compiled model, (1 + k, parameters) of it nudged, and the nudges (k,)."""
+    def _nudged(self, theta: Array, source: Source) -> Nudged:
+        """Compile the model with every parameter nudged, and find where its own states stand."""
         nudges = NUDGE * np.abs(theta)
         if self.warm:
             b = abs(theta[self.names.index("b")])
             nudges[-1] = NUDGE * b
         rows = [theta, *(theta + n * e for n, e in zip(nudges, np.eye(len(theta)), strict=True))]
-        ready = [self._compiled(row, kelvin) for row in rows]
-        return ready[0], np.array([r.par for r in ready]), nudges
+        models = [self.model(row, source.kelvin) for row in rows]
+        ready = [compiled(model) for model in models]
+        first = hidden_paths(models[0], source.signals)
+        hidden = [
+            hidden_paths(model, source.signals) if first.size and name in self.places else first
+            for model, name in zip(models, ("", *self.names), strict=True)
+        ]
+        return Nudged(ready[0], np.array([r.par for r in ready]), nudges, tuple(hidden))
 
-    def _compiled(self, theta: Array, kelvin: float) -> Compiled:
+    def model(self, theta: Array, kelvin: float = 0.0) -> Model:
+        """Return the model of parameters theta (k,), the oil `kelvin` above nominal."""
         values = dict(zip(self.names, theta.tolist(), strict=True))
+        terms = list(self.terms)
+        for name, (k, j) in self.places.items():
+            shape = list(terms[k].shape)
+            shape[j] = values.pop(name)
+            terms[k] = replace(terms[k], shape=tuple(shape))
         if self.warm:
             values["b"] += kelvin * values.pop(nu.KAPPA)
         nan = (np.nan, np.nan)
@@ -190,23 +243,23 @@ class Windows:
             for n, v in values.items()
         }
         k = len(estimates)
-        return compiled(Model(self.rig, self.terms, estimates, np.full((k, k), np.nan)))
+        return Model(self.rig, tuple(terms), estimates, np.full((k, k), np.nan))
 
     def linearised(
         self, theta: Array, starts: Sequence[Array], sigma: Mapping[int, Array]
     ) -> list[Reduced | None]:
         """Shoot every window with every nudge; None for one whose state ceased to exist."""
-        ready = [self._pars(theta, source.kelvin) for source in self.sources]
+        ready = [self._nudged(theta, source) for source in self.sources]
         return [
-            self._window(stretch, start, sigma[stretch.stratum], *ready[stretch.record])
+            self._window(stretch, start, sigma[stretch.stratum], ready[stretch.record])
             for stretch, start in zip(self.stretches, starts, strict=True)
         ]
 
     def _window(
-        self, stretch: Stretch, start: Array, sigma: Array, ready: Compiled, pars: Array,
-        nudges: Array,
-    ) -> Reduced | None:  # fmt: skip
+        self, stretch: Stretch, start: Array, sigma: Array, nudged: Nudged
+    ) -> Reduced | None:
         """Shoot one window with every nudge and eliminate its start."""
+        ready, nudges = nudged.ready, nudged.sizes
         source = self.sources[stretch.record]
         places = self._state_places(stretch)
         free = len(places) // 4
@@ -217,9 +270,12 @@ class Windows:
         for row, (place, nudge) in enumerate(zip(places, state_nudges, strict=True), start=1):
             y0[row, place] += nudge
         chosen = np.concatenate((np.zeros(1 + len(places), dtype=np.int64), 1 + active))
+        if y0.shape[1] > len(start):
+            first = stretch.window.first
+            y0[:, len(start) :] = [nudged.hidden[k][first] for k in chosen]
         states = shoot(
-            ready, np.ascontiguousarray(pars[chosen]), y0, source.inputs, source.signals.rate,
-            source.locked, stretch.window, self.every,
+            ready, np.ascontiguousarray(nudged.pars[chosen]), y0, source.inputs,
+            source.signals.rate, source.locked, stretch.window, self.every, self.parts,
         )  # fmt: skip
         if states is None:
             return None
@@ -237,7 +293,7 @@ class Windows:
         inner, outer = Q.T @ J, Q.T @ r
         left_J, left_r = J - Q @ inner, r - Q @ outer
         return Reduced(
-            left_J.T @ left_r, left_J.T @ left_J, float(r @ r),
+            left_J.T @ left_r, left_J.T @ left_J, float(r @ r), float(left_r @ left_r),
             np.linalg.solve(R, inner), np.linalg.solve(R, outer), residual,
         )  # fmt: skip
 

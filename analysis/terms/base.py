@@ -165,6 +165,19 @@ class Term:
         """Return the number of hidden states that the kernel integrates."""
         return 0
 
+    def hidden_path(
+        self, rig: Rig, signals: Signals, values: Mapping[str, float], shape: Sequence[float]
+    ) -> Array:
+        """Return the hidden states (n, hidden(rig)) along measured signals, in the kernel's units.
+
+        They begin simulations in the midst of a motion.
+        """
+        return np.zeros((len(signals.t), self.hidden(rig)))
+
+    def fastest(self, shape: Sequence[float]) -> float:
+        """Return the fastest rate [1/s] at which a hidden state relaxes (0: none does)."""
+        return 0.0
+
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
         """Return the kernel's `par` (default: coefficients as in the rows, then the shape)."""
         linear = [
