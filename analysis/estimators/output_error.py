@@ -67,7 +67,7 @@ def output_error(
     """
     names = tuple(c.parameter for used in terms for c in used.term.coefficients(rig))
     refuse_undetermined([n for n in names if not np.isfinite(start.get(n, np.nan))])
-    search = _Search(Windows(rig, runs, tuple(terms), names))
+    search = Search(Windows(rig, runs, tuple(terms), names))
     return search.run(np.array([*(start[n] for n in names), start.get(nu.KAPPA, 0.0)]))
 
 
@@ -80,14 +80,17 @@ def refuse_undetermined(missing: Sequence[str]) -> None:
         )
 
 
-class _Search:
-    """The steps of one fit."""
+class Search:
+    """The steps of one fit; `low` and `high` (k,) bound the parameters where they are given."""
 
-    def __init__(self, windows: Windows) -> None:
-        self.windows = windows
+    def __init__(
+        self, windows: Windows, low: Array | None = None, high: Array | None = None
+    ) -> None:
+        self.windows, self.low, self.high = windows, low, high
         self.names, self.stretches = windows.names, windows.stretches
 
     def run(self, theta: Array) -> OutputErrorFit:
+        """Search from theta (k,) on; what nothing in the windows tells of stays as it is."""
         theta = theta[: len(self.names)]
         starts = [self.windows.measured_start(s) for s in self.stretches]
         sigma = self.windows.sigma()
@@ -98,7 +101,8 @@ class _Search:
                 sigma = self._refined(reduced, sigma)
                 reduced = self.windows.linearised(theta, starts, sigma)
             step, inverse = self._step(theta, reduced)
-            moved = float(np.max(np.abs(step) / np.sqrt(np.diag(inverse))))
+            std = np.sqrt(np.diag(inverse))
+            moved = float(np.max(np.abs(step[std > 0]) / std[std > 0], initial=0.0))
             theta, starts, reduced, better = self._try(theta, starts, sigma, reduced, step)
             if not better or (moved < SETTLED and rounds >= 2):
                 break
@@ -116,11 +120,10 @@ class _Search:
         before = sum(r.cost for r in reduced if r is not None)
         for halving in range(HALVINGS):
             size = 0.5**halving
-            new_theta = theta + size * step
+            new_theta = np.clip(theta + size * step, self.low, self.high)
+            taken = new_theta - theta
             new_starts = [
-                s
-                if r is None
-                else self.windows.moved(stretch, s, size * (r.offset - r.back @ step))
+                s if r is None else self.windows.moved(stretch, s, size * r.offset - r.back @ taken)
                 for stretch, s, r in zip(self.stretches, starts, reduced, strict=True)
             ]
             new = self.windows.linearised(new_theta, new_starts, sigma)
@@ -144,7 +147,10 @@ class _Search:
             A = A + np.outer(belief.h, belief.h) / belief.std**2
             g = g - belief.h * float(belief.h @ theta) / belief.std**2
         scale = np.sqrt(np.diag(A))
-        inverse = np.linalg.inv(A / np.outer(scale, scale)) / np.outer(scale, scale)
+        told = np.flatnonzero(scale > 0)
+        inside, scale = A[np.ix_(told, told)], np.outer(scale[told], scale[told])
+        inverse = np.zeros_like(A)
+        inverse[np.ix_(told, told)] = np.linalg.inv(inside / scale) / scale
         return inverse @ g, inverse
 
     def _refined(

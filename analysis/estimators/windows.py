@@ -90,15 +90,16 @@ class Nudged:
 class Windows:
     """The data of one fit by windows, and the simulations of them.
 
-    `names` are the terms' coefficients; `shapes` further free parameters: shapes of the terms.
-    At most `seconds` of data are used.
+    `names` are the terms' coefficients; `shapes` further free parameters: shapes of the terms. With
+    `free` only those named there are free. At most `seconds` of data are used.
     """
 
     def __init__(
         self, rig: Rig, runs: Sequence[Run], terms: tuple[Used, ...], names: tuple[str, ...],
         shapes: tuple[str, ...] = (), seconds: float = MOST_SECONDS,
+        free: frozenset[str] | None = None,
     ) -> None:  # fmt: skip
-        self.rig, self.terms, self.seconds = rig, ordered(terms), seconds
+        self.rig, self.terms, self.seconds, self.free = rig, ordered(terms), seconds, free
         self.places = {
             name: (k, j)
             for k, used in enumerate(self.terms)
@@ -109,8 +110,10 @@ class Windows:
         self.reciprocal = {
             c.parameter for used in terms for c in used.term.coefficients(rig) if c.reciprocal
         }
-        self.warm = "b" in names and all(
-            ch.TEMPERATURE in r.channels for run in runs for r in run.records
+        self.warm = (
+            free is None
+            and "b" in names
+            and all(ch.TEMPERATURE in r.channels for run in runs for r in run.records)
         )
         self.names = (*names, nu.KAPPA) if self.warm else names
         self.sources: list[Source] = []
@@ -304,7 +307,9 @@ class Windows:
         return np.array(
             [
                 k for k, name in enumerate(self.names)
-                if k not in idle and not (name.startswith(("C_", "Fv")) and name[-1] in locked)
+                if k not in idle
+                and (self.free is None or name in self.free)
+                and not (name.startswith(("C_", "Fv")) and name[-1] in locked)
             ],
             dtype=np.int64,
         )  # fmt: skip

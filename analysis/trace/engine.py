@@ -35,6 +35,7 @@ from analysis.trace.result import (
     Found,
     Trace,
 )
+from analysis.trace.shooting import reshaped, told
 from analysis.trace.shortlist import Shortlist
 from analysis.trace.words import sentence
 from rig.model.parse import InputError
@@ -99,6 +100,11 @@ def trace(
         moves = [] if verdict in (CLEAN, EXPLAINED) else _moves(stage, judge, winner)
     further = propose(listed, winner, found, verdict, moves) if look_ahead else None
     after = _extended(runs, terms, winner, before)
+    again = reshaped(runs, holdout, after, stage, judge, winner)
+    if again.winner is not winner:
+        winner = again.winner
+        after = _extended(runs, terms, winner, before)
+    found = tuple(told(f, again.shots) for f in found)
     first, last = held_out.settled(judge, listed.empty.fit), held_out.settled(judge, winner.fit)
     error = held_out.errors(rig, judged, first, last)
     runs_before, runs_after = held_out.free_runs(holdout, before, after)

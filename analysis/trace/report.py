@@ -14,7 +14,7 @@ from analysis.report_page import page, write
 from analysis.trace import figures
 from analysis.trace.lines import loudest
 from analysis.trace.result import CLEAN, Found, Trace
-from analysis.trace.words import quantity, unit_of_equation
+from analysis.trace.words import quantity, shot_in_words, unit_of_equation
 from rig.model.records import Run
 from rig.model.rig import Rig
 
@@ -145,6 +145,7 @@ def _effect(found: Found) -> dict[str, Any]:
         "values": [(n, quantity(e)) for n, e in found.parameters.items()],
         "p": fm.significant(found.p_value),
         "removed": fm.significant(100 * found.removed_fraction),
+        "shot": shot_in_words(found),
         "gates": found.gates,
         "rivals": [
             (

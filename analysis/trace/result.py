@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from analysis.estimators.hidden_states import Shot
 from analysis.model import Estimate, Model, estimate_json, finite
 from analysis.trace.floor import Floor
 from analysis.trace.lines import Lines
@@ -48,7 +49,8 @@ class Found:
     """An effect with its parameters, evidence and the gates it passed or not.
 
     `removed_fraction` is the share of the repeatable energy on held-out records, in the equations
-    that the effect touches, which goes with it, the other effects kept.
+    that the effect touches, which goes with it, the other effects kept. `shot` is what multiple
+    shooting makes of an effect with a hidden state.
     """
 
     name: str
@@ -59,6 +61,7 @@ class Found:
     rivals: tuple[Rival, ...]
     gates: tuple[Gate, ...]
     variable: str = ""
+    shot: Shot | None = None
 
     @property
     def named(self) -> bool:
@@ -194,6 +197,15 @@ def _effect(found: Found) -> dict[str, Any]:
             for r in found.rivals
         ],
         "gates": [{"name": g.name, "ok": g.ok, "detail": g.detail} for g in found.gates],
+        "shooting": _shot(found.shot) if found.shot else None,
+    }  # fmt: skip
+
+
+def _shot(one: Shot) -> dict[str, Any]:
+    return {
+        "parameters": {n: estimate_json(e) for n, e in one.shapes.items()},
+        "windows": one.windows, "settled": one.settled, "taken": one.taken,
+        "held_out_windows": {"rows": finite(one.before), "shooting": finite(one.after)},
     }  # fmt: skip
 
 

@@ -77,6 +77,19 @@ def quantity(estimate: Estimate) -> str:
     return f"{estimate.value:.3g} ± {half:.1g} {unit}".strip()
 
 
+def shot_in_words(found: Found) -> str:
+    """Return what multiple shooting makes of an effect's shapes ('' where it has no such state)."""
+    if found.shot is None:
+        return ""
+    one = found.shot
+    values = ", ".join(f"{n} = {quantity(e)}" for n, e in one.shapes.items())
+    which = "taken" if one.taken else "the rows' stay, their interval holds both"
+    return (
+        f"by multiple shooting {values}; held-out windows {one.before:.2f} → {one.after:.2f} "
+        f"times the sensors' noise: {which}"
+    )
+
+
 def loudest(result: Trace) -> str:
     """Return the equation whose error fell most, relative to its noise."""
     floor: Mapping[str, float] = result.noise_floor

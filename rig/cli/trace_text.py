@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from analysis.trace.lines import loudest
 from analysis.trace.result import Found, Trace
 from analysis.trace.rounds import Round
-from analysis.trace.words import quantity, unit_of_equation
+from analysis.trace.words import quantity, shot_in_words, unit_of_equation
 from rig.cli.output import table
 
 
@@ -77,6 +77,8 @@ def _share(error: float | None, size: float | None) -> str:
 def _effect(found: Found) -> list[str]:
     values = ", ".join(f"{n} = {quantity(e)}" for n, e in found.parameters.items())
     lines = [f"{found.name} at {found.where}: {values}"]
+    if found.shot:
+        lines.append(f"  {shot_in_words(found)}")
     lines += [f"  {'ok    ' if g.ok else 'NOT OK'} {g.name}: {g.detail}" for g in found.gates]
     lines += [
         f"  rival {r.name} at {r.where}: {r.ratio:.2f} times the held-out rms"
