@@ -39,6 +39,7 @@ LINES_PER_PAIR = 0.8  # each pair gives two numbers and each line has two: fewer
 RIDGE = 1e-2  # of a line's own weight, against what short gaps leave undetermined
 STANDS = 4.0  # times what noise alone puts into a kind of lines, in its standard deviations
 ASYMMETRIC, SYMMETRIC = 0.25, 0.1  # shares from which a nonlinearity is spoken of
+LEAST_TOLD = 0.005  # share below which a kind of lines is not spoken of
 OWN = 3.0  # times the velocity's own share
 
 
@@ -72,8 +73,12 @@ class Lines:
     @property
     def text(self) -> str:
         """Where it repeats, and what that means, in words."""
-        where = ", ".join(f"{100 * self.shares[kind]:.0f} % {WORDS[kind]}" for kind in KINDS)
-        return f"{self.equation} in {self.group[1]}: {where}: {self.meaning}"
+        where = ", ".join(
+            f"{100 * share:.0f} % {WORDS[kind]}"
+            for kind, share in self.shares.items()
+            if share >= LEAST_TOLD
+        )
+        return f"{self.equation} in {self.group[1]}: {where or 'no line'}: {self.meaning}"
 
     @property
     def meaning(self) -> str:

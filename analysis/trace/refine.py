@@ -112,6 +112,7 @@ def refine(stage: Board, terms: Sequence[Used], steps: int = MOST_STEPS) -> Fit:
     free = [(k, j, s) for k, u in enumerate(terms) for j, s in enumerate(shapes_of(stage.rig, u))]
     if not free:
         return fit(stage, terms)
+    terms = _on_the_right_side(stage, terms)
     start = np.array([_to_unit(terms[k].shape[j], s) for k, j, s in free])
 
     def at(x: Array) -> tuple[Used, ...]:
@@ -126,6 +127,25 @@ def refine(stage: Board, terms: Sequence[Used], steps: int = MOST_STEPS) -> Fit:
         max_nfev=steps,
     )  # fmt: skip
     return fit(stage, at(found.x))
+
+
+def _on_the_right_side(stage: Board, terms: Sequence[Used]) -> tuple[Used, ...]:
+    """Return the terms with every shape on that side of its neutral value which leaves less.
+
+    Of a column the first look tells the size, not the sign; and from the wrong side a search runs
+    away to the bound, not through the neutral value.
+    """
+    terms = tuple(terms)
+    for k, used in enumerate(terms):
+        for j, s in enumerate(shapes_of(stage.rig, used)):
+            if s.neutral is None or not s.low < s.neutral < s.high:
+                continue
+            mirrored = float(np.clip(2 * s.neutral - used.shape[j], s.low, s.high))
+            shape = (*used.shape[:j], mirrored, *used.shape[j + 1 :])
+            other = (*terms[:k], Used(used.term, shape), *terms[k + 1 :])
+            if fit(stage, other).energy < fit(stage, terms).energy:
+                terms = other
+    return terms
 
 
 def _logarithmic(shape: Shape) -> bool:

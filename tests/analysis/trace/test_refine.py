@@ -1,0 +1,33 @@
+"""The search for shapes ends where the effect is, from whichever side it begins."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from analysis.terms import make
+from analysis.terms.base import Used
+from analysis.trace import refine
+from rig.model.rig import Rig
+
+
+@pytest.mark.parametrize("start", [0.9, 0.98, 1.02, 1.1])
+def test_a_gain_is_found_from_the_wrong_side_of_one_too(
+    rig: Rig, start: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Below one the residual falls towards the bound, as it did on a bench moved by a sine."""
+
+    def fit(stage: Any, terms: Sequence[Used]) -> refine.Fit:
+        gain = terms[-1].shape[0]
+        left = 50.0 * (gain - 1.01) if gain >= 1.0 else 9.0 / (1.6 - gain)
+        return refine.Fit(tuple(terms), {}, np.array([left, 0.1]))
+
+    monkeypatch.setattr(refine, "fit", fit)
+    stage: Any = SimpleNamespace(rig=rig)
+    used = Used(make("sensor_gain", "joint 2 cap"), (start,))
+    found = refine.refine(stage, (used,))
+    assert found.terms[-1].shape[0] == pytest.approx(1.01, abs=1e-3)
