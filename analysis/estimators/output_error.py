@@ -23,7 +23,8 @@ from analysis.checks import Check
 from analysis.estimators import nuisance as nu
 from analysis.estimators.covariance import Spread, spread
 from analysis.estimators.equations import Pieces
-from analysis.estimators.windows import WINDOW, Reduced, Windows
+from analysis.estimators.window_data import Reduced
+from analysis.estimators.windows import WINDOW, Windows
 from analysis.solve import Solution
 from analysis.terms.base import Used
 from rig.model.parse import InputError

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +12,11 @@ from analysis.differentiate import channel_filter
 from analysis.effects.base import ordered
 from analysis.estimators import nuisance as nu
 from analysis.estimators.shooting import SAMPLES_PER_STEP, Window, parts_of, shoot
+from analysis.estimators.window_data import Nudged, Reduced, Source, Stretch
 from analysis.model import Estimate, Model
 from analysis.rows import default_filtering
-from analysis.signals import Mask, Signals, condition
-from analysis.simulate import Compiled, compiled, drive_of, hidden_paths
+from analysis.signals import Mask, condition
+from analysis.simulate import compiled, drive_of, hidden_paths
 from analysis.terms.base import Used
 from rig.model import channels as ch
 from rig.model.parse import InputError
@@ -31,60 +32,6 @@ MOST_SECONDS = 150.0  # with more data, fewer windows of each record, evenly spr
 POINT_RATE = 250.0  # [Hz] at which outputs are compared; the channels are filtered to 80 Hz
 NUDGE = 1e-5  # relative change of a parameter for its sensitivity
 NUDGES = (1e-6, 1e-5, 20.0, 20.0)  # [rad, rad/s, Pa, Pa] of a window's first state
-
-
-@dataclass(frozen=True)
-class Stretch:
-    """One window ready to shoot: inputs, measured outputs (points, 3 F), its place in the data."""
-
-    record: int
-    stratum: int
-    repeat: int
-    part: int
-    window: Window
-    measured: Array
-
-
-@dataclass(frozen=True)
-class Source:
-    """One record: signals and inputs of the integrator, oil temperature less nominal [K].
-
-    The signals are free of what the model says of sensors.
-    """
-
-    signals: Signals
-    inputs: Array
-    locked: Mask
-    kelvin: float
-
-
-@dataclass(frozen=True)
-class Reduced:
-    """A window after its start was eliminated: score, information, cost, and how to get back.
-
-    `rest` is the cost that the best start leaves.
-    """
-
-    score: Array
-    information: Array
-    cost: float
-    rest: float
-    back: Array
-    offset: Array
-    residual: Array
-
-
-@dataclass(frozen=True)
-class Nudged:
-    """The model of one record: as it is, and `pars` (1 + k, parameters) with every nudge.
-
-    `sizes` (k,) are the nudges, `hidden` the terms' own states (n, h) along the record for each.
-    """
-
-    ready: Compiled
-    pars: Array
-    sizes: Array
-    hidden: tuple[Array, ...]
 
 
 class Windows:

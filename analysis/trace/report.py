@@ -86,6 +86,11 @@ def _pictures(rig: Rig, holdout: Sequence[Run], result: Trace) -> list[dict[str,
     for k, clue in enumerate(result.depends_on[:2]):
         heading = f"what is left of {clue.equation} against {clue.variable}"
         out.append(_pair(rig, lines, result, None, clue.variable, clue.equation, heading, f"c{k}"))
+    seen: set[str] = set()
+    for picture in out:  # once in time is enough for each equation
+        if picture["equation"] in seen:
+            picture["time"] = None
+        seen.add(picture["equation"])
     return out
 
 
@@ -104,6 +109,7 @@ def _pair(
     longest = max(here, key=lambda line: float((line.before**2).mean()))
     return {
         "heading": heading,
+        "equation": equation,
         "text": f"{equation}, held-out records; the band is ± one rms of noise, red the mean.",
         "against": figures.against(x, here, noise, unit, label, f"{key}x", changed),
         "time": figures.in_time(longest, noise, unit, f"{key}t", changed),
