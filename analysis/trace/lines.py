@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.rows import LINES_FACTOR, Rows
+from analysis.rows import LINES_FACTOR, ROW_CUTOFF_RANGE, Rows
 from analysis.trace.board import Board, Segment
 from analysis.trace.evidence import Scene, filtered
 from analysis.trace.floor import Group
@@ -33,7 +33,7 @@ WORDS = {
     CONSTANT: "constant", EXCITED: "on excited lines", ODD: "on empty odd ones",
     EVEN: "on even ones",
 }  # fmt: skip
-ABOVE = 1.2 * LINES_FACTOR  # band over the highest excited line: the row filter ends there
+ABOVE = 1.2  # band over the row filter's cutoff, where that filter ends
 PRESENT = 0.7  # share of a period's pairs of rows that must be there
 LINES_PER_PAIR = 0.8  # each pair gives two numbers and each line has two: fewer than there are
 RIDGE = 1e-2  # of a line's own weight, against what short gaps leave undetermined
@@ -145,7 +145,9 @@ def _of_segment(
     per = record.period // scene.filtering.step
     place = np.rint((rows.time - rows.time[0]) * record.sample_rate / scene.filtering.step)
     pairs = _pairs(place.astype(np.int64), per)
-    K = int(min([ABOVE * highest, *(LINES_PER_PAIR * len(p) for p in pairs)]))
+    base = record.sample_rate / record.period
+    band = ABOVE * float(np.clip(LINES_FACTOR * highest * base, *ROW_CUTOFF_RANGE))
+    K = int(min([band / base, *(LINES_PER_PAIR * len(p) for p in pairs)]))
     if not pairs or highest > K:
         return None
     joint = int(s.equation.rsplit("_", 1)[1]) - 1
@@ -161,7 +163,7 @@ def _of_segment(
     own[0] = 0.0  # a mean velocity is what the ends of the record cut
     before = np.abs(single.mean(axis=0)) ** 2 - noise / n
     rest = np.abs(spectra[:, -2].mean(axis=0)) ** 2 - noise / n
-    frequency = np.arange(K + 1) * record.sample_rate / record.period
+    frequency = np.asarray(np.arange(K + 1) * base, dtype=np.float64)
     return Lines(
         s.group, s.equation, frequency, before, noise, rest, excited,
         _shares(before, noise / n, excited), _shares(rest, noise / n, excited),

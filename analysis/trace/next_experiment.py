@@ -1,10 +1,11 @@
 """Which experiment to run next, or none: what survives, what would tell, on which excitation.
 
 `confounded`: the excitation on which the best set and its tied rivals differ most. `unexplained`:
-the one that tells the sets which leave least apart, else the one that carries the variable which
-the rest moves with farthest beyond the records. `clean`: the one on which effects of an
-interesting size that these records could not have shown would stand out. An experiment is only
-offered where it promises more than noise and clearly more than the records already hold.
+the one that tells the sets which leave least apart, else the one that carries a variable which the
+rest moves with farthest beyond the records, else one of many more lines than they hold. `clean`:
+the one on which effects of an interesting size that these records could not have shown would stand
+out. An experiment is only offered where it promises more than noise and clearly more than the
+records already hold.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from analysis.terms import baseline_of, known
 from analysis.terms.base import Used
 from analysis.trace import excitations as ex
 from analysis.trace.board import Board
-from analysis.trace.clue_variables import variables
+from analysis.trace.covering import LINES, farther, richer
 from analysis.trace.discriminate import (
     Ground,
     Hypothesis,
@@ -93,7 +94,7 @@ def propose(
     if best is not None:
         return _told(stage, kind, *best)
     if verdict == UNEXPLAINED and moves:
-        return _covering(stage, winner, moves, tried, views)
+        return _explored(stage, winner, moves, tried, views)
     return None
 
 
@@ -207,41 +208,24 @@ def _worth(answers: Sequence[Answer]) -> float:
     return sum(min(a.promised, ENOUGH) for a in answers if a.open)
 
 
-def _covering(
+def _explored(
     stage: Board, winner: Listed, moves: Sequence[Dependence], tried: Sequence[ex.Excitation],
     views: Sequence[View],
 ) -> Mapping[str, Any] | None:  # fmt: skip
-    """Return the experiment that carries the clue's variable farthest beyond the records."""
-    clue = moves[0]
-    joint = int(clue.equation.rsplit("_", 1)[1]) - 1
-    own = [s for s in stage.scenes if joint + 1 not in s.record.locked]
-    seen = [variables(stage.rig, s.signals, joint).get(clue.variable) for s in own]
-    values = [v for v in seen if v is not None]
-    if not values:
-        return None
-    low, high = np.percentile(np.concatenate(values), [1, 99])
-    reach = []
-    for candidate in views:
-        v = variables(stage.rig, candidate.seen, joint)[clue.variable]
-        if joint + 1 in candidate.scene.record.locked:
-            reach.append(0.0)
-            continue
-        least, most = np.percentile(v, [1, 99])
-        reach.append((max(most, high) - min(least, low)) / max(high - low, 1e-30))
-    k = int(np.argmax(reach))
-    if reach[k] < MORE:
+    """Return the experiment that shows what is unexplained where no record has been yet."""
+    found = farther(stage, moves, views, MORE) or richer(stage, moves, tried)
+    if found is None:
         return None
     now = loudest(stage, winner.fit.left)
-    words = f"carries {clue.variable} {reach[k]:.1f} times as far, which what is left moves with"
     return {
         "kind": COVER,
         "separates": [],
-        "covers": {"variable": clue.variable, "times": float(reach[k])},
+        "covers": {"variable": found.variable, "times": found.times},
         "present": now,
-        "predicted": now * float(reach[k]),
-        "equation": clue.equation,
-        "text": f"{tried[k].text}: {words}",
-        **_protocols(stage, [tried[k]]),
+        "predicted": now * (found.times if found.variable != LINES else 1.0),
+        "equation": found.equation,
+        "text": f"{tried[found.index].text}: {found.words}",
+        **_protocols(stage, [tried[found.index]]),
     }
 
 

@@ -10,10 +10,11 @@ import pytest
 from numpy.typing import NDArray
 
 from analysis.trace.engine import trace
-from analysis.trace.lines import CONSTANT, EVEN, EXCITED, KINDS, ODD, meaning, spectrum
+from analysis.trace.lines import CONSTANT, EVEN, EXCITED, KINDS, ODD, lines, meaning, spectrum
 from analysis.trace.result import Trace, to_json
 from rig.model.rig import Rig
 from tests.analysis.trace.hidden import pair_of_runs
+from tests.analysis.trace.test_next_experiment import sine
 
 Array = NDArray[np.float64]
 EXCITED_LINES = (1, 3, 7, 9, 13, 15)  # 5 and 11 are left empty
@@ -84,6 +85,16 @@ def traced(rig: Rig, **wrong: float) -> Trace:
         for run in pair_of_runs(rig, **wrong)
     )
     return trace([train], [held_out], look_ahead=False)
+
+
+def test_a_single_sine_is_followed_to_where_the_row_filter_ends() -> None:
+    """Its harmonics are what tells: the odd ones are all empty lines."""
+    _, stage = sine()
+    found = lines(stage, stage.mean)
+    assert {one.equation for one in found} == {"torque_2", "flow_cap_2", "flow_rod_2"}
+    for one in found:
+        assert np.flatnonzero(one.excited).tolist() == [1]
+        assert one.frequency[-1] > 8.0  # [Hz] of the slowest row filter
 
 
 def test_friction_shows_on_the_empty_odd_lines_and_a_null_on_the_even_ones(rig: Rig) -> None:

@@ -1,0 +1,61 @@
+"""Where nothing explains a residual the next experiment goes where no record has been."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from analysis.trace.covering import LINES, farther, richer
+from analysis.trace.discriminate import View, calibration, view
+from analysis.trace.excitations import FAMILIES, Excitation, excitation, settings
+from analysis.trace.result import Dependence
+from tests.analysis.trace.test_next_experiment import sine
+
+
+@pytest.fixture(scope="module")
+def candidates() -> tuple[list[Excitation], list[View]]:
+    """Joint 2 moved at creeping speed and at all frequencies, on the twin of the bench."""
+    rig, stage = sine()
+    first = settings(rig, stage.scenes)[0]
+    families = [f for f in FAMILIES if f.name in ("creep", "wide")]
+    tried = [excitation(rig, first, family, np.random.default_rng(1)) for family in families]
+    found = [one for one in tried if one is not None]
+    assert [one.family.name for one in found] == ["wide", "creep"]
+    return found, [view(stage, one, calibration(stage)) for one in found]
+
+
+def clue(variable: str, by: str = "") -> Dependence:
+    return Dependence(variable, 0.5, "torque_2", by)
+
+
+def test_what_moves_with_the_acceleration_asks_for_faster_lines(
+    candidates: tuple[list[Excitation], list[View]],
+) -> None:
+    _, stage = sine()
+    found = farther(stage, [clue("acceleration_2")], candidates[1], 1.3)
+    assert found is not None
+    assert candidates[0][found.index].family.name == "wide"
+    assert found.times > 1.3
+    assert "carries acceleration_2" in found.words
+
+
+def test_a_clue_that_cannot_be_carried_farther_yields_to_the_next(
+    candidates: tuple[list[Excitation], list[View]],
+) -> None:
+    _, stage = sine()
+    moves = [clue("time"), clue("piston_2", "acceleration_2")]
+    found = farther(stage, moves, candidates[1], 1.3)
+    assert found is not None
+    assert found.variable == "acceleration_2"  # the sine has been all over the stroke
+    assert farther(stage, moves, candidates[1], 1e3) is None
+
+
+def test_records_of_one_sine_ask_for_many_lines(
+    candidates: tuple[list[Excitation], list[View]],
+) -> None:
+    _, stage = sine()
+    found = richer(stage, [clue("supply_pressure")], candidates[0])
+    assert found is not None
+    assert (found.variable, candidates[0][found.index].family.name) == (LINES, "wide")
+    assert "where the records hold 1" in found.words
+    assert richer(stage, [clue("supply_pressure")], candidates[0][1:]) is None  # creep has 2 lines
