@@ -97,6 +97,10 @@ def records_of(case: Case) -> tuple[Run, list[Run], Mapping[str, float]]:
     if case.machine or case.kind != NONE:  # a clean shipped bench is judged by the sines alone
         sizes = Overrides(seed=1000 + case.seed, amplitude_scale=0.7, repeats=2)
         held_out.insert(0, simulated_run(rig, plan, case.seed + 50_000, scenario, sizes)[0])
+    if case.bent:
+        from rig.cli.study_distorted import bent
+
+        return bent(train, case), [bent(run, case) for run in held_out], truth
     return train, held_out, truth
 
 

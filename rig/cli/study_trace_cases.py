@@ -80,7 +80,8 @@ SIZE_OF: Final[Mapping[str, tuple[str, float]]] = {
 class Case:
     """One experiment: scenario text, its kind, the right names and places, the seed.
 
-    With `machine` the bench and what it hides are drawn by the seed (`study_machines`).
+    With `machine` the bench and what it hides are drawn by the seed (`study_machines`); `bent` says
+    how its records are changed afterwards (`study_distorted`).
     """
 
     kind: str
@@ -92,6 +93,7 @@ class Case:
     moves: str = ""
     noise: float = 1.0
     machine: bool = False
+    bent: str = ""
 
 
 def place_of(where: str) -> str:

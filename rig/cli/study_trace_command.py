@@ -69,6 +69,34 @@ def trace(
         typer.echo(text(outcomes))
 
 
+def distorted(
+    count: Annotated[int, typer.Option(min=1, help="Of benches, faults in turn.")] = 22,
+    seed: Annotated[int, typer.Option(min=0, help="First seed; below 100 is for tuning.")] = 100,
+    workers: WorkersOption = 2,
+    json: JsonOption = None,
+    keep: KeepOption = None,
+    docs: DocsOption = None,
+) -> None:
+    """Bend clean records as nothing in simulator or catalogue would, and count what is named.
+
+    Example: bramah study distorted --count 11
+    """
+    from rig.cli.pages import replace_section
+    from rig.cli.study_distorted import cases_of
+    from rig.cli.study_trace import all_of
+    from rig.cli.study_trace_text import as_json, bent_text
+
+    outcomes = list(all_of(cases_of(count, seed), workers, progress, keep))
+    write_json(json, as_json(outcomes))
+    if docs is not None:
+        made = f"bramah study distorted --count {count} --seed {seed} --docs {docs}"
+        replace_section(
+            docs, "study distorted", in_section(made, f"```\n{bent_text(outcomes)}\n```")
+        )
+    if json != Path("-"):
+        typer.echo(bent_text(outcomes))
+
+
 def command_of(
     counts: Mapping[str, int], seed: int, docs: Path, quick: bool = False, only: str = "",
     level: int | None = None,
@@ -109,4 +137,5 @@ def study(
 def register(app: typer.Typer) -> None:
     """Add this verb to the studies, and `study --quick`, which is it in short."""
     studies.command()(trace)
+    studies.command()(distorted)
     studies.callback(invoke_without_command=True)(study)

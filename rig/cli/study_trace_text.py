@@ -35,6 +35,20 @@ def text(outcomes: Sequence[Outcome]) -> str:
     return "\n".join(parts)
 
 
+def bent_text(outcomes: Sequence[Outcome]) -> str:
+    """Return one row a case of bent records, in the order drawn, and the counts."""
+    rows = [
+        [
+            o.case.label, f"{o.loudness:.1f}", o.verdict,
+            ", ".join(f"{n} at {w}" for n, w in o.named) or "nothing",
+            ", ".join(o.depends_on[:2]), right(o),
+        ]
+        for o in sorted(outcomes, key=lambda o: o.case.seed)
+    ]  # fmt: skip
+    head = ["records bent by", "x noise", "verdict", "named so far", "moves with", "judged"]
+    return "\n".join([table(head, rows), "", _counts(outcomes)])
+
+
 def _counts(outcomes: Sequence[Outcome]) -> str:
     rows = []
     for other, kind in itertools.product((False, True), (NONE, SINGLE, PAIR, OUTSIDE)):
