@@ -10,7 +10,7 @@ direction of motion, with and without memory, the velocity, the pressure differe
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,6 +35,7 @@ LEAST = 0.05  # share below which a variable is no clue
 ANSWERS = {"torque": ("pressure", ch.DRIVE), "flow": ("velocity",)}
 ANSWER = 0.3  # weight of a variable that only answers
 THROUGH = 0.6  # weight of the spool in a torque: it acts through the pressures
+BEYOND = 0.2  # share by which one chamber's pressure must beat the difference to be no answer
 MORE = 0.05  # share that a product must take beyond either of its parts
 
 
@@ -71,18 +72,19 @@ def dependence(
         if share < LEAST or (name and factor and share < max(parts) + MORE):
             continue
         equation = max(by, key=lambda e: by[e])
-        told = 1.0 if factor else _telling(name, equation)
-        out.append((share * told, _dependence(name, factor, share, equation)))
+        told = 1.0 if factor else _telling(name, equation, sums)
+        out.append((share * told, _dependence(name, factor, share, equation, told)))
     best: dict[str, Dependence] = {}
     for _, clue in sorted(out, key=lambda pair: -pair[0]):
         best.setdefault(clue.variable, clue)
     return list(best.values())
 
 
-def _dependence(name: str, factor: str, share: float, equation: str) -> Dependence:
+def _dependence(
+    name: str, factor: str, share: float, equation: str, told: float
+) -> Dependence:  # fmt: skip
     if not factor:
-        answers = _telling(name, equation) == ANSWER
-        words = f"{name} by balance" if answers else ""
+        words = f"{name} by balance" if told == ANSWER else ""
         return Dependence(name, share, equation, words=words)
     by = factors(equation)[factor]
     if not name:
@@ -90,9 +92,21 @@ def _dependence(name: str, factor: str, share: float, equation: str) -> Dependen
     return Dependence(name, share, equation, by.variable, f"{name} times {by.words}")
 
 
-def _telling(name: str, equation: str) -> float:
-    """Return a variable's weight: what an equation's balance makes follow tells little."""
-    kind = equation.split("_", 1)[0]
+def _telling(name: str, equation: str, shares: Mapping[tuple[str, str], float]) -> float:
+    """Return a variable's weight: what an equation's balance makes follow tells little.
+
+    A torque's balance makes the difference of the pressures follow; one chamber's pressure that
+    says much more than the difference follows nothing, its sensor may be what is wrong.
+    """
+    kind, number = equation.rsplit("_", 1)
+    if kind == "torque" and name in (
+        ch.channel(ch.CAP, int(number)),
+        ch.channel(ch.ROD, int(number)),
+    ):
+        difference = shares.get((f"pressure_difference_{number}", ""), 0.0)
+        if shares[name, ""] > difference + BEYOND:
+            return 1.0
+    kind = kind.split("_", 1)[0]
     if any(word in name for word in ANSWERS[kind]):
         return ANSWER
     return THROUGH if kind == "torque" and name.startswith(ch.SPOOL) else 1.0

@@ -20,6 +20,7 @@ from analysis.trace import clues, gates, held_out
 from analysis.trace.beside import base_terms, stripped
 from analysis.trace.board import Board, board
 from analysis.trace.candidates import catalogue, variants
+from analysis.trace.clue_frequency import frequency_clue
 from analysis.trace.evidence import Scene, scenes
 from analysis.trace.floor import STATED
 from analysis.trace.lines import lines
@@ -219,7 +220,9 @@ def _moves(stage: Board, judge: Board, winner: Listed) -> list[Dependence]:
     loud = [e for e, v in sorted(winner.excess.items(), key=lambda kv: -kv[1]) if v > 0]
     total = sum(winner.excess[e] for e in loud)
     loud = [e for e in loud if winner.excess[e] > 0.1 * total]
-    return clues.dependence(now, winner.fit.left, later, held, loud)
+    found = clues.dependence(now, winner.fit.left, later, held, loud)
+    hum = frequency_clue(lines(stage, winner.fit.left), stage, winner.fit.left, judge, held)
+    return found if hum is None else [hum, *found]
 
 
 def _fraction(listed: Shortlist, winner: Listed) -> float:

@@ -12,6 +12,7 @@ from analysis.effects.base import Effect
 from analysis.report import Provenance
 from analysis.report_page import page, write
 from analysis.trace import figures
+from analysis.trace.clue_frequency import FREQUENCY
 from analysis.trace.lines import loudest
 from analysis.trace.result import CLEAN, Found, Trace
 from analysis.trace.words import quantity, shot_in_words, unit_of_equation
@@ -83,7 +84,9 @@ def _pictures(rig: Rig, holdout: Sequence[Run], result: Trace) -> list[dict[str,
         equation = figures.equation_of(effect, rig, result, lines)
         heading = f"{effect.name.replace('_', ' ')} at {getattr(effect, 'place', effect.where)}"
         out.append(_pair(rig, lines, result, effect, effect.variable, equation, heading, f"e{k}"))
-    for k, clue in enumerate(result.depends_on[:2]):
+    # A frequency is seen in time and in the lines, not against anything.
+    drawn = [d for d in result.depends_on if d.variable != FREQUENCY][:2]
+    for k, clue in enumerate(drawn):
         heading = f"what is left of {clue.equation} against {clue.variable}"
         out.append(_pair(rig, lines, result, None, clue.variable, clue.equation, heading, f"c{k}"))
     seen: set[str] = set()

@@ -73,7 +73,7 @@ FAULTS: Final = (
         lambda m: _sign(m.v) * (1.0 + 2.0 * m.s),
     ),
     Bent("pad that is met a little out", "piston", 0.1, lambda m: np.maximum(m.s - 0.15, 0.0)),
-    Bent("hum that begins with the record", "time", 0.005, lambda m: np.sin(46.0 * m.t)),
+    Bent("hum that begins with the record", "time frequency", 0.005, lambda m: np.sin(46.0 * m.t)),
     Bent(
         "play in the spool's sensor", "spool acceleration velocity", 0.002, None, ch.SPOOL,
         lambda x, t, half: _play(x, half),
