@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 FREQUENCY = "frequency"
 MANY = 8  # excited lines: of fewer, most of anything stands in one place
 BESIDE = 1  # line on either side of the highest: a frequency between two lines stands in both
+FIRST = 5  # line: fewer turns in a period are drift
 PEAK = 0.6  # share of the power that stands there
 LEAST = 0.5  # share of the held-out energy that it must take
 STEPS = 41  # of the search, over one line on either side
@@ -57,6 +58,8 @@ def _peak(one: Lines) -> float | None:
     if int(one.excited.sum()) < MANY or not power.any():
         return None
     k = int(np.argmax(power))
+    if k < FIRST:
+        return None
     here = slice(max(1, k - BESIDE), k + BESIDE + 1)
     if power[here].sum() < PEAK * power.sum():
         return None

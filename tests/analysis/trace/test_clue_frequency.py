@@ -66,6 +66,10 @@ def test_what_goes_with_the_motion_has_no_frequency_of_its_own(
     assert clue_of(rig, *rubbing) is None
 
 
+def test_drift_is_a_matter_of_time_not_of_a_frequency(rig: Rig, quiet: tuple[Run, Run]) -> None:
+    assert clue_of(rig, *(humming(run, 0.06, 3e4) for run in quiet)) is None
+
+
 def test_hum_that_the_held_out_records_do_not_have_is_no_clue(
     rig: Rig, quiet: tuple[Run, Run]
 ) -> None:
