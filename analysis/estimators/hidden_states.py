@@ -112,11 +112,15 @@ def rest_of(runs: Sequence[Run], model: Model, effect: Effect) -> float:
     """Return what windows of records leave under a model, each from its best start [sigma].
 
     The rms of measured less simulated piston and pressures over the sensors' noise; inf where a
-    window cannot be simulated.
+    window cannot be simulated, or the joint moves in none.
     """
-    windows = _windows(runs, model, effect, frozenset())
-    starts = [windows.measured_start(s) for s in windows.stretches]
-    reduced = windows.linearised(_theta(windows, model), starts, windows.sigma())
+    try:
+        windows = _windows(runs, model, effect, frozenset())
+        starts = [windows.measured_start(s) for s in windows.stretches]
+        reduced = windows.linearised(_theta(windows, model), starts, windows.sigma())
+    except (InputError, np.linalg.LinAlgError) as error:
+        log.info("%s is not judged by windows: %s", effect.name, error)
+        return float("inf")
     good = [r for r in reduced if r is not None]
     if len(good) < len(reduced):
         return float("inf")
@@ -126,12 +130,14 @@ def rest_of(runs: Sequence[Run], model: Model, effect: Effect) -> float:
 def _windows(
     runs: Sequence[Run], model: Model, effect: Effect, free: frozenset[str]
 ) -> Windows:  # fmt: skip
-    """Return windows of the records in which the effect's joint moves."""
+    """Return windows of the records in which the effect's joint moves; InputError without one."""
     moving = [
         replace(run, records=tuple(r for r in run.records if effect.joint + 1 not in r.locked))
         for run in runs
     ]
     rig = model.rig
+    if not any(run.records for run in moving):
+        raise InputError(f"joint {effect.joint + 1} moves in no record")
     names = tuple(c.parameter for u in model.terms for c in u.term.coefficients(rig))
     return Windows(rig, moving, model.terms, names, effect.shape_names(), SECONDS, free)
 

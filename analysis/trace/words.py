@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
+
 from analysis.model import Estimate
 from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, Found, Trace
 from rig.model.rig import Rig
@@ -84,10 +86,10 @@ def shot_in_words(found: Found) -> str:
     one = found.shot
     values = ", ".join(f"{n} = {quantity(e)}" for n, e in one.shapes.items())
     which = "taken" if one.taken else "the rows' stay, their interval holds both"
-    return (
-        f"by multiple shooting {values}; held-out windows {one.before:.2f} → {one.after:.2f} "
-        f"times the sensors' noise: {which}"
-    )
+    judged = "no held-out window tells which is closer"
+    if np.isfinite([one.before, one.after]).all():
+        judged = f"held-out windows {one.before:.2f} → {one.after:.2f} times the sensors' noise"
+    return f"by multiple shooting {values}; {judged}: {which}"
 
 
 def loudest(result: Trace) -> str:

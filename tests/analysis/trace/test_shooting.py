@@ -87,6 +87,18 @@ def test_effects_without_a_memory_are_not_shot(rig: Rig) -> None:
     assert hidden_effects(stiff) == []
 
 
+def test_held_out_records_in_which_the_joint_stands_judge_nothing(
+    rig: Rig, runs: tuple[Run, Run], result: Trace
+) -> None:
+    model, effect = lagging(rig, TAU)
+    still = replace(runs[1], records=tuple(replace(r, locked=(1, 2)) for r in runs[1].records))
+    assert rest_of([still], model, effect) == float("inf")
+    (found,) = result.effects
+    assert found.shot is not None
+    unjudged = replace(found.shot, before=float("inf"), after=float("inf"))
+    assert "no held-out window tells" in shot_in_words(replace(found, shot=unjudged))
+
+
 def test_records_without_a_whole_window_are_not_shot_and_nothing_falls(rig: Rig) -> None:
     model, effect = lagging(rig, TAU)
     run = experiment(rig, repeats=1, tau_spool=TAU)
