@@ -166,10 +166,11 @@ class PressureDependentFriction(Friction):
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return G w."""
         i = self.joint
-        level = self._load(signals) * self.contact(rig, signals, ())
         if len(shape):
             path = self.hidden_path(rig, signals, {}, shape)[:, 0]
             level = path * rig.supply.pressure / shape[-1]
+        else:
+            level = self._load(signals) * self.contact(rig, signals, ())
         return self.row({f"k_friction_{i + 1}": signals.G[:, i] * level})
 
     def _load(self, signals: Signals) -> Array:
@@ -185,9 +186,8 @@ class PressureDependentFriction(Friction):
             return super().hidden_path(rig, signals, values, shape)
         stiffness = rig.supply.pressure / shape[-1]
         s = np.ascontiguousarray(signals.s[:, self.joint])
-        return (
-            np.asarray(contact_under_load(s, self._load(signals), stiffness)[:, None]) / stiffness
-        )
+        w = contact_under_load(s, self._load(signals), stiffness)
+        return np.asarray(w[:, None] / stiffness)
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
         """Return joint (0-based), k, presliding distance (0 where none is given), p_S."""
