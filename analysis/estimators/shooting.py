@@ -94,17 +94,7 @@ def shoot(
     out = np.zeros((len(starts), window.points, starts.shape[1]))
     model = (ready.addresses, ready.ends, ready.hidden_ends, ready.prepares)
     good = _shoot(
-        model,
-        pars,
-        starts,
-        inputs,
-        rate,
-        locked,
-        ready.geometry,
-        window.first,
-        every,
-        parts,
-        out,
+        model, pars, starts, inputs, rate, locked, ready.geometry, window.first, every, parts, out,
         work,
-    )
+    )  # fmt: skip
     return out if good else None
