@@ -72,9 +72,14 @@ def default_filtering(record: Record) -> Filtering:
     rate = record.sample_rate
     cutoff = ROW_CUTOFF_ELECTRIC if ch.channel(ch.POSITION, 1) in record.channels else ROW_CUTOFF
     if record.period and record.lines:
-        highest = max(record.lines) * rate / record.period
-        cutoff = float(np.clip(LINES_FACTOR * highest, *ROW_CUTOFF_RANGE))
+        cutoff = lines_cutoff(record)
     return Filtering(channel_filter(rate), row_filter(rate, cutoff), row_step(rate, cutoff))
+
+
+def lines_cutoff(record: Record) -> float:
+    """Return the row filter's cutoff [Hz] for a record that tells its excited lines."""
+    highest = max(record.lines) * record.sample_rate / record.period
+    return float(np.clip(LINES_FACTOR * highest, *ROW_CUTOFF_RANGE))
 
 
 def paper_filtering(record: Record) -> Filtering:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from analysis import integrate
 from analysis.model import Model
 from analysis.signals import Signals
-from analysis.terms.base import OUT_ROWS, X_ROWS
+from analysis.terms.base import OUT_ROWS, X_ROWS, Used
 from rig.model import channels as ch
 from rig.model.electric import drive_gains
 from rig.model.parse import InputError
@@ -257,6 +257,14 @@ def state_at(signals: Signals, sample: int) -> State:
     )
 
 
+def put_right(rig: Rig, terms: Sequence[Used], signals: Signals) -> Signals:
+    """Return signals free of what terms say of sensors; other terms prepare in simulation."""
+    for used in terms:
+        if not used.term.prepares:
+            signals = used.term.prepare(rig, signals, used.shape)
+    return signals
+
+
 def hidden_paths(model: Model, signals: Signals) -> Array:
     """Return the terms' own states (n, h) along measured signals, in the model's order.
 
@@ -264,7 +272,8 @@ def hidden_paths(model: Model, signals: Signals) -> Array:
     free of what sensors distort.
     """
     values, out = model.values, [np.zeros((len(signals.t), 0))]
-    for used in model.terms:
+    last = max((k for k, u in enumerate(model.terms) if u.term.hidden(model.rig)), default=-1)
+    for used in model.terms[: last + 1]:
         out.append(used.term.hidden_path(model.rig, signals, values, used.shape))
         if used.term.prepares:
             signals = used.term.prepare(model.rig, signals, used.shape)

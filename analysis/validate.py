@@ -25,6 +25,7 @@ from analysis.simulate import (
     compiled,
     drive_of,
     hidden_paths,
+    put_right,
     simulate,
     state_at,
 )
@@ -92,7 +93,7 @@ def validate_record(
     """Validate on one record (see `validate`)."""
     smoother = filtering(record).channels
     here = arrived(rig, record)
-    signals = _seen_by(model, rig, condition(rig, record, smoother))
+    signals = put_right(rig, model.terms, condition(rig, record, smoother))
     # A sensor that the model says is wrong is put right before anything is compared with it.
     channels = aligned_channels(rig, record)
     channels = corrected_channels(rig, model.terms, channels, record.sample_rate)
@@ -146,14 +147,6 @@ def arrived(rig: Rig, record: Record) -> Mask:
             f"simulated through more than {1000 * GAP:g} ms without its spool"
         )
     return np.asarray(~lost)
-
-
-def _seen_by(model: Model, rig: Rig, signals: Signals) -> Signals:
-    """Let terms that correct measurements do so; those that prepare in simulation do it there."""
-    for used in model.terms:
-        if not used.term.prepares:
-            signals = used.term.prepare(rig, signals, used.shape)
-    return signals
 
 
 def _compared(rig: Rig, channels: Mapping[str, Array], signals: Signals) -> dict[str, Array]:

@@ -77,6 +77,20 @@ class Friction(Effect):
         """Return the bound of the contact's relaxation."""
         return FASTEST
 
+    def hidden_path(
+        self, rig: Rig, signals: Signals, values: Mapping[str, float], shape: Sequence[float]
+    ) -> Array:
+        """Return the deflection (n, 1) [m]; a contact without memory has none."""
+        if not len(shape):
+            return super().hidden_path(rig, signals, values, shape)
+        return self.deflection(rig, signals, values, shape)[:, None]
+
+    def deflection(
+        self, rig: Rig, signals: Signals, values: Mapping[str, float], shape: Sequence[float]
+    ) -> Array:
+        """Return the deflection y (n,) [m] along the measured path, as the kernel integrates it."""
+        return np.asarray(shape[-1] * self.contact(rig, signals, shape))
+
     def contact(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Array:
         """Return z (n,) along the measured path."""
         if not len(shape):
@@ -149,14 +163,6 @@ class CoulombFriction(Friction):
         z = self.contact(rig, signals, shape)
         return self.row({f"Fc{self.joint + 1}": signals.G[:, self.joint] * z})
 
-    def hidden_path(
-        self, rig: Rig, signals: Signals, values: Mapping[str, float], shape: Sequence[float]
-    ) -> Array:
-        """Return the deflection (n, 1) [m]."""
-        if not len(shape):
-            return super().hidden_path(rig, signals, values, shape)
-        return shape[-1] * self.contact(rig, signals, shape)[:, None]
-
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Refuse friction that drives, and more than half of the cylinder's force."""
         name = f"Fc{self.joint + 1}"
@@ -205,7 +211,7 @@ class StribeckFriction(Friction):
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return G w."""
         if len(shape):
-            w = self.hidden_path(rig, signals, {}, shape)[:, 0] / shape[-1]
+            w = self.deflection(rig, signals, {}, shape) / shape[-1]
         else:
             w = self._level(rig, signals, shape) * self.contact(rig, signals, ())
         return self.row({f"Fs{self.joint + 1}": signals.G[:, self.joint] * w})
@@ -215,15 +221,13 @@ class StribeckFriction(Friction):
         ratio = signals.sd[:, self.joint] / self.shape_of(rig, shape)[0]
         return np.asarray(np.exp(-(ratio**2)))
 
-    def hidden_path(
+    def deflection(
         self, rig: Rig, signals: Signals, values: Mapping[str, float], shape: Sequence[float]
     ) -> Array:
-        """Return w d (n, 1) [m]."""
-        if not len(shape):
-            return super().hidden_path(rig, signals, values, shape)
+        """Return w d (n,) [m]."""
         s = np.ascontiguousarray(signals.s[:, self.joint])
         w = contact_under_load(s, self._level(rig, signals, shape), 1.0 / shape[-1])
-        return np.asarray(shape[-1] * w[:, None])
+        return np.asarray(shape[-1] * w)
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Refuse a breakaway below Coulomb's level, too much of it, and a speed at its bounds."""

@@ -102,16 +102,14 @@ class AsymmetricFriction(Friction):
         z = self.contact(rig, signals, ())
         return np.maximum(z, 0.0), np.maximum(-z, 0.0)
 
-    def hidden_path(
+    def deflection(
         self, rig: Rig, signals: Signals, values: Mapping[str, float], shape: Sequence[float]
     ) -> Array:
-        """Return the force over the sum of both levels, times the first distance (n, 1) [m]."""
-        if not len(shape):
-            return super().hidden_path(rig, signals, values, shape)
+        """Return the force over the sum of both levels, times the first distance (n,) [m]."""
         ahead, back = self._shares(rig, signals, shape)
         extending, retracting = (values[name] for name in self._names())
         force = extending * ahead - retracting * back
-        return (shape[0] * force / (extending + retracting))[:, None]
+        return np.asarray(shape[0] * force / (extending + retracting))
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
         """Return joint (0-based), levels, presliding distances, 0 where none are given."""
@@ -167,7 +165,7 @@ class PressureDependentFriction(Friction):
         """Return G w."""
         i = self.joint
         if len(shape):
-            path = self.hidden_path(rig, signals, {}, shape)[:, 0]
+            path = self.deflection(rig, signals, {}, shape)
             level = path * rig.supply.pressure / shape[-1]
         else:
             level = self._load(signals) * self.contact(rig, signals, ())
@@ -178,16 +176,13 @@ class PressureDependentFriction(Friction):
         i = self.joint
         return np.asarray(np.maximum(signals.p_cap[:, i] + signals.p_rod[:, i], 0.0))
 
-    def hidden_path(
+    def deflection(
         self, rig: Rig, signals: Signals, values: Mapping[str, float], shape: Sequence[float]
     ) -> Array:
-        """Return w d / p_S (n, 1) [m]."""
-        if not len(shape):
-            return super().hidden_path(rig, signals, values, shape)
+        """Return w d / p_S (n,) [m]."""
         stiffness = rig.supply.pressure / shape[-1]
         s = np.ascontiguousarray(signals.s[:, self.joint])
-        w = contact_under_load(s, self._load(signals), stiffness)
-        return np.asarray(w[:, None] / stiffness)
+        return np.asarray(contact_under_load(s, self._load(signals), stiffness) / stiffness)
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
         """Return joint (0-based), k, presliding distance (0 where none is given), p_S."""

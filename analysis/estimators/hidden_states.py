@@ -81,19 +81,14 @@ def completed(runs: Sequence[Run], model: Model) -> Model | None:
 
 def shot(runs: Sequence[Run], model: Model, effect: Effect) -> Shot | None:
     """Search an effect's shapes by multiple shooting; None where no window can be simulated."""
-    rig = model.rig
-    try:
+    bounds = {s.parameter: s for s in effect.shapes(model.rig)}
+    try:  # there may be no stretch without a lost sample or a sensor at its end
         windows = _windows(runs, model, effect, _free(model, effect))
-    except InputError as error:  # no stretch without a lost sample or a sensor at its end
-        log.info("%s is not shot: %s", effect.name, error)
-        return None
-    theta = _theta(windows, model)
-    low, high = np.full(len(theta), -np.inf), np.full(len(theta), np.inf)
-    bounds = {s.parameter: s for s in effect.shapes(rig)}
-    for name, shape in bounds.items():
-        place = windows.names.index(name)
-        low[place], high[place] = shape.low, shape.high
-    try:
+        theta = _theta(windows, model)
+        low, high = np.full(len(theta), -np.inf), np.full(len(theta), np.inf)
+        for name, shape in bounds.items():
+            place = windows.names.index(name)
+            low[place], high[place] = shape.low, shape.high
         found = Search(windows, low, high).run(theta)
     except (InputError, np.linalg.LinAlgError) as error:
         log.info("%s is not shot: %s", effect.name, error)

@@ -16,7 +16,7 @@ from analysis.estimators.window_data import Nudged, Reduced, Source, Stretch
 from analysis.model import Estimate, Model
 from analysis.rows import default_filtering
 from analysis.signals import Mask, condition
-from analysis.simulate import compiled, drive_of, hidden_paths
+from analysis.simulate import compiled, drive_of, hidden_paths, put_right
 from analysis.terms.base import Used
 from rig.model import channels as ch
 from rig.model.parse import InputError
@@ -74,9 +74,7 @@ class Windows:
         most = max(1, round(self.seconds / WINDOW) // len(records))
         for i, record in records:
             signals = condition(self.rig, record, default_filtering(record).channels)
-            for used in self.terms:
-                if not used.term.prepares:  # what simulation does not do itself: put sensors right
-                    signals = used.term.prepare(self.rig, signals, used.shape)
+            signals = put_right(self.rig, self.terms, signals)
             drive = drive_of(signals)
             inputs = np.column_stack(
                 (drive.p_s, drive.temperature, drive.u, drive.q, drive.qd, drive.qdd)

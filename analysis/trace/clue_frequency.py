@@ -60,7 +60,7 @@ def _peak(one: Lines) -> float | None:
     k = int(np.argmax(power))
     if k < FIRST:
         return None
-    here = slice(max(1, k - BESIDE), k + BESIDE + 1)
+    here = slice(k - BESIDE, k + BESIDE + 1)
     if power[here].sum() < PEAK * power.sum():
         return None
     return float(np.average(one.frequency[here], weights=power[here]))

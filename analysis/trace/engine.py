@@ -23,7 +23,7 @@ from analysis.trace.candidates import catalogue, variants
 from analysis.trace.clue_frequency import frequency_clue
 from analysis.trace.evidence import Scene, scenes
 from analysis.trace.floor import STATED
-from analysis.trace.lines import lines
+from analysis.trace.lines import Lines, lines
 from analysis.trace.listed import Listed, within
 from analysis.trace.next_experiment import propose
 from analysis.trace.refine import rebased
@@ -88,7 +88,7 @@ def trace(
     if quiet and not gates.remaining(listed, listed.empty, judge):
         found: tuple[Found, ...] = ()
         refused: tuple[Found, ...] = ()
-        winner, verdict, moves = listed.empty, CLEAN, []
+        winner, verdict = listed.empty, CLEAN
     else:
         winner = listed.run()
         found, winner, verdict = _named(listed, winner, judge, rng)
@@ -98,13 +98,15 @@ def trace(
             notes.append(ELSEWHERE)
         if verdict == UNEXPLAINED and (found or quiet):
             notes += [f"{e}: {words}" for e, words in gates.remaining(listed, winner, judge)]
-        moves = [] if verdict in (CLEAN, EXPLAINED) else _moves(stage, judge, winner)
+    split = lines(stage, winner.fit.left)
+    moves = [] if verdict in (CLEAN, EXPLAINED) else _moves(stage, judge, winner, split)
     further = propose(listed, winner, found, verdict, moves) if look_ahead else None
     after = _extended(runs, terms, winner, before)
     again = reshaped(runs, holdout, after, stage, judge, winner)
     if again.winner is not winner:
         winner = again.winner
         after = _extended(runs, terms, winner, before)
+        split = lines(stage, winner.fit.left)
     found = tuple(told(f, again.shots) for f in found)
     first, last = held_out.settled(judge, listed.empty.fit), held_out.settled(judge, winner.fit)
     error = held_out.errors(rig, judged, first, last)
@@ -115,7 +117,7 @@ def trace(
         _fraction(listed, winner), tuple(moves), further, stage.floors,
         first, last, tuple(notes), refused=refused, size=error.size,
         rmse_before=runs_before.rmse, rmse_after=runs_after.rmse,
-        lines=lines(stage, winner.fit.left),
+        lines=split,
         seconds=time.perf_counter() - started,
     )  # fmt: skip
     return replace(result, sentence=sentence(result))
@@ -212,7 +214,7 @@ def _named(
     return found, winner, CONFOUNDED if tied else EXPLAINED
 
 
-def _moves(stage: Board, judge: Board, winner: Listed) -> list[Dependence]:
+def _moves(stage: Board, judge: Board, winner: Listed, split: Sequence[Lines]) -> list[Dependence]:
     """Return what the remaining residual moves with."""
     held = held_out.left(judge, winner.fit)
     now = rebased(stage, winner.fit)
@@ -221,7 +223,7 @@ def _moves(stage: Board, judge: Board, winner: Listed) -> list[Dependence]:
     total = sum(winner.excess[e] for e in loud)
     loud = [e for e in loud if winner.excess[e] > 0.1 * total]
     found = clues.dependence(now, winner.fit.left, later, held, loud)
-    hum = frequency_clue(lines(stage, winner.fit.left), stage, winner.fit.left, judge, held)
+    hum = frequency_clue(split, stage, winner.fit.left, judge, held)
     return found if hum is None else [hum, *found]
 
 

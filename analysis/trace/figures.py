@@ -20,6 +20,7 @@ from analysis.rows import Rows
 from analysis.terms.base import family_of
 from analysis.trace.clue_variables import variables
 from analysis.trace.evidence import Scene, filtered, prepared, residual, scene_rows, scenes
+from analysis.trace.lines import CONSTANT, EVEN, EXCITED, ODD, members
 from analysis.trace.lines import Lines as Spectrum
 from analysis.trace.refine import Fit
 from analysis.trace.result import Trace
@@ -165,11 +166,11 @@ def over_noise(result: Trace, key: str = "overnoise") -> Markup:
 
 def spectrum(one: Spectrum, unit: str, key: str, after: bool) -> Markup:
     """Draw the lines of a residual by kind, before beside after, over the noise of one repeat."""
-    number = np.arange(len(one.frequency))
+    of = members(one.excited)
     kinds = (
-        ("excited", one.excited, "o", INK, 4.0),
-        ("odd, left empty", (number % 2 == 1) & ~one.excited, "s", MODEL, 3.2),
-        ("even", number % 2 == 0, "^", BLUE, 3.0),
+        ("excited", of[EXCITED], "o", INK, 4.0),
+        ("odd, left empty", of[ODD], "s", MODEL, 3.2),
+        ("even", of[EVEN] | of[CONSTANT], "^", BLUE, 3.0),
     )
     noise = np.sqrt(one.noise)
     low = 0.2 * float(np.median(noise))
@@ -180,10 +181,10 @@ def spectrum(one: Spectrum, unit: str, key: str, after: bool) -> Markup:
             axes = made.add_subplot(1, 2 if after else 1, k + 1)
             power = one.after if k else one.repeatable
             axes.fill_between(one.frequency, low, np.maximum(noise, low), color=PALE, lw=0)
-            for label, members, marker, colour, size in kinds:
-                y = np.sqrt(np.maximum(power[members], 0.0))
+            for label, own, marker, colour, size in kinds:
+                y = np.sqrt(np.maximum(power[own], 0.0))
                 axes.plot(
-                    one.frequency[members], np.where(y > low, y, np.nan), marker, color=colour,
+                    one.frequency[own], np.where(y > low, y, np.nan), marker, color=colour,
                     ms=size, mew=0, label=label,
                 )  # fmt: skip
             axes.set_yscale("log")

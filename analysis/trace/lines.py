@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.rows import LINES_FACTOR, ROW_CUTOFF_RANGE, Rows
+from analysis.rows import Rows, lines_cutoff
 from analysis.trace.board import Board, Segment
 from analysis.trace.evidence import Scene, filtered
 from analysis.trace.floor import Group
@@ -146,8 +146,7 @@ def _of_segment(
     place = np.rint((rows.time - rows.time[0]) * record.sample_rate / scene.filtering.step)
     pairs = _pairs(place.astype(np.int64), per)
     base = record.sample_rate / record.period
-    band = ABOVE * float(np.clip(LINES_FACTOR * highest * base, *ROW_CUTOFF_RANGE))
-    K = int(min([band / base, *(LINES_PER_PAIR * len(p) for p in pairs)]))
+    K = int(min([ABOVE * lines_cutoff(record) / base, *(LINES_PER_PAIR * len(p) for p in pairs)]))
     if not pairs or highest > K:
         return None
     joint = int(s.equation.rsplit("_", 1)[1]) - 1
@@ -201,14 +200,18 @@ def spectrum(phase: Array, series: Array, K: int) -> NDArray[np.complex128]:
     return out
 
 
-def _shares(power: Array, noise: Array, excited: NDArray[np.bool_]) -> dict[str, float]:
-    """Return the share of the power by kind of line; 0 of a kind that noise would explain."""
-    number = np.arange(len(power))
+def members(excited: NDArray[np.bool_]) -> dict[str, NDArray[np.bool_]]:
+    """Return which of the lines 0..K are of which kind, each (K + 1,)."""
+    number = np.arange(len(excited))
     odd = (number % 2 == 1) & ~excited
     even = (number % 2 == 0) & (number > 0)
-    members = dict(zip(KINDS, (number == 0, excited, odd, even), strict=True))
+    return dict(zip(KINDS, (number == 0, excited, odd, even), strict=True))
+
+
+def _shares(power: Array, noise: Array, excited: NDArray[np.bool_]) -> dict[str, float]:
+    """Return the share of the power by kind of line; 0 of a kind that noise would explain."""
     sums = {}
-    for kind, own in members.items():
+    for kind, own in members(excited).items():
         total = float(power[own].sum())
         scatter = float(np.sqrt(np.sum(noise[own] ** 2)))
         sums[kind] = total if total > STANDS * scatter else 0.0

@@ -135,7 +135,7 @@ def _on_the_right_side(stage: Board, terms: Sequence[Used]) -> tuple[Used, ...]:
     Of a column the first look tells the size, not the sign; and from the wrong side a search runs
     away to the bound, not through the neutral value.
     """
-    terms = tuple(terms)
+    terms, least = tuple(terms), np.nan
     for k, used in enumerate(terms):
         for j, s in enumerate(shapes_of(stage.rig, used)):
             if s.neutral is None or not s.low < s.neutral < s.high:
@@ -143,8 +143,11 @@ def _on_the_right_side(stage: Board, terms: Sequence[Used]) -> tuple[Used, ...]:
             mirrored = float(np.clip(2 * s.neutral - used.shape[j], s.low, s.high))
             shape = (*used.shape[:j], mirrored, *used.shape[j + 1 :])
             other = (*terms[:k], Used(used.term, shape), *terms[k + 1 :])
-            if fit(stage, other).energy < fit(stage, terms).energy:
-                terms = other
+            if np.isnan(least):  # few effects lie on either side of nothing
+                least = fit(stage, terms).energy
+            energy = fit(stage, other).energy
+            if energy < least:
+                terms, least = other, energy
     return terms
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -78,30 +78,31 @@ def body(
 def _pictures(rig: Rig, holdout: Sequence[Run], result: Trace) -> list[dict[str, Any]]:
     """Return per effect, else per clue, the residual against its variable and in time."""
     lines = figures.held_out(rig, holdout, result)
-    out = []
+    out: list[dict[str, Any]] = []
+
+    def add(effect: Effect | None, variable: str, equation: str, heading: str, key: str) -> None:
+        timed = equation not in [picture["equation"] for picture in out]  # once is enough
+        drawn = _pair(rig, lines[equation], result, effect, variable, equation, key, timed)
+        out.append({"heading": heading, "equation": equation, **drawn})
+
     effects = [u.term for u in result.model_after.terms if isinstance(u.term, Effect)]
     for k, effect in enumerate(effects):
         equation = figures.equation_of(effect, rig, result, lines)
         heading = f"{effect.name.replace('_', ' ')} at {getattr(effect, 'place', effect.where)}"
-        out.append(_pair(rig, lines, result, effect, effect.variable, equation, heading, f"e{k}"))
+        add(effect, effect.variable, equation, heading, f"e{k}")
     # A frequency is seen in time and in the lines, not against anything.
     drawn = [d for d in result.depends_on if d.variable != FREQUENCY][:2]
     for k, clue in enumerate(drawn):
         heading = f"what is left of {clue.equation} against {clue.variable}"
-        out.append(_pair(rig, lines, result, None, clue.variable, clue.equation, heading, f"c{k}"))
-    seen: set[str] = set()
-    for picture in out:  # once in time is enough for each equation
-        if picture["equation"] in seen:
-            picture["time"] = None
-        seen.add(picture["equation"])
+        add(None, clue.variable, clue.equation, heading, f"c{k}")
     return out
 
 
 def _pair(
-    rig: Rig, lines: Mapping[str, list[figures.Lines]], result: Trace, effect: Effect | None,
-    variable: str, equation: str, heading: str, key: str,
+    rig: Rig, here: Sequence[figures.Lines], result: Trace, effect: Effect | None,
+    variable: str, equation: str, key: str, timed: bool,
 ) -> dict[str, Any]:  # fmt: skip
-    here, unit = lines[equation], unit_of_equation(rig, equation)
+    unit = unit_of_equation(rig, equation)
     noise = result.noise_floor[equation]
     model = result.model_after
     changed = model is not result.model_before
@@ -111,11 +112,9 @@ def _pair(
         label = f"{variable} [{figures.unit_of_variable(rig, variable)}]"
     longest = max(here, key=lambda line: float((line.before**2).mean()))
     return {
-        "heading": heading,
-        "equation": equation,
         "text": f"{equation}, held-out records; the band is ± one rms of noise, red the mean.",
         "against": figures.against(x, here, noise, unit, label, f"{key}x", changed),
-        "time": figures.in_time(longest, noise, unit, f"{key}t", changed),
+        "time": figures.in_time(longest, noise, unit, f"{key}t", changed) if timed else None,
         "record": longest.scene.record.name,
     }
 

@@ -80,7 +80,7 @@ def told(found: Found, shots: Sequence[Shot]) -> Found:
     for one in shots:
         if (one.name, one.where) == (found.name, found.where):
             shapes = {
-                name: replace(new, unit=found.parameters[name].unit) if one.taken
+                name: new if one.taken
                 else _wide(found.parameters[name], new)
                 for name, new in one.shapes.items()
             }  # fmt: skip

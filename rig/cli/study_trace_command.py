@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -45,7 +46,6 @@ def trace(
 
     Example: bramah study trace --quick
     """
-    from rig.cli.pages import replace_section
     from rig.cli.study_machines import cases_of
     from rig.cli.study_trace import all_of
     from rig.cli.study_trace_cases import NONE, OUTSIDE, PAIR, SINGLE, cases
@@ -59,14 +59,11 @@ def trace(
     # Those that take long first: the last to end are then short ones.
     work = [*cases_of(machines, seed), *cases(counts, seed, names, level)[::-1]]
     outcomes = list(all_of(work, workers, progress, keep))
+    asked = {"--clean": clean, "--single": single, "--pairs": pairs, "--outside": outside,
+             "--machines": machines}  # fmt: skip
+    made = partial(command_of, asked, seed, quick=quick, only=only, level=level)
     write_json(json, as_json(outcomes))
-    if docs is not None:
-        asked = {"--clean": clean, "--single": single, "--pairs": pairs, "--outside": outside,
-                 "--machines": machines}  # fmt: skip
-        made = command_of(asked, seed, docs, quick, only, level)
-        replace_section(docs, "study trace", in_section(made, f"```\n{text(outcomes)}\n```"))
-    if json != Path("-"):
-        typer.echo(text(outcomes))
+    _show("study trace", text(outcomes), made, json, docs)
 
 
 def distorted(
@@ -81,20 +78,30 @@ def distorted(
 
     Example: bramah study distorted --count 11
     """
-    from rig.cli.pages import replace_section
     from rig.cli.study_distorted import cases_of
     from rig.cli.study_trace import all_of
     from rig.cli.study_trace_text import as_json, bent_text
 
     outcomes = list(all_of(cases_of(count, seed), workers, progress, keep))
     write_json(json, as_json(outcomes))
+
+    def made(page: Path) -> str:
+        words = ["bramah", "study", "distorted", "--count", str(count), "--seed", str(seed)]
+        return shlex.join([*words, "--docs", str(page)])
+
+    _show("study distorted", bent_text(outcomes), made, json, docs)
+
+
+def _show(
+    section: str, tables: str, made: Callable[[Path], str], json: Path | None, docs: Path | None
+) -> None:
+    """Put a study's tables on its page under the command that makes them, and on the screen."""
+    from rig.cli.pages import replace_section
+
     if docs is not None:
-        made = f"bramah study distorted --count {count} --seed {seed} --docs {docs}"
-        replace_section(
-            docs, "study distorted", in_section(made, f"```\n{bent_text(outcomes)}\n```")
-        )
+        replace_section(docs, section, in_section(made(docs), f"```\n{tables}\n```"))
     if json != Path("-"):
-        typer.echo(bent_text(outcomes))
+        typer.echo(tables)
 
 
 def command_of(
