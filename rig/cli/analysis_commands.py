@@ -16,6 +16,7 @@ from rig.model.records import Record, Run
 if TYPE_CHECKING:
     from analysis.identify import Identification
     from analysis.rows import Filtering
+    from analysis.terms.base import Used
 
 RunsArgument = Annotated[list[Path], typer.Argument(help="Run folders.")]
 
@@ -72,6 +73,16 @@ def _streamed(
         )
 
 
+def _terms_like(path: Path, runs: Sequence[Run]) -> list[Used]:
+    """Return the terms of a model file; raises InputError for one of another rig."""
+    from analysis.model import load_model, refuse_other_rig
+
+    model = load_model(path)
+    for run in runs:
+        refuse_other_rig(model, run.rig, run.source)
+    return list(model.terms)
+
+
 def identify(
     runs: RunsArgument,
     method: Annotated[
@@ -82,6 +93,10 @@ def identify(
         typer.Option(
             "--with", help="Add an effect to the model: NAME (every joint) or 'NAME@joint 1'."
         ),
+    ] = None,
+    like: Annotated[
+        Path | None,
+        typer.Option(help="A model file whose terms, effects with their shapes, are taken over."),
     ] = None,
     estimator: Annotated[
         str | None,
@@ -145,12 +160,18 @@ def identify(
     if filtering not in FILTERINGS:
         raise InputError(f"--filtering {filtering}: expected one of: {' '.join(FILTERINGS)}")
     filters = FILTERINGS[filtering]
+    if like is not None and (effects or stream or cluster is not None):
+        raise InputError(
+            "--like takes a model's terms as they are: leave --with, --stream and --cluster away"
+        )
     if stream or cluster is not None:
         _refuse_unstreamed("--cluster" if cluster else "--stream", method, estimator, bootstrap)
         result = _streamed(runs, filters, effects or (), cluster)
     else:
         loaded = _load(runs)
         terms = [Used(term) for term in with_effects(loaded[0].rig, effects)] if effects else None
+        if like is not None:
+            terms = _terms_like(like, loaded)
         result = identify_runs(
             loaded,
             method,

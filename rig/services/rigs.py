@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import os
+import re
 from importlib import resources
 from pathlib import Path
 
 from rig.model.parse import InputError, parse_model
 from rig.model.rig import Rig
 from rig.services.files import read_text
+from rig.services.store import parse_header
 
 _WHAT = "a rig file (YAML)"
+_RESOLVED = re.compile(r"^format:", re.MULTILINE)  # of a run.yaml; no rig file has that key
 
 
 def shipped_rigs() -> tuple[str, ...]:
@@ -52,6 +55,11 @@ def load_bench(name: str | Path) -> Rig:
 
 
 def load_rig(name_or_path: str | Path, relative_to: Path | None = None) -> Rig:
-    """Load a rig by shipped name or path; raises InputError naming file, line and expectation."""
+    """Load a rig by shipped name, rig file, or the run.yaml of a run that was taken on it.
+
+    Raises InputError naming file, line and expectation.
+    """
     text, source = rig_text(name_or_path, relative_to)
+    if _RESOLVED.search(text):
+        return parse_header(text, source).rig
     return parse_model(Rig, text, source)

@@ -142,17 +142,22 @@ def read_header(folder: Path) -> Header:
         raise InputError(f"{folder}: no such run folder")
     if not is_run(folder):
         raise InputError(f"{folder}: not a run folder: it has no {HEADER}")
-    data, _ = load_yaml(read_text(path, "the head of a run", limit=64 << 20), str(path))
+    return parse_header(read_text(path, "the head of a run", limit=64 << 20), str(path))
+
+
+def parse_header(text: str, source: str) -> Header:
+    """Read the text of a run.yaml; raises InputError naming `source`, line and key."""
+    data, _ = load_yaml(text, source)
     if not isinstance(data, dict):
-        raise InputError(f"{path}:1: expected keys and values")
+        raise InputError(f"{source}:1: expected keys and values")
     if data.get("format") != _FORMAT:
-        raise InputError(f"{path}: format {data.get('format')!r}, this version reads {_FORMAT}")
+        raise InputError(f"{source}: format {data.get('format')!r}, this version reads {_FORMAT}")
     try:
         return Header.model_validate(data)
     except ValidationError as error:
         problem = error.errors()[0]
         where = ".".join(str(part) for part in problem["loc"])
-        raise InputError(f"{path}: {where}: {problem['msg']}") from error
+        raise InputError(f"{source}: {where}: {problem['msg']}") from error
 
 
 def finished(folder: Path) -> tuple[Header, str]:

@@ -1,0 +1,142 @@
+"""A model with an effect goes wherever a model goes: simulate, export, identify, validate."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pyarrow import parquet
+from typer.testing import CliRunner
+
+from analysis.identify import identify
+from analysis.model import load_model, save_model
+from analysis.terms import with_effects
+from analysis.terms.base import Used
+from rig.cli.errors import WorkError
+from rig.cli.main import app
+from rig.model.parse import InputError
+from rig.services.made import write_run
+from rig.services.store import load_run
+from tests.analysis import small_bench as bench
+
+FRICTION = 150.0  # [N]
+PRESLIDING = 2e-5  # [m]
+
+
+def bramah(*words: object) -> str:
+    """Run a command in this process; what it refuses is raised."""
+    done = CliRunner().invoke(app, [str(w) for w in words])
+    if done.exception is not None and not isinstance(done.exception, SystemExit):
+        raise done.exception
+    assert done.exit_code == 0, done.output
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run without friction, and a model of its machine to which dry friction was given."""
+    folder = tmp_path_factory.mktemp("models")
+    run = bench.experiment(bench.shinshu(), bench.default_excitations(1), repeats=2, seed=1)
+    write_run(folder / "run", run)
+    terms = [Used(t) for t in with_effects(run.rig, ["coulomb_friction@joint 2"])]
+    terms[-1] = replace(terms[-1], shape=(PRESLIDING,))
+    model = identify([run], terms=terms).model
+    given = replace(model.parameters["Fc2"], value=FRICTION)
+    save_model(
+        replace(model, parameters={**model.parameters, "Fc2": given}), folder / "rubbing.json"
+    )
+    return folder
+
+
+@pytest.fixture(scope="module")
+def rubbed(folder: Path) -> Path:
+    """The run as the rubbing model would have given it."""
+    out = folder / "rubbed"
+    assert bramah("simulate", folder / "rubbing.json", folder / "run", "--out", out) == f"{out}\n"
+    return out
+
+
+def test_a_simulated_run_gives_its_models_parameters_back(folder: Path, rubbed: Path) -> None:
+    told = json.loads(
+        bramah("identify", rubbed, "--like", folder / "rubbing.json", "--json", "-")
+    )["parameters"]  # fmt: skip
+    wanted = load_model(folder / "rubbing.json").values
+    assert set(told) == set(wanted)
+    assert told["Fc2"]["value"] == pytest.approx(FRICTION, rel=0.02)
+    for name in ("M2", "W2", "b", "C_pp_2"):
+        assert told[name]["value"] == pytest.approx(wanted[name], rel=0.02), name
+
+
+def test_the_model_taken_over_keeps_its_shapes(folder: Path, rubbed: Path) -> None:
+    again = folder / "again.json"
+    bramah("identify", rubbed, "--like", folder / "rubbing.json", "--model", again)
+    term = load_model(again).terms[-1]
+    assert (term.term.name, term.term.where, term.shape) == (
+        "coulomb_friction", "joint 2", (PRESLIDING,),
+    )  # fmt: skip
+
+
+def test_what_the_model_was_driven_with_and_held_by_stays_measured(
+    folder: Path, rubbed: Path
+) -> None:
+    for before, after in zip(
+        load_run(folder / "run").records, load_run(rubbed).records, strict=True
+    ):
+        joint = 3 - before.locked[0] if before.locked else None
+        changed = {
+            name
+            for name, y in before.channels.items()
+            if not np.array_equal(y, after.channels[name])
+        }
+        parts = ("piston", "cap_pressure", "rod_pressure")
+        assert changed == {f"{part}_{i}" for part in parts for i in ((joint,) if joint else (1, 2))}
+        assert (before.name, before.period, before.lines) == (after.name, after.period, after.lines)
+
+
+def test_another_program_gets_measured_and_modelled_side_by_side(folder: Path) -> None:
+    out = folder / "for-others"
+    line = ("export", folder / "run", "--format", "parquet", "--out", out)
+    assert bramah(*line, "--model", folder / "rubbing.json") == f"{out}\n"
+    (record,) = [r for r in load_run(folder / "run").records if r.name == "step1_r1"]
+    table = parquet.read_table(out / "step1_r1.parquet")
+    measured, modelled = (table[n].to_numpy() for n in ("piston_2", "model_piston_2"))
+    np.testing.assert_array_equal(measured, record.channels["piston_2"])
+    # Friction that the bench does not have: near, and not the same.
+    assert 1e-4 < np.sqrt(np.mean((measured - modelled) ** 2)) < 2e-2
+    assert "model_piston_1" not in table.column_names
+
+
+def test_without_a_word_the_files_lie_beside_the_run(folder: Path) -> None:
+    assert bramah("export", folder / "run").strip() == str(folder / "run-csv")
+    assert (folder / "run-csv" / "manifest.yaml").is_file()
+
+
+def test_what_cannot_be_is_said_before_anything_is_written(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, run, none = folder / "rubbing.json", folder / "run", folder / "none"
+    with pytest.raises(InputError, match="--like takes a model's terms"):
+        bramah("identify", run, "--like", model, "--with", "payload")
+    other = load_model(model)
+    save_model(
+        replace(other, rig=other.rig.model_copy(update={"name": "theirs"})), folder / "o.json"
+    )
+    for line in (("simulate", folder / "o.json", run, "--out", none),
+                 ("export", run, "--model", folder / "o.json", "--out", none),
+                 ("identify", run, "--like", folder / "o.json")):  # fmt: skip
+        with pytest.raises(InputError, match="another rig"):
+            bramah(*line)
+    lost = {
+        n: replace(p, value=1e6 if n.startswith("C_") else p.value)
+        for n, p in other.parameters.items()
+    }
+    save_model(replace(other, parameters=lost), folder / "wild.json")
+    with pytest.raises(WorkError, match=r"step1_r1.*cannot be simulated"):
+        bramah("simulate", folder / "wild.json", run, "--out", none)
+    monkeypatch.setattr("rig.services.export.library_missing", lambda kind: "pyarrow")
+    with pytest.raises(WorkError, match=r"pyarrow.*bramah\[export\]"):
+        bramah("export", run, "--format", "parquet", "--out", none)
+    assert not none.exists()
