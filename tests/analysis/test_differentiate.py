@@ -103,7 +103,7 @@ def test_a_filter_beyond_nyquist_is_refused() -> None:
 
 
 def test_the_study_shows_why_the_default_is_the_default(rig: Rig) -> None:
-    entries = table(rig, np.random.default_rng(3), repeats=2)
+    entries = table(rig, np.random.default_rng(3), repeats=1)
     by = {(e.excitation.split()[0], e.filtering.split(";")[0]): e for e in entries}
     for excitation in ("sine", "multisine"):
         default = by[excitation, "default (windowed sinc, 80 Hz"]
