@@ -183,6 +183,14 @@ def refuse_other_rig(model: Model, rig: Rig, source: str) -> None:
         )
 
 
+def terms_like(path: Path, rigs: Mapping[str, Rig]) -> tuple[Used, ...]:
+    """Return the terms of a model file; raises InputError where a rig, by source, is another."""
+    model = load_model(path)
+    for source, rig in rigs.items():
+        refuse_other_rig(model, rig, source or "the run")
+    return model.terms
+
+
 def rig_difference(one: Rig, other: Rig) -> str:
     """Say what differs between two rigs as far as physics is concerned ('' if nothing)."""
     if one.name != other.name:

@@ -15,9 +15,10 @@ from analysis import checks as ck
 from analysis.effects.base import Effect, ordered
 from analysis.identify import identify
 from analysis.model import Model
+from analysis.terms import baseline_of
 from analysis.terms.base import FAMILIES, Used
 from analysis.trace import clues, gates, held_out
-from analysis.trace.beside import base_terms, stripped
+from analysis.trace.beside import beside, stripped
 from analysis.trace.board import Board, board
 from analysis.trace.candidates import catalogue, variants
 from analysis.trace.clue_frequency import frequency_clue
@@ -61,26 +62,29 @@ def trace(
     seed: int = 0,
     families: Sequence[str] = tuple(FAMILIES),
     look_ahead: bool = True,
+    terms: Sequence[Used] | None = None,
 ) -> Trace:
     """Say what the baseline lacks on `runs`, name it or refuse to, and judge it on `holdout`.
 
     `effects` are the candidates, by default the whole catalogue at every place. `seed` draws the
     half-samples and sign flips; `families` are the equations looked at, mechanical or fluid (they
     share no parameter, so that what stays unexplained in one need not hide the other); `look_ahead`
-    designs the next experiment. Raises InputError for records of different rigs, without held-out
+    designs the next experiment; `terms` take the baseline's place: a model's with its effects,
+    whose shapes stay as they are. Raises InputError for records of different rigs, without held-out
     records, with held-out records that are training records, or too short to tell anything.
     """
     started = time.perf_counter()
     rig = ck.common_rig([*runs, *holdout])
     _refuse_same(runs, holdout)
     rng = np.random.default_rng(seed)
-    terms = base_terms(rig, runs, holdout)
+    known = tuple(map(Used, baseline_of(rig))) if terms is None else tuple(terms)
+    terms = ordered((*known, *beside(known, runs, holdout)))
     train = scenes(rig, runs, families=tuple(families))
     judged = scenes(rig, holdout, families=tuple(families))
     stage = board(rig, terms, train)
     _refuse_short(stage, train)
     judge = board(rig, terms, judged, stage.beta)
-    candidates = catalogue(rig) if effects is None else list(effects)
+    candidates = _unknown(catalogue(rig) if effects is None else effects, known)
     listed = Shortlist(stage, variants(rig, candidates))
     before = stripped(identify(runs, terms=terms, estimator=PLAIN).model)
     notes = _notes(stage, judge)
@@ -231,6 +235,12 @@ def _fraction(listed: Shortlist, winner: Listed) -> float:
     """Return the share of the training records' repeatable energy that is left."""
     start = listed.empty.total
     return float(min(1.0, winner.total / start)) if start > 0 else 0.0
+
+
+def _unknown(candidates: Sequence[Effect], known: Sequence[Used]) -> list[Effect]:
+    """Return the candidates that are not in the model already."""
+    there = {(u.term.name, u.term.where) for u in known}
+    return [c for c in candidates if (c.name, c.where) not in there]
 
 
 def _extended(runs: Sequence[Run], terms: Sequence[Used], winner: Listed, before: Model) -> Model:

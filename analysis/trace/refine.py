@@ -108,8 +108,13 @@ def shapes_of(rig: Rig, used: Used) -> tuple[Shape, ...]:
 
 
 def refine(stage: Board, terms: Sequence[Used], steps: int = MOST_STEPS) -> Fit:
-    """Search all shape parameters of a model on the board from where they are."""
-    free = [(k, j, s) for k, u in enumerate(terms) for j, s in enumerate(shapes_of(stage.rig, u))]
+    """Search the shape parameters that the board's own terms do not have, from where they are."""
+    free = [
+        (k, j, s)
+        for k, u in enumerate(terms)
+        if u not in stage.terms
+        for j, s in enumerate(shapes_of(stage.rig, u))
+    ]
     if not free:
         return fit(stage, terms)
     terms = _on_the_right_side(stage, terms)
@@ -137,7 +142,7 @@ def _on_the_right_side(stage: Board, terms: Sequence[Used]) -> tuple[Used, ...]:
     """
     terms, least = tuple(terms), np.nan
     for k, used in enumerate(terms):
-        for j, s in enumerate(shapes_of(stage.rig, used)):
+        for j, s in enumerate(() if used in stage.terms else shapes_of(stage.rig, used)):
             if s.neutral is None or not s.low < s.neutral < s.high:
                 continue
             mirrored = float(np.clip(2 * s.neutral - used.shape[j], s.low, s.high))

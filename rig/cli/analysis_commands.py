@@ -61,26 +61,47 @@ def _streamed(
     runs: Sequence[Path],
     filtering: Callable[[Record], Filtering],
     effects: Sequence[str],
+    like: Path | None,
     cluster: str | None,
 ) -> Identification:
     from analysis.cluster import Cluster
     from analysis.compute import Serial
     from analysis.folders import identify_folders
+    from analysis.model import terms_like
+    from analysis.terms import with_effects
+    from analysis.terms.base import Used
+    from analysis.trace.shapes import open_shapes
+    from rig.services.stream import read_run_head
 
+    heads = [read_run_head(run) for run in runs]
+    terms = [Used(t) for t in with_effects(heads[0].rig, effects)]
+    for used in terms:
+        if open_shapes(heads[0].rig, used):
+            raise InputError(
+                f"--with {used.term.name} has a shape to be found in rows that are all in memory: "
+                "identify a part of the records without --stream or --cluster, write its --model, "
+                "and take the shape from there with --like"
+            )
+    if like is not None:
+        terms = list(terms_like(like, {head.source: head.rig for head in heads}))
     with Serial() if cluster is None else Cluster(cluster) as pool:
         return identify_folders(
-            [str(run) for run in runs], filtering=filtering, pool=pool, effects=effects
+            [str(run) for run in runs], terms=terms, filtering=filtering, pool=pool
         )
 
 
-def _terms_like(path: Path, runs: Sequence[Run]) -> list[Used]:
-    """Return the terms of a model file; raises InputError for one of another rig."""
-    from analysis.model import load_model, refuse_other_rig
+def _terms(runs: Sequence[Run], effects: Sequence[str], like: Path | None) -> Sequence[Used] | None:
+    """Return the terms asked for, shapes found where none are given; None: the rig's own."""
+    from analysis.model import terms_like
+    from analysis.terms import with_effects
+    from analysis.terms.base import Used
+    from analysis.trace.shapes import with_shapes
 
-    model = load_model(path)
-    for run in runs:
-        refuse_other_rig(model, run.rig, run.source)
-    return list(model.terms)
+    if like is not None:
+        return terms_like(like, {run.source: run.rig for run in runs})
+    if not effects:
+        return None
+    return with_shapes(runs, [Used(term) for term in with_effects(runs[0].rig, effects)])
 
 
 def identify(
@@ -151,27 +172,22 @@ def identify(
     from analysis.methods import SearchOptions
     from analysis.model import save_model
     from analysis.rows import FILTERINGS
-    from analysis.terms import with_effects
-    from analysis.terms.base import Used
+    from analysis.trace.shapes import shapes_in
     from rig.cli.method_text import method_text
-    from rig.cli.tables import identification_text
+    from rig.cli.tables import identification_text, shapes_text
     from rig.cli.truth_file import read_truth
 
     if filtering not in FILTERINGS:
         raise InputError(f"--filtering {filtering}: expected one of: {' '.join(FILTERINGS)}")
     filters = FILTERINGS[filtering]
-    if like is not None and (effects or stream or cluster is not None):
-        raise InputError(
-            "--like takes a model's terms as they are: leave --with, --stream and --cluster away"
-        )
+    if like is not None and effects:
+        raise InputError("--like takes a model's terms as they are: leave --with away")
     if stream or cluster is not None:
         _refuse_unstreamed("--cluster" if cluster else "--stream", method, estimator, bootstrap)
-        result = _streamed(runs, filters, effects or (), cluster)
+        result = _streamed(runs, filters, effects or (), like, cluster)
     else:
         loaded = _load(runs)
-        terms = [Used(term) for term in with_effects(loaded[0].rig, effects)] if effects else None
-        if like is not None:
-            terms = _terms_like(like, loaded)
+        terms = _terms(loaded, effects or (), like)
         result = identify_runs(
             loaded,
             method,
@@ -182,7 +198,10 @@ def identify(
             rng=np.random.default_rng(seed),
             search=SearchOptions(evaluations=evaluations),
         )
-    told, more = to_json(result), method_text(result)
+    shapes = shapes_in(result.model.rig, result.model.terms)
+    told, more = to_json(result), shapes_text(shapes) + method_text(result)
+    if shapes:
+        told["shapes"] = {n: {"value": v, "unit": s.unit} for n, (v, s) in shapes.items()}
     if physical:
         from rig.cli.physical import make_physical
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.effects.base import Effect
+from analysis.identify import identify
 from analysis.terms import baseline_of, make
 from analysis.terms.base import Used
 from analysis.trace import held_out
@@ -24,7 +25,10 @@ from analysis.trace.board import board
 from analysis.trace.engine import trace
 from analysis.trace.evidence import scenes
 from analysis.trace.listed import Listed
+from analysis.trace.result import Trace
+from analysis.trace.shapes import shapes_in, with_shapes
 from analysis.trace.shortlist import Shortlist
+from analysis.validate import validate
 from rig.cli.output import table
 from rig.cli.trace_text import trace_text
 from rig.model.parse import InputError
@@ -145,6 +149,24 @@ def _own(rig: Rig, one: Listed) -> str:
     return ", ".join(f"{name} {value:.3g}" for name, value in found)
 
 
+def known_band(runs: Sequence[Run], judge: Sequence[Run]) -> tuple[str, Trace]:
+    """Return the free runs of `judge` without and with a dead band whose edges `runs` give.
+
+    And the trace of what the flows lack when the dead band is taken as known.
+    """
+    plain = [Used(term) for term in baseline_of(runs[0].rig)]
+    band = with_shapes(runs, [*plain, *(Used(make(name, where)) for name, where in FLOW)])
+    rows = []
+    for name, terms in (("baseline", plain), ("dead band known", band)):
+        (found,) = validate(identify(runs, terms=terms).model, judge)
+        error = f"{1e3 * found.rmse['piston_1']:.1f} mm"
+        shapes = shapes_in(runs[0].rig, terms).items()
+        edges = ", ".join(f"{n} {value:.3g}" for n, (value, _) in shapes)
+        rows.append([name, f"{found.fit['piston_1']:.1f} %", error, edges])
+    told = trace(runs, judge, families=("fluid",), terms=band)
+    return table(["model", "piston FIT", "RMSE", "edges"], rows), told
+
+
 def text(folder: Path, say: Say) -> str:
     """Return tables and traces: flows, torques while rising, flows while coming down."""
     data = load(folder)
@@ -161,6 +183,11 @@ def text(folder: Path, say: Say) -> str:
     say("tracing the flows")
     everything = trace([data.second, data.full], [data.first], families=("fluid",))
     parts.append(f"trace of the flows\n\n{trace_text(everything)}")
+    say("tracing the flows with the dead band taken as known")
+    free, beyond = known_band([data.second, data.full], [data.first])
+    seconds = data.first.records[0].time[-1]
+    parts.append(f"free run of the first ramp, {seconds:.0f} s from its first state\n\n{free}")
+    parts.append(f"trace of the flows, the dead band taken as known\n\n{trace_text(beyond)}")
     say("tracing the flows while coming down")
     down = [part(ramps[k], "down", begin=RAISED) for k in ("second", "first")]
     lowering = trace(down[:1], down[1:], families=("fluid",))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
+from analysis.effects.base import Shape
 from analysis.identify import Identification
 from analysis.model import Estimate
 from analysis.validate import RecordValidation
@@ -71,6 +72,12 @@ def identification_text(result: Identification, truth: Mapping[str, float] | Non
     ]
     lines += [f"note: {n}: {e.note}" for n, e in result.estimates.items() if e.note]
     return "\n".join(lines)
+
+
+def shapes_text(shapes: Mapping[str, tuple[float, Shape]]) -> str:
+    """Return the effects' shapes as a line each, '' where the model has none."""
+    lines = [f"shape: {name} = {value:.4g} {s.unit}" for name, (value, s) in shapes.items()]
+    return "".join(f"\n{line}" for line in lines)
 
 
 def validation_text(results: Sequence[RecordValidation]) -> str:

@@ -25,6 +25,10 @@ def trace(
     model: Annotated[
         Path | None, typer.Option(help="Write the model file with the effects here.")
     ] = None,
+    like: Annotated[
+        Path | None,
+        typer.Option(help="A model file: what does it lack still, its effects taken as known?"),
+    ] = None,
     report: Annotated[Path | None, typer.Option(help="Write an HTML report here.")] = None,
     equations: Annotated[
         str, typer.Option(help="all, torque or flow: where one hides what the other lacks.")
@@ -37,7 +41,7 @@ def trace(
 
     Example: bramah trace runs/monday --holdout runs/tuesday --report trace.html
     """
-    from analysis.model import save_model
+    from analysis.model import save_model, terms_like
     from analysis.trace.engine import trace as trace_runs
     from analysis.trace.result import to_json
     from rig.cli.trace_text import trace_text
@@ -53,7 +57,9 @@ def trace(
         raise InputError(f"--equations {equations}: expected one of: {' '.join(FAMILIES_OF)}")
     loaded, judged = [load_run(f) for f in runs], [load_run(f) for f in holdout]
     progress(f"tracing {sum(len(r.records) for r in loaded)} records")
-    result = trace_runs(loaded, judged, seed=seed, families=FAMILIES_OF[equations])
+    rigs = {run.source: run.rig for run in (*loaded, *judged)}
+    known = None if like is None else terms_like(like, rigs)
+    result = trace_runs(loaded, judged, seed=seed, families=FAMILIES_OF[equations], terms=known)
     write_json(json, to_json(result))
     if model is not None:
         save_model(result.model_after, model)

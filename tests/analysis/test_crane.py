@@ -51,6 +51,18 @@ def test_a_dead_band_with_two_edges_is_what_the_flows_lack_most() -> None:
 
 
 @measured
+def test_with_the_dead_band_known_an_unseen_ramp_is_followed_ten_times_closer() -> None:
+    data = study.load(FOLDER)
+    said, left = study.known_band([data.second, data.full], [data.first])
+    plain, known = (line.split() for line in said.splitlines()[2:])
+    errors = [float(line[line.index("mm") - 1]) for line in (plain, known)]
+    assert errors[1] < 0.15 * errors[0]
+    assert (left.verdict, left.effects) == ("unexplained", ())
+    # The rod side's pressure opens the counterbalance valve.
+    assert any("rod_pressure_1" in d.variable for d in left.depends_on[:2])
+
+
+@measured
 def test_the_counterbalance_valve_stays_unexplained() -> None:
     data = study.load(FOLDER)
     down = [study.part(run, "down", begin=study.RAISED) for run in (data.second, data.first)]

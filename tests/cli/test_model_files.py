@@ -79,6 +79,19 @@ def test_the_model_taken_over_keeps_its_shapes(folder: Path, rubbed: Path) -> No
     )  # fmt: skip
 
 
+def test_record_by_record_the_same_terms_give_the_same_numbers(folder: Path, rubbed: Path) -> None:
+    line = ("identify", rubbed, "--like", folder / "rubbing.json", "--json", "-")
+    whole, streamed = (
+        json.loads(bramah(*line, *more)) for more in (("--estimator", "plain"), ("--stream",))
+    )
+    for name, found in whole["parameters"].items():
+        assert streamed["parameters"][name]["value"] == pytest.approx(found["value"], rel=1e-9)
+    assert whole["shapes"] == streamed["shapes"]
+    assert whole["shapes"]["presliding_2"] == {"value": PRESLIDING, "unit": "m"}
+    with pytest.raises(InputError, match=r"valve_deadband has a shape .* --like"):
+        bramah("identify", rubbed, "--with", "valve_deadband@joint 2", "--stream")
+
+
 def test_what_the_model_was_driven_with_and_held_by_stays_measured(
     folder: Path, rubbed: Path
 ) -> None:
@@ -126,7 +139,9 @@ def test_what_cannot_be_is_said_before_anything_is_written(
     )
     for line in (("simulate", folder / "o.json", run, "--out", none),
                  ("export", run, "--model", folder / "o.json", "--out", none),
-                 ("identify", run, "--like", folder / "o.json")):  # fmt: skip
+                 ("identify", run, "--like", folder / "o.json"),
+                 ("identify", run, "--like", folder / "o.json", "--stream"),
+                 ("trace", run, "--holdout", run, "--like", folder / "o.json")):  # fmt: skip
         with pytest.raises(InputError, match="another rig"):
             bramah(*line)
     lost = {

@@ -27,7 +27,7 @@ def test_a_gain_is_found_from_the_wrong_side_of_one_too(
         return refine.Fit(tuple(terms), {}, np.array([left, 0.1]))
 
     monkeypatch.setattr(refine, "fit", fit)
-    stage: Any = SimpleNamespace(rig=rig)
+    stage: Any = SimpleNamespace(rig=rig, terms=())
     used = Used(make("sensor_gain", "joint 2 cap"), (start,))
     found = refine.refine(stage, (used,))
     assert found.terms[-1].shape[0] == pytest.approx(1.01, abs=1e-3)

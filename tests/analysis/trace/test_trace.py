@@ -12,6 +12,8 @@ import pytest
 from analysis.effects.base import Effect
 from analysis.identify import identify
 from analysis.model import load_model, save_model
+from analysis.terms import baseline_of, make
+from analysis.terms.base import Used
 from analysis.trace.engine import trace
 from analysis.trace.result import Trace, to_json
 from rig.model.parse import InputError
@@ -73,6 +75,26 @@ def test_the_extended_model_is_a_model_file_like_any_other(leaking: Trace, tmp_p
     again = load_model(path)
     assert [u.term.name for u in again.terms][-1] == "internal_leakage"
     assert again.values["c_internal_2"] == leaking.model_after.values["c_internal_2"]
+
+
+def test_the_extended_model_lacks_nothing_any_more(rig: Rig, leaking: Trace) -> None:
+    """Told what the machine has, the trace takes it as known and names no other in its place."""
+    train, held_out = pair_of_runs(rig, c_internal=2e-12)
+    known = leaking.model_after.terms
+    result = trace([train], [held_out], look_ahead=False, terms=known)
+    assert result.verdict == "clean"
+    assert result.model_before.values["c_internal_2"] == pytest.approx(2e-12, rel=0.03)
+
+
+def test_beside_a_known_dead_band_friction_alone_is_new(rig: Rig) -> None:
+    train, held_out = pair_of_runs(rig, Fc=60, w_ahead=8e-3, w_astern=8e-3)
+    band = Used(make("valve_deadband", "joint 2"), (8e-3, 8e-3, 0.0))
+    known = (*map(Used, baseline_of(rig)), band)
+    result = trace([train], [held_out], look_ahead=False, terms=known)
+    assert result.verdict == "explained"
+    assert [(e.name, e.where) for e in result.effects] == [("coulomb_friction", "joint 2")]
+    kept = [u.term.name for u in result.model_after.terms if isinstance(u.term, Effect)]
+    assert sorted(kept) == ["coulomb_friction", "valve_deadband"]
 
 
 def test_the_result_has_the_contracts_keys(leaking: Trace) -> None:

@@ -1,0 +1,54 @@
+"""Somebody knows what the machine has, and not how much: the shape comes from the records."""
+
+from __future__ import annotations
+
+import pytest
+
+from analysis.identify import identify
+from analysis.terms import with_effects
+from analysis.terms.base import Used
+from analysis.trace.shapes import open_shapes, shapes_in, with_shapes
+from rig.model.records import Run
+from rig.model.rig import Rig
+from tests.analysis.small_bench import TRUTH
+from tests.analysis.trace.hidden import experiment
+
+
+def used(rig: Rig, *effects: str) -> list[Used]:
+    return [Used(term) for term in with_effects(rig, effects)]
+
+
+@pytest.fixture(scope="module")
+def overlapped(rig: Rig) -> Run:
+    return experiment(rig, repeats=2, w_ahead=8e-3, w_astern=5e-3)
+
+
+def test_a_dead_band_is_found_with_both_edges_and_the_gains_come_back(
+    rig: Rig, overlapped: Run
+) -> None:
+    terms = with_shapes([overlapped], used(rig, "valve_deadband@joint 2"))
+    shapes = {name: value for name, (value, _) in shapes_in(rig, terms).items()}
+    assert shapes["w_ahead_2"] == pytest.approx(8e-3, rel=0.05)
+    assert shapes["w_astern_2"] == pytest.approx(5e-3, rel=0.05)
+    found = identify([overlapped], terms=terms).estimates
+    plain = identify([overlapped]).estimates
+    off = [abs(e["C_pp_2"].value / TRUTH["C_pp_2"] - 1) for e in (found, plain)]
+    assert off[0] < 0.01
+    assert off[1] > 0.05
+
+
+def test_what_the_records_do_not_have_comes_out_as_next_to_nothing(rig: Rig) -> None:
+    """And not as edges that no spool ever reaches."""
+    run = experiment(rig, repeats=2)
+    terms = with_shapes([run], used(rig, "valve_deadband@joint 2"))
+    shapes = {name: value for name, (value, _) in shapes_in(rig, terms).items()}
+    assert max(shapes["w_ahead_2"], shapes["w_astern_2"]) < 1e-3
+
+
+def test_a_shape_that_is_given_stays_and_dry_friction_needs_none(rig: Rig, overlapped: Run) -> None:
+    terms = used(rig, "coulomb_friction@joint 2", "valve_deadband@joint 2")
+    assert [open_shapes(rig, u) for u in terms[-2:]] == [False, True]
+    given = (*terms[:-1], Used(terms[-1].term, (0.01, 0.01, 0.0)))
+    assert with_shapes([overlapped], given) == given
+    assert with_shapes([overlapped], terms[:-1]) == tuple(terms[:-1])
+    assert shapes_in(rig, given)["w_ahead_2"][0] == 0.01
