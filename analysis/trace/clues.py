@@ -11,19 +11,15 @@ direction of motion, with and without memory, the velocity, the pressure differe
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.rows import Rows
-from analysis.signals import Signals
 from analysis.trace.board import Board
+from analysis.trace.clue_sides import Part, Side, columns_of, judged, side_of
 from analysis.trace.clue_variables import factor_of, factors, variables
-from analysis.trace.evidence import Scene, filtered, prepared
 from analysis.trace.listed import excess_of
 from analysis.trace.result import Dependence
-from analysis.trace.select import orthonormal
 from rig.model import channels as ch
 from rig.model.rig import Rig
 
@@ -61,7 +57,7 @@ def dependence(
     total = sum(weight.values()) or 1.0
     found: dict[tuple[str, str], dict[str, float]] = {}
     for equation in equations:
-        sides = _side(train, left, equation), _side(judge, judge_left, equation)
+        sides = side_of(train, left, equation), side_of(judge, judge_left, equation)
         for key, share in _shares(train.rig, equation, *sides).items():
             found.setdefault(key, {})[equation] = share
     sums = {k: sum(s * weight[e] / total for e, s in by.items()) for k, by in found.items()}
@@ -112,46 +108,8 @@ def _telling(name: str, equation: str, shares: Mapping[tuple[str, str], float]) 
     return THROUGH if kind == "torque" and name.startswith(ch.SPOOL) else 1.0
 
 
-@dataclass(frozen=True)
-class _Part:
-    """A record's rows of one equation: signals as the model's terms prepare them, and weight."""
-
-    scene: Scene
-    rows: Rows
-    seen: Signals
-    weight: float
-
-
-@dataclass(frozen=True)
-class _Side:
-    """One set of records' rows of one equation: residual (m,) off the model's `base` (m, r)."""
-
-    parts: tuple[_Part, ...]
-    rest: Array
-    base: Array
-
-
-def _side(stage: Board, left: Array, equation: str) -> _Side | None:
-    index = {scene.group: k for k, scene in enumerate(stage.scenes)}
-    parts, rest, base = [], [], []
-    for s in stage.segments:
-        if s.equation != equation:
-            continue
-        k = index[s.group]
-        seen = prepared(stage.rig, stage.terms, stage.scenes[k])
-        weight = float(np.sqrt(s.repeats)) / s.noise
-        parts.append(_Part(stage.scenes[k], stage.rows[k][equation], seen, weight))
-        rest.append(left[s.where])
-        base.append(stage.base[s.where])
-    if not parts:
-        return None
-    B = orthonormal(np.concatenate(base))
-    r = np.concatenate(rest)
-    return _Side(tuple(parts), r - B @ (B.T @ r), B)
-
-
 def _shares(
-    rig: Rig, equation: str, first: _Side | None, second: _Side | None
+    rig: Rig, equation: str, first: Side | None, second: Side | None
 ) -> dict[tuple[str, str], float]:
     """Return the share of every curve alone, factor alone (variable ''), and product of both.
 
@@ -184,14 +142,14 @@ def _shares(
                 if factor
                 else curve
             )
-            one, two = _columns(first, made[:count]), _columns(second, made[count:])
+            one, two = columns_of(first, made[:count]), columns_of(second, made[count:])
             out[name, factor] = max(
-                0.0, _judged(one, first, two, second), _judged(two, second, one, first)
+                0.0, judged(one, first, two, second), judged(two, second, one, first)
             )
     return out
 
 
-def _moves(part: _Part, joint: int) -> bool:
+def _moves(part: Part, joint: int) -> bool:
     return joint + 1 not in part.scene.record.locked
 
 
@@ -200,24 +158,3 @@ def _knots(values: Array) -> Array | None:
     if len(knots) < 3 or np.ptp(knots) <= 1e-9 * max(1e-300, float(np.max(np.abs(knots)))):
         return None
     return np.asarray(knots)
-
-
-def _columns(side: _Side, made: Sequence[Array]) -> Array:
-    """Return columns (m, k) filtered as the rows are, whitened, off the model's own."""
-    stack = []
-    for part, columns in zip(side.parts, made, strict=True):
-        named = {str(k): columns[:, k] for k in range(columns.shape[1])}
-        found = filtered(named, part.scene, part.rows)
-        stack.append(np.column_stack(list(found.values())) * part.weight)
-    D = np.concatenate(stack)
-    return np.asarray(D - side.base @ (side.base.T @ D))
-
-
-def _judged(fitted: Array, side: _Side, judging: Array, other: _Side) -> float:
-    scale = np.linalg.norm(fitted, axis=0)
-    scale[scale == 0] = 1.0
-    curve = np.linalg.lstsq(fitted / scale, side.rest, rcond=1e-2)[0] / scale
-    q = other.rest
-    before = float(q @ q) - len(q)
-    after = float(np.sum((q - judging @ curve) ** 2)) - len(q)
-    return min(1.0, (before - after) / before) if before > 0 else 0.0

@@ -17,17 +17,17 @@ from analysis.identify import identify
 from analysis.model import Model
 from analysis.terms import baseline_of
 from analysis.terms.base import FAMILIES, Used
-from analysis.trace import clues, gates, held_out
+from analysis.trace import gates, held_out
 from analysis.trace.beside import beside, stripped
 from analysis.trace.board import Board, board
 from analysis.trace.candidates import catalogue, variants
-from analysis.trace.clue_frequency import frequency_clue
+from analysis.trace.clue_formula import Formula
 from analysis.trace.evidence import Scene, scenes
 from analysis.trace.floor import STATED
-from analysis.trace.lines import Lines, lines
+from analysis.trace.lines import lines
 from analysis.trace.listed import Listed, within
 from analysis.trace.next_experiment import propose
-from analysis.trace.refine import rebased
+from analysis.trace.remaining import clues_to
 from analysis.trace.result import (
     CLEAN,
     CONFOUNDED,
@@ -103,7 +103,10 @@ def trace(
         if verdict == UNEXPLAINED and (found or quiet):
             notes += [f"{e}: {words}" for e, words in gates.remaining(listed, winner, judge)]
     split = lines(stage, winner.fit.left)
-    moves = [] if verdict in (CLEAN, EXPLAINED) else _moves(stage, judge, winner, split)
+    moves: tuple[Dependence, ...] = ()
+    formulas: tuple[Formula, ...] = ()
+    if verdict not in (CLEAN, EXPLAINED):
+        moves, formulas = clues_to(stage, judge, winner, split)
     further = propose(listed, winner, found, verdict, moves) if look_ahead else None
     after = _extended(runs, terms, winner, before)
     again = reshaped(runs, holdout, after, stage, judge, winner)
@@ -118,10 +121,11 @@ def trace(
     result = Trace(
         verdict, found, error.noise, error.before, error.after,
         runs_before.fit, runs_after.fit, before, after,
-        _fraction(listed, winner), tuple(moves), further, stage.floors,
+        _fraction(listed, winner), moves, further, stage.floors,
         first, last, tuple(notes), refused=refused, size=error.size,
         rmse_before=runs_before.rmse, rmse_after=runs_after.rmse,
-        lines=split,
+        window_before=runs_before.window_rmse, window_after=runs_after.window_rmse,
+        lines=split, formulas=formulas,
         seconds=time.perf_counter() - started,
     )  # fmt: skip
     return replace(result, sentence=sentence(result))
@@ -216,19 +220,6 @@ def _named(
         found, winner, rest = wider, more, later
     tied = any(r.tied for f in found for r in f.rivals)
     return found, winner, CONFOUNDED if tied else EXPLAINED
-
-
-def _moves(stage: Board, judge: Board, winner: Listed, split: Sequence[Lines]) -> list[Dependence]:
-    """Return what the remaining residual moves with."""
-    held = held_out.left(judge, winner.fit)
-    now = rebased(stage, winner.fit)
-    later = rebased(judge, winner.fit)
-    loud = [e for e, v in sorted(winner.excess.items(), key=lambda kv: -kv[1]) if v > 0]
-    total = sum(winner.excess[e] for e in loud)
-    loud = [e for e in loud if winner.excess[e] > 0.1 * total]
-    found = clues.dependence(now, winner.fit.left, later, held, loud)
-    hum = frequency_clue(split, stage, winner.fit.left, judge, held)
-    return found if hum is None else [hum, *found]
 
 
 def _fraction(listed: Shortlist, winner: Listed) -> float:

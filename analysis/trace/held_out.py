@@ -117,10 +117,14 @@ def _rms(parts: Sequence[Array]) -> float:
 
 @dataclass(frozen=True)
 class FreeRuns:
-    """Free runs over the held-out records, by channel: mean FIT [%], RMSE [SI]; NaN if failed."""
+    """Simulations of the held-out records, by channel: mean FIT [%] and RMSE [SI] of free runs.
+
+    `window_rmse` [SI] is of windows restarted from the data; NaN where the model failed.
+    """
 
     fit: Mapping[str, float]
     rmse: Mapping[str, float]
+    window_rmse: Mapping[str, float]
 
 
 def free_runs(holdout: Sequence[Run], before: Model, after: Model) -> tuple[FreeRuns, FreeRuns]:
@@ -133,15 +137,20 @@ def _free_runs(holdout: Sequence[Run], model: Model) -> FreeRuns:
     try:
         results = validate(model, holdout)
     except InputError:  # a parameter that is not identified: there is no simulation
-        return FreeRuns({}, {})
+        return FreeRuns({}, {}, {})
     fits: dict[str, list[float]] = {}
     squares: dict[str, list[float]] = {}
+    windows: dict[str, list[float]] = {}
     for r in results:
         for channel in r.fit:
             lost = bool(r.failure)
             fits.setdefault(channel, []).append(float("nan") if lost else r.fit[channel])
             squares.setdefault(channel, []).append(float("nan") if lost else r.rmse[channel] ** 2)
+            windows.setdefault(channel, []).append(r.window_rmse[channel] ** 2)
     return FreeRuns(
         {c: float(np.mean(v)) for c, v in sorted(fits.items())},
-        {c: float(np.sqrt(np.mean(v))) for c, v in sorted(squares.items())},
+        *(
+            {c: float(np.sqrt(np.mean(v))) for c, v in sorted(x.items())}
+            for x in (squares, windows)
+        ),
     )

@@ -63,7 +63,12 @@ def body(
                 fm.fit(result.fit_after.get(name)),
                 *(
                     fm.significant(errors.get(name, math.nan))
-                    for errors in (result.rmse_before, result.rmse_after)
+                    for errors in (
+                        result.rmse_before,
+                        result.rmse_after,
+                        result.window_before,
+                        result.window_after,
+                    )
                 ),
                 rig.unit_of(name),
             )
@@ -85,7 +90,12 @@ def _pictures(rig: Rig, holdout: Sequence[Run], result: Trace) -> list[dict[str,
         drawn = _pair(rig, lines[equation], result, effect, variable, equation, key, timed)
         out.append({"heading": heading, "equation": equation, **drawn})
 
-    effects = [u.term for u in result.model_after.terms if isinstance(u.term, Effect)]
+    known = {(u.term.name, u.term.where) for u in result.model_before.terms}
+    effects = [
+        u.term
+        for u in result.model_after.terms
+        if isinstance(u.term, Effect) and (u.term.name, u.term.where) not in known
+    ]
     for k, effect in enumerate(effects):
         equation = figures.equation_of(effect, rig, result, lines)
         heading = f"{effect.name.replace('_', ' ')} at {getattr(effect, 'place', effect.where)}"

@@ -10,6 +10,7 @@ import numpy as np
 
 from analysis.estimators.hidden_states import Shot
 from analysis.model import Estimate, Model, estimate_json, finite
+from analysis.trace.clue_formula import Formula
 from analysis.trace.floor import Floor
 from analysis.trace.lines import Lines
 from analysis.trace.refine import Fit
@@ -92,6 +93,8 @@ class Dependence:
 class Trace:
     """The whole result; every error, fit and rmse is of the held-out records, SI and percent.
 
+    `fit` and `rmse` are of free runs, `window` of 0.25 s windows restarted from the data.
+
     `size` is the rms of each equation's right side, beside which an error is large or small.
 
     `floors` are the training records' split residuals under the baseline, `notes` what a person
@@ -123,7 +126,10 @@ class Trace:
     size: Mapping[str, float] = field(default_factory=dict)
     rmse_before: Mapping[str, float] = field(default_factory=dict)
     rmse_after: Mapping[str, float] = field(default_factory=dict)
+    window_before: Mapping[str, float] = field(default_factory=dict)
+    window_after: Mapping[str, float] = field(default_factory=dict)
     lines: tuple[Lines, ...] = ()
+    formulas: tuple[Formula, ...] = ()
 
     @property
     def tied(self) -> list[tuple[str, str]]:
@@ -144,7 +150,7 @@ class Trace:
 def to_json(result: Trace) -> dict[str, Any]:
     """Return the contract's JSON.
 
-    Added to it are `refused gates size rmse noise lines notes sentence seconds`.
+    Added to it are `refused gates size rmse window_rmse noise lines notes sentence seconds`.
     """
     return {
         "verdict": result.verdict,
@@ -158,6 +164,9 @@ def to_json(result: Trace) -> dict[str, Any]:
         "fit": {"before": _numbers(result.fit_before), "after": _numbers(result.fit_after)},
         "size": _numbers(result.size),
         "rmse": {"before": _numbers(result.rmse_before), "after": _numbers(result.rmse_after)},
+        "window_rmse": {
+            "before": _numbers(result.window_before), "after": _numbers(result.window_after),
+        },
         "parameters": {
             "before": _parameters(result.model_before),
             "after": _parameters(result.model_after),
@@ -166,6 +175,13 @@ def to_json(result: Trace) -> dict[str, Any]:
             "fraction": finite(result.unexplained_fraction),
             "depends_on": list(result.moves_with),
             "shares": {d.text: finite(d.share) for d in result.depends_on},
+            "formulas": [
+                {
+                    "equation": f.equation, "text": f.text, "share": finite(f.share),
+                    "terms": dict(f.terms),
+                }
+                for f in result.formulas
+            ],
         },
         "next_experiment": dict(result.next_experiment) if result.next_experiment else None,
         "noise": [

@@ -44,8 +44,15 @@ def sentence(result: Trace) -> str:
         f"{found}{100 * result.unexplained_fraction:.0f} % of what repeats stays unexplained"
         + (f"; it moves with {clue}" if clue else "")
         + _symmetry(result)
+        + _formula(result)
         + (f". {errors}" if named else ".")
     )
+
+
+def _formula(result: Trace) -> str:
+    """Say what a sparse fit reads that leaves next to nothing ('' where none does)."""
+    sure = [f for f in result.formulas if f.sure]
+    return f"; a sparse fit reads {max(sure, key=lambda f: f.share).text}" if sure else ""
 
 
 def _symmetry(result: Trace) -> str:

@@ -42,7 +42,12 @@ def trace_text(result: Trace) -> str:
             f"{result.fit_after.get(name, math.nan):.1f} %",
             *(
                 f"{errors.get(name, math.nan):.3g}"
-                for errors in (result.rmse_before, result.rmse_after)
+                for errors in (
+                    result.rmse_before,
+                    result.rmse_after,
+                    result.window_before,
+                    result.window_after,
+                )
             ),
             rig.unit_of(name),
         ]
@@ -51,7 +56,17 @@ def trace_text(result: Trace) -> str:
     if fits:
         lines += [
             table(
-                ["held-out free run", "FIT before", "after", "RMSE before", "after", "unit"], fits
+                [
+                    "held-out free run",
+                    "FIT before",
+                    "after",
+                    "RMSE before",
+                    "after",
+                    "in 0.25 s before",
+                    "after",
+                    "unit",
+                ],
+                fits,
             ),
             "",
         ]
@@ -62,6 +77,11 @@ def trace_text(result: Trace) -> str:
     if result.depends_on:
         moves = ", ".join(f"{d.text} ({100 * d.share:.0f} %)" for d in result.depends_on[:4])
         lines.append(f"what is left moves with: {moves} (a clue, not a name)")
+    lines += [
+        f"a sparse fit of what {f.equation} lacks: {f.text} "
+        f"({100 * f.share:.0f} % of it held out; a clue, not a name)"
+        for f in result.formulas
+    ]
     if result.next_experiment:
         lines.append(f"next experiment: {result.next_experiment['text']}")
     lines += [f"note: {note}" for note in result.notes]

@@ -64,6 +64,9 @@ def test_force_and_free_run_are_far_better_on_records_not_seen(found: Trace) -> 
     assert found.rmse_after["position_1"] < 0.05 * found.rmse_before["position_1"]
     told = to_json(found)
     assert told["rmse"]["after"]["position_1"] == found.rmse_after["position_1"]
+    windows = told["window_rmse"]
+    assert windows["after"]["position_1"] < 0.5 * windows["before"]["position_1"]
+    assert windows["after"]["position_1"] < told["rmse"]["after"]["position_1"]
     assert "spool" not in json.dumps(told)
     assert "N·m" not in told["sentence"]
 

@@ -1,0 +1,91 @@
+"""What no catalogue has a word for is offered as a formula: a clue that a person can read."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from analysis.trace.clue_formula import Formula
+from analysis.trace.engine import trace
+from analysis.trace.result import Trace, to_json
+from rig.cli.trace_text import trace_text
+from rig.model.records import Record, Run
+from rig.model.rig import Rig
+from tests.analysis.trace.hidden import hardening, pair_of_runs
+
+CAP, ROD = 7.0e-4, 5.4e-4  # [m²] of joint 2
+
+
+def dragged(run: Run, k: float) -> Run:
+    """Return the run as if F = k v |v| braked the piston, carried by both chambers alike."""
+
+    def one(record: Record) -> Record:
+        window = np.hanning(41) / np.hanning(41).sum()
+        s = np.convolve(np.pad(record.channels["piston_2"], 20, mode="edge"), window, "valid")
+        v = np.gradient(s) * record.sample_rate
+        force, channels = k * v * np.abs(v), dict(record.channels)
+        channels["cap_pressure_2"] = channels["cap_pressure_2"] + 0.5 * force / CAP
+        channels["rod_pressure_2"] = channels["rod_pressure_2"] - 0.5 * force / ROD
+        return replace(record, channels=channels)
+
+    return replace(run, records=tuple(map(one, run.records)))
+
+
+@pytest.fixture(scope="module")
+def quiet(rig: Rig) -> tuple[Run, Run]:
+    return pair_of_runs(rig)
+
+
+@pytest.fixture(scope="module")
+def sprung(quiet: tuple[Run, Run]) -> Trace:
+    train, held_out = (hardening(run, 2.0e7) for run in quiet)
+    return trace([train], [held_out], look_ahead=False)
+
+
+def test_a_spring_that_goes_with_the_cube_is_read_off_with_its_stiffness(sprung: Trace) -> None:
+    (found,) = sprung.formulas
+    assert found.equation == "torque_2"
+    assert found.at_piston
+    assert set(found.terms) == {"piston_2³"}
+    assert found.terms["piston_2³"] == pytest.approx(2.0e7, rel=0.02)
+    assert found.share > 0.95
+
+
+def test_drag_by_the_square_of_the_speed_is_read_off(quiet: tuple[Run, Run]) -> None:
+    train, held_out = (dragged(run, 6.0e4) for run in quiet)
+    result = trace([train], [held_out], look_ahead=False)
+    assert result.verdict == "unexplained"
+    best = max(result.formulas, key=lambda f: f.share)
+    assert set(best.terms) == {"velocity_2 |velocity_2|"}
+    assert best.terms["velocity_2 |velocity_2|"] == pytest.approx(6.0e4, rel=0.05)
+    assert result.depends_on[0].variable == "velocity_2"
+
+
+def test_it_is_told_as_a_clue_and_no_name(sprung: Trace) -> None:
+    assert sprung.effects == ()
+    assert "2e+07 piston_2³" in sprung.sentence
+    assert "a clue, not a name" in trace_text(sprung)
+    (told,) = to_json(sprung)["unexplained"]["formulas"]
+    assert told["terms"]["piston_2³"] == sprung.formulas[0].terms["piston_2³"]
+    assert sprung.moves_with[0] == "piston_2"
+
+
+@pytest.mark.parametrize(
+    ("terms", "variables"),
+    [
+        ({"1": 1.0, "piston_1 sign(velocity_1)": 2.0}, ("piston_1", "velocity_1")),
+        ({"velocity_12 |velocity_12|": 1.0}, ("velocity_12",)),
+        ({"cap_pressure_2²": 1.0}, ("cap_pressure_2",)),
+        ({"time": 1.0}, ("time",)),
+        ({"1": 1.0}, ()),
+    ],
+)
+def test_its_variables_are_read_from_its_monomials(
+    terms: dict[str, float], variables: tuple[str, ...]
+) -> None:
+    found = Formula("torque_1", terms, 0.95, True)
+    assert found.variables == variables
+    assert found.sure == bool(variables)
+    assert not replace(found, share=0.5).sure
