@@ -12,6 +12,7 @@ import numpy as np
 
 from analysis.estimators.coverage import GOAL, MOST_BIAS, MOST_BIAS_OF_B, Row, Trial, overall, rows
 from rig.cli.study_jobs import JUDGING_SEED, MODEL, Experiment, all_of
+from rig.cli.study_pool import Workers
 
 Say = Callable[[str], None]
 _SAID = {
@@ -26,7 +27,7 @@ def coverage_study(
     estimator: str,
     noise: float,
     repeats: int,
-    workers: int,
+    workers: Workers,
     say: Say,
     first: int = JUDGING_SEED,
     folder: Path | None = None,
@@ -110,7 +111,7 @@ def estimator_study(
     noise: Sequence[float],
     experiments: int,
     kind: str,
-    workers: int,
+    workers: Workers,
     say: Say,
     first: int = JUDGING_SEED,
     folder: Path | None = None,

@@ -12,6 +12,10 @@ from rig.cli.output import progress, write_json
 
 studies = typer.Typer(name="study", rich_markup_mode=None)
 WorkersOption = Annotated[int, typer.Option(min=1, help="Processes at once.")]
+ClusterOption = Annotated[
+    str | None,
+    typer.Option(help="tcp://HOST:PORT of a Dask scheduler: its workers instead of processes."),
+]
 FirstSeed = Annotated[
     int, typer.Option("--first-seed", min=0, help="Those below 100 served to find errors.")
 ]
@@ -33,6 +37,7 @@ def coverage(
     repeats: Annotated[int, typer.Option(min=1, help="Of every step.")] = 4,
     first: FirstSeed = 100,
     workers: WorkersOption = 2,
+    cluster: ClusterOption = None,
     keep: KeepOption = None,
     json: JsonOption = None,
     docs: DocsOption = None,
@@ -50,7 +55,7 @@ def coverage(
         refuse_unknown(estimator)
     kinds = ("model", "plant") if kind == "both" else (kind,)
     found = coverage_study(
-        kinds, experiments, estimator, noise, repeats, workers, progress, first, keep
+        kinds, experiments, estimator, noise, repeats, cluster or workers, progress, first, keep
     )
     write_json(json, found)
     if docs is not None:
@@ -76,6 +81,7 @@ def estimators(
     kind: Annotated[str, typer.Option(help="model or plant.")] = "plant",
     first: FirstSeed = 100,
     workers: WorkersOption = 2,
+    cluster: ClusterOption = None,
     keep: KeepOption = None,
     json: JsonOption = None,
     docs: DocsOption = None,
@@ -93,7 +99,9 @@ def estimators(
     every = tuple(which.split())
     for name in every:
         refuse_unknown(name)
-    found = estimator_study(every, levels, experiments, kind, workers, progress, first, keep)
+    found = estimator_study(
+        every, levels, experiments, kind, cluster or workers, progress, first, keep
+    )
     write_json(json, found)
     if docs is not None:
         made = (

@@ -12,7 +12,7 @@ import numpy as np
 from analysis.estimators.coverage import Trial, trial
 from analysis.identify import identify
 from analysis.synthetic import multisine, synthetic_run
-from rig.cli.study_pool import Kept, performed
+from rig.cli.study_pool import Kept, Workers, performed
 from rig.model.records import Run
 from rig.services.rigs import load_rig
 
@@ -76,11 +76,11 @@ def _name(e: Experiment) -> str:
 
 def all_of(
     experiments: Sequence[Experiment],
-    workers: int,
+    workers: Workers,
     say: Callable[[str], None],
     folder: Path | None = None,
 ) -> Iterator[tuple[Experiment, dict[str, Trial]]]:
-    """Perform experiments on `workers` processes, in the order they end.
+    """Perform experiments on `workers`, in the order they end.
 
     One that fails (a simulated bench whose piston would leave its limits) is told and left out.
     What is found is kept in `folder`, if given, and what is there already is not done again.

@@ -1,4 +1,4 @@
-"""A study's work on a pool of processes; what is found is kept, and a study ended goes on."""
+"""A study's work on processes or a cluster; what is found is kept, and a study ended goes on."""
 
 from __future__ import annotations
 
@@ -12,10 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
+from analysis.cluster import Cluster
 from rig.model.parse import InputError
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
+Workers = int | str  # processes of this machine, or tcp://HOST:PORT of a Dask scheduler
+Errors = tuple[type[Exception], ...]
 
 
 @dataclass(frozen=True)
@@ -43,12 +46,12 @@ class Kept(Generic[Job, Result]):
 def performed(
     work: Sequence[Job],
     perform: Callable[[Job], Result],
-    workers: int,
+    workers: Workers,
     tell: Callable[[int, int, Job, Result | Exception], None],
     kept: Kept[Job, Result] | None = None,
-    left_out: tuple[type[Exception], ...] = (InputError, RuntimeError),
+    left_out: Errors = (InputError, RuntimeError),
 ) -> Iterator[tuple[Job, Result]]:
-    """Perform jobs on `workers` processes; returns each with its result, in the order they end.
+    """Perform jobs on `workers`; returns each with its result, in the order they end.
 
     What was kept comes first and is not done again. `tell` hears how many of how many are done, the
     job, and its result or the error of the kinds `left_out` that leaves it out; others are raised.
@@ -61,22 +64,48 @@ def performed(
             yield job, kept.read(job)
         else:
             left.append(job)
+    for done, (job, found) in enumerate(_results(left, perform, workers, left_out), start=1):
+        tell(done, len(left), job, found)
+        if isinstance(found, Exception):
+            continue
+        if kept is not None:
+            kept.write(job, found)
+        yield job, found
+
+
+def _results(
+    work: Sequence[Job], perform: Callable[[Job], Result], workers: Workers, left_out: Errors
+) -> Iterator[tuple[Job, Result | Exception]]:
+    """Yield jobs with what they gave or, of the kinds `left_out`, raised."""
+    if isinstance(workers, str):
+        with Cluster(workers) as pool:
+            yield from zip(work, pool.map(_Caught(perform, left_out), work), strict=True)
+        return
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, mp_context=context, initializer=_end_with_parent) as pool:
-        waiting = {pool.submit(perform, job): job for job in left}
-        for done, future in enumerate(as_completed(waiting), start=1):
-            job = waiting[future]
+        waiting = {pool.submit(perform, job): job for job in work}
+        for future in as_completed(waiting):
             try:
-                found = future.result()
+                found: Result | Exception = future.result()
             except BrokenExecutor:  # a RuntimeError, but of the machine and not of this job
                 raise
             except left_out as error:
-                tell(done, len(left), job, error)
-                continue
-            tell(done, len(left), job, found)
-            if kept is not None:
-                kept.write(job, found)
-            yield job, found
+                found = error
+            yield waiting[future], found
+
+
+@dataclass(frozen=True)
+class _Caught(Generic[Job, Result]):
+    """A job's work that gives back its error instead of raising it: on a cluster it ends no map."""
+
+    perform: Callable[[Job], Result]
+    kinds: Errors
+
+    def __call__(self, job: Job) -> Result | Exception:
+        try:
+            return self.perform(job)
+        except self.kinds as error:
+            return error
 
 
 def _end_with_parent() -> None:

@@ -19,7 +19,7 @@ import numpy as np
 
 from protocols.model import Protocol
 from protocols.plan import Overrides
-from rig.cli.study_pool import Kept, performed
+from rig.cli.study_pool import Kept, Workers, performed
 from rig.cli.study_trace_cases import NONE, OUTSIDE, SIZE_OF, Case
 from rig.model.records import Run
 
@@ -123,9 +123,9 @@ def _size_error(case: Case, effects: Sequence[Any]) -> float:
 
 
 def all_of(
-    work: Sequence[Case], workers: int, say: Callable[[str], None], folder: Path | None = None
+    work: Sequence[Case], workers: Workers, say: Callable[[str], None], folder: Path | None = None
 ) -> Iterator[Outcome]:
-    """Perform the cases on `workers` processes, in the order they end; one that fails is told.
+    """Perform the cases on `workers`, in the order they end; one that fails is told.
 
     With a `folder` every outcome is kept there, and a study that was ended goes on from it.
     """

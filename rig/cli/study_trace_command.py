@@ -13,6 +13,7 @@ import typer
 from rig.cli.bench_commands import JsonOption
 from rig.cli.output import progress, write_json
 from rig.cli.study_command import (
+    ClusterOption,
     DocsOption,
     KeepOption,
     WorkersOption,
@@ -38,6 +39,7 @@ def trace(
         int | None, typer.Option(min=0, max=2, help="Only this size: 0 small .. 2 large.")
     ] = None,
     workers: WorkersOption = 2,
+    cluster: ClusterOption = None,
     json: JsonOption = None,
     keep: KeepOption = None,
     docs: DocsOption = None,
@@ -58,7 +60,7 @@ def trace(
         names = names or ("coulomb_friction", "internal_leakage", "valve_deadband", "torque_offset")
     # Those that take long first: the last to end are then short ones.
     work = [*cases_of(machines, seed), *cases(counts, seed, names, level)[::-1]]
-    outcomes = list(all_of(work, workers, progress, keep))
+    outcomes = list(all_of(work, cluster or workers, progress, keep))
     asked = {"--clean": clean, "--single": single, "--pairs": pairs, "--outside": outside,
              "--machines": machines}  # fmt: skip
     made = partial(command_of, asked, seed, quick=quick, only=only, level=level)
@@ -70,6 +72,7 @@ def distorted(
     count: Annotated[int, typer.Option(min=1, help="Of benches, faults in turn.")] = 22,
     seed: Annotated[int, typer.Option(min=0, help="First seed; below 100 is for tuning.")] = 100,
     workers: WorkersOption = 2,
+    cluster: ClusterOption = None,
     json: JsonOption = None,
     keep: KeepOption = None,
     docs: DocsOption = None,
@@ -82,7 +85,7 @@ def distorted(
     from rig.cli.study_trace import all_of
     from rig.cli.study_trace_text import as_json, bent_text
 
-    outcomes = list(all_of(cases_of(count, seed), workers, progress, keep))
+    outcomes = list(all_of(cases_of(count, seed), cluster or workers, progress, keep))
     write_json(json, as_json(outcomes))
 
     def made(page: Path) -> str:
@@ -124,6 +127,7 @@ def study(
     ] = False,
     seed: Annotated[int, typer.Option(min=0, help="First seed of --quick.")] = 100,
     workers: WorkersOption = 2,
+    cluster: ClusterOption = None,
     json: JsonOption = None,
 ) -> None:
     """Measure the method itself: the trace's answers, coverage of intervals, estimators, filters.
@@ -136,7 +140,7 @@ def study(
         if quick:
             raise InputError("--quick stands for a study of its own: leave the other one away")
     elif quick:
-        trace(quick=True, seed=seed, workers=workers, json=json)
+        trace(quick=True, seed=seed, workers=workers, cluster=cluster, json=json)
     else:
         typer.echo(context.get_help())
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import socket
 import subprocess
@@ -19,6 +20,7 @@ from analysis.cluster import Cluster
 from analysis.compute import Pool, Processes, Serial, local_pool
 from analysis.folders import identify_folders
 from analysis.identify import PLAIN, identify
+from rig.cli.study_pool import Kept, performed
 from rig.model.parse import InputError
 from rig.model.records import Run
 from rig.services.made import write_run
@@ -159,6 +161,21 @@ def test_a_cluster_identifies_what_one_process_does(
             list(pool.map(broken, [3]))
         with pytest.raises(InputError, match="wednesday: no worker of the cluster sees it"):
             identify_folders([str(tmp_path / "wednesday")], pool=pool)
+
+
+def test_a_study_on_a_cluster_goes_on_when_a_job_fails(scheduler: str, tmp_path: Path) -> None:
+    told: list[object] = []
+    kept = Kept(tmp_path, lambda job: f"{job}.json", lambda root: root, lambda job, root: root)
+    for again in (False, True):
+        found = performed(
+            [4.0, -1.0, 9.0], math.sqrt, scheduler, lambda *words: told.append(words[2:]), kept,
+            left_out=(ValueError,),
+        )  # fmt: skip
+        assert list(found) == [(4.0, 2.0), (9.0, 3.0)]
+        # What was found is not done again; what failed is tried anew.
+        assert [job for job, _ in told] == ([-1.0] if again else [4.0, -1.0, 9.0])
+        assert isinstance(dict(told)[-1.0], ValueError)
+        told.clear()
 
 
 def test_the_command_line_works_on_a_cluster(
