@@ -79,7 +79,7 @@ def trace_text(result: Trace) -> str:
         lines.append(f"what is left moves with: {moves} (a clue, not a name)")
     lines += [
         f"a sparse fit of what {f.equation} lacks: {f.text} "
-        f"({100 * f.share:.0f} % of it held out; a clue, not a name)"
+        f"({100 * f.share:.0f} % of it on held-out records; a clue, not a name)"
         for f in result.formulas
     ]
     if result.next_experiment:
