@@ -14,6 +14,7 @@ from analysis.identify import identify
 from analysis.model import load_model, save_model
 from analysis.terms import baseline_of, make
 from analysis.terms.base import Used
+from analysis.trace.candidates import catalogue
 from analysis.trace.engine import trace
 from analysis.trace.result import Trace, to_json
 from rig.model.parse import InputError
@@ -90,7 +91,9 @@ def test_beside_a_known_dead_band_friction_alone_is_new(rig: Rig) -> None:
     train, held_out = pair_of_runs(rig, Fc=60, w_ahead=8e-3, w_astern=8e-3)
     band = Used(make("valve_deadband", "joint 2"), (8e-3, 8e-3, 0.0))
     known = (*map(Used, baseline_of(rig)), band)
-    result = trace([train], [held_out], look_ahead=False, terms=known)
+    few = ("coulomb_friction", "stribeck_friction", "spool_lag", "valve_deadband")
+    candidates = catalogue(rig, few)
+    result = trace([train], [held_out], candidates, look_ahead=False, terms=known)
     assert result.verdict == "explained"
     assert [(e.name, e.where) for e in result.effects] == [("coulomb_friction", "joint 2")]
     kept = [u.term.name for u in result.model_after.terms if isinstance(u.term, Effect)]
