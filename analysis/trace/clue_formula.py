@@ -139,7 +139,9 @@ def _monomials(
         # Pressures, squared too, are the balance's other side: they would take whatever it lacks.
         out |= {f"{name} sign({v})": y * sign for name, y in sides.items()}
         return {name: seen.G[:, joint] * y for name, y in out.items()}
-    del out[v]  # so is the velocity in a flow's
+    # So is the velocity in a flow's, whatever it is multiplied with: a boom that only comes down
+    # has all its products alike.
+    out = {name: y for name, y in out.items() if v not in name}
     out |= {f"{name}²": y**2 for name, y in sides.items()}
     spool = ch.channel(ch.SPOOL, i)
     out |= {spool: u, f"{spool}²": u**2, f"{spool} |{spool}|": u * np.abs(u), f"{spool}³": u**3}
