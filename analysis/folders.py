@@ -8,10 +8,14 @@ from analysis import checks as ck
 from analysis.compute import Pool, Serial
 from analysis.condense import Task, first_of_steps, moving_task, path_of, reduce_task, steps_of
 from analysis.identify import Identification, conclude
+from analysis.model import Model, refuse_other_rig
 from analysis.rows import Filtering, default_filtering
 from analysis.terms import with_effects
 from analysis.terms.base import Used
+from analysis.trace.shapes import open_shapes
+from rig.model.parse import InputError
 from rig.model.records import Record
+from rig.model.rig import Rig
 from rig.services.stream import read_run_head
 
 
@@ -22,19 +26,26 @@ def identify_folders(
     reject_noise: bool = True,
     pool: Pool | None = None,
     effects: Sequence[str] = (),
+    like: Model | None = None,
 ) -> Identification:
     """Identify from run folders, of which one record at a time is in memory.
 
     This is `identify` by the coupled method with the estimator "plain", for the other methods and
-    estimators go over all rows again and again. `terms` defaults to the rig's baseline with
-    `effects` (`analysis.terms.with_effects`). With a `pool` each record is reduced in one of its
-    processes, where the folders are read; only triangles come back. Raises InputError as
-    `identify` and `load_run` do.
+    estimators go over all rows again and again. `terms` defaults to those of the model `like`, or
+    to the rig's baseline with `effects` (`analysis.terms.with_effects`). With a `pool` each record
+    is reduced in one of its processes, where the folders are read; only triangles come back. Raises
+    InputError as `identify` and `load_run` do, for a model of another rig, and for an effect whose
+    shape is open.
     """
     workers = pool or Serial()
     heads = list(workers.map(read_run_head, folders, reads=str))
     rig = ck.common_rig(heads)
+    if terms is None and like is not None:
+        for head in heads:
+            refuse_other_rig(like, head.rig, head.source)
+        terms = like.terms
     used = tuple(terms) if terms is not None else tuple(map(Used, with_effects(rig, effects)))
+    _refuse_open(rig, used)
     steps = [
         (number, one)
         for number, (folder, head) in enumerate(zip(folders, heads, strict=True))
@@ -59,3 +70,14 @@ def identify_folders(
     ]
     reductions = list(workers.map(reduce_task, tasks, reads=path_of))
     return conclude(rig, [h.source for h in heads], used, reductions, reject_noise)
+
+
+def _refuse_open(rig: Rig, terms: Sequence[Used]) -> None:
+    """Raise InputError for an effect whose shape would have to be found in all rows at once."""
+    for used in terms:
+        if open_shapes(rig, used):
+            raise InputError(
+                f"--with {used.term.name} has a shape to be found in rows that are all in memory: "
+                "identify a part of the records without --stream or --cluster, write its --model, "
+                "and take the shape from there with --like"
+            )

@@ -67,26 +67,13 @@ def _streamed(
     from analysis.cluster import Cluster
     from analysis.compute import Serial
     from analysis.folders import identify_folders
-    from analysis.model import terms_like
-    from analysis.terms import with_effects
-    from analysis.terms.base import Used
-    from analysis.trace.shapes import open_shapes
-    from rig.services.stream import read_run_head
+    from analysis.model import load_model
 
-    heads = [read_run_head(run) for run in runs]
-    terms = [Used(t) for t in with_effects(heads[0].rig, effects)]
-    for used in terms:
-        if open_shapes(heads[0].rig, used):
-            raise InputError(
-                f"--with {used.term.name} has a shape to be found in rows that are all in memory: "
-                "identify a part of the records without --stream or --cluster, write its --model, "
-                "and take the shape from there with --like"
-            )
-    if like is not None:
-        terms = list(terms_like(like, {head.source: head.rig for head in heads}))
+    model = None if like is None else load_model(like)
+    # What the folders hold is read by who works on them: they need not exist here.
     with Serial() if cluster is None else Cluster(cluster) as pool:
         return identify_folders(
-            [str(run) for run in runs], terms=terms, filtering=filtering, pool=pool
+            [str(run) for run in runs], filtering=filtering, pool=pool, effects=effects, like=model
         )
 
 

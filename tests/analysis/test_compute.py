@@ -190,6 +190,24 @@ def test_the_command_line_works_on_a_cluster(
     assert "C_mm_2" in done.stdout
 
 
+def test_runs_that_only_the_workers_see_are_identified_from_elsewhere(
+    scheduler: str, tmp_path: Path, multisine_run: Run
+) -> None:
+    folder = os.path.relpath(
+        write_run(tmp_path / "tuesday", multisine_run)
+    )  # from the workers' own
+    elsewhere = tmp_path / "away" / "from" / "there"
+    elsewhere.mkdir(parents=True)
+    assert not (elsewhere / folder).exists()
+    line = [sys.executable, "-c", "from rig.cli.main import run; run()", "identify", folder]
+    done = subprocess.run(
+        [*line, "--cluster", scheduler], cwd=elsewhere,
+        capture_output=True, text=True, timeout=100, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "C_mm_2" in done.stdout
+
+
 def test_an_address_where_nobody_answers_is_said() -> None:
     with socket.socket() as taken:  # bound, but not listening
         taken.bind(("127.0.0.1", 0))
