@@ -31,10 +31,10 @@ from rig.model.rig import Rig
 LEAST = 0.05  # [K] between all records: less moves b by a fraction of 0.001
 
 
-def base_terms(rig: Rig, runs: Sequence[Run], holdout: Sequence[Run] = ()) -> tuple[Used, ...]:
+def base_terms(rig: Rig, runs: Sequence[Run]) -> tuple[Used, ...]:
     """Return the rig's baseline terms with those that belong beside them on these records."""
     terms = tuple(map(Used, baseline_of(rig)))
-    return (*terms, *beside(terms, runs, holdout))
+    return (*terms, *beside(terms, runs))
 
 
 def beside(

@@ -11,7 +11,7 @@ monomials are forces at the piston, times the linkage's G.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -68,6 +68,11 @@ class Formula:
         return ()
 
 
+def surest(formulas: Sequence[Formula]) -> Formula | None:
+    """Return the sure formula that leaves least, None where none is sure."""
+    return max((f for f in formulas if f.sure), key=lambda f: f.share, default=None)
+
+
 def formula(
     train: Board, left: Array, judge: Board, judge_left: Array, equation: str
 ) -> Formula | None:
@@ -79,14 +84,13 @@ def formula(
     second = side_of(judge, judge_left, equation)
     if first is None or second is None:
         return None
-    sides = first, second
-    names, one, two = _library(train.rig, equation, *sides)
-    both = Side((), np.concatenate([x.rest for x in sides]), np.zeros((0, 0)))
+    names, one, two = _library(train.rig, equation, first, second)
+    both = Side((), np.concatenate((first.rest, second.rest)), np.zeros((0, 0)))
     chosen = _selected(np.concatenate((one, two)), both)
-    share = judged(one[:, chosen], sides[0], two[:, chosen], sides[1]) if chosen else 0.0
+    share = judged(one[:, chosen], first, two[:, chosen], second) if chosen else 0.0
     if share < OFFERED:
         return None
-    values = fitted_to(one[:, chosen], sides[0])
+    values = fitted_to(one[:, chosen], first)
     terms = {names[k]: float(v) for k, v in zip(chosen, values, strict=True)}
     at_piston = equation.startswith("torque") and not train.rig.electric
     return Formula(equation, terms, share, at_piston)
@@ -156,11 +160,11 @@ def _selected(columns: Array, side: Side) -> list[int]:
     share = 0.0
     while len(chosen) < min(MOST, columns.shape[1]):
         free = [k for k in range(columns.shape[1]) if k not in chosen]
-        best = max(free, key=lambda k: _share([*chosen, k], columns, side))
-        found = _share([*chosen, best], columns, side)
-        if found < share + ADDS:
+        found = {k: _share([*chosen, k], columns, side) for k in free}
+        best = max(free, key=lambda k: found[k])
+        if found[best] < share + ADDS:
             break
-        chosen, share = [*chosen, best], found
+        chosen, share = [*chosen, best], found[best]
     for k in list(chosen):
         rest = [j for j in chosen if j != k]
         if rest and _share(rest, columns, side) > share - ADDS:

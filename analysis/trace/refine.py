@@ -109,15 +109,10 @@ def shapes_of(rig: Rig, used: Used) -> tuple[Shape, ...]:
 
 def refine(stage: Board, terms: Sequence[Used], steps: int = MOST_STEPS) -> Fit:
     """Search the shape parameters that the board's own terms do not have, from where they are."""
-    free = [
-        (k, j, s)
-        for k, u in enumerate(terms)
-        if u not in stage.terms
-        for j, s in enumerate(shapes_of(stage.rig, u))
-    ]
+    free = _free(stage, terms)
     if not free:
         return fit(stage, terms)
-    terms = _on_the_right_side(stage, terms)
+    terms = _on_the_right_side(stage, terms, free)
     start = np.array([_to_unit(terms[k].shape[j], s) for k, j, s in free])
 
     def at(x: Array) -> tuple[Used, ...]:
@@ -134,25 +129,37 @@ def refine(stage: Board, terms: Sequence[Used], steps: int = MOST_STEPS) -> Fit:
     return fit(stage, at(found.x))
 
 
-def _on_the_right_side(stage: Board, terms: Sequence[Used]) -> tuple[Used, ...]:
-    """Return the terms with every shape on that side of its neutral value which leaves less.
+def _free(stage: Board, terms: Sequence[Used]) -> list[tuple[int, int, Shape]]:
+    """Return the shapes to be searched: place of the term, of the shape in it, and what it is."""
+    return [
+        (k, j, s)
+        for k, u in enumerate(terms)
+        if u not in stage.terms
+        for j, s in enumerate(shapes_of(stage.rig, u))
+    ]
+
+
+def _on_the_right_side(
+    stage: Board, terms: Sequence[Used], free: Sequence[tuple[int, int, Shape]]
+) -> tuple[Used, ...]:
+    """Return the terms with every free shape on the side of its neutral value that leaves less.
 
     Of a column the first look tells the size, not the sign; and from the wrong side a search runs
     away to the bound, not through the neutral value.
     """
     terms, least = tuple(terms), np.nan
-    for k, used in enumerate(terms):
-        for j, s in enumerate(() if used in stage.terms else shapes_of(stage.rig, used)):
-            if s.neutral is None or not s.low < s.neutral < s.high:
-                continue
-            mirrored = float(np.clip(2 * s.neutral - used.shape[j], s.low, s.high))
-            shape = (*used.shape[:j], mirrored, *used.shape[j + 1 :])
-            other = (*terms[:k], Used(used.term, shape), *terms[k + 1 :])
-            if np.isnan(least):  # few effects lie on either side of nothing
-                least = fit(stage, terms).energy
-            energy = fit(stage, other).energy
-            if energy < least:
-                terms, least = other, energy
+    for k, j, s in free:
+        if s.neutral is None or not s.low < s.neutral < s.high:
+            continue
+        used = terms[k]
+        mirrored = float(np.clip(2 * s.neutral - used.shape[j], s.low, s.high))
+        shape = (*used.shape[:j], mirrored, *used.shape[j + 1 :])
+        other = (*terms[:k], Used(used.term, shape), *terms[k + 1 :])
+        if np.isnan(least):  # few effects lie on either side of nothing
+            least = fit(stage, terms).energy
+        energy = fit(stage, other).energy
+        if energy < least:
+            terms, least = other, energy
     return terms
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from analysis.trace import clues, held_out
 from analysis.trace.board import Board
-from analysis.trace.clue_formula import Formula, formula
+from analysis.trace.clue_formula import Formula, formula, surest
 from analysis.trace.clue_frequency import frequency_clue
 from analysis.trace.lines import Lines
 from analysis.trace.listed import Listed
@@ -36,10 +36,9 @@ def clues_to(
 
 def _leading(formulas: Sequence[Formula]) -> list[Dependence]:
     """Return the variable of the formula that leaves least, where one leaves next to nothing."""
-    sure = [f for f in formulas if f.sure]
-    if not sure:
+    best = surest(formulas)
+    if best is None:
         return []
-    best = max(sure, key=lambda f: f.share)
     variable, by = (*best.variables, "")[:2]
     monomial = next(name for name in best.terms if variable in name)
     words = "" if monomial == variable else monomial

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from analysis.model import Estimate
+from analysis.trace.clue_formula import surest
 from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, Found, Trace
 from rig.model.rig import Rig
 
@@ -51,8 +52,8 @@ def sentence(result: Trace) -> str:
 
 def _formula(result: Trace) -> str:
     """Say what a sparse fit reads that leaves next to nothing ('' where none does)."""
-    sure = [f for f in result.formulas if f.sure]
-    return f"; a sparse fit reads {max(sure, key=lambda f: f.share).text}" if sure else ""
+    best = surest(result.formulas)
+    return f"; a sparse fit reads {best.text}" if best else ""
 
 
 def _symmetry(result: Trace) -> str:
