@@ -1,16 +1,11 @@
 """Dry friction of a cylinder's seals, in four forms that all act as a force on the piston.
 
 Torque row of joint i (friction stands with the load): ... + G F_f = G F. Every form is a level
-[N] times the state z of the contact, -1 <= z <= 1, which turns over within a presliding distance d
-of travel after each reversal (Dahl 1968; Armstrong-Helouvry, Dupont and Canudas de Wit
-1994; Jelali and Kroll 2003):
-
-    dz/ds = (sign(s') - z) / d        so that   dz/dt = (s' - |s'| z) / d
-
-With d -> 0, z = sign(s'). The state follows from the piston's path alone, so that the rows have it
-from the measured piston without a differentiation; d is a shape parameter. The simulation carries
-the deflection y = d z [m] as a hidden state. A model that gives no presliding distance means the
-contact without memory, z = tanh(s'/v) with v = `TRANSITION`.
+[N] times the state of the seal's contact (`contact`), which the piston's path alone decides, so
+that the rows have it from the measured piston; presliding distance d and stiffening k of the
+contact are shape parameters. The simulation carries the deflection y = d z [m] as a hidden state.
+A model that gives no presliding distance means the contact without memory, z = tanh(s'/v) with
+v = `TRANSITION`.
 """
 
 from __future__ import annotations
@@ -21,9 +16,18 @@ from dataclasses import dataclass
 from typing import ClassVar, Final
 
 import numpy as np
-from numba import njit
 
 from analysis.effects.base import Array, Effect, Shape, beyond
+from analysis.effects.contact import (
+    FASTEST,
+    TRANSITION,
+    contact_state,
+    contact_under_load,
+    presliding,
+    slide,
+    stiffening,
+    worked,
+)
 from analysis.signals import Signals
 from analysis.terms.base import (
     CONTRIBUTE,
@@ -38,32 +42,40 @@ from analysis.terms.base import (
 )
 from rig.model.rig import Rig
 
-PRESLIDING: Final = (5e-6, 40e-6, 150e-6)  # [m] seals give a few hundredths of a millimetre
-PRESLIDING_BOUNDS: Final = (2e-6, 5e-4)
-FASTEST: Final = 3e3  # [1/s] relaxation in simulation; faster changes nothing that is seen
-# Speed of the transition through rest [m/s, or rad/s] where no presliding distance is given. A jump
-# would make the integrator chatter where a joint sticks; this creeps by less than 0.1 mm/s there.
-# On the measured positioning system 0.01 mm/s and 0.1 mm/s give the same parameters to 0.4 %,
-# 1 mm/s does not (2 %).
-TRANSITION: Final = 1e-4
 LEAST_LEVEL: Final = 1e-6  # of the breakaway, where it has long vanished: no division by zero
 
 
 @dataclass(frozen=True)
 class Friction(Effect):
-    """What the four forms share: joint, presliding distance, the state z of the contact."""
+    """What the four forms share: joint, presliding distance, the state z of the contact.
+
+    Where the contact `stiffens` its stiffening is the last shape; a model without it, as files of
+    before have it, means a contact that does not.
+    """
 
     family: ClassVar[str] = "friction"
     per_joint: ClassVar[bool] = True
+    stiffens: ClassVar[bool] = False
     where: str = "joint 1"
 
     def shape_names(self) -> tuple[str, ...]:
-        """Name the presliding distance."""
-        return (f"presliding_{self.joint + 1}",)
+        """Name the presliding distance and, where the contact stiffens, the stiffening."""
+        own = (f"presliding_{self.joint + 1}",)
+        return (*own, f"stiffening_{self.joint + 1}") if self.stiffens else own
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return the presliding distance [m] (electric: in the joint's own unit)."""
-        return (presliding(f"presliding_{self.joint + 1}"),)
+        """Return presliding distance [m], stiffening [s/m] (electric: in the joint's own unit)."""
+        own = (presliding(f"presliding_{self.joint + 1}"),)
+        return (*own, stiffening(f"stiffening_{self.joint + 1}")) if self.stiffens else own
+
+    def contact_of(self, shape: Sequence[float]) -> tuple[float, float]:
+        """Return presliding distance [m] and stiffening [s/m] of a shape, 0 where not given."""
+        return (*shape, 0.0, 0.0)[0], (*shape, 0.0, 0.0)[1]
+
+    def path(self, signals: Signals, shape: Sequence[float]) -> Array:
+        """Return the path (n,) [m] that the contact is worked along."""
+        i = self.joint
+        return worked(signals.s[:, i], signals.sd[:, i], self.contact_of(shape)[1])
 
     def tolerance(self, shape: Sequence[float]) -> float:
         """Return a fine one for the contact without memory: coarser, creep at rest is noise."""
@@ -89,33 +101,26 @@ class Friction(Effect):
         self, rig: Rig, signals: Signals, values: Mapping[str, float], shape: Sequence[float]
     ) -> Array:
         """Return the deflection y (n,) [m] along the measured path, as the kernel integrates it."""
-        return np.asarray(shape[-1] * self.contact(rig, signals, shape))
+        return np.asarray(self.contact_of(shape)[0] * self.contact(rig, signals, shape))
 
     def contact(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Array:
         """Return z (n,) along the measured path."""
         if not len(shape):
             return np.asarray(np.tanh(signals.sd[:, self.joint] / TRANSITION))
-        s = np.ascontiguousarray(signals.s[:, self.joint])
-        return np.asarray(contact_state(s, shape[-1]))
+        return np.asarray(contact_state(self.path(signals, shape), shape[0]))
 
     def row(self, columns: Mapping[str, Array]) -> Columns:
         """Return columns of the joint's torque row."""
         return {equation("torque", self.joint): dict(columns)}
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
-        """Return joint (0-based), coefficients, shape; a presliding distance of 0 where none is."""
+        """Return joint (0-based), coefficients, shape; a contact that is not given is 0, 0."""
         linear = [values[c.parameter] for c in self.coefficients(rig)]
-        full = shape if len(shape) else (*self.shape_of(rig, ())[:-1], 0.0)
-        return np.array([self.joint, *linear, *full], dtype=np.float64)
+        return np.array([self.joint, *linear, *self.contact_of(shape)], dtype=np.float64)
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return the piston's speed [m/s]."""
         return {equation("torque", self.joint): signals.sd[:, self.joint]}
-
-
-def presliding(name: str) -> Shape:
-    """Return a presliding distance's shape [m]; a contact may be stiffer than sensors resolve."""
-    return Shape(name, "m", *PRESLIDING_BOUNDS, PRESLIDING, resolution=True)
 
 
 def force_limit(rig: Rig, joint: int) -> float:
@@ -139,6 +144,7 @@ class CoulombFriction(Friction):
     """
 
     name: ClassVar[str] = "coulomb_friction"
+    stiffens: ClassVar[bool] = True
     variable: ClassVar[str] = "the sign of the piston's velocity"
     confounders: ClassVar[tuple[str, ...]] = (
         "stribeck_friction",
@@ -204,14 +210,13 @@ class StribeckFriction(Friction):
         """Return the Stribeck speed [m/s] and the presliding distance [m]."""
         speed = rig.joints[self.joint].limits.speed
         grid = (0.01 * speed, 0.03 * speed, 0.1 * speed)
-        name = f"v_stribeck_{self.joint + 1}"
-        own = Shape(name, "m/s", 2e-3 * speed, 0.4 * speed, grid)
+        own = Shape(self.shape_names()[0], "m/s", 2e-3 * speed, 0.4 * speed, grid)
         return (own, *super().shapes(rig))
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return G w."""
         if len(shape):
-            w = self.deflection(rig, signals, {}, shape) / shape[-1]
+            w = self.deflection(rig, signals, {}, shape) / shape[1]
         else:
             w = self._level(rig, signals, shape) * self.contact(rig, signals, ())
         return self.row({f"Fs{self.joint + 1}": signals.G[:, self.joint] * w})
@@ -225,9 +230,14 @@ class StribeckFriction(Friction):
         self, rig: Rig, signals: Signals, values: Mapping[str, float], shape: Sequence[float]
     ) -> Array:
         """Return w d (n,) [m]."""
-        s = np.ascontiguousarray(signals.s[:, self.joint])
-        w = contact_under_load(s, self._level(rig, signals, shape), 1.0 / shape[-1])
-        return np.asarray(shape[-1] * w)
+        s, level = self.path(signals, ()), self._level(rig, signals, shape)
+        return np.asarray(shape[1] * contact_under_load(s, level, 1.0 / shape[1]))
+
+    def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
+        """Return joint (0-based), Fs, Stribeck speed, presliding distance (0 where none)."""
+        speed = self.shape_of(rig, shape)[0]
+        distance = shape[1] if len(shape) else 0.0
+        return np.array([self.joint, values[f"Fs{self.joint + 1}"], speed, distance])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Refuse a breakaway below Coulomb's level, too much of it, and a speed at its bounds."""
@@ -236,47 +246,11 @@ class StribeckFriction(Friction):
         return found or Effect.outside(self, rig, (shape[0], self.shapes(rig)[1].grid[1]))
 
 
-@njit(cache=True, error_model="numpy")
-def contact_state(s, distance):  # type: ignore[no-untyped-def]
-    """Return z (n,) of the path s (n,) [m]: exact over every step, which is taken as monotone."""
-    z = np.zeros(len(s))
-    for k in range(1, len(s)):
-        step = s[k] - s[k - 1]
-        side = 1.0 if step > 0.0 else -1.0
-        z[k] = side + (z[k - 1] - side) * math.exp(-abs(step) / distance)
-    return z
-
-
-@njit(cache=True, error_model="numpy")
-def contact_under_load(s, levels, stiffness):  # type: ignore[no-untyped-def]
-    """Return the force w (n,) of a contact along the path s (n,) [m], exact over every step.
-
-    Its level (n,) changes, its stiffness [unit of level / m] does not:
-    dw/ds = stiffness (sign(s') - w / level) (Dahl 1968).
-    """
-    w = np.zeros(len(s))
-    for k in range(1, len(s)):
-        step = s[k] - s[k - 1]
-        level = levels[k] if step > 0.0 else -levels[k]
-        keep = math.exp(-abs(step) * stiffness / levels[k]) if levels[k] > 0.0 else 0.0
-        w[k] = level + (w[k - 1] - level) * keep
-    return w
-
-
-@njit(cache=True, error_model="numpy")
-def slide(v, y, distance):  # type: ignore[no-untyped-def]
-    """Return (z, dy/dt) of the deflection y = d z, its relaxation bounded at `FASTEST`."""
-    if distance <= 0.0:
-        return math.tanh(v / TRANSITION), 0.0
-    relax = abs(v) / distance
-    return y / distance, (v - relax * y) / (1.0 + relax / FASTEST)
-
-
 @kernel
 def _coulomb(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
     if phase == CONTRIBUTE:
         i = int(par[0])
-        state, dz[0] = slide(x[SD, i], z[0], par[2])
+        state, dz[0] = slide(x[SD, i], z[0], par[2], par[3])
         out[TORQUE, i] -= par[1] * x[G, i] * state
 
 
@@ -287,7 +261,7 @@ def _stribeck(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-d
         i = int(par[0])
         level = max(math.exp(-((x[SD, i] / par[2]) ** 2)), LEAST_LEVEL)
         # At a constant stiffness the distance goes with the level.
-        state, dz[0] = slide(x[SD, i], z[0], par[3] * level)
+        state, dz[0] = slide(x[SD, i], z[0], par[3] * level, 0.0)
         out[TORQUE, i] -= par[1] * level * x[G, i] * state
 
 

@@ -1,6 +1,6 @@
 """Dry friction whose level depends on the direction of motion, or on what the seals hold back.
 
-The contact's law is that of `friction` (Dahl 1968), with a level that changes along the path.
+The contact's law is that of `contact`, with a level that changes along the path.
 """
 
 from __future__ import annotations
@@ -11,18 +11,16 @@ from dataclasses import dataclass
 from typing import ClassVar, Final
 
 import numpy as np
-from numba import njit
 
 from analysis.effects.base import Array, Shape, beyond
-from analysis.effects.friction import (
+from analysis.effects.contact import (
     FASTEST,
     TRANSITION,
-    Friction,
+    contact_levels,
     contact_under_load,
-    force_limit,
-    force_unit,
     presliding,
 )
+from analysis.effects.friction import Friction, force_limit, force_unit
 from analysis.signals import Signals
 from analysis.terms.base import (
     CONTRIBUTE,
@@ -79,7 +77,7 @@ class AsymmetricFriction(Friction):
         return f"presliding_ext_{self.joint + 1}", f"presliding_ret_{self.joint + 1}"
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return the presliding distances [m] (electric: in the joint's own unit)."""
+        """Return the presliding distances [m]."""
         return tuple(map(presliding, self.shape_names()))
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
@@ -96,8 +94,7 @@ class AsymmetricFriction(Friction):
     def _shares(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> tuple[Array, Array]:
         """Return the shares (n,) of the two levels along the measured path."""
         if len(shape):
-            s = np.ascontiguousarray(signals.s[:, self.joint])
-            ahead, back = contact_levels(s, shape[0], shape[1])
+            ahead, back = contact_levels(self.path(signals, ()), shape[0], shape[1])
             return ahead, back
         z = self.contact(rig, signals, ())
         return np.maximum(z, 0.0), np.maximum(-z, 0.0)
@@ -135,12 +132,13 @@ class PressureDependentFriction(Friction):
     """F_f = k w: seals pressed on by the oil (Jelali and Kroll 2003).
 
     k [m^2] is the friction coefficient times the seals' area under pressure. w [Pa] builds up to
-    the load p_cap + p_rod at a contact stiffness that does not depend on it (Dahl 1968):
-    dw/ds = (p_S / d) (sign(s') - w / (p_cap + p_rod)), d the presliding
-    distance at supply pressure.
+    the load p_cap + p_rod at a contact stiffness that does not depend on it, only on speed
+    (`contact`): dw/ds = (1 + k_s |s'|) (p_S / d) (sign(s') - w / (p_cap + p_rod)), d the presliding
+    distance at supply pressure, k_s the stiffening.
     """
 
     name: ClassVar[str] = "pressure_dependent_friction"
+    stiffens: ClassVar[bool] = True
     variable: ClassVar[str] = "the sum of the chamber pressures, with the velocity's sign"
     confounders: ClassVar[tuple[str, ...]] = ("coulomb_friction", "asymmetric_friction")
     separated_by: ClassVar[str] = (
@@ -166,7 +164,7 @@ class PressureDependentFriction(Friction):
         i = self.joint
         if len(shape):
             path = self.deflection(rig, signals, {}, shape)
-            level = path * rig.supply.pressure / shape[-1]
+            level = path * rig.supply.pressure / shape[0]
         else:
             level = self._load(signals) * self.contact(rig, signals, ())
         return self.row({f"k_friction_{i + 1}": signals.G[:, i] * level})
@@ -180,34 +178,19 @@ class PressureDependentFriction(Friction):
         self, rig: Rig, signals: Signals, values: Mapping[str, float], shape: Sequence[float]
     ) -> Array:
         """Return w d / p_S (n,) [m]."""
-        stiffness = rig.supply.pressure / shape[-1]
-        s = np.ascontiguousarray(signals.s[:, self.joint])
-        return np.asarray(contact_under_load(s, self._load(signals), stiffness) / stiffness)
+        stiffness = rig.supply.pressure / shape[0]
+        path = self.path(signals, shape)
+        return np.asarray(contact_under_load(path, self._load(signals), stiffness) / stiffness)
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
-        """Return joint (0-based), k, presliding distance (0 where none is given), p_S."""
+        """Return joint (0-based), k, presliding distance (0 where none), stiffening, p_S."""
         k = values[f"k_friction_{self.joint + 1}"]
-        return np.array([self.joint, k, shape[-1] if len(shape) else 0.0, rig.supply.pressure])
+        return np.array([self.joint, k, *self.contact_of(shape), rig.supply.pressure])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Refuse friction that drives, and more than half of the cylinder's force."""
         name = f"k_friction_{self.joint + 1}"
         return beyond(name, values[name], "m^2", 0.5 * rig.joints[self.joint].cylinder.cap_area)
-
-
-@njit(cache=True, error_model="numpy")
-def contact_levels(s, extending, retracting):  # type: ignore[no-untyped-def]
-    """Return the shares a, r (n,) of the two levels along the path s (n,) [m], exact per step."""
-    a, r = np.zeros(len(s)), np.zeros(len(s))
-    for k in range(1, len(s)):
-        step = s[k] - s[k - 1]
-        if step > 0.0:
-            keep = math.exp(-step / extending)
-            a[k], r[k] = 1.0 + (a[k - 1] - 1.0) * keep, r[k - 1] * keep
-        else:
-            keep = math.exp(step / retracting)
-            a[k], r[k] = a[k - 1] * keep, 1.0 + (r[k - 1] - 1.0) * keep
-    return a, r
 
 
 @kernel
@@ -236,9 +219,10 @@ def _by_pressure(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untype
         if par[2] <= 0.0:
             out[TORQUE, i] -= par[1] * load * x[G, i] * math.tanh(v / TRANSITION)
             return
-        stiffness = par[3] / par[2]
+        stiffness = par[4] / par[2]
+        pace = 1.0 + par[3] * abs(v)
         relax = abs(v) * stiffness / max(load, 1.0)
-        dz[0] = (v - relax * z[0]) / (1.0 + relax / FASTEST)
+        dz[0] = pace * (v - relax * z[0]) / (1.0 + pace * relax / FASTEST)
         out[TORQUE, i] -= par[1] * stiffness * z[0] * x[G, i]
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.effects.friction import contact_state
+from analysis.effects.contact import contact_state
 from analysis.signals import Signals
 from rig.model import channels as ch
 from rig.model.rig import Rig

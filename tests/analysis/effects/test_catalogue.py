@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from analysis.effects.base import Effect, ordered
-from analysis.effects.friction import contact_state, contact_under_load
-from analysis.effects.friction_levels import contact_levels
+from analysis.effects.contact import contact_levels, contact_state, contact_under_load, worked
 from analysis.effects.measurement import Sensor
 from analysis.effects.payload import growth, payload_of_shift
 from analysis.effects_catalogue import FAMILIES, pages
@@ -34,7 +33,7 @@ CONTRACT = {
 }  # fmt: skip
 
 
-DETAILS = ("rounding", "V_supply")  # of an edge and of a line: forms, not sizes
+DETAILS = ("rounding", "V_supply", "stiffening")  # of an edge, a line, a seal: forms, not sizes
 
 
 def effects(rig: Rig) -> list[Effect]:
@@ -116,13 +115,15 @@ def hidden_state(e: Effect, rig: Rig, signals: Signals, shape: tuple[float, ...]
         return np.asarray(0.5 * (ahead - back) * shape[0])
     if e.name == "pressure_dependent_friction":
         load = signals.p_cap[:, e.joint] + signals.p_rod[:, e.joint]
-        stiffness = rig.supply.pressure / shape[-1]
-        return np.asarray(contact_under_load(s, load, stiffness) / stiffness)
+        stiffness = rig.supply.pressure / shape[0]
+        path = worked(s, signals.sd[:, e.joint], shape[1])
+        return np.asarray(contact_under_load(path, load, stiffness) / stiffness)
     if e.name == "stribeck_friction":
         level = np.exp(-((signals.sd[:, e.joint] / shape[0]) ** 2))
         return np.asarray(contact_under_load(s, level, 1.0 / shape[-1]) * shape[-1])
     if e.family == "friction":
-        return np.asarray(shape[-1] * contact_state(s, shape[-1]))
+        path = worked(s, signals.sd[:, e.joint], shape[1])
+        return np.asarray(shape[0] * contact_state(path, shape[0]))
     if e.name == "spool_lag":
         return e.prepare(rig, signals, shape).u[:, e.joint]
     return np.zeros(len(signals.t))
@@ -212,9 +213,11 @@ def test_hidden_states_move_as_the_rows_say(rig: Rig) -> None:
     qd = np.gradient(q, 1 / rate, axis=0)
     signals = replace(signals_of(rig, q, qd, np.zeros_like(q), rng), t=t, rate=rate)
     signals.u[:] = 0.1 * np.sin(2 * np.pi * 5 * t)[:, None]
-    for name in ("coulomb_friction", "spool_lag"):
+    signals.p_cap[:] = 3e6 + 5e5 * np.sin(2 * np.pi * 3 * t)[:, None]
+    signals.p_rod[:] = 4e6
+    for name in ("coulomb_friction", "pressure_dependent_friction", "spool_lag"):
         e = effect(name, "joint 2")
-        shape = (1e-4,) if e.family == "friction" else (3e-3,)
+        shape = (1e-4, 40.0) if e.family == "friction" else (3e-3,)
         memory = hidden_state(e, rig, signals, shape)
         slope = np.gradient(memory, 1 / rate)
         par = packed(e, rig, shape)[1]
