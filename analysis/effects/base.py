@@ -30,7 +30,9 @@ class Shape:
     """A shape parameter: its parameter name, SI unit, physical bounds and points of first look.
 
     At `neutral` the effect is not there; None where its size is a linear coefficient. With
-    `resolution` the low bound is only what data resolve: to lie there contradicts nothing.
+    `resolution` the low bound is only what data resolve: to lie there contradicts nothing. A
+    `detail` of the form stands last, and a shape may do without it: it is searched only where the
+    records ask for it, and makes no explanation less simple than another.
     """
 
     parameter: str
@@ -40,6 +42,7 @@ class Shape:
     grid: tuple[float, ...]
     neutral: float | None = None
     resolution: bool = False
+    detail: bool = False
 
 
 @dataclass(frozen=True)
@@ -115,11 +118,11 @@ class Effect(Term):
         """Return the shape, or each parameter's middle point of first look where none is given."""
         if len(shape):
             return tuple(shape)
-        return tuple(s.grid[len(s.grid) // 2] for s in self.shapes(rig))
+        return tuple(s.grid[len(s.grid) // 2] for s in self.shapes(rig) if not s.detail)
 
     def outside(self, rig: Rig, shape: Sequence[float]) -> str:
         """Say which shape parameter lies on or beyond its physical bounds ('' if none)."""
-        for s, value in zip(self.shapes(rig), shape, strict=True):
+        for s, value in zip(self.shapes(rig), shape, strict=False):
             margin = 1e-3 * (s.high - s.low)
             allowed = s.resolution or s.neutral == s.low
             low = s.low if allowed else s.low + margin

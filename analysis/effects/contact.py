@@ -22,9 +22,8 @@ from analysis.effects.base import Array, Shape
 
 PRESLIDING: Final = (5e-6, 40e-6, 150e-6)  # [m] seals give a few hundredths of a millimetre
 PRESLIDING_BOUNDS: Final = (2e-6, 5e-4)
-STIFFENING: Final = 30.0  # [s/m] the first look's
-# [s/m] the low one is nothing: a tenth more at 0.1 m/s.
-STIFFENING_BOUNDS: Final = (1.0, 3e3)
+STIFFENING: Final = 30.0  # [s/m] where a search begins
+STIFFENING_BOUNDS: Final = (0.0, 3e3)
 FASTEST: Final = 3e3  # [1/s] relaxation in simulation; faster changes nothing that is seen
 # Speed of the transition through rest [m/s, or rad/s] where no presliding distance is given. A jump
 # would make the integrator chatter where a joint sticks; this creeps by less than 0.1 mm/s there.
@@ -40,7 +39,7 @@ def presliding(name: str) -> Shape:
 
 def stiffening(name: str) -> Shape:
     """Return a stiffening's shape [s/m]; a contact may stiffen less than can be seen."""
-    return Shape(name, "s/m", *STIFFENING_BOUNDS, (STIFFENING,), resolution=True)
+    return Shape(name, "s/m", *STIFFENING_BOUNDS, (STIFFENING,), resolution=True, detail=True)
 
 
 def worked(s: Array, v: Array, stiffening: float) -> Array:

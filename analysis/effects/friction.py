@@ -1,11 +1,16 @@
 """Dry friction of a cylinder's seals, in four forms that all act as a force on the piston.
 
 Torque row of joint i (friction stands with the load): ... + G F_f = G F. Every form is a level
-[N] times the state of the seal's contact (`contact`), which the piston's path alone decides, so
-that the rows have it from the measured piston; presliding distance d and stiffening k of the
-contact are shape parameters. The simulation carries the deflection y = d z [m] as a hidden state.
-A model that gives no presliding distance means the contact without memory, z = tanh(s'/v) with
-v = `TRANSITION`.
+[N] times the state z of the seal's contact (`contact`), -1 <= z <= 1, which turns over within a
+presliding distance d of travel after each reversal (Dahl 1968; Jelali and Kroll 2003), the sooner
+the faster it is (stiffening k; of rubber: Ferry 1980):
+
+    dz/ds = (1 + k |s'|) (sign(s') - z) / d
+
+Both are shape parameters. The piston's path alone decides z, so that the rows have it from the
+measured piston; the simulation carries the deflection y = d z [m] as a hidden state. A model that
+gives no presliding distance means the contact without memory, z = tanh(s'/v) with v = `TRANSITION`.
+Stribeck's and asymmetric friction have k = 0.
 """
 
 from __future__ import annotations
@@ -49,8 +54,7 @@ LEAST_LEVEL: Final = 1e-6  # of the breakaway, where it has long vanished: no di
 class Friction(Effect):
     """What the four forms share: joint, presliding distance, the state z of the contact.
 
-    Where the contact `stiffens` its stiffening is the last shape; a model without it, as files of
-    before have it, means a contact that does not.
+    Where the contact `stiffens` the stiffening is a detail: a shape without it does not stiffen.
     """
 
     family: ClassVar[str] = "friction"

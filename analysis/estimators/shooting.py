@@ -27,7 +27,7 @@ SAMPLES_PER_STEP = 2
 STABLE = 2.0  # step times relaxation rate; the fourth-order rule diverges from 2.78
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 def _shoot(model, pars, starts, inputs, rate, locked, geometry, first, every, parts, out, work):  # type: ignore[no-untyped-def]
     """Fill out (P, points, size), a point every `every` steps of `parts` each; return success."""
     trajectories, points, size = out.shape

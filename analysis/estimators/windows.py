@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -27,6 +28,7 @@ Array = NDArray[np.float64]
 
 # The measured spool drives the simulation, and its noise is integrated: after a second it moves the
 # piston by as much as its sensor's noise. Tried were 3, 1 and 0.5 s; shorter was the more exact.
+WORKERS = 2
 WINDOW = 0.5  # [s]
 MOST_SECONDS = 150.0  # with more data, fewer windows of each record, evenly spread
 POINT_RATE = 250.0  # [Hz] at which outputs are compared; the channels are filtered to 80 Hz
@@ -198,10 +200,19 @@ class Windows:
     ) -> list[Reduced | None]:
         """Shoot every window with every nudge; None for one whose state ceased to exist."""
         ready = [self._nudged(theta, source) for source in self.sources]
-        return [
-            self._window(stretch, start, sigma[stretch.stratum], ready[stretch.record])
-            for stretch, start in zip(self.stretches, starts, strict=True)
-        ]
+
+        def one(k: int) -> Reduced | None:
+            stretch = self.stretches[k]
+            return self._window(stretch, starts[k], sigma[stretch.stratum], ready[stretch.record])
+
+        # A record's first window tells which parameters move nothing in it; the others need not
+        # wait for one another.
+        first = {s.record: k for k, s in reversed(list(enumerate(self.stretches)))}
+        found = {k: one(k) for k in sorted(first.values())}
+        rest = [k for k in range(len(self.stretches)) if k not in found]
+        with ThreadPoolExecutor(WORKERS) as pool:
+            found |= zip(rest, pool.map(one, rest), strict=True)
+        return [found[k] for k in range(len(self.stretches))]
 
     def _window(
         self, stretch: Stretch, start: Array, sigma: Array, nudged: Nudged

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from analysis.effects.base import Effect
+from analysis.effects.base import Effect, Shape
 from analysis.terms import known
 from analysis.terms.base import Used
 from rig.model.rig import Rig
@@ -46,7 +46,7 @@ def catalogue(rig: Rig, names: Sequence[str] | None = None) -> list[Effect]:
 
 def points(effect: Effect, rig: Rig) -> list[tuple[float, ...]]:
     """Return the shape grid of an effect, thinned where it has too many points."""
-    axes = [shape.grid for shape in effect.shapes(rig)]
+    axes = [shape.grid for shape in effect.shapes(rig) if not shape.detail]
     grid = list(itertools.product(*axes))
     if len(grid) > MOST_POINTS:
         per = max(2, int(MOST_POINTS ** (1 / len(axes))))
@@ -66,6 +66,17 @@ def variants(rig: Rig, effects: Sequence[Effect]) -> list[Variant]:
 
 
 def complexity(rig: Rig, used: Sequence[Used]) -> tuple[int, int]:
-    """Return the number of effects and of their free numbers: the simpler of two equals wins."""
-    free = sum(len(u.term.coefficients(rig)) + len(u.shape) for u in used)
+    """Return the number of effects and of their free numbers: the simpler of two equals wins.
+
+    Details of a form do not count.
+    """
+    free = sum(
+        len(u.term.coefficients(rig)) + sum(not shape.detail for shape in shapes_of(rig, u))
+        for u in used
+    )
     return len(used), free
+
+
+def shapes_of(rig: Rig, used: Used) -> tuple[Shape, ...]:
+    """Return the shape parameters that a used term has, none for a term that is no effect."""
+    return used.term.shapes(rig)[: len(used.shape)] if isinstance(used.term, Effect) else ()

@@ -28,7 +28,7 @@ from analysis.rows import Rows
 from analysis.signals import Signals, condition
 from analysis.terms.base import Used
 from analysis.trace.board import Board, entries
-from analysis.trace.candidates import Variant
+from analysis.trace.candidates import Variant, shapes_of
 from analysis.trace.evidence import (
     Scene,
     candidate_columns,
@@ -39,7 +39,6 @@ from analysis.trace.evidence import (
 )
 from analysis.trace.excitations import REPEATS, Excitation
 from analysis.trace.floor import stated_noise
-from analysis.trace.refine import shapes_of
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]

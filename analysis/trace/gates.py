@@ -18,10 +18,10 @@ from analysis.solve import half_width
 from analysis.terms.base import Used
 from analysis.trace import inference
 from analysis.trace.board import Board
+from analysis.trace.candidates import shapes_of
 from analysis.trace.held_out import left as held_left
 from analysis.trace.invariance import invariance
 from analysis.trace.listed import Listed, excess_of, parameter_values
-from analysis.trace.refine import shapes_of
 from analysis.trace.result import Found, Gate, Rival
 from analysis.trace.select import FORM
 from analysis.trace.shortlist import Shortlist

@@ -19,8 +19,9 @@ from analysis.effects.base import Effect
 from analysis.terms.base import Used
 from analysis.trace import select
 from analysis.trace.board import Board
+from analysis.trace.candidates import shapes_of
 from analysis.trace.listed import Listed, excess_of
-from analysis.trace.refine import Fit, jacobian, shapes_of, table
+from analysis.trace.refine import Fit, jacobian, table
 from analysis.trace.select import Field, orthonormal
 from analysis.trace.shortlist import Shortlist
 
@@ -211,7 +212,9 @@ def spread(stage: Board, model: Fit, used: Used, values: Mapping[str, float]) ->
     names, J = jacobian(stage, model, used)
     base = others(stage, model, names)
     J_p = J - base @ (base.T @ J)
-    pinv = np.linalg.pinv(J_p, rcond=1e-8)
+    scale = np.linalg.norm(J_p, axis=0)  # units differ by many powers of ten
+    scale[scale == 0] = 1.0
+    pinv = np.linalg.pinv(J_p / scale, rcond=1e-8) / scale[:, None]
     variance, dof = np.zeros(len(names)), 0
     for group in sorted({s.group for s in stage.segments}):
         parts = [s for s in stage.segments if s.group == group]
@@ -222,7 +225,7 @@ def spread(stage: Board, model: Fit, used: Used, values: Mapping[str, float]) ->
         each = sum(pinv[:, s.where] @ stage.left[:R, s.where].T / np.sqrt(R) for s in parts)
         variance += R * np.var(each, axis=1, ddof=1)
         dof += R - 1
-    shapes = dict(zip(used.term.shape_names(), used.shape, strict=True))
+    shapes = dict(zip(used.term.shape_names(), used.shape, strict=False))
     value = np.array([values.get(n, shapes.get(n, np.nan)) for n in names])
     return Spread(names, value, np.sqrt(variance), float(max(dof, 1)))
 

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from analysis.effects.base import Effect
 from analysis.terms.base import Used
 from analysis.trace.board import Board
+from analysis.trace.candidates import shapes_of
 from analysis.trace.floor import STATED
 from analysis.trace.inference import Spread, blocks, others
-from analysis.trace.refine import Fit, jacobian, shapes_of, table
+from analysis.trace.refine import Fit, jacobian, table
 from analysis.trace.select import FORM, orthonormal
 
 Array = NDArray[np.float64]

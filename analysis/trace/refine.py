@@ -19,13 +19,16 @@ from analysis.effects.base import Effect, Shape
 from analysis.rows import Rows
 from analysis.terms.base import Used
 from analysis.trace.board import Board
+from analysis.trace.candidates import shapes_of
 from analysis.trace.evidence import Scene, held, scene_rows
+from analysis.trace.select import CHANCE
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
 TOLERANCE = 1e-4
 MOST_STEPS = 10
+DETAIL = 0.05  # of what is left above noise: less does not earn a detail of the form
 REMEMBERED = 150  # rows of scenes under a model, about 0.2 MB each
 
 
@@ -102,13 +105,29 @@ def fit(stage: Board, terms: Sequence[Used]) -> Fit:
     return Fit(tuple(terms), beta, rows.left(beta))
 
 
-def shapes_of(rig: Rig, used: Used) -> tuple[Shape, ...]:
-    """Return the shape parameters of a term, none for a term that is no effect."""
-    return used.term.shapes(rig) if isinstance(used.term, Effect) else ()
-
-
 def refine(stage: Board, terms: Sequence[Used], steps: int = MOST_STEPS) -> Fit:
-    """Search the shape parameters that the board's own terms do not have, from where they are."""
+    """Search the shape parameters that the board's own terms do not have, from where they are.
+
+    Then details of forms join that take more away than chance, and a share of what is left.
+    """
+    plain = _searched(stage, terms, steps)
+    opened = tuple(u if u in stage.terms else _in_detail(stage.rig, u) for u in plain.terms)
+    excess = plain.energy - len(plain.left)
+    if opened == plain.terms or excess < CHANCE:
+        return plain
+    found = _searched(stage, opened, steps)
+    return found if plain.energy - found.energy > max(CHANCE, DETAIL * excess) else plain
+
+
+def _in_detail(rig: Rig, used: Used) -> Used:
+    """Return a term with the details that its shape does without, at their first look."""
+    if not isinstance(used.term, Effect) or not len(used.shape):
+        return used
+    more = [s.grid[len(s.grid) // 2] for s in used.term.shapes(rig)[len(used.shape) :]]
+    return Used(used.term, (*used.shape, *more))
+
+
+def _searched(stage: Board, terms: Sequence[Used], steps: int) -> Fit:
     free = _free(stage, terms)
     if not free:
         return fit(stage, terms)

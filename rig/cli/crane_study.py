@@ -145,7 +145,7 @@ def _own(rig: Rig, one: Listed) -> str:
     found: list[tuple[str, float]] = []
     for used in one.effects:
         found += [(c.parameter, one.fit.beta[c.parameter]) for c in used.term.coefficients(rig)]
-        found += zip(used.term.shape_names(), used.shape, strict=True)
+        found += zip(used.term.shape_names(), used.shape, strict=False)
     return ", ".join(f"{name} {value:.3g}" for name, value in found)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.differentiate import butterworth, channel_filter, row_filter, row_step
-from analysis.effects.friction import TRANSITION
+from analysis.effects.contact import TRANSITION
 from analysis.identify import Identification, identify
 from analysis.model import Model
 from analysis.rows import Filtering, default_filtering

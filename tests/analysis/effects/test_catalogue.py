@@ -116,13 +116,13 @@ def hidden_state(e: Effect, rig: Rig, signals: Signals, shape: tuple[float, ...]
     if e.name == "pressure_dependent_friction":
         load = signals.p_cap[:, e.joint] + signals.p_rod[:, e.joint]
         stiffness = rig.supply.pressure / shape[0]
-        path = worked(s, signals.sd[:, e.joint], shape[1])
+        path = worked(s, signals.sd[:, e.joint], sum(shape[1:]))
         return np.asarray(contact_under_load(path, load, stiffness) / stiffness)
     if e.name == "stribeck_friction":
         level = np.exp(-((signals.sd[:, e.joint] / shape[0]) ** 2))
         return np.asarray(contact_under_load(s, level, 1.0 / shape[-1]) * shape[-1])
     if e.family == "friction":
-        path = worked(s, signals.sd[:, e.joint], shape[1])
+        path = worked(s, signals.sd[:, e.joint], sum(shape[1:]))
         return np.asarray(shape[0] * contact_state(path, shape[0]))
     if e.name == "spool_lag":
         return e.prepare(rig, signals, shape).u[:, e.joint]
@@ -135,6 +135,7 @@ def test_kernels_and_rows_are_the_same_equations(rig: Rig, state: Signals) -> No
         if isinstance(e, Sensor):
             continue
         shape = e.shape_of(rig, ())
+        shape = (*shape, *(s.grid[0] for s in e.shapes(rig)[len(shape) :]))  # details too
         if e.name == "supply_sag":
             shape = (*shape[:2], 0.0)  # the simulation's line follows at once
         signals = consistent(rig, state, e, shape) if e.stage == 4 else state

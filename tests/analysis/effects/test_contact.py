@@ -58,7 +58,7 @@ def test_a_level_that_does_not_change_is_the_plain_contact() -> None:
     assert force == pytest.approx(3.0 * contact_state(s, DISTANCE))
 
 
-def test_shapes_of_a_model_file_of_before_still_mean_a_contact_that_does_not_stiffen(
+def test_a_shape_without_the_detail_is_a_contact_that_does_not_stiffen(
     rig: Rig, multisine_run: Run
 ) -> None:
     signals = condition(rig, multisine_run.records[0])
