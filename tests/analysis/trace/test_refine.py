@@ -9,10 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from analysis.terms import make
+from analysis.terms import baseline, make
 from analysis.terms.base import Used
 from analysis.trace import refine
+from analysis.trace.board import board
+from analysis.trace.evidence import scenes
 from rig.model.rig import Rig
+from tests.analysis.effects import one_joint as bench
 
 
 @pytest.mark.parametrize("start", [0.9, 0.98, 1.02, 1.1])
@@ -31,3 +34,16 @@ def test_a_gain_is_found_from_the_wrong_side_of_one_too(
     used = Used(make("sensor_gain", "joint 2 cap"), (start,))
     found = refine.refine(stage, (used,))
     assert found.terms[-1].shape[0] == pytest.approx(1.01, abs=1e-3)
+
+
+@pytest.mark.parametrize("stiffening", [0.0, 60.0])
+def test_a_contact_stiffens_in_the_model_where_it_does_on_the_bench_and_else_says_nothing_of_it(
+    rig: Rig, stiffening: float
+) -> None:
+    wrong = bench.Wrong.of(Fc=80, presliding=150e-6, stiffening=stiffening)
+    records = scenes(rig, [bench.run(rig, wrong, 0.03, 1)])
+    stage = board(rig, tuple(map(Used, baseline())), records)
+    friction = Used(make("coulomb_friction", "joint 2"), (40e-6,))
+    distance, *more = refine.refine(stage, (*stage.terms, friction)).terms[-1].shape
+    assert distance == pytest.approx(150e-6, rel=0.15)
+    assert more == ([pytest.approx(stiffening, rel=0.25)] if stiffening else [])
