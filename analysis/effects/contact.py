@@ -23,7 +23,7 @@ from analysis.effects.base import Array, Shape
 PRESLIDING: Final = (5e-6, 40e-6, 150e-6)  # [m] seals give a few hundredths of a millimetre
 PRESLIDING_BOUNDS: Final = (2e-6, 5e-4)
 STIFFENING: Final = 30.0  # [s/m] where a search begins
-STIFFENING_BOUNDS: Final = (0.0, 3e3)
+STIFFENING_BOUNDS: Final = (1.0, 3e3)  # [s/m] less is a tenth at 0.1 m/s: nothing
 FASTEST: Final = 3e3  # [1/s] relaxation in simulation; faster changes nothing that is seen
 # Speed of the transition through rest [m/s, or rad/s] where no presliding distance is given. A jump
 # would make the integrator chatter where a joint sticks; this creeps by less than 0.1 mm/s there.

@@ -163,7 +163,7 @@ class Windows:
 
     def _nudged(self, theta: Array, source: Source) -> Nudged:
         """Compile the model with every parameter nudged, and find where its own states stand."""
-        nudges = NUDGE * np.abs(theta)
+        nudges = NUDGE * np.where(theta == 0.0, 1.0, np.abs(theta))
         if self.warm:
             b = abs(theta[self.names.index("b")])
             nudges[-1] = NUDGE * b

@@ -27,7 +27,7 @@ from analysis.trace.floor import STATED
 from analysis.trace.lines import lines
 from analysis.trace.listed import Listed, within
 from analysis.trace.next_experiment import propose
-from analysis.trace.remaining import clues_to
+from analysis.trace.remaining import clues_to, left_over
 from analysis.trace.result import (
     CLEAN,
     CONFOUNDED,
@@ -101,7 +101,7 @@ def trace(
         if quiet and verdict == UNEXPLAINED:
             notes.append(ELSEWHERE)
         if verdict == UNEXPLAINED and (found or quiet):
-            notes += [f"{e}: {words}" for e, words in gates.remaining(listed, winner, judge)]
+            notes += [f"{e}: {words}" for e, words in left_over(listed, winner, judge)]
     split = lines(stage, winner.fit.left)
     moves: tuple[Dependence, ...] = ()
     formulas: tuple[Formula, ...] = ()
@@ -210,11 +210,11 @@ def _named(
         if not smaller:
             return refused, listed.empty, UNEXPLAINED
         winner = listed.exact(smaller)
-    rest = gates.remaining(listed, winner, judge)
+    rest = left_over(listed, winner, judge)
     while rest:
         more = listed.closer(winner, {equation for equation, _ in rest})
         wider = gates.judge(listed, more, judge, rng) if more else ()
-        later = gates.remaining(listed, more, judge) if more else rest
+        later = left_over(listed, more, judge) if more else rest
         if more is None or len(later) >= len(rest) or not all(map(gates.stands, wider)):
             return (*found, *refused), winner, UNEXPLAINED
         found, winner, rest = wider, more, later

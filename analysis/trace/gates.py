@@ -77,7 +77,7 @@ def judge(
             Gate(REMOVES, removed >= REMOVED and not worse, _taken(removed, worse)),
             Gate(PHYSICAL, not physical, physical or "sign and size are"),
             Gate(INVARIANT, not differing, _differences(differing)),
-            Gate(STABLE, share >= CHOSEN or bool(tied), _chosen(share, others)),
+            Gate(STABLE, share >= CHOSEN or bool(tied), _chosen(share, others, bool(tied))),
             Gate(SIGNIFICANT, p <= P_LIMIT, f"family-wise p = {p:.3g}"),
             Gate(ALONE, not (tied or twins), _told_apart([*twins, *rivals])),
         )
@@ -249,8 +249,10 @@ def _differences(differing: Sequence[tuple[str, str, float, float]]) -> str:
     )
 
 
-def _chosen(share: float, others: Mapping[str, int]) -> str:
+def _chosen(share: float, others: Mapping[str, int], tied: bool) -> str:
     text = f"chosen in {100 * share:.0f} % of half-samples"
+    if share < CHOSEN and tied:
+        text = f"not asked, for a rival fits as well: {text}"
     if share < CHOSEN and others:
         text += "; else " + ", ".join(sorted(others, key=lambda k: -others[k])[:2])
     return text

@@ -1,10 +1,15 @@
-"""What stays when a search has ended, told by clues: variables, a frequency, a formula."""
+"""What stays when a search has ended: whether it is nothing, and what tells it.
+
+Clues tell it: variables, a frequency, a formula.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from analysis.trace import clues, held_out
+import numpy as np
+
+from analysis.trace import clues, gates, held_out
 from analysis.trace.board import Board
 from analysis.trace.clue_formula import Formula, formula, surest
 from analysis.trace.clue_frequency import frequency_clue
@@ -12,8 +17,39 @@ from analysis.trace.lines import Lines
 from analysis.trace.listed import Listed
 from analysis.trace.refine import rebased
 from analysis.trace.result import Dependence
+from analysis.trace.shortlist import Shortlist
 
 LOUD = 0.1  # of all that is left: an equation with less asks for no clue
+# What the band lets pass is looked at again from here on: deviations of the noise's own energy,
+# and share of what was there before. A catalogue's simpler form leaves what no formula holds.
+SEEN = 8.0
+SHARE = 0.005
+HELD = 0.7  # share of the rest from which a formula holds it
+
+
+def left_over(listed: Shortlist, winner: Listed, judge: Board) -> list[tuple[str, str]]:
+    """Return the equations that keep more than is nothing, and say what.
+
+    Beside those that keep more than the noise floor's band (`gates.remaining`), those whose rest
+    one formula holds: it is no noise, and no form that is only a little simpler.
+    """
+    out = gates.remaining(listed, winner, judge)
+    known = {equation for equation, _ in out}
+    rows: dict[str, int] = {}
+    for s in listed.stage.segments:
+        rows[s.equation] = rows.get(s.equation, 0) + s.where.stop - s.where.start
+    for equation, left in winner.excess.items():
+        share = left / max(listed.empty.excess[equation], 1e-30)
+        seen = left > SEEN * np.sqrt(2 * rows[equation]) and share > SHARE
+        if not winner.effects or equation in known or not seen:
+            continue
+        now, later = rebased(listed.stage, winner.fit), rebased(judge, winner.fit)
+        held = held_out.left(judge, winner.fit)
+        found = formula(now, winner.fit.left, later, held, equation)
+        if found is not None and found.share >= HELD:
+            words = f"{100 * share:.2g} % of what repeated stays, and a formula holds it"
+            out.append((equation, f"{words}: {found.text}"))
+    return out
 
 
 def clues_to(
