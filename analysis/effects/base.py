@@ -44,6 +44,11 @@ class Shape:
     resolution: bool = False
     detail: bool = False
 
+    @property
+    def middle(self) -> float:
+        """The middle point of first look."""
+        return self.grid[len(self.grid) // 2]
+
 
 @dataclass(frozen=True)
 class Effect(Term):
@@ -118,11 +123,11 @@ class Effect(Term):
         """Return the shape, or each parameter's middle point of first look where none is given."""
         if len(shape):
             return tuple(shape)
-        return tuple(s.grid[len(s.grid) // 2] for s in self.shapes(rig) if not s.detail)
+        return tuple(s.middle for s in self.shapes(rig) if not s.detail)
 
     def outside(self, rig: Rig, shape: Sequence[float]) -> str:
         """Say which shape parameter lies on or beyond its physical bounds ('' if none)."""
-        for s, value in zip(self.shapes(rig), shape, strict=False):
+        for s, value in zip(self.shapes(rig)[: len(shape)], shape, strict=True):
             margin = 1e-3 * (s.high - s.low)
             allowed = s.resolution or s.neutral == s.low
             low = s.low if allowed else s.low + margin
@@ -139,6 +144,11 @@ def beyond(parameter: str, value: float, unit: str, high: float, low: float = 0.
     if low < value < high:
         return ""
     return f"{parameter} = {value:.4g} {unit} is not between {low:.4g} and {high:.4g}"
+
+
+def shapes_of(rig: Rig, used: Used) -> tuple[Shape, ...]:
+    """Return the shape parameters that a used term has, none for a term that is no effect."""
+    return used.term.shapes(rig)[: len(used.shape)] if isinstance(used.term, Effect) else ()
 
 
 def ordered(terms: Sequence[Used]) -> tuple[Used, ...]:

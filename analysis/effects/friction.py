@@ -74,7 +74,8 @@ class Friction(Effect):
 
     def contact_of(self, shape: Sequence[float]) -> tuple[float, float]:
         """Return presliding distance [m] and stiffening [s/m] of a shape, 0 where not given."""
-        return (*shape, 0.0, 0.0)[0], (*shape, 0.0, 0.0)[1]
+        distance, rate, *_ = (*shape, 0.0, 0.0)
+        return distance, rate
 
     def path(self, signals: Signals, shape: Sequence[float]) -> Array:
         """Return the path (n,) [m] that the contact is worked along."""

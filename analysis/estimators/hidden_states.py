@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.effects.base import Effect
+from analysis.effects.base import Effect, Shape, shapes_of
 from analysis.estimators.output_error import Search
 from analysis.estimators.windows import Windows
 from analysis.model import Estimate, Model
@@ -81,8 +81,7 @@ def completed(runs: Sequence[Run], model: Model) -> Model | None:
 
 def shot(runs: Sequence[Run], model: Model, effect: Effect) -> Shot | None:
     """Search an effect's shapes by multiple shooting; None where no window can be simulated."""
-    names = _shapes(model, effect)
-    bounds = {s.parameter: s for s in effect.shapes(model.rig) if s.parameter in names}
+    bounds = {s.parameter: s for s in _shapes(model, effect)}
     try:  # there may be no stretch without a lost sample or a sensor at its end
         windows = _windows(runs, model, effect, _free(model, effect))
         theta = _theta(windows, model)
@@ -135,13 +134,13 @@ def _windows(
     if not any(run.records for run in moving):
         raise InputError(f"joint {effect.joint + 1} moves in no record")
     names = tuple(c.parameter for u in model.terms for c in u.term.coefficients(rig))
-    return Windows(rig, moving, model.terms, names, _shapes(model, effect), SECONDS, free)
+    shapes = tuple(s.parameter for s in _shapes(model, effect))
+    return Windows(rig, moving, model.terms, names, shapes, SECONDS, free)
 
 
-def _shapes(model: Model, effect: Effect) -> tuple[str, ...]:
-    """Return the names of the shapes that the effect has in the model."""
-    used = next(u for u in model.terms if u.term == effect)
-    return effect.shape_names()[: len(used.shape)]
+def _shapes(model: Model, effect: Effect) -> tuple[Shape, ...]:
+    """Return the shapes that the effect has in the model."""
+    return shapes_of(model.rig, next(u for u in model.terms if u.term == effect))
 
 
 def _theta(windows: Windows, model: Model) -> Array:
@@ -165,4 +164,4 @@ def _free(model: Model, effect: Effect) -> frozenset[str]:
         for c in used.term.coefficients(rig)
         if c.family == family and (c.parameter == "b" or c.parameter.endswith(str(joint)))
     }
-    return frozenset(own | others | set(_shapes(model, effect)))
+    return frozenset(own | others | {s.parameter for s in _shapes(model, effect)})

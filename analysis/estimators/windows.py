@@ -28,8 +28,8 @@ Array = NDArray[np.float64]
 
 # The measured spool drives the simulation, and its noise is integrated: after a second it moves the
 # piston by as much as its sensor's noise. Tried were 3, 1 and 0.5 s; shorter was the more exact.
-WORKERS = 2
 WINDOW = 0.5  # [s]
+WORKERS = 2
 MOST_SECONDS = 150.0  # with more data, fewer windows of each record, evenly spread
 POINT_RATE = 250.0  # [Hz] at which outputs are compared; the channels are filtered to 80 Hz
 NUDGE = 1e-5  # relative change of a parameter for its sensitivity
@@ -205,10 +205,12 @@ class Windows:
             stretch = self.stretches[k]
             return self._window(stretch, starts[k], sigma[stretch.stratum], ready[stretch.record])
 
-        # A record's first window tells which parameters move nothing in it; the others need not
-        # wait for one another.
-        first = {s.record: k for k, s in reversed(list(enumerate(self.stretches)))}
-        found = {k: one(k) for k in sorted(first.values())}
+        # A record's first window tells which parameters move nothing in it; once that is known,
+        # windows need not wait for one another.
+        found = {}
+        for k, stretch in enumerate(self.stretches):
+            if stretch.record not in self._idle:
+                found[k] = one(k)
         rest = [k for k in range(len(self.stretches)) if k not in found]
         with ThreadPoolExecutor(WORKERS) as pool:
             found |= zip(rest, pool.map(one, rest), strict=True)

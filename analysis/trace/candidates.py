@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from analysis.effects.base import Effect, Shape
+from analysis.effects.base import Effect, shapes_of
 from analysis.terms import known
 from analysis.terms.base import Used
 from rig.model.rig import Rig
@@ -75,8 +75,3 @@ def complexity(rig: Rig, used: Sequence[Used]) -> tuple[int, int]:
         for u in used
     )
     return len(used), free
-
-
-def shapes_of(rig: Rig, used: Used) -> tuple[Shape, ...]:
-    """Return the shape parameters that a used term has, none for a term that is no effect."""
-    return used.term.shapes(rig)[: len(used.shape)] if isinstance(used.term, Effect) else ()

@@ -22,13 +22,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.effects.base import Effect
+from analysis.effects.base import Effect, shapes_of
 from analysis.prediction_twin import ideal
 from analysis.rows import Rows
 from analysis.signals import Signals, condition
 from analysis.terms.base import Used
 from analysis.trace.board import Board, entries
-from analysis.trace.candidates import Variant, shapes_of
+from analysis.trace.candidates import Variant
 from analysis.trace.evidence import (
     Scene,
     candidate_columns,

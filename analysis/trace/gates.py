@@ -12,13 +12,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.effects.base import Effect
+from analysis.effects.base import Effect, shapes_of
 from analysis.model import Estimate
 from analysis.solve import half_width
 from analysis.terms.base import Used
 from analysis.trace import inference
 from analysis.trace.board import Board
-from analysis.trace.candidates import shapes_of
 from analysis.trace.held_out import left as held_left
 from analysis.trace.invariance import invariance
 from analysis.trace.listed import Listed, excess_of, parameter_values

@@ -10,10 +10,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.effects.base import Effect
+from analysis.effects.base import Effect, shapes_of
 from analysis.terms.base import Used
 from analysis.trace.board import Board
-from analysis.trace.candidates import shapes_of
 from analysis.trace.floor import STATED
 from analysis.trace.inference import Spread, blocks, others
 from analysis.trace.refine import Fit, jacobian, table

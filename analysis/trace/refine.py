@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares as search_shapes
 
-from analysis.effects.base import Effect, Shape
+from analysis.effects.base import Effect, Shape, shapes_of
 from analysis.rows import Rows
 from analysis.terms.base import Used
 from analysis.trace.board import Board
-from analysis.trace.candidates import shapes_of
 from analysis.trace.evidence import Scene, held, scene_rows
 from analysis.trace.select import CHANCE
 from rig.model.rig import Rig
@@ -123,7 +122,7 @@ def _in_detail(rig: Rig, used: Used) -> Used:
     """Return a term with the details that its shape does without, at their first look."""
     if not isinstance(used.term, Effect) or not len(used.shape):
         return used
-    more = [s.grid[len(s.grid) // 2] for s in used.term.shapes(rig)[len(used.shape) :]]
+    more = [s.middle for s in used.term.shapes(rig)[len(used.shape) :]]
     return Used(used.term, (*used.shape, *more))
 
 

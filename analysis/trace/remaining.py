@@ -34,22 +34,32 @@ def left_over(listed: Shortlist, winner: Listed, judge: Board) -> list[tuple[str
     one formula holds: it is no noise, and no form that is only a little simpler.
     """
     out = gates.remaining(listed, winner, judge)
+    seen = _seen(listed, winner) if winner.effects else {}
     known = {equation for equation, _ in out}
+    asked = [equation for equation in seen if equation not in known]
+    if not asked:
+        return out
+    now, later = rebased(listed.stage, winner.fit), rebased(judge, winner.fit)
+    held = held_out.left(judge, winner.fit)
+    for equation in asked:
+        found = formula(now, winner.fit.left, later, held, equation)
+        if found is not None and found.share >= HELD:
+            words = f"{100 * seen[equation]:.2g} % of what repeated stays, and a formula holds it"
+            out.append((equation, f"{words}: {found.text}"))
+    return out
+
+
+def _seen(listed: Shortlist, winner: Listed) -> dict[str, float]:
+    """Return the share that stays, by equation, where it stands out of the noise's own energy."""
     rows: dict[str, int] = {}
     for s in listed.stage.segments:
         rows[s.equation] = rows.get(s.equation, 0) + s.where.stop - s.where.start
-    for equation, left in winner.excess.items():
-        share = left / max(listed.empty.excess[equation], 1e-30)
-        seen = left > SEEN * np.sqrt(2 * rows[equation]) and share > SHARE
-        if not winner.effects or equation in known or not seen:
-            continue
-        now, later = rebased(listed.stage, winner.fit), rebased(judge, winner.fit)
-        held = held_out.left(judge, winner.fit)
-        found = formula(now, winner.fit.left, later, held, equation)
-        if found is not None and found.share >= HELD:
-            words = f"{100 * share:.2g} % of what repeated stays, and a formula holds it"
-            out.append((equation, f"{words}: {found.text}"))
-    return out
+    shares = {e: v / max(listed.empty.excess[e], 1e-30) for e, v in winner.excess.items()}
+    return {
+        e: share
+        for e, share in shares.items()
+        if share > SHARE and winner.excess[e] > SEEN * np.sqrt(2 * rows[e])
+    }
 
 
 def clues_to(

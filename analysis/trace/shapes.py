@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 from analysis import checks as ck
-from analysis.effects.base import Effect, Shape
+from analysis.effects.base import Effect, Shape, shapes_of
 from analysis.terms.base import Used
 from analysis.trace.beside import beside
 from analysis.trace.board import board
@@ -59,6 +59,5 @@ def shapes_in(rig: Rig, terms: Sequence[Used]) -> Mapping[str, tuple[float, Shap
     return {
         s.parameter: (value, s)
         for u in terms
-        if isinstance(u.term, Effect)
-        for value, s in zip(u.shape, u.term.shapes(rig), strict=False)
+        for value, s in zip(u.shape, shapes_of(rig, u), strict=True)
     }

@@ -198,7 +198,7 @@ def _outcome(
     plain, fit = train.solved(base), fitted(train, effect, floor)
     before, after = held_out.rms(base, plain.values), held_out.rms(fit.terms, fit.values)
     shape = next(u.shape for u in fit.terms if u.term == effect)
-    found = {**fit.values, **dict(zip(effect.shape_names(), shape, strict=False))}
+    found = {**fit.values, **dict(zip(effect.shape_names(), shape, strict=True))}
     worst = max(
         (name for name in judged if name in effect.abscissa(train.rig, train.records[0][0])),
         key=lambda name: before[name] / judged[name],

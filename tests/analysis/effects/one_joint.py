@@ -25,8 +25,7 @@ Array = NDArray[np.float64]
 FLOW = 11.7e-3 / 60  # the pump's [m^3/s]
 P0 = 101_325.0
 NAMES = (
-    "Fc", "Fs", "v_stribeck", "F_ext", "F_ret", "k_friction", "presliding",
-    "stiffening",
+    "Fc", "Fs", "v_stribeck", "F_ext", "F_ret", "k_friction", "presliding", "stiffening",
     "inclination", "k_spring", "rest", "T_offset",
     "w_ahead", "w_astern", "u_null", "w_underlap", "tau_spool",
     "c_internal", "c_cap", "c_rod", "dp_supply", "p_tank", "p_back",
