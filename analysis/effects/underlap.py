@@ -11,7 +11,8 @@ import numpy as np
 from numba import njit
 
 from analysis.effects.base import Array, Shape
-from analysis.effects.valve import ValveEffect, edge, opened, rounding
+from analysis.effects.edges import corner, edge, form_of, opened, rounding
+from analysis.effects.valve import ValveEffect
 from analysis.signals import Signals
 from analysis.terms.base import (
     CONTRIBUTE,
@@ -65,15 +66,16 @@ class UnderlapLeakage(ValveEffect):
         return tuple(Coefficient(name, parameter_unit(name), "fluid") for name in names)
 
     def shape_names(self) -> tuple[str, ...]:
-        """Name the underlap and the edges' rounding."""
-        return f"w_underlap_{self.joint + 1}", f"rounding_{self.joint + 1}"
+        """Name the underlap, the edges' rounding and their corner."""
+        joint = self.joint + 1
+        return f"w_underlap_{joint}", f"rounding_{joint}", f"corner_{joint}"
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return the underlap [V], up to a tenth of the spool's stroke, and rounding [V]."""
+        """Return the underlap [V], up to a tenth of the spool's stroke, and the edges' form."""
         stroke = rig.joints[self.joint].valve.spool_stroke
         grid = (0.002 * stroke, 0.006 * stroke, 0.02 * stroke)
-        own = Shape(self.shape_names()[0], "V", 0.0, 0.1 * stroke, grid, 0.0)
-        return own, rounding(self.joint, stroke)
+        own, r, c = self.shape_names()
+        return Shape(own, "V", 0.0, 0.1 * stroke, grid, 0.0), rounding(r, stroke), corner(c)
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Return the signals unchanged."""
@@ -83,9 +85,10 @@ class UnderlapLeakage(ValveEffect):
         """Return the additional openings times the roots, under the orifices' own names."""
         i = self.joint
         pp, pm, mp, mm = gain_names(i + 1)
-        u, (w, r) = signals.u[:, i], self.shape_of(rig, shape)
-        ahead = opened(u + w, r) - np.maximum(u, 0.0)
-        astern = opened(w - u, r) - np.maximum(-u, 0.0)
+        w, *form = self.shape_of(rig, shape)
+        u, (r, c) = signals.u[:, i], form_of(form)
+        ahead = opened(u + w, r, c) - np.maximum(u, 0.0)
+        astern = opened(w - u, r, c) - np.maximum(-u, 0.0)
         cap, rod, p_s, p_t = signals.p_cap[:, i], signals.p_rod[:, i], signals.p_s, signals.p_tank
         return {
             equation("flow_cap", i): {pp: ahead * _root(p_s - cap), pm: -astern * _root(cap - p_t)},
@@ -93,9 +96,10 @@ class UnderlapLeakage(ValveEffect):
         }
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
-        """Return joint, gains, underlap, rounding."""
+        """Return joint, gains, underlap, rounding, corner."""
         gains = [values[name] for name in gain_names(self.joint + 1)]
-        return np.array([self.joint, *gains, *self.shape_of(rig, shape)])
+        w, *form = self.shape_of(rig, shape)
+        return np.array([self.joint, *gains, w, *form_of(form)])
 
 
 def _root(drop: Array) -> Array:
@@ -113,8 +117,8 @@ def _underlap(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-d
         return
     i = int(par[0])
     u, w = x[U, i], par[5]
-    ahead = edge(u + w, par[6]) - max(u, 0.0)
-    astern = edge(w - u, par[6]) - max(-u, 0.0)
+    ahead = edge(u + w, par[6], par[7]) - max(u, 0.0)
+    astern = edge(w - u, par[6], par[7]) - max(-u, 0.0)
     cap, rod, p_s, p_t = x[P_CAP, i], x[P_ROD, i], bench[P_S], bench[P_TANK]
     out[FLOW_CAP, i] += par[1] * ahead * _signed(p_s - cap) - par[2] * astern * _signed(cap - p_t)
     out[FLOW_ROD, i] += par[4] * astern * _signed(p_s - rod) - par[3] * ahead * _signed(rod - p_t)

@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 
 from analysis.effects.base import EDGES, LAG, NULL, Array, Effect, Shape
+from analysis.effects.edges import corner, edge, form_of, opened, rounding
 from analysis.signals import Signals
 from analysis.terms.base import (
     PREPARE,
@@ -74,8 +75,8 @@ class ValveEffect(Effect):
 class ValveDeadband(ValveEffect):
     """Overlapped edges: no opening for -w_astern < u < w_ahead, u less the edge beyond.
 
-    An edge at x is open by (x + sqrt(x^2 + r^2)) / 2: radial clearance and rounded corners let
-    oil pass before it and beside it (r the rounding, 0 for a sharp edge).
+    An edge at x is open by (x + (|x|^n + r^n)^(1/n)) / 2, n = 2 + c: r the rounding, 0 for a sharp
+    edge, c its corner, 0 where only clearance rounds it (see `edges`).
     Source: Merritt 1967, chapter 5 (overlap, "dead band"); Jelali and Kroll 2003.
     Hides in the flow gains: 10 mV make those of the seed bench 12 to 17 % too small (NOTES).
     """
@@ -94,22 +95,28 @@ class ValveDeadband(ValveEffect):
         return _deadband
 
     def shape_names(self) -> tuple[str, ...]:
-        """Name the two edges and their rounding."""
+        """Name the two edges, their rounding and their corner."""
         joint = self.joint + 1
-        return f"w_ahead_{joint}", f"w_astern_{joint}", f"rounding_{joint}"
+        return f"w_ahead_{joint}", f"w_astern_{joint}", f"rounding_{joint}", f"corner_{joint}"
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return the edges [V], each up to four tenths of the spool's stroke, and rounding [V]."""
+        """Return the edges [V], each up to four tenths of the spool's stroke, and their form."""
         stroke = rig.joints[self.joint].valve.spool_stroke
         grid = (0.003 * stroke, 0.01 * stroke, 0.05 * stroke, 0.2 * stroke)
-        edges = [Shape(n, "V", 0.0, 0.4 * stroke, grid, 0.0) for n in self.shape_names()[:2]]
-        return (*edges, rounding(self.joint, stroke))
+        *edges, r, c = self.shape_names()
+        laps = [Shape(name, "V", 0.0, 0.4 * stroke, grid, 0.0) for name in edges]
+        return (*laps, rounding(r, stroke), corner(c))
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Take the dead band out of the spool's signal."""
-        ahead, astern, r = self.shape_of(rig, shape)
-        u = signals.u[:, self.joint]
-        return self.with_opening(signals, opened(u - ahead, r) - opened(-u - astern, r))
+        ahead, astern, *form = self.shape_of(rig, shape)
+        u, (r, c) = signals.u[:, self.joint], form_of(form)
+        return self.with_opening(signals, opened(u - ahead, r, c) - opened(-u - astern, r, c))
+
+    def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
+        """Return joint, edges, rounding, corner."""
+        ahead, astern, *form = self.shape_of(rig, shape)
+        return np.array([self.joint, ahead, astern, *form_of(form)], dtype=np.float64)
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Refuse a shape at its bounds, and one edge without the other."""
@@ -220,27 +227,6 @@ class SpoolLag(ValveEffect):
         return {equation(kind, self.joint): rate for kind in ("flow_cap", "flow_rod")}
 
 
-def rounding(joint: int, stroke: float) -> Shape:
-    """Return the shape of an edge's rounding [V] of a joint (0-based), from sharp to 3 % of stroke.
-
-    Clearances of some micrometres on a stroke of some tenths of a millimetre.
-    """
-    return Shape(
-        f"rounding_{joint + 1}", "V", 0.0, 0.03 * stroke, (0.002 * stroke,), resolution=True
-    )
-
-
-def opened(x: Array, r: float) -> Array:
-    """Return how far an edge at x (n,) [V] is open with rounding r [V]."""
-    return np.asarray(0.5 * (x + np.sqrt(x * x + r * r)))
-
-
-@njit(cache=True)
-def edge(x, r):  # type: ignore[no-untyped-def]
-    """Return `opened` of one number."""
-    return 0.5 * (x + math.sqrt(x * x + r * r))
-
-
 def lagged(u: Array, tau: float) -> Array:
     """Return the response (n,) of a first-order lag of `tau` samples, at rest before the first."""
     return u if tau < 1e-3 else np.asarray(_lagged(u, tau))
@@ -263,7 +249,8 @@ def _lagged(u, tau):  # type: ignore[no-untyped-def]
 def _deadband(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
     if phase == PREPARE:
         i = int(par[0])
-        x[U, i] = edge(x[U, i] - par[1], par[3]) - edge(-x[U, i] - par[2], par[3])
+        ahead = edge(x[U, i] - par[1], par[3], par[4])
+        x[U, i] = ahead - edge(-x[U, i] - par[2], par[3], par[4])
 
 
 @kernel

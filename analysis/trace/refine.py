@@ -20,7 +20,7 @@ from analysis.rows import Rows
 from analysis.terms.base import Used
 from analysis.trace.board import Board
 from analysis.trace.evidence import Scene, held, scene_rows
-from analysis.trace.select import CHANCE
+from analysis.trace.select import CHANCE, orthonormal
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
@@ -107,15 +107,35 @@ def fit(stage: Board, terms: Sequence[Used]) -> Fit:
 def refine(stage: Board, terms: Sequence[Used], steps: int = MOST_STEPS) -> Fit:
     """Search the shape parameters that the board's own terms do not have, from where they are.
 
-    Then details of forms join that take more away than chance, and a share of what is left.
+    Then details of forms join, one after another, that take more away than chance, and a share of
+    what is left.
     """
-    plain = _searched(stage, terms, steps)
-    opened = tuple(u if u in stage.terms else _in_detail(stage.rig, u) for u in plain.terms)
-    excess = plain.energy - len(plain.left)
-    if opened == plain.terms or excess < CHANCE:
-        return plain
-    found = _searched(stage, opened, steps)
-    return found if plain.energy - found.energy > max(CHANCE, DETAIL * excess) else plain
+    found = _searched(stage, terms, steps)
+    for k in range(len(terms)):
+        used = found.terms[k]
+        opened = used if used in stage.terms else _in_detail(stage.rig, used)
+        asked = max(CHANCE, DETAIL * (found.energy - len(found.left)))
+        # Half, since in a straight line a detail promises less than it takes.
+        if opened == used or _promise(stage, found, used, opened) < 0.5 * asked:
+            continue
+        more = _searched(stage, _with(found.terms, used, opened), steps)
+        found = more if found.energy - more.energy > asked else found
+    return found
+
+
+def _promise(stage: Board, found: Fit, used: Used, opened: Used) -> float:
+    """Return the energy that a term with its details would take, were all linear in them."""
+    column = table(stage, _with(found.terms, used, opened)).left(found.beta) - found.left
+    absorbed = np.hstack((table(stage, found.terms).matrix, jacobian(stage, found, used)[1]))
+    basis = orthonormal(absorbed)
+    column = column - basis @ (basis.T @ column)
+    size = float(column @ column)
+    return float(column @ found.left) ** 2 / size if size > 0 else 0.0
+
+
+def _with(terms: Sequence[Used], used: Used, other: Used) -> tuple[Used, ...]:
+    """Return the terms with another in the place of one."""
+    return tuple(other if u is used else u for u in terms)
 
 
 def _in_detail(rig: Rig, used: Used) -> Used:
@@ -215,8 +235,7 @@ def jacobian(stage: Board, model: Fit, used: Used) -> tuple[tuple[str, ...], Arr
         ends = []
         for value in (up, down):
             changed = Used(used.term, (*used.shape[:j], value, *used.shape[j + 1 :]))
-            terms = tuple(changed if u is used else u for u in model.terms)
-            ends.append(table(stage, terms).left(model.beta))
+            ends.append(table(stage, _with(model.terms, used, changed)).left(model.beta))
         names.append(shape.parameter)
         columns.append(-(ends[0] - ends[1]) / (up - down))
     stack = np.column_stack(columns) if columns else np.zeros((len(model.left), 0))

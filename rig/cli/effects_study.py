@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from analysis import plots
-from analysis.effects.base import Effect, ordered
+from analysis.effects.base import Effect, Shape, ordered, shapes_of
 from analysis.rows import Filtering, Rows, default_filtering, record_rows
 from analysis.signals import Signals, condition
 from analysis.terms import baseline, make
@@ -31,6 +31,7 @@ Array = NDArray[np.float64]
 PROTOCOL: Final = "lock-and-excite-multisine"
 BINS: Final = 40
 SEARCH: Final = 50  # looks at a shape after the grid
+ENDS: Final = ("low", "high")
 
 # place (the analysis's), what the scenario says beside the name, the sizes to be found
 Example = tuple[str, str, str, Mapping[str, float]]
@@ -138,26 +139,41 @@ def _left(rows: Rows, values: Mapping[str, float]) -> Array:
 def fitted(bench: Bench, effect: Effect, floor: Mapping[str, float]) -> Fit:
     """Return the baseline with the effect, its shapes searched (variable projection)."""
     base = tuple(Used(term) for term in baseline())
-    shapes = effect.shapes(bench.rig)
-    low, high = (np.array([getattr(s, end) for s in shapes]) for end in ("low", "high"))
 
     def solved(shape: Sequence[float]) -> Fit:
-        inside = np.clip(shape, low, high) if len(shapes) else ()
-        return bench.solved(ordered((*base, Used(effect, tuple(map(float, inside))))))
+        return bench.solved(ordered((*base, Used(effect, tuple(shape)))))
 
-    def cost(fit: Fit) -> float:
+    def cost(shape: Sequence[float]) -> float:
+        fit = solved(shape)
         return sum((fit.rms[name] / floor[name]) ** 2 for name in floor)
 
-    start = min(itertools.product(*(s.grid for s in shapes)), key=lambda v: cost(solved(v)))
+    return solved(searched(effect.shapes(bench.rig), cost, SEARCH))
+
+
+def searched(
+    shapes: Sequence[Shape], cost: Callable[[Sequence[float]], float], most: int
+) -> tuple[float, ...]:
+    """Return the shape of least cost, from the grid on by at most `most` looks; details last."""
+
+    def nearby(start: Sequence[float]) -> tuple[float, ...]:
+        low, high = (np.array([getattr(s, end) for s in shapes[: len(start)]]) for end in ENDS)
+        size = np.where(np.array(start) != 0, 0.3 * np.abs(start), 0.02 * (high - low))
+        simplex = np.vstack((np.zeros(len(start)), np.eye(len(start))))
+
+        def at(a: Array) -> tuple[float, ...]:
+            return tuple(map(float, np.clip(start + size * a, low, high)))
+
+        found = minimize(
+            lambda a: cost(at(a)), simplex[0], method="Nelder-Mead",
+            options={"initial_simplex": simplex, "maxfev": most, "xatol": 0.01},
+        )  # fmt: skip
+        return at(found.x)
+
     if not shapes:
-        return solved(())
-    size = np.where(np.array(start) != 0, 0.3 * np.abs(start), 0.02 * (high - low))
-    simplex = np.vstack((np.zeros(len(shapes)), np.eye(len(shapes))))
-    found = minimize(
-        lambda a: cost(solved(start + size * a)), simplex[0], method="Nelder-Mead",
-        options={"initial_simplex": simplex, "maxfev": SEARCH, "xatol": 0.01},
-    )  # fmt: skip
-    return solved(start + size * found.x)
+        return ()
+    details = tuple(s.middle for s in shapes if s.detail)
+    best = nearby(min(itertools.product(*(s.grid for s in shapes if not s.detail)), key=cost))
+    return min(best, nearby((*best, *details)), key=cost) if details else best
 
 
 @dataclass(frozen=True)
@@ -197,8 +213,9 @@ def _outcome(
 ) -> Outcome:  # fmt: skip
     plain, fit = train.solved(base), fitted(train, effect, floor)
     before, after = held_out.rms(base, plain.values), held_out.rms(fit.terms, fit.values)
-    shape = next(u.shape for u in fit.terms if u.term == effect)
-    found = {**fit.values, **dict(zip(effect.shape_names(), shape, strict=True))}
+    used = next(u for u in fit.terms if u.term == effect)
+    shapes = [s.parameter for s in shapes_of(train.rig, used)]
+    found = {**fit.values, **dict(zip(shapes, used.shape, strict=True))}
     worst = max(
         (name for name in judged if name in effect.abscissa(train.rig, train.records[0][0])),
         key=lambda name: before[name] / judged[name],

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize
 
 from analysis.effects.base import Effect, ordered
 from analysis.model import Estimate, Model
@@ -15,6 +13,7 @@ from analysis.rows import Filtering, Rows, default_filtering, record_rows
 from analysis.signals import Signals, condition
 from analysis.terms import baseline
 from analysis.terms.base import FAMILIES, Used, family_of
+from rig.cli.effects_study import searched
 from rig.model.records import Run
 from rig.model.rig import Rig
 
@@ -29,7 +28,9 @@ class Fit:
 
     def of(self, effect: Effect) -> dict[str, float]:
         """Return all parameters, shapes beside coefficients."""
-        return self.values | dict(zip(effect.shape_names(), self.shape, strict=True))
+        return self.values | dict(
+            zip(effect.shape_names()[: len(self.shape)], self.shape, strict=True)
+        )
 
 
 class Data:
@@ -75,23 +76,13 @@ def fitted(data: Data, effect: Effect, floor: dict[str, float], tries: int = 60)
     """Search the effect's shape from its grid and solve; residuals are weighed by `floor`."""
 
     def solved(shape: Sequence[float]) -> Fit:
-        return data.solved([Used(effect, tuple(map(float, shape)))])
+        return data.solved([Used(effect, tuple(shape))])
 
-    def cost(fit: Fit) -> float:
+    def cost(shape: Sequence[float]) -> float:
+        fit = solved(shape)
         return sum((fit.rms[name] / floor[name]) ** 2 for name in floor)
 
-    shapes = effect.shapes(data.rig)
-    start = min(itertools.product(*(s.grid for s in shapes)), key=lambda v: cost(solved(v)))
-    if not shapes:
-        return solved(())
-    low, high = (np.array([getattr(s, end) for s in shapes]) for end in ("low", "high"))
-    size = np.where(np.array(start) != 0, 0.3 * np.abs(start), 0.02 * (high - low))
-    simplex = np.vstack((np.zeros(len(shapes)), np.eye(len(shapes))))
-    found = minimize(
-        lambda a: cost(solved(np.clip(start + size * a, low, high))), simplex[0],
-        method="Nelder-Mead", options={"initial_simplex": simplex, "maxfev": tries, "xatol": 0.01},
-    )  # fmt: skip
-    return solved(np.clip(start + size * found.x, low, high))
+    return solved(searched(effect.shapes(data.rig), cost, tries))
 
 
 def model_of(rig: Rig, effect: Effect, values: dict[str, float], shape: Sequence[float]) -> Model:

@@ -33,7 +33,7 @@ CONTRACT = {
 }  # fmt: skip
 
 
-DETAILS = ("rounding", "V_supply", "stiffening")  # of an edge, a line, a seal: forms, not sizes
+DETAILS = ("rounding", "corner", "V_supply", "stiffening")  # forms of edge, line, seal, no sizes
 
 
 def effects(rig: Rig) -> list[Effect]:
