@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.signals import Signals
-from analysis.terms.base import Kernel, Term, Used, kernel
+from analysis.terms.base import FAMILIES, Kernel, Term, Used, kernel
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 
@@ -58,7 +58,8 @@ class Effect(Term):
     effects whose columns look alike on poor excitation, `separated_by` the excitation that tells
     them apart; `includes` names effects that it becomes at a limit of its own numbers. `stage`
     orders the terms' `prepare` (see `ordered`): what a sensor distorts is undone first, then comes
-    what acts on the spool, in the oil's own order.
+    what acts on the spool, in the oil's own order. `alters` names the families of rows that
+    `prepare` changes: rows of others need not be built again for another shape.
     """
 
     family: ClassVar[str] = ""
@@ -67,6 +68,7 @@ class Effect(Term):
     separated_by: ClassVar[str] = ""
     includes: ClassVar[tuple[str, ...]] = ()
     stage: ClassVar[int] = PLANT
+    alters: ClassVar[tuple[str, ...]] = tuple(FAMILIES)
 
     @property
     def place(self) -> str:

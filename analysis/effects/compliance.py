@@ -102,6 +102,7 @@ class DeadVolume(Effect):
     name: ClassVar[str] = "dead_volume"
     prepares: ClassVar[bool] = True
     family: ClassVar[str] = "fluid"
+    alters: ClassVar[tuple[str, ...]] = ("fluid",)
     variable: ClassVar[str] = "the chamber's pressure rate"
     confounders: ClassVar[tuple[str, ...]] = ("entrained_air", "spool_lag", "channel_delay")
     separated_by: ClassVar[str] = (

@@ -48,6 +48,7 @@ class BaseInclination(Effect):
     name: ClassVar[str] = "base_inclination"
     prepares: ClassVar[bool] = True
     family: ClassVar[str] = "mechanics"
+    alters: ClassVar[tuple[str, ...]] = ("mechanical",)
     variable: ClassVar[str] = "the cosine of the absolute angles"
     confounders: ClassVar[tuple[str, ...]] = ("torque_offset", "joint_spring", "sensor_offset")
     separated_by: ClassVar[str] = (

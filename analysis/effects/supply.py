@@ -40,6 +40,7 @@ LONGEST: Final = 5.0  # [s] of the pump's flow: the most oil between supply sens
 @dataclass(frozen=True)
 class _PortEffect(Effect):
     family: ClassVar[str] = "fluid"
+    alters: ClassVar[tuple[str, ...]] = ("fluid",)
     prepares: ClassVar[bool] = True
     stage: ClassVar[int] = SUPPLY
 

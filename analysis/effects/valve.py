@@ -34,6 +34,7 @@ class ValveEffect(Effect):
     """What the valve's effects share: one hydraulic joint, no linear unknown, spool as abscissa."""
 
     family: ClassVar[str] = "valve"
+    alters: ClassVar[tuple[str, ...]] = ("fluid",)
     prepares: ClassVar[bool] = True
     per_joint: ClassVar[bool] = True
     where: str = "joint 1"

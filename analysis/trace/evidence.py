@@ -10,7 +10,7 @@ which to first order in the change is what the effect puts into the residual.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -92,9 +92,19 @@ def changes_signals(term: Term) -> bool:
     return kind.prepare is not Term.prepare or kind.valid is not Term.valid
 
 
-def scene_rows(rig: Rig, terms: Sequence[Used], scene: Scene) -> dict[str, Rows]:
+def acts_on(rig: Rig, term: Term, family: str) -> bool:
+    """Tell whether a family's rows need a term: it has columns there, or alters their signals."""
+    if any(c.family == family for c in term.coefficients(rig)):
+        return True
+    return changes_signals(term) and family in getattr(term, "alters", FAMILIES)
+
+
+def scene_rows(
+    rig: Rig, terms: Sequence[Used], scene: Scene, families: Collection[str] = tuple(FAMILIES)
+) -> dict[str, Rows]:
     """Return the rows of one record under a model (see `analysis.rows.record_rows`)."""
-    return record_rows(rig, ordered(terms), scene.signals, scene.filtering, scene.families)
+    asked = [family for family in scene.families if family in families]
+    return record_rows(rig, ordered(terms), scene.signals, scene.filtering, asked)
 
 
 def prepared(rig: Rig, terms: Sequence[Used], scene: Scene) -> Signals:

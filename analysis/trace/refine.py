@@ -19,7 +19,7 @@ from analysis.effects.base import Effect, Shape, shapes_of
 from analysis.rows import Rows
 from analysis.terms.base import Used
 from analysis.trace.board import Board
-from analysis.trace.evidence import Scene, held, scene_rows
+from analysis.trace.evidence import Scene, acts_on, held, scene_rows
 from analysis.trace.select import CHANCE, orthonormal
 from rig.model.rig import Rig
 
@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 TOLERANCE = 1e-4
 MOST_STEPS = 10
 DETAIL = 0.05  # of what is left above noise: less does not earn a detail of the form
-REMEMBERED = 150  # rows of scenes under a model, about 0.2 MB each
+REMEMBERED = 300  # families of rows of scenes under a model, about 0.1 MB each
 
 
 @dataclass(frozen=True)
@@ -84,14 +84,18 @@ def table(stage: Board, terms: Sequence[Used]) -> Table:
 
 
 def _rows(stage: Board, terms: Sequence[Used], scene: Scene) -> dict[str, Rows]:
-    """Return a scene's rows, remembered: many sets share what acts on a scene."""
-    acting = tuple(u for u in terms if not held(u.term, scene))
-    key = (scene.group, acting)
-    if key not in stage.memo:
-        if len(stage.memo) >= REMEMBERED:
-            stage.memo.clear()
-        stage.memo[key] = scene_rows(stage.rig, acting, scene)
-    return stage.memo[key]
+    """Return a scene's rows, remembered: many sets share what acts on a family of its rows."""
+    here = [u for u in terms if not held(u.term, scene)]
+    found: dict[str, Rows] = {}
+    for family in scene.families:
+        acting = tuple(u for u in here if acts_on(stage.rig, u.term, family))
+        key = (scene.group, family, acting)
+        if key not in stage.memo:
+            if len(stage.memo) >= REMEMBERED:
+                stage.memo.clear()
+            stage.memo[key] = scene_rows(stage.rig, acting, scene, (family,))
+        found |= stage.memo[key]
+    return found
 
 
 def fit(stage: Board, terms: Sequence[Used]) -> Fit:

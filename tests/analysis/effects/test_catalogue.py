@@ -14,9 +14,10 @@ from analysis.effects.measurement import Sensor
 from analysis.effects.payload import growth, payload_of_shift
 from analysis.effects_catalogue import FAMILIES, pages
 from analysis.identify import identify
+from analysis.rows import right_sides
 from analysis.signals import Signals
 from analysis.terms import base, baseline, known, make
-from analysis.terms.base import Used
+from analysis.terms.base import Used, family_of
 from rig.model.parameters import gain_names
 from rig.model.parse import InputError
 from rig.model.records import Run
@@ -93,6 +94,30 @@ def state(rig: Rig) -> Signals:
     qd = 0.2 * 2 * np.pi * 3 * np.cos(2 * np.pi * 3 * t[:, None] + phase[:1])
     qdd = -((2 * np.pi * 3) ** 2) * (q - middle)
     return replace(signals_of(rig, q, qd, qdd, rng), t=t)
+
+
+def test_preparing_alters_the_rows_of_no_family_but_those_that_an_effect_names(
+    rig: Rig, state: Signals
+) -> None:
+    terms = baseline()
+
+    def seen(signals: Signals) -> dict[str, list[np.ndarray]]:
+        found = {name: [side] for name, side in right_sides(rig, signals).items()}
+        for term in terms:
+            for name, columns in term.columns(rig, signals, ()).items():
+                found[name] += columns.values()
+        return found
+
+    before = seen(state)
+    for e in effects(rig):
+        shape = tuple(s.grid[-1] for s in e.shapes(rig))
+        after = seen(e.prepare(rig, state, shape))
+        changed = {
+            family_of(name)
+            for name, columns in before.items()
+            if not all(map(np.array_equal, columns, after[name]))
+        }
+        assert changed <= set(e.alters), e.name
 
 
 def packed(e: Effect, rig: Rig, shape: tuple[float, ...]) -> tuple[dict[str, float], np.ndarray]:
