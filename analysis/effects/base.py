@@ -127,6 +127,11 @@ class Effect(Term):
             return tuple(shape)
         return tuple(s.middle for s in self.shapes(rig) if not s.detail)
 
+    def whole(self, rig: Rig, shape: Sequence[float]) -> tuple[float, ...]:
+        """Return `shape_of` with 0 for each parameter that the shape does without."""
+        given = self.shape_of(rig, shape)
+        return (*given, *(0.0 for _ in self.shape_names()[len(given) :]))
+
     def outside(self, rig: Rig, shape: Sequence[float]) -> str:
         """Say which shape parameter lies on or beyond its physical bounds ('' if none)."""
         for s, value in zip(self.shapes(rig)[: len(shape)], shape, strict=True):
@@ -151,6 +156,11 @@ def beyond(parameter: str, value: float, unit: str, high: float, low: float = 0.
 def shapes_of(rig: Rig, used: Used) -> tuple[Shape, ...]:
     """Return the shape parameters that a used term has, none for a term that is no effect."""
     return used.term.shapes(rig)[: len(used.shape)] if isinstance(used.term, Effect) else ()
+
+
+def shape_values(rig: Rig, used: Used) -> dict[str, float]:
+    """Return the values of a used term's shape parameters, by name."""
+    return {s.parameter: v for s, v in zip(shapes_of(rig, used), used.shape, strict=True)}
 
 
 def ordered(terms: Sequence[Used]) -> tuple[Used, ...]:

@@ -11,7 +11,6 @@ edge itself it is open by r / 2 with any c.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -34,12 +33,6 @@ def rounding(name: str, stroke: float) -> Shape:
 def corner(name: str) -> Shape:
     """Return the shape of an edge's corner, a detail of its form: 0 where not given."""
     return Shape(name, "", *CORNER_BOUNDS, (CORNER,), resolution=True, detail=True)
-
-
-def form_of(shape: Sequence[float]) -> tuple[float, float]:
-    """Return rounding [V] and corner from where these two stand in a shape."""
-    r, c, *_ = (*shape, 0.0)
-    return r, c
 
 
 def opened(x: Array, r: float, c: float) -> Array:

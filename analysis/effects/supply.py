@@ -166,24 +166,20 @@ class TankPressure(_PortEffect):
             Shape("p_back", "Pa", 0.0, 0.5 * p, (0.0, 0.05 * p), 0.0),
         )
 
-    def shape_of(self, rig: Rig, shape: Sequence[float]) -> tuple[float, ...]:
-        """Return both; a constant pressure alone where only one is given."""
-        return super().shape_of(rig, shape) if len(shape) != 1 else (shape[0], 0.0)
-
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Raise the tank pressure."""
-        constant, back = self.shape_of(rig, shape)
+        constant, back = self.whole(rig, shape)
         ratio = port_flow(rig, signals, drawn=False) / rig.supply.flow if back else 0.0
         return replace(signals, p_tank=signals.p_tank + constant + back * ratio**2)
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
         """Return p_t, p_back / Q_pump^2, then C_mp and C_pm of each joint."""
-        constant, back = self.shape_of(rig, shape)
+        constant, back = self.whole(rig, shape)
         return np.array([constant, back / rig.supply.flow**2, *_gains(rig, values, (2, 1))])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Refuse pressures at their bounds, but for one of the two that is not there."""
-        constant, back = self.shape_of(rig, shape)
+        constant, back = self.whole(rig, shape)
         if max(constant, back) <= 1e-3 * rig.supply.pressure:
             return f"p_tank = {constant:.4g} Pa is nothing"
         inner = tuple(s.grid[-1] for s in self.shapes(rig))

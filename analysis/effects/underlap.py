@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 
 from analysis.effects.base import Array, Shape
-from analysis.effects.edges import corner, edge, form_of, opened, rounding
+from analysis.effects.edges import corner, edge, opened, rounding
 from analysis.effects.valve import ValveEffect
 from analysis.signals import Signals
 from analysis.terms.base import (
@@ -85,8 +85,7 @@ class UnderlapLeakage(ValveEffect):
         """Return the additional openings times the roots, under the orifices' own names."""
         i = self.joint
         pp, pm, mp, mm = gain_names(i + 1)
-        w, *form = self.shape_of(rig, shape)
-        u, (r, c) = signals.u[:, i], form_of(form)
+        u, (w, r, c) = signals.u[:, i], self.whole(rig, shape)
         ahead = opened(u + w, r, c) - np.maximum(u, 0.0)
         astern = opened(w - u, r, c) - np.maximum(-u, 0.0)
         cap, rod, p_s, p_t = signals.p_cap[:, i], signals.p_rod[:, i], signals.p_s, signals.p_tank
@@ -98,8 +97,7 @@ class UnderlapLeakage(ValveEffect):
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
         """Return joint, gains, underlap, rounding, corner."""
         gains = [values[name] for name in gain_names(self.joint + 1)]
-        w, *form = self.shape_of(rig, shape)
-        return np.array([self.joint, *gains, w, *form_of(form)])
+        return np.array([self.joint, *gains, *self.whole(rig, shape)])
 
 
 def _root(drop: Array) -> Array:

@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 
 from analysis.effects.base import EDGES, LAG, NULL, Array, Effect, Shape
-from analysis.effects.edges import corner, edge, form_of, opened, rounding
+from analysis.effects.edges import corner, edge, opened, rounding
 from analysis.signals import Signals
 from analysis.terms.base import (
     PREPARE,
@@ -60,7 +60,7 @@ class ValveEffect(Effect):
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
         """Return joint, shape."""
-        return np.array([self.joint, *self.shape_of(rig, shape)], dtype=np.float64)
+        return np.array([self.joint, *self.whole(rig, shape)], dtype=np.float64)
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Refuse a shape at its bounds."""
@@ -110,14 +110,9 @@ class ValveDeadband(ValveEffect):
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Take the dead band out of the spool's signal."""
-        ahead, astern, *form = self.shape_of(rig, shape)
-        u, (r, c) = signals.u[:, self.joint], form_of(form)
+        ahead, astern, r, c = self.whole(rig, shape)
+        u = signals.u[:, self.joint]
         return self.with_opening(signals, opened(u - ahead, r, c) - opened(-u - astern, r, c))
-
-    def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
-        """Return joint, edges, rounding, corner."""
-        ahead, astern, *form = self.shape_of(rig, shape)
-        return np.array([self.joint, ahead, astern, *form_of(form)], dtype=np.float64)
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Refuse a shape at its bounds, and one edge without the other."""

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.effects.base import Effect, Shape, shapes_of
+from analysis.effects.base import Effect, Shape, shape_values, shapes_of
 from analysis.estimators.output_error import Search
 from analysis.estimators.windows import Windows
 from analysis.model import Estimate, Model
@@ -147,7 +147,7 @@ def _theta(windows: Windows, model: Model) -> Array:
     """Return the windows' parameters (k,) as the model has them, 1/b for b."""
     values = dict(model.values)
     for used in model.terms:
-        values |= zip(used.term.shape_names(), used.shape, strict=False)
+        values |= shape_values(model.rig, used)
     return np.array(
         [1.0 / values[n] if n in windows.reciprocal else values[n] for n in windows.names]
     )

@@ -95,13 +95,13 @@ def trace(
         winner, verdict = listed.empty, CLEAN
     else:
         winner = listed.run()
-        found, winner, verdict = _named(listed, winner, judge, rng)
+        found, winner, verdict, rest = _named(listed, winner, judge, rng)
         refused = tuple(f for f in found if not gates.stands(f))
         found = tuple(f for f in found if gates.stands(f))
         if quiet and verdict == UNEXPLAINED:
             notes.append(ELSEWHERE)
         if verdict == UNEXPLAINED and (found or quiet):
-            notes += [f"{e}: {words}" for e, words in left_over(listed, winner, judge)]
+            notes += [f"{e}: {words}" for e, words in rest]
     split = lines(stage, winner.fit.left)
     moves: tuple[Dependence, ...] = ()
     formulas: tuple[Formula, ...] = ()
@@ -195,8 +195,12 @@ def _notes(stage: Board, judge: Board) -> list[str]:
 
 def _named(
     listed: Shortlist, winner: Listed, judge: Board, rng: np.random.Generator
-) -> tuple[tuple[Found, ...], Listed, str]:
-    """Put the winner through the gates; returns what stands, the set that stands, the verdict."""
+) -> tuple[tuple[Found, ...], Listed, str, list[tuple[str, str]]]:
+    """Put the winner through the gates.
+
+    Returns what was judged, the set that stands, the verdict, and the equations that keep more than
+    is nothing, each with what it keeps.
+    """
     found: tuple[Found, ...] = ()
     refused: tuple[Found, ...] = ()
     # What stands beside others may fall without them: judged again until all that is left stands.
@@ -208,7 +212,7 @@ def _named(
         refused += fallen
         smaller = [u for u, f in zip(winner.effects, found, strict=True) if gates.stands(f)]
         if not smaller:
-            return refused, listed.empty, UNEXPLAINED
+            return refused, listed.empty, UNEXPLAINED, left_over(listed, listed.empty, judge)
         winner = listed.exact(smaller)
     rest = left_over(listed, winner, judge)
     while rest:
@@ -216,10 +220,10 @@ def _named(
         wider = gates.judge(listed, more, judge, rng) if more else ()
         later = left_over(listed, more, judge) if more else rest
         if more is None or len(later) >= len(rest) or not all(map(gates.stands, wider)):
-            return (*found, *refused), winner, UNEXPLAINED
+            return (*found, *refused), winner, UNEXPLAINED, rest
         found, winner, rest = wider, more, later
     tied = any(r.tied for f in found for r in f.rivals)
-    return found, winner, CONFOUNDED if tied else EXPLAINED
+    return found, winner, CONFOUNDED if tied else EXPLAINED, rest
 
 
 def _fraction(listed: Shortlist, winner: Listed) -> float:

@@ -10,7 +10,7 @@ which to first order in the change is what the effect puts into the residual.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -99,12 +99,9 @@ def acts_on(rig: Rig, term: Term, family: str) -> bool:
     return changes_signals(term) and family in getattr(term, "alters", FAMILIES)
 
 
-def scene_rows(
-    rig: Rig, terms: Sequence[Used], scene: Scene, families: Collection[str] = tuple(FAMILIES)
-) -> dict[str, Rows]:
+def scene_rows(rig: Rig, terms: Sequence[Used], scene: Scene) -> dict[str, Rows]:
     """Return the rows of one record under a model (see `analysis.rows.record_rows`)."""
-    asked = [family for family in scene.families if family in families]
-    return record_rows(rig, ordered(terms), scene.signals, scene.filtering, asked)
+    return record_rows(rig, ordered(terms), scene.signals, scene.filtering, scene.families)
 
 
 def prepared(rig: Rig, terms: Sequence[Used], scene: Scene) -> Signals:

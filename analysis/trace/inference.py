@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.effects.base import Effect, shapes_of
+from analysis.effects.base import Effect, shape_values, shapes_of
 from analysis.terms.base import Used
 from analysis.trace import select
 from analysis.trace.board import Board
@@ -224,8 +224,8 @@ def spread(stage: Board, model: Fit, used: Used, values: Mapping[str, float]) ->
         each = sum(pinv[:, s.where] @ stage.left[:R, s.where].T / np.sqrt(R) for s in parts)
         variance += R * np.var(each, axis=1, ddof=1)
         dof += R - 1
-    shapes = {s.parameter: v for s, v in zip(shapes_of(stage.rig, used), used.shape, strict=True)}
-    value = np.array([values.get(n, shapes.get(n, np.nan)) for n in names])
+    known = {**shape_values(stage.rig, used), **values}
+    value = np.array([known.get(n, np.nan) for n in names])
     return Spread(names, value, np.sqrt(variance), float(max(dof, 1)))
 
 

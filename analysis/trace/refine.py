@@ -93,7 +93,7 @@ def _rows(stage: Board, terms: Sequence[Used], scene: Scene) -> dict[str, Rows]:
         if key not in stage.memo:
             if len(stage.memo) >= REMEMBERED:
                 stage.memo.clear()
-            stage.memo[key] = scene_rows(stage.rig, acting, scene, (family,))
+            stage.memo[key] = scene_rows(stage.rig, acting, replace(scene, families=(family,)))
         found |= stage.memo[key]
     return found
 

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.effects.base import Effect, shapes_of
+from analysis.effects.base import Effect, shape_values
 from analysis.identify import identify
 from analysis.terms import baseline_of, make
 from analysis.terms.base import Used
@@ -145,8 +145,7 @@ def _own(rig: Rig, one: Listed) -> str:
     found: list[tuple[str, float]] = []
     for used in one.effects:
         found += [(c.parameter, one.fit.beta[c.parameter]) for c in used.term.coefficients(rig)]
-        names = [s.parameter for s in shapes_of(rig, used)]
-        found += zip(names, used.shape, strict=True)
+        found += shape_values(rig, used).items()
     return ", ".join(f"{name} {value:.3g}" for name, value in found)
 
 

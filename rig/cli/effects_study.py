@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from analysis import plots
-from analysis.effects.base import Effect, Shape, ordered, shapes_of
+from analysis.effects.base import Effect, Shape, ordered, shape_values
 from analysis.rows import Filtering, Rows, default_filtering, record_rows
 from analysis.signals import Signals, condition
 from analysis.terms import baseline, make
@@ -31,7 +31,6 @@ Array = NDArray[np.float64]
 PROTOCOL: Final = "lock-and-excite-multisine"
 BINS: Final = 40
 SEARCH: Final = 50  # looks at a shape after the grid
-ENDS: Final = ("low", "high")
 
 # place (the analysis's), what the scenario says beside the name, the sizes to be found
 Example = tuple[str, str, str, Mapping[str, float]]
@@ -156,7 +155,7 @@ def searched(
     """Return the shape of least cost, from the grid on by at most `most` looks; details last."""
 
     def nearby(start: Sequence[float]) -> tuple[float, ...]:
-        low, high = (np.array([getattr(s, end) for s in shapes[: len(start)]]) for end in ENDS)
+        low, high = np.array([(s.low, s.high) for s in shapes[: len(start)]]).T
         size = np.where(np.array(start) != 0, 0.3 * np.abs(start), 0.02 * (high - low))
         simplex = np.vstack((np.zeros(len(start)), np.eye(len(start))))
 
@@ -214,8 +213,7 @@ def _outcome(
     plain, fit = train.solved(base), fitted(train, effect, floor)
     before, after = held_out.rms(base, plain.values), held_out.rms(fit.terms, fit.values)
     used = next(u for u in fit.terms if u.term == effect)
-    shapes = [s.parameter for s in shapes_of(train.rig, used)]
-    found = {**fit.values, **dict(zip(shapes, used.shape, strict=True))}
+    found = {**fit.values, **shape_values(train.rig, used)}
     worst = max(
         (name for name in judged if name in effect.abscissa(train.rig, train.records[0][0])),
         key=lambda name: before[name] / judged[name],
