@@ -14,7 +14,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.signals import Signals
+from analysis.signals.conditioning import Signals
 from analysis.terms.base import FAMILIES, Kernel, Term, Used, kernel
 from rig.model.parse import InputError
 from rig.model.rig import Rig

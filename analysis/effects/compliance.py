@@ -9,7 +9,7 @@ from typing import ClassVar, Final
 import numpy as np
 
 from analysis.effects.base import Array, Effect, Shape, beyond
-from analysis.signals import Signals
+from analysis.signals.conditioning import Signals
 from analysis.terms.base import (
     COMP_CAP,
     COMP_ROD,

@@ -33,7 +33,7 @@ from analysis.effects.contact import (
     stiffening,
     worked,
 )
-from analysis.signals import Signals
+from analysis.signals.conditioning import Signals
 from analysis.terms.base import (
     CONTRIBUTE,
     SD,

@@ -21,7 +21,7 @@ from analysis.effects.contact import (
     presliding,
 )
 from analysis.effects.friction import Friction, force_limit, force_unit
-from analysis.signals import Signals
+from analysis.signals.conditioning import Signals
 from analysis.terms.base import (
     CONTRIBUTE,
     P_CAP,

@@ -13,7 +13,7 @@ from typing import ClassVar
 import numpy as np
 
 from analysis.effects.base import Array, Effect, beyond
-from analysis.signals import Signals
+from analysis.signals.conditioning import Signals
 from analysis.terms.base import (
     CONTRIBUTE,
     FLOW_CAP,

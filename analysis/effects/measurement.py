@@ -18,9 +18,9 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from analysis.differentiate import align
 from analysis.effects.base import NO_KERNEL, SENSOR, Array, Effect, Shape
-from analysis.signals import Signals
+from analysis.signals.conditioning import Signals
+from analysis.signals.filters import align
 from analysis.terms.base import Coefficient, Columns, Kernel, Used, equation
 from rig.model import channels as ch
 from rig.model.rig import Rig

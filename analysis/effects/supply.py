@@ -16,7 +16,7 @@ import numpy as np
 from numba import njit
 
 from analysis.effects.base import SUPPLY, Array, Effect, Shape
-from analysis.signals import Signals
+from analysis.signals.conditioning import Signals
 from analysis.terms.base import (
     P_CAP,
     P_ROD,

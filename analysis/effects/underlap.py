@@ -13,7 +13,7 @@ from numba import njit
 from analysis.effects.base import Array, Shape
 from analysis.effects.edges import corner, edge, opened, rounding
 from analysis.effects.valve import ValveEffect
-from analysis.signals import Signals
+from analysis.signals.conditioning import Signals
 from analysis.terms.base import (
     CONTRIBUTE,
     FLOW_CAP,

@@ -16,7 +16,7 @@ from numba import njit
 
 from analysis.effects.base import EDGES, LAG, NULL, Array, Effect, Shape
 from analysis.effects.edges import corner, edge, opened, rounding
-from analysis.signals import Signals
+from analysis.signals.conditioning import Signals
 from analysis.terms.base import (
     PREPARE,
     Coefficient,

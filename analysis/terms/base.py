@@ -34,7 +34,7 @@ import numpy as np
 from numba import cfunc, types
 from numpy.typing import NDArray
 
-from analysis.signals import Mask, Signals
+from analysis.signals.conditioning import Mask, Signals
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 

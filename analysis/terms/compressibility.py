@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
-from analysis.signals import Signals
+from analysis.signals.conditioning import Signals
 from analysis.terms.base import (
     COMP_CAP,
     COMP_ROD,

@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from analysis.signals import Signals
+from analysis.signals.conditioning import Signals
 from analysis.terms.base import (
     CONTRIBUTE,
     QD,

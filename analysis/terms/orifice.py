@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 from numba import njit
 
-from analysis.signals import Mask, Signals
+from analysis.signals.conditioning import Mask, Signals
 from analysis.terms.base import (
     CONTRIBUTE,
     FLOW_CAP,

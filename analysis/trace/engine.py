@@ -11,22 +11,22 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis import checks as ck
 from analysis.effects.base import Effect, ordered
-from analysis.identify import identify
-from analysis.model import Model
+from analysis.identify import checks as ck
+from analysis.identify.identify import identify
+from analysis.simulation.model import Model
 from analysis.terms import baseline_of
 from analysis.terms.base import FAMILIES, Used
-from analysis.trace import gates, held_out
-from analysis.trace.beside import beside, stripped
-from analysis.trace.board import Board, board
-from analysis.trace.candidates import catalogue, variants
-from analysis.trace.clue_formula import Formula
-from analysis.trace.evidence import Scene, scenes
-from analysis.trace.floor import STATED
-from analysis.trace.lines import lines
-from analysis.trace.listed import Listed, within
-from analysis.trace.next_experiment import propose
+from analysis.trace.clues.formula import Formula
+from analysis.trace.data.candidates import catalogue, variants
+from analysis.trace.data.conditioned_record import Scene, scenes
+from analysis.trace.data.noise_floor import STATED
+from analysis.trace.data.regression_data import Board, board
+from analysis.trace.data.spectral_lines import lines
+from analysis.trace.data.temperature_nuisance import beside, stripped
+from analysis.trace.judge import gates, held_out
+from analysis.trace.judge.shooting import reshaped, told
+from analysis.trace.next_experiment.proposal import propose
 from analysis.trace.remaining import clues_to, left_over
 from analysis.trace.result import (
     CLEAN,
@@ -37,8 +37,8 @@ from analysis.trace.result import (
     Found,
     Trace,
 )
-from analysis.trace.shooting import reshaped, told
-from analysis.trace.shortlist import Shortlist
+from analysis.trace.search.hypothesis import Listed, within
+from analysis.trace.search.hypothesis_set import Shortlist
 from analysis.trace.words import sentence
 from rig.model.parse import InputError
 from rig.model.records import Record, Run

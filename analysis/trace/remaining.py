@@ -9,15 +9,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from analysis.trace import clues, gates, held_out
-from analysis.trace.board import Board
-from analysis.trace.clue_formula import Formula, formula, surest
-from analysis.trace.clue_frequency import frequency_clue
-from analysis.trace.lines import Lines
-from analysis.trace.listed import Listed
-from analysis.trace.refine import rebased
+from analysis.trace.clues import dependence
+from analysis.trace.clues.formula import Formula, formula, surest
+from analysis.trace.clues.frequency import frequency_clue
+from analysis.trace.data.regression_data import Board
+from analysis.trace.data.spectral_lines import Lines
+from analysis.trace.judge import gates, held_out
 from analysis.trace.result import Dependence
-from analysis.trace.shortlist import Shortlist
+from analysis.trace.search.hypothesis import Listed
+from analysis.trace.search.hypothesis_set import Shortlist
+from analysis.trace.search.refinement import rebased
 
 LOUD = 0.1  # of all that is left: an equation with less asks for no clue
 # What the band lets pass is looked at again from here on: deviations of the noise's own energy,
@@ -71,7 +72,7 @@ def clues_to(
     loud = [e for e, v in sorted(winner.excess.items(), key=lambda kv: -kv[1]) if v > 0]
     total = sum(winner.excess[e] for e in loud)
     loud = [e for e in loud if winner.excess[e] > LOUD * total]
-    moves = clues.dependence(now, left, later, held, loud)
+    moves = dependence.dependence(now, left, later, held, loud)
     hum = frequency_clue(split, stage, left, judge, held)
     found = [formula(now, left, later, held, e) for e in loud]
     formulas = tuple(one for one in found if one is not None)

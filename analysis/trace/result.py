@@ -8,12 +8,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from analysis.estimators.hidden_states import Shot
-from analysis.model import Estimate, Model, estimate_json, finite
-from analysis.trace.clue_formula import Formula
-from analysis.trace.floor import Floor
-from analysis.trace.lines import Lines
-from analysis.trace.refine import Fit
+from analysis.identify.output_error.hidden_states import Shot
+from analysis.simulation.model import Estimate, Model, estimate_json, finite
+from analysis.trace.clues.formula import Formula
+from analysis.trace.data.noise_floor import Floor
+from analysis.trace.data.spectral_lines import Lines
+from analysis.trace.search.refinement import Fit
 
 CLEAN: Final = "clean"
 EXPLAINED: Final = "explained"

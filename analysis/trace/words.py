@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from analysis.model import Estimate
-from analysis.trace.clue_formula import surest
+from analysis.simulation.model import Estimate
+from analysis.trace.clues.formula import surest
 from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, Found, Trace
 from rig.model.rig import Rig
 

@@ -14,8 +14,8 @@ from rig.model.parse import InputError
 from rig.model.records import Record, Run
 
 if TYPE_CHECKING:
-    from analysis.identify import Identification
-    from analysis.rows import Filtering
+    from analysis.identify.identify import Identification
+    from analysis.regression.rows import Filtering
     from analysis.terms.base import Used
 
 RunsArgument = Annotated[list[Path], typer.Argument(help="Run folders.")]
@@ -29,7 +29,7 @@ def import_foreign(
 
     Example: bramah import manifest.yaml --out runs/foreign
     """
-    from rig.services.importer import import_records
+    from rig.runs.exchange.importer import import_records
 
     report = import_records(manifest, out)
     for warning in report.warnings:
@@ -38,7 +38,7 @@ def import_foreign(
 
 
 def _load(folders: Sequence[Path]) -> list[Run]:
-    from rig.services.store import load_run
+    from rig.runs.store import load_run
 
     return [load_run(folder) for folder in folders]
 
@@ -64,10 +64,10 @@ def _streamed(
     like: Path | None,
     cluster: str | None,
 ) -> Identification:
-    from analysis.cluster import Cluster
-    from analysis.compute import Serial
-    from analysis.folders import identify_folders
-    from analysis.model import load_model
+    from analysis.identify.out_of_core import identify_folders
+    from analysis.simulation.model import load_model
+    from analysis.workers.cluster import Cluster
+    from analysis.workers.pool import Serial
 
     model = None if like is None else load_model(like)
     # What the folders hold is read by who works on them: they need not exist here.
@@ -79,10 +79,10 @@ def _streamed(
 
 def _terms(runs: Sequence[Run], effects: Sequence[str], like: Path | None) -> Sequence[Used] | None:
     """Return the terms asked for, shapes found where none are given; None: the rig's own."""
-    from analysis.model import terms_like
+    from analysis.simulation.model import terms_like
     from analysis.terms import with_effects
     from analysis.terms.base import Used
-    from analysis.trace.shapes import with_shapes
+    from analysis.trace.search.shapes import with_shapes
 
     if like is not None:
         return terms_like(like, {run.source: run.rig for run in runs})
@@ -154,12 +154,12 @@ def identify(
     """
     import numpy as np
 
-    from analysis.identify import identify as identify_runs
-    from analysis.identify import to_json
-    from analysis.methods import SearchOptions
-    from analysis.model import save_model
-    from analysis.rows import FILTERINGS
-    from analysis.trace.shapes import shapes_in
+    from analysis.identify.identify import identify as identify_runs
+    from analysis.identify.identify import to_json
+    from analysis.identify.methods import SearchOptions
+    from analysis.regression.rows import FILTERINGS
+    from analysis.simulation.model import save_model
+    from analysis.trace.search.shapes import shapes_in
     from rig.cli.method_text import method_text
     from rig.cli.tables import identification_text, shapes_text
     from rig.cli.truth_file import read_truth
@@ -215,9 +215,9 @@ def validate(
 
     Example: bramah validate model.json runs/tuesday
     """
-    from analysis.model import load_model
-    from analysis.validate import to_json
-    from analysis.validate import validate as validate_model
+    from analysis.simulation.model import load_model
+    from analysis.simulation.validate import to_json
+    from analysis.simulation.validate import validate as validate_model
     from rig.cli.tables import validation_text
 
     results = validate_model(load_model(model), _load(runs))

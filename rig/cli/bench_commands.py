@@ -156,7 +156,7 @@ def runs(
 
     Example: bramah runs runs/
     """
-    from rig.services.store import list_runs
+    from rig.runs.store import list_runs
 
     found = list_runs(folder)
     write_json(json, [{**asdict(one), "path": str(one.path)} for one in found])
@@ -193,7 +193,7 @@ def recover(
 
     Example: bramah recover runs/monday
     """
-    from rig.services.recover import recover as recover_run
+    from rig.runs.recover import recover as recover_run
 
     typer.echo(recover_run(run, force=force).message)
 

@@ -12,9 +12,9 @@ import typer
 from typer.exceptions import TyperException
 
 from drivers.base import DeviceError
-from protocols.errors import ProtocolAborted
+from protocols.engine.errors import ProtocolAborted
 from rig.model.parse import InputError
-from rig.services.trips import Latched, OperatorStop, RecordingFailed, SafetyTrip
+from rig.model.trips import Latched, OperatorStop, RecordingFailed, SafetyTrip
 
 OK = 0
 FAILED = 1

@@ -13,7 +13,7 @@ from rig.cli.errors import WorkError
 from rig.cli.output import progress
 
 if TYPE_CHECKING:
-    from analysis.model import Model
+    from analysis.simulation.model import Model
     from rig.model.records import Record
     from rig.model.rig import Rig
 
@@ -36,8 +36,8 @@ def export(
 
     Example: bramah export runs/monday --format mat
     """
-    from rig.services.export import export_run, library_missing
-    from rig.services.stream import read_run_head
+    from rig.runs.exchange.export import export_run, library_missing
+    from rig.runs.stream import read_run_head
 
     missing = library_missing(kind)
     if missing:
@@ -65,8 +65,8 @@ def simulate(
 
     Example: bramah simulate model.json runs/monday --out runs/monday-simulated
     """
-    from rig.services.made import write_run
-    from rig.services.store import load_run, refuse_occupied
+    from rig.runs.exchange.fixtures import write_run
+    from rig.runs.store import load_run, refuse_occupied
 
     refuse_occupied(out)
     loaded = load_run(run)
@@ -81,8 +81,8 @@ def _simulator(path: Path, rig: Rig, source: str) -> Callable[[Record], Mapping[
 
     Raises InputError for a model of another rig, WorkError where a simulation fails.
     """
-    from analysis.model import load_model, refuse_other_rig
-    from analysis.validate import validate_record
+    from analysis.simulation.model import load_model, refuse_other_rig
+    from analysis.simulation.validate import validate_record
 
     model: Model = load_model(path)
     refuse_other_rig(model, rig, source)

@@ -10,21 +10,21 @@ from typing import Any
 
 import numpy as np
 
-from analysis.design import Design, improve
-from analysis.design_moves import Tone
-from analysis.prediction import Prediction, predict, to_json
-from analysis.prediction_twin import PlannedStep
-from analysis.twin import simulate_commands
-from protocols import library
-from protocols.check import check
-from protocols.check_report import CheckReport
-from protocols.plan import Overrides, Plan, resolve
-from protocols.write import protocol_text
+from analysis.design.moves import Tone
+from analysis.design.optimise import Design, improve
+from analysis.design.predict import Prediction, predict, to_json
+from analysis.design.twin_records import PlannedStep
+from analysis.simulation.twin import simulate_commands
+from protocols.design.check import check
+from protocols.design.check_report import CheckReport
+from protocols.files import library
+from protocols.files.plan import Overrides, Plan, resolve
+from protocols.files.writer import protocol_text
 from rig.cli.output import progress, table
 from rig.cli.planned import designed_protocol, designed_step, empty_lines, planned_steps
 from rig.model.parse import InputError
 from rig.model.rig import Rig
-from rig.services.rigs import load_bench
+from rig.runs.rigs import load_bench
 
 
 @dataclass(frozen=True)

@@ -64,7 +64,7 @@ def loop(
             "can answer"
         )
     # What loads the analysis comes after what can be refused without it.
-    from protocols.plan import Overrides
+    from protocols.files.plan import Overrides
     from rig.cli.looping import Loop, Wanted, refuse_taken
     from rig.cli.simulated import simulated_bench
 
@@ -93,8 +93,8 @@ def _asked(experiment: Mapping[str, Any]) -> bool:
 
 
 def _tell(going: Any, json: Path | None, report: Path) -> None:
-    from analysis.model import save_model
-    from analysis.trace.rounds import story_json
+    from analysis.simulation.model import save_model
+    from analysis.trace.loop_rounds import story_json
     from rig.cli.trace_reporting import write_story
     from rig.cli.trace_text import story_text
 

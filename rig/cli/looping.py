@@ -15,20 +15,20 @@ from typing import Any, Final
 
 import yaml
 
+from analysis.simulation.twin import simulate_commands
 from analysis.trace.engine import trace
+from analysis.trace.loop_rounds import Round, achieved
 from analysis.trace.result import CLEAN, EXPLAINED, UNEXPLAINED
-from analysis.trace.rounds import Round, achieved
-from analysis.twin import simulate_commands
-from protocols import library
-from protocols.check import check
-from protocols.errors import ProtocolAborted
-from protocols.plan import Overrides, resolve
+from protocols.design.check import check
+from protocols.engine.errors import ProtocolAborted
+from protocols.files import library
+from protocols.files.plan import Overrides, resolve
 from rig.cli.running import Job, run_protocol
 from rig.model.parse import InputError
 from rig.model.records import Run
 from rig.model.rig import Rig
-from rig.services.rigs import load_bench
-from rig.services.store import load_run
+from rig.runs.rigs import load_bench
+from rig.runs.store import load_run
 
 log = logging.getLogger(__name__)
 

@@ -6,12 +6,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from analysis.design import Design
-from analysis.design_moves import Tone
-from analysis.prediction_twin import PlannedStep
-from protocols.excite import Waveform, chosen_lines
-from protocols.model import CLOSED, Protocol, Step
-from protocols.plan import Plan, StepPlan
+from analysis.design.moves import Tone
+from analysis.design.optimise import Design
+from analysis.design.twin_records import PlannedStep
+from protocols.files.plan import Plan, StepPlan
+from protocols.files.schema import CLOSED, Protocol, Step
+from protocols.files.waveforms import Waveform, chosen_lines
 
 
 def planned_steps(

@@ -6,14 +6,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from protocols import library
-from protocols.generate import Predictor, generate, prove
-from protocols.judging import validation
-from protocols.model import Protocol
-from protocols.proof import Proof
-from protocols.write import protocol_text
+from protocols.design.generate import Predictor, generate, prove
+from protocols.design.proof import Proof
+from protocols.design.validation_steps import validation
+from protocols.files import library
+from protocols.files.schema import Protocol
+from protocols.files.writer import protocol_text
 from rig.model.parse import InputError
-from rig.services.rigs import load_bench
+from rig.runs.rigs import load_bench
 
 Say = Callable[[str], None]
 
@@ -30,8 +30,8 @@ class Wish:
 
 def predictor() -> Predictor:
     """Return the twin with the analysis' view of its motion."""
-    from analysis.proof import judge, predicted_rows
-    from analysis.twin import simulate_commands
+    from analysis.regression.identifiability import judge, predicted_rows
+    from analysis.simulation.twin import simulate_commands
 
     return Predictor(simulate_commands, predicted_rows, judge)
 

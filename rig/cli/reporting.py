@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 
-from analysis.identify import Identification
-from analysis.report import Provenance, write_report
+from analysis.identify.identify import Identification
+from analysis.report.identification import Provenance, write_report
 from rig.cli.story import Experiment
 from rig.model.records import Run
-from rig.services.versions import versions
+from rig.runs.versions import versions
 
 
 def _provenance(commands: tuple[str, ...], seeds: dict[str, str | int]) -> Provenance:

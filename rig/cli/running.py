@@ -12,16 +12,17 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from drivers import make_driver
-from protocols import engine, library
-from protocols.check import check
-from protocols.plan import Overrides, Plan, resolve
+from protocols.design.check import check
+from protocols.engine import engine
+from protocols.files import library
+from protocols.files.plan import Overrides, Plan, resolve
+from rig.bench.attach import AttachError, Publisher
+from rig.bench.session import Bench
 from rig.model.parse import InputError
 from rig.model.parts import Wire
 from rig.model.rig import Rig
-from rig.services.attach import AttachError, Publisher
-from rig.services.bench import Bench
-from rig.services.recorder import Recorder
-from rig.services.rigs import load_bench
+from rig.runs.recorder import Recorder
+from rig.runs.rigs import load_bench
 
 if TYPE_CHECKING:
     from rig.cli.tracking import Tracking
@@ -119,7 +120,7 @@ def run_protocol(job: Job, say: Say) -> Path:
     wire = rig.wire if job.endpoint is None else wire_at(job.endpoint, rig.wire)
     rig = rig.model_copy(update={"wire": wire})
     say(f"checking {plan.protocol.name} on the twin of {rig.name}")
-    from analysis.twin import simulate_commands
+    from analysis.simulation.twin import simulate_commands
 
     report = check(plan, rig, simulate_commands)
     report.require()

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from protocols.check_report import CheckReport, Prediction
-from protocols.proof import Proof, Verdicts
+from protocols.design.check_report import CheckReport, Prediction
+from protocols.design.proof import Proof, Verdicts
 from rig.cli.output import table
 from rig.model.quantity import unit_map
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from hil_sim.plant import Plant
-from hil_sim.scenario import Scenario, load_shipped, parse_scenario, shipped_scenarios
-from hil_sim.scenario_random import RANDOM, draw
-from hil_sim.server import EndpointError, serve, warm_up
+from hil_sim.device.server import EndpointError, serve, warm_up
+from hil_sim.plant.plant import Plant
+from hil_sim.scenario.file import Scenario, load_shipped, parse_scenario, shipped_scenarios
+from hil_sim.scenario.random_draw import RANDOM, draw
 from rig.cli.errors import WorkError
 from rig.cli.truth_file import write_truth
 from rig.model.rig import Rig
-from rig.services.files import read_text
-from rig.services.rigs import load_bench
+from rig.runs.files import read_text
+from rig.runs.rigs import load_bench
 
 
 @dataclass(frozen=True)

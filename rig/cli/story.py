@@ -10,21 +10,21 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from analysis.identify import Identification, identify
-from analysis.identify import to_json as identification_json
-from analysis.model import save_model
+from analysis.identify.identify import Identification, identify
+from analysis.identify.identify import to_json as identification_json
+from analysis.simulation.model import save_model
+from analysis.simulation.validate import RecordValidation, validate
+from analysis.simulation.validate import to_json as validation_json
 from analysis.trace.engine import trace
 from analysis.trace.result import to_json as trace_json
-from analysis.validate import RecordValidation, validate
-from analysis.validate import to_json as validation_json
-from protocols.plan import Overrides
+from protocols.files.plan import Overrides
 from rig.cli.output import progress, write_json
 from rig.cli.running import Job, run_protocol
 from rig.cli.simulated import simulated_bench
 from rig.cli.tables import identification_text, parameter_table, validation_text
 from rig.cli.truth_file import read_truth
 from rig.model.records import Run
-from rig.services.store import load_run
+from rig.runs.store import load_run
 
 IDENTIFY = "lock-and-excite-multisine"
 VALIDATE = "validate"

@@ -6,9 +6,9 @@ import math
 from collections.abc import Mapping, Sequence
 
 from analysis.effects.base import Shape
-from analysis.identify import Identification
-from analysis.model import Estimate
-from analysis.validate import RecordValidation
+from analysis.identify.identify import Identification
+from analysis.simulation.model import Estimate
+from analysis.simulation.validate import RecordValidation
 from rig.cli.output import table
 from rig.model.quantity import unit_map
 

@@ -41,12 +41,12 @@ def trace(
 
     Example: bramah trace runs/monday --holdout runs/tuesday --report trace.html
     """
-    from analysis.model import save_model, terms_like
+    from analysis.simulation.model import save_model, terms_like
     from analysis.trace.engine import trace as trace_runs
     from analysis.trace.result import to_json
     from rig.cli.trace_text import trace_text
     from rig.model.parse import InputError
-    from rig.services.store import load_run
+    from rig.runs.store import load_run
 
     if not holdout:
         raise InputError(

@@ -8,13 +8,13 @@ from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 
-from analysis.report import Provenance
-from analysis.trace.loop_report import write_loop_report
-from analysis.trace.report import write_trace_report
+from analysis.report.identification import Provenance
+from analysis.report.loop import write_loop_report
+from analysis.report.trace import write_trace_report
+from analysis.trace.loop_rounds import Round
 from analysis.trace.result import Trace
-from analysis.trace.rounds import Round
 from rig.model.records import Run
-from rig.services.versions import versions
+from rig.runs.versions import versions
 
 
 def write_trace(path: Path, holdout: Sequence[Run], result: Trace) -> None:

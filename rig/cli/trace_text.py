@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from analysis.trace.lines import loudest
+from analysis.trace.data.spectral_lines import loudest
+from analysis.trace.loop_rounds import Round
 from analysis.trace.result import Found, Trace
-from analysis.trace.rounds import Round
 from analysis.trace.words import quantity, shot_in_words, unit_of_equation
 from rig.cli.output import table
 

@@ -24,17 +24,17 @@ from typing import Any, Self
 import numpy as np
 import zmq
 
-from analysis.compute import environment
-from analysis.model import Estimate, estimate_json
-from analysis.online import Tracker
+from analysis.identify.online import Tracker
+from analysis.simulation.model import Estimate, estimate_json
+from analysis.workers.pool import environment
 from drivers.base import SampleBlock
 from rig.cli.following import Follower
 from rig.cli.output import write_json
 from rig.model.parse import InputError
 from rig.model.records import RecordHead
 from rig.model.rig import Rig
-from rig.services.recorder import RecordMeta
-from rig.services.runstate import EventLog
+from rig.runs.recorder import RecordMeta
+from rig.runs.runstate import EventLog
 
 log = logging.getLogger(__name__)
 Say = Callable[[str], None]

@@ -13,8 +13,8 @@ from textual.app import ComposeResult
 from textual.containers import ItemGrid, Vertical
 from textual.widgets import Static
 
+from rig.bench.attach import ChannelView
 from rig.model import channels as ch
-from rig.services.attach import ChannelView
 from rig.tui.gauge import LABEL, gauge
 from rig.tui.link import Frame
 from rig.tui.plot import LivePlot, Trace

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from rig.services.attach import Snapshot
+from rig.bench.attach import Snapshot
 
 
 @dataclass(frozen=True)

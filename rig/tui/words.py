@@ -8,8 +8,8 @@ from typing import Final
 
 from rich.text import Text
 
+from rig.bench.attach import ChannelView, Endpoint, Snapshot
 from rig.model import channels as ch
-from rig.services.attach import ChannelView, Endpoint, Snapshot
 from rig.tui.link import ENDED_STATES, QUIET, Frame, Stage
 from rig.tui.story import trip_text
 from rig.tui.units import Band, age_text, band, clock_text, limit, shown

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from analysis.prediction_twin import PlannedStep
+from analysis.design.twin_records import PlannedStep
 
 PERIOD = 2000  # samples
 LINES = tuple(range(1, 18, 2))  # 0.5 to 8.5 Hz

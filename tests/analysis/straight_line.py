@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from analysis.estimators.equations import Block, segments
+from analysis.identify.estimators.equations import Block, segments
 
 
 def line(rng: np.random.Generator, bend: float, repeats: int = 4) -> tuple[Block, ...]:

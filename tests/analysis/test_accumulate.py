@@ -13,26 +13,26 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import lstsq
 
-from analysis.accumulate import Accumulator, accumulate
-from analysis.condense import reduce_record, solve_reductions
-from analysis.folders import identify_folders
-from analysis.identify import (
+from analysis.identify.identify import (
     PLAIN,
     Identification,
     build_rows,
     identify,
     solve_rows,
 )
-from analysis.rows import default_filtering, paper_filtering
-from analysis.solve import triangle
-from analysis.stretches import InMemory, locks_of, source_rows
+from analysis.identify.out_of_core import identify_folders
+from analysis.identify.reduction import reduce_record, solve_reductions
+from analysis.regression.chunks import InMemory, locks_of, source_rows
+from analysis.regression.qr import Accumulator, accumulate
+from analysis.regression.rows import default_filtering, paper_filtering
+from analysis.regression.solve import triangle
 from analysis.terms import baseline
 from analysis.terms.base import Used
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
-from rig.services.made import write_run
-from rig.services.store import load_run
-from rig.services.stream import iterate_records, open_record, read_run_head
+from rig.runs.exchange.fixtures import write_run
+from rig.runs.store import load_run
+from rig.runs.stream import iterate_records, open_record, read_run_head
 
 TERMS = tuple(Used(term) for term in baseline())
 

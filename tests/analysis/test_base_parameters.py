@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.advice import base_statements
-from analysis.base_parameters import determined
-from analysis.identify import Identification, identify
-from analysis.solve import Cluster, solve, triangle
+from analysis.identify.advice import base_statements
+from analysis.identify.identify import Identification, identify
+from analysis.regression.base_parameters import determined
+from analysis.regression.solve import Cluster, solve, triangle
 from rig.model.parse import InputError
 from rig.model.records import Run
-from rig.services.rigs import load_rig
+from rig.runs.rigs import load_rig
 
 NAMES = ("R11", "R22", "R12", "W1", "Fv1")
 

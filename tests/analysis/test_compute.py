@@ -16,15 +16,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.cluster import Cluster
-from analysis.compute import Pool, Processes, Serial, local_pool
-from analysis.folders import identify_folders
-from analysis.identify import PLAIN, identify
-from rig.cli.study_pool import Kept, performed
+from analysis.identify.identify import PLAIN, identify
+from analysis.identify.out_of_core import identify_folders
+from analysis.workers.cluster import Cluster
+from analysis.workers.pool import Pool, Processes, Serial, local_pool
 from rig.model.parse import InputError
 from rig.model.records import Run
-from rig.services.made import write_run
+from rig.runs.exchange.fixtures import write_run
 from tests.analysis.test_accumulate import assert_same
+from tests.studies.pool import Kept, performed
 
 END_SECONDS = 20.0
 

@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from analysis.consistent import feasible, links_of, physical, to_json, with_physics
-from analysis.constrained import minimise
-from analysis.identify import Identification, identify
+from analysis.identify.constrained import minimise
+from analysis.identify.identify import Identification, identify
+from analysis.identify.physical import feasible, links_of, physical, to_json, with_physics
 from analysis.terms.inertia import inertia_map
 from rig.model.parameters import mechanical_names
 from rig.model.parse import InputError

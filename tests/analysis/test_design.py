@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from analysis.design import FILL, KEEP, TOO_FAR, Design, improve
-from analysis.design_limits import bounds, forecast_of
-from analysis.design_moves import tone_of
-from analysis.prediction import predict
-from analysis.prediction_twin import play
+from analysis.design.limits import bounds, forecast_of
+from analysis.design.moves import tone_of
+from analysis.design.optimise import FILL, KEEP, TOO_FAR, Design, improve
+from analysis.design.predict import predict
+from analysis.design.twin_records import play
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 from tests.analysis.designed_steps import LINES, steps

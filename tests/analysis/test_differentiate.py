@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from analysis import differentiate as d
-from analysis.differentiate_study import markdown, table
+from analysis.signals import filters as d
 from rig.model.parse import InputError
 from rig.model.rig import Rig
+from tests.studies.estimators.differentiation import markdown, table
 
 RATE = 1000.0
 FIR = [

@@ -7,20 +7,20 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
-from analysis.differentiate import butterworth, channel_filter
-from analysis.identify import build_rows, identify, to_json
-from analysis.model import Estimate, Model, load_model, save_model
-from analysis.signals import condition
-from analysis.simulate import Drive, State, compiled, rates_of, simulate
+from analysis.identify.identify import build_rows, identify, to_json
+from analysis.signals.conditioning import condition
+from analysis.signals.filters import butterworth, channel_filter
+from analysis.simulation.model import Estimate, Model, load_model, save_model
+from analysis.simulation.simulate import Drive, State, compiled, rates_of, simulate
+from analysis.simulation.validate import validate
 from analysis.terms import with_effects
 from analysis.terms.base import Used
-from analysis.validate import validate
-from hil_sim import electric as plant
 from rig.model.electric import ElectricRig
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
-from rig.services.rigs import load_rig
+from rig.runs.rigs import load_rig
+from tests.studies.machines import electric_plant as plant
 
 FRICTION = ("coulomb_friction",)
 

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from analysis.checks import Check
-from analysis.estimators import coverage as cov
-from analysis.estimators.covariance import by_parts, lack_of_fit, spread
-from analysis.estimators.equations import least_squares, pieces
-from analysis.estimators.output_error import output_error
-from analysis.identify import Identification, identify, to_json
+from analysis.identify.checks import Check
+from analysis.identify.estimators.covariance import by_parts, lack_of_fit, spread
+from analysis.identify.estimators.equations import least_squares, pieces
+from analysis.identify.identify import Identification, identify, to_json
+from analysis.identify.output_error.fit import output_error
 from analysis.terms import baseline
 from analysis.terms.base import Used
 from rig.model.parse import InputError
@@ -21,6 +20,7 @@ from rig.model.records import Run
 from tests.analysis import small_bench as bench
 from tests.analysis.small_bench import TRUTH
 from tests.analysis.straight_line import line
+from tests.studies.estimators import coverage as cov
 
 
 def error(result: Identification, name: str) -> float:

@@ -7,17 +7,17 @@ from pathlib import Path
 
 import numpy as np
 
-from analysis.folders import identify_folders
-from analysis.identify import PLAIN, identify
+from analysis.identify.identify import PLAIN, identify
+from analysis.identify.out_of_core import identify_folders
 from analysis.terms import with_effects
 from analysis.terms.base import Used
-from hil_sim import electric
 from rig.model.electric import ElectricRig
 from rig.model.records import Run
-from rig.services.made import write_run
-from rig.services.rigs import load_rig
+from rig.runs.exchange.fixtures import write_run
+from rig.runs.rigs import load_rig
 from tests.analysis.test_accumulate import assert_same
 from tests.analysis.test_lost_samples import with_lost
+from tests.studies.machines import electric_plant
 
 
 def test_samples_lost_on_the_wire_are_masked_in_both_ways(
@@ -56,8 +56,8 @@ def test_an_electric_robot_streams_too(tmp_path: Path) -> None:
     """With the base's slope, whose parameters are fewer than the rows' unknowns."""
     robot = load_rig("electric-2dof")
     assert isinstance(robot, ElectricRig)
-    arm = electric.draw_arm(np.random.default_rng(5))
-    run = electric.records(robot, arm, np.random.default_rng(6), repeats=2)
+    arm = electric_plant.draw_arm(np.random.default_rng(5))
+    run = electric_plant.records(robot, arm, np.random.default_rng(6), repeats=2)
     folder = write_run(tmp_path / "monday", run)
     result = identify_folders([str(folder)])
     assert_same(result, identify([run]))

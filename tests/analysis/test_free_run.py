@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from analysis.identify import Identification, identify
+from analysis.identify.identify import Identification, identify
+from analysis.simulation.validate import validate
 from analysis.terms import with_effects
 from analysis.terms.base import Used
-from analysis.validate import validate
 from rig.model.parse import InputError
 from rig.model.records import Run
-from rig.services.rigs import load_rig
+from rig.runs.rigs import load_rig
 from tests.analysis.carriage import Carriage, moves, record
 
 EFFECTS = ("coulomb_friction", "torque_offset")

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.differentiate import channel_filter, row_filter, row_step
-from analysis.identify import Identification, identify, to_json
-from analysis.rows import FILTERINGS, Filtering
-from analysis.signals import condition, gives
+from analysis.identify.identify import Identification, identify, to_json
+from analysis.regression.rows import FILTERINGS, Filtering
+from analysis.signals.conditioning import condition, gives
+from analysis.signals.filters import channel_filter, row_filter, row_step
 from rig.model.parameters import parameter_names, parameter_unit
 from rig.model.parse import InputError
 from rig.model.records import Record, Run

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.identify import build_rows, identify
-from analysis.model import Model
-from analysis.report import write_report
-from analysis.rows import default_filtering
+from analysis.identify.identify import build_rows, identify
+from analysis.regression.rows import default_filtering
+from analysis.report.identification import write_report
+from analysis.simulation.model import Model
+from analysis.simulation.validate import validate
 from analysis.terms import baseline
 from analysis.terms.base import Used
-from analysis.validate import validate
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
 from rig.model.rig import Rig

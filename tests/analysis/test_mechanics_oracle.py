@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from analysis.rows import parameters_of
+from analysis.regression.rows import parameters_of
 from analysis.terms import baseline, make
 from analysis.terms.base import Used, equation
 from analysis.terms.inertia import chain_matrix, mass_matrix
-from hil_sim.kernel import angular
-from hil_sim.kernel_data import JOINT
-from hil_sim.plant_tables import inertia_matrix
-from rig.model.bodies import Body, chain_parameters
+from hil_sim.plant.kernel import angular
+from hil_sim.plant.kernel_data import JOINT
+from hil_sim.plant.tables import inertia_matrix
 from rig.model.rig import Rig
 from tests.analysis.test_terms import chain_rig, signals_of
+from tests.studies.machines.bodies import Body, chain_parameters
 
 pin = pytest.importorskip("pinocchio", reason="the independent oracle, a development dependency")
 

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.identify import Identification, identify, to_json
-from analysis.methods.search import (
+from analysis.identify.identify import Identification, identify, to_json
+from analysis.identify.methods.search import (
     COMPLEX,
     DEAD,
     DIVERGED,
@@ -20,14 +20,7 @@ from analysis.methods.search import (
     searched_names,
     step_one,
 )
-from analysis.reproduction import (
-    experiments,
-    oil_temperatures,
-    payload_changes,
-    payload_response,
-    spread,
-)
-from analysis.rows import default_filtering
+from analysis.regression.rows import default_filtering
 from analysis.terms import baseline
 from analysis.terms.base import Used
 from rig.model.parse import InputError
@@ -35,6 +28,13 @@ from rig.model.records import Run
 from rig.model.rig import Rig
 from tests.analysis import small_bench as bench
 from tests.analysis.small_bench import TRUTH
+from tests.studies.reproduction.numbers import (
+    experiments,
+    oil_temperatures,
+    payload_changes,
+    payload_response,
+    spread,
+)
 
 WARM = {**TRUTH, "b": 260e6}
 STEP1 = ("M2", "Fv2", "W2", "b", "C_pp_2", "C_pm_2", "C_mp_2", "C_mm_2")

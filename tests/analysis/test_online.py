@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.identify import PLAIN, build_rows, identify, solve_rows
-from analysis.online import FLOOR, RowFeed, Tracker, track
-from analysis.rows import default_filtering
-from analysis.stretches import Locks, stretch_rows
+from analysis.identify.identify import PLAIN, build_rows, identify, solve_rows
+from analysis.identify.online import FLOOR, RowFeed, Tracker, track
+from analysis.regression.chunks import Locks, stretch_rows
+from analysis.regression.rows import default_filtering
 from analysis.terms import baseline
 from analysis.terms.base import Used
 from rig.model.parse import InputError

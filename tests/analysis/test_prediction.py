@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.identify import build_rows, solve_rows
-from analysis.prediction import Prediction, predict, to_json
-from analysis.prediction_noise import moved
-from analysis.prediction_twin import Played, ideal, play
-from analysis.rows import default_filtering
-from analysis.signals import condition
+from analysis.design.predict import Prediction, predict, to_json
+from analysis.design.sensor_noise import moved
+from analysis.design.twin_records import Played, ideal, play
+from analysis.identify.identify import build_rows, solve_rows
+from analysis.regression.rows import default_filtering
+from analysis.signals.conditioning import condition
 from analysis.terms import baseline
 from analysis.terms.base import Used
 from rig.model import channels as ch
@@ -106,7 +106,7 @@ def test_a_shifted_piston_moves_everything_that_follows_from_it(
     filters = default_filtering(record)
     moving = np.array([True, True])
     signals = condition(ideal(rig), record, filters.channels, moving)
-    from analysis.prediction_noise import Input
+    from analysis.design.sensor_noise import Input
 
     by = 1e-4
     shifted = {**record.channels, "piston_1": record.channels["piston_1"] + by}

@@ -9,11 +9,11 @@ from pathlib import Path
 import matplotlib as mpl
 import pytest
 
-from analysis.checks import Check
-from analysis.identify import Identification, identify
-from analysis.model import Model
-from analysis.report import Provenance, render_report, write_report
-from analysis.validate import RecordValidation, validate
+from analysis.identify.checks import Check
+from analysis.identify.identify import Identification, identify
+from analysis.report.identification import Provenance, render_report, write_report
+from analysis.simulation.model import Model
+from analysis.simulation.validate import RecordValidation, validate
 from rig.model.parse import InputError
 from rig.model.records import Run
 from rig.model.rig import Rig

@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis import paper_tables as paper
-from analysis import plots, plots_records, plots_rig, report_facts
-from analysis import report_format as fm
-from analysis.identify import RecordRows, build_rows, identify
-from analysis.report_residuals import per_repeat, residuals
-from analysis.rows import Rows
+from analysis.identify.identify import RecordRows, build_rows, identify
+from analysis.regression.rows import Rows
+from analysis.report import facts, paper
+from analysis.report import format as fm
+from analysis.report.plots import arm_plot, record_plots, style
+from analysis.report.residuals import per_repeat, residuals
 from rig.model.parameters import parameter_names
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
@@ -71,7 +71,7 @@ def test_a_thinned_trace_keeps_its_one_spike() -> None:
     x = np.linspace(0, 1, 50_000)
     y = np.sin(40 * x)
     y[31_234] = 9.0
-    tx, ty = plots.thin(x, y, 300)
+    tx, ty = style.thin(x, y, 300)
     assert len(tx) <= 310
     assert ty.max() == 9.0
     assert (np.diff(tx) > 0).all()
@@ -80,7 +80,7 @@ def test_a_thinned_trace_keeps_its_one_spike() -> None:
 
 def test_no_line_is_drawn_over_a_gap() -> None:
     t = np.array([0.0, 0.1, 0.2, 0.9, 1.0])
-    x, y = plots.gapped(t, np.ones(5))
+    x, y = style.gapped(t, np.ones(5))
     assert np.isnan(y).sum() == 1
     assert np.isnan(y[3])
     assert len(x) == 6
@@ -91,14 +91,14 @@ def test_the_line_spectrum_shows_amplitudes_in_volts() -> None:
     t = np.arange(n) / 1000.0
     x = 0.3 * np.sin(2 * np.pi * 3 * t + 0.4) + 0.01 * np.cos(2 * np.pi * 4 * t) + 5.0
     record = Record("a", "a", (), 1, 1000.0, {"spool_1": x}, period=period, lines=(3, 5))
-    lines = plots_records.line_spectrum(record, x)
+    lines = record_plots.line_spectrum(record, x)
     assert lines is not None
     by_frequency = dict(zip(lines.frequency.round(9), lines.amplitude, strict=True))
     assert by_frequency[3.0] == pytest.approx(0.3, rel=1e-9)
     assert by_frequency[4.0] == pytest.approx(0.01, rel=1e-9)
     assert by_frequency[5.0] < 1e-12
     assert list(lines.frequency[lines.excited]) == [3.0, 5.0]
-    assert plots_records.line_spectrum(replace(record, period=0), x) is None
+    assert record_plots.line_spectrum(replace(record, period=0), x) is None
 
 
 @given(st.lists(st.floats(-0.5, 0.5), min_size=2, max_size=2))
@@ -106,7 +106,7 @@ def test_pins_of_the_drawing_are_a_cylinders_length_apart(strokes: list[float]) 
     rig = _rig()
     pistons = [f * j.cylinder.stroke for f, j in zip(strokes, rig.joints, strict=True)]
     q = np.array([float(j.linkage.angle(s)) for s, j in zip(pistons, rig.joints, strict=True)])
-    at = plots_rig.pose(rig, q)
+    at = arm_plot.pose(rig, q)
     for k, joint in enumerate(rig.joints):
         length = float(np.linalg.norm(at.outer[k] - at.inner[k]))
         assert length == pytest.approx(joint.linkage.mid_length + pistons[k], abs=1e-9)
@@ -192,7 +192,7 @@ def test_each_repeat_alone_gives_what_identifying_it_alone_gives(multisine_run: 
 
 def test_a_bench_that_is_no_rigid_body_is_told_from_a_bad_identification() -> None:
     rig = _rig()
-    said = report_facts.truth_remark(rig, {"R12": 1.37, "W2": 3.30})
+    said = facts.truth_remark(rig, {"R12": 1.37, "W2": 3.30})
     assert "R12/W2 = 0.415 m for a link of 0.500 m" in said
-    assert report_facts.truth_remark(rig, {"R12": 1.65, "W2": 3.30}) == ""
-    assert report_facts.truth_remark(rig, None) == ""
+    assert facts.truth_remark(rig, {"R12": 1.65, "W2": 3.30}) == ""
+    assert facts.truth_remark(rig, None) == ""

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from analysis.estimators.covariance import spread
-from analysis.estimators.equations import Block, Prepared, least_squares, pieces
-from analysis.estimators.instruments import hausman
-from analysis.estimators.nuisance import Belief, joined
-from analysis.estimators.shifts import Shift, certain_shift, including, shifts_of
-from analysis.estimators.statements import noise_statement
+from analysis.identify.estimators.covariance import spread
+from analysis.identify.estimators.equations import Block, Prepared, least_squares, pieces
+from analysis.identify.estimators.instruments import hausman
+from analysis.identify.estimators.nuisance import Belief, joined
+from analysis.identify.estimators.shifts import Shift, certain_shift, including, shifts_of
+from analysis.identify.estimators.statements import noise_statement
 from tests.analysis.straight_line import line
 
 CASES = {

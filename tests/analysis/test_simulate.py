@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from analysis.identify import identify
-from analysis.integrate import integrate
-from analysis.model import Model, nominal_model
-from analysis.rows import right_sides
-from analysis.signals import Signals, condition
-from analysis.simulate import compiled, drive_of, rates_of, simulate, state_at
+from analysis.identify.identify import identify
+from analysis.regression.rows import right_sides
+from analysis.signals.conditioning import Signals, condition
+from analysis.simulation.integrator import integrate
+from analysis.simulation.model import Model, nominal_model
+from analysis.simulation.simulate import compiled, drive_of, rates_of, simulate, state_at
 from analysis.terms import base, baseline
 from analysis.terms.base import Coefficient, Columns, Kernel, Term, Used, kernel
 from rig.model.parse import InputError

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import lstsq
 
-from analysis.solve import Cluster, half_width, merge, solve, triangle
+from analysis.regression.solve import Cluster, half_width, merge, solve, triangle
 
 NAMES = ("a", "b", "c")
 

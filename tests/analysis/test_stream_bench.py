@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from analysis.stream_bench import row_figures
+from rig.cli.bench.stream import row_figures
 
 
 def test_rows_stream_in_little_memory_to_numpy_s_solution(tmp_path: Path) -> None:

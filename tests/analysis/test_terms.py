@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from analysis.rows import right_sides
-from analysis.signals import Signals
+from analysis.regression.rows import right_sides
+from analysis.signals.conditioning import Signals
 from analysis.terms import base, baseline, known, make
 from analysis.terms.inertia import chain_matrix, mass_matrix
 from rig.model.parameters import inertia_names, parameter_names

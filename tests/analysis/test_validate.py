@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.identify import Identification, identify
-from analysis.model import load_model, save_model
-from analysis.twin import simulate_commands, spool_response
-from analysis.validate import fit_percent, to_json, validate
+from analysis.identify.identify import Identification, identify
+from analysis.simulation.model import load_model, save_model
+from analysis.simulation.twin import simulate_commands, spool_response
+from analysis.simulation.validate import fit_percent, to_json, validate
 from rig.model.parse import InputError
 from rig.model.records import Run
 from rig.model.rig import Rig

@@ -13,9 +13,10 @@ from pathlib import Path
 
 from drivers.modbus_tcp import ModbusTcpDriver
 from rig.cli.running import wire_at
-from rig.services.rigs import load_rig
+from rig.runs.rigs import load_rig
 
 START = "from rig.cli.main import run; run()"
+ROOT = Path(__file__).parents[2]
 LONG = 120.0  # [s] nothing here takes it; a hang ends in an error that says so
 
 SHORT = """
@@ -49,6 +50,14 @@ def bramah(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedP
     return subprocess.run(
         words(*arguments), capture_output=True, text=True, timeout=LONG, cwd=cwd, check=False
     )
+
+
+def study(*arguments: object) -> subprocess.CompletedProcess[str]:
+    """Run `python -m tests.studies` to its end."""
+    return subprocess.run(
+        [sys.executable, "-m", "tests.studies", *map(str, arguments)],
+        capture_output=True, text=True, timeout=LONG, cwd=ROOT, check=False,
+    )  # fmt: skip
 
 
 @contextmanager

@@ -6,12 +6,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from hil_sim.scenario import Scenario, parse_scenario
-from protocols import engine, library
-from protocols.plan import Overrides, resolve
-from rig.cli.direct_bench import DirectBench
+from hil_sim.scenario.file import Scenario, parse_scenario
+from protocols.engine import engine
+from protocols.files import library
+from protocols.files.plan import Overrides, resolve
 from rig.cli.looping import Loop, Wanted
 from rig.model.records import Run
+from tests.studies.direct_bench import DirectBench
 
 SINE = """
 name: sine

@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from rig.cli.main import app
-from rig.services.store import load_run
+from rig.runs.store import load_run
 from tests.cli.bench import (
     ENDLESS,
     LONG,

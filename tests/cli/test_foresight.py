@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from protocols import library
-from protocols.plan import resolve
+from protocols.files import library
+from protocols.files.plan import resolve
 from rig.cli.main import run
-from rig.services.rigs import load_rig
+from rig.runs.rigs import load_rig
 from tests.cli.bench import SHORT
 
 RIG = "shinshu-2dof"

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 import yaml
 
-from hil_sim.scenario_random import KINDS, draw
-from rig.services.rigs import load_rig
+from hil_sim.scenario.random_draw import KINDS, draw
+from rig.runs.rigs import load_rig
 from tests.cli.bench import SHORT, bramah, simulated
 from tests.cli.recording_proxy import tapped
 

@@ -9,18 +9,18 @@ from pathlib import Path
 
 import pytest
 
-from analysis.trace.candidates import catalogue
+from analysis.report.loop import render
+from analysis.simulation.twin import simulate_commands
+from analysis.trace.data.candidates import catalogue
 from analysis.trace.engine import trace
-from analysis.trace.loop_report import render
-from analysis.trace.rounds import Round, story_json
-from analysis.twin import simulate_commands
-from protocols import library
-from protocols.check import check
-from protocols.plan import resolve
+from analysis.trace.loop_rounds import Round, story_json
+from protocols.design.check import check
+from protocols.files import library
+from protocols.files.plan import resolve
 from rig.cli import looping
 from rig.cli.looping import DECLINED, FLOOR, NOTHING, REFUSED, ROUNDS, Loop, Wanted
 from rig.cli.trace_text import story_text
-from rig.services.rigs import load_rig
+from rig.runs.rigs import load_rig
 from tests.analysis.page import Page
 from tests.cli.bench import bramah
 from tests.cli.loops import SINE, WAVES, Inside, looped

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from rig.services.store import load_run
+from rig.runs.store import load_run
 from tests.cli.bench import ENDLESS, LONG, outputs_are_zero, simulated, started, wait_for
 
 RIG = "shinshu-2dof"

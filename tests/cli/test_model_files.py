@@ -11,15 +11,15 @@ import pytest
 from pyarrow import parquet
 from typer.testing import CliRunner
 
-from analysis.identify import identify
-from analysis.model import load_model, save_model
+from analysis.identify.identify import identify
+from analysis.simulation.model import load_model, save_model
 from analysis.terms import with_effects
 from analysis.terms.base import Used
 from rig.cli.errors import WorkError
 from rig.cli.main import app
 from rig.model.parse import InputError
-from rig.services.made import write_run
-from rig.services.store import load_run
+from rig.runs.exchange.fixtures import write_run
+from rig.runs.store import load_run
 from tests.analysis import small_bench as bench
 
 FRICTION = 150.0  # [N]
@@ -151,7 +151,7 @@ def test_what_cannot_be_is_said_before_anything_is_written(
     save_model(replace(other, parameters=lost), folder / "wild.json")
     with pytest.raises(WorkError, match=r"step1_r1.*cannot be simulated"):
         bramah("simulate", folder / "wild.json", run, "--out", none)
-    monkeypatch.setattr("rig.services.export.library_missing", lambda kind: "pyarrow")
+    monkeypatch.setattr("rig.runs.exchange.export.library_missing", lambda kind: "pyarrow")
     with pytest.raises(WorkError, match=r"pyarrow.*bramah\[export\]"):
         bramah("export", run, "--format", "parquet", "--out", none)
     assert not none.exists()

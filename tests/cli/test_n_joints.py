@@ -9,24 +9,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.identify import Identification, identify
-from analysis.validate import validate
-from hil_sim.plant import Law, Plant
-from hil_sim.scenario import Scenario
-from hil_sim.sensors import converters
-from protocols import library
-from protocols.generate import generate
-from protocols.judging import validation
-from protocols.model import Protocol
-from protocols.plan import Plan, StepPlan, resolve
-from protocols.write import protocol_text
+from analysis.identify.identify import Identification, identify
+from analysis.simulation.validate import validate
+from hil_sim.plant.plant import Law, Plant
+from hil_sim.plant.sensors import converters
+from hil_sim.scenario.file import Scenario
+from protocols.design.generate import generate
+from protocols.design.validation_steps import validation
+from protocols.files import library
+from protocols.files.plan import Plan, StepPlan, resolve
+from protocols.files.schema import Protocol
+from protocols.files.writer import protocol_text
 from rig.cli.planning import predictor
 from rig.model.codes import decode_input
 from rig.model.parameters import parameter_names
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
-from rig.services.rigs import load_rig
-from rig.services.store import load_run
+from rig.runs.rigs import load_rig
+from rig.runs.store import load_run
 from tests.cli.bench import bramah, simulated
 
 SETTLE = 6.0  # [s] pistons come to their places, waveforms have started

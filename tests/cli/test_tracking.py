@@ -12,18 +12,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.folders import identify_folders
-from analysis.online import Tracker, track
+from analysis.identify.online import Tracker, track
+from analysis.identify.out_of_core import identify_folders
 from drivers.base import SampleBlock
+from rig.bench.observers import Observers
+from rig.bench.session import Bench
 from rig.cli.following import Follower
 from rig.cli.tracking import Tracking, summary
 from rig.model.records import Record, Run, head_of
 from rig.model.rig import Rig
-from rig.services.bench import Bench
-from rig.services.observe import Observers
-from rig.services.recorder import RecordMeta
-from rig.services.rigs import load_rig
-from rig.services.runstate import read_events
+from rig.runs.recorder import RecordMeta
+from rig.runs.rigs import load_rig
+from rig.runs.runstate import read_events
 from tests.analysis import small_bench
 from tests.cli.bench import SHORT, bramah, simulated
 from tests.services.fake_driver import FakeDriver

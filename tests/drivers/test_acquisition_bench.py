@@ -7,9 +7,9 @@ from collections.abc import Iterable
 import numpy as np
 import pytest
 
-from drivers.acquisition_bench import measure_acquisition
 from drivers.base import DeviceInfo, SampleBlock
 from drivers.modbus_tcp import ModbusTcpDriver
+from rig.cli.bench.acquisition import measure_acquisition
 from tests.drivers.wires import device_process
 from tests.hil_sim.integrator import seed_rig
 

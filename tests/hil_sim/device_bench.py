@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hil_sim.device import Device
-from hil_sim.device_laws import Refused
-from hil_sim.device_map import RegisterMap
+from hil_sim.device.device import Device
+from hil_sim.device.laws import Refused
+from hil_sim.device.register_map import RegisterMap
 from rig.model import registers as reg
 from rig.model.registers import Refusal
 from tests.hil_sim.integrator import IntegratorPlant, seed_rig

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hil_sim.server import serve
+from hil_sim.device.server import serve
 from rig.model import channels as ch
 from rig.model.codes import decode_output, encode_input, encode_output
 from rig.model.parse import parse_model

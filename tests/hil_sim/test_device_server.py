@@ -14,7 +14,7 @@ from collections.abc import Iterator
 import pytest
 from pymodbus.client import ModbusTcpClient
 
-from hil_sim.server import EndpointError, serve, warm_up
+from hil_sim.device.server import EndpointError, serve, warm_up
 from rig.model import registers as reg
 from rig.model.registers import TripCause
 from tests.drivers.wires import ROOT, device_process

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hil_sim.plant_bench import accuracy, speed
+from rig.cli.bench.plant import accuracy, speed
 
 
 def test_the_fixed_step_agrees_with_scipy() -> None:

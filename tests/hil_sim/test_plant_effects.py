@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hil_sim.plant import Law, Plant
-from hil_sim.plant_effects import APPLY
-from hil_sim.scenario import Scenario
+from hil_sim.plant.effects import APPLY
+from hil_sim.plant.plant import Law, Plant
+from hil_sim.scenario.file import Scenario
 from tests.hil_sim.plant_trace import CLOSED, Array, Trace, bench, scenario, sine, story
 
 RIG = bench(2000.0)

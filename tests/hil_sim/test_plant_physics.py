@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hil_sim import kernel
-from hil_sim.kernel_data import ATMOSPHERE, record
-from hil_sim.plant import Law, Plant, compression
-from hil_sim.plant_tables import build
-from hil_sim.scenario import Scenario
-from hil_sim.truth import Machine, load_machine
+from hil_sim.plant import kernel
+from hil_sim.plant.kernel_data import ATMOSPHERE, record
+from hil_sim.plant.plant import Law, Plant, compression
+from hil_sim.plant.tables import build
+from hil_sim.scenario.file import Scenario
+from hil_sim.scenario.truth import Machine, load_machine
 from rig.model.parameters import parameter_names
 from rig.model.parse import InputError
 from rig.model.rig import Rig

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hil_sim import kernel_loop
-from hil_sim.kernel_data import record as record_of
-from hil_sim.plant import Law, Plant
-from hil_sim.scenario import Scenario
+from hil_sim.plant import kernel_loop
+from hil_sim.plant.kernel_data import record as record_of
+from hil_sim.plant.plant import Law, Plant
+from hil_sim.scenario.file import Scenario
 from rig.model.channels import kind_of
 from rig.model.codes import decode_input, decode_output, encode_output
 from rig.model.rig import Rig

@@ -6,11 +6,11 @@ from collections import Counter
 
 import pytest
 
-from hil_sim.plant import Law, Plant
-from hil_sim.scenario import Scenario
-from hil_sim.scenario_random import KINDS, STRANGERS, draw
+from hil_sim.plant.plant import Law, Plant
+from hil_sim.scenario.file import Scenario
+from hil_sim.scenario.random_draw import KINDS, STRANGERS, draw
 from rig.model.rig import Rig
-from rig.services.rigs import load_rig
+from rig.runs.rigs import load_rig
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import pytest
 from rig.model.electric import ElectricRig
 from rig.model.parse import InputError, parse_model
 from rig.model.rig import Rig
-from rig.services.rigs import load_bench, load_rig, rig_text
+from rig.runs.rigs import load_bench, load_rig, rig_text
 
 TEXT, _ = rig_text("emps")
 ARM, _ = rig_text("electric-2dof")

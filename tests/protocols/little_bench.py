@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.base import DeviceInfo, OutputLaw, SampleBlock
+from rig.bench.guard import JointRole
 from rig.model import channels as ch
 from rig.model.rig import Rig
-from rig.services.recorder import RecordMeta
-from rig.services.safety import JointRole
+from rig.runs.recorder import RecordMeta
 
 Array = NDArray[np.float64]
 BLOCK = 10

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocols.centring import follow, forecast, leaves, motion, recentring, trim
+from protocols.engine.centring import follow, forecast, leaves, motion, recentring, trim
 
 RATE = 1000.0
 gains = st.floats(0.05, 0.4)

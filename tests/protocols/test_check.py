@@ -9,14 +9,14 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from protocols.check import check
-from protocols.check_report import CheckReport, worst
-from protocols.excite import Array
-from protocols.library import load
-from protocols.plan import Overrides, resolve
+from protocols.design.check import check
+from protocols.design.check_report import CheckReport, worst
+from protocols.files.library import load
+from protocols.files.plan import Overrides, resolve
+from protocols.files.waveforms import Array
 from rig.model.parse import InputError
 from rig.model.rig import Rig
-from rig.services.rigs import load_rig
+from rig.runs.rigs import load_rig
 
 GAIN = 0.16  # m/s per volt
 NULL = 0.04  # V

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from protocols.engine import run
-from protocols.library import load
-from protocols.model import Protocol
-from protocols.plan import Overrides, Plan, resolve
+from protocols.engine.engine import run
+from protocols.files.library import load
+from protocols.files.plan import Overrides, Plan, resolve
+from protocols.files.schema import Protocol
 from rig.model.parse import parse_model
 from rig.model.rig import Rig
-from rig.services.rigs import load_rig
+from rig.runs.rigs import load_rig
 from tests.protocols.little_bench import Cylinder, LittleBench, default_cylinders
 
 Phase = tuple[str, str, int, int, str]

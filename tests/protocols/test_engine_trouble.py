@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from protocols.engine import run
-from protocols.errors import LockFailed, ProtocolAborted
-from protocols.model import Protocol
-from protocols.plan import Plan, resolve
+from protocols.engine.engine import run
+from protocols.engine.errors import LockFailed, ProtocolAborted
+from protocols.files.plan import Plan, resolve
+from protocols.files.schema import Protocol
 from rig.model.parse import parse_model
 from rig.model.rig import Rig
-from rig.services.rigs import load_rig
+from rig.runs.rigs import load_rig
 from tests.protocols.little_bench import Cylinder, Handle, LittleBench, default_cylinders
 
 TEXT = """\

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocols.excite import Array, make_multisine, make_sine, whole_period
-from protocols.model import Multisine, Sine
+from protocols.files.schema import Multisine, Sine
+from protocols.files.waveforms import Array, make_multisine, make_sine, whole_period
 
 RATE = 1000.0
 

@@ -7,19 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.twin import simulate_commands
-from protocols import library
-from protocols.candidates import candidates, steps_needed
-from protocols.check import check
-from protocols.generate import Generated, generate, prove
-from protocols.judging import validation
-from protocols.model import Protocol
-from protocols.plan import resolve
-from protocols.write import protocol_text
+from analysis.simulation.twin import simulate_commands
+from protocols.design.candidates import candidates, steps_needed
+from protocols.design.check import check
+from protocols.design.generate import Generated, generate, prove
+from protocols.design.validation_steps import validation
+from protocols.files import library
+from protocols.files.plan import resolve
+from protocols.files.schema import Protocol
+from protocols.files.writer import protocol_text
 from rig.cli.planning import predictor
 from rig.model.parse import InputError, parse_model
 from rig.model.rig import Rig
-from rig.services.rigs import load_rig
+from rig.runs.rigs import load_rig
 
 
 @pytest.fixture(scope="module")

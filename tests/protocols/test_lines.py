@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from protocols import library
-from protocols.excite import chosen_lines, make_waveform, scaled
-from protocols.model import Lines, Protocol
-from protocols.plan import Overrides, override
-from protocols.write import protocol_text
+from protocols.files import library
+from protocols.files.plan import Overrides, override
+from protocols.files.schema import Lines, Protocol
+from protocols.files.waveforms import chosen_lines, make_waveform, scaled
+from protocols.files.writer import protocol_text
 from rig.model.parse import InputError, parse_model
 
 TEXT = """

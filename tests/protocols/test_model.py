@@ -9,11 +9,11 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocols.library import load, shipped_names
-from protocols.model import Multisine, Protocol, Sine
-from protocols.plan import resolve
+from protocols.files.library import load, shipped_names
+from protocols.files.plan import resolve
+from protocols.files.schema import Multisine, Protocol, Sine
 from rig.model.parse import InputError, parse_model
-from rig.services.rigs import load_rig
+from rig.runs.rigs import load_rig
 
 GOOD = """\
 name: mine

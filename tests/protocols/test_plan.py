@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from protocols.library import load, shipped_names
-from protocols.model import Protocol
-from protocols.plan import Overrides, resolve
+from protocols.files.library import load, shipped_names
+from protocols.files.plan import Overrides, resolve
+from protocols.files.schema import Protocol
 from rig.model.parse import InputError, parse_model
 from rig.model.rig import Rig
-from rig.services.rigs import load_rig
+from rig.runs.rigs import load_rig
 
 TEXT = """\
 name: mine

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from analysis import design_limits
-from protocols.centring import under_loop
+from analysis.design import limits
+from protocols.engine.centring import under_loop
 
 RATE, PULL = 100.0, 2.0  # Hz, 1/s
 
@@ -45,5 +45,5 @@ def test_the_piston_under_the_loop_is_that_of_its_equation(
 def test_designs_and_checks_foresee_the_same_swing(wave: tuple[np.ndarray, np.ndarray]) -> None:
     """Two layers that may not import one another; 0.8 m/s per volt, 2.5 V/m."""
     speed, free = wave
-    ours = design_limits._under_loop(free, speed / 0.8, 2.5, RATE)
+    ours = limits._under_loop(free, speed / 0.8, 2.5, RATE)
     assert ours == pytest.approx(under_loop(free, 0.8 * 2.5, RATE), abs=1e-9)

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 from drivers.base import DeviceInfo, OutputLaw, SampleBlock
-from protocols.engine import run
-from protocols.errors import LockFailed
-from protocols.excite import Array
-from protocols.library import load
-from protocols.plan import Overrides, resolve
+from protocols.engine.engine import run
+from protocols.engine.errors import LockFailed
+from protocols.files.library import load
+from protocols.files.plan import Overrides, resolve
+from protocols.files.waveforms import Array
+from rig.bench.session import Bench
 from rig.model.rig import Rig
-from rig.services.bench import Bench
-from rig.services.recorder import Recorder
-from rig.services.rigs import load_rig
-from rig.services.store import load_run
+from rig.runs.recorder import Recorder
+from rig.runs.rigs import load_rig
+from rig.runs.store import load_run
 from tests.protocols.little_bench import LittleBench, default_cylinders
 
 

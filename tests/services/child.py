@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Any
 
 from drivers.base import OutputLaw
-from rig.services import archive, journal, recorder, store
-from rig.services.attach import Publisher
-from rig.services.bench import Bench
-from rig.services.recorder import Recorder
-from rig.services.rigs import load_rig
-from rig.services.trips import OperatorStop, RecordingFailed
+from rig.bench.attach import Publisher
+from rig.bench.session import Bench
+from rig.model.trips import OperatorStop, RecordingFailed
+from rig.runs import archive, journal, recorder, store
+from rig.runs.recorder import Recorder
+from rig.runs.rigs import load_rig
 from tests.services.fake_driver import FakeDriver, kill_self
 
 RIG = load_rig("shinshu-2dof")

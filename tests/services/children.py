@@ -10,7 +10,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from rig.services.rigs import load_rig
+from rig.runs.rigs import load_rig
 from tests.services.fake_driver import samples
 
 RIG = load_rig("shinshu-2dof")

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from rig.model.parse import InputError
-from rig.services.recover import recover
-from rig.services.runstate import read_events
-from rig.services.store import list_runs, load_run
-from rig.services.trips import RecordingFailed
+from rig.model.trips import RecordingFailed
+from rig.runs.recover import recover
+from rig.runs.runstate import read_events
+from rig.runs.store import list_runs, load_run
 from tests.services.children import RIG, acknowledged, assert_all_there, finish, measured, start
 from tests.services.fake_driver import samples
 

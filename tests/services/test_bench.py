@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from drivers.base import DeviceError, DeviceInfo, DeviceLost, OutputLaw, SampleBlock
-from rig.services.bench import Bench
-from rig.services.recorder import Recorder
-from rig.services.rigs import load_rig
-from rig.services.runstate import read_events
-from rig.services.safety import EXCITED, FREE, JointRole
-from rig.services.store import load_run
-from rig.services.trips import Latched, OperatorStop, SafetyTrip
+from rig.bench.guard import EXCITED, FREE, JointRole
+from rig.bench.session import Bench
+from rig.model.trips import Latched, OperatorStop, SafetyTrip
+from rig.runs.recorder import Recorder
+from rig.runs.rigs import load_rig
+from rig.runs.runstate import read_events
+from rig.runs.store import load_run
 from tests.services.fake_driver import FakeDriver
 
 RIG = load_rig("shinshu-2dof")

@@ -14,12 +14,12 @@ from scipy.io import loadmat
 
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
-from rig.services import export
-from rig.services.export import export_run, library_missing
-from rig.services.importer import import_records
-from rig.services.made import write_run
-from rig.services.rigs import load_rig
-from rig.services.store import list_runs, load_run
+from rig.runs.exchange import export
+from rig.runs.exchange.export import export_run, library_missing
+from rig.runs.exchange.fixtures import write_run
+from rig.runs.exchange.importer import import_records
+from rig.runs.rigs import load_rig
+from rig.runs.store import list_runs, load_run
 from tests.services.fake_driver import samples
 
 RIG = load_rig("shinshu-2dof")

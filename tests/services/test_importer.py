@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from scipy.io import savemat
 
 from rig.model.parse import InputError
-from rig.services.importer import import_records
-from rig.services.rigs import load_rig
-from rig.services.store import list_runs, load_run
+from rig.runs.exchange.importer import import_records
+from rig.runs.rigs import load_rig
+from rig.runs.store import list_runs, load_run
 from tests.services.fake_driver import samples
 
 RIG = load_rig("shinshu-2dof")

@@ -10,8 +10,8 @@ import pytest
 from scipy.io import savemat
 
 from rig.model.parse import InputError
-from rig.services.importer import import_records
-from rig.services.store import load_run
+from rig.runs.exchange.importer import import_records
+from rig.runs.store import load_run
 
 N = 500
 HEAD = "rig: emps\nrecords:\n"

@@ -11,16 +11,16 @@ import pytest
 import yaml
 
 from drivers.base import OutputLaw, SampleBlock
+from rig.bench.session import Bench
 from rig.model.channels import unit_of
 from rig.model.parse import InputError
-from rig.services import archive
-from rig.services.bench import Bench
-from rig.services.recorder import Recorder, RecordMeta
-from rig.services.recover import recover
-from rig.services.rigs import load_rig
-from rig.services.runstate import read_events
-from rig.services.store import list_runs, load_run, read_header
-from rig.services.trips import RecordingFailed
+from rig.model.trips import RecordingFailed
+from rig.runs import archive
+from rig.runs.recorder import Recorder, RecordMeta
+from rig.runs.recover import recover
+from rig.runs.rigs import load_rig
+from rig.runs.runstate import read_events
+from rig.runs.store import list_runs, load_run, read_header
 from tests.services.fake_driver import FakeDriver, samples
 
 RIG = load_rig("shinshu-2dof")

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from rig.model.parse import InputError
-from rig.services.rigs import load_rig, shipped_rigs
+from rig.runs.rigs import load_rig, shipped_rigs
 
 SEED = resources.files("rig").joinpath("shipped", "shinshu-2dof.yaml").read_text()
 

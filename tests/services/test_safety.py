@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from drivers.base import SampleBlock
-from rig.services.rigs import load_rig
-from rig.services.safety import EXCITED, FREE, Guard, GuardSettings, JointRole, rate_window
-from rig.services.trips import SafetyTrip, Violation
+from rig.bench.guard import EXCITED, FREE, Guard, GuardSettings, JointRole, rate_window
+from rig.model.trips import SafetyTrip, Violation
+from rig.runs.rigs import load_rig
 
 RIG = load_rig("shinshu-2dof")
 NAMES = RIG.recorded

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from analysis.effects.base import Effect, ordered
-from analysis.model import Estimate, Model
-from analysis.rows import Filtering, Rows, default_filtering, record_rows
-from analysis.signals import Signals, condition
+from analysis.regression.rows import Filtering, Rows, default_filtering, record_rows
+from analysis.signals.conditioning import Signals, condition
+from analysis.simulation.model import Estimate, Model
 from analysis.terms import baseline
 from analysis.terms.base import FAMILIES, Used, family_of
-from rig.cli.effects_study import searched
 from rig.model.records import Run
 from rig.model.rig import Rig
+from tests.studies.effects.simulated import searched
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,9 @@ from analysis.effects.base import Effect, ordered
 from analysis.effects.contact import contact_levels, contact_state, contact_under_load, worked
 from analysis.effects.measurement import Sensor
 from analysis.effects.payload import growth, payload_of_shift
-from analysis.effects_catalogue import FAMILIES, pages
-from analysis.identify import identify
-from analysis.rows import right_sides
-from analysis.signals import Signals
+from analysis.identify.identify import identify
+from analysis.regression.rows import right_sides
+from analysis.signals.conditioning import Signals
 from analysis.terms import base, baseline, known, make
 from analysis.terms.base import Used, family_of
 from rig.model.parameters import gain_names
@@ -24,6 +23,7 @@ from rig.model.records import Run
 from rig.model.rig import Rig
 from tests.analysis.small_bench import TRUTH
 from tests.analysis.test_terms import signals_of
+from tests.studies.effects.catalogue_text import FAMILIES, pages
 
 CONTRACT = {
     "coulomb_friction", "stribeck_friction", "asymmetric_friction", "pressure_dependent_friction",
@@ -351,10 +351,10 @@ def test_a_place_that_is_none_is_named() -> None:
 
 
 def test_the_pages_are_those_of_the_classes(rig: Rig) -> None:
-    """`bramah effects --docs docs/` was run after the last change of the catalogue."""
+    """The pages were written after the last change of the catalogue."""
     docs = Path(__file__).parents[3] / "docs"
     for name, text in pages(rig).items():
         written = (docs / name).read_text(encoding="utf-8")
-        assert written.startswith(text), f"{name} is old: run bramah effects --docs docs/"
+        assert written.startswith(text), f'run `make study NAME="effects --docs docs"`: {name}'
     for family in FAMILIES:
         assert (docs / "images" / f"effects-{family}.svg").stat().st_size < 200_000

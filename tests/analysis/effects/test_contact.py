@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from analysis.effects.contact import contact_state, contact_under_load, worked
 from analysis.effects.friction import CoulombFriction, StribeckFriction
 from analysis.effects.friction_levels import PressureDependentFriction
-from analysis.signals import condition
+from analysis.signals.conditioning import condition
 from rig.model.records import Run
 from rig.model.rig import Rig
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from analysis.effects.base import Effect
-from analysis.signals import condition
-from analysis.simulate import drive_of, hidden_paths, simulate, state_at
+from analysis.signals.conditioning import condition
+from analysis.simulation.simulate import drive_of, hidden_paths, simulate, state_at
 from analysis.terms import make
 from rig.model.rig import Rig
 from tests.analysis.effects import one_joint as bench

@@ -10,14 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from analysis.differentiate import channel_filter
 from analysis.effects.base import Effect
 from analysis.effects.measurement import Sensor
-from analysis.signals import condition
-from analysis.simulate import State, drive_of, simulate
+from analysis.signals.conditioning import condition
+from analysis.signals.filters import channel_filter
+from analysis.simulation.simulate import State, drive_of, simulate
+from analysis.simulation.validate import fit_percent
 from analysis.terms import make
 from analysis.terms.base import Used
-from analysis.validate import fit_percent
 from rig.model.rig import Rig
 from tests.analysis.effects import one_joint as bench
 from tests.analysis.effects.fitting import Data, fitted, model_of, residual

@@ -1,7 +1,7 @@
 """Effects in the simulator's own form, found by the catalogue's: size within a tenth.
 
-One step, one repeat of the multisine protocol; `bramah effects --study` does all effects and all
-steps, with held-out records.
+One step, one repeat of the multisine protocol; `python -m tests.studies effects --study` does all
+effects and all steps, with held-out records.
 """
 
 from __future__ import annotations
@@ -10,11 +10,11 @@ import pytest
 
 from analysis.effects.base import Effect
 from analysis.terms import make
-from hil_sim.scenario import parse_scenario
-from protocols.plan import Overrides
-from rig.cli.direct_bench import simulated_run
+from hil_sim.scenario.file import parse_scenario
+from protocols.files.plan import Overrides
 from rig.model.rig import Rig
 from tests.analysis.effects.fitting import Data, fitted
+from tests.studies.direct_bench import simulated_run
 
 ONE_STEP = Overrides(repeats=1, steps=("step1",))
 CASES = [

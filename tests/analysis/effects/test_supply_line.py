@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from analysis.effects.supply import SupplySag
-from analysis.signals import Signals
+from analysis.signals.conditioning import Signals
 from rig.model.rig import Rig
 from tests.analysis.test_terms import signals_of
 

@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.identify import identify
-from analysis.synthetic import multisine, synthetic_run
+from analysis.identify.identify import identify
+from analysis.simulation.synthetic import multisine, synthetic_run
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
-from analysis.trace import held_out
-from analysis.trace.beside import beside, plausible, stripped
-from analysis.trace.board import board
-from analysis.trace.evidence import scenes
-from analysis.trace.refine import fit
+from analysis.trace.data.conditioned_record import scenes
+from analysis.trace.data.regression_data import board
+from analysis.trace.data.temperature_nuisance import beside, plausible, stripped
+from analysis.trace.judge import held_out
+from analysis.trace.search.refinement import fit
 from rig.model.records import Run
 from rig.model.rig import Rig
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.trace.candidates import catalogue
-from analysis.trace.clue_formula import Formula
+from analysis.trace.clues.formula import Formula
+from analysis.trace.data.candidates import catalogue
 from analysis.trace.engine import trace
 from analysis.trace.result import Trace, to_json
 from rig.cli.trace_text import trace_text

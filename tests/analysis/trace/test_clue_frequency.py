@@ -9,10 +9,10 @@ import pytest
 
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
-from analysis.trace.board import Board, board
-from analysis.trace.clue_frequency import FREQUENCY, frequency_clue
-from analysis.trace.evidence import scenes
-from analysis.trace.lines import lines
+from analysis.trace.clues.frequency import FREQUENCY, frequency_clue
+from analysis.trace.data.conditioned_record import scenes
+from analysis.trace.data.regression_data import Board, board
+from analysis.trace.data.spectral_lines import lines
 from analysis.trace.result import Dependence
 from rig.model.records import Run
 from rig.model.rig import Rig

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from analysis.signals import Signals
+from analysis.signals.conditioning import Signals
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
-from analysis.trace.board import Board, board
-from analysis.trace.clue_variables import factor_of
-from analysis.trace.clues import dependence
-from analysis.trace.evidence import filtered, prepared, scenes
+from analysis.trace.clues.dependence import dependence
+from analysis.trace.clues.variables import factor_of
+from analysis.trace.data.conditioned_record import filtered, prepared, scenes
+from analysis.trace.data.regression_data import Board, board
 from analysis.trace.result import Dependence
 from rig.model.rig import Rig
 from tests.analysis.trace.hidden import pair_of_runs

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from analysis.trace.covering import LINES, farther, richer
-from analysis.trace.discriminate import View, calibration, view
-from analysis.trace.excitations import FAMILIES, Excitation, excitation, settings
+from analysis.trace.next_experiment.discrimination import View, calibration, view
+from analysis.trace.next_experiment.excitations import FAMILIES, Excitation, excitation, settings
+from analysis.trace.next_experiment.range_extension import LINES, farther, richer
 from analysis.trace.result import Dependence
 from tests.analysis.trace.test_next_experiment import sine
 

@@ -11,15 +11,15 @@ import pytest
 from typer.testing import CliRunner
 
 from analysis.effects.friction_levels import AsymmetricFriction
-from analysis.trace.candidates import catalogue
+from analysis.trace.data.candidates import catalogue
 from analysis.trace.engine import trace
 from analysis.trace.result import CLEAN, EXPLAINED, Trace, to_json
-from rig.cli import emps_study as study
 from rig.cli.main import app
 from rig.model.records import Run
-from rig.services.made import write_run
-from rig.services.rigs import load_rig
+from rig.runs.exchange.fixtures import write_run
+from rig.runs.rigs import load_rig
 from tests.analysis.carriage import Carriage, moves, record
+from tests.studies.machines import emps as study
 
 PLACE = Path(os.environ.get("BRAMAH_DATA", Path(__file__).parents[4] / "shared" / "data"))
 FILE = PLACE / "emps" / "DATA_EMPS.mat"

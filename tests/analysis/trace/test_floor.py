@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.synthetic import multisine, synthetic_run
+from analysis.simulation.synthetic import multisine, synthetic_run
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
-from analysis.trace.board import board
-from analysis.trace.evidence import scenes
-from analysis.trace.floor import LEAST, STATED, floors, stated_noise
+from analysis.trace.data.conditioned_record import scenes
+from analysis.trace.data.noise_floor import LEAST, STATED, floors, stated_noise
+from analysis.trace.data.regression_data import board
 from rig.model.rig import Rig
 
 

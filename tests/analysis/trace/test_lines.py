@@ -9,8 +9,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from analysis.trace.data.spectral_lines import (
+    CONSTANT,
+    EVEN,
+    EXCITED,
+    KINDS,
+    ODD,
+    lines,
+    meaning,
+    spectrum,
+)
 from analysis.trace.engine import trace
-from analysis.trace.lines import CONSTANT, EVEN, EXCITED, KINDS, ODD, lines, meaning, spectrum
 from analysis.trace.result import Trace, to_json
 from rig.model.rig import Rig
 from tests.analysis.trace.hidden import pair_of_runs

@@ -9,9 +9,11 @@ import pytest
 
 from analysis.terms import baseline_of, known
 from analysis.terms.base import Used
-from analysis.trace.board import Board, board
-from analysis.trace.candidates import catalogue
-from analysis.trace.discriminate import (
+from analysis.trace.data.candidates import catalogue
+from analysis.trace.data.conditioned_record import scenes
+from analysis.trace.data.regression_data import Board, board
+from analysis.trace.next_experiment.detectable_size import smallest
+from analysis.trace.next_experiment.discrimination import (
     Ground,
     Hypothesis,
     Question,
@@ -21,14 +23,18 @@ from analysis.trace.discriminate import (
     separation,
     view,
 )
-from analysis.trace.evidence import scenes
-from analysis.trace.excitations import FAMILIES, Setting, excitation, protocol, settings
-from analysis.trace.interesting import smallest
-from hil_sim.scenario import Scenario
-from protocols.plan import Overrides
-from rig.cli.direct_bench import simulated_run
+from analysis.trace.next_experiment.excitations import (
+    FAMILIES,
+    Setting,
+    excitation,
+    protocol,
+    settings,
+)
+from hil_sim.scenario.file import Scenario
+from protocols.files.plan import Overrides
 from rig.model.rig import Rig
-from rig.services.rigs import load_rig
+from rig.runs.rigs import load_rig
+from tests.studies.direct_bench import simulated_run
 
 FAST = next(f for f in FAMILIES if f.name == "fast")
 AIR = Hypothesis((Used(known()["entrained_air"]("bench")),), {"alpha_air": 3e-3})

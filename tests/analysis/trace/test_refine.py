@@ -11,9 +11,9 @@ import pytest
 
 from analysis.terms import baseline, make
 from analysis.terms.base import Used
-from analysis.trace import refine
-from analysis.trace.board import board
-from analysis.trace.evidence import scenes
+from analysis.trace.data.conditioned_record import scenes
+from analysis.trace.data.regression_data import board
+from analysis.trace.search import refinement
 from rig.model.rig import Rig
 from tests.analysis.effects import one_joint as bench
 
@@ -24,15 +24,15 @@ def test_a_gain_is_found_from_the_wrong_side_of_one_too(
 ) -> None:
     """Below one the residual falls towards the bound, as it did on a bench moved by a sine."""
 
-    def fit(stage: Any, terms: Sequence[Used]) -> refine.Fit:
+    def fit(stage: Any, terms: Sequence[Used]) -> refinement.Fit:
         gain = terms[-1].shape[0]
         left = 50.0 * (gain - 1.01) if gain >= 1.0 else 9.0 / (1.6 - gain)
-        return refine.Fit(tuple(terms), {}, np.array([left, 0.1]))
+        return refinement.Fit(tuple(terms), {}, np.array([left, 0.1]))
 
-    monkeypatch.setattr(refine, "fit", fit)
+    monkeypatch.setattr(refinement, "fit", fit)
     stage: Any = SimpleNamespace(rig=rig, terms=())
     used = Used(make("sensor_gain", "joint 2 cap"), (start,))
-    found = refine.refine(stage, (used,))
+    found = refinement.refine(stage, (used,))
     assert found.terms[-1].shape[0] == pytest.approx(1.01, abs=1e-3)
 
 
@@ -44,6 +44,6 @@ def test_a_contact_stiffens_in_the_model_where_it_does_on_the_bench_and_else_say
     records = scenes(rig, [bench.run(rig, wrong, 0.03, 1)])
     stage = board(rig, tuple(map(Used, baseline())), records)
     friction = Used(make("coulomb_friction", "joint 2"), (40e-6,))
-    distance, *more = refine.refine(stage, (*stage.terms, friction)).terms[-1].shape
+    distance, *more = refinement.refine(stage, (*stage.terms, friction)).terms[-1].shape
     assert distance == pytest.approx(150e-6, rel=0.15)
     assert more == ([pytest.approx(stiffening, rel=0.25)] if stiffening else [])

@@ -7,13 +7,13 @@ from dataclasses import replace
 import pytest
 
 from analysis.effects.base import Effect
-from analysis.estimators.hidden_states import hidden_effects, rest_of, shot
-from analysis.model import Estimate, Model
+from analysis.identify.output_error.hidden_states import hidden_effects, rest_of, shot
+from analysis.simulation.model import Estimate, Model
 from analysis.terms import make
 from analysis.terms.base import Used
 from analysis.trace.engine import trace
+from analysis.trace.judge.shooting import told
 from analysis.trace.result import Trace, to_json
-from analysis.trace.shooting import told
 from analysis.trace.words import shot_in_words
 from rig.model.records import Run
 from rig.model.rig import Rig

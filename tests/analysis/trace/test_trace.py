@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from analysis.effects.base import Effect
-from analysis.identify import identify
-from analysis.model import load_model, save_model
+from analysis.identify.identify import identify
+from analysis.simulation.model import load_model, save_model
 from analysis.terms import baseline_of, make
 from analysis.terms.base import Used
-from analysis.trace.candidates import catalogue
+from analysis.trace.data.candidates import catalogue
 from analysis.trace.engine import trace
 from analysis.trace.result import Trace, to_json
 from rig.model.parse import InputError

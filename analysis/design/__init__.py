@@ -1,0 +1,1 @@
+"""Experiments before they run: predicted standard errors, limits, better excitations."""

@@ -1,0 +1,125 @@
+"""Changes of one joint's spectrum that the search for a better excitation tries."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.design.limits import Spectrum
+from analysis.design.twin_records import PlannedStep
+
+Array = NDArray[np.float64]
+Lines = NDArray[np.int64]
+
+WIDER = 1.6  # lines up to this times the highest of the protocol may be taken
+LOWER = 0.6  # and down to this times the lowest
+TILTS = (-0.8, 1.3)  # of new shapes, amplitudes f^-tilt
+ANCHORS = 4  # lowest lines that a new shape keeps: they move the piston, and so centre it
+KINDS = ("shape", "bump", "lines", "phases")
+EARLY, LATE = (0.6, 0.2, 0.1, 0.1), (0.15, 0.35, 0.25, 0.25)  # how often each
+FEWEST = 3  # lines of a tone
+
+
+@dataclass(frozen=True)
+class Tone:
+    """The lines that one joint of one step may use, and the amplitude and phase of each [V].
+
+    `empty` lines stay so; `spectrum` (lines,) is zero where a line is not used.
+    """
+
+    joint: int
+    lines: Lines
+    spectrum: Spectrum
+    empty: tuple[int, ...]
+
+    @property
+    def chosen(self) -> tuple[int, ...]:
+        """The lines in use."""
+        return tuple(int(k) for k in self.lines[np.abs(self.spectrum) > 0])
+
+
+def mutated(tone: Tone, early: bool, rng: np.random.Generator) -> tuple[Spectrum, int]:
+    """Return the tone's spectrum with one random change, and how many plays that is worth.
+
+    `early` in a search, large changes are more frequent.
+    """
+    size, level = np.abs(tone.spectrum), envelope(tone)
+    many = len(tone.lines)
+    kind = rng.choice(KINDS, p=EARLY if early else LATE)
+    x = np.log(tone.lines / tone.lines[0])
+    if kind == "phases":
+        spread = rng.uniform(0.1, np.pi)
+        turn = np.exp(1j * spread * rng.uniform(-1, 1, many))
+        return np.asarray(tone.spectrum * turn), 2
+    if kind == "bump":
+        middle, width = rng.uniform(x[0], x[-1]), rng.uniform(0.08, 0.6)
+        height = 0.7 * rng.standard_normal()
+        size = size * np.exp(height * np.exp(-0.5 * ((x - middle) / width) ** 2))
+    elif kind == "lines":
+        some = rng.random(many) < rng.uniform(0.03, 0.3)
+        size = np.where(some, np.where(size > 0, 0.0, level), size)
+    else:
+        size = reshaped(tone, rng)
+    if np.count_nonzero(size) < FEWEST:
+        return tone.spectrum, 1
+    fresh = np.exp(2j * np.pi * rng.random(many))
+    turn = np.where(np.abs(tone.spectrum) > 0, np.exp(1j * np.angle(tone.spectrum)), fresh)
+    return np.asarray(size * turn), 4 if kind == "shape" else 3
+
+
+def tilted(tone: Tone, tilt: float, rng: np.random.Generator) -> tuple[Spectrum, int]:
+    """Return all lines with amplitudes f^-tilt, of the tone's power, and its worth in plays."""
+    size = tone.lines.astype(np.float64) ** -tilt
+    size *= np.linalg.norm(tone.spectrum) / np.linalg.norm(size)
+    return np.asarray(size * np.exp(2j * np.pi * rng.random(len(size)))), 4
+
+
+def reshaped(tone: Tone, rng: np.random.Generator) -> Array:
+    """Return amplitudes f^-tilt in a random band above the lowest lines, which stay."""
+    size = np.abs(tone.spectrum)
+    lowest = np.flatnonzero(size > 0)[:ANCHORS]
+    many, first = len(size), int(lowest[-1]) + 1
+    low, high = np.sort(rng.uniform(size=2) ** [2.0, 0.5]) * (many - first) + first
+    inside = (np.arange(many) >= low) & (np.arange(many) < high)
+    shape = tone.lines.astype(np.float64) ** -rng.uniform(*TILTS) * inside
+    power = np.linalg.norm(shape)
+    if power == 0:
+        return size
+    above = np.linalg.norm(size[first:]) or np.linalg.norm(size)
+    shape *= above / power * np.exp(0.6 * rng.standard_normal())
+    shape[lowest] = size[lowest]
+    return np.asarray(shape)
+
+
+def tone_of(joint: int, wave: Array, empty: Sequence[int]) -> Tone:
+    """Return the tone of one period of a command (n,), with the lines it may take."""
+    spectrum = np.fft.rfft(wave) * (2.0 / len(wave))
+    own = np.flatnonzero(np.abs(spectrum) > 1e-6 * np.abs(spectrum).max())
+    stride = int(np.gcd.reduce(np.diff(own))) if len(own) > 1 else 1
+    first = max(own[0] - stride * int((1 - LOWER) * own[0] / stride), 1)
+    last = own[-1] + stride * int((WIDER - 1) * own[-1] / stride) if len(own) > 1 else own[-1]
+    lines = np.setdiff1d(np.arange(first, last + 1, stride), np.array(empty, dtype=np.int64))
+    lines = np.union1d(lines, own)
+    values = np.where(np.isin(lines, own), spectrum[lines], 0.0)
+    return Tone(joint, lines.astype(np.int64), values, tuple(empty))
+
+
+def envelope(tone: Tone) -> Array:
+    """Return the amplitude (lines,) a line would have among its neighbours in use."""
+    size = np.abs(tone.spectrum)
+    in_use = size > 0
+    return np.asarray(np.interp(tone.lines, tone.lines[in_use], size[in_use]))
+
+
+def with_tones(step: PlannedStep, tones: Mapping[int, Tone]) -> PlannedStep:
+    """Return the step with the waves of these tones."""
+    n, waves, lines = step.period, dict(step.waves), set()
+    for joint, tone in tones.items():
+        full = np.zeros(n // 2 + 1, dtype=np.complex128)
+        full[tone.lines] = tone.spectrum * (n / 2.0)
+        waves[joint] = np.asarray(np.fft.irfft(full, n))
+        lines |= set(tone.chosen)
+    return replace(step, waves=waves, lines=tuple(sorted(lines)))

@@ -1,0 +1,269 @@
+"""Improving an excitation: lines, amplitudes and phases for what is identified worst.
+
+A seeded evolution strategy (one parent, one child) over the spectra of the steps. A child changes
+one joint's spectrum in one step: a smooth bump of its amplitudes, another band, a few lines left
+out or brought back, a new tilt, or its phases; phases are then changed until the forecast peaks
+are low, and the whole is scaled to fill the tightest limit. It is judged by the predicted
+covariance on the twin (`prediction`), rows and noise as in the identification itself, and lives
+if the criterion falls and no other parameter pays too much for it (`KEEP`). The information
+of the other steps is kept, so a trial costs one step's simulation. Criteria, of the covariance
+relative to the nominal parameters (Pintelon and Schoukens, ch. 5; Pronzato and Pazman, Design of
+Experiments in Nonlinear Models, ch. 5): D log det, E the largest eigenvalue, or one parameter's
+variance.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.design.limits import forecast_of, used
+from analysis.design.moves import Tone, mutated, tilted, tone_of, with_tones
+from analysis.design.predict import StepInformation, coefficients, covariance, information
+from analysis.design.twin_records import PlannedStep, Played, play
+from analysis.regression.rows import parameters_of
+from analysis.terms import baseline
+from analysis.terms.base import FAMILIES, Used
+from rig.model.parse import InputError
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+Lines = NDArray[np.int64]
+log = logging.getLogger(__name__)
+Say = Callable[[str], None]
+Passes = Callable[[PlannedStep, Mapping[int, Tone]], bool]
+
+FILL = 0.95  # share of the tightest limit that a design uses on the twin
+KEEP = 1.5  # times its first error is what a parameter may lose, or more while it stays better
+# than that which the criterion is about was at first
+ROUNDS = 40  # of the search for phases, for each child
+NEAR = 0.93  # of the share to fill: a child that fills less is scaled up and played again
+TOO_FAR = 1.02  # of the share to fill: such a child is scaled down and played again
+LARGER = 3.0  # factor by which a spectrum is scaled at most, at once
+GAIN_BAND = 0.2  # of the logarithm of a piston's gain, which the bench needs to centre it
+FIRST_TILTS = (0.0, 0.5, -0.5)  # tried on every tone before anything random
+EARLY_SHARE = 0.6  # of the budget
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One step as designed so far: its tones by joint, what the twin did, what it tells."""
+
+    tones: Mapping[int, Tone]
+    played: Played
+    found: StepInformation
+    share: float
+    limit: str
+
+
+@dataclass(frozen=True)
+class Design:
+    """The improved steps, and relative standard errors by parameter before and after."""
+
+    steps: tuple[PlannedStep, ...]
+    tones: tuple[Mapping[int, Tone], ...]
+    before: Mapping[str, float]
+    after: Mapping[str, float]
+    shares_before: Mapping[str, tuple[float, str]]
+    shares_after: Mapping[str, tuple[float, str]]
+    tried: int
+    kept: int
+
+
+def improve(
+    rig: Rig,
+    steps: Sequence[PlannedStep],
+    empty: Mapping[tuple[str, int], tuple[int, ...]],
+    criterion: str,
+    budget: int,
+    rng: np.random.Generator,
+    say: Say = log.info,
+    passes: Passes = lambda step, tones: True,
+) -> Design:
+    """Improve the steps' multisines with `budget` simulations of a step on the twin.
+
+    `empty` names the detection lines of (step, 0-based joint) at the step's period; `criterion` is
+    D, E or a parameter; `passes` may refuse a step that is about to be kept. Raises InputError
+    for an unknown criterion and where no step has a multisine.
+    """
+    search = _Search(rig, criterion, rng)
+    candidates = [search.first(step, empty) for step in steps]
+    free = [
+        (s, j) for s, c in enumerate(candidates) for j, t in c.tones.items() if len(t.chosen) > 1
+    ]
+    if not free:
+        raise InputError("no step has a multisine to improve; start from lock-and-excite-multisine")
+    search.begin([c.found for c in candidates])
+    before = search.errors([c.found for c in candidates])
+    shares = {c.found.step: (c.share, c.limit) for c in candidates}
+    plays, kept, children = 0, 0, 0
+    for s, _ in dict.fromkeys((s, 0) for s, _ in free):
+        candidates[s], cost = search.fitted(candidates[s])
+        plays += cost
+    best = search.value([c.found for c in candidates])
+    search.loosen([c.found for c in candidates])
+    shapes = [(s, joint, tilt) for tilt in FIRST_TILTS for s, joint in free]
+    while plays < budget:
+        s, joint, tilt = shapes.pop(0) if shapes else (*free[int(rng.integers(len(free)))], None)
+        child, cost = search.child(candidates[s], joint, tilt, plays < EARLY_SHARE * budget)
+        plays, children = plays + cost, children + 1
+        if child is None:
+            continue
+        trial = [*candidates[:s], child, *candidates[s + 1 :]]
+        value = search.value([c.found for c in trial])
+        if value < best and passes(child.played.step, child.tones):
+            candidates, best, kept = trial, value, kept + 1
+            say(f"{plays:4d} of {budget}: {search.text(value)} ({child.limit} {child.share:.0%})")
+    return Design(
+        tuple(c.played.step for c in candidates), tuple(c.tones for c in candidates), before,
+        search.errors([c.found for c in candidates]), shares,
+        {c.found.step: (c.share, c.limit) for c in candidates}, children, kept,
+    )  # fmt: skip
+
+
+class _Search:
+    """What all children share: rig, model, criterion, random stream, the guarded errors."""
+
+    def __init__(self, rig: Rig, criterion: str, rng: np.random.Generator) -> None:
+        self.rig, self.criterion, self.rng = rig, criterion, rng
+        self.terms = tuple(Used(term) for term in baseline())
+        nominal = coefficients(rig, self.terms)
+        self.names = {f: parameters_of(rig, self.terms, f) for f in FAMILIES}
+        self.scale = {f: np.array([nominal[n] for n in names]) for f, names in self.names.items()}
+        if criterion not in ("D", "E") and criterion not in nominal:
+            raise InputError(
+                f"--criterion {criterion}: expected D, E or a parameter: {' '.join(nominal)}"
+            )
+        self.allowed: dict[str, float] = {}
+        self.gains: dict[str, Mapping[int, float]] = {}
+
+    def begin(self, found: Sequence[StepInformation]) -> None:
+        """Refuse steps that leave the wanted undetermined; remember how good each parameter was."""
+        errors = self.errors(found)
+        lost = [n for n, e in errors.items() if not math.isfinite(e)]
+        wanted = lost if self.criterion in ("D", "E") else [n for n in lost if n == self.criterion]
+        if wanted:
+            raise InputError(
+                f"the steps do not determine {' '.join(wanted)}; no excitation cures that: "
+                "add a step that excites the joint concerned"
+            )
+        known = {n: e for n, e in errors.items() if math.isfinite(e)}
+        aim = {"D": float(np.exp(np.mean(np.log(list(known.values()))))), "E": max(known.values())}
+        about = aim.get(self.criterion, known.get(self.criterion, 0.0))
+        self.allowed = {n: max(KEEP * e, about) for n, e in known.items()}
+
+    def loosen(self, found: Sequence[StepInformation]) -> None:
+        """Let a start that had to be made smaller to keep the limits be as poor as it then is."""
+        for name, error in self.errors(found).items():
+            if name in self.allowed:
+                self.allowed[name] = max(self.allowed[name], 1.001 * error)
+
+    def relative(self, found: Sequence[StepInformation]) -> dict[str, Array]:
+        """Return the covariance of each family relative to the nominal coefficients."""
+        return {
+            f: covariance(found, f)[0] / np.outer(self.scale[f], self.scale[f]) for f in FAMILIES
+        }
+
+    def errors(self, found: Sequence[StepInformation]) -> dict[str, float]:
+        """Return the relative standard errors by parameter."""
+        out = {}
+        for family, cov in self.relative(found).items():
+            for name, variance in zip(self.names[family], np.diag(cov), strict=True):
+                out[name] = float(np.sqrt(variance))
+        return out
+
+    def value(self, found: Sequence[StepInformation]) -> float:
+        """Return the criterion, smaller is better; infinite where a parameter got too poor."""
+        covariances = self.relative(found)
+        errors = self.errors(found)
+        if any(not errors[n] <= limit for n, limit in self.allowed.items()):
+            return math.inf
+        if self.criterion == "D":
+            return float(sum(np.linalg.slogdet(c)[1] for c in covariances.values()))
+        if self.criterion == "E":
+            return float(max(np.linalg.eigvalsh(c)[-1] for c in covariances.values()))
+        return errors[self.criterion] ** 2
+
+    def text(self, value: float) -> str:
+        """Say a criterion's value as a relative error."""
+        if self.criterion == "D":
+            size = sum(len(names) for names in self.names.values())
+            return f"D: {100 * math.exp(0.5 * value / size):.4f} % geometric mean"
+        what = "worst direction" if self.criterion == "E" else self.criterion
+        return f"{what}: {100 * math.sqrt(value):.4f} %"
+
+    def first(
+        self, step: PlannedStep, empty: Mapping[tuple[str, int], tuple[int, ...]]
+    ) -> Candidate:
+        """Play the protocol's own step and lay its tones out."""
+        tones = {
+            j: tone_of(j, wave, empty.get((step.name, j), ())) for j, wave in step.waves.items()
+        }
+        candidate = self.judged(step, tones)
+        self.gains[step.name] = candidate.played.gains
+        return candidate
+
+    def judged(self, step: PlannedStep, tones: Mapping[int, Tone]) -> Candidate:
+        """Play a step; raises InputError where the twin cannot."""
+        played = play(self.rig, step)
+        found = information(self.rig, played, self.terms)
+        return Candidate(tones, played, found, *used(self.rig, played))
+
+    def fitted(self, candidate: Candidate) -> tuple[Candidate, int]:
+        """Make a step that passes a limit smaller until it keeps them all."""
+        cost = 0
+        while candidate.share > FILL and cost < 6:
+            smaller = {
+                j: replace(t, spectrum=t.spectrum * (0.98 * FILL / min(candidate.share, 2.0)))
+                for j, t in candidate.tones.items()
+            }
+            candidate = self.judged(with_tones(candidate.played.step, smaller), smaller)
+            cost += 1
+        return candidate, cost
+
+    def child(
+        self, parent: Candidate, joint: int, tilt: float | None, early: bool
+    ) -> tuple[Candidate | None, int]:
+        """Return a changed copy of one step that keeps the limits, or None, and its cost.
+
+        With a `tilt` all lines are used, amplitudes f^-tilt; without, the change is random. The
+        forecast is made anew from each play, because the twin is not linear.
+        """
+        tone = parent.tones[joint]
+        spectrum, plays = (
+            mutated(tone, early, self.rng) if tilt is None else tilted(tone, tilt, self.rng)
+        )
+        base, found = parent, None
+        for cost in range(1, plays + 1):
+            known = forecast_of(self.rig, base.played, joint, tone.lines)
+            spectrum, share = known.flattened(spectrum, ROUNDS)
+            spectrum = spectrum * min(FILL / share, LARGER)
+            tones = {**parent.tones, joint: replace(tone, spectrum=spectrum)}
+            try:
+                base = self.judged(with_tones(base.played.step, tones), tones)
+            except InputError:
+                spectrum, base = 0.5 * spectrum, parent
+                continue
+            if not self.centrable(base):
+                return found, cost
+            if base.share <= FILL * TOO_FAR:
+                found = base
+                if base.share > NEAR * FILL:
+                    return found, cost
+            spectrum = spectrum * (FILL / min(base.share, LARGER))
+        return found, plays
+
+    def centrable(self, candidate: Candidate) -> bool:
+        """Tell whether the pistons still follow their commands about as they did at first.
+
+        The bench trims its biases by that gain; excited only near its resonance a joint shows
+        none, and could not be kept in its stroke.
+        """
+        played = candidate.played
+        first = self.gains[played.step.name]
+        return all(abs(math.log(k / first[j])) < GAIN_BAND for j, k in played.gains.items())

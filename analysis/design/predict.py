@@ -1,0 +1,283 @@
+"""Identifiability before the experiment: each parameter's standard error, predicted.
+
+The plan's steps are played on the twin (nominal parameters), their rows are built exactly as
+`identify` builds them, and the rig's stated sensor noise is carried through the filters
+(`prediction_noise`). With A = sum n_s X_s'X_s and n_s repeats of step s the coupled solution has
+    cov beta = A^-1 [ sum n_s cov g_s ] A^-1.
+What is predicted is the scatter between repeats. Model error is not noise and is not in it; what
+the oil's temperature does to b from step to step is given apart (`oil`), because it shows between
+experiments and not between the repeats of one. Glossary: `std` standard error of one experiment,
+`half` half width of its 95 % interval, both relative to the nominal value.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.design.sensor_noise import score_covariance
+from analysis.design.twin_records import PlannedStep, Played, ideal, play
+from analysis.identify.identify import build_rows
+from analysis.identify.reduction import SEGMENTS
+from analysis.regression.noise import noise_moments
+from analysis.regression.rows import Filtering, Rows, default_filtering, parameters_of
+from analysis.regression.solve import Cluster, half_width, solve, triangle
+from analysis.signals.conditioning import condition
+from analysis.simulation.model import finite
+from analysis.terms import baseline
+from analysis.terms.base import FAMILIES, Used, family_of
+from rig.model.parse import InputError
+from rig.model.records import Record, Run
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+Filters = Callable[[Record], Filtering]
+log = logging.getLogger(__name__)
+
+# Relative fall of a mineral oil's bulk modulus per kelvin, about 0.4 to 0.6 % (Merritt, Hydraulic
+# Control Systems, ch. 2); the swing of `oil.temperature_band` is taken as a sine's.
+OIL_FALL = 0.005
+SEED = 0  # of the noise whose share in the rows is judged
+
+
+@dataclass(frozen=True)
+class StepInformation:
+    """What one record of a step adds, by family: X'X, cov g, the noise's own [X y]'[X y], rows.
+
+    `moments` is (k+1, k+1) or empty where it was not asked for; `triangle` is R of [X y].
+    """
+
+    step: str
+    repeats: int
+    matrix: Mapping[str, Array]
+    scores: Mapping[str, Array]
+    moments: Mapping[str, Array]
+    triangle: Mapping[str, Array]
+    rows: Mapping[str, int]
+    oil: Array
+    masked: int
+
+
+@dataclass(frozen=True)
+class Expected:
+    """One parameter's prediction; `std`, `half` and `oil` are relative, NaN where undetermined."""
+
+    nominal: float
+    unit: str
+    std: float
+    half: float
+    oil: float
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What an experiment is expected to tell: by parameter, and by family its conditioning.
+
+    `covariance` is of the rows' coefficients (1/b), relative to their nominal values.
+    """
+
+    parameters: Mapping[str, Expected]
+    condition: Mapping[str, float]
+    rank: Mapping[str, tuple[int, int]]
+    covariance: Mapping[str, Array]
+    names: Mapping[str, tuple[str, ...]]
+    masked_share: float
+
+    @property
+    def worst(self) -> str:
+        """The identifiable parameter with the largest relative standard error."""
+        known = {n: p.std for n, p in self.parameters.items() if math.isfinite(p.std)}
+        return max(known, key=lambda n: known[n]) if known else ""
+
+
+def predict(
+    rig: Rig,
+    steps: Sequence[PlannedStep],
+    terms: Sequence[Used] | None = None,
+    filtering: Filters = default_filtering,
+) -> Prediction:
+    """Predict what identifying these steps on this rig will give.
+
+    Raises InputError for a rig without nominal values and for steps the twin cannot follow.
+    """
+    used = tuple(terms) if terms is not None else tuple(Used(term) for term in baseline())
+    played = [play(rig, step) for step in steps]
+    found = [information(rig, one, used, filtering, moments=True) for one in played]
+    return combine(rig, used, found)
+
+
+def coefficients(rig: Rig, terms: Sequence[Used]) -> dict[str, float]:
+    """Return the rows' nominal coefficients (1/b for b); raises InputError where one is missing."""
+    out = {}
+    for used in terms:
+        for c in used.term.coefficients(rig):
+            if c.parameter not in rig.nominal:
+                raise InputError(
+                    f"rig {rig.name!r} has no nominal {c.parameter!r} [{c.unit}]; nothing can be "
+                    "predicted without: add it under 'nominal' in the rig file"
+                )
+            value = rig.nominal[c.parameter]
+            out[c.parameter] = 1.0 / value if c.reciprocal else value
+    return out
+
+
+def information(
+    rig: Rig,
+    played: Played,
+    terms: Sequence[Used],
+    filtering: Filters = default_filtering,
+    *,
+    moments: bool = False,
+) -> StepInformation:
+    """Return what one record of a played step adds; `moments` also predicts the noise's share."""
+    exact, record = ideal(rig), played.record
+    # An end stop gives a little on a real bench, how much no rig file says. Where it shows, the
+    # analysis lets that piston's noise into the rows; so does the prediction.
+    moving = np.ones(len(rig.joints), dtype=bool)
+    filters = filtering(record)
+    signals = condition(exact, record, filters.channels, moving)
+    run = Run(exact, (record,), source="twin")
+    rows = build_rows(exact, [run], terms, filtering)[0].rows
+    scores = score_covariance(
+        exact, terms, signals, moving, filters, rows, coefficients(rig, terms)
+    )
+    share = (
+        noise_moments(exact, [run], terms, filtering, np.random.default_rng(SEED))
+        if moments
+        else {}
+    )
+    matrix, triangles, count = {}, {}, {}
+    for family in FAMILIES:
+        mine = [r for name, r in rows.items() if family_of(name) == family]
+        X = np.concatenate([r.matrix for r in mine])
+        y = np.concatenate([r.rhs for r in mine])
+        matrix[family], triangles[family], count[family] = X.T @ X, triangle(X, y), len(y)
+    return StepInformation(
+        played.step.name, played.step.repeats, matrix, scores, share, triangles, count,
+        _oil(rig, terms, rows), sum(r.masked for r in rows.values()),
+    )  # fmt: skip
+
+
+def _oil(rig: Rig, terms: Sequence[Used], rows: Mapping[str, Rows]) -> Array:
+    """Return X' x_b (1/b) (k,): the scores that a relative change of 1/b in this step makes."""
+    names = parameters_of(rig, terms, "fluid")
+    if "b" not in names:
+        return np.zeros(len(names))
+    column = names.index("b")
+    total = np.zeros(len(names))
+    for name, r in rows.items():
+        if family_of(name) == "fluid":
+            total += r.matrix.T @ r.matrix[:, column] / rig.nominal["b"]
+    return total
+
+
+def combine(rig: Rig, terms: Sequence[Used], found: Sequence[StepInformation]) -> Prediction:
+    """Solve all steps together, each with its repeats, as the coupled method would."""
+    parameters: dict[str, Expected] = {}
+    condition, rank, covariances, order = {}, {}, {}, {}
+    nominal = coefficients(rig, terms)
+    units = {c.parameter: c.unit for used in terms for c in used.term.coefficients(rig)}
+    for family in FAMILIES:
+        names = parameters_of(rig, terms, family)
+        clusters = [
+            Cluster(one.step, r, one.triangle[family], one.rows[family])
+            for one in found
+            for r in range(max(one.repeats, 2))
+        ]
+        share = None
+        if all(one.moments for one in found):
+            parts = [max(one.repeats, 2) * one.moments[family] for one in found]
+            share = np.sum(parts, axis=0)
+        solved = solve(names, clusters, share)
+        scale = np.array([nominal[name] for name in names])
+        kept = np.array([name not in solved.unidentifiable for name in names])
+        cov, dof = covariance(found, family, kept)
+        std = np.sqrt(np.diag(cov)) / np.abs(scale)
+        oil = _oil_scatter(rig, found, kept) / np.abs(scale) if family == "fluid" else 0.0 * scale
+        half = half_width(std, dof)
+        for i, name in enumerate(names):
+            note = solved.unidentifiable.get(name, "")
+            value = rig.nominal[name]
+            parameters[name] = Expected(
+                value, units[name], float(std[i]), float(half[i]), float(oil[i]), note
+            )
+        condition[family], rank[family] = solved.condition_number, (int(kept.sum()), len(names))
+        covariances[family], order[family] = cov / np.outer(scale, scale), names
+    rows = sum(sum(one.rows.values()) * one.repeats for one in found)
+    masked = sum(one.masked * one.repeats for one in found)
+    return Prediction(
+        parameters, condition, rank, covariances, order, masked / max(rows + masked, 1)
+    )
+
+
+def covariance(
+    found: Sequence[StepInformation], family: str, kept: NDArray[np.bool_] | None = None
+) -> tuple[Array, Array]:
+    """Return cov beta (k, k) of one family and Satterthwaite's degrees of freedom (k,).
+
+    Entries outside `kept` are NaN; columns that no row fills count as outside.
+    """
+    A = np.sum([one.repeats * one.matrix[family] for one in found], axis=0)
+    kept = np.diag(A) > 0 if kept is None else kept & (np.diag(A) > 0)
+    inverse = _inverse(A[np.ix_(kept, kept)])
+    parts = [inverse @ one.scores[family][np.ix_(kept, kept)] @ inverse for one in found]
+    total = np.full(A.shape, np.nan)
+    inner = np.sum([one.repeats * part for one, part in zip(found, parts, strict=True)], axis=0)
+    total[np.ix_(kept, kept)] = inner
+    dof = np.full(len(A), np.nan)
+    squares = np.zeros(int(kept.sum()))
+    for one, part in zip(found, parts, strict=True):
+        # identify divides the only repeat of a step into segments.
+        free = (one.repeats if one.repeats > 1 else SEGMENTS) - 1
+        squares += (one.repeats * np.diag(part)) ** 2 / free
+    dof[kept] = np.diag(inner) ** 2 / squares
+    return total, dof
+
+
+def _inverse(A: Array) -> Array:
+    scale = 1.0 / np.sqrt(np.diag(A))
+    return np.asarray(np.linalg.pinv(A * np.outer(scale, scale), 1e-12)) * np.outer(scale, scale)
+
+
+def _oil_scatter(rig: Rig, found: Sequence[StepInformation], kept: NDArray[np.bool_]) -> Array:
+    """Return the scatter (k,) of the coefficients if 1/b differs from step to step with the oil."""
+    A = np.sum([one.repeats * one.matrix["fluid"] for one in found], axis=0)
+    kept = kept & (np.diag(A) > 0)
+    inverse = _inverse(A[np.ix_(kept, kept)])
+    spread = OIL_FALL * rig.oil.temperature_band / math.sqrt(2.0)
+    shifts = np.array([inverse @ (one.repeats * one.oil[kept]) for one in found])
+    out = np.full(len(A), np.nan)
+    out[kept] = spread * np.sqrt(np.sum(shifts**2, axis=0))
+    return out
+
+
+def with_repeats(found: Sequence[StepInformation], repeats: int) -> list[StepInformation]:
+    """Return the same steps with another number of repeats each."""
+    return [replace(one, repeats=repeats) for one in found]
+
+
+def to_json(prediction: Prediction) -> dict[str, object]:
+    """Return it as plain data: relative figures, null where a parameter is not determined."""
+    return {
+        "parameters": {
+            name: {
+                "nominal": finite(p.nominal),
+                "unit": p.unit,
+                "relative_std": finite(p.std),
+                "relative_half_width_95": finite(p.half),
+                "relative_oil_scatter": finite(p.oil),
+                **({"note": p.note} if p.note else {}),
+            }
+            for name, p in prediction.parameters.items()
+        },
+        "condition_number": {f: finite(v) for f, v in prediction.condition.items()},
+        "rank": {f: list(v) for f, v in prediction.rank.items()},
+        "masked_share": finite(prediction.masked_share),
+        "worst": prediction.worst,
+    }

@@ -1,0 +1,179 @@
+"""Sensor noise carried exactly, to first order, from the converters to the normal equations.
+
+The residual of one equation is e(t) = y - X beta, built point by point from filtered channels,
+then low-passed and decimated as a whole row. White noise n_c of channel c (its stated noise and
+the rounding of its converter, step^2 / 12) enters through every derivative k that is taken of it:
+
+    e = D H_rows sum_c sum_k diag(S_ck) H_k n_c,        S_ck(t) = d e(t) / d (channel c's k-th).
+
+The scores g = X'e of all equations of a record therefore have the covariance
+    cov g = sum_c sigma_c^2 B_c B_c',   B_c = sum_eq X' D H_rows sum_k diag(S_ck) H_k,
+and B_c is had by running the filters backwards (their transposes) over the columns of X. Nothing
+is drawn at random, noise shared between equations is shared here, and the correlation that the
+filters put between rows is in it. Source: linear error propagation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import oaconvolve
+
+from analysis.regression.rows import Filtering, Rows, right_sides
+from analysis.signals.conditioning import Mask, Signals
+from analysis.signals.filters import FirSmoother
+from analysis.terms.base import Used, family_of
+from rig.model import channels as ch
+from rig.model.parse import InputError
+from rig.model.parts import AnySensor
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+
+# What a step of a finite difference is of the noise that the filtered signal still carries.
+STEP_OF_NOISE = 0.1
+
+
+@dataclass(frozen=True)
+class Input:
+    """One filtered signal that equations are built from: a derivative of one channel.
+
+    `field` is its name among the signals, `joint` 0-based or None for the bench.
+    """
+
+    channel: str
+    order: int
+    field: str
+    joint: int | None
+
+
+def sensor_variance(sensor: AnySensor) -> float:
+    """Return the variance of one sample [SI^2]: stated noise and the converter's rounding."""
+    low, high = sensor.range
+    rounding = (high - low) / ((1 << sensor.bits) - 1)
+    return float(sensor.noise**2 + rounding**2 / 12.0)
+
+
+def inputs_of(rig: Rig, moving: Mask) -> tuple[Input, ...]:
+    """Return the inputs of the rows; a joint that does not move is held and lets no noise in."""
+    found = []
+    for i in range(len(rig.joints)):
+
+        def name(kind: str, joint: int = i + 1) -> str:
+            return ch.channel(kind, joint)
+
+        if moving[i]:
+            found += [Input(name(ch.PISTON), k, f, i) for k, f in enumerate(("s", "sd", "sdd"))]
+        found.append(Input(name(ch.SPOOL), 0, "u", i))
+        for kind, fields in ((ch.CAP, ("p_cap", "pd_cap")), (ch.ROD, ("p_rod", "pd_rod"))):
+            found += [Input(name(kind), k, f, i) for k, f in enumerate(fields)]
+    found.append(Input(ch.SUPPLY, 0, "p_s", None))
+    found.append(Input(ch.TEMPERATURE, 0, "temperature", None))
+    return tuple(i for i in found if i.channel in rig.channels)
+
+
+def moved(rig: Rig, signals: Signals, what: Input, by: float) -> Signals:
+    """Return the signals with one input shifted by `by` at every instant (n,)."""
+    if what.joint is None:
+        return replace(signals, **{what.field: getattr(signals, what.field) + by})
+    i = what.joint
+    if what.field not in ("s", "sd", "sdd"):
+        changed = getattr(signals, what.field).copy()
+        changed[:, i] += by
+        return replace(signals, **{what.field: changed})
+    link = rig.joints[i].linkage
+    s, sd = signals.s.copy(), signals.sd.copy()
+    # The second derivative of the piston is not kept; it follows from the joint's.
+    slope = link.jacobian_rate(signals.q[:, i])
+    sdd = signals.G[:, i] * signals.qdd[:, i] + slope * signals.qd[:, i] ** 2
+    s[:, i] += by if what.field == "s" else 0.0
+    sd[:, i] += by if what.field == "sd" else 0.0
+    sdd = sdd + (by if what.field == "sdd" else 0.0)
+    q, qd, qdd, G = (a.copy() for a in (signals.q, signals.qd, signals.qdd, signals.G))
+    half = 0.55 * rig.joints[i].cylinder.stroke
+    q[:, i] = link.angle(np.clip(s[:, i], -half, half))
+    G[:, i] = link.jacobian(q[:, i])
+    qd[:, i] = sd[:, i] / G[:, i]
+    qdd[:, i] = (sdd - link.jacobian_rate(q[:, i]) * qd[:, i] ** 2) / G[:, i]
+    V_cap, V_rod = signals.V_cap.copy(), signals.V_rod.copy()
+    V_cap[:, i], V_rod[:, i] = rig.chamber_volumes(i, s[:, i])
+    return replace(
+        signals, s=s, sd=sd, q=q, qd=qd, qdd=qdd, G=G, theta=np.cumsum(q, axis=1),
+        V_cap=V_cap, V_rod=V_rod,
+    )  # fmt: skip
+
+
+def residuals(
+    rig: Rig, terms: Sequence[Used], signals: Signals, beta: Mapping[str, float]
+) -> dict[str, Array]:
+    """Return y - X beta (n,) of every equation, before the rows' filter."""
+    for used in terms:
+        signals = used.term.prepare(rig, signals, used.shape)
+    out = right_sides(rig, signals)
+    for used in terms:
+        for name, columns in used.term.columns(rig, signals, used.shape).items():
+            for parameter, column in columns.items():
+                out[name] = out[name] - beta[parameter] * column
+    return out
+
+
+def score_covariance(
+    rig: Rig,
+    terms: Sequence[Used],
+    signals: Signals,
+    moving: Mask,
+    filtering: Filtering,
+    rows: Mapping[str, Rows],
+    beta: Mapping[str, float],
+) -> dict[str, Array]:
+    """Return cov g (k, k) of each family's scores for one record, from its noise-free signals.
+
+    `rows` are the record's own, `beta` the rows' coefficients (1/b, not b). Raises InputError for
+    filters that are no finite convolutions.
+    """
+    channels = filtering.channels
+    if not isinstance(channels, FirSmoother):
+        raise InputError(f"noise cannot be carried through the filter {channels.name!r}")
+    n = len(signals.t)
+    back = {name: _backwards(r, filtering, n, signals.rate) for name, r in rows.items()}
+    out = {family_of(name): np.zeros((len(r.names), len(r.names))) for name, r in rows.items()}
+    by_channel: dict[str, list[Input]] = {}
+    for what in inputs_of(rig, moving):
+        by_channel.setdefault(what.channel, []).append(what)
+    for channel, parts in by_channel.items():
+        variance = sensor_variance(rig.sensors.of(ch.kind_of(channel)[0]))
+        carried: dict[str, Array] = {}
+        for what in parts:
+            taps = channels.taps[what.order]
+            by = STEP_OF_NOISE * float(np.sqrt(variance) * np.linalg.norm(taps))
+            high = residuals(rig, terms, moved(rig, signals, what, by), beta)
+            low = residuals(rig, terms, moved(rig, signals, what, -by), beta)
+            for name, weights in back.items():
+                slope = (high[name] - low[name]) / (2.0 * by)
+                if slope.any():
+                    family = family_of(name)
+                    part = _transposed(slope[:, None] * weights, taps)
+                    carried[family] = carried[family] + part if family in carried else part
+        for family, B in carried.items():
+            out[family] += variance * (B.T @ B)
+    return out
+
+
+def _backwards(rows: Rows, filtering: Filtering, n: int, rate: float) -> Array:
+    """Return (D H_rows)' X (n, k): what each instant's residual adds to the scores."""
+    places = np.rint(rows.time * rate).astype(int)
+    spread = np.zeros((n, rows.matrix.shape[1]))
+    spread[places] = rows.matrix
+    return spread if filtering.rows is None else _transposed(spread, filtering.rows.taps[0])
+
+
+def _transposed(weights: Array, taps: Array) -> Array:
+    """Return H'w of the filter y = taps * x: convolution with the taps turned round, (n, k)."""
+    filled = np.flatnonzero(weights.any(axis=0))
+    out = np.zeros_like(weights)
+    if len(filled):
+        out[:, filled] = oaconvolve(weights[:, filled], taps[::-1, None], mode="same", axes=0)
+    return out

@@ -1,0 +1,184 @@
+"""A planned step played on the twin: the noise-free record that it would leave.
+
+Between a lock at an end stop, which holds, and one by a closed valve there is a difference that
+identification lives on: a closed valve is a spring of oil, and the joint behind it gives (2 mm on
+the seed bench). So only joints held by an end stop are held here; a closed valve is simulated.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.simulation.twin import simulate_commands
+from rig.model import channels as ch
+from rig.model.parse import InputError
+from rig.model.records import Record
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+log = logging.getLogger(__name__)
+
+LEAD = 3.0  # [s] simulated before the record, so that the start has faded
+RAMP = 1.0  # [s] in which the waveform grows
+TRIMS = 4  # simulations to find the bias that centres a piston
+DRIFT = 0.5e-3  # [m] left within a record after trimming
+FROM_END = 1e-4  # [m] a twin's piston stands this far from the end it is pushed against
+
+
+@dataclass(frozen=True)
+class PlannedStep:
+    """One step in device terms, joints 0-based.
+
+    `waves` maps an excited joint to one period of its command [V] (all the same length), `lines`
+    are multiples of 1/period; `held` maps a joint at an end stop, `closed` one behind a closed
+    valve, to its piston [m]; `centres` and `biases` [V] belong to the excited joints; `samples`
+    are those of one record. A closed joint may give by `gives` [m]; an excited one is centred to
+    within `offsets` [m], by a loop of `loops` [V/m] before the records; `strokes` are the pistons
+    [m] it starts from, where not its centres.
+    """
+
+    name: str
+    waves: Mapping[int, Array]
+    lines: tuple[int, ...]
+    held: Mapping[int, float]
+    closed: Mapping[int, float]
+    centres: Mapping[int, float]
+    biases: Mapping[int, float]
+    samples: int
+    repeats: int
+    strokes: Mapping[int, float] = field(default_factory=dict)
+    gives: Mapping[int, float] = field(default_factory=dict)
+    offsets: Mapping[int, float] = field(default_factory=dict)
+    loops: Mapping[int, float] = field(default_factory=dict)
+
+    @property
+    def period(self) -> int:
+        """Samples until all waveforms start again."""
+        return len(next(iter(self.waves.values())))
+
+    @property
+    def locked(self) -> tuple[int, ...]:
+        """The locked joints, 1-based as in records."""
+        return tuple(sorted(j + 1 for j in (*self.held, *self.closed)))
+
+
+@dataclass(frozen=True)
+class Played:
+    """What the twin did: the noise-free `record`, the step with its found biases, the motion.
+
+    `motion` holds the twin's signals within the record, (samples, N) each, by the names of
+    `twin.simulate_commands`, and `command` [V]; `gains` [m/(s V)] how the excited pistons follow
+    their commands, as the bench will measure it to centre them.
+    """
+
+    step: PlannedStep
+    record: Record
+    motion: Mapping[str, Array]
+    gains: Mapping[int, float]
+
+
+def ideal(rig: Rig) -> Rig:
+    """Return the rig with channels that show the tick's instant: the twin has no multiplexer."""
+    sensors = rig.sensors
+    parts = {
+        name: part.model_copy(update={"delay": 0.0})
+        for name in type(sensors).model_fields
+        if hasattr(part := getattr(sensors, name), "delay")
+    }
+    return rig.model_copy(update={"sensors": sensors.model_copy(update={**parts, "skew": 0.0})})
+
+
+def play(rig: Rig, step: PlannedStep, trims: int = TRIMS) -> Played:
+    """Play a step on the twin, trimming the biases until the pistons stay where they belong.
+
+    Raises InputError where the twin's state ceases to exist or it cannot be centred.
+    """
+    for attempt in range(trims):
+        commands, start, lead = _commands(rig, step)
+        moved = simulate_commands(rig, commands, start, _held(rig, step))
+        exists = moved["valid"] > 0
+        good = len(exists) if exists.all() else int(np.argmin(exists))
+        step, steady, gains = _trimmed(rig, step, commands, moved["piston"], lead, good)
+        if good == len(exists) and (steady or attempt == trims - 1):
+            motion = {name: values[lead:] for name, values in moved.items()}
+            motion["command"] = commands[lead:]
+            return Played(step, _record(rig, step, motion), motion, gains)
+    raise InputError(
+        f"step {step.name!r}: on the twin the state ceases to exist (end of the linkage, vacuum); "
+        "lower the amplitude"
+    )
+
+
+def _held(rig: Rig, step: PlannedStep) -> dict[int, float]:
+    out = {}
+    for joint, piston in step.held.items():
+        half = 0.5 * rig.joints[joint].cylinder.stroke - FROM_END
+        out[joint] = float(np.clip(piston, -half, half))
+    return out
+
+
+def _commands(rig: Rig, step: PlannedStep) -> tuple[Array, Array, int]:
+    """Return commands (n, N) [V] that end with a record, start pistons (N,), and its first."""
+    rate, joints = rig.sample_rate, len(rig.joints)
+    lead = min(step.period, round(LEAD * rate))
+    commands = np.zeros((lead + step.samples, joints))
+    start = np.zeros(joints)
+    ramp = np.minimum(1.0, np.arange(len(commands)) / (RAMP * rate))
+    for joint, wave in step.waves.items():
+        phase = np.arange(-lead, step.samples) % len(wave)
+        commands[:, joint] = ramp * (wave[phase] + step.biases.get(joint, 0.0))
+        start[joint] = step.strokes.get(joint, step.centres.get(joint, 0.0))
+    for joint, piston in step.closed.items():
+        start[joint] = piston
+    return commands, start, lead
+
+
+def _trimmed(
+    rig: Rig, step: PlannedStep, commands: Array, piston: Array, lead: int, good: int
+) -> tuple[PlannedStep, bool, dict[int, float]]:
+    """Return the step with better biases and starts, whether it was steady, and the gains."""
+    rate, gains = rig.sample_rate, {}
+    biases, starts, steady = dict(step.biases), dict(step.strokes), good == len(piston)
+    for joint in step.waves:
+        span = slice(lead if good > lead + rate else 0, good)
+        v, s = commands[span, joint], piston[span, joint]
+        # An open-loop piston integrates its valve: s = c + d t + k int(v - mean v).
+        basis = np.column_stack(
+            (np.ones(len(v)), np.arange(len(v)) / rate, np.cumsum(v - v.mean()) / rate)
+        )
+        _, drift, gain = np.linalg.lstsq(basis, s, rcond=None)[0]
+        if not gain > 0:
+            raise InputError(f"step {step.name!r}: the twin of joint {joint + 1} does not follow")
+        gains[joint] = float(gain)
+        off = float(s.mean()) - step.centres.get(joint, 0.0)
+        calm = abs(drift) * step.samples / rate < DRIFT and abs(off) < 4 * DRIFT
+        if not calm:
+            biases[joint] = float(v.mean() - drift / gain)
+            centre = starts.get(joint, step.centres.get(joint, 0.0))
+            starts[joint] = float(np.clip(centre - off, *rig.joints[joint].limits.piston))
+            steady = False
+    return replace(step, biases=biases, strokes=starts), steady, gains
+
+
+def _record(rig: Rig, step: PlannedStep, motion: Mapping[str, Array]) -> Record:
+    channels: dict[str, Array] = {}
+    kinds = {
+        ch.SPOOL: "spool", ch.PISTON: "piston", ch.CAP: "cap_pressure", ch.ROD: "rod_pressure",
+        ch.COMMAND: "command",
+    }  # fmt: skip
+    for name in rig.recorded:
+        kind, joint = ch.kind_of(name)
+        if joint is not None:
+            channels[name] = motion[kinds[kind]][:, joint - 1]
+        else:
+            level = rig.supply.pressure if kind == ch.SUPPLY else rig.oil.temperature
+            channels[name] = np.full(step.samples, level)
+    return Record(
+        f"{step.name}_r1", step.name, step.locked, 1, rig.sample_rate, channels,
+        period=step.period, lines=step.lines,
+    )  # fmt: skip

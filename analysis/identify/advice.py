@@ -1,0 +1,134 @@
+"""What to do about parameters that records leave open: their combinations, and the step to add.
+
+A step that would help is found by geometry alone: a candidate (one joint excited, the joints beyond
+it at an end stop or at mid-stroke) gets a motion within its stroke, and its torque rows are held
+against the null directions of the records. What a direction turns into there, it shows.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.identify.checks import Check
+from analysis.regression.base_parameters import Determined, determined
+from analysis.regression.identifiability import predicted_rows
+from analysis.regression.solve import Solution
+from rig.model.parameters import gain_names, parameter_names
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+
+SHOWS = 0.02  # of unit columns: the size from which a direction shows in a step
+MOST_POSES = 81  # candidates are not looked for beyond so many poses
+SECONDS = 4.0
+LINES = ((0.5, 1.0), (1.75, 0.3), (4.0, 0.1))  # [Hz], share of the motion
+SHARE_OF_STROKE = 0.25
+
+
+def base_statements(rig: Rig, solutions: Mapping[str, Solution]) -> list[Check]:
+    """State, for each family with parameters lost, what is determined and what would help."""
+    out = []
+    for family, solution in solutions.items():
+        if not solution.unidentifiable or not len(solution.triangle):
+            continue
+        k = len(solution.names)
+        noise = solution.noise[:k, :k] if len(solution.noise) else None
+        found = determined(solution.names, solution.triangle[:k, :k], noise)
+        combined = ", ".join(part.text for part in found.base) or "no combination of them"
+        helps = _help(rig, family, found)
+        out.append(
+            Check(
+                f"base parameters {family}", False,
+                f"rank {found.rank} of {k}; of {' '.join(solution.unidentifiable)} these records "
+                f"determine: {combined}. {_told(helps)}",
+            )
+        )  # fmt: skip
+    return out
+
+
+def _help(rig: Rig, family: str, found: Determined) -> list[str]:
+    # The steps of electric rigs are not planned: no stroke says what motion is to be had. What an
+    # effect's own parameters need stands in the catalogue, not here.
+    known = parameter_names(len(rig.joints))
+    if rig.electric or any(name not in known for name in found.names):
+        return []
+    return mechanical_help(rig, found) if family == "mechanical" else fluid_help(rig, found)
+
+
+def _told(helps: Sequence[str]) -> str:
+    if not helps:
+        return "Add a richer excitation: other poses, other speeds"
+    return "Add: " + ", and: ".join(helps)
+
+
+def fluid_help(rig: Rig, found: Determined) -> list[str]:
+    """Return what would show gains and bulk modulus."""
+    helps = []
+    for joint in range(1, len(rig.joints) + 1):
+        if set(gain_names(joint)) & set(found.lost):
+            helps.append(f"excite joint {joint} in both directions")
+    if not helps and "b" in found.lost:
+        helps.append("excite any joint faster, with a multisine to 5 Hz and above")
+    return helps
+
+
+def mechanical_help(rig: Rig, found: Determined) -> list[str]:
+    """Return the fewest steps found that show every null direction, in words."""
+    left = found.null
+    steps = list(_candidates(rig))
+    rows = [_rows(rig, excited, places) for excited, places in steps]
+    scale = np.maximum(np.linalg.norm(np.vstack(rows), axis=0), 1e-300)
+    # Each candidate against itself: an outer joint's torques are small, and tell as much.
+    rows = [X / np.linalg.norm(X / scale, 2) for X in rows]
+    helps = []
+    while len(left):
+        basis = np.linalg.qr((left * scale).T)[0]
+        seen = [np.linalg.svd(X / scale @ basis, full_matrices=True) for X in rows]
+        ranks = [int(np.sum(sigma > SHOWS)) for _, sigma, _ in seen]
+        # As many directions as possible, then as clearly; a closed valve gives, a stop does not.
+        clear = [
+            float(np.sum(sigma)) * 0.9 ** steps[i][1].count(0.0)
+            for i, (_, sigma, _) in enumerate(seen)
+        ]
+        best = max(range(len(rows)), key=lambda i: (ranks[i], clear[i]))
+        if not ranks[best]:
+            break
+        helps.append(_words(rig, *steps[best]))
+        left = (basis @ seen[best][2][ranks[best] :].T).T / scale
+    return helps
+
+
+def _candidates(rig: Rig) -> Iterator[tuple[int, tuple[float, ...]]]:
+    """Yield (excited joint 0-based, places of the joints beyond in half strokes)."""
+    N = len(rig.joints)
+    for excited in range(N - 1, -1, -1):
+        beyond = itertools.product((-1.0, 1.0, 0.0), repeat=N - 1 - excited)
+        for places in itertools.islice(beyond, MOST_POSES):
+            yield excited, places
+
+
+def _rows(rig: Rig, excited: int, places: tuple[float, ...]) -> Array:
+    """Return the triangle of the torque rows of a motion prescribed to one joint."""
+    N, n = len(rig.joints), round(SECONDS * rig.sample_rate)
+    t = np.arange(n) / rig.sample_rate
+    piston = np.zeros((n, N))
+    for joint, place in enumerate(places, start=excited + 1):
+        piston[:, joint] = 0.5 * place * rig.joints[joint].cylinder.stroke
+    wave = sum(share * np.sin(2 * np.pi * hertz * t + hertz) for hertz, share in LINES)
+    piston[:, excited] = SHARE_OF_STROKE * rig.joints[excited].cylinder.stroke * np.asarray(wave)
+    level = np.full((n, N), 0.5 * rig.supply.pressure)
+    moved = {"piston": piston, "spool": np.zeros((n, N)), "cap_pressure": level,
+             "rod_pressure": level}  # fmt: skip
+    locked = [i + 1 for i in range(N) if i != excited]
+    return predicted_rows(rig, moved, locked)["mechanical"]
+
+
+def _words(rig: Rig, excited: int, places: tuple[float, ...]) -> str:
+    at = {-1.0: "at end_min", 1.0: "at end_max", 0.0: "closed at 0 mm"}
+    still = [f"joint {i + 1} closed at 0 mm" for i in range(excited)]
+    still += [f"joint {i} {at[p]}" for i, p in enumerate(places, start=excited + 2)]
+    return f"excite joint {excited + 1}" + (f" with {', '.join(still)}" if still else "")

@@ -1,0 +1,241 @@
+"""Statements about records before, and about what was solved after, an identification.
+
+What makes a number meaningless is refused (InputError naming record and channel); what a person
+should know is a `Check`, ok or not, with the figures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.regression.solve import Solution
+from analysis.signals.conditioning import clipped_samples
+from analysis.simulation.model import rig_difference
+from rig.model import channels as ch
+from rig.model.parse import InputError
+from rig.model.records import Record, RecordHead, Run
+from rig.model.rig import Rig
+from rig.runs.stream import RunHead
+
+Array = NDArray[np.float64]
+
+MOVED = 50.0  # an excited piston travels at least this many times its sensor's noise
+CLIPPED_SHARE = 0.01
+LOST_SHARE = 0.01
+MASKED_SHARE = 0.2
+CONDITION_LIMIT = 200.0  # scaled columns; the paper's are 10 to 27
+NOISE_BIAS = 0.01  # relative
+
+
+@dataclass(frozen=True)
+class Check:
+    """One statement: its name, whether all is well, and the figures."""
+
+    name: str
+    ok: bool
+    detail: str
+
+
+def common_rig(runs: Sequence[Run] | Sequence[RunHead]) -> Rig:
+    """Return the rig all runs share; raises InputError where they differ or hold no record."""
+    if not runs or not any(run.records for run in runs):
+        raise InputError("no records to work on: the run holds none (was it aborted at once?)")
+    for run in runs[1:]:
+        difference = rig_difference(runs[0].rig, run.rig)
+        if difference:
+            raise InputError(
+                f"{runs[0].source or 'the first run'} and {run.source or 'another'} are of "
+                f"different rigs: {difference}; identify them apart"
+            )
+    joints = set(range(1, len(runs[0].rig.joints) + 1))
+    if all(joints <= set(record.locked) for run in runs for record in run.records):
+        raise InputError(
+            "every record has every joint locked: nothing moved, so nothing can be identified; "
+            "record a step that excites a joint"
+        )
+    return runs[0].rig
+
+
+def spans_of(record: Record) -> dict[str, tuple[float, float]]:
+    """Return the smallest and largest sample of every channel; (inf, -inf) where all were lost."""
+    return {
+        name: (float(np.fmin.reduce(x, initial=np.inf)), float(np.fmax.reduce(x, initial=-np.inf)))
+        for name, x in record.channels.items()
+    }
+
+
+def refuse_dead_channels(
+    rig: Rig, record: Record | RecordHead, spans: Mapping[str, tuple[float, float]] | None = None
+) -> None:
+    """Raise InputError for an excited joint that never moved or a channel that stood still.
+
+    `spans` are the channels' extremes where the record is known by its head only.
+    """
+    if spans is None:
+        spans = spans_of(record) if isinstance(record, Record) else {}
+    for i in range(1, len(rig.joints) + 1):
+        if i in record.locked:
+            continue
+        for kind in rig.joint_kinds:
+            name = ch.channel(kind, i)
+            if name not in spans:
+                continue
+            low, high = spans[name]
+            if low > high:
+                raise InputError(
+                    f"record {record.name!r}, channel {name!r}: every sample was lost; leave the "
+                    "record out"
+                )
+            if low == high:
+                raise InputError(
+                    f"record {record.name!r}, channel {name!r}: every sample is {low:g}; is the "
+                    "sensor connected?"
+                )
+        place = ch.channel(rig.position_kind, i)
+        low, high = spans.get(place, (-np.inf, np.inf))
+        travel, noise = high - low, rig.sensors.of(rig.position_kind).noise
+        if travel < MOVED * noise:
+            unit = "m" + rig.unit_of(place)
+            raise InputError(
+                f"record {record.name!r}, channel {place!r}: joint {i} is not locked but moved "
+                f"only {travel * 1e3:.3g} {unit} (sensor noise {noise * 1e3:.3g} {unit}); it was "
+                "not excited, or belongs under 'locked'"
+            )
+
+
+def clipped_counts(rig: Rig, record: Record) -> dict[str, int]:
+    """Count, per channel that rows need, the samples at an end of their sensor's range."""
+    return {
+        name: int(mask.sum())
+        for name, mask in clipped_samples(rig, record).items()
+        if ch.kind_of(name)[1] not in record.locked or name.startswith(rig.position_kind)
+    }
+
+
+def clipping(
+    rig: Rig, found: Iterable[tuple[Record | RecordHead, Mapping[str, int]]]
+) -> list[Check]:
+    """State every sensor that touched an end of its range, by step, with the worst record.
+
+    `found` holds what `clipped_counts` says of every record.
+    """
+    worst: dict[tuple[str, str], tuple[int, float, str]] = {}
+    for head, counts in found:
+        for name, count in counts.items():
+            share = (count, count / head.samples, head.name)
+            worst[head.step, name] = max(share, worst.get((head.step, name), share))
+    out = []
+    for (_, name), (count, part, record_name) in worst.items():
+        low, high = rig.sensors.of(ch.kind_of(name)[0]).range
+        out.append(
+            Check(
+                "clipped sensor",
+                part < CLIPPED_SHARE,
+                f"record {record_name!r}, channel {name!r}: {count} samples "
+                f"({100 * part:.2g} %) at the end of {low:g}..{high:g} {rig.unit_of(name)}; "
+                "masked (the worst record of its step)",
+            )
+        )
+    return out or [Check("clipped sensor", True, "no sensor reached the end of its range")]
+
+
+def lost_samples(found: Iterable[tuple[Record | RecordHead, int]]) -> Check:
+    """State how many samples never arrived, `found` being (record, its lost samples)."""
+    pairs = [(lost, head) for head, lost in found]
+    total = sum(lost for lost, _ in pairs)
+    if not total:
+        return Check("lost samples", True, "every sample arrived")
+    worst, head = max(pairs, key=lambda pair: pair[0])
+    return Check(
+        "lost samples",
+        total < LOST_SHARE * sum(head.samples for _, head in pairs),
+        f"{total} samples never arrived (most in record {head.name!r}: {worst} of "
+        f"{head.samples}); the rows whose filters reach them are masked",
+    )
+
+
+def repeats(strata: Mapping[tuple[int, str], int]) -> Check:
+    """State the repeats behind the intervals, `strata` being (run, step) -> repeats."""
+    single = sorted({step for (_, step), count in strata.items() if count < 2})
+    if single:
+        return Check(
+            "repeats",
+            False,
+            f"only one repeat of {' '.join(single)}: scatter between repeats cannot be had; the "
+            "intervals come from segments within the record and may be too narrow",
+        )
+    return Check("repeats", True, f"{min(strata.values())} or more repeats of every step")
+
+
+def joints_excited(rig: Rig, records: Sequence[Record | RecordHead]) -> Check:
+    """State joints that no record excites: their parameters cannot be identified."""
+    still = [
+        i for i in range(1, len(rig.joints) + 1) if all(i in record.locked for record in records)
+    ]
+    if still:
+        return Check(
+            "excited joints", False,
+            f"no record excites joint {' '.join(map(str, still))}: its gains and friction are not "
+            "identifiable from these records; add a step that excites it",
+        )  # fmt: skip
+    return Check("excited joints", True, "every joint is excited in some record")
+
+
+def identifiability(solutions: Mapping[str, Solution]) -> list[Check]:
+    """State what could not be identified and how well conditioned the rest is."""
+    out = []
+    for family, solution in solutions.items():
+        lost = "; ".join(f"{name}: {why}" for name, why in solution.unidentifiable.items())
+        out.append(
+            Check(f"identifiable {family}", not lost, lost or "every parameter is determined")
+        )
+        out.append(
+            Check(
+                f"condition {family}",
+                solution.condition_number < CONDITION_LIMIT,
+                f"{solution.condition_number:.1f} (scaled columns; below {CONDITION_LIMIT:g} "
+                "wanted, a richer excitation lowers it)",
+            )
+        )
+    return out
+
+
+def noise_bias(solutions: Mapping[str, Solution], unbiased: bool = False) -> Check:
+    """State the worst relative bias that sensor noise in the columns is predicted to make.
+
+    It is that of least squares; `unbiased` says that the values come from what it cannot bias.
+    """
+    found = [
+        (abs(bias / value), name)
+        for solution in solutions.values()
+        for name, value, bias in zip(
+            solution.names, solution.value, solution.noise_bias, strict=True
+        )
+        if np.isfinite(value) and np.isfinite(bias) and value != 0
+    ]
+    if not found:
+        return Check("noise bias", False, "nothing identified to judge")
+    worst, name = max(found)
+    return Check(
+        "noise bias",
+        bool(worst < NOISE_BIAS) or unbiased,
+        f"the stated sensor noise biases {name} most, by {100 * worst:.2g} % as predicted "
+        f"(below {100 * NOISE_BIAS:g} % wanted)"
+        + ("; that is of least squares, and these values are not from it" if unbiased else ""),
+    )
+
+
+def masked(rows: int, dropped: int) -> Check:
+    """State the share of rows lost to pressures outside [0, p_s] or clipped sensors."""
+    share = dropped / max(rows + dropped, 1)
+    return Check(
+        "masked rows",
+        share < MASKED_SHARE,
+        f"{dropped} of {rows + dropped} rows ({100 * share:.2g} %) lie outside the model's "
+        "domain (chamber pressure below tank or above supply, clipped sensor, lost samples) and "
+        "were left out",
+    )

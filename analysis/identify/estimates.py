@@ -1,0 +1,68 @@
+"""From the rows' coefficients to the parameters that a person is told, with intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.regression.solve import Solution, half_width
+from analysis.simulation.model import Estimate
+from analysis.terms.base import Coefficient, Used
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+
+
+def estimates_of(
+    rig: Rig, terms: Sequence[Used], solutions: Mapping[str, Solution]
+) -> tuple[dict[str, Estimate], Array]:
+    """Turn the rows' coefficients into parameters (b = 1/coefficient) with intervals."""
+    coefficients = {c.parameter: c for used in terms for c in used.term.parameters(rig)}
+    found: dict[str, Estimate] = {}
+    blocks = []
+    for solution in solutions.values():
+        std = np.sqrt(np.diag(solution.covariance))
+        half = half_width(std, solution.dof)
+        slopes = np.ones(len(std))
+        for i, name in enumerate(solution.names):
+            c = coefficients[name]
+            note = solution.unidentifiable.get(name, "")
+            found[name], slopes[i] = _estimate(c, solution.value[i], std[i], half[i], note)
+        blocks.append(solution.covariance * np.outer(slopes, slopes))
+    names = list(found)
+    covariance = np.zeros((len(names), len(names)))
+    start = 0
+    for block in blocks:
+        covariance[start : start + len(block), start : start + len(block)] = block
+        start += len(block)
+    return found, covariance
+
+
+def _estimate(
+    c: Coefficient, value: float, std: float, half: float, note: str
+) -> tuple[Estimate, float]:
+    """Return the parameter's estimate and d parameter / d coefficient."""
+    low, high = value - half, value + half
+    if not c.reciprocal:
+        return Estimate(float(value), c.unit, float(std), (float(low), float(high)), note), 1.0
+    if value == 0:
+        return Estimate(np.nan, c.unit, np.nan, (np.nan, np.nan), "its row came out zero"), np.nan
+    slope = -1.0 / value**2
+    # An interval of 1/b that reaches zero leaves b unbounded above.
+    ends = (1.0 / high, 1.0 / low if low > 0 else np.inf) if value > 0 else (np.nan, np.nan)
+    estimate = Estimate(float(1.0 / value), c.unit, float(abs(slope) * std), ends, note)
+    return estimate, float(slope)
+
+
+def with_ends(
+    estimates: Mapping[str, Estimate], ends: Mapping[str, tuple[float, float]]
+) -> dict[str, Estimate]:
+    """Replace intervals by the bootstrap's; `ends` are of the rows' coefficients (1/b)."""
+    out = dict(estimates)
+    for name, (low, high) in ends.items():
+        interval = (1.0 / high, 1.0 / low) if name == "b" else (low, high)
+        out[name] = replace(out[name], ci95=interval)
+    return out

@@ -1,0 +1,133 @@
+"""Covariance of an estimate: scatter between repeats, and lack of fit where it shows.
+
+Repeats show noise and whatever differs from one to the next, but not what the model gets wrong
+in every repeat alike. That shows in the scores g = Z'w e of groups of rows, all repeats together:
+were the model exact, they would differ from zero by noise only, and how much that is the repeats
+tell. Groups are the parts of the excitation's period, and the levels of the state that an
+equation's law depends on. For either grouping, with u = A^-1 g,
+ V_groups = sum u u',  V_noise = sum over groups of n/(n-1) sum_r (u_r - mean)(u_r - mean)',
+and where V_groups exceeds V_noise by an F test, the difference is added to the scatter between
+repeats as a systematic component: V = V_repeats + max(V_groups - V_noise). It is the square of a
+misfit, not an average over many, and counts as known (GUM, type B): it has no part in Student's t.
+Sources: stratified cluster covariance as in `analysis.regression.solve`; the idea of grouping in
+more than one way is Cameron, Gelbach and Miller's (2011); jackknife CR3 for one repeat only,
+MacKinnon, Nielsen and Webb (2023), section 2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import f as fisher
+
+from analysis.identify.estimators.equations import Indices, Pieces
+
+Array = NDArray[np.float64]
+
+VISIBLE = 0.01  # level of the F test below which lack of fit counts as seen
+
+
+@dataclass(frozen=True)
+class Spread:
+    """A covariance (k, k), the degrees of freedom (k,), and the systematic share of variance."""
+
+    covariance: Array
+    dof: Array
+    systematic: Array
+
+
+def spread(groupings: Sequence[Pieces], inverse: Array) -> Spread:
+    """Return V_repeats + visible lack of fit; the first grouping is that of the period.
+
+    Where a step has one repeat only there is no scatter, and the parts of the period stand for it.
+    """
+    repeats = by_repeats(groupings[0], inverse)
+    if repeats is None:
+        return by_parts(groupings[0], inverse)
+    misfit = [lack_of_fit(pieces, inverse) for pieces in groupings]
+    worst = np.max([np.diag(m) for m in misfit], axis=0)
+    total = repeats.covariance + np.sum(misfit, axis=0)
+    scatter = np.diag(repeats.covariance)
+    variance = scatter + worst
+    scale = np.sqrt(variance / np.maximum(np.diag(total), 1e-300))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        dof = np.where(scatter > 0, repeats.dof * (variance / scatter) ** 2, 1.0)
+        share = np.where(variance > 0, worst / variance, 0.0)
+    return Spread(total * np.outer(scale, scale), dof, share)
+
+
+def by_repeats(pieces: Pieces, inverse: Array) -> Spread | None:
+    """Return the scatter between repeats within their steps; None where a step has only one."""
+    stratum, score, _ = pieces.grouped(pieces.repeat)
+    return stratified(stratum, score @ inverse.T)
+
+
+def stratified(stratum: Indices, influence: Array) -> Spread | None:
+    """Return sum over strata of n/(n-1) sum (u - mean)(u - mean)' of influences u (c, k).
+
+    Degrees of freedom are Satterthwaite's; None where a stratum has one member only.
+    """
+    k = influence.shape[1]
+    total, squares = np.zeros((k, k)), np.zeros(k)
+    for s in np.unique(stratum, axis=0):
+        u = influence[(stratum == s) if stratum.ndim == 1 else (stratum == s).all(axis=1)]
+        n = len(u)
+        if n < 2:
+            return None
+        u = u - u.mean(axis=0)
+        part = u.T @ u * (n / (n - 1))
+        total += part
+        squares += np.diag(part) ** 2 / (n - 1)
+    return Spread(total, _satterthwaite(np.diag(total), squares), np.zeros(k))
+
+
+def lack_of_fit(pieces: Pieces, inverse: Array) -> Array:
+    """Return V_groups - V_noise (k, k), positive, zero for parameters where it is not visible."""
+    _, score, _ = pieces.grouped(pieces.part)
+    u = score @ inverse.T
+    noise = stratified(np.column_stack((pieces.stratum, pieces.part)), pieces.score @ inverse.T)
+    k = len(inverse)
+    if noise is None:
+        return np.zeros((k, k))
+    found = u.T @ u
+    size, floor = np.diag(found), np.diag(noise.covariance)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        dof = np.where(size > 0, size**2 / np.sum(u**4, axis=0), 1.0)
+        p = fisher.sf(size / floor, np.maximum(dof, 1.0), np.maximum(noise.dof, 1.0))
+    excess = np.where(p < VISIBLE, np.maximum(size - floor, 0.0), 0.0)
+    scale = np.sqrt(excess / np.where(size > 0, size, 1.0))
+    return np.asarray(found * np.outer(scale, scale))
+
+
+def by_parts(pieces: Pieces, inverse: Array) -> Spread:
+    """Return the jackknife over the parts of the period, all repeats of a part together."""
+    stratum, score, information = pieces.grouped(pieces.part)
+    A: Array = np.asarray(np.linalg.inv(inverse))
+    left_out = np.array([_without(A, part, g) for part, g in zip(information, score, strict=True)])
+    k = len(A)
+    total, squares = np.zeros((k, k)), np.zeros(k)
+    for s in np.unique(stratum):
+        u = left_out[stratum == s]
+        n = len(u)
+        part = u.T @ u * ((n - 1) / n if n > 1 else 1.0)
+        total += part
+        squares += np.diag(part) ** 2 / max(n - 1, 1)
+    return Spread(total, _satterthwaite(np.diag(total), squares), np.zeros(k))
+
+
+def _without(A: Array, part: Array, score: Array) -> Array:
+    """Return the change of beta when a part is left out: (A - A_c)^-1 g_c."""
+    scale = np.sqrt(np.abs(np.diag(A)))
+    reduced = (A - part) / np.outer(scale, scale)
+    if np.linalg.cond(reduced) > 1e10:
+        # That part alone determines some direction: its influence to first order.
+        reduced = A / np.outer(scale, scale)
+    return np.asarray(np.linalg.solve(reduced, score / scale) / scale)
+
+
+def _satterthwaite(variance: Array, squares: Array) -> Array:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.where(squares > 0, variance**2 / squares, 1.0))

@@ -1,0 +1,281 @@
+"""Estimating equations on the rows of one family: solve, influences of repeats and segments.
+
+sum_b Z_b' w_b (y_b - X_b beta) = 0 over blocks b (one equation of one record); with
+A = sum Z'wX the influence of a set of rows c on beta is A^-1 sum_c Z'w e.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.regression.rows import Rows
+from analysis.signals.conditioning import bridged
+from analysis.terms.base import family_of
+from rig.model import channels as ch
+from rig.model.records import Record
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+SEGMENTS = 10  # of one period of the excitation
+LEVELS = 8  # bins of an equation's state
+AVERAGED = 0.02  # [s] of a channel, for sorting
+SHORTEST_SEGMENT = 0.25  # [s]: longer than the row filter's memory of the noise
+
+
+class HasRows(Protocol):
+    """The rows of one record by equation (`analysis.identify.identify.RecordRows`)."""
+
+    @property
+    def run(self) -> int:
+        """Index of the run."""
+
+    @property
+    def record(self) -> str:
+        """Name of the record."""
+
+    @property
+    def step(self) -> str:
+        """Its step."""
+
+    @property
+    def repeat(self) -> int:
+        """Its repeat."""
+
+    @property
+    def rows(self) -> Mapping[str, Rows]:
+        """Rows by equation."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """One equation of one record: X (m, k), y (m,), time (m,) [s], where each row lies (m,).
+
+    `segment` is the part of the excitation's period, `level` the bin of the equation's own state
+    (`levels`).
+    """
+
+    run: int
+    step: str
+    repeat: int
+    record: str
+    equation: str
+    X: Array
+    y: Array
+    time: Array
+    segment: Indices
+    level: Indices
+
+    @property
+    def stratum(self) -> tuple[int, str]:
+        """The (run, step) whose repeats are alike."""
+        return self.run, self.step
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A family's blocks, nuisance columns last, with the names of all columns."""
+
+    family: str
+    names: tuple[str, ...]
+    parameters: int
+    blocks: tuple[Block, ...]
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A solution beta (k,) with A^-1 (k, k), and the instruments and weights that made it."""
+
+    blocks: tuple[Block, ...]
+    Z: tuple[Array, ...]
+    w: tuple[Array, ...]
+    beta: Array
+    inverse: Array
+
+    def residuals(self) -> list[Array]:
+        """Return y - X beta of every block."""
+        return [b.y - b.X @ self.beta for b in self.blocks]
+
+
+def segments(time: Array, period: float, segments_wanted: int = SEGMENTS) -> Indices:
+    """Return which part of the excitation's period each row (m,) lies in.
+
+    Without a period [s] (0) the record itself is cut. Rows of the same part of later periods
+    belong together: what the model lacks comes back there.
+    """
+    span = period if period > 0 else float(time[-1] - time[0]) + 1e-9 if len(time) else 1.0
+    count = int(np.clip(span / SHORTEST_SEGMENT, 1, segments_wanted))
+    place = (time - (0.0 if period > 0 else time[0] if len(time) else 0.0)) / span
+    return np.asarray(np.floor((place % 1.0) * count), dtype=np.int64)
+
+
+def blocks_of(
+    per_record: Sequence[HasRows], family: str, kept: Sequence[int], periods: Sequence[float]
+) -> list[Block]:
+    """Return the blocks of one family with the columns `kept`; `periods` [s] per record."""
+    found = []
+    for one, period in zip(per_record, periods, strict=True):
+        for name, rows in one.rows.items():
+            if family_of(name) == family and len(rows.rhs):
+                found.append(
+                    Block(
+                        one.run, one.step, one.repeat, one.record, name,
+                        rows.matrix[:, list(kept)], rows.rhs, rows.time,
+                        segments(rows.time, period), np.zeros(len(rows.rhs), dtype=np.int64),
+                    )
+                )  # fmt: skip
+    return found
+
+
+def solve(blocks: Sequence[Block], Z: Sequence[Array], w: Sequence[Array]) -> Fit:
+    """Solve the estimating equations, columns scaled to unit norm first."""
+    k = blocks[0].X.shape[1]
+    A, c = np.zeros((k, k)), np.zeros(k)
+    for b, z, weight in zip(blocks, Z, w, strict=True):
+        weighted = z * weight[:, None]
+        A += weighted.T @ b.X
+        c += weighted.T @ b.y
+    scale = np.sqrt(np.abs(np.diag(A)))
+    scale[scale == 0.0] = 1.0
+    inverse = np.linalg.inv(A / np.outer(scale, scale)) / np.outer(scale, scale)
+    return Fit(tuple(blocks), tuple(Z), tuple(w), inverse @ c, inverse)
+
+
+def least_squares(blocks: Sequence[Block], w: Sequence[Array] | None = None) -> Fit:
+    """Solve with Z = X and weights w (default 1)."""
+    weights = [np.ones(len(b.y)) for b in blocks] if w is None else w
+    return solve(blocks, [b.X for b in blocks], weights)
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """Scores g = Z'w e and information A of every (stratum, repeat, part) that has rows.
+
+    Arrays of the length of the pieces: `stratum`, `repeat`, `part` (c,), `score` (c, k),
+    `information` (c, k, k).
+    """
+
+    stratum: Indices
+    repeat: Indices
+    part: Indices
+    score: Array
+    information: Array
+
+    def grouped(self, key: Indices) -> tuple[Indices, Array, Array]:
+        """Sum pieces alike in stratum and `key`: (stratum (g,), scores, information)."""
+        table = np.column_stack((self.stratum, key))
+        unique, place = np.unique(table, axis=0, return_inverse=True)
+        score = np.zeros((len(unique), self.score.shape[1]))
+        information = np.zeros((len(unique), *self.information.shape[1:]))
+        np.add.at(score, place.ravel(), self.score)
+        np.add.at(information, place.ravel(), self.information)
+        return unique[:, 0], score, information
+
+
+def pieces(fit: Fit, by: str = "segment") -> Pieces:
+    """Return scores and information of a fit by stratum, repeat and `segment` or `level`."""
+    strata = {s: i for i, s in enumerate(sorted({b.stratum for b in fit.blocks}))}
+    found: dict[tuple[int, int, int], tuple[Array, Array]] = {}
+    for b, z, weight, e in zip(fit.blocks, fit.Z, fit.w, fit.residuals(), strict=True):
+        weighted = z * weight[:, None]
+        labels = b.segment if by == "segment" else b.level
+        for part in np.unique(labels):
+            here = labels == part
+            score, information = weighted[here].T @ e[here], weighted[here].T @ b.X[here]
+            key = (strata[b.stratum], b.repeat, int(part))
+            if key in found:
+                score, information = score + found[key][0], information + found[key][1]
+            found[key] = (score, information)
+    keys = np.array(list(found), dtype=np.int64)
+    return Pieces(
+        keys[:, 0], keys[:, 1], keys[:, 2],
+        np.array([g for g, _ in found.values()]), np.array([a for _, a in found.values()]),
+    )  # fmt: skip
+
+
+def common(blocks: Sequence[Block]) -> list[Block]:
+    """Return the blocks cut to the rows that every repeat of their step and equation kept."""
+    shared: dict[tuple[int, str, str], Array] = {}
+    for b in blocks:
+        key = (*b.stratum, b.equation)
+        ticks = np.round(b.time, 9)
+        shared[key] = np.intersect1d(shared[key], ticks) if key in shared else ticks
+    out = []
+    for b in blocks:
+        here = np.isin(np.round(b.time, 9), shared[*b.stratum, b.equation])
+        out.append(
+            b if here.all() else
+            _rows_of(b, here)
+        )  # fmt: skip
+    return out
+
+
+def _rows_of(b: Block, here: NDArray[np.bool_]) -> Block:
+    return replace(
+        b, X=b.X[here], y=b.y[here], time=b.time[here], segment=b.segment[here],
+        level=b.level[here],
+    )  # fmt: skip
+
+
+def levelled(blocks: Sequence[Block], records: Mapping[tuple[int, str], Record]) -> list[Block]:
+    """Return the blocks with `level`: the bin of the state that the equation's law depends on.
+
+    Flow rows are sorted by their chamber's pressure, torque rows by their piston's place, into
+    bins of equally many rows; time by time the mean over the repeats decides, so that noise does
+    not sort. A law that is wrong somewhere in the state leaves its misfit in few of the bins.
+    """
+    states: dict[tuple[int, str, str], dict[float, list[float]]] = {}
+    for b in blocks:
+        found = states.setdefault((*b.stratum, b.equation), {})
+        for t, x in zip(np.round(b.time, 9), _state(b, records[b.run, b.record]), strict=True):
+            found.setdefault(float(t), []).append(float(x))
+    bins = {}
+    for number, (key, found) in enumerate(sorted(states.items())):
+        mean = np.array([np.mean(v) for v in found.values()])
+        rank = np.argsort(np.argsort(mean))
+        label = number * LEVELS + rank * LEVELS // len(rank)
+        bins[key] = dict(zip(found, label.tolist(), strict=True))
+    return [
+        replace(
+            b,
+            level=np.array(
+                [bins[*b.stratum, b.equation][float(t)] for t in np.round(b.time, 9)],
+                dtype=np.int64,
+            ),
+        )
+        for b in blocks
+    ]
+
+
+def _state(b: Block, record: Record) -> Array:
+    kind, joint = b.equation.rsplit("_", 1)
+    place = ch.POSITION if ch.channel(ch.POSITION, int(joint)) in record.channels else ch.PISTON
+    channel = {"flow_cap": ch.CAP, "flow_rod": ch.ROD}.get(kind, place)
+    x = bridged(np.asarray(record.channels[ch.channel(channel, int(joint))], dtype=np.float64))
+    width = max(1, round(AVERAGED * record.sample_rate))
+    smooth = np.convolve(x, np.full(width, 1.0 / width), mode="same")
+    return np.asarray(np.interp(b.time, record.time, smooth))
+
+
+def residual_scatter(blocks: Sequence[Block], residuals: Sequence[Array]) -> list[Array]:
+    """Return each block's residuals less the mean over its repeats, scaled to the noise's size.
+
+    The blocks must share their rows (`common`). With n repeats the deviations are sqrt((n-1)/n)
+    of the noise, which is undone.
+    """
+    total: dict[tuple[int, str, str], Array] = {}
+    count: dict[tuple[int, str, str], int] = {}
+    for b, e in zip(blocks, residuals, strict=True):
+        key = (*b.stratum, b.equation)
+        total[key] = total[key] + e if key in total else e.copy()
+        count[key] = count.get(key, 0) + 1
+    out = []
+    for b, e in zip(blocks, residuals, strict=True):
+        n = count[*b.stratum, b.equation]
+        out.append((e - total[*b.stratum, b.equation] / n) * np.sqrt(n / max(n - 1, 1)))
+    return out

@@ -1,0 +1,87 @@
+"""Instrumental variables across synchronised repeats, and the check on noise in the regressors.
+
+Repeats of a step had the same excitation started at the same sample, so the rows of the other
+repeats say what a repeat's regressor is without its noise: Z_r = mean of X over the others. Noise
+of r is independent of Z_r, and attenuation, the bias of least squares, is gone.
+Hausman's idea: both estimates agree unless noise in the regressors biases least squares; whether
+their difference is more than its own scatter is tested. Source: Hausman (1978), Econometrica 46;
+Soederstroem and Stoica, Instrumental Variable Methods for System Identification (1983).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import t as student
+
+from analysis.identify.estimators.covariance import stratified
+from analysis.identify.estimators.equations import (
+    Block,
+    Fit,
+    Indices,
+    common,
+    least_squares,
+    pieces,
+    solve,
+)
+
+Array = NDArray[np.float64]
+
+LEVEL = 0.01  # of the test, over all parameters together (Bonferroni)
+
+
+@dataclass(frozen=True)
+class Hausman:
+    """Least squares minus instruments (k,), its standard error (k,) and p values (k,)."""
+
+    difference: Array
+    error: Array
+    p: Array
+    relative: Array
+
+    @property
+    def certain(self) -> NDArray[np.bool_]:
+        """Where (k,) the difference is more than chance."""
+        return np.asarray(self.p < LEVEL / len(self.p))
+
+
+def instrumental_variables(blocks: Sequence[Block]) -> Fit:
+    """Solve with the other repeats' mean rows as instruments; every step needs two repeats."""
+    blocks = common(blocks)
+    total: dict[tuple[int, str, str], Array] = {}
+    count: dict[tuple[int, str, str], int] = {}
+    for b in blocks:
+        key = (*b.stratum, b.equation)
+        total[key] = total[key] + b.X if key in total else b.X.copy()
+        count[key] = count.get(key, 0) + 1
+    Z = [
+        (total[*b.stratum, b.equation] - b.X) / (count[*b.stratum, b.equation] - 1) for b in blocks
+    ]
+    return solve(blocks, Z, [np.ones(len(b.y)) for b in blocks])
+
+
+def hausman(blocks: Sequence[Block]) -> Hausman:
+    """Compare least squares with instruments on the same rows.
+
+    The difference scatters by noise, which parts of the period show separately: its covariance is
+    that between repeats within each part (of which there are many more than repeats).
+    """
+    iv = instrumental_variables(blocks)
+    ls = least_squares(iv.blocks)
+    difference = ls.beta - iv.beta
+    one, other = pieces(ls), pieces(iv)
+    influence = one.score @ ls.inverse.T - other.score @ iv.inverse.T
+    spread = stratified(_part_of(one.stratum, one.part), influence)
+    assert spread is not None, "instruments exist only where steps have repeats"
+    error = np.sqrt(np.diag(spread.covariance))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        statistic = np.where(error > 0, np.abs(difference) / error, 0.0)
+        relative = difference / iv.beta
+    return Hausman(difference, error, 2 * student.sf(statistic, spread.dof), relative)
+
+
+def _part_of(stratum: Indices, part: Indices) -> Indices:
+    return np.column_stack((stratum, part))

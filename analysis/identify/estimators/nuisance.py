@@ -1,0 +1,176 @@
+"""What the model leaves out though it is known to be there, fitted beside it in small columns.
+
+Both shift parameters by more than their scatter, so that without them no interval could be right;
+both are one column of the fluid rows, estimated with the rest, and neither is a parameter.
+
+Oil temperature. Between two records the oil warms or cools, and its bulk modulus with it; one b
+for all records lies where the temperatures happened to be, and the gains of the steps shift with
+it. Here b is that of the rig's nominal temperature T0:
+ 1/b becomes 1/b(T0) + kappa (T - T0), kappa = - alpha / b, alpha = d ln b / dT.
+Known beforehand: alpha lies between that of pure mineral oil, 10^(0.0023 (20 - T)) or -0.0053 per
+kelvin (Hodges, Hydraulic Fluids, 1996, ch. 7), and that of hoses and lines alone, about 0.
+
+Laminar transition. An orifice's flow is C u dp / (dp^2 + dp_t^2)^(1/4) (as in Borutzky, Barnard
+and Thoma, 2002, and the orifices of common simulation libraries), to first order
+ C u sqrt(dp) (1 - dp_t^2 / (4 dp^2)),
+and so a little less than the root everywhere: at drops of a few MPa this looks like a smaller C.
+C is then that of fully turbulent flow. Known beforehand: dp_t is of the order of 0.1 MPa or below.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.identify.estimators.covariance import Spread
+from analysis.signals.conditioning import Signals
+from analysis.terms.base import Coefficient, Columns, Term, Used, equation
+from rig.model import channels as ch
+from rig.model.parameters import gain_names
+from rig.model.records import Run
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+
+SLOPE, SLOPE_STD = -0.003, 0.003  # [1/K] d ln b / dT: middle and spread of what is plausible
+TRANSITION = 1e5  # [Pa] dp_t^2 is 0 +- TRANSITION^2 beforehand
+LEAST_DROP = 2.0  # drops below this many TRANSITIONs are beyond the first order, and held there
+IMPLAUSIBLE = 4.0  # standard deviations from what is known beforehand: then something else is there
+
+KAPPA, TAU = "1/b per kelvin", "transition pressure squared"
+
+
+@dataclass(frozen=True)
+class BulkTemperature(Term):
+    """- V dp/dt (T - T0) in the flow rows: the temperature part of 1/b.
+
+    T0 is `reference` [degC], the rig's nominal temperature where it is None.
+    """
+
+    name: ClassVar[str] = "bulk_temperature_nuisance"
+    reference: float | None = None
+
+    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
+        """Return kappa [1/(Pa K)]."""
+        return (Coefficient(KAPPA, "Pa^-1*K^-1", "fluid"),)
+
+    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
+        """Return the column of each chamber."""
+        reference = rig.oil.temperature if self.reference is None else self.reference
+        kelvin = signals.temperature - reference
+        out: Columns = {}
+        for i in range(signals.joints):
+            out[equation("flow_cap", i)] = {KAPPA: -signals.V_cap[:, i] * signals.pd_cap[:, i]}
+            out[equation("flow_rod", i)] = {KAPPA: -signals.V_rod[:, i] * signals.pd_rod[:, i]}
+        return {e: {KAPPA: column[KAPPA] * kelvin} for e, column in out.items()}
+
+
+@dataclass(frozen=True)
+class LaminarTransition(Term):
+    """- (C u / 4) dp^(-3/2) on every edge, with the gains C of a first solution."""
+
+    name: ClassVar[str] = "laminar_transition_nuisance"
+    gains: tuple[tuple[str, float], ...] = ()
+
+    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
+        """Return dp_t^2 [Pa^2]."""
+        return (Coefficient(TAU, "Pa^2", "fluid"),)
+
+    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
+        """Return the column of each chamber."""
+        C = dict(self.gains)
+        out: Columns = {}
+        for i in range(signals.joints):
+            pp, pm, mp, mm = (C.get(name, 0.0) for name in gain_names(i + 1))
+            u, p_s, p_t = signals.u[:, i], signals.p_s, signals.p_tank
+            cap, rod = signals.p_cap[:, i], signals.p_rod[:, i]
+            ahead, astern = np.maximum(u, 0.0), np.minimum(u, 0.0)
+            in_cap = pp * _lost(p_s - cap) * ahead + pm * _lost(cap - p_t) * astern
+            in_rod = -mp * _lost(rod - p_t) * ahead - mm * _lost(p_s - rod) * astern
+            out[equation("flow_cap", i)] = {TAU: in_cap}
+            out[equation("flow_rod", i)] = {TAU: in_rod}
+        return out
+
+
+def _lost(drop: Array) -> Array:
+    return np.asarray(-0.25 * np.maximum(drop, LEAST_DROP * TRANSITION) ** -1.5)
+
+
+@dataclass(frozen=True)
+class Belief:
+    """One observation beforehand, 0 = h'beta with standard deviation `std`, of column `name`."""
+
+    name: str
+    h: Array
+    std: float
+
+
+def nuisance_terms(
+    terms: Sequence[Used], runs: Sequence[Run], values: Mapping[str, float]
+) -> tuple[Used, ...]:
+    """Return the nuisances that belong to the terms; `values` are first estimates by name.
+
+    The transition goes with the orifices alone: beside further terms of the flow it would take
+    from them what is theirs.
+    """
+    names = {used.term.name for used in terms}
+    found: list[Used] = []
+    measured = all(ch.TEMPERATURE in r.channels for run in runs for r in run.records)
+    if "compressibility" in names and measured and np.isfinite(values.get("b", np.nan)):
+        found.append(Used(BulkTemperature()))
+    gains = {n: v for n, v in values.items() if n.startswith("C_") and np.isfinite(v)}
+    if "orifice" in names and gains:
+        found.append(Used(LaminarTransition(gains=tuple(gains.items()))))
+    return tuple(found)
+
+
+def beliefs(names: Sequence[str], value: Array) -> list[Belief]:
+    """Return what is known beforehand of the nuisances among the columns `names` (k,)."""
+    out = []
+    if KAPPA in names and "b" in names:
+        h = np.zeros(len(names))
+        b = names.index("b")
+        h[names.index(KAPPA)], h[b] = 1.0, SLOPE
+        out.append(Belief(KAPPA, h, SLOPE_STD * abs(float(value[b]))))
+    if TAU in names:
+        h = np.zeros(len(names))
+        h[names.index(TAU)] = 1.0
+        out.append(Belief(TAU, h, TRANSITION**2))
+    return out
+
+
+def implausible(belief: Belief, beta: Array, covariance: Array) -> bool:
+    """Tell whether the data contradict what is known: something else is in that column."""
+    variance = belief.std**2 + float(belief.h @ covariance @ belief.h)
+    return bool(abs(belief.h @ beta) > IMPLAUSIBLE * np.sqrt(variance))
+
+
+def joined(
+    beta: Array, spread: Spread, belief: Belief, inverse: Array
+) -> tuple[Array, Spread, Array]:
+    """Join one observation into beta (k,), its spread and its A^-1 (k, k), which is `inverse`.
+
+    The gain g of Kalman's update is taken from A^-1, sized to the spread V:
+     g = P h / (h'P h + s^2),  P = A^-1 (h'V h) / (h'A^-1 h).
+    V itself rests on a few repeats: a gain from it would follow their noise and promise (1 - r^2)
+    of a variance with an r^2 that is too large. What an estimate with any gain scatters is
+     (I - g h') V (I - g h')' + g s^2 g'  (Joseph's form).
+    """
+    V, h = spread.covariance, belief.h
+    shape = 0.5 * (inverse + inverse.T)
+    P = shape * (h @ V @ h) / (h @ shape @ h)
+    gain = P @ h / (h @ P @ h + belief.std**2)
+    move = np.eye(len(h)) - np.outer(gain, h)
+    scatter = move @ V @ move.T
+    after = scatter + belief.std**2 * np.outer(gain, gain)
+    left = np.diag(scatter)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # What is known beforehand needs no repeats: its part of the variance counts as known.
+        grown = np.where(left > 0, np.minimum(np.diag(after) / left, 1e3), 1.0)
+        systematic = np.minimum(spread.systematic, 1.0) / grown
+    new = Spread(after, spread.dof * grown**2, systematic)
+    return beta - gain * (h @ beta), new, move @ inverse

@@ -1,0 +1,94 @@
+"""What noise in the regressors does to least squares: how certain it is, and whether it matters.
+
+With enough data any shift becomes certain, one of a hundred-thousandth as well; what a person needs
+to know is whether it is large. Both are asked of every parameter, and only a shift that is certain
+and large makes another estimator the better one. A certain shift that is too small to matter stays
+in the value, and its size goes into the interval (GUM F.2.4.5: a known systematic effect that is
+not corrected is part of the uncertainty).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.identify.estimators.covariance import Spread
+from analysis.identify.estimators.equations import Fit, Prepared
+from analysis.identify.estimators.instruments import Hausman
+from analysis.regression.solve import half_width
+
+Array = NDArray[np.float64]
+
+LIMIT, LIMIT_OF_B = 0.005, 0.02  # relative: a shift beyond always matters
+SHARE = 0.5  # of the half width of the 95 % interval: a shift beyond it matters as well,
+LEAST = 0.1  # ... unless it is below this part of the limit: then nobody needs to know of it
+
+
+@dataclass(frozen=True)
+class Shift:
+    """How far noise in the regressors moves one parameter from what instruments say of it.
+
+    `relative` is signed, of the parameter itself; `t` its size in its own standard errors;
+    `of_half_width` its size over the half width of the 95 % interval without it.
+    """
+
+    name: str
+    relative: float
+    t: float
+    of_half_width: float
+    significant: bool
+
+    @property
+    def limit(self) -> float:
+        """The relative shift that always matters."""
+        return LIMIT_OF_B if self.name == "b" else LIMIT
+
+    @property
+    def material(self) -> bool:
+        """Whether it is large enough to matter, were it certain."""
+        size = abs(self.relative)
+        return size > self.limit or (self.of_half_width > SHARE and size > LEAST * self.limit)
+
+
+def shifts_of(
+    prepared: Sequence[Prepared],
+    tests: Mapping[str, Hausman],
+    reference: Mapping[str, tuple[Array, Spread, Fit]],
+) -> list[Shift]:
+    """Return the shift of every parameter; `reference` is least squares, by family."""
+    found = []
+    for p in prepared:
+        test, (_, error, _) = tests[p.family], reference[p.family]
+        half = half_width(np.sqrt(np.diag(error.covariance)), error.dof)
+        for i, name in enumerate(p.names[: p.parameters]):
+            size = abs(float(test.difference[i]))
+            # The rows hold 1/b: what makes 1/b larger makes b smaller.
+            sign = -1.0 if name == "b" else 1.0
+            found.append(
+                Shift(
+                    name,
+                    sign * float(test.relative[i]),
+                    size / float(test.error[i]) if test.error[i] > 0 else 0.0,
+                    size / float(half[i]) if half[i] > 0 else np.inf,
+                    bool(test.certain[i]),
+                )
+            )
+    return found
+
+
+def certain_shift(test: Hausman, p: Prepared) -> Array:
+    """Return least squares minus instruments (k,) of the family's parameters, 0 where chance."""
+    return np.where(test.certain, test.difference, 0.0)[: p.parameters]
+
+
+def including(error: Spread, shift: Array) -> Spread:
+    """Return the spread (k,) of least squares with every certain shift as a systematic part."""
+    before = np.diag(error.covariance)
+    after = before + shift**2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        grown = np.where(before > 0, after / before, 1.0)
+        share = np.where(after > 0, (error.systematic * before + shift**2) / after, 0.0)
+    return Spread(error.covariance + np.outer(shift, shift), error.dof * grown**2, share)

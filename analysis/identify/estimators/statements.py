@@ -1,0 +1,111 @@
+"""What an estimator has to say of itself: sentences with figures, as checks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.identify.checks import Check
+from analysis.identify.estimators import nuisance as nu
+from analysis.identify.estimators.covariance import Spread
+from analysis.identify.estimators.equations import Fit
+from analysis.identify.estimators.robust import outlying
+from analysis.identify.estimators.shifts import LEAST, SHARE, Shift
+
+Array = NDArray[np.float64]
+
+FEW_OUTLIERS = 0.02
+NOISE_CHECK = "noise in regressors"
+
+
+def nuisance_statement(
+    belief: nu.Belief, names: Sequence[str], beta: Array, error: Spread, wrong: bool
+) -> Check:
+    """State what the records say of a nuisance, and whether that can be."""
+    i = list(names).index(belief.name)
+    value, std = float(beta[i]), float(np.sqrt(error.covariance[i, i]))
+    if belief.name == nu.KAPPA:
+        compliance = float(beta[list(names).index("b")])
+        alpha, spread_ = -100 * value / compliance, 100 * std / abs(compliance)
+        said = f"b changes by {alpha:.2f} +- {2 * spread_:.2f} % per kelvin by these records"
+        if spread_ > 100 * nu.SLOPE_STD:
+            said = (
+                "the oil's temperature hardly varied: its effect on b is taken as "
+                f"{100 * nu.SLOPE:.1f} +- {200 * nu.SLOPE_STD:.1f} % per kelvin"
+            )
+        if wrong:
+            said += ", which no oil does: b is that of the records' mean temperature"
+        else:
+            said += "; b is that of the rig's nominal oil temperature"
+        return Check("oil temperature", not wrong, said)
+    size = np.sqrt(max(value, 0.0) + 2 * std)
+    said = f"laminar below a drop of {size / 1e6:.2g} MPa at most by these records"
+    if wrong:
+        said = (
+            "the flow depends on the pressure drop in a way no orifice does (a tank pressure, a "
+            "sensor's offset, a leak?); the gains are those of the plain square root"
+        )
+    return Check("laminar transition", not wrong, said)
+
+
+def noise_statement(shifts: Sequence[Shift]) -> Check:
+    """State whether noise in the regressors biases least squares (Hausman's test), and if so much.
+
+    Not ok is a shift that is certain and matters; of any other the figures are said.
+    """
+    if not shifts:
+        return Check(NOISE_CHECK, False, "nothing identified to judge")
+    certain = [s for s in shifts if s.significant]
+    biased = [s for s in certain if s.material]
+    if biased:
+        worst = max(biased, key=lambda s: abs(s.relative))
+        return Check(
+            NOISE_CHECK, False,
+            f"least squares is biased by noise in the regressors, {_figures(worst)}; so are "
+            f"{len(biased) - 1} others; --estimator auto or iv is not",
+        )  # fmt: skip
+    if certain:
+        worst = max(certain, key=lambda s: s.t)
+        return Check(
+            NOISE_CHECK, True,
+            f"noise in the regressors moves least squares, but too little to matter: most "
+            f"certainly {_figures(worst)}; {_bounds(worst)}; the intervals include it",
+        )  # fmt: skip
+    worst = max(shifts, key=lambda s: abs(s.relative))
+    chance = (
+        ", which would matter but may be chance: more repeats would tell" if worst.material else ""
+    )
+    return Check(
+        NOISE_CHECK, True,
+        f"least squares and instruments from the other repeats agree within their scatter: "
+        f"largest difference {_figures(worst)}{chance}",
+    )  # fmt: skip
+
+
+def _figures(s: Shift) -> str:
+    return (
+        f"{s.name} by {100 * s.relative:+.2g} % against instruments from the other repeats "
+        f"({s.t:.2g} of its standard errors, {s.of_half_width:.2g} of the 95 % interval's half "
+        "width)"
+    )
+
+
+def _bounds(s: Shift) -> str:
+    return (
+        f"it would matter beyond {100 * s.limit:g} %, or beyond {SHARE:g} of the half width and "
+        f"{100 * LEAST * s.limit:g} %"
+    )
+
+
+def outlier_statement(family: str, fit: Fit) -> Check:
+    """State the share of rows that the robust loss set aside, in the worst record."""
+    shares = outlying(fit)
+    record, share = max(shares.items(), key=lambda item: item[1])
+    return Check(
+        f"outliers {family}",
+        share < FEW_OUTLIERS,
+        f"{100 * share:.2g} % of the rows of record {record!r} lie far outside the scatter and "
+        "were left out (the worst record)",
+    )

@@ -1,0 +1,84 @@
+"""Least squares weighted by measured noise: the scatter of the residuals between repeats.
+
+The flow rows of the two chambers of one joint share the noise of its piston, with opposite sign;
+their 2 x 2 covariance is measured too, and both are whitened together (generalised least squares).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.identify.estimators.equations import (
+    Block,
+    Fit,
+    common,
+    least_squares,
+    residual_scatter,
+)
+from rig.model.parse import InputError
+
+Array = NDArray[np.float64]
+
+ROUNDS = 2  # of weights from residuals; the first solution is close already
+
+
+def weighted_least_squares(blocks: Sequence[Block]) -> Fit:
+    """Solve with weights 1 / sigma^2 of each step's equation; blocks need repeats."""
+    blocks = common(blocks)
+    fit = least_squares(blocks)
+    for _ in range(ROUNDS):
+        whitened = _whitened(blocks, replace(fit, blocks=tuple(blocks)))
+        fit = least_squares(whitened)
+    return fit
+
+
+def _whitened(blocks: Sequence[Block], fit: Fit) -> list[Block]:
+    """Return the blocks with unit noise, those of a pair of chambers mixed by inv(cholesky)."""
+    residuals = fit.residuals()
+    deviation = residual_scatter(blocks, residuals)
+    place = {(b.run, b.record, b.equation): i for i, b in enumerate(blocks)}
+    factors: dict[tuple[int, str, str], Array] = {}
+    out = list(blocks)
+    for i, b in enumerate(blocks):
+        other = place.get((b.run, b.record, b.equation.replace("flow_cap", "flow_rod")), i)
+        key = (*b.stratum, b.equation)
+        if b.equation.startswith("flow_rod") and _paired(blocks, place, b):
+            continue
+        pair = [i] if other == i or len(blocks[other].y) != len(b.y) else [i, other]
+        if key not in factors:
+            members = [
+                (m, *(place[c.run, c.record, blocks[p].equation] for p in pair[1:]))
+                for m, c in enumerate(blocks)
+                if c.stratum == b.stratum and c.equation == b.equation
+            ]
+            stacked = np.concatenate(
+                [np.column_stack([deviation[j] for j in member]) for member in members]
+            )
+            factors[key] = _whitener(stacked, b)
+        L = factors[key]
+        for row, target in enumerate(pair):
+            X = sum(L[row, c] * blocks[j].X for c, j in enumerate(pair))
+            y = sum(L[row, c] * blocks[j].y for c, j in enumerate(pair))
+            out[target] = replace(blocks[target], X=np.asarray(X), y=np.asarray(y))
+    return out
+
+
+def _paired(blocks: Sequence[Block], place: dict[tuple[int, str, str], int], b: Block) -> bool:
+    cap = place.get((b.run, b.record, b.equation.replace("flow_rod", "flow_cap")))
+    return cap is not None and len(blocks[cap].y) == len(b.y)
+
+
+def _whitener(deviation: Array, b: Block) -> Array:
+    """Return inv(cholesky(covariance)) of deviations (rows, equations of the pair)."""
+    covariance = deviation.T @ deviation / len(deviation)
+    try:
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
+    except np.linalg.LinAlgError:
+        raise InputError(
+            f"--estimator wls weighs by the scatter between repeats, but the repeats of "
+            f"{b.step!r} do not differ in {b.equation}: are they copies of one record?"
+        ) from None

@@ -1,0 +1,219 @@
+"""What a search method asks of the model: the output error of a candidate, or that it has none.
+
+A candidate is a set of STEP1's parameters (the last joint's: inertia, friction, gravity, four
+gains, and b: 8). Its model runs free over windows of a record, from the measured state and driven
+by the measured spool; the other joints stand still, as the paper's STEP1 has it, so that their
+parameters play no part. Error of a candidate, over piston, cap and rod pressure and all windows:
+ J = mean [ |y - yhat|^2 / |y - mean y|^2 ]          (FIT = 100 (1 - sqrt J) for one channel)
+
+Not every candidate has a state: where a chamber's pressure leaves [0, p_s] an orifice's root is
+complex, and where the state diverges there is nothing left to compare (the paper's section II.B).
+Such a candidate is counted by its fate, and its error is DEAD or more, worse than any that lives
+(more, the more of the windows it lost, so that a search among the dead is not blind).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.regression.rows import Filtering
+from analysis.signals.conditioning import Mask, aligned_channels, condition
+from analysis.simulation.model import Estimate, Model
+from analysis.simulation.simulate import Drive, State, compiled, drive_of, simulate, state_at
+from analysis.simulation.validate import arrived
+from analysis.terms.base import Used
+from rig.model import channels as ch
+from rig.model.parameters import gain_names, inertia_names
+from rig.model.parse import InputError
+from rig.model.records import Record, Run
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+
+DEAD = 1e6  # error of a candidate without a state; the living are far below
+COMPLEX, DIVERGED = "pressure outside 0..supply", "state diverged"
+PLAIN = 1.0  # of parameters that play no part, where the rig has no nominal value
+
+
+@dataclass(frozen=True)
+class SearchOptions:
+    """How long a search may go on, where, and on how much data.
+
+    `evaluations` candidates in generations of `population`; each parameter between its nominal
+    value divided and multiplied by `factor`, searched in the logarithm; `windows` stretches of
+    `seconds` of one record.
+    """
+
+    evaluations: int = 2000
+    population: int = 40
+    factor: float = 10.0
+    windows: int = 2
+    seconds: float = 2.0
+
+    def __post_init__(self) -> None:
+        if self.evaluations < 4 or self.population < 4:
+            raise InputError(
+                f"a search of {self.evaluations} evaluations in generations of {self.population} "
+                "is none: expected at least 4 of each"
+            )
+        if not self.factor > 1.0 or self.windows < 1 or not self.seconds > 0.0:
+            raise InputError("a search needs a factor above 1 and at least one window of data")
+
+
+@dataclass(frozen=True)
+class Window:
+    """A stretch of the record: where it starts, the state there, what was measured by channel.
+
+    `here` (samples,) is false where a sample was lost and nothing is compared.
+    """
+
+    first: int
+    samples: int
+    start: State
+    measured: Mapping[str, Array]
+    spread: Mapping[str, float]
+    here: Mask
+
+
+@dataclass(frozen=True)
+class Task:
+    """A search's task: the model to fill in, the names searched, their bounds, the data."""
+
+    record: str
+    model: Model
+    names: tuple[str, ...]
+    low: Array
+    high: Array
+    drive: Drive
+    windows: tuple[Window, ...]
+
+
+@dataclass(frozen=True)
+class Score:
+    """A candidate's error, and why its state ceased to exist ('' if it did not)."""
+
+    error: float
+    fate: str
+
+
+def searched_names(rig: Rig) -> tuple[str, ...]:
+    """Name STEP1's parameters: inertia, friction and gravity of the last joint, b, its gains."""
+    N = len(rig.joints)
+    inertia = inertia_names(N)
+    last = "M2" if N == 2 else inertia[-1]
+    return (last, f"Fv{N}", f"W{N}", "b", *gain_names(N))
+
+
+def step_one(runs: Sequence[Run]) -> Record:
+    """Return the first record that moves the last joint alone; raises InputError without one."""
+    for run in runs:
+        N = len(run.rig.joints)
+        for record in run.records:
+            if set(record.locked) == set(range(1, N)):
+                return record
+    raise InputError(
+        "a search needs a record that excites the last joint alone (the paper's STEP1), and the "
+        "runs hold none; `bramah run lock-and-excite` records it"
+    )
+
+
+def make_task(
+    rig: Rig, record: Record, terms: Sequence[Used], filtering: Filtering, options: SearchOptions
+) -> Task:
+    """Lay out the search on one record; raises InputError for a rig without nominal values.
+
+    Also for a record with a gap of lost samples that a model cannot be simulated through.
+    """
+    names = searched_names(rig)
+    model = _template(rig, terms, names)
+    nominal = np.array([rig.nominal[name] for name in names])
+    signals = condition(rig, record, filtering.channels)
+    drive = _stilled(drive_of(signals))
+    length, reach = round(options.seconds * record.sample_rate), filtering.channels.reach
+    room = record.samples - 2 * reach - length
+    if room < 0:
+        raise InputError(
+            f"record {record.name!r} of {record.samples / record.sample_rate:g} s is too short "
+            f"for a window of {options.seconds:g} s"
+        )
+    channels, every = aligned_channels(rig, record), arrived(rig, record)
+    shown = [
+        ch.channel(kind, i + 1)
+        for i in map(int, np.flatnonzero(signals.excited))
+        for kind in (ch.PISTON, ch.CAP, ch.ROD)
+    ]
+    windows = []
+    for first in np.unique(np.linspace(reach, reach + room, options.windows).astype(int)):
+        measured = {name: channels[name][first : first + length] for name in shown}
+        here = every[first : first + length]
+        spread = {n: float(here.sum() * y[here].var()) for n, y in measured.items()}
+        start = state_at(signals, int(first))
+        windows.append(Window(int(first), length, start, measured, spread, here))
+    return Task(
+        record.name, model, names, nominal / options.factor, nominal * options.factor,
+        drive, tuple(windows),
+    )  # fmt: skip
+
+
+def _template(rig: Rig, terms: Sequence[Used], names: Sequence[str]) -> Model:
+    """Return a model whose searched parameters are nominal and whose others play no part."""
+    missing = [name for name in names if not rig.nominal.get(name, 0.0) > 0.0]
+    if missing:
+        raise InputError(
+            f"rig {rig.name!r} has no positive nominal {' '.join(missing)}: a search has to know "
+            "where to look; add them under 'nominal' in the rig file"
+        )
+    none = (np.nan, np.nan)
+    parameters = {
+        c.parameter: Estimate(rig.nominal.get(c.parameter, PLAIN), c.unit, np.nan, none)
+        for used in terms
+        for c in used.term.coefficients(rig)
+    }
+    if set(names) - set(parameters):
+        raise InputError("a search needs the paper's terms: inertia, friction, gravity, oil, gains")
+    k = len(parameters)
+    return Model(rig, tuple(terms), parameters, np.full((k, k), np.nan))
+
+
+def _stilled(drive: Drive) -> Drive:
+    """Hold the locked joints at their mean, without velocity: what STEP1's equations assume."""
+    mean = np.where(drive.locked, drive.q.mean(axis=0), drive.q)
+    still = np.where(drive.locked, 0.0, 1.0)
+    return replace(drive, q=mean, qd=drive.qd * still, qdd=drive.qdd * still)
+
+
+def with_values(model: Model, values: Mapping[str, float]) -> Model:
+    """Return the model with some of its parameters' values replaced."""
+    parameters = {
+        name: replace(p, value=values.get(name, p.value)) for name, p in model.parameters.items()
+    }
+    return replace(model, parameters=parameters)
+
+
+def score(task: Task, values: Mapping[str, float]) -> Score:
+    """Simulate a candidate over all windows and return its error and its fate."""
+    ready = compiled(with_values(task.model, values))
+    total, lost, samples, fate = 0.0, 0, 0, ""
+    for window in task.windows:
+        samples += window.samples
+        if fate == DIVERGED:
+            lost += window.samples
+            continue
+        found = simulate(ready, task.drive, window.start, window.first, window.samples)
+        lost += found.outside + window.samples - found.filled
+        if found.failure:
+            fate = DIVERGED
+        elif found.outside:
+            fate = fate or COMPLEX
+        elif not fate:
+            channels = found.channels()
+            for name, y in window.measured.items():
+                off = (y - channels[name])[window.here]
+                total += float(np.sum(off**2)) / window.spread[name]
+    if fate:
+        return Score(DEAD * (1.0 + lost / samples), fate)
+    return Score(total / (len(task.windows) * len(task.windows[0].measured)), "")

@@ -1,0 +1,202 @@
+"""The sequential method, step after step, in the two ways the paper names (its section II.B).
+
+ E1  a parameter is identified at one step only and known in every step after it
+ E2  every step identifies what it can by itself, and the steps' values are averaged
+
+A step alone may show only a combination (STEP2: M1 + 2 R12 cos q2). In E1 its rows then wait for
+the next step's; in E2 such parameters are solved from all rows with the averages known.
+
+Both give one list of numbers, and neither is unique: a parameter that several steps show (b in
+all of them) has as many values as steps. All of them are reported, with their disagreement in
+units of their own 95 % intervals: max |v_i - v_j| / sqrt(h_i^2 + h_j^2).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from analysis.identify import checks as ck
+from analysis.identify.checks import Check
+from analysis.identify.estimates import estimates_of
+from analysis.identify.identify import (
+    Identification,
+    RecordRows,
+    build_rows,
+    clusters_of,
+    repeats_of,
+)
+from analysis.identify.methods.stages import Outcome, Stage, as_solution, solve_stages
+from analysis.identify.plausibility import consistency
+from analysis.regression.noise import noise_moments
+from analysis.regression.rows import Filtering, parameters_of
+from analysis.regression.solve import Cluster
+from analysis.signals.conditioning import lost_samples
+from analysis.simulation.model import Estimate, Model, estimate_json, finite
+from analysis.terms.base import FAMILIES, Used
+from rig.model.parse import InputError
+from rig.model.records import Record, Run
+from rig.model.rig import Rig
+
+WORST = 3  # disagreements that the check spells out; the table has them all
+
+
+def sequential(
+    runs: Sequence[Run],
+    terms: Sequence[Used],
+    filtering: Callable[[Record], Filtering],
+    reject_noise: bool,
+) -> Identification:
+    """Identify step after step: the estimates are E1's, `extra` holds E2 and every step's values.
+
+    Raises InputError for runs of different rigs and records that cannot be used.
+    """
+    rig = ck.common_rig(runs)
+    stages, masked, names = _stages(rig, runs, terms, filtering)
+    started = time.perf_counter()
+    outcomes = {
+        family: solve_stages(parameters_of(rig, terms, family), stages[family], reject_noise)
+        for family in FAMILIES
+    }
+    seconds = time.perf_counter() - started
+    solutions = {f: as_solution(o, o.first) for f, o in outcomes.items()}
+    estimates, covariance = estimates_of(rig, terms, solutions)
+    rows = {family: outcome.rows for family, outcome in outcomes.items()}
+    shown = {name: _shown(rig, terms, outcomes, name) for name in estimates}
+    records = [record for run in runs for record in run.records]
+    statements = (
+        _uniqueness(shown),
+        ck.repeats(_repeats(runs)),
+        ck.joints_excited(rig, records),
+        *ck.clipping(rig, [(r, ck.clipped_counts(rig, r)) for r in records]),
+        ck.lost_samples([(r, int(lost_samples(rig, r).any(axis=1).sum())) for r in records]),
+        ck.masked(sum(rows.values()), masked),
+        *consistency(rig, estimates),
+    )
+    provenance = {
+        "method": "sequential",
+        "runs": [run.source for run in runs],
+        "records": names,
+        "rows": rows,
+        "checks_failed": [c.name for c in statements if not c.ok],
+    }
+    second = {f: as_solution(o, o.averaged) for f, o in outcomes.items()}
+    extra = {"sequential": _json(outcomes, shown, estimates, estimates_of(rig, terms, second)[0])}
+    model = Model(rig, tuple(terms), estimates, covariance, provenance)
+    return Identification(
+        "sequential", estimates, solutions, rows, masked, seconds, statements, model, extra
+    )
+
+
+def _repeats(runs: Sequence[Run]) -> dict[tuple[int, str], int]:
+    counts: dict[tuple[int, str], set[int]] = {}
+    for index, run in enumerate(runs):
+        for record in run.records:
+            counts.setdefault((index, record.step), set()).add(record.repeat)
+    return {key: len(found) for key, found in counts.items()}
+
+
+def _stages(
+    rig: Rig,
+    runs: Sequence[Run],
+    terms: Sequence[Used],
+    filtering: Callable[[Record], Filtering],
+) -> tuple[dict[str, list[Stage]], int, list[str]]:
+    """Return the stages of each family in the order of the steps, rows masked, records' names."""
+    out: dict[str, list[Stage]] = {family: [] for family in FAMILIES}
+    masked, names = 0, []
+    for step in dict.fromkeys(record.step for run in runs for record in run.records):
+        part = [
+            replace(run, records=tuple(r for r in run.records if r.step == step)) for run in runs
+        ]
+        built = build_rows(rig, part, terms, filtering)
+        masked += sum(rows.masked for one in built for rows in one.rows.values())
+        names += [one.record for one in built]
+        noise = noise_moments(rig, part, terms, filtering, np.random.default_rng(0))
+        for family in FAMILIES:
+            clusters = _clusters(built, family)
+            if clusters:
+                out[family].append(Stage(step, clusters, noise[family]))
+    for family, found in out.items():
+        if not found:
+            raise InputError(f"no {family} row of any record can be used; all of them are masked")
+    return out, masked, names
+
+
+def _clusters(built: Sequence[RecordRows], family: str) -> tuple[Cluster, ...]:
+    repeats = repeats_of(built)
+    return tuple(c for one in built for c in clusters_of(one, family, repeats))
+
+
+def _shown(
+    rig: Rig, terms: Sequence[Used], outcomes: Mapping[str, Outcome], name: str
+) -> list[tuple[str, Estimate]]:
+    """Return every step's own value of one parameter, as an estimate in the parameter's unit."""
+    family, outcome = next((f, o) for f, o in outcomes.items() if name in o.names)
+    out = []
+    for value in outcome.own[name]:
+        solutions = {family: as_solution(outcome, {name: value})}
+        out.append((value.step, estimates_of(rig, terms, solutions)[0][name]))
+    return out
+
+
+def disagreement(values: Sequence[Estimate]) -> float:
+    """Return the largest difference of two values over their common 95 % half width."""
+    halves = [0.5 * (v.ci95[1] - v.ci95[0]) for v in values]
+    return max(
+        (
+            abs(a.value - b.value) / float(np.hypot(halves[i], halves[j]))
+            for i, a in enumerate(values)
+            for j, b in enumerate(values[:i])
+        ),
+        default=0.0,
+    )
+
+
+def _uniqueness(shown: Mapping[str, Sequence[tuple[str, Estimate]]]) -> Check:
+    """State which parameters have several values, and by how much the worst of them disagree."""
+    several = {name: found for name, found in shown.items() if len(found) > 1}
+    if not several:
+        return Check("one value each", True, "no parameter is identified by more than one step")
+    by_size = sorted(several, key=lambda n: -disagreement([e for _, e in several[n]]))
+    texts = []
+    for name in by_size[:WORST]:
+        values = ", ".join(f"{step} {estimate.value:.5g}" for step, estimate in several[name])
+        apart = disagreement([e for _, e in several[name]])
+        texts.append(f"{name}: {values} ({apart:.1f} of their 95 % intervals apart)")
+    return Check(
+        "one value each", False,
+        f"{len(several)} parameters have several values, worst: " + "; ".join(texts),
+    )  # fmt: skip
+
+
+def _json(
+    outcomes: Mapping[str, Outcome],
+    shown: Mapping[str, Sequence[tuple[str, Estimate]]],
+    first: Mapping[str, Estimate],
+    averaged: Mapping[str, Estimate],
+) -> dict[str, Any]:
+    taken = {n: v.step for o in outcomes.values() for n, v in o.first.items()}
+    means = {n: v.step for o in outcomes.values() for n, v in o.averaged.items()}
+    return {
+        "steps": list(next(iter(outcomes.values())).condition),
+        "per_step": {
+            name: [{"step": step, **estimate_json(e)} for step, e in found]
+            for name, found in shown.items()
+        },
+        "disagreement": {
+            name: finite(disagreement([e for _, e in found]))
+            for name, found in shown.items()
+            if len(found) > 1
+        },
+        "E1": {n: {"step": taken.get(n), **estimate_json(e)} for n, e in first.items()},
+        "E2": {n: {"steps": means.get(n), **estimate_json(e)} for n, e in averaged.items()},
+        "condition_number": {
+            family: {step: finite(c) for step, c in outcome.condition.items()}
+            for family, outcome in outcomes.items()
+        },
+    }

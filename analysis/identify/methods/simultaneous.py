@@ -1,0 +1,72 @@
+"""The simultaneous method: every joint excited at once, and nothing else (the paper's section V.C).
+
+The rows and the solve are the coupled method's; only the choice of records differs. All the
+parameters share one excitation, so columns that lock-and-excite keeps apart lie close together:
+the condition number tells by how much, the physical checks whether noise has used the room.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from analysis.identify.checks import Check, common_rig
+from analysis.identify.identify import Identification, identify
+from analysis.regression.rows import Filtering
+from analysis.simulation.model import Estimate
+from analysis.terms.base import Used
+from rig.model.parse import InputError
+from rig.model.records import Record, Run
+from rig.model.rig import Rig
+
+
+def simultaneous(
+    runs: Sequence[Run],
+    terms: Sequence[Used],
+    filtering: Callable[[Record], Filtering],
+    reject_noise: bool,
+) -> Identification:
+    """Identify from the records without a locked joint; raises InputError where there is none."""
+    rig = common_rig(runs)
+    kept = [replace(run, records=tuple(r for r in run.records if not r.locked)) for run in runs]
+    used = sum(len(run.records) for run in kept)
+    every = sum(len(run.records) for run in runs)
+    if not used:
+        steps = " ".join(sorted({r.step for run in runs for r in run.records}))
+        raise InputError(
+            f"the simultaneous method needs records that excite all {len(rig.joints)} joints at "
+            f"once; in the steps {steps} a joint is locked (`bramah run validate` records some)"
+        )
+    chosen = [run for run in kept if run.records]
+    # Least squares as in the paper, whatever noise makes of it: that is what is compared.
+    result = identify(chosen, "coupled", terms, filtering, reject_noise, estimator="ls")
+    statements = (
+        Check(
+            "records used", used == every,
+            f"{used} of {every} records excite all joints at once; the others were left out",
+        ),
+        *gravity_order(rig, {n: e for n, e in result.estimates.items() if e.identified}),
+        *result.checks,
+    )  # fmt: skip
+    failed = [c.name for c in statements if not c.ok]
+    provenance = {**result.model.provenance, "method": "simultaneous", "checks_failed": failed}
+    model = replace(result.model, provenance=provenance)
+    return replace(result, method="simultaneous", checks=statements, model=model)
+
+
+def gravity_order(rig: Rig, estimates: dict[str, Estimate]) -> list[Check]:
+    """State whether each W_i can belong to masses that lie within their links.
+
+    W_i = m_i lg_i + l_i (masses beyond) and 0 <= lg <= l give W_i/l_i >= W_(i+1)/l_(i+1) >= 0.
+    """
+    names = [f"W{i}" for i in range(1, len(rig.joints) + 1)]
+    if any(name not in estimates for name in names):
+        return []
+    loads = [
+        estimates[name].value / joint.link_length
+        for name, joint in zip(names, rig.joints, strict=True)
+    ]
+    ok = all(a >= b for a, b in zip(loads, [*loads[1:], 0.0], strict=True))
+    detail = ", ".join(f"{n} = {estimates[n].value:.4g} kg m" for n in names)
+    wanted = "masses within their links give W_i/l_i >= W_(i+1)/l_(i+1) >= 0"
+    return [Check("gravity order", ok, f"{detail}; {wanted}")]

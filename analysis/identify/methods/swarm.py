@@ -1,0 +1,274 @@
+"""PSO and GA on STEP1's parameters: the search methods that the paper compares with.
+
+The algorithms are pymoo's (Blank and Deb, pymoo: Multi-objective optimization in Python, 2020):
+of the libraries looked at it is the one that has both, is maintained, takes a seed instead of
+numpy's global generator, and offers ask-and-tell, so that every candidate is simulated and counted
+here and nothing of the library reaches the physics. PSO is its adaptive form, GA its real-coded
+form (simulated binary crossover, polynomial mutation). Both search the decades of
+value / nominal.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.identify import checks as ck
+from analysis.identify.checks import Check
+from analysis.identify.estimates import estimates_of
+from analysis.identify.identify import Identification
+from analysis.identify.methods.search import (
+    COMPLEX,
+    DEAD,
+    DIVERGED,
+    SearchOptions,
+    Task,
+    make_task,
+    score,
+    step_one,
+)
+from analysis.regression.rows import Filtering, parameters_of
+from analysis.regression.solve import Solution
+from analysis.simulation.model import Model
+from analysis.terms.base import FAMILIES, Used
+from rig.model.parse import InputError
+from rig.model.records import Record, Run
+
+Array = NDArray[np.float64]
+log = logging.getLogger(__name__)
+
+AT_BOUND = 0.02  # of the decades searched: nearer to an end than this, the bound made the value
+
+_PYMOO = {
+    "pso": "algorithms.soo.nonconvex.pso",
+    "ga": "algorithms.soo.nonconvex.ga",
+    "evaluator": "core.evaluator",
+    "problem": "core.problem",
+    "termination": "core.termination",
+    "static": "problems.static",
+}
+
+
+@dataclass(frozen=True)
+class Trail:
+    """A finished search: the best values, and what became of every candidate.
+
+    `errors` (generations,) is the best error so far after each generation, `first` the best of the
+    first one; `lost` counts candidates by fate, `lost_first` those of the first generation.
+    """
+
+    values: Mapping[str, float]
+    error: float
+    first: float
+    evaluations: int
+    errors: tuple[float, ...]
+    sizes: tuple[int, ...]
+    lost: Mapping[str, int]
+    lost_first: int
+    lost_by_generation: tuple[int, ...]
+    seconds: float
+
+
+def search(
+    method: str,
+    runs: Sequence[Run],
+    terms: Sequence[Used],
+    filtering: Callable[[Record], Filtering],
+    rng: np.random.Generator,
+    options: SearchOptions,
+) -> Identification:
+    """Search STEP1's parameters by simulation; every other parameter is null.
+
+    Raises InputError without a record that excites the last joint alone, without nominal values,
+    or where every candidate lost its state.
+    """
+    rig = ck.common_rig(runs)
+    record = step_one(runs)
+    ck.refuse_dead_channels(rig, record)
+    task = make_task(rig, record, terms, filtering(record), options)
+    trail = run_search(method, task, options, rng)
+    if trail.error >= DEAD:
+        raise InputError(
+            f"{method}: every one of {trail.evaluations} candidates lost its state "
+            f"({_fates(trail)}); try more --evaluations"
+        )
+    return _identification(method, runs, task, trail, options)
+
+
+def run_search(method: str, task: Task, options: SearchOptions, rng: np.random.Generator) -> Trail:
+    """Let the algorithm propose generations until the evaluations are spent."""
+    started = time.perf_counter()
+    algorithm, evaluator, wrap = _pymoo(method, task, options, rng)
+    best, best_error = np.zeros(len(task.names)), np.inf
+    errors: list[float] = []
+    sizes: list[int] = []
+    lost = {COMPLEX: 0, DIVERGED: 0}
+    gone: list[int] = []
+    while True:
+        population = algorithm.ask()
+        if population is None or not len(population):
+            break
+        if sum(sizes) + len(population) > options.evaluations:
+            break
+        points = np.asarray(population.get("X"), dtype=np.float64)
+        scores = [score(task, _values(task, x)) for x in points]
+        found = np.array([s.error for s in scores])
+        sizes.append(len(scores))
+        gone.append(sum(bool(s.fate) for s in scores))
+        for s in scores:
+            if s.fate:
+                lost[s.fate] += 1
+        if found.min() < best_error:
+            best, best_error = points[int(found.argmin())], float(found.min())
+        errors.append(best_error)
+        evaluator.eval(wrap(found), population)
+        algorithm.tell(infills=population)
+    seconds = time.perf_counter() - started
+    log.info("%s: %d candidates in %.1f s, %s lost", method, sum(sizes), seconds, lost)
+    return Trail(
+        _values(task, best), best_error, errors[0], sum(sizes), tuple(errors), tuple(sizes),
+        lost, gone[0], tuple(gone), seconds,
+    )  # fmt: skip
+
+
+def _pymoo(
+    method: str, task: Task, options: SearchOptions, rng: np.random.Generator
+) -> tuple[Any, Any, Callable[[Array], Any]]:
+    """Return pymoo's algorithm, its evaluator, and how it wants to be told errors (n,)."""
+    # An extra: who never searches need not install it.
+    try:
+        core = {name: import_module(f"pymoo.{place}") for name, place in _PYMOO.items()}
+    except ImportError as error:
+        raise InputError(
+            f"the methods pso and ga need the package pymoo ({error}); install bramah[search]"
+        ) from error
+    span = np.log10(task.high / task.low)
+    problem = core["problem"].Problem(n_var=len(span), n_obj=1, xl=np.zeros(len(span)), xu=span)
+    size = min(options.population, options.evaluations)
+    algorithm = getattr(core[method], method.upper())(pop_size=size)
+    seed = int(rng.integers(2**31))
+    algorithm.setup(
+        problem, termination=core["termination"].NoTermination(), seed=seed, verbose=False
+    )
+    static = core["static"].StaticProblem
+    return (
+        algorithm,
+        core["evaluator"].Evaluator(),
+        lambda errors: static(problem, F=errors[:, None]),
+    )
+
+
+def _values(task: Task, point: Array) -> dict[str, float]:
+    return dict(zip(task.names, map(float, task.low * 10.0**point), strict=True))
+
+
+def _identification(
+    method: str, runs: Sequence[Run], task: Task, trail: Trail, options: SearchOptions
+) -> Identification:
+    rig, used = task.model.rig, task.model.terms
+    solutions = {family: _as_solution(method, task, trail, family) for family in FAMILIES}
+    estimates, covariance = estimates_of(rig, used, solutions)
+    statements = _statements(method, runs, task, trail)
+    provenance = {
+        "method": method,
+        "runs": [run.source for run in runs],
+        "records": [task.record],
+        "evaluations": trail.evaluations,
+        "checks_failed": [c.name for c in statements if not c.ok],
+    }
+    model = Model(rig, used, estimates, covariance, provenance)
+    rows = dict.fromkeys(FAMILIES, 0)
+    extra = {"search": trail_json(task, trail, options)}
+    return Identification(
+        method, estimates, solutions, rows, 0, trail.seconds, statements, model, extra
+    )
+
+
+def _as_solution(method: str, task: Task, trail: Trail, family: str) -> Solution:
+    """Return a family's values as a solution of no rows: no interval, no condition number."""
+    coefficients = {
+        c.parameter: c for u in task.model.terms for c in u.term.coefficients(task.model.rig)
+    }
+    names = parameters_of(task.model.rig, task.model.terms, family)
+    nan = np.full(len(names), np.nan)
+    value = nan.copy()
+    for i, name in enumerate(names):
+        if name in trail.values:
+            found = trail.values[name]
+            value[i] = 1.0 / found if coefficients[name].reciprocal else found
+    lost = {n: f"{method} searches STEP1's parameters only" for n in names if n not in trail.values}
+    return Solution(names, value, np.diag(nan), nan, np.nan, 0, np.nan, nan, lost)
+
+
+def _fates(trail: Trail) -> str:
+    return ", ".join(f"{count} {fate}" for fate, count in trail.lost.items())
+
+
+def _statements(method: str, runs: Sequence[Run], task: Task, trail: Trail) -> tuple[Check, ...]:
+    gone = sum(trail.lost.values())
+    share = 100.0 * gone / trail.evaluations
+    parameters = len(task.model.parameters)
+    span = np.log10(task.high / task.low)
+    place = np.array([np.log10(trail.values[n] / low) for n, low in zip(task.names, task.low)])  # noqa: B905
+    stuck = [
+        name
+        for name, x, width in zip(task.names, place, span, strict=True)
+        if min(x, width - x) < AT_BOUND * width
+    ]
+    records = [record for run in runs for record in run.records]
+    return (
+        Check(
+            "state exists",
+            gone == 0,
+            f"{gone} of {trail.evaluations} candidates ({share:.1f} %) lost their state: "
+            f"{_fates(trail)}; of the first {trail.sizes[0]}, {trail.lost_first}",
+        ),
+        Check(
+            "all parameters",
+            False,
+            f"{len(task.names)} of {parameters}: {method} searches STEP1's parameters on record "
+            f"{task.record!r} of {len(records)}; the others have no value, and none an interval",
+        ),
+        Check(
+            "bounds",
+            not stuck,
+            f"{' '.join(stuck)} ended at a bound of the search"
+            if stuck
+            else "no parameter ended at a bound of the search",
+        ),
+        Check(
+            "output error",
+            True,
+            f"best relative output error {trail.error:.4g} (the first generation's best: "
+            f"{trail.first:.4g}); nothing says that another search would end at the same values",
+        ),
+    )
+
+
+def trail_json(task: Task, trail: Trail, options: SearchOptions) -> dict[str, Any]:
+    """Return the search as plain data."""
+    return {
+        "record": task.record,
+        "windows": [w.first for w in task.windows],
+        "window_seconds": options.seconds,
+        "evaluations": trail.evaluations,
+        "lost": dict(trail.lost),
+        "lost_first_generation": trail.lost_first,
+        "lost_by_generation": list(trail.lost_by_generation),
+        "generation_sizes": list(trail.sizes),
+        "error_first_generation": trail.first if trail.first < DEAD else None,
+        "error": trail.error,
+        "error_by_generation": [e if e < DEAD else None for e in trail.errors],
+        "bounds": {
+            name: [float(a), float(b)]
+            for name, a, b in zip(task.names, task.low, task.high, strict=True)
+        },
+        "seconds": trail.seconds,
+    }

@@ -1,0 +1,297 @@
+"""Identification while the bench runs: a square-root information filter over rows as they come.
+
+The rows are the batch's own: samples are filtered in chunks with the overlap that zero-phase
+filters need, so a row comes out `Tracker.delay` seconds late and is exactly the row that
+`analysis.identify.identify` would make. A chunk's rows are folded into the triangle R of all
+before,
+
+    R'R  <-  w R'R + [X y]' W [X y],     w = exp(-dt/memory),
+
+(Bierman, Factorization Methods, ch. V; with memory infinite, w = 1, this is the batch solution).
+Forgetting goes by the device's clock, so a parameter that changes is followed whatever is excited.
+What is not excited fades, but never below FLOOR of its column's best: there its value is held, and
+it is said to be held, in the place of numbers that come from rounding.
+
+Followed by default are the flow rows (b and the gains), which need nothing of the locked joints.
+Torque rows can be followed as well; locked joints then count as moving as measured, whereas
+`identify` decides from the whole record whether a lock gives.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.identify.estimates import estimates_of
+from analysis.regression.chunks import Locks, divisible, overlap, stretch_rows
+from analysis.regression.qr import Accumulator
+from analysis.regression.rows import Filtering, Rows, default_filtering, parameters_of
+from analysis.regression.solve import Cluster, Solution, merge, solve
+from analysis.simulation.model import Estimate
+from analysis.terms import baseline_of
+from analysis.terms.base import Term, Used, family_of
+from rig.model.parse import InputError
+from rig.model.records import Record, RecordHead, head_of
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+
+CHUNK = 0.5  # [s] of new samples worked on together; one independent piece for the intervals
+FLOOR = 1e-4  # of the largest norm that a column of R has had
+SPENT = 1e-6  # weight below which a segment says nothing any more
+
+
+class RowFeed:
+    """The rows of one record while its samples come in."""
+
+    def __init__(
+        self,
+        rig: Rig,
+        terms: Sequence[Used],
+        head: RecordHead,
+        filtering: Filtering,
+        families: Collection[str],
+        chunk: float = CHUNK,
+    ) -> None:
+        if not divisible(filtering):
+            raise InputError("rows can only be made on-line by filters of finite length")
+        N = len(rig.joints)
+        self._rig, self._terms, self._head, self._filtering = rig, terms, head, filtering
+        self._families = families
+        self._chunk = round(chunk * head.sample_rate)
+        self._spare = overlap(rig, head.sample_rate, filtering)
+        self._locks = Locks(np.ones(N, dtype=bool), np.zeros(N))
+        self._waiting: list[Mapping[str, Array]] = []
+        self._offset = self._first = self._total = 0
+
+    @property
+    def delay(self) -> float:
+        """How late a row comes out at most [s]."""
+        return (self._spare + self._chunk) / self._head.sample_rate
+
+    def feed(self, channels: Mapping[str, Array]) -> dict[str, Rows]:
+        """Take the next samples, NaN where lost; return the rows that they complete, if any."""
+        self._waiting.append(channels)
+        self._total += len(next(iter(channels.values())))
+        last = self._total - self._spare
+        return self._work(last) if last - self._first >= self._chunk else {}
+
+    def finish(self) -> dict[str, Rows]:
+        """Return the rows that were waiting for samples beyond the record's end."""
+        return self._work(self._total) if self._total else {}
+
+    def _work(self, last: int) -> dict[str, Rows]:
+        names = self._waiting[0]
+        part: dict[str, Array] = {n: np.concatenate([w[n] for w in self._waiting]) for n in names}
+        own = (self._first, last)
+        rows = stretch_rows(
+            self._rig, self._terms, self._head.record(part), self._offset, own,
+            self._filtering, self._locks, self._families,
+        )  # fmt: skip
+        step = self._filtering.step
+        offset = max(0, last - self._spare) // step * step
+        cut = offset - self._offset
+        self._waiting = [{name: x[cut:] for name, x in part.items()}]
+        self._offset, self._first = offset, last
+        return rows
+
+
+@dataclass(frozen=True)
+class _Segment:
+    """The rows of one chunk as a triangle, their weight being 1 at `time` [s]."""
+
+    step: str
+    repeat: int
+    index: int
+    triangle: Array
+    rows: int
+    time: float
+
+
+class _Filter:
+    """The square-root information filter of one family, and the pieces its intervals rest on."""
+
+    def __init__(self, names: tuple[str, ...], memory: float) -> None:
+        self.names = names
+        self.held: frozenset[str] = frozenset()
+        self._memory = memory
+        self._sum = Accumulator(len(names))
+        self._peak = np.zeros(len(names))
+        self._time = -np.inf
+        self._segments: list[_Segment] = []
+
+    def fold(self, head: RecordHead, found: Sequence[Rows], start: float) -> None:
+        """Fold the rows of a chunk, their times counting from `start` [s]."""
+        matrix = np.concatenate([r.matrix for r in found])
+        rhs = np.concatenate([r.rhs for r in found])
+        time = start + np.concatenate([r.time for r in found])
+        if not len(rhs):
+            return
+        now = max(float(time.max()), self._time)
+        if np.isfinite(self._time):
+            self._fade(now - self._time)
+        root = np.exp(0.5 * (time - now) / self._memory)
+        piece = Accumulator(len(self.names))
+        piece.fold(matrix * root[:, None], rhs * root)
+        self._sum.merge(piece.triangle, piece.rows)
+        self._peak = np.maximum(self._peak, _norms(self._sum.triangle))
+        self._time = now
+        here = (head.step, head.repeat, len(self._segments))
+        self._segments = [s for s in self._segments if self._weight(s) > SPENT]
+        self._segments.append(_Segment(*here, piece.triangle, piece.rows, now))
+
+    def _weight(self, segment: _Segment) -> float:
+        return float(np.exp((segment.time - self._time) / self._memory))
+
+    def _fade(self, seconds: float) -> None:
+        """Forget, but hold up what has become too faint at the value it had."""
+        self._sum.fade(float(np.exp(-seconds / self._memory)))
+        R = self._sum.triangle
+        size, least = _norms(R), FLOOR * self._peak
+        faint = size < least
+        self.held = frozenset(n for n, low in zip(self.names, faint, strict=True) if low)
+        if self.held:
+            value = np.nan_to_num(solve(self.names, [Cluster(0, 0, R, 1)]).value)
+            lift = np.diag(np.sqrt(np.maximum(least**2 - size**2, 0.0)))[faint]
+            self._sum.merge(np.column_stack((lift, lift @ value)), 0)
+
+    def condense(self) -> None:
+        """Make one piece of each finished repeat, if nothing is forgotten and it has company."""
+        if np.isfinite(self._memory):
+            return
+        pieces: dict[tuple[str, object], _Segment] = {}
+        for key, one in zip(self._keys(), self._segments, strict=True):
+            if key in pieces:
+                both = merge((pieces[key].triangle, one.triangle))
+                pieces[key] = replace(one, triangle=both, rows=one.rows + pieces[key].rows)
+            else:
+                pieces[key] = one
+        self._segments = list(pieces.values())
+
+    def _keys(self) -> list[tuple[str, object]]:
+        """Return stratum and cluster of every segment: repeats of a step where there are some."""
+        repeats: dict[str, set[int]] = {}
+        for one in self._segments:
+            repeats.setdefault(one.step, set()).add(one.repeat)
+        whole = np.isinf(self._memory)
+        return [
+            (s.step, s.repeat if whole and len(repeats[s.step]) > 1 else (s.repeat, s.index))
+            for s in self._segments
+        ]
+
+    def solution(self) -> Solution:
+        """Return the estimate of now; its errors are NaN while there is but one piece."""
+        keys = self._keys()
+        count = Counter(step for step, _ in set(keys))
+        # A step just begun has one piece, and no scatter of its own yet.
+        others = [step for step, pieces in count.items() if pieces > 1]
+        scatter = []
+        for (step, key), one in zip(keys, self._segments, strict=True):
+            alone = count[step] == 1 and others
+            stratum, cluster = (others[0], (step, key)) if alone else (step, key)
+            triangle = one.triangle * np.sqrt(self._weight(one))
+            scatter.append(Cluster(stratum, cluster, triangle, one.rows))
+        whole = Cluster("all", "all", self._sum.triangle, self._sum.rows)
+        return solve(self.names, [whole], scatter=scatter)
+
+
+def _norms(R: Array) -> Array:
+    return np.asarray(np.linalg.norm(R[:, :-1], axis=0))
+
+
+class Tracker:
+    """Follows parameters through the records of a run: `begin`, `feed` ..., `end` or `discard`.
+
+    `memory` [s] is the time constant of forgetting, infinite for none. Raises InputError for one
+    that is not positive, and from `begin` for filters of infinite length.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        terms: Sequence[Used] | None = None,
+        memory: float = np.inf,
+        families: Collection[str] | None = None,
+        filtering: Callable[[Record], Filtering] = default_filtering,
+    ) -> None:
+        if not memory > 0.0:
+            raise InputError(f"a memory of {memory:g} s; expected more than 0")
+        used = tuple(terms) if terms is not None else tuple(map(Used, baseline_of(rig)))
+        if families is None:  # what needs nothing of the locked joints, where there is such
+            families = ("mechanical",) if rig.electric else ("fluid",)
+        self._rig, self._filtering, self._families = rig, filtering, tuple(families)
+        self._terms = tuple(one for one in used if self._concerns(one))
+        names = {family: parameters_of(rig, self._terms, family) for family in families}
+        self._kept = {family: _Filter(every, memory) for family, every in names.items()}
+        self._running = self._kept
+        self._head: RecordHead | None = None
+        self._feed: RowFeed | None = None
+        self._start = 0.0
+        self._clock = -np.inf
+
+    def _concerns(self, used: Used) -> bool:
+        """Tell whether a term has to do with the families followed."""
+        prepares = type(used.term).prepare is not Term.prepare
+        return prepares or any(
+            c.family in self._families for c in used.term.coefficients(self._rig)
+        )
+
+    def begin(self, head: RecordHead) -> None:
+        """Begin a record, of which `samples` need not be known; `start` [s] is the device's."""
+        # Imported records all start at 0: then one follows the other.
+        self._start = max(head.start, self._clock)
+        self._head = head
+        filters = self._filtering(head.record({}))
+        self._feed = RowFeed(self._rig, self._terms, head, filters, self._families)
+        self._running = copy.deepcopy(self._kept)
+
+    def feed(self, channels: Mapping[str, Array]) -> bool:
+        """Take the record's next samples, NaN where lost; says whether the estimates are new."""
+        return self._feed is not None and self._fold(self._feed.feed(channels))
+
+    def end(self) -> None:
+        """End the record; what it told is kept."""
+        if self._feed is not None:
+            self._fold(self._feed.finish())
+            for one in self._running.values():
+                one.condense()
+        self._kept, self._feed = self._running, None
+
+    def discard(self) -> None:
+        """End the record as if it had not been."""
+        self._running, self._feed = self._kept, None
+
+    def _fold(self, found: Mapping[str, Rows]) -> bool:
+        if self._head is None or not found:
+            return False
+        for family, one in self._running.items():
+            rows = [r for name, r in found.items() if family_of(name) == family]
+            if rows:
+                one.fold(self._head, rows, self._start)
+                self._clock = max([self._clock, *(self._start + r.time[-1:].sum() for r in rows)])
+        return True
+
+    def estimates(self) -> dict[str, Estimate]:
+        """Return every parameter followed; NaN until rows tell it, no interval while it is held."""
+        solutions = {family: one.solution() for family, one in self._running.items()}
+        found, _ = estimates_of(self._rig, self._terms, solutions)
+        nothing = (float("nan"), float("nan"))
+        for one in self._running.values():
+            for name in one.held & found.keys():
+                note = "not excited for long; the value is held"
+                found[name] = replace(found[name], std=float("nan"), ci95=nothing, note=note)
+        return found
+
+
+def track(tracker: Tracker, record: Record, block: int = 10) -> None:
+    """Feed a record at hand to a tracker, `block` samples at a time, as a bench would."""
+    tracker.begin(head_of(record))
+    for first in range(0, record.samples, block):
+        part = slice(first, first + block)
+        tracker.feed({name: x[part] for name, x in record.channels.items()})
+    tracker.end()

@@ -1,0 +1,90 @@
+"""Identification from run folders that need not fit into memory, here or where the folders are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from analysis.identify import checks as ck
+from analysis.identify.identify import Identification, conclude
+from analysis.identify.reduction import (
+    Task,
+    first_of_steps,
+    moving_task,
+    path_of,
+    reduce_task,
+    steps_of,
+)
+from analysis.regression.rows import Filtering, default_filtering
+from analysis.simulation.model import Model, refuse_other_rig
+from analysis.terms import with_effects
+from analysis.terms.base import Used
+from analysis.trace.search.shapes import open_shapes
+from analysis.workers.pool import Pool, Serial
+from rig.model.parse import InputError
+from rig.model.records import Record
+from rig.model.rig import Rig
+from rig.runs.stream import read_run_head
+
+
+def identify_folders(
+    folders: Sequence[str],
+    terms: Sequence[Used] | None = None,
+    filtering: Callable[[Record], Filtering] = default_filtering,
+    reject_noise: bool = True,
+    pool: Pool | None = None,
+    effects: Sequence[str] = (),
+    like: Model | None = None,
+) -> Identification:
+    """Identify from run folders, of which one record at a time is in memory.
+
+    This is `identify` by the coupled method with the estimator "plain", for the other methods and
+    estimators go over all rows again and again. `terms` defaults to those of the model `like`, or
+    to the rig's baseline with `effects` (`analysis.terms.with_effects`). With a `pool` each record
+    is reduced in one of its processes, where the folders are read; only triangles come back. Raises
+    InputError as `identify` and `load_run` do, for a model of another rig, and for an effect whose
+    shape is open.
+    """
+    workers = pool or Serial()
+    heads = list(workers.map(read_run_head, folders, reads=str))
+    rig = ck.common_rig(heads)
+    if terms is None and like is not None:
+        for head in heads:
+            refuse_other_rig(like, head.rig, head.source)
+        terms = like.terms
+    used = tuple(terms) if terms is not None else tuple(map(Used, with_effects(rig, effects)))
+    _refuse_open(rig, used)
+    steps = [
+        (number, one)
+        for number, (folder, head) in enumerate(zip(folders, heads, strict=True))
+        for one in steps_of(rig, folder, head.records)
+    ]
+    found = workers.map(moving_task, [one for _, one in steps], reads=path_of)
+    moving = {(n, one.step): moves for (n, one), moves in zip(steps, found, strict=True)}
+    tasks = [
+        Task(
+            rig,
+            number,
+            folder,
+            record.name,
+            used,
+            filtering,
+            record.name in first,
+            moving=moving.get((number, record.step)),
+        )
+        for number, (folder, head) in enumerate(zip(folders, heads, strict=True))
+        for first in (first_of_steps(head.records),)
+        for record in head.records
+    ]
+    reductions = list(workers.map(reduce_task, tasks, reads=path_of))
+    return conclude(rig, [h.source for h in heads], used, reductions, reject_noise)
+
+
+def _refuse_open(rig: Rig, terms: Sequence[Used]) -> None:
+    """Raise InputError for an effect whose shape would have to be found in all rows at once."""
+    for used in terms:
+        if open_shapes(rig, used):
+            raise InputError(
+                f"--with {used.term.name} has a shape to be found in rows that are all in memory: "
+                "identify a part of the records without --stream or --cluster, write its --model, "
+                "and take the shape from there with --like"
+            )

@@ -1,0 +1,201 @@
+"""Output error: the model simulated from free window starts is fitted to what was measured.
+
+Multiple shooting: each record is cut into windows, the state at each window's start is unknown
+too, and sum |measured - simulated|^2 / sigma^2 over piston and chamber pressures of the excited
+joints is least. Noise in the outputs then biases nothing, for no measured output is in a
+regressor. Windows are not tied to each other: what a tie would tell of the parameters is little,
+and it would turn what the model gets slowly wrong into bias.
+Gauss and Newton with halved steps, the windows' states eliminated (Schur's complement) each time.
+Intervals: as for the other estimators, with the windows as parts. Source: Bock (1981) and
+Schloeder; Ljung, System Identification (1999), section 3.6.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.identify.checks import Check
+from analysis.identify.estimators import nuisance as nu
+from analysis.identify.estimators.covariance import Spread, spread
+from analysis.identify.estimators.equations import Pieces
+from analysis.identify.output_error.window_data import Reduced
+from analysis.identify.output_error.windows import WINDOW, Windows
+from analysis.regression.solve import Solution
+from analysis.terms.base import Used
+from rig.model.parse import InputError
+from rig.model.records import Run
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+log = logging.getLogger(__name__)
+
+ROUNDS = 8
+HALVINGS = 5
+SETTLED = 0.1  # of its standard error, that a parameter still moves
+
+
+@dataclass(frozen=True)
+class OutputErrorFit:
+    """Rows' coefficients (k,) by name with their spread, and how the search ended."""
+
+    names: tuple[str, ...]
+    value: Array
+    spread: Spread
+    check: Check
+
+    def solution(self, family: str, solution: Solution) -> Solution:
+        """Return the family's solution with these values, covariance and dof."""
+        place = [self.names.index(n) for n in solution.names]
+        return replace(
+            solution,
+            value=self.value[place],
+            covariance=self.spread.covariance[np.ix_(place, place)],
+            dof=self.spread.dof[place],
+        )
+
+
+def output_error(
+    rig: Rig, runs: Sequence[Run], terms: Sequence[Used], start: Mapping[str, float]
+) -> OutputErrorFit:
+    """Fit all parameters, beginning at `start` (rows' coefficients by name, 1/b for b).
+
+    Raises InputError for a start that is incomplete or that cannot be simulated at all.
+    """
+    names = tuple(c.parameter for used in terms for c in used.term.coefficients(rig))
+    refuse_undetermined([n for n in names if not np.isfinite(start.get(n, np.nan))])
+    search = Search(Windows(rig, runs, tuple(terms), names))
+    return search.run(np.array([*(start[n] for n in names), start.get(nu.KAPPA, 0.0)]))
+
+
+def refuse_undetermined(missing: Sequence[str]) -> None:
+    """Raise InputError if least squares left any parameter of the model without a value."""
+    if missing:
+        raise InputError(
+            f"--estimator output-error simulates the whole model, but least squares does not "
+            f"determine {' '.join(missing)}: add records that excite them, or use another estimator"
+        )
+
+
+class Search:
+    """The steps of one fit; `low` and `high` (k,) bound the parameters where they are given."""
+
+    def __init__(
+        self, windows: Windows, low: Array | None = None, high: Array | None = None
+    ) -> None:
+        self.windows, self.low, self.high = windows, low, high
+        self.names, self.stretches = windows.names, windows.stretches
+
+    def run(self, theta: Array) -> OutputErrorFit:
+        """Search from theta (k,) on; what nothing in the windows tells of stays as it is."""
+        theta = theta[: len(self.names)]
+        starts = [self.windows.measured_start(s) for s in self.stretches]
+        sigma = self.windows.sigma()
+        reduced = self.windows.linearised(theta, starts, sigma)
+        rounds, moved = 0, np.inf
+        for rounds in range(1, ROUNDS + 1):
+            if rounds == 2:
+                sigma = self._refined(reduced, sigma)
+                reduced = self.windows.linearised(theta, starts, sigma)
+            step, inverse = self._step(theta, reduced)
+            std = np.sqrt(np.diag(inverse))
+            moved = float(np.max(np.abs(step[std > 0]) / std[std > 0], initial=0.0))
+            theta, starts, reduced, better = self._try(theta, starts, sigma, reduced, step)
+            if not better or (moved < SETTLED and rounds >= 2):
+                break
+        return self._result(theta, reduced, rounds, moved)
+
+    def _try(
+        self,
+        theta: Array,
+        starts: list[Array],
+        sigma: dict[int, Array],
+        reduced: list[Reduced | None],
+        step: Array,
+    ) -> tuple[Array, list[Array], list[Reduced | None], bool]:
+        """Take the step, halved until the cost falls."""
+        before = sum(r.cost for r in reduced if r is not None)
+        for halving in range(HALVINGS):
+            size = 0.5**halving
+            new_theta = np.clip(theta + size * step, self.low, self.high)
+            taken = new_theta - theta
+            new_starts = [
+                s if r is None else self.windows.moved(stretch, s, size * r.offset - r.back @ taken)
+                for stretch, s, r in zip(self.stretches, starts, reduced, strict=True)
+            ]
+            new = self.windows.linearised(new_theta, new_starts, sigma)
+            lost = sum(a is None and b is not None for a, b in zip(new, reduced, strict=True))
+            after = sum(r.cost for r in new if r is not None)
+            if not lost and after <= before * (1 + 1e-9):
+                return new_theta, new_starts, new, True
+        return theta, starts, reduced, False
+
+    def _step(self, theta: Array, reduced: Sequence[Reduced | None]) -> tuple[Array, Array]:
+        good = [r for r in reduced if r is not None]
+        if not good:
+            raise InputError(
+                "--estimator output-error: the model of least squares could not be simulated over "
+                "any window; its parameters are too far off (see the checks with --estimator ls)"
+            )
+        A = np.sum([r.information for r in good], axis=0)
+        g = np.sum([r.score for r in good], axis=0)
+        # What is known beforehand is one more observation each, in the same units of one sigma.
+        for belief in nu.beliefs(self.names, theta):
+            A = A + np.outer(belief.h, belief.h) / belief.std**2
+            g = g - belief.h * float(belief.h @ theta) / belief.std**2
+        scale = np.sqrt(np.diag(A))
+        told = np.flatnonzero(scale > 0)
+        inside, scale = A[np.ix_(told, told)], np.outer(scale[told], scale[told])
+        inverse = np.zeros_like(A)
+        inverse[np.ix_(told, told)] = np.linalg.inv(inside / scale) / scale
+        return inverse @ g, inverse
+
+    def _refined(
+        self, reduced: Sequence[Reduced | None], sigma: dict[int, Array]
+    ) -> dict[int, Array]:
+        """Return each step's scatter of the outputs as the first fit left it."""
+        out = {}
+        for stratum, old in sigma.items():
+            left = [
+                r.residual for s, r in zip(self.stretches, reduced, strict=True)
+                if r is not None and s.stratum == stratum
+            ]  # fmt: skip
+            out[stratum] = (
+                old * np.sqrt(np.mean(np.concatenate(left) ** 2, axis=0)) if left else old
+            )
+        return out
+
+    def _result(
+        self, theta: Array, reduced: Sequence[Reduced | None], rounds: int, moved: float
+    ) -> OutputErrorFit:
+        _, inverse = self._step(theta, reduced)
+        pairs = [(s, r) for s, r in zip(self.stretches, reduced, strict=True) if r is not None]
+        pieces = Pieces(
+            np.array([s.stratum for s, _ in pairs]),
+            np.array([s.repeat for s, _ in pairs]),
+            np.array([s.part for s, _ in pairs]),
+            np.array([r.score for _, r in pairs]),
+            np.array([r.information for _, r in pairs]),
+        )
+        error = spread([pieces], inverse)
+        covariance = error.covariance
+        for belief in nu.beliefs(self.names, theta):
+            moves = inverse @ belief.h / belief.std
+            covariance = covariance + np.outer(moves, moves)
+        grown = np.diag(covariance) / np.maximum(np.diag(error.covariance), 1e-300)
+        error = Spread(covariance, error.dof * np.minimum(grown, 1e6) ** 2, error.systematic)
+        failed = len(self.stretches) - len(pairs)
+        settled = moved < 1.0
+        detail = (
+            f"{len(pairs)} windows of {WINDOW:g} s, {rounds} rounds from least squares, the last "
+            f"moved no parameter by more than {moved:.2g} of its standard error"
+        )
+        if failed:
+            detail += f"; {failed} windows could not be simulated and were left out"
+        return OutputErrorFit(
+            self.names, theta, error, Check("output error", settled and not failed, detail)
+        )

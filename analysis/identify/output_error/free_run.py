@@ -1,0 +1,143 @@
+"""Output error of an electric robot: the free run of whole records, as `validate` judges it.
+
+The least sum over records and joints of |measured - simulated position|^2, the model driven by the
+measured drive alone from each record's measured first state. A position sensor's noise is far
+below what a free run is off, so the first state needs no fitting (fitted, it takes the constant
+torque's place); what is off is friction that wanders, and a free run weighs that by what it does to
+the position. The rows weigh it at every instant alike, reversals and all.
+
+Where dry friction holds a joint the simulated position has kinks, so slopes are taken over steps of
+one per cent; shorter ones see the kink and the search stops too early. Source: Ljung, System
+Identification (1999), section 3.6; Janot, Vandanjon and Gautier (2014), DIDIM, for robots.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import OptimizeResult, least_squares
+
+from analysis.identify.checks import Check
+from analysis.identify.estimators.covariance import spread
+from analysis.identify.estimators.equations import SEGMENTS, Pieces
+from analysis.identify.output_error.fit import refuse_undetermined
+from analysis.regression.rows import default_filtering
+from analysis.regression.solve import Solution
+from analysis.signals.conditioning import Mask, aligned_channels, condition
+from analysis.simulation.model import Estimate, Model
+from analysis.simulation.simulate import Drive, State, compiled, drive_of, simulate
+from analysis.simulation.validate import arrived, first_state
+from analysis.terms.base import Used
+from rig.model import channels as ch
+from rig.model.records import Record, Run
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+log = logging.getLogger(__name__)
+
+STEP = 1e-2  # relative, of a parameter for its slope
+MOST = 60  # simulations of all records for each parameter
+FAILED = 1e3  # [m or rad] in place of a state that ceased to exist
+
+
+class _Record:
+    """One record ready to run: drive, first state, measured positions (n, F) that arrived."""
+
+    def __init__(self, rig: Rig, run: int, record: Record) -> None:
+        signals = condition(rig, record, default_filtering(record).channels)
+        channels = aligned_channels(rig, record)
+        self.key, self.repeat = (run, record.step), record.repeat
+        self.drive: Drive = drive_of(signals)
+        self.start: State = first_state(rig, record, signals, channels)
+        self.names = [
+            ch.channel(rig.position_kind, i + 1) for i in map(int, np.flatnonzero(signals.excited))
+        ]
+        self.here: Mask = arrived(rig, record)
+        self.measured: Array = np.column_stack([channels[n] for n in self.names])[self.here]
+
+    def left(self, model: Model) -> Array:
+        """Return measured less simulated positions (n, F)."""
+        found = simulate(compiled(model), self.drive, self.start)
+        if found.failure:
+            return np.full(self.measured.shape, FAILED)
+        simulated = found.channels()
+        return self.measured - np.column_stack([simulated[n] for n in self.names])[self.here]
+
+
+class FreeRuns:
+    """The free runs of all records under a model's parameters."""
+
+    def __init__(self, rig: Rig, runs: Sequence[Run], terms: Sequence[Used]) -> None:
+        self.rig, self.terms = rig, tuple(terms)
+        self.records = [_Record(rig, i, r) for i, run in enumerate(runs) for r in run.records]
+
+    def left(self, values: Mapping[str, float]) -> list[Array]:
+        """Return every record's measured less simulated positions (n, F)."""
+        nan = (np.nan, np.nan)
+        estimates = {n: Estimate(v, "", np.nan, nan) for n, v in values.items()}
+        k = len(estimates)
+        model = Model(self.rig, self.terms, estimates, np.full((k, k), np.nan))
+        return [record.left(model) for record in self.records]
+
+
+def free_run_fit(
+    rig: Rig, runs: Sequence[Run], terms: Sequence[Used], solutions: Mapping[str, Solution]
+) -> tuple[dict[str, Solution], Check]:
+    """Return the solutions with values of least free-run error, begun at theirs.
+
+    Intervals are from repeats, or of a step with one repeat from ten parts of the record. Raises
+    InputError where least squares left a parameter undetermined or terms keep parameters that are
+    not linear in the rows.
+    """
+    (solution,) = solutions.values()
+    refuse_undetermined(list(solution.unidentifiable))
+    ready = FreeRuns(rig, runs, terms)
+    scale = np.abs(solution.value)
+
+    def stacked(share: Array) -> Array:
+        left = ready.left(dict(zip(solution.names, map(float, share * scale), strict=True)))
+        return np.concatenate([part.ravel() for part in left])
+
+    first = solution.value / scale
+    found = least_squares(stacked, first, diff_step=STEP, max_nfev=MOST)
+    before = float(np.sqrt(np.mean(stacked(first) ** 2)))
+    after = float(np.sqrt(np.mean(found.fun**2)))
+    jacobian = found.jac / scale
+    inverse = np.linalg.inv(jacobian.T @ jacobian)
+    error = spread([_pieces(ready.records, found, jacobian)], inverse)
+    unit = rig.unit_of(ready.records[0].names[0])
+    check = Check(
+        "output error",
+        bool(found.success),
+        f"free runs of {len(ready.records)} whole record(s) from their measured first state: "
+        f"{before:.3g} {unit} rms with least squares, {after:.3g} {unit} with these parameters"
+        + ("" if found.success else f"; not settled after {found.nfev} steps"),
+    )
+    new = replace(solution, value=found.x * scale, covariance=error.covariance, dof=error.dof)
+    return dict.fromkeys(solutions, new), check
+
+
+def _pieces(records: Sequence[_Record], found: OptimizeResult, jacobian: Array) -> Pieces:
+    """Return the scores of ten parts of every record."""
+    strata = {key: k for k, key in enumerate(dict.fromkeys(r.key for r in records))}
+    stratum, repeat, part, score, information = [], [], [], [], []
+    start = 0
+    for record in records:
+        stop = start + record.measured.size
+        edges = np.linspace(start, stop, SEGMENTS + 1).astype(int)
+        for k, (low, high) in enumerate(itertools.pairwise(edges)):
+            J, r = jacobian[low:high], found.fun[low:high]
+            stratum.append(strata[record.key])
+            repeat.append(record.repeat)
+            part.append(k)
+            score.append(J.T @ r)
+            information.append(J.T @ J)
+        start = stop
+    return Pieces(
+        np.array(stratum), np.array(repeat), np.array(part), np.array(score), np.array(information)
+    )

@@ -1,0 +1,167 @@
+"""Shapes of effects with a hidden state, by multiple shooting from what the rows found.
+
+The rows have a lagging spool or a contact's deflection along the *measured* path, through filters
+that round every reversal; a simulation has it along its own. So the shapes of such an effect are
+searched again with the model run freely over short windows (`analysis.identify.output_error.fit`),
+beside the coefficients of the equations that the effect acts in; the others stay as the rows have
+them. It is one more estimate, not the better one by nature: what the measured spool's noise moves
+in a window is error here and noise in the rows. `rest_of` says which does better on other records.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.effects.base import Effect, Shape, shape_values, shapes_of
+from analysis.identify.output_error.fit import Search
+from analysis.identify.output_error.windows import Windows
+from analysis.regression.solve import half_width
+from analysis.simulation.model import Estimate, Model
+from rig.model.parse import InputError
+from rig.model.records import Run
+
+Array = NDArray[np.float64]
+log = logging.getLogger(__name__)
+
+SECONDS = 8.0  # of windows of a fit: a shape is one number, and a trace must not take minutes
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One effect by multiple shooting: estimates of its shapes by name, from so many windows.
+
+    `before` and `after` are what windows of other records leave with the rows' shapes and with
+    these [sigma] (see `rest_of`), `taken` whether these took the rows' place.
+    """
+
+    name: str
+    where: str
+    shapes: Mapping[str, Estimate]
+    windows: int
+    settled: bool
+    before: float = math.nan
+    after: float = math.nan
+    taken: bool = False
+
+
+def hidden_effects(model: Model) -> list[Effect]:
+    """Return the effects of a model that carry a state of their own and have a shape."""
+    return [
+        u.term
+        for u in model.terms
+        if isinstance(u.term, Effect) and u.term.hidden(model.rig) and len(u.shape)
+    ]
+
+
+def completed(runs: Sequence[Run], model: Model) -> Model | None:
+    """Return a model that can be run: what no record moves is taken from the rig's nominal values.
+
+    None where a parameter of a moving joint was not identified, or there is no nominal value.
+    """
+    rig = model.rig
+    still = set(range(1, len(rig.joints) + 1))
+    for record in (r for run in runs for r in run.records):
+        still &= set(record.locked)
+    values = {}
+    for name, one in model.parameters.items():
+        if one.identified:
+            continue
+        joints = {int(digit) for digit in name if digit.isdecimal()}
+        if not joints & still or name not in rig.nominal:
+            return None
+        values[name] = replace(one, value=rig.nominal[name], ci95=(rig.nominal[name],) * 2)
+    return replace(model, parameters={**model.parameters, **values})
+
+
+def shot(runs: Sequence[Run], model: Model, effect: Effect) -> Shot | None:
+    """Search an effect's shapes by multiple shooting; None where no window can be simulated."""
+    bounds = {s.parameter: s for s in _shapes(model, effect)}
+    try:  # there may be no stretch without a lost sample or a sensor at its end
+        windows = _windows(runs, model, effect, _free(model, effect))
+        theta = _theta(windows, model)
+        low, high = np.full(len(theta), -np.inf), np.full(len(theta), np.inf)
+        for name, shape in bounds.items():
+            place = windows.names.index(name)
+            low[place], high[place] = shape.low, shape.high
+        found = Search(windows, low, high).run(theta)
+    except (InputError, np.linalg.LinAlgError) as error:
+        log.info("%s is not shot: %s", effect.name, error)
+        return None
+    half = half_width(np.sqrt(np.diag(found.spread.covariance)), found.spread.dof)
+    shapes = {}
+    for name, shape in bounds.items():
+        k = windows.names.index(name)
+        value, std = float(found.value[k]), float(np.sqrt(found.spread.covariance[k, k]))
+        ends = (value - float(half[k]), value + float(half[k]))
+        shapes[name] = Estimate(value, shape.unit, std, ends)
+    return Shot(effect.name, effect.where, shapes, len(windows.stretches), found.check.ok)
+
+
+def rest_of(runs: Sequence[Run], model: Model, effect: Effect) -> float:
+    """Return what windows of records leave under a model, each from its best start [sigma].
+
+    The rms of measured less simulated piston and pressures over the sensors' noise; inf where a
+    window cannot be simulated, or the joint moves in none.
+    """
+    try:
+        windows = _windows(runs, model, effect, frozenset())
+        starts = [windows.measured_start(s) for s in windows.stretches]
+        reduced = windows.linearised(_theta(windows, model), starts, windows.sigma())
+    except (InputError, np.linalg.LinAlgError) as error:
+        log.info("%s is not judged by windows: %s", effect.name, error)
+        return float("inf")
+    good = [r for r in reduced if r is not None]
+    if len(good) < len(reduced):
+        return float("inf")
+    return float(np.sqrt(sum(r.rest for r in good) / sum(r.residual.size for r in good)))
+
+
+def _windows(
+    runs: Sequence[Run], model: Model, effect: Effect, free: frozenset[str]
+) -> Windows:  # fmt: skip
+    """Return windows of the records in which the effect's joint moves; InputError without one."""
+    moving = [
+        replace(run, records=tuple(r for r in run.records if effect.joint + 1 not in r.locked))
+        for run in runs
+    ]
+    rig = model.rig
+    if not any(run.records for run in moving):
+        raise InputError(f"joint {effect.joint + 1} moves in no record")
+    names = tuple(c.parameter for u in model.terms for c in u.term.coefficients(rig))
+    shapes = tuple(s.parameter for s in _shapes(model, effect))
+    return Windows(rig, moving, model.terms, names, shapes, SECONDS, free)
+
+
+def _shapes(model: Model, effect: Effect) -> tuple[Shape, ...]:
+    """Return the shapes that the effect has in the model."""
+    return shapes_of(model.rig, next(u for u in model.terms if u.term == effect))
+
+
+def _theta(windows: Windows, model: Model) -> Array:
+    """Return the windows' parameters (k,) as the model has them, 1/b for b."""
+    values = dict(model.values)
+    for used in model.terms:
+        values |= shape_values(model.rig, used)
+    return np.array(
+        [1.0 / values[n] if n in windows.reciprocal else values[n] for n in windows.names]
+    )
+
+
+def _free(model: Model, effect: Effect) -> frozenset[str]:
+    """Return the effect's own parameters and its joint's part of the equations it acts in."""
+    rig, joint = model.rig, effect.joint + 1
+    own = {c.parameter for c in effect.coefficients(rig)}
+    family = "mechanical" if own else "fluid"
+    others = {
+        c.parameter
+        for used in model.terms
+        for c in used.term.coefficients(rig)
+        if c.family == family and (c.parameter == "b" or c.parameter.endswith(str(joint)))
+    }
+    return frozenset(own | others | {s.parameter for s in _shapes(model, effect)})

@@ -1,0 +1,68 @@
+"""What output error handles: windows of records, models with nudges, what a window tells."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.identify.output_error.shooting import Window
+from analysis.signals.conditioning import Mask, Signals
+from analysis.simulation.simulate import Compiled
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """One window ready to shoot: inputs, measured outputs (points, 3 F), its place in the data."""
+
+    record: int
+    stratum: int
+    repeat: int
+    part: int
+    window: Window
+    measured: Array
+
+
+@dataclass(frozen=True)
+class Source:
+    """One record: signals and inputs of the integrator, oil temperature less nominal [K].
+
+    The signals are free of what the model says of sensors.
+    """
+
+    signals: Signals
+    inputs: Array
+    locked: Mask
+    kelvin: float
+
+
+@dataclass(frozen=True)
+class Reduced:
+    """A window after its start was eliminated: score, information, cost, and how to get back.
+
+    `rest` is the cost that the best start leaves.
+    """
+
+    score: Array
+    information: Array
+    cost: float
+    rest: float
+    back: Array
+    offset: Array
+    residual: Array
+
+
+@dataclass(frozen=True)
+class Nudged:
+    """The model of one record: as it is, and `pars` (1 + k, parameters) with every nudge.
+
+    `sizes` (k,) are the nudges, `hidden` the terms' own states (n, h) along the record for each.
+    """
+
+    ready: Compiled
+    pars: Array
+    sizes: Array
+    hidden: tuple[Array, ...]

@@ -1,0 +1,287 @@
+"""The windows of output error: cut from the records, simulated with every nudge, linearised."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.effects.base import ordered
+from analysis.identify.estimators import nuisance as nu
+from analysis.identify.output_error.shooting import SAMPLES_PER_STEP, Window, parts_of, shoot
+from analysis.identify.output_error.window_data import Nudged, Reduced, Source, Stretch
+from analysis.regression.rows import default_filtering
+from analysis.signals.conditioning import Mask, condition
+from analysis.signals.filters import channel_filter
+from analysis.simulation.model import Estimate, Model
+from analysis.simulation.simulate import compiled, drive_of, hidden_paths, put_right
+from analysis.terms.base import Used
+from rig.model import channels as ch
+from rig.model.parse import InputError
+from rig.model.records import Run
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+
+# The measured spool drives the simulation, and its noise is integrated: after a second it moves the
+# piston by as much as its sensor's noise. Tried were 3, 1 and 0.5 s; shorter was the more exact.
+WINDOW = 0.5  # [s]
+WORKERS = 2
+MOST_SECONDS = 150.0  # with more data, fewer windows of each record, evenly spread
+POINT_RATE = 250.0  # [Hz] at which outputs are compared; the channels are filtered to 80 Hz
+NUDGE = 1e-5  # relative change of a parameter for its sensitivity
+NUDGES = (1e-6, 1e-5, 20.0, 20.0)  # [rad, rad/s, Pa, Pa] of a window's first state
+
+
+class Windows:
+    """The data of one fit by windows, and the simulations of them.
+
+    `names` are the terms' coefficients; `shapes` further free parameters: shapes of the terms. With
+    `free` only those named there are free. At most `seconds` of data are used.
+    """
+
+    def __init__(
+        self, rig: Rig, runs: Sequence[Run], terms: tuple[Used, ...], names: tuple[str, ...],
+        shapes: tuple[str, ...] = (), seconds: float = MOST_SECONDS,
+        free: frozenset[str] | None = None,
+    ) -> None:  # fmt: skip
+        self.rig, self.terms, self.seconds, self.free = rig, ordered(terms), seconds, free
+        self.places = {
+            name: (k, j)
+            for k, used in enumerate(self.terms)
+            for j, name in enumerate(used.term.shape_names())
+            if name in shapes
+        }
+        names = (*names, *shapes)
+        self.reciprocal = {
+            c.parameter for used in terms for c in used.term.coefficients(rig) if c.reciprocal
+        }
+        self.warm = (
+            free is None
+            and "b" in names
+            and all(ch.TEMPERATURE in r.channels for run in runs for r in run.records)
+        )
+        self.names = (*names, nu.KAPPA) if self.warm else names
+        self.sources: list[Source] = []
+        self.stretches: list[Stretch] = []
+        self._idle: dict[int, set[int]] = {}
+        self._cut(runs)
+
+    def _cut(self, runs: Sequence[Run]) -> None:
+        records = [(i, r) for i, run in enumerate(runs) for r in run.records]
+        strata = {s: k for k, s in enumerate(sorted({(i, r.step) for i, r in records}))}
+        most = max(1, round(self.seconds / WINDOW) // len(records))
+        for i, record in records:
+            signals = condition(self.rig, record, default_filtering(record).channels)
+            signals = put_right(self.rig, self.terms, signals)
+            drive = drive_of(signals)
+            inputs = np.column_stack(
+                (drive.p_s, drive.temperature, drive.u, drive.q, drive.qd, drive.qdd)
+            )
+            kelvin = float(np.mean(signals.temperature)) - self.rig.oil.temperature
+            self.sources.append(Source(signals, np.ascontiguousarray(inputs), drive.locked, kelvin))
+            free = ~drive.locked
+            every = self.every
+            points = round(WINDOW * record.sample_rate) // (SAMPLES_PER_STEP * every)
+            length = points * SAMPLES_PER_STEP * every
+            good: Mask = np.asarray(signals.valid[:, free].all(axis=1))
+            if signals.lost is not None:  # of any joint: the locked ones drive the others
+                good = np.asarray(good & ~signals.lost.any(axis=1))
+            firsts = self._fitting(good, length)
+            chosen = firsts[:: max(1, -(-len(firsts) // most))][:most]
+            measured = np.column_stack(
+                (signals.s[:, free], signals.p_cap[:, free], signals.p_rod[:, free])
+            )
+            for part, first in enumerate(chosen):
+                at = first + SAMPLES_PER_STEP * every * np.arange(points)
+                self.stretches.append(
+                    Stretch(len(self.sources) - 1, strata[i, record.step], record.repeat, part,
+                             Window(first, points), measured[at])
+                )  # fmt: skip
+        if not self.stretches:
+            raise InputError(
+                f"no record holds {WINDOW:g} s without a clipped sensor or a lost sample: output "
+                "error has nothing to simulate; use --estimator ls"
+            )
+
+    @staticmethod
+    def _fitting(good: Mask, length: int) -> list[int]:
+        """Return the first samples of windows that lie end to end within good samples."""
+        found, first = [], 0
+        bad = np.flatnonzero(~good)
+        for stop in (*bad.tolist(), len(good)):
+            while first + length < stop:
+                found.append(first)
+                first += length
+            first = max(first, stop + 1)
+        return found
+
+    @property
+    def every(self) -> int:
+        """Steps between two points compared."""
+        return max(1, round(self.rig.sample_rate / POINT_RATE / SAMPLES_PER_STEP))
+
+    @property
+    def parts(self) -> int:
+        """Steps into which two samples are cut."""
+        return parts_of(self.terms, self.rig.sample_rate)
+
+    def sigma(self) -> dict[int, Array]:
+        """Return the outputs' noise by step, (3 F,): the sensors' stated, behind the filter."""
+        sensors = self.rig.sensors
+        taps = left_of_noise(self.rig)
+        base = np.array([sensors.piston.noise, *[sensors.chamber_pressure.noise] * 2]) * taps
+        steps = [(r[1] - r[0]) / (1 << bits) for r, bits in (
+            (sensors.piston.range, sensors.piston.bits),
+            (sensors.chamber_pressure.range, sensors.chamber_pressure.bits))]  # fmt: skip
+        floor = np.array([steps[0], steps[1], steps[1]]) / np.sqrt(12)
+        out = {}
+        for s in self.stretches:
+            free = int((~self.sources[s.record].locked).sum())
+            out[s.stratum] = np.repeat(np.maximum(base, floor), free)
+        return out
+
+    def measured_start(self, stretch: Stretch) -> Array:
+        """Return a window's first state [q, q', p_cap, p_rod] as measured, (4 N,)."""
+        source = self.sources[stretch.record]
+        s, k = source.signals, stretch.window.first
+        return np.concatenate((s.q[k], s.qd[k], s.p_cap[k], s.p_rod[k]))
+
+    def _state_places(self, stretch: Stretch) -> NDArray[np.int64]:
+        locked = self.sources[stretch.record].locked
+        free = np.flatnonzero(~locked)
+        return np.concatenate([kind * len(locked) + free for kind in range(4)])
+
+    def moved(self, stretch: Stretch, start: Array, change: Array) -> Array:
+        """Return a first state with the free joints' part changed."""
+        moved = start.copy()
+        moved[self._state_places(stretch)] += change
+        return moved
+
+    def _nudged(self, theta: Array, source: Source) -> Nudged:
+        """Compile the model with every parameter nudged, and find where its own states stand."""
+        nudges = NUDGE * np.where(theta == 0.0, 1.0, np.abs(theta))
+        if self.warm:
+            b = abs(theta[self.names.index("b")])
+            nudges[-1] = NUDGE * b
+        rows = [theta, *(theta + n * e for n, e in zip(nudges, np.eye(len(theta)), strict=True))]
+        models = [self.model(row, source.kelvin) for row in rows]
+        ready = [compiled(model) for model in models]
+        first = hidden_paths(models[0], source.signals)
+        hidden = [
+            hidden_paths(model, source.signals) if first.size and name in self.places else first
+            for model, name in zip(models, ("", *self.names), strict=True)
+        ]
+        return Nudged(ready[0], np.array([r.par for r in ready]), nudges, tuple(hidden))
+
+    def model(self, theta: Array, kelvin: float = 0.0) -> Model:
+        """Return the model of parameters theta (k,), the oil `kelvin` above nominal."""
+        values = dict(zip(self.names, theta.tolist(), strict=True))
+        terms = list(self.terms)
+        for name, (k, j) in self.places.items():
+            shape = list(terms[k].shape)
+            shape[j] = values.pop(name)
+            terms[k] = replace(terms[k], shape=tuple(shape))
+        if self.warm:
+            values["b"] += kelvin * values.pop(nu.KAPPA)
+        nan = (np.nan, np.nan)
+        estimates = {
+            n: Estimate(1.0 / v if n in self.reciprocal else v, "", np.nan, nan)
+            for n, v in values.items()
+        }
+        k = len(estimates)
+        return Model(self.rig, tuple(terms), estimates, np.full((k, k), np.nan))
+
+    def linearised(
+        self, theta: Array, starts: Sequence[Array], sigma: Mapping[int, Array]
+    ) -> list[Reduced | None]:
+        """Shoot every window with every nudge; None for one whose state ceased to exist."""
+        ready = [self._nudged(theta, source) for source in self.sources]
+
+        def one(k: int) -> Reduced | None:
+            stretch = self.stretches[k]
+            return self._window(stretch, starts[k], sigma[stretch.stratum], ready[stretch.record])
+
+        # A record's first window tells which parameters move nothing in it; once that is known,
+        # windows need not wait for one another.
+        found = {}
+        for k, stretch in enumerate(self.stretches):
+            if stretch.record not in self._idle:
+                found[k] = one(k)
+        rest = [k for k in range(len(self.stretches)) if k not in found]
+        with ThreadPoolExecutor(WORKERS) as pool:
+            found |= zip(rest, pool.map(one, rest), strict=True)
+        return [found[k] for k in range(len(self.stretches))]
+
+    def _window(
+        self, stretch: Stretch, start: Array, sigma: Array, nudged: Nudged
+    ) -> Reduced | None:
+        """Shoot one window with every nudge and eliminate its start."""
+        ready, nudges = nudged.ready, nudged.sizes
+        source = self.sources[stretch.record]
+        places = self._state_places(stretch)
+        free = len(places) // 4
+        state_nudges = np.repeat(NUDGES, free)
+        active = self._active(stretch.record)
+        y0 = np.zeros((1 + len(places) + len(active), len(start) + int(ready.hidden_ends[-1])))
+        y0[:, : len(start)] = start
+        for row, (place, nudge) in enumerate(zip(places, state_nudges, strict=True), start=1):
+            y0[row, place] += nudge
+        chosen = np.concatenate((np.zeros(1 + len(places), dtype=np.int64), 1 + active))
+        if y0.shape[1] > len(start):
+            first = stretch.window.first
+            y0[:, len(start) :] = [nudged.hidden[k][first] for k in chosen]
+        states = shoot(
+            ready, np.ascontiguousarray(nudged.pars[chosen]), y0, source.inputs,
+            source.signals.rate, source.locked, stretch.window, self.every, self.parts,
+        )  # fmt: skip
+        if states is None:
+            return None
+        outputs = self._outputs(states, source.locked) / sigma
+        residual = stretch.measured / sigma - outputs[0]
+        change = (outputs[1:] - outputs[0]).reshape(len(outputs) - 1, -1)
+        Js = (change[: len(places)] / state_nudges[:, None]).T
+        J = np.zeros((Js.shape[0], len(nudges)))
+        J[:, active] = (change[len(places) :] / nudges[active, None]).T
+        if stretch.record not in self._idle:
+            self._idle[stretch.record] = {int(k) for k in active if not J[:, k].any()}
+        r = residual.ravel()
+        # Project the window's start out by QR of its sensitivities.
+        Q, R = np.linalg.qr(Js)
+        inner, outer = Q.T @ J, Q.T @ r
+        left_J, left_r = J - Q @ inner, r - Q @ outer
+        return Reduced(
+            left_J.T @ left_r, left_J.T @ left_J, float(r @ r), float(left_r @ left_r),
+            np.linalg.solve(R, inner), np.linalg.solve(R, outer), residual,
+        )  # fmt: skip
+
+    def _active(self, record: int) -> NDArray[np.int64]:
+        """Return the parameters that move anything in a record (what a first window showed)."""
+        locked = {str(i + 1) for i in np.flatnonzero(self.sources[record].locked)}
+        idle = self._idle.get(record, set())
+        return np.array(
+            [
+                k for k, name in enumerate(self.names)
+                if k not in idle
+                and (self.free is None or name in self.free)
+                and not (name.startswith(("C_", "Fv")) and name[-1] in locked)
+            ],
+            dtype=np.int64,
+        )  # fmt: skip
+
+    def _outputs(self, states: Array, locked: Mask) -> Array:
+        N = len(locked)
+        free = np.flatnonzero(~locked)
+        piston = [self.rig.joints[i].linkage.piston(states[..., i]) for i in map(int, free)]
+        return np.concatenate(
+            (np.stack(piston, axis=-1), states[..., 2 * N + free], states[..., 3 * N + free]),
+            axis=-1,
+        )
+
+
+def left_of_noise(rig: Rig) -> float:
+    """Return what the channels' filter leaves of white noise, as a share of its amplitude."""
+    return float(np.linalg.norm(channel_filter(rig.sample_rate).taps[0]))

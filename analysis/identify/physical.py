@@ -1,0 +1,301 @@
+"""Parameters that rigid bodies and real oil can have, and the price that the data ask for them.
+
+Level 1, *signs*: friction, flow gains and 1/b are not negative, and the chain's R is positive
+semidefinite. M_ij(q) sums R_kl cos(theta_k - theta_l) (`terms.inertia`), and the cosines form a
+Gram matrix, so by Schur's product theorem M(q) is then so in every posture; with all links in line
+M(q) is made of R alone, so over all postures nothing weaker would do.
+Level 2, *rigid bodies*: R_ij = l_i W_j for i < j besides, l_i being the rig's link lengths (NOTES,
+"N DOF planar chain"). Both levels together say exactly that there are links with masses m_k > 0,
+first moments h_k and pseudo-inertias [[I_k, h_k], [h_k, m_k]] >= 0 behind the parameters:
+    R_kk = I_k + l_k^2 m_beyond(k),  W_k = h_k + l_k m_beyond(k),  m_beyond(k) = sum_{j>k} m_j;
+eliminating the links from the tip inwards takes the same Schur complements as R >= 0 (`links_of`).
+
+Solved as constrained least squares on the triangle that the identification has made already: the
+consistent parameters are those nearest to the free ones in the metric X'X of all rows. A
+constraint that moves the parameters further than their scatter between repeats explains is
+*rejected by the data* (Hotelling's T^2 on the active constraints, cluster covariance), and the
+parameters given out are then those of the level below.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import f as fisher
+
+from analysis.identify.checks import Check
+from analysis.identify.constrained import Feasible, Minimum, minimise
+from analysis.identify.estimates import estimates_of
+from analysis.identify.identify import Identification
+from analysis.regression.solve import Solution
+from analysis.simulation.model import Estimate, estimate_json, finite
+from analysis.terms.inertia import chain_matrix, inertia_map
+from rig.model.parameters import inertia_names
+from rig.model.parse import InputError
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+
+REJECTED = 0.01  # p value below which the data reject a constraint
+LEVELS = ("signs", "rigid bodies")
+
+
+@dataclass(frozen=True)
+class Price:
+    """What a level costs one family: `residual` is the relative growth of the residual's RMS.
+
+    `active` says what holds the solution, `gap` by how much the data alone break each, in words;
+    `p` is the probability that scatter alone does so, NaN where it cannot be judged.
+    """
+
+    residual: float
+    active: tuple[str, ...]
+    gap: tuple[str, ...]
+    p: float
+
+    @property
+    def rejected(self) -> bool:
+        """Whether the data contradict the constraints."""
+        return bool(self.p < REJECTED)
+
+
+@dataclass(frozen=True)
+class Level:
+    """One level's parameters and its price by family."""
+
+    name: str
+    estimates: Mapping[str, Estimate]
+    covariance: Array
+    prices: Mapping[str, Price]
+
+    @property
+    def rejected(self) -> bool:
+        """Whether any family's data contradict it."""
+        return any(price.rejected for price in self.prices.values())
+
+
+@dataclass(frozen=True)
+class Physical:
+    """The free estimates, both levels, and which one is given out (its index)."""
+
+    free: Mapping[str, Estimate]
+    levels: tuple[Level, ...]
+    given: int
+
+    @property
+    def checks(self) -> tuple[Check, ...]:
+        """One statement for each level."""
+        return tuple(_statement(level) for level in self.levels)
+
+
+def feasible(rig: Rig, names: tuple[str, ...], rigid: bool) -> Feasible:
+    """Return the constraints on one family's coefficients, `names` in the rows' order."""
+    k, N = len(names), len(rig.joints)
+    index = {name: i for i, name in enumerate(names)}
+    signed = [n for n in names if n == "b" or n.startswith(("Fv", "C_"))]
+    positive = np.zeros((len(signed), k))
+    for row, name in zip(positive, signed, strict=True):
+        row[index[name]] = 1.0
+    labels = tuple(f"{'1/b' if name == 'b' else name} >= 0" for name in signed)
+    inertia = inertia_names(N)
+    forms = np.zeros((k, 0, 0))
+    equal, equal_labels = np.zeros((0, k)), tuple[str, ...]()
+    if all(name in index for name in inertia):
+        forms = np.zeros((k, N, N))
+        weights = inertia_map(N)
+        for name, weight in zip(inertia, weights, strict=True):
+            forms[index[name]] = weight
+        if rigid:
+            equal, equal_labels = _rigid(rig, index, weights)
+    return Feasible(equal, equal_labels, positive, labels, forms, "R positive definite")
+
+
+def _rigid(rig: Rig, index: Mapping[str, int], weights: Array) -> tuple[Array, tuple[str, ...]]:
+    """Return R_ij - l_i W_j = 0 for i < j wherever length and weight are known."""
+    N = len(rig.joints)
+    inertia, rows, labels = inertia_names(N), [], []
+    for i in range(N):
+        # A robot of electric joints may leave its lengths unsaid.
+        length = getattr(rig.joints[i], "link_length", None)
+        for j in range(i + 1, N):
+            if length is None or f"W{j + 1}" not in index:
+                continue
+            row = np.zeros(len(index))
+            for name, weight in zip(inertia, weights, strict=True):
+                row[index[name]] = weight[i, j]
+            row[index[f"W{j + 1}"]] = -length
+            rows.append(row)
+            labels.append(f"R{i + 1}{j + 1} = l{i + 1} W{j + 1}")
+    return np.array(rows).reshape(len(rows), len(index)), tuple(labels)
+
+
+def physical(result: Identification) -> Physical:
+    """Return physically consistent parameters and what they cost.
+
+    Raises InputError where a parameter is not identified: nothing can be constrained then.
+    """
+    lost = [n for n, e in result.estimates.items() if not e.identified]
+    if lost:
+        raise InputError(
+            f"--physical needs every parameter identified, and {' '.join(lost)} is not; "
+            "record the step that excites it"
+        )
+    levels = tuple(_level(result, name, rigid=bool(k)) for k, name in enumerate(LEVELS))
+    accepted = [k for k, level in enumerate(levels) if not level.rejected]
+    # Signs hold for every body there is: the last resort even where data speak against them.
+    return Physical(result.estimates, levels, max(accepted, default=0))
+
+
+def with_physics(result: Identification, found: Physical) -> Identification:
+    """Return the identification with the consistent parameters in place of the free ones."""
+    level = found.levels[found.given]
+    checks = (*result.checks, *found.checks)
+    provenance = {
+        **result.model.provenance,
+        "physical": level.name,
+        "checks_failed": [c.name for c in checks if not c.ok],
+    }
+    model = replace(
+        result.model, parameters=level.estimates, covariance=level.covariance,
+        provenance=provenance,
+    )  # fmt: skip
+    return replace(result, estimates=level.estimates, model=model, checks=checks)
+
+
+def _level(result: Identification, name: str, rigid: bool) -> Level:
+    rig = result.model.rig
+    solutions, prices = {}, {}
+    for family, solution in result.solutions.items():
+        k = len(solution.names)
+        X, y = solution.triangle[:k, :k], solution.triangle[:k, k]
+        # An estimator may have moved the free solution off the triangle's own: project that one.
+        found = minimise(X, X @ solution.value, feasible(rig, solution.names, rigid))
+        solutions[family] = _constrained(solution, X, found)
+        prices[family] = _price(rig, solution, X, y, found)
+    estimates, covariance = estimates_of(rig, result.model.terms, solutions)
+    return Level(name, estimates, covariance, prices)
+
+
+def _constrained(solution: Solution, X: Array, found: Minimum) -> Solution:
+    """Return the solution moved; its covariance loses the directions that are held."""
+    k, C = len(found.beta), found.active
+    if not len(C):
+        return solution
+    scale = 1.0 / np.linalg.norm(X, axis=0)
+    A = (X * scale).T @ (X * scale)
+    held = C * scale
+    lever = np.linalg.solve(A, held.T)
+    P = np.eye(k) - lever @ np.linalg.pinv(held @ lever) @ held
+    P = P * np.outer(scale, 1.0 / scale)
+    return replace(solution, value=found.beta, covariance=P @ solution.covariance @ P.T)
+
+
+def _price(rig: Rig, solution: Solution, X: Array, y: Array, found: Minimum) -> Price:
+    k = len(found.beta)
+    rest = solution.triangle[k, k] ** 2
+    before = float(np.sum((y - X @ solution.value) ** 2)) + rest
+    after = float(np.sum((y - X @ found.beta) ** 2)) + rest
+    growth = float(np.sqrt(after / before) - 1.0) if before > 0 else 0.0
+    C = found.active
+    if not len(C):
+        return Price(0.0, (), (), 1.0)
+    apart = C @ solution.value
+    gap = tuple(
+        _words(label, rig, solution, row, value)
+        for label, row, value in zip(found.labels, C, apart, strict=True)
+    )
+    return Price(growth, found.labels, gap, _probability(solution, C, apart))
+
+
+def _words(label: str, rig: Rig, solution: Solution, row: Array, apart: float) -> str:
+    """Say how far the data alone are from one active constraint."""
+    std = float(np.sqrt(row @ solution.covariance @ row))
+    far = f", {abs(apart) / std:.3g} standard errors" if std > 0 else ""
+    if "=" not in label or ">=" in label:
+        return f"{label}: the data alone give {apart:.3g}{far}"
+    i, j = (int(d) for d in label[1:3])
+    values = dict(zip(solution.names, solution.value, strict=True))
+    R = chain_matrix(values, len(rig.joints))[i - 1, j - 1]
+    rigid = rig.joints[i - 1].link_length * values[f"W{j}"]
+    return (
+        f"{label}: the data alone give {R:.4g} and {rigid:.4g} kg m^2 ({R / rigid - 1:+.1%}{far})"
+    )
+
+
+def _probability(solution: Solution, C: Array, apart: Array) -> float:
+    """Return p of T^2 = d' (C V C')^-1 d, Hotelling's with the least dof of what C touches."""
+    V = C @ solution.covariance @ C.T
+    dof = float(np.min(solution.dof[np.abs(C).sum(axis=0) > 0]))
+    q = len(C)
+    if not np.isfinite(V).all() or np.linalg.matrix_rank(V, hermitian=True) < q:
+        return float("nan")
+    free = dof - q + 1.0
+    if not free > 0:
+        return float("nan")
+    t2 = float(apart @ np.linalg.solve(V, apart))
+    return float(fisher.sf(t2 * free / (dof * q), q, free))
+
+
+def _statement(level: Level) -> Check:
+    active = [label for price in level.prices.values() for label in price.active]
+    name = f"physical: {level.name}"
+    if not active:
+        return Check(name, True, "the free estimate is inside already: nothing was changed")
+    costs = "; ".join(
+        f"{family}: residual {price.residual:+.3%}, {_verdict(price)} ({'; '.join(price.gap)})"
+        for family, price in level.prices.items()
+        if price.active
+    )
+    return Check(name, not level.rejected, costs)
+
+
+def _verdict(price: Price) -> str:
+    if not np.isfinite(price.p):
+        return "the repeats are too few to tell whether the data allow it"
+    word = "REJECTED by the data" if price.rejected else "compatible with the data"
+    return f"{word}, p = {price.p:.2g}"
+
+
+def links_of(rig: Rig, R: Array, W: Array) -> list[tuple[float, float, float]]:
+    """Return links (m, h, I) behind R (N, N) and W (N,), the least masses that do, tip last.
+
+    From the tip inwards: m_k is the least with [[I_k, h_k], [h_k, m_k]] >= 0, where I_k = R_kk -
+    l_k^2 m_beyond and h_k = W_k - l_k m_beyond. Raises InputError where no link can do it.
+    """
+    found, beyond = [], 0.0
+    for k in range(len(W) - 1, -1, -1):
+        length = rig.joints[k].link_length if k < len(W) - 1 else 0.0
+        inertia, moment = R[k, k] - length**2 * beyond, W[k] - length * beyond
+        if not inertia > 0:
+            raise InputError(f"no link {k + 1} of positive mass has these parameters")
+        mass = moment**2 / inertia
+        found.append((float(mass), float(moment), float(inertia)))
+        beyond += mass
+    return found[::-1]
+
+
+def to_json(found: Physical) -> dict[str, Any]:
+    """Return both levels as plain data."""
+    return {
+        "given": found.levels[found.given].name,
+        "levels": [
+            {
+                "name": level.name,
+                "rejected": level.rejected,
+                "parameters": {n: estimate_json(e) for n, e in level.estimates.items()},
+                "price": {
+                    family: {
+                        "residual_growth": finite(price.residual),
+                        "active": list(price.active),
+                        "p_value": finite(price.p),
+                    }
+                    for family, price in level.prices.items()
+                },
+            }
+            for level in found.levels
+        ],
+    }

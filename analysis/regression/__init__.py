@@ -1,0 +1,1 @@
+"""Rows of the regression, their triangular factors, least squares, noise and identifiability."""

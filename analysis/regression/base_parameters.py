@@ -1,0 +1,127 @@
+"""Which combinations of parameters records determine where they do not determine every one.
+
+Rows [X] determine c'p exactly where c is orthogonal to the null space of X. With m null directions
+m parameters are chosen to be *dependent* (columns that pivoted QR of the null space finds best
+conditioned) and are regrouped into the others:
+ c_i = e_i - sum_d B_id e_d,  B = Z_ind Z_dep^-1,  Z (k, m) the null space.
+The remaining k - m *base parameters* are the fewest that say all that the records can say.
+Source: Gautier, Numerical calculation of the base inertial parameters of robots (1991).
+
+Columns are scaled to unit norm throughout, so that "zero" means the same for kg m^2 and kg m. A
+direction that shows mostly the sensors' noise counts as null (`analysis.regression.noise`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import qr
+
+from analysis.regression.solve import RANK_TOLERANCE, SHARE_OF_NOISE, SHARE_OF_NULL
+
+Array = NDArray[np.float64]
+
+NEGLIGIBLE = 0.02  # of a combination's largest scaled coefficient
+ROUND = 0.02  # a coefficient this close to a whole number is written as one
+
+
+@dataclass(frozen=True)
+class Combination:
+    """A base parameter: parts (name, coefficient), the first with coefficient 1."""
+
+    parts: tuple[tuple[str, float], ...]
+
+    @property
+    def text(self) -> str:
+        """The combination as people write it: "R11 + R22 + 1.56 R12"."""
+        words: list[str] = []
+        for name, coefficient in self.parts:
+            size = abs(coefficient)
+            whole = round(size)
+            figure = f"{whole}" if whole and abs(size - whole) < ROUND else f"{size:.3g}"
+            sign = ("+ " if coefficient > 0 else "- ") if words else ""
+            words.append(sign + (name if figure == "1" else f"{figure} {name}"))
+        return " ".join(words)
+
+
+@dataclass(frozen=True)
+class Determined:
+    """What rows determine of `names`: rank, condition number of the unit columns, and the rest.
+
+    `null` (m, k) are the directions of the parameters that do not show; `lost` the parameters in
+    them; `base` the identifiable combinations of those, `known` those that are identified alone.
+    """
+
+    names: tuple[str, ...]
+    rank: int
+    condition: float
+    null: Array
+    known: tuple[str, ...]
+    lost: tuple[str, ...]
+    base: tuple[Combination, ...]
+
+    @property
+    def complete(self) -> bool:
+        """Whether every parameter is determined."""
+        return self.rank == len(self.names)
+
+
+def determined(names: Sequence[str], X: Array, noise: Array | None = None) -> Determined:
+    """Say what rows X (m, k), or their triangle, determine of the k parameters `names`.
+
+    `noise` (k, k) is the part of X'X that sensor noise makes.
+    """
+    k = len(names)
+    size = np.linalg.norm(X, axis=0)
+    scale = np.where(size > 0.0, size, 1.0)
+    _, sigma, Vt = np.linalg.svd(X / scale, full_matrices=True)
+    sigma = np.concatenate((sigma, np.zeros(k - len(sigma))))
+    strong = sigma > RANK_TOLERANCE * sigma[0] if sigma[0] > 0 else np.zeros(k, dtype=bool)
+    null = np.vstack((Vt[~strong], _noisy(Vt[strong], sigma[strong], scale, noise)))
+    condition = float(sigma[0] / sigma[-1]) if sigma[-1] > 0 else float("inf")
+    if len(null):
+        null = np.linalg.qr(null.T)[0].T
+    members = np.linalg.norm(null, axis=0) > SHARE_OF_NULL
+    lost = tuple(n for n, inside in zip(names, members, strict=True) if inside)
+    known = tuple(n for n in names if n not in lost)
+    base = _combinations(names, null, scale, size) if len(null) else ()
+    return Determined(
+        tuple(names), k - len(null), condition, null / scale, known, lost,
+        tuple(c for c in base if any(name in lost for name, _ in c.parts)),
+    )  # fmt: skip
+
+
+def _noisy(Vt: Array, sigma: Array, scale: Array, noise: Array | None) -> Array:
+    """Return the directions (scaled) whose information is mostly noise."""
+    if noise is None or not len(sigma):
+        return np.zeros((0, len(scale)))
+    white = Vt / sigma[:, None]
+    share, turn = np.linalg.eigh(white @ (noise / np.outer(scale, scale)) @ white.T)
+    found = (turn.T @ white)[share > SHARE_OF_NOISE]
+    return np.asarray(found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-300))
+
+
+def _combinations(
+    names: Sequence[str], null: Array, scale: Array, size: Array
+) -> list[Combination]:
+    """Return the base parameters of a scaled null space (m, k), in the names' order."""
+    m = len(null)
+    order = qr(null, mode="r", pivoting=True)[1]
+    dependent = np.sort(order[:m])
+    independent = np.setdiff1d(np.arange(len(names)), dependent)
+    back = np.linalg.inv(null[:, dependent])
+    out = []
+    for i in independent:
+        c = np.zeros(len(names))
+        c[i], c[dependent] = 1.0, -(back @ null[:, i])
+        # A column of zeros carries nothing: it is lost alone, and in no combination.
+        c[(np.abs(c) < NEGLIGIBLE * np.abs(c).max()) | (size == 0.0)] = 0.0
+        parts = [int(p) for p in np.flatnonzero(c)]
+        plain = c * scale
+        if parts:
+            first = plain[parts[0]]
+            out.append(Combination(tuple((names[int(p)], float(plain[p] / first)) for p in parts)))
+    return out

@@ -1,0 +1,76 @@
+"""What an experiment will determine, before it is run: the regressor of motions on the twin.
+
+A step's motion gives the same rows that its record would (`analysis.regression.rows`), less the
+sensors' noise: rank and condition number of all steps' rows stacked say what can be identified at
+all. The row filter is left out: it takes noise, of which there is none, and does not change the
+rank.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.regression.base_parameters import Determined, determined
+from analysis.regression.rows import Filtering, parameters_of, record_rows
+from analysis.signals.conditioning import condition
+from analysis.signals.filters import channel_filter
+from analysis.terms import baseline
+from analysis.terms.base import FAMILIES, Used, family_of
+from rig.model import channels as ch
+from rig.model.records import Record
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+Triangles = Mapping[str, Array]  # family -> triangle (k, k) of its rows
+
+STEP = 5  # every so many samples; a millisecond later a row says the same
+_KEYS = {ch.SPOOL: "spool", ch.PISTON: "piston", ch.CAP: "cap_pressure", ch.ROD: "rod_pressure"}
+
+
+def predicted_rows(
+    rig: Rig, moved: Mapping[str, Array], locked: Sequence[int], terms: Sequence[Used] | None = None
+) -> dict[str, Array]:
+    """Return the triangle (k, k) of each family's rows of a motion on the twin.
+
+    `moved` is what `analysis.simulation.twin.simulate_commands` returns or a stretch of it, arrays
+    (n, N); `locked` the joints (1-based) that were held.
+    """
+    used = tuple(terms) if terms is not None else tuple(Used(term) for term in baseline())
+    ideal = rig.model_copy(update={"sensors": rig.sensors.model_copy(update={"skew": 0.0})})
+    n = len(moved["piston"])
+    channels: dict[str, Array] = {}
+    for name in rig.channels:
+        kind, joint = ch.kind_of(name)
+        if joint is not None:
+            channels[name] = moved[_KEYS[kind]][:, joint - 1]
+        else:
+            steady = rig.supply.pressure if kind == ch.SUPPLY else rig.oil.temperature
+            channels[name] = np.full(n, steady)
+    record = Record("twin", "twin", tuple(locked), 1, rig.sample_rate, channels)
+    filters = Filtering(channel_filter(rig.sample_rate), None, STEP)
+    moving = np.array([i + 1 not in locked for i in range(len(rig.joints))])
+    rows = record_rows(ideal, used, condition(ideal, record, filters.channels, moving), filters)
+    stacked: dict[str, list[Array]] = {}
+    for name, one in rows.items():
+        stacked.setdefault(family_of(name), []).append(one.matrix)
+    return {family: _triangle(np.vstack(parts)) for family, parts in stacked.items()}
+
+
+def judge(rig: Rig, steps: Sequence[Triangles]) -> dict[str, Determined]:
+    """Say, by family, what the rows of these steps determine together."""
+    used = tuple(Used(term) for term in baseline())
+    out = {}
+    for family in FAMILIES:
+        names = parameters_of(rig, used, family)
+        X = np.vstack([step[family] for step in steps]) if steps else np.zeros((1, len(names)))
+        out[family] = determined(names, X)
+    return out
+
+
+def _triangle(matrix: Array) -> Array:
+    k = matrix.shape[1]
+    R = np.asarray(np.linalg.qr(matrix, mode="r"))
+    return np.vstack((R, np.zeros((k - len(R), k)))) if len(R) < k else R

@@ -1,0 +1,96 @@
+"""Fewer parameters than linear unknowns: nonlinear least squares on the reduced rows alone.
+
+Rows y = X x with x = h(p). Gauss and Newton's step from p0 is least squares of y - X c on X J,
+J = dh/dp at p0 and c = h(p0) - J p0; both follow from the triangle of [X y] by
+
+    [X J, y - X c] = [X y] S,   S = [[J, -c], [0, 1]],
+
+so the rows are never touched again, and covariance, noise bias and identifiability are those of
+`analysis.regression.solve` at the solution (the delta method). Source: Bjorck, Numerical Methods
+for Least Squares Problems, section 9.2.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.regression.solve import Cluster, Solution, merge, solve
+from analysis.terms.base import Reduction, Used
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+log = logging.getLogger(__name__)
+
+ROUNDS = 30
+TOLERANCE = 1e-10  # of a parameter, against the largest
+
+
+def reduced(
+    rig: Rig,
+    terms: Sequence[Used],
+    linear: Solution,
+    clusters: Sequence[Cluster],
+    noise: Array | None = None,
+    reject_noise: bool = True,
+) -> Solution:
+    """Return the solution in the terms' parameters; `linear` itself where no term reduces."""
+    solution = linear
+    for used in terms:
+        reduction = used.term.reduction(rig)
+        if reduction is not None and set(reduction.linear) <= set(solution.names):
+            solution, clusters, noise = _reduce(reduction, solution, clusters, noise, reject_noise)
+    return solution
+
+
+def _reduce(
+    reduction: Reduction,
+    linear: Solution,
+    clusters: Sequence[Cluster],
+    noise: Array | None,
+    reject_noise: bool,
+) -> tuple[Solution, Sequence[Cluster], Array | None]:
+    names = linear.names
+    places = [names.index(name) for name in reduction.linear]
+    others = [i for i in range(len(names)) if i not in places]
+    new = (*(names[i] for i in others), *reduction.parameters)
+    x = np.nan_to_num(linear.value)
+    p = np.concatenate((x[others], reduction.start(x[places])))
+    # All clusters as one: the step needs the sum only, the scatter comes at the end.
+    whole = [Cluster("all", "all", merge(c.triangle for c in clusters), linear.rows)]
+    for _ in range(ROUNDS):
+        change = _transform(reduction, places, others, p)
+        stepped = solve(new, _transformed(whole, change), None, False)
+        found = np.where(np.isfinite(stepped.value), stepped.value, p)
+        step, p = np.abs(found - p).max(), found
+        if step <= TOLERANCE * np.abs(p).max():
+            break
+    else:
+        log.warning("%s: no convergence in %d rounds", " ".join(reduction.parameters), ROUNDS)
+    change = _transform(reduction, places, others, p)
+    moved = _transformed(clusters, change)
+    moment = None if noise is None else change.T @ noise @ change
+    return solve(new, moved, moment, reject_noise), moved, moment
+
+
+def _transform(
+    reduction: Reduction, places: Sequence[int], others: Sequence[int], p: Array
+) -> Array:
+    """Return S (k+1, m+1) at p."""
+    k, kept = len(places) + len(others), len(others)
+    slope = np.zeros((k, len(p)))
+    slope[others, np.arange(kept)] = 1.0
+    slope[np.ix_(places, range(kept, len(p)))] = reduction.slope(p[kept:])
+    constant = np.zeros(k)
+    constant[places] = reduction.value(p[kept:]) - reduction.slope(p[kept:]) @ p[kept:]
+    S = np.zeros((k + 1, len(p) + 1))
+    S[:k, :-1], S[:k, -1], S[k, -1] = slope, -constant, 1.0
+    return S
+
+
+def _transformed(clusters: Sequence[Cluster], change: Array) -> list[Cluster]:
+    return [replace(c, triangle=merge([c.triangle @ change])) for c in clusters]

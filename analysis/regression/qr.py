@@ -1,0 +1,86 @@
+"""Rows folded into triangles as they come: any number of rows in the memory of one block.
+
+[X y] = Q R block by block: the triangle so far on top of the next rows, one Householder QR, and
+only R (k+1, k+1) stays (a sequential TSQR: Golub and Van Loan, section 5.1.9 and the flat tree of
+Demmel et al. 2012). Every block is small enough for the processor's cache, which is why this is
+faster than one QR of all rows. The clustered standard errors need X'(y - X beta) of each cluster,
+which its own triangle gives (`analysis.regression.solve.scores`): one triangle per repeat is all
+that is kept of its samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import lapack
+
+Array = NDArray[np.float64]
+
+BLOCK_ROWS = 4096  # times 10 columns: 0.3 MB, in a second-level cache; flat from 1024 to 16384
+
+
+class Accumulator:
+    """The triangle of all rows folded so far; memory does not grow with their number."""
+
+    def __init__(self, columns: int, block_rows: int = BLOCK_ROWS) -> None:
+        self.rows = 0
+        self._width = columns + 1
+        self._block = max(block_rows, self._width)
+        self._R = np.zeros((self._width, self._width))
+        self._space: Array | None = None
+
+    @property
+    def triangle(self) -> Array:
+        """R (k+1, k+1), upper triangular, with R'R = [X y]'[X y]."""
+        return self._R.copy()
+
+    def fold(self, matrix: Array, rhs: Array) -> None:
+        """Fold rows (m, k), (m,) in; raises ValueError if they do not fit."""
+        if matrix.shape != (len(rhs), self._width - 1):
+            raise ValueError(f"rows {matrix.shape}, {rhs.shape} do not fit {self._width - 1}")
+        for first in range(0, len(rhs), self._block):
+            part = slice(first, first + self._block)
+            count = len(rhs[part])
+            space = self._stack(count)
+            space[self._width :, :-1] = matrix[part]
+            space[self._width :, -1] = rhs[part]
+            self._reduce(space)
+        self.rows += len(rhs)
+
+    def merge(self, triangle: Array, rows: int) -> None:
+        """Fold another accumulator's triangle (or a part of one) in, which stands for `rows`."""
+        space = self._stack(len(triangle))
+        space[self._width :] = triangle
+        self._reduce(space)
+        self.rows += rows
+
+    def fade(self, factor: float) -> None:
+        """Weaken everything folded so far: R'R by `factor` (exponential forgetting)."""
+        self._R *= np.sqrt(factor)
+
+    def _stack(self, count: int) -> Array:
+        """Return space (k+1 + count, k+1) in LAPACK's order with the triangle on top."""
+        if count != self._block:
+            space = np.empty((self._width + count, self._width), order="F")
+        else:
+            if self._space is None:
+                self._space = np.empty((self._width + count, self._width), order="F")
+            space = self._space
+        space[: self._width] = self._R
+        return space
+
+    def _reduce(self, space: Array) -> None:
+        packed, _, _, info = lapack.dgeqrf(space, overwrite_a=1)
+        if info != 0:
+            raise ValueError(f"LAPACK refused the rows (dgeqrf: {info})")
+        self._R = np.triu(packed[: self._width])
+
+
+def accumulate(columns: int, blocks: Iterable[tuple[Array, Array]]) -> Accumulator:
+    """Fold all blocks of rows ((m, k), (m,)) into one accumulator."""
+    whole = Accumulator(columns)
+    for matrix, rhs in blocks:
+        whole.fold(matrix, rhs)
+    return whole

@@ -1,0 +1,253 @@
+"""Rows of the regression: what every term says about every equation of one record.
+
+Used are the torque rows and the chamber-flow rows of the excited joints only: a locked joint's
+contact torque is unknown, and its valve is shut. Rows are built point by point from the filtered
+signals, then whole rows pass the row filter and are decimated (`analysis.signals.filters` says
+why). Sum of columns times coefficients = right-hand side; units: torque_i [N m], flow_* [m^3/s].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import upfirdn
+
+from analysis.signals.conditioning import Mask, Signals
+from analysis.signals.filters import (
+    FirSmoother,
+    Smoother,
+    butterworth,
+    channel_filter,
+    moving_average,
+    row_filter,
+    row_step,
+)
+from analysis.terms.base import FAMILIES, Columns, Used, equation
+from rig.model import channels as ch
+from rig.model.electric import drive_gains
+from rig.model.records import Record
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+
+ROW_CUTOFF = 15.0  # [Hz] where a record does not tell its excited lines
+ROW_CUTOFF_RANGE = (8.0, 30.0)  # [Hz]
+# An electric joint's rows need one derivative less of anything noisy, and its friction flips in
+# milliseconds: narrower loses of the flips (`python -m tests.studies emps` prints the figures).
+ROW_CUTOFF_ELECTRIC = 30.0  # [Hz] where a record does not tell its excited lines
+LINES_FACTOR = 1.5  # row filter over the highest excited line; the noise goes with its 5th power
+MASKED_SHARE = 1e-3  # of a filter's weight on masked samples: a row with more is dropped
+
+
+@dataclass(frozen=True)
+class Filtering:
+    """The filters of one record: `channels` before, `rows` (or none) after."""
+
+    channels: Smoother
+    rows: FirSmoother | None
+    step: int = 1
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Rows of one equation of one record: matrix (m, k), rhs (m,), time [s] of each row (m,).
+
+    `names` are the parameters of the columns; `masked` rows were dropped because a sample under
+    the filter lay outside the model, was clipped or was lost.
+    """
+
+    equation: str
+    names: tuple[str, ...]
+    matrix: Array
+    rhs: Array
+    time: Array
+    masked: int
+
+
+def default_filtering(record: Record) -> Filtering:
+    """Return the filters that the bias study chose, fitted to the record's excitation."""
+    rate = record.sample_rate
+    cutoff = ROW_CUTOFF_ELECTRIC if ch.channel(ch.POSITION, 1) in record.channels else ROW_CUTOFF
+    if record.period and record.lines:
+        cutoff = lines_cutoff(record)
+    return Filtering(channel_filter(rate), row_filter(rate, cutoff), row_step(rate, cutoff))
+
+
+def lines_cutoff(record: Record) -> float:
+    """Return the row filter's cutoff [Hz] for a record that tells its excited lines."""
+    highest = max(record.lines) * record.sample_rate / record.period
+    return float(np.clip(LINES_FACTOR * highest, *ROW_CUTOFF_RANGE))
+
+
+def paper_filtering(record: Record) -> Filtering:
+    """Return the paper's: a 20-sample average (zero-phase here), differences, every row used."""
+    return Filtering(moving_average(record.sample_rate), None)
+
+
+def butterworth_filtering(record: Record) -> Filtering:
+    """Return a zero-phase Butterworth on the channels in place of the windowed sinc."""
+    chosen = default_filtering(record)
+    cutoff = min(80.0, 0.2 * record.sample_rate)
+    return replace(chosen, channels=butterworth(record.sample_rate, cutoff))
+
+
+FILTERINGS: dict[str, Callable[[Record], Filtering]] = {
+    "default": default_filtering,
+    "moving-average": paper_filtering,
+    "butterworth": butterworth_filtering,
+}
+
+
+def right_sides(rig: Rig, signals: Signals) -> dict[str, Array]:
+    """Return the right-hand side (n,) of every equation: G F, A_cap ds/dt, - A_rod ds/dt.
+
+    An electric joint has its drive's torque or force alone: gain times drive.
+
+    The torque is G F (NOTES; the paper's regressor lines print the inverse of G).
+    """
+    if rig.electric:
+        gains = drive_gains(rig)
+        return {equation("torque", i): gain * signals.u[:, i] for i, gain in enumerate(gains)}
+    sides = {}
+    for i, joint in enumerate(rig.joints):
+        cap, rod = joint.cylinder.cap_area, joint.cylinder.rod_area
+        force = cap * signals.p_cap[:, i] - rod * signals.p_rod[:, i]
+        sides[equation("torque", i)] = signals.G[:, i] * force
+        sides[equation("flow_cap", i)] = cap * signals.sd[:, i]
+        sides[equation("flow_rod", i)] = -rod * signals.sd[:, i]
+    return sides
+
+
+def parameters_of(rig: Rig, terms: Sequence[Used], family: str) -> tuple[str, ...]:
+    """Return the parameters that the terms put into one family's rows, in the terms' order."""
+    names = {
+        c.parameter: None
+        for used in terms
+        for c in used.term.coefficients(rig)
+        if c.family == family
+    }
+    return tuple(names)
+
+
+def record_rows(
+    rig: Rig,
+    terms: Sequence[Used],
+    signals: Signals,
+    filtering: Filtering,
+    families: Collection[str] = tuple(FAMILIES),
+    within: tuple[float, float] = (-np.inf, np.inf),
+) -> dict[str, Rows]:
+    """Return the filtered rows of every equation of the excited joints of one record.
+
+    Only those of `families`, and only rows whose time [s] lies `within` (from, before): a part of
+    a longer record yields the rows that are its own.
+    """
+    for used in terms:
+        signals = used.term.prepare(rig, signals, used.shape)
+    columns: Columns = {}
+    valid: dict[str, Mask] = {}
+    for used in terms:
+        for name, more in used.term.columns(rig, signals, used.shape).items():
+            here = columns.setdefault(name, {})
+            here.update({p: here[p] + v if p in here else v for p, v in more.items()})
+        for name, mask in used.term.valid(rig, signals, used.shape).items():
+            valid[name] = valid.get(name, np.ones(len(mask), dtype=bool)) & mask
+    sides = right_sides(rig, signals)
+    out = {}
+    for family, kinds in FAMILIES.items():
+        if family not in families:
+            continue
+        names = parameters_of(rig, terms, family)
+        for i in map(int, np.flatnonzero(signals.excited)):
+            # Inertia couples: a clipped piston of any joint spoils every torque row.
+            whole = family == "mechanical"
+            sensors = np.asarray(signals.valid.all(axis=1) if whole else signals.valid[:, i])
+            lost = _lost(signals, slice(None) if whole else slice(i, i + 1))
+            for kind in kinds:
+                name = equation(kind, i)
+                if name not in sides:
+                    continue
+                masks = Masks(~(sensors & valid.get(name, sensors)), lost)
+                rows = _filtered(
+                    name, names, columns.get(name, {}), sides[name], masks, signals.t, filtering
+                )
+                out[name] = rows.kept(names, within)
+    return out
+
+
+def _lost(signals: Signals, joints: slice) -> Mask:
+    if signals.lost is None:
+        return np.zeros(len(signals.t), dtype=bool)
+    return np.asarray(signals.lost[:, joints].any(axis=1))
+
+
+@dataclass(frozen=True)
+class Masks:
+    """Samples (n,) outside the model or clipped, and samples that never arrived."""
+
+    bad: Mask
+    lost: Mask
+
+
+@dataclass(frozen=True)
+class _Filtered:
+    """One equation's filtered columns and right side (m, filled + 1), before rows are dropped."""
+
+    equation: str
+    filled: list[int]
+    stack: Array
+    dropped: Mask
+    time: Array
+
+    def kept(self, names: tuple[str, ...], within: tuple[float, float]) -> Rows:
+        """Return the rows within a stretch of time, without the dropped ones."""
+        inside = (self.time >= within[0]) & (self.time < within[1])
+        kept = inside & ~self.dropped
+        matrix = np.zeros((int(kept.sum()), len(names)))
+        matrix[:, self.filled] = self.stack[kept, :-1]
+        masked = int((inside & self.dropped).sum())
+        return Rows(self.equation, names, matrix, self.stack[kept, -1], self.time[kept], masked)
+
+
+def _filtered(
+    name: str,
+    names: tuple[str, ...],
+    columns: dict[str, Array],
+    side: Array,
+    masks: Masks,
+    time: Array,
+    filtering: Filtering,
+) -> _Filtered:
+    """Filter and decimate one equation's columns and right side together."""
+    edges = filtering.channels.reach
+    inside = slice(edges, len(side) - edges)
+    filled = [k for k, parameter in enumerate(names) if parameter in columns]
+    stack = np.column_stack([*(columns[names[k]] for k in filled), side])[inside]
+    masks, time = Masks(masks.bad[inside], masks.lost[inside]), time[inside]
+    if filtering.rows is None:
+        dropped, every = masks.bad | masks.lost, slice(None, None, filtering.step)
+        return _Filtered(name, filled, stack[every], dropped[every], time[every])
+    stack, dropped, time = _low_passed(stack, masks, time, filtering.rows, filtering.step)
+    return _Filtered(name, filled, stack, dropped, time)
+
+
+def _low_passed(
+    stack: Array, masks: Masks, time: Array, rows: FirSmoother, step: int
+) -> tuple[Array, Mask, Array]:
+    filtered = rows.decimate(stack, step)
+    start = -(-2 * rows.reach // step)
+    centres = start * step - rows.reach + step * np.arange(len(filtered))
+    dropped = np.zeros(len(filtered), dtype=bool)
+    weights = np.abs(rows.taps[0]) / np.abs(rows.taps[0]).sum()
+    # What stands for a lost sample is made up: not even the filter's tails may touch it.
+    for mask, taps, limit in (
+        (masks.bad, weights, MASKED_SHARE),
+        (masks.lost, np.ones(len(weights)), 0.5),
+    ):
+        if mask.any():
+            share = upfirdn(taps, mask.astype(np.float64), 1, step)
+            dropped |= share[start : start + len(filtered)] > limit
+    return filtered, dropped, time[centres]

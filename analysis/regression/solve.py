@@ -1,0 +1,182 @@
+"""Coupled least squares by QR, in a form that streams: factors merge, rows may be forgotten.
+
+The rows of all records are stacked and solved once, so that a parameter that appears in several
+steps has one value (NOTES, "Why coupled"; the paper's STEP4). Each cluster of rows is reduced to
+the triangle R of [X y] = Q R, (k+1, k+1); triangles merge by another QR, and everything below
+(solution, condition number, residual, clustered errors) needs triangles only.
+
+Standard errors are clustered by repeat: within one record residuals are correlated, so only whole
+repeats are independent. Steps are strata: the scores g = X'(y - X beta) of the repeats of a step
+are taken about their mean, so what repeats identically (model error) is not mistaken for scatter.
+ V = A^-1 [ sum_steps n/(n-1) sum_r (g_r - mean g)(g_r - mean g)' ] A^-1,  A = X'X,
+and a parameter's t quantile has Satterthwaite's degrees of freedom over the steps (n - 1 each).
+Source: Liang and Zeger (1986) in its stratified form (Cochran, Sampling Techniques, ch. 11).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import t as student
+
+Array = NDArray[np.float64]
+
+RANK_TOLERANCE = 1e-3  # smallest singular value of the scaled matrix over the largest
+SHARE_OF_NOISE = 0.1  # of a column's own information: beyond, the parameter rests on noise
+SHARE_OF_NULL = 0.05  # a parameter with more of a null direction than this is not identifiable
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """The reduced rows of one independent cluster: a repeat (or a segment of the only repeat)."""
+
+    stratum: Hashable
+    key: Hashable
+    triangle: Array
+    rows: int
+
+
+@dataclass(frozen=True)
+class Solution:
+    """A solved family of rows: `value` and `covariance` in the rows' own coefficients.
+
+    Entries of parameters in `unidentifiable` (name -> why) are NaN. `condition_number` is of the
+    column-scaled matrix, over all columns that are not zero. `residual_rms` has the rows' unit.
+    `noise_bias` is the bias that the stated sensor noise predicts, NaN where not asked for.
+    `triangle` (k+1, k+1) of all rows and `noise`, as given (empty if not), serve questions asked
+    later (`analysis.regression.base_parameters`).
+    """
+
+    names: tuple[str, ...]
+    value: Array
+    covariance: Array
+    dof: Array
+    condition_number: float
+    rows: int
+    residual_rms: float
+    noise_bias: Array
+    unidentifiable: dict[str, str] = field(default_factory=dict)
+    triangle: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    noise: Array = field(default_factory=lambda: np.zeros((0, 0)))
+
+
+def triangle(matrix: Array, rhs: Array) -> Array:
+    """Return R (k+1, k+1) of [X y] = Q R for rows (m, k), (m,)."""
+    return _square(np.column_stack((matrix, rhs)))
+
+
+def merge(triangles: Iterable[Array]) -> Array:
+    """Return the triangle of all rows behind the given triangles, (k+1, k+1)."""
+    return _square(np.vstack(list(triangles)))
+
+
+def _square(stacked: Array) -> Array:
+    width = stacked.shape[1]
+    R: Array = np.asarray(np.linalg.qr(stacked, mode="r"))
+    return np.vstack((R, np.zeros((width - len(R), width)))) if len(R) < width else R
+
+
+def solve(
+    names: Sequence[str],
+    clusters: Sequence[Cluster],
+    noise: Array | None = None,
+    reject_noise: bool = True,
+    scatter: Sequence[Cluster] | None = None,
+) -> Solution:
+    """Solve all clusters at once; parameters that the rows do not determine come out as NaN.
+
+    `noise` (k+1, k+1) is the part of [X y]'[X y] that sensors' noise makes
+    (`analysis.regression.noise`); with `reject_noise` a parameter that rests on it counts as
+    undetermined. The errors come from the clusters `scatter`, where those are others
+    (`analysis.identify.online`).
+    """
+    k = len(names)
+    R = merge(c.triangle for c in clusters)
+    X, y = R[:k, :k], R[:k, k]
+    inverse, condition, lost = _pseudo_inverse(names, X)
+    beta, bread = inverse @ y, inverse @ inverse.T
+    covariance, dof = _clustered(beta, bread, clusters if scatter is None else scatter)
+    noise_bias = np.full(k, np.nan)
+    if noise is not None:
+        noise_bias = -bread @ (noise[:k, :k] @ beta - noise[:k, k])
+        share = np.diag(bread @ noise[:k, :k])
+        for name, part in zip(names, share, strict=True):
+            if reject_noise and part > SHARE_OF_NOISE:
+                lost.setdefault(name, "what these records show of it is mostly sensor noise")
+    rows = sum(c.rows for c in clusters)
+    squares = np.sum((y - X @ beta) ** 2) + R[k, k] ** 2
+    residual_rms = float(np.sqrt(squares / max(rows, 1)))
+    gone = np.array([name in lost for name in names])
+    beta[gone] = dof[gone] = np.nan
+    covariance[gone, :] = covariance[:, gone] = np.nan
+    return Solution(
+        tuple(names), beta, covariance, dof, condition, rows, residual_rms, noise_bias, lost,
+        R, np.zeros((0, 0)) if noise is None or not reject_noise else noise,
+    )  # fmt: skip
+
+
+def _pseudo_inverse(names: Sequence[str], X: Array) -> tuple[Array, float, dict[str, str]]:
+    """Return the inverse of X (k, k) with unit columns, their condition number, and who is lost.
+
+    Columns that are zero, and directions below the rank tolerance, are left out of the inverse.
+    """
+    scale = np.linalg.norm(X, axis=0)
+    kept = np.flatnonzero(scale > 0.0)
+    lost = {n: "no row contains it" for n, size in zip(names, scale, strict=True) if size == 0.0}
+    inverse = np.zeros_like(X)
+    if not len(kept):
+        return inverse, float("inf"), lost
+    U, sigma, Vt = np.linalg.svd(X[:, kept] / scale[kept], full_matrices=False)
+    strong = sigma > RANK_TOLERANCE * sigma[0]
+    lost |= _confounded([names[int(i)] for i in kept], Vt[~strong])
+    inverse[kept] = (Vt[strong].T / sigma[strong]) / scale[kept, None] @ U[:, strong].T
+    condition = float(sigma[0] / sigma[-1]) if sigma[-1] > 0 else float("inf")
+    return inverse, condition, lost
+
+
+def _confounded(names: Sequence[str], null: Array) -> dict[str, str]:
+    """Say of every parameter in a null direction with which others it cannot be told apart."""
+    lost = {}
+    for direction in null:
+        members = [n for n, v in zip(names, direction, strict=True) if abs(v) > SHARE_OF_NULL]
+        for name in members:
+            others = " ".join(m for m in members if m != name) or "nothing else"
+            lost[name] = f"only a combination with {others} shows in these records"
+    return lost
+
+
+def scores(beta: Array, cluster: Cluster) -> Array:
+    """Return X'(y - X beta) (k,) of a cluster from its triangle alone."""
+    k = len(beta)
+    X, y = cluster.triangle[:, :k], cluster.triangle[:, k]
+    return np.asarray(X.T @ (y - X @ beta))
+
+
+def _clustered(beta: Array, bread: Array, clusters: Sequence[Cluster]) -> tuple[Array, Array]:
+    """Return the stratified cluster covariance (k, k) and Satterthwaite's dof (k,)."""
+    k = len(beta)
+    strata: dict[Hashable, dict[Hashable, Array]] = {}
+    for cluster in clusters:
+        keys = strata.setdefault(cluster.stratum, {})
+        keys[cluster.key] = keys.get(cluster.key, np.zeros(k)) + scores(beta, cluster)
+    total, squares = np.zeros((k, k)), np.zeros(k)
+    for keys in strata.values():
+        n = len(keys)
+        if n < 2:
+            return np.full((k, k), np.nan), np.full(k, np.nan)
+        influence = np.array(list(keys.values())) @ bread
+        influence -= influence.mean(axis=0)
+        part = influence.T @ influence * (n / (n - 1))
+        total += part
+        squares += np.diag(part) ** 2 / (n - 1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        dof = np.where(squares > 0, np.diag(total) ** 2 / squares, 1.0)
+    return total, dof
+
+
+def half_width(std: Array, dof: Array, level: float = 0.95) -> Array:
+    """Return the half width of confidence intervals, Student's t with `dof` (arrays alike)."""
+    return np.asarray(student.ppf(0.5 + 0.5 * level, np.maximum(dof, 1.0)) * std)

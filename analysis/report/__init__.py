@@ -1,0 +1,1 @@
+"""Reports: self-contained HTML pages of an identification, a trace or a loop."""

@@ -1,0 +1,272 @@
+"""What the report says first: what was done, how well, the checks in words, the parameters."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from analysis.identify.checks import Check
+from analysis.identify.identify import Identification
+from analysis.identify.plausibility import LENGTH_TOLERANCE
+from analysis.report import format as fm
+from analysis.report import paper
+from analysis.report.plots.interval_plots import relative_half_width
+from analysis.report.tables import Table4, worst_fit
+from analysis.simulation.model import Estimate
+from analysis.simulation.validate import RecordValidation
+from rig.model.parameters import parameter_names
+from rig.model.records import Record, Run
+from rig.model.rig import Rig
+
+
+@dataclass(frozen=True)
+class Tile:
+    """One figure of the headline: the number, what it is, what it refers to."""
+
+    number: str
+    label: str
+    detail: str
+    warn: bool = False
+
+
+@dataclass(frozen=True)
+class CheckLine:
+    """All statements of one check: ok if every one is; the gravest first, the rest in `more`."""
+
+    name: str
+    ok: bool
+    detail: str
+    more: tuple[str, ...]
+
+
+def check_lines(checks: Sequence[Check]) -> list[CheckLine]:
+    """Gather checks by name, what is not ok before what is."""
+    by_name: dict[str, list[Check]] = {}
+    for check in checks:
+        by_name.setdefault(check.name, []).append(check)
+    out = []
+    for name, members in by_name.items():
+        ordered = sorted(members, key=lambda c: c.ok)
+        bad = sum(not c.ok for c in members)
+        detail = ordered[0].detail
+        if len(members) > 1:
+            detail += f" ({bad} of {len(members)} such statements are not ok)" if bad else ""
+        more = tuple(f"{'ok' if c.ok else 'not ok'}: {c.detail}" for c in ordered[1:])
+        out.append(CheckLine(name, not bad, detail, more))
+    return sorted(out, key=lambda line: line.ok)
+
+
+def truth_remark(rig: Rig, truth: Mapping[str, float] | None) -> str:
+    """Say where a simulated bench's own truth is no rigid body's (R_ij = l_i W_j), '' otherwise."""
+    found = []
+    for i, j in itertools.combinations(range(1, len(rig.joints) + 1), 2):
+        R, W = (truth or {}).get(f"R{i}{j}"), (truth or {}).get(f"W{j}")
+        length = rig.joints[i - 1].link_length
+        if R is not None and W and abs(R / W / length - 1) >= LENGTH_TOLERANCE:
+            found.append(
+                f"R{i}{j}/W{j} = {fm.significant(R / W)} m for a link of {fm.significant(length)} m"
+            )
+    if not found:
+        return ""
+    return (
+        f"The simulated bench's own truth has {'; '.join(found)}: there the check on link length "
+        "speaks of the bench, not of the identification."
+    )
+
+
+@dataclass(frozen=True)
+class ParameterRow:
+    """One line of the parameter table, every field ready to be read."""
+
+    name: str
+    meaning: str
+    value: str
+    half: str
+    unit: str
+    interval: str
+    rsd: str
+    nominal: str
+    truth: str
+    error: str
+    covered: str
+    paper: str
+    note: str
+
+
+def records_of(runs: Sequence[Run]) -> list[Record]:
+    """Return all records of the runs in their order."""
+    return [record for run in runs for record in run.records]
+
+
+def duration(records: Sequence[Record]) -> float:
+    """Return the seconds of data in all records together."""
+    return sum(record.samples / record.sample_rate for record in records)
+
+
+def minutes(seconds: float) -> str:
+    """Write a duration as a person would: seconds below two minutes, else minutes."""
+    if seconds < 120:
+        return f"{seconds:.3g} seconds"
+    return f"{seconds / 60:.3g} minutes"
+
+
+def shared_records(runs: Sequence[Run], others: Sequence[Run]) -> int:
+    """Count records of `others` whose samples were also used in `runs`."""
+    used = {_print(record) for record in records_of(runs)}
+    return sum(_print(record) in used for record in records_of(others))
+
+
+def _print(record: Record) -> tuple[tuple[str, bytes], ...]:
+    return tuple(
+        (name, np.ascontiguousarray(samples).tobytes())
+        for name, samples in sorted(record.channels.items())
+    )
+
+
+def sentences(
+    rig: Rig,
+    runs: Sequence[Run],
+    identification: Identification,
+    validation: Sequence[RecordValidation],
+    validation_runs: Sequence[Run],
+    *,
+    simulated: bool,
+) -> list[str]:
+    """Say in plain sentences what was done and with what result."""
+    records = records_of(runs)
+    joints = len(rig.joints)
+    expected = tuple(identification.estimates) if rig.electric else parameter_names(joints)
+    kind = "electric joint" if rig.electric else "hydraulic joint"
+    found = [e for n, e in identification.estimates.items() if e.identified and n in expected]
+    steps = len({(i, r.step) for i, run in enumerate(runs) for r in run.records})
+    bench = "the simulated bench" if simulated else "the rig"
+    first = (
+        f"On {bench} {rig.name} ({fm.count(joints, kind)}), "
+        f"{fm.count(len(records), 'record')} of {fm.count(steps, 'step')} were taken, "
+        f"{minutes(duration(records))} of data; one {identification.method} least-squares solve "
+        f"gives {len(found)} of the {len(expected)} parameters of the model."
+    )
+    if not validation:
+        return [first, "The model has not been validated: no validation records were given."]
+    worst = worst_fit(validation)
+    shared = shared_records(runs, validation_runs)
+    fresh = (
+        "never used for the fit" if not shared
+        else f"of which {shared} had also been used for the fit"
+    )  # fmt: skip
+    second = (
+        f"Driven by the measured spool alone, the model was then compared with "
+        f"{fm.count(len(validation), 'record')} {fresh}"
+    )
+    if worst is None:
+        return [first, f"{second}; no channel gave a FIT."]
+    return [
+        first,
+        f"{second}; the worst FIT of any channel is {fm.fit(worst.fit)} % "
+        f"({worst.channel} of {worst.record}).",
+    ]
+
+
+def tiles(
+    identification: Identification,
+    validation: Sequence[RecordValidation],
+    truth: Mapping[str, float] | None,
+    table4: Table4,
+) -> list[Tile]:
+    """Return the headline's figures."""
+    estimates = identification.estimates
+    found = {n: e for n, e in estimates.items() if e.identified}
+    out = [
+        Tile(f"{len(found)} of {len(estimates)}", "parameters identified",
+             "all of the model's" if len(found) == len(estimates) else "the rest is noted below",
+             len(found) < len(estimates))
+    ]  # fmt: skip
+    widths = {n: w for n, e in found.items() if not math.isnan(w := relative_half_width(e))}
+    if widths:
+        name = max(widths, key=lambda n: widths[n])
+        out.append(Tile(f"±{fm.percent(widths[name])} %", "widest 95 % interval", name))
+    if truth:
+        errors = {n: 100 * (e.value / truth[n] - 1) for n, e in found.items() if truth.get(n)}
+        if errors:
+            name = max(errors, key=lambda n: abs(errors[n]))
+            inside = sum(covers(found[n], truth[n]) for n in errors)
+            out.append(
+                Tile(f"{fm.percent(errors[name], signed=True)} %", "largest error against truth",
+                     f"{name}; {inside} of {len(errors)} intervals hold the truth")
+            )  # fmt: skip
+    worst = worst_fit(validation)
+    if worst is not None:
+        out.append(Tile(f"{fm.fit(worst.fit)} %", "worst FIT, free run",
+                        f"{worst.channel}, {worst.record}"))  # fmt: skip
+    failed = sum(bool(r.failure) for r in validation)
+    if failed:
+        out.append(Tile(str(failed), "free runs that failed", "see validation", True))
+    if table4.compared:
+        out.append(Tile(f"{table4.above} of {table4.compared}", "FIT cells above the paper",
+                        "Table IV", table4.above < table4.compared))  # fmt: skip
+    lines = check_lines(identification.checks)
+    bad = sum(not line.ok for line in lines)
+    good = len(lines) - bad
+    which = "the others are named below" if bad else "all of them"
+    out.append(Tile(f"{good} of {good + bad}", "checks ok", which, bool(bad)))
+    return out
+
+
+def covers(estimate: Estimate, truth: float) -> bool:
+    """Whether the 95 % interval holds the truth."""
+    return bool(estimate.ci95[0] <= truth <= estimate.ci95[1])
+
+
+def parameter_rows(
+    rig: Rig, identification: Identification, truth: Mapping[str, float] | None
+) -> list[ParameterRow]:
+    """Return the parameter table; fields without a number hold a dash."""
+    return [
+        _parameter_row(rig, name, estimate, truth or {})
+        for name, estimate in identification.estimates.items()
+    ]
+
+
+def _parameter_row(
+    rig: Rig, name: str, estimate: Estimate, truth: Mapping[str, float]
+) -> ParameterRow:
+    unit = fm.display_unit(estimate.unit)
+    value = unit.scale * estimate.value
+    low, high = (unit.scale * end for end in estimate.ci95)
+    places = fm.decimals(value, 0.5 * (high - low))
+    true = truth.get(name)
+    mean = paper.TABLE_III[name].mean if rig.name == paper.RIG and name in paper.TABLE_III else None
+    shown = estimate.identified
+    error = 100 * (estimate.value / true - 1) if true and shown else None
+    has_interval = shown and math.isfinite(low)
+    return ParameterRow(
+        name,
+        fm.meaning(name, len(rig.joints)),
+        fm.fixed(value, places) if shown else fm.DASH,
+        f"± {_half(0.5 * (high - low), places)}" if has_interval else "",
+        unit.text,
+        f"{fm.fixed(low, places)} … {fm.fixed(high, places)}" if has_interval else fm.DASH,
+        fm.column_percent(100 * estimate.std / abs(estimate.value)) if shown else fm.DASH,
+        _scaled(rig.nominal.get(name), unit.scale),
+        _scaled(true, unit.scale),
+        fm.column_percent(error, signed=True),
+        ("yes" if covers(estimate, true) else "no") if true and has_interval else fm.DASH,
+        _scaled(mean, unit.scale),
+        "" if shown and not estimate.note else f"not identifiable: {estimate.note or 'no value'}"
+        if not shown else estimate.note,
+    )  # fmt: skip
+
+
+def _half(half: float, places: int) -> str:
+    """Write half an interval to the value's decimals, in powers of ten where those show nothing."""
+    if not math.isfinite(half) or round(half, places) == 0:
+        return fm.significant(half, 1)
+    return fm.fixed(half, places)
+
+
+def _scaled(value: float | None, scale: float) -> str:
+    return fm.DASH if value is None else fm.significant(scale * value, 4 if scale == 1e6 else 3)

@@ -1,0 +1,208 @@
+"""Which figures a report shows, in which order, with captions; the page escapes the captions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from markupsafe import Markup
+
+from analysis.identify.identify import Identification
+from analysis.report import format as fm
+from analysis.report.machine import steps
+from analysis.report.plots import arm_plot, interval_plots, record_plots, validation_plots
+from analysis.report.residuals import Residual
+from analysis.report.tables import joints_of
+from analysis.simulation.validate import RecordValidation
+from rig.model import channels as ch
+from rig.model.records import Record, Run
+from rig.model.rig import Rig
+
+MOST = 18  # figures of one kind: the tables hold the rest
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A figure with its caption: heading and explanation, plain text."""
+
+    svg: Markup
+    heading: str
+    text: str = ""
+
+
+@dataclass(frozen=True)
+class Gallery:
+    """Figures of one kind and how many more there would have been."""
+
+    figures: tuple[Shown, ...]
+    left_out: int = 0
+
+
+def parameters(
+    rig: Rig, identification: Identification, truth: Mapping[str, float] | None
+) -> Gallery:
+    """Return the dots with whiskers: against truth or nominal where there is one, and widths."""
+    estimates = identification.estimates
+    found = []
+    reference, kind = (truth, "truth") if truth else (rig.nominal, "nominal")
+    if reference and any(name in reference for name in estimates):
+        text = (
+            "Zero is the value the simulated bench was built with." if truth
+            else "Zero is the rig file's nominal value: a design figure, not the truth."
+        )  # fmt: skip
+        found.append(
+            Shown(interval_plots.against_reference(estimates, reference, kind),
+                  f"Parameters against the {kind}", text)
+        )  # fmt: skip
+    found.append(
+        Shown(interval_plots.interval_widths(estimates), "Width of the intervals",
+              "Scatter is not accuracy: a narrow interval says nothing of what the model lacks.")
+    )  # fmt: skip
+    return Gallery(tuple(found))
+
+
+def arm(rig: Rig) -> Shown | None:
+    """Return the drawing of the arm; None of an electric one, which has no linkage to draw."""
+    if rig.electric:
+        return None
+    return Shown(
+        arm_plot.arm(rig), "The arm, from its linkage",
+        "Pistons at mid-stroke; dashed, each joint alone at either end of its stroke. Angles are "
+        "relative to the link before, the first to the vertical below.",
+    )  # fmt: skip
+
+
+def _input(rig: Rig) -> str:
+    return ch.DRIVE if rig.electric else ch.SPOOL
+
+
+def _excitation(rig: Rig) -> Callable[[Rig, Record, int, str], Markup]:
+    return record_plots.electric_excitation if rig.electric else record_plots.excitation
+
+
+def excitations(rig: Rig, runs: Sequence[Run]) -> Gallery:
+    """Return one figure per step and excited joint, of the step's first repeat."""
+    wanted = [
+        (step, joint) for step in steps(rig, runs) for joint in step.excited
+        if ch.channel(_input(rig), joint) in step.records[0].channels
+    ]  # fmt: skip
+    return Gallery(
+        tuple(
+            Shown(
+                _excitation(rig)(rig, step.records[0], joint, f"exc{n}"),
+                f"{step.name}, joint {joint}",
+                f"record {step.records[0].name}",
+            )
+            for n, (step, joint) in enumerate(wanted[:MOST])
+        ),
+        max(0, len(wanted) - MOST),
+    )
+
+
+EQUATIONS = {
+    "torque": "torque balance",
+    "flow_cap": "flow into the cap side",
+    "flow_rod": "flow into the rod side",
+}
+
+
+def residuals(found: Sequence[Residual]) -> Gallery:
+    """Return one figure per step and equation."""
+    return Gallery(
+        tuple(
+            Shown(
+                record_plots.residual(one, f"res{n}"),
+                f"{one.step}, joint {one.joint}: {equation_text(one)}",
+            )
+            for n, one in enumerate(found[:MOST])
+        ),
+        max(0, len(found) - MOST),
+    )
+
+
+def equation_text(found: Residual) -> str:
+    """Say in words which equation a residual belongs to."""
+    return EQUATIONS[found.equation.rsplit("_", 1)[0]]
+
+
+def comparisons(rig: Rig, validation: Sequence[RecordValidation], runs: Sequence[Run]) -> Gallery:
+    """Return measured against simulated for each kind of record and joint, first repeats only."""
+    first: dict[str, tuple[RecordValidation, Record | None]] = {}
+    for result, record in paired(validation, runs):
+        first.setdefault(result.step, (result, record))
+    wanted = [
+        (result, record, joint)
+        for result, record in first.values() for joint in joints_of(result)
+    ]  # fmt: skip
+    figures = []
+    for n, (result, record, joint) in enumerate(wanted[:MOST]):
+        part = validation_plots.shown_part(result)
+        seconds = (part.stop - part.start) / result.simulation.rate
+        whole = len(result.time) / result.simulation.rate
+        text = f"last {seconds:.3g} s of {whole:.3g} s, free run from the first sample"
+        if part.start == 0:
+            text = f"all {whole:.3g} s, free run from the first sample"
+        if result.failure:
+            text += f"; {result.failure}"
+        svg = validation_plots.comparison(rig, result, record, joint, f"val{n}")
+        figures.append(Shown(svg, f"{result.record}, joint {joint}", text))
+    return Gallery(tuple(figures), max(0, len(wanted) - MOST))
+
+
+def paired(
+    validation: Sequence[RecordValidation], runs: Sequence[Run]
+) -> list[tuple[RecordValidation, Record | None]]:
+    """Put each validation beside its record: by order where it fits, else by name."""
+    records = [record for run in runs for record in run.records]
+    if [r.name for r in records] == [v.record for v in validation]:
+        return list(zip(validation, records, strict=True))
+    by_name = {r.name: r for r in records}
+    return [(v, by_name.get(v.record)) for v in validation]
+
+
+@dataclass(frozen=True)
+class ResidualRow:
+    """One line of the residual table, in N m or mL/s."""
+
+    step: str
+    joint: int
+    equation: str
+    unit: str
+    side: str
+    rms: str
+    share: str
+    repeatable: str
+    scatter: str
+    rows: str
+    masked: str
+
+
+def residual_rows(found: Sequence[Residual]) -> list[ResidualRow]:
+    """Return the residual table, ready to be read."""
+    out = []
+    for one in found:
+        unit = fm.display_unit(one.unit)
+        share = 100 * one.rms / one.rms_side if one.rms_side else float("nan")
+        scatter = one.scatter if one.repeats > 1 else float("nan")
+        repeatable = one.repeatable if one.repeats > 1 else float("nan")
+        out.append(
+            ResidualRow(
+                one.step, one.joint, equation_text(one), unit.text,
+                fm.significant(unit.scale * one.rms_side), fm.significant(unit.scale * one.rms),
+                fm.percent(share), fm.significant(unit.scale * repeatable),
+                fm.significant(unit.scale * scatter), str(one.rows),
+                fm.percent(100 * one.masked / max(one.rows + one.masked, 1)) if one.masked else "0",
+            )
+        )  # fmt: skip
+    return out
+
+
+def largest_share(found: Sequence[Residual]) -> str:
+    """Return the largest residual relative to its measured side, in words ('' without rows)."""
+    shares = {(r.step, equation_text(r), r.joint): r.rms / r.rms_side for r in found if r.rms_side}
+    if not shares:
+        return ""
+    step, equation, joint = max(shares, key=lambda key: shares[key])
+    value = fm.percent(100 * float(np.max(list(shares.values()))))
+    return f"{value} % of the measured side ({equation}, joint {joint}, {step})"

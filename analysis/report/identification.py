@@ -1,0 +1,204 @@
+"""The report: one self-contained HTML page that says what was done and how well, with figures.
+
+Every number is computed from the arguments. The page refers to nothing outside itself, needs no
+script, and the same arguments give the same bytes.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from analysis.identify.identify import Identification, RecordRows, build_rows
+from analysis.report import facts, figures, machine, paper, tables
+from analysis.report import format as fm
+from analysis.report.page import page, write
+from analysis.report.residuals import per_repeat, residuals
+from analysis.simulation.model import Model, rig_difference
+from analysis.simulation.validate import RecordValidation
+from rig.model.parse import InputError
+from rig.model.records import Run
+from rig.model.rig import Rig
+
+log = logging.getLogger(__name__)
+
+TEMPLATE = "report.html"
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where the report comes from, as the caller knows it: nothing here is read from the clock.
+
+    `versions` maps a package to its version, `seeds` a purpose to its seed, `commands` are the
+    lines that make the report again, `notes` free lines.
+    """
+
+    date: str = ""
+    commands: tuple[str, ...] = ()
+    versions: Mapping[str, str] = field(default_factory=dict)
+    seeds: Mapping[str, str | int] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class _RunLine:
+    name: str
+    role: str
+    state: str
+    records: int
+
+
+def write_report(
+    path: Path,
+    *,
+    runs: Sequence[Run],
+    identification: Identification,
+    model: Model | None = None,
+    validation: Sequence[RecordValidation] = (),
+    validation_runs: Sequence[Run] = (),
+    truth: Mapping[str, float] | None = None,
+    title: str = "Identification report",
+    provenance: Provenance | None = None,
+    rows: Sequence[RecordRows] | None = None,
+) -> None:
+    """Write the report as one HTML file, replacing an old one only when the new one is complete.
+
+    See `render_report` for the arguments; raises InputError where the file cannot be written.
+    """
+    text = render_report(
+        runs=runs, identification=identification, model=model, validation=validation,
+        validation_runs=validation_runs, truth=truth, title=title, provenance=provenance, rows=rows,
+    )  # fmt: skip
+    write(path, text)
+    log.info("wrote %s, %d kB", path, len(text) // 1000)
+
+
+def render_report(
+    *,
+    runs: Sequence[Run],
+    identification: Identification,
+    model: Model | None = None,
+    validation: Sequence[RecordValidation] = (),
+    validation_runs: Sequence[Run] = (),
+    truth: Mapping[str, float] | None = None,
+    title: str = "Identification report",
+    provenance: Provenance | None = None,
+    rows: Sequence[RecordRows] | None = None,
+) -> str:
+    """Return the report as HTML text.
+
+    `runs` are those behind `identification`, `model` the one that was validated (default: the
+    identified one), `truth` the parameters of a simulated bench (SI, by name), `rows` the
+    regression rows where they were not built by the default filtering. Raises InputError for
+    records that cannot be used or a model of another rig.
+    """
+    model = model or identification.model
+    rig = identification.model.rig
+    difference = rig_difference(model.rig, rig)
+    if difference:
+        raise InputError(f"the model and the identification are of different rigs: {difference}")
+    if rows is None:
+        rows = build_rows(rig, runs, identification.model.terms)
+    context = {
+        "title": title,
+        "rig": rig,
+        "simulated": bool(truth),
+        "provenance": provenance or Provenance(),
+        "run_lines": _run_lines(runs, validation_runs),
+        **_headline(rig, runs, identification, validation, validation_runs, truth),
+        **_regression(identification, rows),
+        **_bench(rig, runs, identification, truth),
+        **_validated(rig, validation, validation_runs),
+    }
+    return page(TEMPLATE, context)
+
+
+def _headline(
+    rig: Rig,
+    runs: Sequence[Run],
+    identification: Identification,
+    validation: Sequence[RecordValidation],
+    validation_runs: Sequence[Run],
+    truth: Mapping[str, float] | None,
+) -> dict[str, Any]:
+    table4 = tables.table_iv(rig.name, validation)
+    return {
+        "sentences": facts.sentences(
+            rig, runs, identification, validation, validation_runs, simulated=bool(truth)
+        ),
+        "tiles": facts.tiles(identification, validation, truth, table4),
+        "truth_remark": facts.truth_remark(rig, truth),
+        "checks": facts.check_lines(identification.checks),
+        "table4": table4,
+        "table4_search": {
+            name: tuple(fm.fit(v) for v in values) for name, values in paper.TABLE_IV_SEARCH.items()
+        },
+    }
+
+
+def _regression(identification: Identification, rows: Sequence[RecordRows]) -> dict[str, Any]:
+    left = residuals(identification, rows)
+    scatter = per_repeat(identification, rows)
+    rig = identification.model.rig
+    return {
+        "solutions": [
+            {
+                "family": family,
+                "condition": fm.significant(solution.condition_number),
+                "rows": f"{solution.rows}",
+                "parameters": len(solution.names),
+            }
+            for family, solution in identification.solutions.items()
+        ],
+        "method": identification.method,
+        "masked_rows": identification.masked_rows,
+        "solve": fm.significant(1e3 * identification.solve_seconds),
+        "paper": paper if rig.name == paper.RIG else None,
+        "residual_rows": figures.residual_rows(left),
+        "residual_figures": figures.residuals(left),
+        "largest_share": figures.largest_share(left),
+        "single": any(one.repeats < 2 for one in left),
+        "table3": tables.table_iii(rig.name, identification, scatter),
+        "repeats": max((s.repeats for s in scatter.values()), default=0),
+    }
+
+
+def _bench(
+    rig: Rig,
+    runs: Sequence[Run],
+    identification: Identification,
+    truth: Mapping[str, float] | None,
+) -> dict[str, Any]:
+    return {
+        "parameters": facts.parameter_rows(rig, identification, truth),
+        "parameter_figures": figures.parameters(rig, identification, truth),
+        "has_paper": rig.name == paper.RIG,
+        "arm": figures.arm(rig),
+        "bench": machine.bench_constants(rig),
+        "joints": machine.joint_constants(rig),
+        "steps": machine.step_rows(rig, runs),
+        "several_runs": len(runs) > 1,
+        "excitation_figures": figures.excitations(rig, runs),
+    }
+
+
+def _validated(
+    rig: Rig, validation: Sequence[RecordValidation], validation_runs: Sequence[Run]
+) -> dict[str, Any]:
+    return {
+        "fit_rows": tables.fit_rows(validation),
+        "fit_figures": figures.comparisons(rig, validation, validation_runs),
+        "validation_steps": machine.step_rows(rig, validation_runs),
+    }
+
+
+def _run_lines(runs: Sequence[Run], validation_runs: Sequence[Run]) -> list[_RunLine]:
+    """Name the run folders without where they lie: a report may leave the house."""
+    return [
+        _RunLine(fm.folder_name(run.source) or f"run {n}", role, run.state, len(run.records))
+        for role, group in (("identification", runs), ("validation", validation_runs))
+        for n, run in enumerate(group, start=1)
+    ]

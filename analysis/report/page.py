@@ -1,0 +1,37 @@
+"""HTML pages: a template filled in, and a file written whole or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, FunctionLoader, StrictUndefined
+from markupsafe import Markup
+
+from rig.model.parse import InputError
+
+
+def page(template: str, context: Mapping[str, Any]) -> str:
+    """Return a template filled in, with the pages' style."""
+    environment = Environment(
+        loader=FunctionLoader(_read), autoescape=True, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    style = Markup(_read("report.css"))
+    return environment.get_template(template).render(context, style=style)
+
+
+def write(path: Path, text: str) -> None:
+    """Write a page whole or not at all; raises InputError where it cannot be written."""
+    part = path.with_name(path.name + ".part")
+    try:
+        part.write_text(text, encoding="utf-8")
+        part.replace(path)
+    except OSError as error:
+        raise InputError(f"cannot write the report {path}: {error.strerror or error}") from error
+
+
+def _read(name: str) -> str:
+    return (resources.files("analysis.report") / "templates" / name).read_text(encoding="utf-8")

@@ -1,0 +1,205 @@
+"""Figures of records: what was put in (time and lines) and what the regression left."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+
+from analysis.report.format import display_unit, significant
+from analysis.report.plots.style import (
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    MODEL,
+    ORANGE,
+    SKY,
+    figure,
+    gapped,
+    note,
+    plain_log,
+    style,
+    svg,
+    thin,
+)
+from analysis.report.residuals import Residual
+from analysis.signals.conditioning import bridged
+from rig.model import channels as ch
+from rig.model.records import Record
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+
+SHOWN_SECONDS = 10.0
+ELECTRIC_SECONDS = 15.0  # an electric joint moves slowly
+SPAN = 500.0  # of a residual spectrum, largest over smallest
+FEWEST_LINES = 10  # of the period's multiples that a spectrum shows: a sine's harmonics too
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Amplitudes [V] at multiples of 1/period: frequency [Hz], amplitude, which were excited."""
+
+    frequency: Array
+    amplitude: Array
+    excited: NDArray[np.bool_]
+    even: NDArray[np.bool_]
+
+
+def line_spectrum(record: Record, x: Array) -> Lines | None:
+    """Return a channel's amplitude [V peak] at the period's multiples; None if not periodic.
+
+    Over whole periods only, so that no line leaks into its neighbours.
+    """
+    periods = len(x) // record.period if record.period else 0
+    if not periods or not record.lines:
+        return None
+    whole = x[: periods * record.period]
+    spectrum = 2.0 * np.abs(np.fft.rfft(whole)) / len(whole)
+    shown = max(round(1.35 * max(record.lines)), FEWEST_LINES)
+    k = np.arange(1, min(shown, record.period // 2) + 1)
+    return Lines(
+        k * record.sample_rate / record.period, spectrum[k * periods],
+        np.isin(k, record.lines), k % 2 == 0,
+    )  # fmt: skip
+
+
+def excitation(rig: Rig, record: Record, joint: int, key: str) -> Markup:
+    """Draw command and spool of one joint in time, and the lines they hold."""
+    gain = rig.joints[joint - 1].valve.spool_gain
+    spool = bridged(np.asarray(record.channels[ch.channel(ch.SPOOL, joint)]))
+    command = record.channels.get(ch.channel(ch.COMMAND, joint))
+    shown = slice(0, int(min(record.samples, SHOWN_SECONDS * record.sample_rate)))
+    with style():
+        made = figure(3.7)
+        top = made.add_axes((0.13, 0.60, 0.84, 0.33))
+        low = made.add_axes((0.13, 0.115, 0.84, 0.33))
+        if command is not None:
+            top.plot(
+                *thin(record.time[shown], np.asarray(command)[shown]), color=SKY, linewidth=2.2
+            )
+        top.plot(*thin(record.time[shown], spool[shown] / gain), color=INK, linewidth=0.7)
+        top.margins(x=0, y=0.22)
+        top.set_ylabel("V of command")
+        top.set_xlabel("time [s]", labelpad=1)
+        top.set_title("command and spool")
+        note(top, 0.995, 0.99, f"spool, divided by its gain of {gain:g}", INK)
+        if command is not None:
+            note(top, 0.005, 0.99, "command", BLUE, ha="left")
+        _spectrum(low, record, spool)
+        return svg(made, key, f"Excitation of joint {joint} in time and frequency")
+
+
+def electric_excitation(rig: Rig, record: Record, joint: int, key: str) -> Markup:
+    """Draw drive and position of one electric joint in time."""
+    shown = slice(0, int(min(record.samples, ELECTRIC_SECONDS * record.sample_rate)))
+    with style():
+        made = figure(3.7)
+        for place, kind in enumerate((ch.DRIVE, ch.POSITION)):
+            axes = made.add_axes((0.15, 0.60 - 0.485 * place, 0.82, 0.33))
+            name = ch.channel(kind, joint)
+            x = bridged(np.asarray(record.channels[name]))
+            axes.plot(*thin(record.time[shown], x[shown]), color=INK, linewidth=0.7)
+            axes.margins(x=0, y=0.12)
+            axes.set_ylabel(f"{kind} [{rig.unit_of(name)}]")
+            axes.set_xlabel("time [s]", labelpad=1)
+        return svg(made, key, f"Drive and position of joint {joint} in time")
+
+
+def _spectrum(axes: Any, record: Record, spool: Array) -> None:
+    axes.set_yscale("log")
+    plain_log(axes.yaxis)
+    axes.set_xlabel("frequency [Hz]", labelpad=1)
+    axes.set_ylabel("spool [mV]")
+    axes.set_title("amplitude of each line")
+    lines = line_spectrum(record, spool)
+    if lines is None:
+        _unknown_lines(axes, record, spool)
+        return
+    # A line that is exactly empty would stretch the axis to nothing.
+    amplitude = 1e3 * np.maximum(lines.amplitude, 1e-7 * lines.amplitude.max() + 1e-12)
+    floor = amplitude.min() / 3
+    kinds = (
+        ("excited", lines.excited, BLUE, "o", 3.2),
+        ("empty, odd", ~lines.excited & ~lines.even, ORANGE, "^", 3.0),
+        ("empty, even", ~lines.excited & lines.even, GREEN, "s", 2.2),
+    )
+    x = 0.005
+    for name, chosen, colour, marker, size in kinds:
+        if not chosen.any():
+            continue
+        axes.vlines(lines.frequency[chosen], floor, amplitude[chosen], color=colour, linewidth=0.6,
+                    alpha=0.5)  # fmt: skip
+        axes.plot(lines.frequency[chosen], amplitude[chosen], marker, color=colour, markersize=size)
+        note(axes, x, 1.0, {"o": "●", "^": "▲", "s": "■"}[marker] + " " + name, colour, ha="left")
+        x += 0.06 + 0.023 * len(name)
+    axes.set_ylim(floor, amplitude.max() * 6)
+    axes.set_xlim(0, lines.frequency[-1] * 1.02)
+
+
+def _unknown_lines(axes: Any, record: Record, spool: Array) -> None:
+    window = np.hanning(len(spool))
+    spectrum = 2e3 * np.abs(np.fft.rfft((spool - spool.mean()) * window)) / window.sum()
+    frequency: Array = np.fft.rfftfreq(len(spool), 1.0 / record.sample_rate).astype(np.float64)
+    inside = (frequency > 0) & (frequency <= min(50.0, 0.4 * record.sample_rate))
+    seen: Array = np.maximum(spectrum[inside], 1e-9).astype(np.float64)
+    axes.plot(*thin(frequency[inside], seen), color=BLUE, linewidth=0.8)
+    axes.margins(x=0)
+    note(axes, 0.995, 0.99, "excited lines not stated in the record", GREY)
+
+
+def residual(found: Residual, key: str) -> Markup:
+    """Draw one equation's residual in time, and its density against the scatter of repeats."""
+    unit = display_unit(found.unit)
+    with style():
+        made = figure(3.3)
+        top = made.add_axes((0.15, 0.60, 0.82, 0.32))
+        low = made.add_axes((0.15, 0.125, 0.82, 0.31))
+        t, mean = gapped(found.time, unit.scale * found.mean)
+        if found.repeats > 1:
+            _, band = gapped(found.time, unit.scale * found.scatter_band)
+            top.fill_between(t, mean - band, mean + band, color=SKY, alpha=0.45, linewidth=0)
+        top.plot(t, mean, color=BLUE, linewidth=0.8)
+        top.axhline(0, color=INK, linewidth=0.5)
+        top.margins(x=0, y=0.25)
+        top.yaxis.set_major_locator(MaxNLocator(4))
+        top.set_ylabel(unit.text)
+        top.set_xlabel("time [s]", labelpad=1)
+        top.set_title(
+            f"residual; measured side {significant(unit.scale * found.rms_side)} {unit.text} RMS"
+        )
+        what = "mean of repeats, ±1 scatter" if found.repeats > 1 else "the only repeat"
+        note(top, 0.995, 0.99, what, BLUE)
+        _densities(low, found, unit.scale, unit.text)
+        return svg(made, key, f"Residual of one equation of joint {found.joint}, time and spectrum")
+
+
+def _densities(axes: Any, found: Residual, scale: float, unit: str) -> None:
+    axes.set_yscale("log")
+    plain_log(axes.yaxis)
+    axes.plot(found.frequency, scale * found.spectrum, color=BLUE, linewidth=1.0)
+    above = {"va": "bottom", "ha": "left"}
+    note(
+        axes,
+        0.0,
+        1.02,
+        "mean of repeats" if found.repeats > 1 else "the only repeat",
+        BLUE,
+        **above,
+    )
+    if found.repeats > 1:
+        axes.plot(found.frequency, scale * found.spectrum_scatter, color=GREY, linewidth=1.0)
+        floor = scale * found.spectrum_scatter / np.sqrt(found.repeats)
+        axes.plot(found.frequency, floor, color=MODEL, linewidth=0.9, linestyle=(0, (4, 2)))
+        note(axes, 0.26, 1.02, "scatter of one repeat", "#6b7280", **above)
+        note(axes, 0.59, 1.02, "scatter left in the mean", "#c2410c", **above)
+    axes.margins(x=0)
+    # The row filter's stop band would take up most of the axis.
+    axes.set_ylim(bottom=max(axes.get_ylim()[0], scale * float(found.spectrum.max()) / SPAN))
+    axes.set_xlabel("frequency [Hz]", labelpad=1)
+    axes.set_ylabel(f"{unit}/√Hz")

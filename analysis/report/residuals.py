@@ -1,0 +1,205 @@
+"""What the regression leaves: residuals per step and equation, split into what repeats and not.
+
+Repeats of a step had the same excitation, started at the same sample. With n repeats r_k(t),
+ scatter^2 = mean_t var_k(r_k)  (ddof 1),   repeatable^2 = mean_t(mean_k r)^2 - scatter^2 / n,
+so that noise averaged over n repeats is not counted as model error (negative estimates are zero).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import welch
+
+from analysis.identify.identify import Identification, RecordRows
+from analysis.regression.rows import Rows
+from analysis.regression.solve import Cluster, solve, triangle
+from analysis.terms.base import FAMILIES, family_of
+
+Array = NDArray[np.float64]
+
+SPECTRUM_SECONDS = 4.0  # Welch segment: resolves 0.5 Hz with Hann's window
+KINDS = ("torque", "flow_cap", "flow_rod")
+
+
+@dataclass(frozen=True)
+class Residual:
+    """One equation of one step: rows in time and figures, SI (N m or m^3/s).
+
+    `mean` (m,) is the residual averaged over repeats, `scatter_band` (m,) its standard deviation
+    between repeats (NaN for one repeat), `side` (m,) the right-hand side averaged alike.
+    Spectra are amplitude densities [unit/sqrt(Hz)] over `frequency` [Hz].
+    """
+
+    run: int
+    step: str
+    equation: str
+    joint: int
+    unit: str
+    repeats: int
+    rows: int
+    masked: int
+    time: Array
+    side: Array
+    mean: Array
+    scatter_band: Array
+    rms_side: float
+    rms: float
+    repeatable: float
+    scatter: float
+    frequency: Array
+    spectrum: Array
+    spectrum_scatter: Array
+
+
+def coefficients(
+    identification: Identification, per_record: Sequence[RecordRows]
+) -> dict[str, Array]:
+    """Return the rows' coefficients (k,) per family, parameters not identified filled.
+
+    Where a combination only is determined, the shortest coefficients that fit the rows are taken:
+    the residual does not depend on the choice.
+    """
+    out = {}
+    for family, solution in identification.solutions.items():
+        beta = np.array(solution.value)
+        if not np.isfinite(beta).all():
+            parts = [r for one in per_record for n, r in one.rows.items() if family_of(n) == family]
+            X = np.concatenate([r.matrix for r in parts])
+            y = np.concatenate([r.rhs for r in parts])
+            scale = np.linalg.norm(X, axis=0)
+            scale[scale == 0] = 1.0
+            beta = np.linalg.lstsq(X / scale, y, rcond=1e-6)[0] / scale
+        out[family] = beta
+    return out
+
+
+def residuals(identification: Identification, per_record: Sequence[RecordRows]) -> list[Residual]:
+    """Return the residual of every equation of every (run, step), torque before flows."""
+    beta = coefficients(identification, per_record)
+    groups: dict[tuple[int, str], list[RecordRows]] = {}
+    for one in per_record:
+        groups.setdefault((one.run, one.step), []).append(one)
+    out = []
+    for (run, step), members in groups.items():
+        names = sorted(members[0].rows, key=_order)
+        for name in names:
+            rows = [m.rows[name] for m in members if name in m.rows]
+            found = _residual(run, step, name, rows, beta[family_of(name)])
+            if found is not None:
+                out.append(found)
+    return out
+
+
+def _order(equation: str) -> tuple[int, int]:
+    kind, joint = equation.rsplit("_", 1)
+    return int(joint), KINDS.index(kind)
+
+
+def _residual(run: int, step: str, name: str, rows: Sequence[Rows], beta: Array) -> Residual | None:
+    common = rows[0].time
+    for r in rows[1:]:
+        common = np.intersect1d(common, r.time)
+    if len(common) < 2:
+        return None
+    picked = [np.isin(r.time, common) for r in rows]
+    side = np.array([r.rhs[p] for r, p in zip(rows, picked, strict=True)])
+    left = np.array([(r.rhs - r.matrix @ beta)[p] for r, p in zip(rows, picked, strict=True)])
+    n = len(rows)
+    band = left.std(axis=0, ddof=1) if n > 1 else np.full(len(common), np.nan)
+    scatter = float(np.sqrt(np.mean(band**2)))
+    mean = left.mean(axis=0)
+    excess = float(np.mean(mean**2)) - (scatter**2 / n if n > 1 else 0.0)
+    frequency, whole = _density(common, mean)
+    noise = (
+        np.sqrt(np.mean([_density(common, r - mean)[1] ** 2 for r in left], axis=0) * n / (n - 1))
+        if n > 1 else np.full(len(frequency), np.nan)
+    )  # fmt: skip
+    kind, joint = name.rsplit("_", 1)
+    return Residual(
+        run, step, name, int(joint), "N*m" if kind == "torque" else "m^3/s", n,
+        sum(len(r.rhs) for r in rows), sum(r.masked for r in rows), common, side.mean(axis=0),
+        mean, band, _rms(side), _rms(left), float(np.sqrt(max(excess, 0.0))), scatter,
+        frequency, whole, noise,
+    )  # fmt: skip
+
+
+def _rms(x: Array) -> float:
+    return float(np.sqrt(np.mean(x**2)))
+
+
+def _density(t: Array, x: Array) -> tuple[Array, Array]:
+    """Return frequency [Hz] above zero and amplitude density [unit/sqrt(Hz)] by Welch's method.
+
+    Rows that were masked leave gaps: they are filled with zeros, and the power is divided by the
+    share of rows present, which is right on average for a stationary residual.
+    """
+    step = float(np.median(np.diff(t)))
+    place = np.rint((t - t[0]) / step).astype(int)
+    filled = np.zeros(int(place[-1]) + 1)
+    filled[place] = x
+    share = len(x) / len(filled)
+    length = min(len(filled), max(8, round(SPECTRUM_SECONDS / step)))
+    frequency, power = welch(filled, 1.0 / step, nperseg=length, detrend=False)
+    return np.asarray(frequency[1:]), np.asarray(np.sqrt(power[1:] / share))
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """A parameter identified from each repeat alone: lowest, mean, highest, RSD [%], how many."""
+
+    low: float
+    mean: float
+    high: float
+    rsd: float
+    repeats: int
+
+
+def per_repeat(
+    identification: Identification, per_record: Sequence[RecordRows]
+) -> dict[str, Scatter]:
+    """Identify from every repeat alone, as the paper's Table III does; {} below two repeats."""
+    rounds: dict[int, list[RecordRows]] = {}
+    for one in per_record:
+        rounds.setdefault(one.repeat, []).append(one)
+    steps = {(one.run, one.step) for one in per_record}
+    whole = [m for m in rounds.values() if {(one.run, one.step) for one in m} == steps]
+    if len(whole) < 2:
+        return {}
+    reciprocal = {
+        c.parameter for used in identification.model.terms
+        for c in used.term.coefficients(identification.model.rig) if c.reciprocal
+    }  # fmt: skip
+    found: dict[str, list[float]] = {}
+    for members in whole:
+        for family, solution in identification.solutions.items():
+            alone = _solve_once(members, family, solution.names)
+            for name, value in alone.items():
+                found.setdefault(name, []).append(1.0 / value if name in reciprocal else value)
+    return {name: _scatter(np.array(values)) for name, values in found.items()}
+
+
+def _solve_once(
+    members: Sequence[RecordRows], family: str, names: Sequence[str]
+) -> Mapping[str, float]:
+    clusters = []
+    for one in members:
+        rows = [r for n, r in one.rows.items() if family_of(n) == family and len(r.rhs)]
+        if rows:
+            matrix = np.concatenate([r.matrix for r in rows])
+            rhs = np.concatenate([r.rhs for r in rows])
+            clusters.append(
+                Cluster((one.run, one.step), one.repeat, triangle(matrix, rhs), len(rhs))
+            )
+    if not clusters or family not in FAMILIES:
+        return {}
+    return dict(zip(names, solve(names, clusters).value, strict=True))
+
+
+def _scatter(values: Array) -> Scatter:
+    mean = float(values.mean())
+    rsd = 100.0 * float(values.std(ddof=1)) / abs(mean) if mean else float("nan")
+    return Scatter(float(values.min()), mean, float(values.max()), rsd, len(values))

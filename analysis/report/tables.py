@@ -1,0 +1,210 @@
+"""Tables of the validation and of the paper: FIT per record, Table III, Table IV."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from analysis.identify.identify import Identification
+from analysis.report import format as fm
+from analysis.report import paper
+from analysis.report.residuals import Scatter
+from analysis.simulation.validate import RecordValidation
+from rig.model import channels as ch
+
+KINDS = (ch.PISTON, ch.CAP, ch.ROD)
+ABOVE, BELOW, EQUAL = "▲", "▼", "="
+
+
+@dataclass(frozen=True)
+class Worst:
+    """The lowest FIT [%], and where."""
+
+    fit: float
+    channel: str
+    record: str
+
+
+def worst_fit(validation: Sequence[RecordValidation]) -> Worst | None:
+    """Return the lowest finite FIT of all records and channels, None where there is none."""
+    every = [
+        Worst(value, name, result.record)
+        for result in validation
+        for name, value in result.fit.items()
+        if math.isfinite(value)
+    ]
+    return min(every, key=lambda w: w.fit, default=None)
+
+
+@dataclass(frozen=True)
+class FitRow:
+    """One joint of one validation record: FIT [%], RMSE and windowed RMSE of s, p_cap, p_rod."""
+
+    record: str
+    joint: int
+    fit: tuple[str, ...]
+    rmse: tuple[str, ...]
+    window: tuple[str, ...]
+    remark: str
+
+
+def joints_of(result: RecordValidation) -> list[int]:
+    """Return the 1-based joints that a validation compares."""
+    return sorted({joint for name in result.fit if (joint := ch.kind_of(name)[1]) is not None})
+
+
+def fit_rows(validation: Sequence[RecordValidation]) -> list[FitRow]:
+    """Return the table of all validation records, RMSE in mm and kPa."""
+    out = []
+    for result in validation:
+        for joint in joints_of(result):
+            names = [ch.channel(kind, joint) for kind in KINDS]
+            scales = (1e3, 1e-3, 1e-3)
+            remark = f"failed: {result.failure}" if result.failure else ""
+            if result.outside:
+                remark += ("; " if remark else "") + (
+                    f"{fm.count(result.outside, 'simulated sample')} outside [0, supply]"
+                )
+            out.append(
+                FitRow(
+                    result.record, joint,
+                    tuple(fm.fit(result.fit.get(n)) for n in names),
+                    _scaled(result.rmse, names, scales),
+                    _scaled(result.window_rmse, names, scales),
+                    remark,
+                )
+            )  # fmt: skip
+    return out
+
+
+def _scaled(
+    figures: Mapping[str, float], names: Sequence[str], scales: Sequence[float]
+) -> tuple[str, ...]:
+    return tuple(
+        fm.significant(figures[n] * s) if n in figures else fm.DASH
+        for n, s in zip(names, scales, strict=True)
+    )
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One comparison: ours, the paper's, and the mark between them ('' if nothing to compare)."""
+
+    ours: str
+    paper: str
+    mark: str
+
+
+@dataclass(frozen=True)
+class Table4Row:
+    """One joint of one kind of record against one column of the paper's Table IV."""
+
+    record: str
+    joint: int
+    records: int
+    cells: tuple[Cell, ...]
+    figure: str
+
+
+@dataclass(frozen=True)
+class Table4:
+    """The paper's Table IV: rows, how many cells were compared, how many lie above."""
+
+    rows: tuple[Table4Row, ...]
+    compared: int
+    above: int
+
+
+def table_iv(rig_name: str, validation: Sequence[RecordValidation]) -> Table4:
+    """Set the FIT of the records named as the paper's columns beside its numbers.
+
+    Repeats of a record are averaged; empty for another rig or without such records.
+    """
+    if rig_name != paper.RIG:
+        return Table4((), 0, 0)
+    rows = []
+    compared = above = 0
+    for column in paper.TABLE_IV:
+        results = [r for r in validation if r.step == column.step]
+        if not results:
+            continue
+        cells = []
+        for i, kind in enumerate(KINDS):
+            name = ch.channel(kind, column.joint)
+            found = [r.fit[name] for r in results if name in r.fit]
+            ours = float(np.mean(found)) if found else float("nan")
+            theirs = column.fit[i] if column.fit else None
+            mark = "" if theirs is None or math.isnan(ours) else mark_of(ours, theirs)
+            compared += bool(theirs is not None)
+            above += mark == ABOVE
+            cells.append(Cell(fm.fit(ours), fm.fit(theirs), mark))
+        rows.append(Table4Row(column.step, column.joint, len(results), tuple(cells), column.figure))
+    return Table4(tuple(rows), compared, above)
+
+
+def mark_of(ours: float, theirs: float) -> str:
+    """Mark whether a number lies above, below or at the other."""
+    return EQUAL if ours == theirs else ABOVE if ours > theirs else BELOW
+
+
+@dataclass(frozen=True)
+class Table3Row:
+    """One parameter against the paper's Table III, ready to be read."""
+
+    name: str
+    unit: str
+    coupled: str
+    repeats: tuple[str, ...]  # min, mean, max
+    rsd: str
+    rsd_mark: str
+    paper: tuple[str, ...]  # min, mean, max, RSD, PSO, GA, nominal
+    against: str  # our coupled value against the paper's mean [%]
+
+
+def table_iii(
+    rig_name: str, identification: Identification, scatter: Mapping[str, Scatter]
+) -> list[Table3Row]:
+    """Set the parameters beside the paper's Table III; empty for another rig."""
+    if rig_name != paper.RIG:
+        return []
+    out = []
+    for name, estimate in identification.estimates.items():
+        theirs = paper.TABLE_III.get(name)
+        if theirs is None:
+            continue
+        unit = fm.display_unit(estimate.unit)
+
+        def shown(value: float | None, digits: int = 4, scale: float = unit.scale) -> str:
+            return fm.DASH if value is None else fm.significant(value * scale, digits)
+
+        ours = scatter.get(name)
+        spread = (ours.low, ours.mean, ours.high) if ours else (None, None, None)
+        deviation = 100 * (estimate.value / theirs.mean - 1)
+        mark = mark_of(ours.rsd, theirs.rsd) if ours and math.isfinite(ours.rsd) else ""
+        out.append(
+            Table3Row(
+                name, unit.text, shown(estimate.value),
+                tuple(shown(v) for v in spread),
+                fm.column_percent(ours.rsd if ours else None),
+                mark,
+                _printed(theirs, unit.scale, 0 if name == "b" else 2),
+                fm.column_percent(deviation, signed=True),
+            )
+        )  # fmt: skip
+    return out
+
+
+def _printed(theirs: paper.PaperParameter, scale: float, places: int) -> tuple[str, ...]:
+    """Write the paper's min, mean, max, RSD, PSO, GA, nominal with the decimals it prints."""
+
+    def shown(value: float | None) -> str:
+        return fm.DASH if value is None else fm.fixed(scale * value, places)
+
+    return (
+        *(shown(v) for v in (theirs.low, theirs.mean, theirs.high)),
+        f"{theirs.rsd:.2f}", shown(theirs.pso), shown(theirs.ga),
+        " to ".join(shown(v) for v in theirs.nominal) or fm.DASH,
+    )  # fmt: skip

@@ -1,0 +1,189 @@
+"""The trace's report: one HTML page whose pictures alone make the point."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from analysis.effects.base import Effect
+from analysis.report import format as fm
+from analysis.report import trace_figures
+from analysis.report.identification import Provenance
+from analysis.report.page import page, write
+from analysis.trace.clues.frequency import FREQUENCY
+from analysis.trace.data.spectral_lines import loudest
+from analysis.trace.result import CLEAN, Found, Trace
+from analysis.trace.words import quantity, shot_in_words, unit_of_equation
+from rig.model.records import Run
+from rig.model.rig import Rig
+
+TEMPLATE = "trace.html"
+TITLES = {
+    "clean": "Nothing above the noise",
+    "explained": "What the model lacked, named",
+    "confounded": "Two or more effects fit alike",
+    "unexplained": "Something the catalogue does not hold",
+}
+
+
+def write_trace_report(
+    path: Path, holdout: Sequence[Run], result: Trace, provenance: Provenance | None = None
+) -> None:
+    """Write the report as one HTML file; raises InputError where it cannot be written."""
+    write(path, render(holdout, result, provenance))
+
+
+def render(holdout: Sequence[Run], result: Trace, provenance: Provenance | None = None) -> str:
+    """Return the report as HTML text."""
+    return page(TEMPLATE, body(holdout, result, provenance))
+
+
+def body(
+    holdout: Sequence[Run], result: Trace, provenance: Provenance | None = None
+) -> dict[str, Any]:
+    """Return what the pages of a trace show, for `analysis.report.page.page`."""
+    rig = result.model_before.rig
+    return {
+        "title": TITLES[result.verdict],
+        "rig": rig,
+        "result": result,
+        "provenance": provenance or Provenance(),
+        "galleries": _pictures(rig, holdout, result),
+        "overview": trace_figures.over_noise(result),
+        "errors": _errors(result),
+        "effects": [_effect(e) for e in result.effects],
+        "refused": [_effect(e) for e in result.refused],
+        "parameters": _parameters(result),
+        "fits": [
+            (
+                name,
+                fm.fit(value),
+                fm.fit(result.fit_after.get(name)),
+                *(
+                    fm.significant(errors.get(name, math.nan))
+                    for errors in (
+                        result.rmse_before,
+                        result.rmse_after,
+                        result.window_before,
+                        result.window_after,
+                    )
+                ),
+                rig.unit_of(name),
+            )
+            for name, value in result.fit_before.items()
+        ],
+        "floors": result.floors,
+        "spectra": _spectra(rig, result),
+        "fm": fm,
+    }
+
+
+def _pictures(rig: Rig, holdout: Sequence[Run], result: Trace) -> list[dict[str, Any]]:
+    """Return per effect, else per clue, the residual against its variable and in time."""
+    lines = trace_figures.held_out(rig, holdout, result)
+    out: list[dict[str, Any]] = []
+
+    def add(effect: Effect | None, variable: str, equation: str, heading: str, key: str) -> None:
+        timed = equation not in [picture["equation"] for picture in out]  # once is enough
+        drawn = _pair(rig, lines[equation], result, effect, variable, equation, key, timed)
+        out.append({"heading": heading, "equation": equation, **drawn})
+
+    known = {(u.term.name, u.term.where) for u in result.model_before.terms}
+    effects = [
+        u.term
+        for u in result.model_after.terms
+        if isinstance(u.term, Effect) and (u.term.name, u.term.where) not in known
+    ]
+    for k, effect in enumerate(effects):
+        equation = trace_figures.equation_of(effect, rig, result, lines)
+        heading = f"{effect.name.replace('_', ' ')} at {getattr(effect, 'place', effect.where)}"
+        add(effect, effect.variable, equation, heading, f"e{k}")
+    # A frequency is seen in time and in the lines, not against anything.
+    drawn = [d for d in result.depends_on if d.variable != FREQUENCY][:2]
+    for k, clue in enumerate(drawn):
+        heading = f"what is left of {clue.equation} against {clue.variable}"
+        add(None, clue.variable, clue.equation, heading, f"c{k}")
+    return out
+
+
+def _pair(
+    rig: Rig, here: Sequence[trace_figures.Lines], result: Trace, effect: Effect | None,
+    variable: str, equation: str, key: str, timed: bool,
+) -> dict[str, Any]:  # fmt: skip
+    unit = unit_of_equation(rig, equation)
+    noise = result.noise_floor[equation]
+    model = result.model_after
+    changed = model is not result.model_before
+    x = trace_figures.abscissae(rig, here, effect, variable, equation, model)
+    label = variable
+    if effect is None:
+        label = f"{variable} [{trace_figures.unit_of_variable(rig, variable)}]"
+    longest = max(here, key=lambda line: float((line.before**2).mean()))
+    return {
+        "text": f"{equation}, held-out records; the band is ± one rms of noise, red the mean.",
+        "against": trace_figures.against(x, here, noise, unit, label, f"{key}x", changed),
+        "time": trace_figures.in_time(longest, noise, unit, f"{key}t", changed) if timed else None,
+        "record": longest.scene.record.name,
+    }
+
+
+def _spectra(rig: Rig, result: Trace) -> list[dict[str, Any]]:
+    """Return the lines of the loudest residuals: picture and words."""
+    changed = result.model_after is not result.model_before
+    return [
+        {
+            "text": one.text,
+            "figure": trace_figures.spectrum(
+                one, unit_of_equation(rig, one.equation), f"l{k}", changed
+            ),
+        }
+        for k, one in enumerate(loudest(result.lines))
+    ]
+
+
+def _errors(result: Trace) -> list[tuple[str, ...]]:
+    rig = result.model_before.rig
+    out: list[tuple[str, ...]] = []
+    for name, before in result.before.items():
+        floor, after = result.noise_floor.get(name, math.nan), result.after.get(name, math.nan)
+        out.append(
+            (
+                name, unit_of_equation(rig, name), fm.significant(floor),
+                fm.significant(before), fm.significant(after),
+                fm.significant(before / floor), fm.significant(after / floor),
+            )
+        )  # fmt: skip
+    return out
+
+
+def _effect(found: Found) -> dict[str, Any]:
+    return {
+        "name": found.name.replace("_", " "),
+        "where": found.where,
+        "values": [(n, quantity(e)) for n, e in found.parameters.items()],
+        "p": fm.significant(found.p_value),
+        "removed": fm.significant(100 * found.removed_fraction),
+        "shot": shot_in_words(found),
+        "gates": found.gates,
+        "rivals": [
+            (
+                r.name.replace("_", " "), r.where, fm.significant(r.ratio),
+                fm.significant(r.training_ratio), "cannot be told apart" if r.tied else "ruled out",
+            )
+            for r in found.rivals
+        ],
+    }  # fmt: skip
+
+
+def _parameters(result: Trace) -> list[tuple[str, ...]]:
+    if result.verdict == CLEAN or result.model_after is result.model_before:
+        return []
+    after = result.model_after.parameters
+    out: list[tuple[str, ...]] = []
+    for name, one in result.model_before.parameters.items():
+        if name in after and one.identified and after[name].identified:
+            change = 100 * (after[name].value / one.value - 1) if one.value else math.nan
+            out.append((name, quantity(one), quantity(after[name]), f"{change:+.1f} %"))
+    return out

@@ -1,0 +1,258 @@
+"""The trace's pictures: residual before and after against what it moves with, in time, in figures.
+
+All of held-out records. Grey is before, blue after; the pale band is the noise (± one rms).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from markupsafe import Markup
+from numpy.typing import NDArray
+
+from analysis.effects.base import Effect
+from analysis.regression.rows import Rows
+from analysis.report import format as fm
+from analysis.report.plots.style import (
+    BLUE,
+    CARD,
+    GREY,
+    INK,
+    MODEL,
+    PALE,
+    figure,
+    gapped,
+    note,
+    style,
+    svg,
+)
+from analysis.simulation.model import Model
+from analysis.terms.base import family_of
+from analysis.trace.clues.variables import variables
+from analysis.trace.data.conditioned_record import (
+    Scene,
+    filtered,
+    prepared,
+    residual,
+    scene_rows,
+    scenes,
+)
+from analysis.trace.data.spectral_lines import CONSTANT, EVEN, EXCITED, ODD, members
+from analysis.trace.data.spectral_lines import Lines as Spectrum
+from analysis.trace.result import Trace
+from analysis.trace.search.refinement import Fit
+from analysis.trace.words import loudest
+from rig.model import channels as ch
+from rig.model.channels import kind_of
+from rig.model.records import Run
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+
+POINTS = 1500  # dots of a scatter
+SECONDS = 4.0  # of a time trace
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Held-out residuals of one equation of one record, SI, at the instants of its rows."""
+
+    scene: Scene
+    rows: Rows
+    before: Array
+    after: Array
+
+
+def held_out(rig: Rig, holdout: Sequence[Run], result: Trace) -> dict[str, list[Lines]]:
+    """Return, by equation, every held-out record's residual under both models."""
+    out: dict[str, list[Lines]] = {}
+    families = tuple({family_of(e): None for e in result.before})
+    for scene in scenes(rig, holdout, families=families):
+        before = _left(rig, scene, result.rows_before)
+        after = _left(rig, scene, result.rows_after)
+        for name, (rows, r) in before.items():
+            later, q = after[name]
+            _, here, there = np.intersect1d(rows.time, later.time, return_indices=True)
+            part = Rows(name, rows.names, rows.matrix[here], rows.rhs[here], rows.time[here], 0)
+            out.setdefault(name, []).append(Lines(scene, part, r[here], q[there]))
+    return out
+
+
+def _left(rig: Rig, scene: Scene, model: Fit) -> dict[str, tuple[Rows, Array]]:
+    built = scene_rows(rig, model.terms, scene)
+    return {name: (rows, residual(rows, model.beta)) for name, rows in built.items()}
+
+
+def abscissae(
+    rig: Rig,
+    lines: Sequence[Lines],
+    effect: Effect | None,
+    variable: str,
+    equation: str,
+    model: Model,
+) -> Array:
+    """Return what one equation's residuals are drawn against: the effect's own variable or one."""
+    joint = int(equation.rsplit("_", 1)[1]) - 1
+    out = []
+    for line in lines:
+        if effect is not None:
+            seen = prepared(rig, model.terms, line.scene)
+            raw = effect.abscissa(rig, seen)[equation]
+        else:
+            raw = variables(rig, line.scene.signals, joint)[variable]
+        out.append(filtered({"x": np.asarray(raw)}, line.scene, line.rows)["x"])
+    return np.concatenate(out)
+
+
+def against(
+    x: Array, lines: Sequence[Lines], noise: float, unit: str, label: str, key: str, after: bool
+) -> Markup:
+    """Draw the residual over a variable, before beside after on one scale, with binned means."""
+    parts = [("before", np.concatenate([line.before for line in lines]))]
+    if after:
+        parts.append(("after", np.concatenate([line.after for line in lines])))
+    top = 1.1 * max(float(np.quantile(np.abs(parts[0][1]), 0.995)), 2.5 * noise)
+    kept = np.linspace(0, len(x) - 1, min(POINTS, len(x))).astype(int)
+    with style():
+        made = figure(2.5, CARD * (2 if after else 1))
+        for k, (word, y) in enumerate(parts):
+            axes = made.add_subplot(1, len(parts), k + 1)
+            axes.axhspan(-noise, noise, color=PALE, alpha=0.7, lw=0)
+            colour = BLUE if k else GREY
+            axes.plot(x[kept], y[kept], ".", color=colour, ms=2.2, alpha=0.5, mew=0)
+            curve = binned(x, y)
+            axes.plot(curve["x"], curve["mean"], "-", color=MODEL, lw=1.8)
+            axes.plot(curve["x"], curve["mean"], "o", color=MODEL, ms=2.6)
+            axes.set_ylim(-top, top)
+            axes.set_xlabel(label)
+            if not k:
+                axes.set_ylabel(f"residual [{unit}]")
+            rms = float(np.sqrt(np.mean(y**2)))
+            note(axes, 0.98, 0.98, f"{word}: {fm.significant(rms)} {unit} rms", INK)
+        made.tight_layout()
+        return svg(made, key, f"Residual against {label}, before and after")
+
+
+def in_time(line: Lines, noise: float, unit: str, key: str, after: bool) -> Markup:
+    """Draw a few seconds of the residual before and after."""
+    t = line.rows.time
+    middle = 0.5 * (t[0] + t[-1])
+    shown = (t >= middle - 0.5 * SECONDS) & (t <= middle + 0.5 * SECONDS)
+    with style():
+        made = figure(2.1, CARD * 2)
+        axes = made.add_subplot()
+        axes.axhspan(-noise, noise, color=PALE, alpha=0.7, lw=0)
+        axes.plot(*gapped(t[shown], line.before[shown]), color=GREY, lw=1.1)
+        note(axes, 0.99, 0.97, "before", GREY)
+        if after:
+            axes.plot(*gapped(t[shown], line.after[shown]), color=BLUE, lw=1.1)
+            note(axes, 0.99, 0.84, "after", BLUE)
+        axes.set_xlabel("time in the record [s]")
+        axes.set_ylabel(f"residual [{unit}]")
+        made.tight_layout()
+        return svg(made, key, "Held-out residual in time, before and after")
+
+
+def over_noise(result: Trace, key: str = "overnoise") -> Markup:
+    """Draw every equation's held-out error over its noise floor, before and after."""
+    names = list(result.before)
+    with style():
+        made = figure(0.5 + 0.32 * len(names), CARD * 2)
+        axes = made.add_subplot()
+        for k, name in enumerate(reversed(names)):
+            floor = result.noise_floor.get(name, np.nan)
+            a, b = result.before[name] / floor, result.after.get(name, np.nan) / floor
+            axes.plot([a, b], [k, k], "-", color=PALE, lw=5, solid_capstyle="round", zorder=1)
+            axes.plot(a, k, "o", color=GREY, ms=6)
+            axes.plot(b, k, "o", color=BLUE, ms=6)
+        axes.axvline(1.0, color=INK, lw=0.8, ls="--")
+        axes.set_xscale("log")
+        low, high = axes.get_xlim()
+        # Less than an octave leaves no ticks to read, and noise would look like a difference.
+        low, high = min(low, 0.8), max(high, 2.5)
+        axes.set_xlim(low, high)
+        axes.xaxis.set_major_formatter(lambda v, _: f"{v:g}")
+        # Within one decade the ticks between are all there is.
+        axes.xaxis.set_minor_formatter(lambda v, _: f"{v:.1g}" if high < 10 * low else "")
+        axes.set_yticks(range(len(names)), list(reversed(names)))
+        axes.set_ylim(-0.6, len(names) - 0.4)
+        axes.set_xlabel("held-out error over the noise floor (grey before, blue after)")
+        made.tight_layout()
+        return svg(made, key, "Held-out error over the noise floor, before and after")
+
+
+def spectrum(one: Spectrum, unit: str, key: str, after: bool) -> Markup:
+    """Draw the lines of a residual by kind, before beside after, over the noise of one repeat."""
+    of = members(one.excited)
+    kinds = (
+        ("excited", of[EXCITED], "o", INK, 4.0),
+        ("odd, left empty", of[ODD], "s", MODEL, 3.2),
+        ("even", of[EVEN] | of[CONSTANT], "^", BLUE, 3.0),
+    )
+    noise = np.sqrt(one.noise)
+    low = 0.2 * float(np.median(noise))
+    top = 2.0 * float(np.sqrt(max(one.repeatable.max(), one.noise.max())))
+    with style():
+        made = figure(2.6, CARD * (2 if after else 1))
+        for k, word in enumerate(("before", "after") if after else ("before",)):
+            axes = made.add_subplot(1, 2 if after else 1, k + 1)
+            power = one.after if k else one.repeatable
+            axes.fill_between(one.frequency, low, np.maximum(noise, low), color=PALE, lw=0)
+            for label, own, marker, colour, size in kinds:
+                y = np.sqrt(np.maximum(power[own], 0.0))
+                axes.plot(
+                    one.frequency[own], np.where(y > low, y, np.nan), marker, color=colour,
+                    ms=size, mew=0, label=label,
+                )  # fmt: skip
+            axes.set_yscale("log")
+            axes.set_ylim(low, top)
+            axes.yaxis.set_major_formatter(lambda v, _: f"{v:g}")
+            axes.set_xlabel("frequency [Hz]")
+            if not k:
+                axes.set_ylabel(f"repeats, rms per line [{unit}]")
+                axes.legend(loc="lower left", fontsize=7, ncols=3, handletextpad=0.2, frameon=False)
+            note(axes, 0.98, 0.98, word, INK)
+        made.tight_layout()
+        return svg(made, key, "Lines of the residual, before and after")
+
+
+def binned(x: Array, y: Array, count: int = 24) -> dict[str, Array]:
+    """Return mean and quartiles of y in bins of equally many x."""
+    order = np.argsort(x)
+    parts = [p for p in np.array_split(order, min(count, max(1, len(x) // 5))) if len(p)]
+    return {
+        "x": np.array([x[p].mean() for p in parts]),
+        "mean": np.array([y[p].mean() for p in parts]),
+        "low": np.array([np.quantile(y[p], 0.25) for p in parts]),
+        "high": np.array([np.quantile(y[p], 0.75) for p in parts]),
+    }
+
+
+def unit_of_variable(rig: Rig, name: str) -> str:
+    """Return a variable's SI unit for an axis."""
+    stem = name.rsplit("_", 1)[0]
+    way = rig.unit_of(ch.channel(rig.position_kind, 1))
+    made = {
+        "velocity": f"{way}/s", "acceleration": f"{way}/s²", "pressure_difference": "Pa",
+        "time": "s",
+    }  # fmt: skip
+    return made[stem] if stem in made else rig.unit_of(name)
+
+
+def equation_of(
+    effect: Effect, rig: Rig, result: Trace, lines: Mapping[str, Sequence[Lines]]
+) -> str:
+    """Return the equation whose residual shows an effect best: most over its noise before."""
+    scene = next(iter(lines.values()))[0].scene
+    own = [e for e in effect.abscissa(rig, scene.signals) if e in lines]
+    if not own:
+        return loudest(result)
+    return max(own, key=lambda e: result.before[e] / max(result.noise_floor[e], 1e-30))
+
+
+__all__ = [
+    "Lines", "abscissae", "against", "equation_of", "held_out", "in_time", "kind_of",
+    "over_noise", "spectrum", "unit_of_variable",
+]  # fmt: skip

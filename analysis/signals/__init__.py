@@ -1,0 +1,1 @@
+"""Records to signals: filtered, differentiated, with the linkage's geometry; which locks hold."""

@@ -1,0 +1,102 @@
+"""The twin: what the rig's nominal model would do with given commands, before anything moves."""
+
+from __future__ import annotations
+
+import functools
+import logging
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import cont2discrete, lfilter
+
+from analysis.simulation.model import Model, nominal_model
+from analysis.simulation.simulate import Drive, State, simulate
+from analysis.terms import baseline
+from analysis.terms.base import Used
+from rig.model.parse import InputError
+from rig.model.parts import Valve
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+log = logging.getLogger(__name__)
+
+
+def spool_response(valve: Valve, command: Array, rate: float) -> Array:
+    """Return the spool [V] of a held command [V], (n,): second order, stopped at its stroke.
+
+    u'' + 2 d w u' + w^2 u = w^2 k v with natural frequency w and damping d of the rig file.
+    """
+    b, a = _held_response(valve.natural_frequency, valve.damping_ratio, rate)
+    held = np.clip(command, -valve.command_range, valve.command_range) * valve.spool_gain
+    spool = lfilter(b, a, np.clip(held, -valve.spool_stroke, valve.spool_stroke))
+    return np.asarray(np.clip(spool, -valve.spool_stroke, valve.spool_stroke))
+
+
+@functools.lru_cache(maxsize=32)
+def _held_response(frequency: float, damping: float, rate: float) -> tuple[Array, Array]:
+    """Return the digital filter (b, a) of a unit second-order lag between held samples."""
+    w, d = 2 * np.pi * frequency, damping
+    b, a, _ = cont2discrete(([w * w], [1.0, 2 * d * w, w * w]), 1 / rate, method="zoh")
+    return b.ravel(), a
+
+
+def holding_state(rig: Rig, model: Model, piston: Array) -> State:
+    """Return the state at rest at piston positions (N,): gravity held, chambers around p_s/2."""
+    N = len(rig.joints)
+    q = np.array([float(j.linkage.angle(p)) for j, p in zip(rig.joints, piston, strict=True)])
+    theta, values = np.cumsum(q), model.values
+    pull = np.array([values[f"W{i + 1}"] * rig.gravity * np.sin(theta[i]) for i in range(N)])
+    torque = np.cumsum(pull[::-1])[::-1]
+    cap, rod = np.empty(N), np.empty(N)
+    for i, joint in enumerate(rig.joints):
+        force = torque[i] / float(joint.linkage.jacobian(q[i]))
+        area_cap, area_rod = joint.cylinder.cap_area, joint.cylinder.rod_area
+        # The chambers' mean is half the supply, their difference carries the load.
+        half = 0.5 * rig.supply.pressure
+        excess = (force - half * (area_cap - area_rod)) / (area_cap + area_rod)
+        cap[i] = np.clip(half + excess, 0.0, rig.supply.pressure)
+        rod[i] = np.clip(half - excess, 0.0, rig.supply.pressure)
+    return State(q, np.zeros(N), cap, rod)
+
+
+def simulate_commands(
+    rig: Rig, commands: Array, start: Array, locked: Mapping[int, float]
+) -> dict[str, Array]:
+    """Simulate valve commands (n, N) [V] at the rig's sample rate on the nominal model.
+
+    `start` (N,) are the pistons' first positions [m], `locked` maps a 0-based joint to the piston
+    position [m] that holds it. Returns `piston speed cap_pressure rod_pressure spool`, each (n, N)
+    in SI, and `valid` (n,), 0 from where the state ceased to exist and 1 before (the last state is
+    then held, which lies outside every limit). Raises InputError for a rig without nominal values
+    or arrays that do not fit it.
+    """
+    N = len(rig.joints)
+    commands = np.asarray(commands, dtype=np.float64)
+    if commands.ndim != 2 or commands.shape[1] != N or len(commands) < 2:
+        raise InputError(f"commands of shape {commands.shape} do not fit a rig of {N} joints")
+    held = np.array([i in locked for i in range(N)])
+    place = np.array([locked.get(i, float(start[i])) for i in range(N)])
+    model = nominal_model(rig, tuple(Used(term) for term in baseline()))
+    state = holding_state(rig, model, place)
+    n, rate = len(commands), rig.sample_rate
+    spool = np.column_stack(
+        [spool_response(j.valve, commands[:, i], rate) for i, j in enumerate(rig.joints)]
+    )
+    spool[:, held] = 0.0
+    still = np.zeros((n, N))
+    drive = Drive(
+        rate, spool, np.full(n, rig.supply.pressure), np.full(n, rig.oil.temperature), held,
+        np.tile(state.q, (n, 1)), still, still,
+    )  # fmt: skip
+    result = simulate(model, drive, state)
+    if result.failure:
+        log.info("the twin stopped: %s", result.failure)
+    return {
+        "piston": result.piston,
+        "speed": result.speed,
+        "cap_pressure": result.p_cap,
+        "rod_pressure": result.p_rod,
+        "spool": spool,
+        "valid": (np.arange(n) < result.filled).astype(np.float64),
+    }

@@ -1,0 +1,213 @@
+"""Validation: the model driven by the measured spool (electric: drive) against what was measured.
+
+FIT = 100 (1 - |y - yhat| / |y - mean y|) per channel (NOTES, Table IV), free run from the record's
+first sample; windowed RMSE restarts the model from the data every 0.25 s, which shows the model's
+rates without the drift that a free run collects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.effects.measurement import corrected_channels
+from analysis.regression.rows import Filtering, default_filtering
+from analysis.signals.conditioning import Mask, Signals, aligned_channels, condition, lost_samples
+from analysis.signals.filters import Smoother
+from analysis.simulation.model import Model, finite, refuse_other_rig
+from analysis.simulation.simulate import (
+    Simulation,
+    State,
+    compiled,
+    drive_of,
+    hidden_paths,
+    put_right,
+    simulate,
+    state_at,
+)
+from rig.model import channels as ch
+from rig.model.parse import InputError
+from rig.model.records import Record, Run
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+
+WINDOW = 0.25  # [s]
+START_SAMPLES = 0.04  # [s] of samples that the first state is fitted to
+START_DEGREE = 3
+GAP = 0.05  # [s] of lost samples that a simulation may bridge
+
+
+@dataclass(frozen=True)
+class RecordValidation:
+    """One record: FIT [%], RMSE and windowed RMSE [SI] per channel of the excited joints.
+
+    `simulation` is the free run and `measured` the aligned channels, for plots; `failure` and
+    `outside` are the free run's; NaN stands where a window's model failed.
+    """
+
+    record: str
+    step: str
+    fit: Mapping[str, float]
+    rmse: Mapping[str, float]
+    window_rmse: Mapping[str, float]
+    failure: str
+    outside: int
+    simulation: Simulation
+    measured: Mapping[str, Array]
+    time: Array
+    units: Mapping[str, str] = field(default_factory=dict)
+
+
+def fit_percent(measured: Array, simulated: Array) -> float:
+    """Return FIT [%] of one channel (n,); NaN where the measured one stands still."""
+    spread = float(np.linalg.norm(measured - measured.mean()))
+    if spread == 0:
+        return float("nan")
+    return 100.0 * (1.0 - float(np.linalg.norm(measured - simulated)) / spread)
+
+
+def validate(model: Model, runs: Sequence[Run]) -> list[RecordValidation]:
+    """Simulate every record of the runs with its measured spool and compare.
+
+    Raises InputError for a run of another rig, a record too short, or a model with parameters
+    that were not identified.
+    """
+    out = []
+    for run in runs:
+        refuse_other_rig(model, run.rig, run.source or "the run")
+        out += [validate_record(model, run.rig, record) for record in run.records]
+    if not out:
+        raise InputError("no records to validate on: the run holds none")
+    return out
+
+
+def validate_record(
+    model: Model, rig: Rig, record: Record,
+    filtering: Callable[[Record], Filtering] = default_filtering,
+) -> RecordValidation:  # fmt: skip
+    """Validate on one record (see `validate`)."""
+    smoother = filtering(record).channels
+    here = arrived(rig, record)
+    signals = put_right(rig, model.terms, condition(rig, record, smoother))
+    # A sensor that the model says is wrong is put right before anything is compared with it.
+    channels = aligned_channels(rig, record)
+    channels = corrected_channels(rig, model.terms, channels, record.sample_rate)
+    measured = _compared(rig, channels, signals)
+    ready, drive = compiled(model), drive_of(signals)
+    hidden = hidden_paths(model, signals)
+    first_of_all = first_state(rig, record, signals, channels)
+    free = simulate(ready, drive, replace(first_of_all, hidden=hidden[0]))
+    simulated = free.channels()
+    windows = dict.fromkeys(measured, 0.0)
+    count = 0
+    for first, length in _windows(record, smoother):
+        if not here[first : first + length].all():
+            continue
+        start = replace(state_at(signals, first), hidden=hidden[first])
+        short = simulate(ready, drive, start, first, length)
+        stretch = short.channels()
+        for name, y in measured.items():
+            error = stretch[name] - y[first : first + length]
+            windows[name] += np.nan if short.failure else float(error @ error)
+        count += length
+    return RecordValidation(
+        record.name,
+        record.step,
+        {name: fit_percent(y[here], simulated[name][here]) for name, y in measured.items()},
+        {
+            name: float(np.sqrt(np.mean((y - simulated[name])[here] ** 2)))
+            for name, y in measured.items()
+        },
+        {name: float(np.sqrt(v / count)) if count else np.nan for name, v in windows.items()},
+        free.failure,
+        free.outside,
+        free,
+        measured,
+        record.time,
+        {name: rig.unit_of(name) for name in measured},
+    )
+
+
+def arrived(rig: Rig, record: Record) -> Mask:
+    """Return which samples (n,) arrived; raises InputError for a gap too long to bridge.
+
+    The model is driven by the measured spool, which over a short gap is a straight line.
+    """
+    lost = lost_samples(rig, record).any(axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], lost, [False])).astype(np.int8)))
+    longest = int(np.max(edges[1::2] - edges[::2], initial=0))
+    if longest > GAP * record.sample_rate:
+        raise InputError(
+            f"record {record.name!r}: {longest} samples in a row were lost; a model cannot be "
+            f"simulated through more than {1000 * GAP:g} ms without its spool"
+        )
+    return np.asarray(~lost)
+
+
+def _compared(rig: Rig, channels: Mapping[str, Array], signals: Signals) -> dict[str, Array]:
+    """Return the measured piston and pressures (electric: position) of the excited joints."""
+    kinds = (rig.position_kind,) if rig.electric else (ch.PISTON, ch.CAP, ch.ROD)
+    return {
+        ch.channel(kind, i + 1): channels[ch.channel(kind, i + 1)]
+        for i in map(int, np.flatnonzero(signals.excited))
+        for kind in kinds
+    }
+
+
+def _windows(record: Record, smoother: Smoother) -> Iterator[tuple[int, int]]:
+    length = round(WINDOW * record.sample_rate)
+    for first in range(smoother.reach, record.samples - smoother.reach - length + 1, length):
+        yield first, length
+
+
+def first_state(
+    rig: Rig, record: Record, signals: Signals, channels: Mapping[str, Array] | None = None
+) -> State:
+    """Return the state at the first sample, from a cubic fitted to the first 40 ms of data.
+
+    `channels` defaults to the record's, aligned. The filter has no samples before the first; a
+    short one-sided fit is the better edge. The velocity is the fit's first derivative.
+    """
+    count = min(record.samples, max(START_DEGREE + 2, round(START_SAMPLES * record.sample_rate)))
+    t = np.arange(count) / record.sample_rate
+    channels = aligned_channels(rig, record) if channels is None else channels
+    state = state_at(signals, 0)
+    q, qd, cap, rod = (a.copy() for a in (state.q, state.qd, state.p_cap, state.p_rod))
+    for i in map(int, np.flatnonzero(signals.excited)):
+
+        def fitted(kind: str, joint: int = i) -> Array:
+            samples = channels[ch.channel(kind, joint + 1)][:count]
+            return np.asarray(np.polynomial.polynomial.polyfit(t, samples, START_DEGREE))
+
+        s = fitted(rig.position_kind)
+        if rig.electric:
+            q[i], qd[i] = s[0], s[1]
+            continue
+        linkage = rig.joints[i].linkage
+        q[i] = linkage.angle(s[0])
+        qd[i] = s[1] / linkage.jacobian(q[i])
+        cap[i], rod[i] = fitted(ch.CAP)[0], fitted(ch.ROD)[0]
+    return replace(state, q=q, qd=qd, p_cap=cap, p_rod=rod)
+
+
+def to_json(results: Sequence[RecordValidation]) -> dict[str, Any]:
+    """Return the validation as the contract's JSON; `failure` and `outside` added per record."""
+    return {
+        "records": [
+            {
+                "record": r.record,
+                "step": r.step,
+                "fit": {name: finite(v) for name, v in r.fit.items()},
+                "rmse": {name: finite(v) for name, v in r.rmse.items()},
+                "window_rmse": {name: finite(v) for name, v in r.window_rmse.items()},
+                "failure": r.failure or None,
+                "outside_samples": r.outside,
+            }
+            for r in results
+        ]
+    }

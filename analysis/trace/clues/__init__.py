@@ -1,0 +1,1 @@
+"""Clues to a residual that no effect explains: variables, formulas, frequencies."""

@@ -1,0 +1,160 @@
+"""Clues: what an unexplained residual moves with. A clue is not a name.
+
+For each variable v the residual's equation gets a free curve of v (hat functions over quantiles,
+filtered like any column, projected off the model's own columns) on one set of records, and is
+judged on the other: the share of the energy above noise that the curve takes from records it was
+not fitted to. Friedman's partial dependence, with the held-out record as its referee. The curve
+may also be the slope of another variable (Hastie and Tibshirani's varying coefficients): the
+direction of motion, with and without memory, the velocity, the pressure difference, the spool.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.trace.clues.equation_rows import Part, Side, columns_of, judged, side_of
+from analysis.trace.clues.variables import factor_of, factors, variables
+from analysis.trace.data.regression_data import Board
+from analysis.trace.result import Dependence
+from analysis.trace.search.hypothesis import excess_of
+from rig.model import channels as ch
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+
+KNOTS = 9
+LEAST = 0.05  # share below which a variable is no clue
+# An equation's own balance makes these follow whatever it lacks: they answer and tell nothing.
+ANSWERS = {"torque": ("pressure", ch.DRIVE), "flow": ("velocity",)}
+ANSWER = 0.3  # weight of a variable that only answers
+THROUGH = 0.6  # weight of the spool in a torque: it acts through the pressures
+BEYOND = 0.2  # share by which one chamber's pressure must beat the difference to be no answer
+MORE = 0.05  # share that a product must take beyond either of its parts
+
+
+def hats(v: Array, knots: Array) -> Array:
+    """Return the hat functions (n, k) of a piecewise linear curve with the given knots."""
+    out = np.zeros((len(v), len(knots)))
+    place = np.clip(np.searchsorted(knots, v) - 1, 0, len(knots) - 2)
+    share = np.clip((v - knots[place]) / (knots[place + 1] - knots[place]), 0.0, 1.0)
+    at = np.arange(len(v))
+    out[at, place] = 1.0 - share
+    out[at, place + 1] = share
+    return out
+
+
+def dependence(
+    train: Board, left: Array, judge: Board, judge_left: Array, equations: Sequence[str]
+) -> list[Dependence]:
+    """Return what the residual moves with by share of the energy above noise, most telling first.
+
+    `left` (M,) and `judge_left` are residuals under the model of `train` (rebased to it).
+    """
+    weight = {e: max(0.0, v) for e, v in excess_of(train, left).items() if e in equations}
+    total = sum(weight.values()) or 1.0
+    found: dict[tuple[str, str], dict[str, float]] = {}
+    for equation in equations:
+        sides = side_of(train, left, equation), side_of(judge, judge_left, equation)
+        for key, share in _shares(train.rig, equation, *sides).items():
+            found.setdefault(key, {})[equation] = share
+    sums = {k: sum(s * weight[e] / total for e, s in by.items()) for k, by in found.items()}
+    out: list[tuple[float, Dependence]] = []
+    for (name, factor), by in found.items():
+        share = sums[name, factor]
+        parts = [sums.get(part, 0.0) for part in ((name, ""), ("", factor))]
+        if share < LEAST or (name and factor and share < max(parts) + MORE):
+            continue
+        equation = max(by, key=lambda e: by[e])
+        told = 1.0 if factor else _telling(name, equation, sums)
+        out.append((share * told, _dependence(name, factor, share, equation, told)))
+    best: dict[str, Dependence] = {}
+    for _, clue in sorted(out, key=lambda pair: -pair[0]):
+        best.setdefault(clue.variable, clue)
+    return list(best.values())
+
+
+def _dependence(
+    name: str, factor: str, share: float, equation: str, told: float
+) -> Dependence:  # fmt: skip
+    if not factor:
+        words = f"{name} by balance" if told == ANSWER else ""
+        return Dependence(name, share, equation, words=words)
+    by = factors(equation)[factor]
+    if not name:
+        return Dependence(by.variable, share, equation, words=by.words)
+    return Dependence(name, share, equation, by.variable, f"{name} times {by.words}")
+
+
+def _telling(name: str, equation: str, shares: Mapping[tuple[str, str], float]) -> float:
+    """Return a variable's weight: what an equation's balance makes follow tells little.
+
+    A torque's balance makes the difference of the pressures follow; one chamber's pressure that
+    says much more than the difference follows nothing, its sensor may be what is wrong.
+    """
+    kind, number = equation.rsplit("_", 1)
+    if kind == "torque" and name in (
+        ch.channel(ch.CAP, int(number)),
+        ch.channel(ch.ROD, int(number)),
+    ):
+        difference = shares.get((f"pressure_difference_{number}", ""), 0.0)
+        if shares[name, ""] > difference + BEYOND:
+            return 1.0
+    kind = kind.split("_", 1)[0]
+    if any(word in name for word in ANSWERS[kind]):
+        return ANSWER
+    return THROUGH if kind == "torque" and name.startswith(ch.SPOOL) else 1.0
+
+
+def _shares(
+    rig: Rig, equation: str, first: Side | None, second: Side | None
+) -> dict[tuple[str, str], float]:
+    """Return the share of every curve alone, factor alone (variable ''), and product of both.
+
+    Each is fitted on either side and judged on the other; the larger counts: a curve fitted to
+    small motions says nothing of large ones, the other way round it does.
+    """
+    if first is None or second is None:
+        return {}
+    joint = int(equation.rsplit("_", 1)[1]) - 1
+    every = [*first.parts, *second.parts]
+    travel = max(float(np.ptp(p.scene.signals.s[:, joint])) for p in every)
+    values = [variables(rig, p.seen, joint) for p in every]
+    by = factors(equation)
+    scales = [
+        {f: v[f] if f in v else factor_of(f, p.seen, joint, travel) for f in by}
+        for v, p in zip(values, every, strict=True)
+    ]
+    curves: dict[str, list[Array]] = {"": [np.ones((len(p.seen.t), 1)) for p in every]}
+    for name in values[0]:
+        moving = [v[name] for v, p in zip(values, every, strict=True) if _moves(p, joint)]
+        knots = _knots(np.concatenate(moving)) if moving else None
+        if knots is not None:
+            curves[name] = [hats(v[name], knots) for v in values]
+    count = len(first.parts)
+    out = {}
+    for name, curve in curves.items():
+        for factor in ("", *by) if name else by:
+            made = (
+                [c * s[factor][:, None] for c, s in zip(curve, scales, strict=True)]
+                if factor
+                else curve
+            )
+            one, two = columns_of(first, made[:count]), columns_of(second, made[count:])
+            out[name, factor] = max(
+                0.0, judged(one, first, two, second), judged(two, second, one, first)
+            )
+    return out
+
+
+def _moves(part: Part, joint: int) -> bool:
+    return joint + 1 not in part.scene.record.locked
+
+
+def _knots(values: Array) -> Array | None:
+    knots = np.unique(np.quantile(values, np.linspace(0.005, 0.995, KNOTS)))
+    if len(knots) < 3 or np.ptp(knots) <= 1e-9 * max(1e-300, float(np.max(np.abs(knots)))):
+        return None
+    return np.asarray(knots)

@@ -1,0 +1,177 @@
+"""A sparse generic fit of what stays unexplained: a formula as a clue, clearly not a name.
+
+Monomials of a joint's variables, columns like any other (filtered, whitened, projected off the
+model's own), are joined one by one to the set that leaves least of training and held-out residual
+together, small motions and large ones (a cube and a line are alike in either); any that is idle
+then goes (forward and backward selection; sparse identification, Brunton, Proctor and Kutz 2016).
+Coefficients are the training records' alone, and the held-out ones judge. In a torque the
+monomials are forces at the piston, times the linkage's G.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.signals.conditioning import Signals
+from analysis.trace.clues.equation_rows import Side, columns_of, fitted_to, judged, side_of
+from analysis.trace.clues.variables import factor_of
+from analysis.trace.data.regression_data import Board
+from rig.model import channels as ch
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+
+MOST: Final = 3  # monomials
+ADDS: Final = 0.05  # of the held-out energy above noise that one more must take
+OFFERED: Final = 0.5  # share that a formula must take to be worth reading
+ALIKE: Final = 0.999  # correlation from which two columns are one
+SURE: Final = 0.9  # share from which a formula goes before free curves
+FEW: Final = 2  # monomials of such a one: three bend to much
+_NAME: Final = re.compile(r"[a-z]+(?:_[a-z]+)*(?:_[0-9]+)?")
+
+
+@dataclass(frozen=True)
+class Formula:
+    """What an equation lacks, about: coefficient [SI] by monomial, and the held-out share taken."""
+
+    equation: str
+    terms: Mapping[str, float]
+    share: float
+    at_piston: bool
+
+    @property
+    def text(self) -> str:
+        """The formula in one line."""
+        parts = [f"{value:+.3g} {name}".replace("e-0", "e-") for name, value in self.terms.items()]
+        line = " ".join(parts).removeprefix("+")
+        what = "force at the piston [N]" if self.at_piston else f"{self.equation} [SI]"
+        return f"{what} ≈ {line}"
+
+    @property
+    def sure(self) -> bool:
+        """Whether it goes before free curves: a few monomials that leave next to nothing."""
+        return self.share >= SURE and len(self.terms) <= FEW and bool(self.variables)
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """The variables of its first monomial that has any, in the order they stand there."""
+        for name in self.terms:
+            found = [word for word in _NAME.findall(name) if word != "sign"]
+            if found:
+                return tuple(dict.fromkeys(found))
+        return ()
+
+
+def surest(formulas: Sequence[Formula]) -> Formula | None:
+    """Return the sure formula that leaves least, None where none is sure."""
+    return max((f for f in formulas if f.sure), key=lambda f: f.share, default=None)
+
+
+def formula(
+    train: Board, left: Array, judge: Board, judge_left: Array, equation: str
+) -> Formula | None:
+    """Return the formula of what is left of an equation, None where none takes half of it.
+
+    `left` (M,) and `judge_left` are residuals under the model of `train` (rebased to it).
+    """
+    first = side_of(train, left, equation)
+    second = side_of(judge, judge_left, equation)
+    if first is None or second is None:
+        return None
+    names, one, two = _library(train.rig, equation, first, second)
+    both = Side((), np.concatenate((first.rest, second.rest)), np.zeros((0, 0)))
+    chosen = _selected(np.concatenate((one, two)), both)
+    share = judged(one[:, chosen], first, two[:, chosen], second) if chosen else 0.0
+    if share < OFFERED:
+        return None
+    values = fitted_to(one[:, chosen], first)
+    terms = {names[k]: float(v) for k, v in zip(chosen, values, strict=True)}
+    at_piston = equation.startswith("torque") and not train.rig.electric
+    return Formula(equation, terms, share, at_piston)
+
+
+def _library(
+    rig: Rig, equation: str, one: Side, two: Side
+) -> tuple[list[str], Array, Array]:  # fmt: skip
+    """Return the monomials' names and their columns on either side, what is one left out."""
+    joint = int(equation.rsplit("_", 1)[1]) - 1
+    every = [*one.parts, *two.parts]
+    travel = max(float(np.ptp(p.scene.signals.s[:, joint])) for p in every)
+    made = [_monomials(rig, equation, p.seen, joint, travel) for p in every]
+    names = list(made[0])
+    stacks = [np.column_stack([m[n] for n in names]) for m in made]
+    count = len(one.parts)
+    first, second = columns_of(one, stacks[:count]), columns_of(two, stacks[count:])
+    both = np.concatenate((first, second))
+    size = np.linalg.norm(both, axis=0)
+    kept: list[int] = []
+    for k in np.flatnonzero(size > 1e-12):
+        unit = both[:, k] / size[k]
+        if all(abs(float(unit @ both[:, j])) < ALIKE * size[j] for j in kept):
+            kept.append(int(k))
+    return [names[k] for k in kept], first[:, kept], second[:, kept]
+
+
+def _monomials(
+    rig: Rig, equation: str, seen: Signals, joint: int, travel: float
+) -> dict[str, Array]:  # fmt: skip
+    """Return the monomials (n,) by name, simpler ones first: of two that are one, these stay."""
+    i, t = joint + 1, seen.t
+    place, v = ch.channel(rig.position_kind, i), f"velocity_{i}"
+    s, sd = (seen.q, seen.qd) if rig.electric else (seen.s, seen.sd)
+    x, w = s[:, joint], sd[:, joint]
+    sign = factor_of("direction", seen, joint, travel)
+    out = {
+        "1": np.ones(len(t)), place: x, f"{place}²": x**2, f"{place}³": x**3,
+        v: w, f"{v} |{v}|": w * np.abs(w), f"{v}²": w**2, f"{v}³": w**3,
+        f"sign({v})": sign, f"{place} {v}": x * w, f"{place} sign({v})": x * sign,
+        f"{place}² {v}": x**2 * w, "time": t, f"time {v}": t * w,
+    }  # fmt: skip
+    if rig.electric:
+        return out
+    cap, rod, u = seen.p_cap[:, joint], seen.p_rod[:, joint], seen.u[:, joint]
+    sides = {ch.channel(ch.CAP, i): cap, ch.channel(ch.ROD, i): rod}
+    for name, y in sides.items():
+        out[f"{name} time"] = y * t
+    if equation.startswith("torque"):
+        # Pressures, squared too, are the balance's other side: they would take whatever it lacks.
+        out |= {f"{name} sign({v})": y * sign for name, y in sides.items()}
+        return {name: seen.G[:, joint] * y for name, y in out.items()}
+    # So is the velocity in a flow's, whatever it is multiplied with: a boom that only comes down
+    # has all its products alike.
+    out = {name: y for name, y in out.items() if v not in name}
+    out |= {f"{name}²": y**2 for name, y in sides.items()}
+    spool = ch.channel(ch.SPOOL, i)
+    out |= {spool: u, f"{spool}²": u**2, f"{spool} |{spool}|": u * np.abs(u), f"{spool}³": u**3}
+    for name, y in {**sides, ch.SUPPLY: seen.p_s}.items():
+        out |= {name: y, f"{name} {spool}": y * u}
+    return out | {f"{place} {spool}": x * u, f"{spool} time": u * t}
+
+
+def _selected(columns: Array, side: Side) -> list[int]:
+    """Return the columns chosen, in the order they were; none idle."""
+    chosen: list[int] = []
+    share = 0.0
+    while len(chosen) < min(MOST, columns.shape[1]):
+        free = [k for k in range(columns.shape[1]) if k not in chosen]
+        found = {k: _share([*chosen, k], columns, side) for k in free}
+        best = max(free, key=lambda k: found[k])
+        if found[best] < share + ADDS:
+            break
+        chosen, share = [*chosen, best], found[best]
+    for k in list(chosen):
+        rest = [j for j in chosen if j != k]
+        if rest and _share(rest, columns, side) > share - ADDS:
+            chosen = rest
+    return chosen
+
+
+def _share(chosen: list[int], columns: Array, side: Side) -> float:
+    """Return the share of a side's energy above noise that the chosen columns take of it."""
+    return judged(columns[:, chosen], side, columns[:, chosen], side)

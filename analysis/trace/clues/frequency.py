@@ -1,0 +1,79 @@
+"""A clue of its own: what is left repeats at one frequency, whatever the joint does.
+
+Hum of a pump, of a mains supply, of a loop nearby. Of the training records' lines most of the power
+stands in one place though the excitation holds many; the frequency is then searched about it, and
+judged on the held-out records, where a sine and a cosine of it (phases are free in every record)
+must take the energy above noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.trace.data.regression_data import Board
+from analysis.trace.data.spectral_lines import Lines
+from analysis.trace.result import Dependence
+from analysis.trace.search.hypothesis import excess_of
+
+Array = NDArray[np.float64]
+
+FREQUENCY = "frequency"
+MANY = 8  # excited lines: of fewer, most of anything stands in one place
+BESIDE = 1  # line on either side of the highest: a frequency between two lines stands in both
+FIRST = 5  # line: fewer turns in a period are drift
+PEAK = 0.6  # share of the power that stands there
+LEAST = 0.5  # share of the held-out energy that it must take
+STEPS = 41  # of the search, over one line on either side
+
+
+def frequency_clue(
+    found: Sequence[Lines], train: Board, left: Array, judge: Board, judge_left: Array
+) -> Dependence | None:
+    """Return the clue of the loudest equation that repeats at one frequency, None of none.
+
+    `left` (M,) and `judge_left` are whitened residuals of averaged records, as in `clues`.
+    """
+    for one in sorted(found, key=lambda one: -one.loud_after):
+        near = _peak(one) if one.loud_after >= 1.0 else None
+        if near is None:
+            continue
+        width = one.frequency[1]
+        tried = np.linspace(near - width, near + width, STEPS)
+        f = max(tried, key=lambda f: _taken(train, left, one.equation, float(f)))
+        energy = excess_of(judge, judge_left)[one.equation]
+        share = _taken(judge, judge_left, one.equation, float(f)) / max(energy, 1e-300)
+        if energy > 0 and share >= LEAST:
+            words = f"a frequency of {f:.3g} Hz"
+            return Dependence(FREQUENCY, min(1.0, share), one.equation, words=words)
+    return None
+
+
+def _peak(one: Lines) -> float | None:
+    """Return where [Hz] most of what is left stands, None where it is spread."""
+    power = np.maximum(one.after, 0.0)
+    power[0] = 0.0
+    if int(one.excited.sum()) < MANY or not power.any():
+        return None
+    k = int(np.argmax(power))
+    if k < FIRST:
+        return None
+    here = slice(k - BESIDE, k + BESIDE + 1)
+    if power[here].sum() < PEAK * power.sum():
+        return None
+    return float(np.average(one.frequency[here], weights=power[here]))
+
+
+def _taken(stage: Board, left: Array, equation: str, f: float) -> float:
+    """Return the energy above chance that a sine and a cosine of f [Hz] take in all records."""
+    total = 0.0
+    for scene, rows in zip(stage.scenes, stage.rows, strict=True):
+        for s in stage.segments:
+            if s.group == scene.group and s.equation == equation:
+                angle = 2 * np.pi * f * rows[equation].time
+                waves = np.column_stack((np.sin(angle), np.cos(angle)))
+                Q, _ = np.linalg.qr(waves)
+                total += float(np.sum((Q.T @ left[s.where]) ** 2)) - 2.0
+    return total

@@ -1,0 +1,1 @@
+"""What a trace works on: conditioned records, whitened residuals, noise floor, candidates."""

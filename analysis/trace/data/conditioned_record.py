@@ -1,0 +1,175 @@
+"""Evidence: every record conditioned once, its rows, and columns of candidates beside them.
+
+A `Sheet` holds one record's rows of every equation under a model, whitened by the noise floor of
+their group (run, step, equation), so that a residual of 1 is the size of the noise whatever its
+unit. Effects that change the signals (`prepare`) enter as a pseudo-column: with X', y' the rows
+after the change and beta the present coefficients,
+ d = (y - X beta) - (y' - X' beta),
+which to first order in the change is what the effect puts into the residual.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.effects.base import SENSOR, ordered
+from analysis.identify import checks as ck
+from analysis.regression.rows import Filtering, Rows, default_filtering, record_rows
+from analysis.signals.conditioning import Signals, condition
+from analysis.terms.base import FAMILIES, Columns, Term, Used
+from rig.model.records import Record, Run
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One record made ready: its signals under the channel filter, its filters, its equations.
+
+    `families` are the families of rows that are looked at, by default all.
+    """
+
+    run: int
+    record: Record
+    signals: Signals
+    filtering: Filtering
+    families: tuple[str, ...] = tuple(FAMILIES)
+
+    @property
+    def group(self) -> tuple[int, str]:
+        """Which repeats belong together: the run and the step."""
+        return self.run, self.record.step
+
+
+def trace_filtering(record: Record) -> Filtering:
+    """Return the default filters with a decimation that whole periods are multiples of.
+
+    Rows of successive periods then stand at the same phase and can be compared one by one.
+    """
+    chosen = default_filtering(record)
+    if not record.period:
+        return chosen
+    step = next(k for k in range(chosen.step, 0, -1) if record.period % k == 0)
+    return replace(chosen, step=max(step, (chosen.step + 1) // 2))
+
+
+def scenes(
+    rig: Rig,
+    runs: Sequence[Run],
+    filtering: Callable[[Record], Filtering] = trace_filtering,
+    families: tuple[str, ...] = tuple(FAMILIES),
+) -> list[Scene]:
+    """Condition every record of the runs; raises InputError for a record that cannot be used."""
+    out = []
+    for index, run in enumerate(runs):
+        for record in run.records:
+            ck.refuse_dead_channels(rig, record)
+            filters = filtering(record)
+            signals = condition(rig, record, filters.channels)
+            out.append(Scene(index, record, signals, filters, families))
+    return out
+
+
+def held(term: Term, scene: Scene) -> bool:
+    """Tell whether an effect at a joint cannot show because the joint is locked.
+
+    A sensor of a locked joint still tells where that joint stands.
+    """
+    where = term.where
+    if not where.startswith("joint ") or getattr(term, "stage", None) == SENSOR:
+        return False
+    return int(where.split()[1]) in scene.record.locked
+
+
+def changes_signals(term: Term) -> bool:
+    """Tell whether a term changes what all terms see, or where the equations hold."""
+    kind = type(term)
+    return kind.prepare is not Term.prepare or kind.valid is not Term.valid
+
+
+def acts_on(rig: Rig, term: Term, family: str) -> bool:
+    """Tell whether a family's rows need a term: it has columns there, or alters their signals."""
+    if any(c.family == family for c in term.coefficients(rig)):
+        return True
+    return changes_signals(term) and family in getattr(term, "alters", FAMILIES)
+
+
+def scene_rows(rig: Rig, terms: Sequence[Used], scene: Scene) -> dict[str, Rows]:
+    """Return the rows of one record under a model (see `analysis.regression.rows.record_rows`)."""
+    return record_rows(rig, ordered(terms), scene.signals, scene.filtering, scene.families)
+
+
+def prepared(rig: Rig, terms: Sequence[Used], scene: Scene) -> Signals:
+    """Return the signals of a record as the terms of a model see them."""
+    signals = scene.signals
+    for used in ordered(terms):
+        signals = used.term.prepare(rig, signals, used.shape)
+    return signals
+
+
+def filtered(columns: Mapping[str, Array], scene: Scene, rows: Rows) -> dict[str, Array]:
+    """Filter point-by-point columns (n,) as `rows` were, at the instants of `rows`."""
+    names = list(columns)
+    reach, filters = scene.filtering.channels.reach, scene.filtering
+    n = scene.record.samples
+    stack = np.column_stack([columns[name] for name in names])[reach : n - reach]
+    time = scene.signals.t[reach : n - reach]
+    if filters.rows is not None:
+        stack_out = filters.rows.decimate(stack, filters.step)
+        first = -(-2 * filters.rows.reach // filters.step) * filters.step - filters.rows.reach
+        time = time[first + filters.step * np.arange(len(stack_out))]
+    else:
+        stack_out, time = stack[:: filters.step], time[:: filters.step]
+    at = np.searchsorted(time, rows.time - 1e-9)
+    return {name: stack_out[at, k] for k, name in enumerate(names)}
+
+
+def candidate_columns(
+    rig: Rig,
+    terms: Sequence[Used],
+    scene: Scene,
+    seen: Signals,
+    rows: Mapping[str, Rows],
+    beta: Mapping[str, float],
+    used: Used,
+) -> dict[str, dict[str, Array]]:
+    """Return what a candidate would add to a record's rows: equation -> name -> column.
+
+    `seen` are the signals under `terms`, `rows` the rows under `terms`, `beta` their coefficients
+    (of the rows, b as 1/b). The pseudo-column of a change of signals is named ''.
+    """
+    if not changes_signals(used.term):
+        raw: Columns = used.term.columns(rig, seen, used.shape)
+        return {
+            name: filtered(raw[name], scene, rows[name])
+            for name in rows
+            if name in raw and any(np.any(v) for v in raw[name].values())
+        }
+    changed = scene_rows(rig, (*terms, used), scene)
+    own = [c.parameter for c in used.term.coefficients(rig)]
+    out: dict[str, dict[str, Array]] = {}
+    for name, before in rows.items():
+        after = changed[name]
+        _, here, there = np.intersect1d(before.time, after.time, return_indices=True)
+        difference = np.zeros(len(before.rhs))
+        difference[here] = residual(before, beta)[here] - residual(after, beta)[there]
+        found = {"": difference}
+        for k, parameter in enumerate(after.names):
+            if parameter in own and np.any(after.matrix[:, k]):
+                found[parameter] = np.zeros(len(before.rhs))
+                found[parameter][here] = after.matrix[there, k]
+        found = {key: column for key, column in found.items() if np.any(column)}
+        if found:
+            out[name] = found
+    return out
+
+
+def residual(rows: Rows, beta: Mapping[str, float]) -> Array:
+    """Return y - X beta (m,), coefficients that `beta` lacks being zero."""
+    vector = np.array([beta.get(name, 0.0) for name in rows.names])
+    return np.asarray(rows.rhs - rows.matrix @ vector)

@@ -1,0 +1,159 @@
+"""Noise floor: what of a residual repeats (model error) and what does not (noise).
+
+With n repeats r_k(t) of one excitation,
+ noise^2 = mean_t var_k r_k (ddof 1),   repeatable^2 = mean_t (mean_k r_k)^2 - noise^2 / n.
+A record that is the only repeat of its step is cut into its periods, which repeat one another as
+records do. Where there is neither, the rig's stated sensor noise, put through the same rows,
+stands in: that sees no noise that the rig file does not state, and is said to be weaker.
+
+The floor lies no lower than `LEAST` of the stated noise: with sensors so much better than their
+data sheet (or simulated without noise) repeats tell apart what no bench would ask about, and a
+clean one would never be clean.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.regression.noise import disturbed
+from analysis.regression.rows import Rows
+from analysis.signals.conditioning import condition, moving_joints
+from analysis.terms.base import Used
+from analysis.trace.data.conditioned_record import Scene, residual, scene_rows
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+
+REPEATS, PERIODS, STATED = "repeats", "periods", "stated noise"
+Group = tuple[int, str]
+LEAST = 0.2  # of the noise that the rig file states
+NO_ROWS = 1e-30  # SI: where every row is masked nothing is weighed by it
+
+
+@dataclass(frozen=True)
+class Floor:
+    """The split of one equation's residual in one group of records, SI.
+
+    `source` says what the noise was told from; `count` repeats or periods stand behind it.
+    """
+
+    group: Group
+    equation: str
+    noise: float
+    repeatable: float
+    total: float
+    count: int
+    source: str
+
+    @property
+    def ratio(self) -> float:
+        """The repeatable part over the noise."""
+        return self.repeatable / self.noise if self.noise > 0 else float("inf")
+
+
+def split(repeats: Array) -> tuple[float, float]:
+    """Return noise and repeatable rms of residuals (n, m) of n repeats."""
+    n = len(repeats)
+    noise2 = float(np.mean(np.var(repeats, axis=0, ddof=1)))
+    mean2 = float(np.mean(np.mean(repeats, axis=0) ** 2))
+    return float(np.sqrt(noise2)), float(np.sqrt(max(0.0, mean2 - noise2 / n)))
+
+
+def floors(
+    rig: Rig,
+    terms: Sequence[Used],
+    members: Sequence[Scene],
+    rows: Sequence[Mapping[str, Rows]],
+    beta: Mapping[str, float],
+) -> list[Floor]:
+    """Return the split of every equation of every group of records under a model."""
+    groups: dict[Group, list[int]] = {}
+    for index, scene in enumerate(members):
+        groups.setdefault(scene.group, []).append(index)
+    out = []
+    for group, indices in groups.items():
+        stated = stated_noise(rig, terms, members[indices[0]], rows[indices[0]], beta)
+        for equation in rows[indices[0]]:
+            parts = [rows[i][equation] for i in indices if equation in rows[i]]
+            left = [residual(r, beta) for r in parts]
+            every = np.concatenate(left)
+            total = float(np.sqrt(np.mean(every**2))) if len(every) else 0.0  # all rows masked
+            table, source = repeats_of(members[indices[0]], parts, left)
+            if table is not None:
+                noise, repeatable = split(table)
+                noise = max(noise, LEAST * stated[equation])
+                out.append(Floor(group, equation, noise, repeatable, total, len(table), source))
+                continue
+            noise = stated[equation]
+            rest = float(np.sqrt(max(0.0, total**2 - noise**2)))
+            out.append(Floor(group, equation, noise, rest, total, 1, STATED))
+    return out
+
+
+def repeats_of(
+    scene: Scene, parts: Sequence[Rows], left: Sequence[Array]
+) -> tuple[Array | None, str]:
+    """Return residuals of repeats, or of one record's periods, one under the other (n, m)."""
+    if len(parts) > 1:
+        common = parts[0].time
+        for rows in parts[1:]:
+            common = np.intersect1d(common, rows.time)
+        if len(common) >= 10:
+            picked = [r[np.isin(p.time, common)] for p, r in zip(parts, left, strict=True)]
+            return np.array(picked), REPEATS
+    if len(parts) == 1:
+        table = _periods(scene, parts[0], left[0])
+        if table is not None:
+            return table, PERIODS
+    return None, STATED
+
+
+def _periods(scene: Scene, rows: Rows, left: Array) -> Array | None:
+    """Cut a record's residual into whole periods, one under the other.
+
+    Of a record of less than three, what the first two have in common, if that is a quarter of a
+    period or more; None where there is less than that, or periods of fewer than five rows.
+    """
+    period, step = scene.record.period, scene.filtering.step
+    if not period or period % step or not len(rows.time):
+        return None
+    per = period // step
+    index = np.rint((rows.time - rows.time[0]) * scene.record.sample_rate / step).astype(int)
+    whole = (int(index[-1]) + 1) // per
+    if whole < 3:
+        least, whole = max(5, per // 4), 2
+    else:
+        least = 5
+    if per < 5:
+        return None
+    grid = np.full(whole * per, np.nan)
+    inside = index < whole * per
+    grid[index[inside]] = left[inside]
+    table = grid.reshape(whole, per)
+    table = table[:, np.isfinite(table).all(axis=0)]
+    return table if table.shape[1] >= least else None
+
+
+def stated_noise(
+    rig: Rig,
+    terms: Sequence[Used],
+    scene: Scene,
+    rows: Mapping[str, Rows],
+    beta: Mapping[str, float],
+) -> dict[str, float]:
+    """Return the rms that the rig's stated sensor noise alone puts into each residual."""
+    rng = np.random.default_rng(0)  # a prediction, the same every time
+    record = disturbed(rig, scene.record, rng)
+    moving = moving_joints(rig, scene.record)
+    signals = condition(rig, record, scene.filtering.channels, moving)
+    again = scene_rows(rig, terms, replace(scene, record=record, signals=signals))
+    out = {}
+    for name, before in rows.items():
+        _, a, b = np.intersect1d(before.time, again[name].time, return_indices=True)
+        change = residual(again[name], beta)[b] - residual(before, beta)[a]
+        out[name] = float(np.sqrt(np.mean(change**2))) if len(change) else NO_ROWS
+    return out

@@ -1,0 +1,230 @@
+"""The board: averaged records, their whitened residuals, and every candidate's columns on them.
+
+Repeats of one excitation are averaged channel by channel; the average's rows carry the columns,
+and each repeat keeps its own residual. So 12 records of 10 s become a table of a few thousand
+rows in which the whole catalogue fits, and half-samples and sign flips cost one product each.
+Rows are whitened by the noise floor and weighted by the root of the number of repeats: noise then
+adds 1 per row to a residual's energy, whatever the unit and the number of repeats.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Hashable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.regression.rows import Rows
+from analysis.signals.conditioning import Signals, condition, moving_joints
+from analysis.terms.base import Used
+from analysis.trace.data.candidates import Variant
+from analysis.trace.data.conditioned_record import (
+    Scene,
+    candidate_columns,
+    held,
+    prepared,
+    residual,
+    scene_rows,
+)
+from analysis.trace.data.noise_floor import Floor, Group, floors
+from rig.model.parse import InputError
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+log = logging.getLogger(__name__)
+
+WORKERS = 2
+VISIBLE = 0.02  # share of a column that must survive the projection off the baseline
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Rows of one equation of one group on the board: `rows[where]`, of `repeats` records."""
+
+    group: Group
+    equation: str
+    where: slice
+    noise: float
+    repeats: int
+    locked: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Board:
+    """Whitened rows: `base` (M, k) of `names`, `left` (R, M) residuals of the repeats.
+
+    `left[r]` is NaN on segments with fewer repeats. `scenes` are the averaged records.
+    """
+
+    rig: Rig
+    terms: tuple[Used, ...]
+    beta: Mapping[str, float]
+    names: tuple[str, ...]
+    base: Array
+    left: Array
+    segments: tuple[Segment, ...]
+    floors: tuple[Floor, ...]
+    scenes: tuple[Scene, ...]
+    rows: tuple[Mapping[str, Rows], ...]
+    memo: dict[Hashable, dict[str, Rows]] = field(default_factory=dict, repr=False, compare=False)
+
+    @property
+    def mean(self) -> Array:
+        """The averaged residual (M,), in units of its own noise."""
+        weights = np.zeros(self.left.shape[1])
+        for segment in self.segments:
+            weights[segment.where] = np.sqrt(segment.repeats)
+        return np.asarray(np.nanmean(self.left, axis=0) * weights)
+
+
+def averaged(rig: Rig, members: Sequence[Scene]) -> list[Scene]:
+    """Return one scene per group: the repeats' channels averaged, filtered as they were."""
+    groups: dict[Group, list[Scene]] = {}
+    for scene in members:
+        groups.setdefault(scene.group, []).append(scene)
+    return [_average(rig, repeats) for repeats in groups.values()]
+
+
+def _average(rig: Rig, repeats: Sequence[Scene]) -> Scene:
+    first = repeats[0]
+    if len(repeats) == 1:
+        return first
+    n = min(scene.record.samples for scene in repeats)
+    names = [c for c in first.record.channels if all(c in s.record.channels for s in repeats)]
+    channels = {
+        name: np.mean([np.asarray(s.record.channels[name])[:n] for s in repeats], axis=0)
+        for name in names
+    }
+    record = replace(first.record, channels=channels)
+    moving = np.any([moving_joints(rig, s.record) for s in repeats], axis=0)
+    signals = condition(rig, record, first.filtering.channels, moving)
+    valid = np.all([s.signals.valid[:n] for s in repeats], axis=0)
+    return replace(first, record=record, signals=replace(signals, valid=signals.valid & valid))
+
+
+def least_squares(rig: Rig, rows: Sequence[Mapping[str, Rows]]) -> dict[str, float]:
+    """Return the coefficients of stacked rows, equations unweighted, shortest where not unique."""
+    out: dict[str, float] = {}
+    for kinds in (("torque",), ("flow_cap", "flow_rod")):
+        parts = [r for one in rows for name, r in one.items() if name.rsplit("_", 1)[0] in kinds]
+        if not parts:
+            continue
+        X, y = np.concatenate([r.matrix for r in parts]), np.concatenate([r.rhs for r in parts])
+        scale = np.linalg.norm(X, axis=0)
+        scale[scale == 0] = 1.0
+        out |= zip(
+            parts[0].names, np.linalg.lstsq(X / scale, y, rcond=1e-6)[0] / scale, strict=True
+        )
+    return out
+
+
+def board(
+    rig: Rig,
+    terms: Sequence[Used],
+    members: Sequence[Scene],
+    beta: Mapping[str, float] | None = None,
+) -> Board:
+    """Lay out records under a model with coefficients `beta`, or fitted here; see the module."""
+    every = [scene_rows(rig, terms, scene) for scene in members]
+    beta = least_squares(rig, every) if beta is None else beta
+    split = floors(rig, terms, members, every, beta)
+    mean_scenes = averaged(rig, members)
+    mean_rows = [scene_rows(rig, terms, scene) for scene in mean_scenes]
+    names = tuple(dict.fromkeys(n for one in mean_rows for r in one.values() for n in r.names))
+    noise = {(f.group, f.equation): f.noise for f in split}
+    most = max(sum(s.group == scene.group for s in members) for scene in mean_scenes)
+    base, left, segments, start = [], [], [], 0
+    kept_rows: list[dict[str, Rows]] = []
+    for scene, rows in zip(mean_scenes, mean_rows, strict=True):
+        own = [one for s, one in zip(members, every, strict=True) if s.group == scene.group]
+        kept_rows.append({})
+        for equation, mean in rows.items():
+            time = mean.time
+            for one in own:
+                time = np.intersect1d(time, one[equation].time)
+            if len(time) < 5:
+                continue
+            cut = _at(mean, time)
+            kept_rows[-1][equation] = cut
+            sigma = max(noise[scene.group, equation], 1e-30)
+            base.append(_spread(cut, names) * np.sqrt(len(own)) / sigma)
+            table = np.full((most, len(time)), np.nan)
+            for k, one in enumerate(own):
+                table[k] = residual(_at(one[equation], time), beta) / sigma
+            left.append(table)
+            where = slice(start, start + len(time))
+            segments.append(
+                Segment(scene.group, equation, where, sigma, len(own), scene.record.locked)
+            )
+            start = where.stop
+    if not segments:
+        raise InputError(
+            "the records are too short: no rows are left behind the filters' edges; record longer"
+        )
+    return Board(
+        rig, tuple(terms), beta, names, np.concatenate(base), np.concatenate(left, axis=1),
+        tuple(segments), tuple(split), tuple(mean_scenes), tuple(kept_rows),
+    )  # fmt: skip
+
+
+def _at(rows: Rows, time: Array) -> Rows:
+    kept = np.isin(rows.time, time)
+    return replace(rows, matrix=rows.matrix[kept], rhs=rows.rhs[kept], time=rows.time[kept])
+
+
+def _spread(rows: Rows, names: Sequence[str]) -> Array:
+    """Return the rows' matrix under a longer list of names."""
+    out = np.zeros((len(rows.rhs), len(names)))
+    out[:, [names.index(n) for n in rows.names]] = rows.matrix
+    return out
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A variant on the board: its whitened columns (M, c), named, and the equations it touches."""
+
+    variant: Variant
+    names: tuple[str, ...]
+    columns: Array
+    touched: frozenset[str]
+
+
+def entries(stage: Board, chosen: Sequence[Variant]) -> list[Entry]:
+    """Return the columns of every variant that shows on the board, in the variants' order."""
+    seen = [prepared(stage.rig, stage.terms, scene) for scene in stage.scenes]
+    with ThreadPoolExecutor(WORKERS) as pool:
+        found = pool.map(lambda v: _entry(stage, v, seen), chosen)
+    return [entry for entry in found if entry is not None]
+
+
+def _entry(stage: Board, variant: Variant, seen: Sequence[Signals]) -> Entry | None:
+    columns: dict[str, Array] = {}
+    touched = set()
+    M = stage.base.shape[0]
+    for index, scene in enumerate(stage.scenes):
+        if held(variant.effect, scene):
+            continue
+        rows = stage.rows[index]
+        found = candidate_columns(
+            stage.rig,
+            stage.terms,
+            scene,
+            seen[index],
+            rows,
+            stage.beta,
+            variant.used,
+        )
+        for segment in stage.segments:
+            if segment.group == scene.group and segment.equation in found:
+                touched.add(segment.equation)
+                for name, column in found[segment.equation].items():
+                    whole = columns.setdefault(name, np.zeros(M))
+                    whole[segment.where] += column * np.sqrt(segment.repeats) / segment.noise
+    if not columns or not all(np.isfinite(c).all() for c in columns.values()):
+        return None
+    return Entry(
+        variant, tuple(columns), np.column_stack(list(columns.values())), frozenset(touched)
+    )

@@ -1,0 +1,228 @@
+"""Lines: where in frequency a residual repeats, and whether its cause is symmetric.
+
+A multisine of odd lines leaves all even lines and some odd ones empty. What is linear answers on
+the excited lines alone, a symmetric nonlinearity (dry friction, a dead band) also on the empty odd
+ones, an asymmetric one (tank pressure, other levels either way) on the even ones (Pintelon and
+Schoukens, System Identification: A Frequency Domain Approach, 2012, ch. 4). With A_k,r the rms
+amplitude of line k in repeat r,
+ repeatable_k = |mean_r A_k,r|^2 - noise_k / n,   noise_k = var_r A_k,r (ddof 1).
+Rows at a record's ends and masked ones are absent. Half the sum and half the difference of what is
+half a period apart hold even and odd lines alone; in each the lines are fitted by least squares.
+The linkage and the two piston areas bend every motion a little: the piston's own velocity says how
+much of a linear cause lies off the excited lines.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.regression.rows import Rows, lines_cutoff
+from analysis.trace.data.conditioned_record import Scene, filtered
+from analysis.trace.data.noise_floor import Group
+from analysis.trace.data.regression_data import Board, Segment
+
+Array = NDArray[np.float64]
+
+CONSTANT, EXCITED, ODD, EVEN = "constant", "excited", "odd", "even"
+KINDS = (CONSTANT, EXCITED, ODD, EVEN)
+WORDS = {
+    CONSTANT: "constant", EXCITED: "on excited lines", ODD: "on empty odd ones",
+    EVEN: "on even ones",
+}  # fmt: skip
+ABOVE = 1.2  # band over the row filter's cutoff, where that filter ends
+PRESENT = 0.7  # share of a period's pairs of rows that must be there
+LINES_PER_PAIR = 0.8  # each pair gives two numbers and each line has two: fewer than there are
+RIDGE = 1e-2  # of a line's own weight, against what short gaps leave undetermined
+STANDS = 4.0  # times what noise alone puts into a kind of lines, in its standard deviations
+ASYMMETRIC, SYMMETRIC = 0.25, 0.1  # shares from which a nonlinearity is spoken of
+LEAST_TOLD = 0.005  # share below which a kind of lines is not spoken of
+OWN = 3.0  # times the velocity's own share
+
+
+@dataclass(frozen=True)
+class Lines:
+    """The lines 0..K of one equation's residual in one group of records, powers (rms squared, SI).
+
+    `frequency` [Hz], `repeatable` and `noise` of one repeat, each (K + 1,); `after` is what repeats
+    under the model that the trace ended with; `excited` marks the excited lines. `shares` are of
+    the repeatable power by kind, `shares_after` those of what is left, `own` those of the joint's
+    velocity; `loud` is the repeatable rms over the noise of the whole residual.
+    """
+
+    group: Group
+    equation: str
+    frequency: Array
+    repeatable: Array
+    noise: Array
+    after: Array
+    excited: NDArray[np.bool_]
+    shares: Mapping[str, float]
+    shares_after: Mapping[str, float]
+    own: Mapping[str, float]
+    loud: float
+
+    @property
+    def loud_after(self) -> float:
+        """What repeats after, rms over the noise of one repeat, both over all lines."""
+        return float(np.sqrt(max(0.0, self.after.sum()) / max(float(self.noise.sum()), 1e-300)))
+
+    @property
+    def text(self) -> str:
+        """Where it repeats, and what that means, in words."""
+        where = ", ".join(
+            f"{100 * share:.0f} % {WORDS[kind]}"
+            for kind, share in self.shares.items()
+            if share >= LEAST_TOLD
+        )
+        return f"{self.equation} in {self.group[1]}: {where or 'no line'}: {self.meaning}"
+
+    @property
+    def meaning(self) -> str:
+        """What the lines say of the cause of the whole residual."""
+        return meaning(self.shares, self.own)
+
+    @property
+    def meaning_after(self) -> str:
+        """What the lines say of the cause of what is left."""
+        return meaning(self.shares_after, self.own)
+
+
+def meaning(shares: Mapping[str, float], own: Mapping[str, float]) -> str:
+    """Return what the shares of a residual say of its cause, beside those of the velocity."""
+    if not any(shares.values()):
+        return "nothing above the noise"
+    moving = 1.0 - shares[CONSTANT]
+    if moving < ASYMMETRIC:
+        return "a constant"
+    found = []
+    for kind, least, word in (
+        (EVEN, ASYMMETRIC, "asymmetric"),
+        (ODD, SYMMETRIC, "a symmetric nonlinearity"),
+    ):
+        share = shares[kind] / moving
+        if share > least and share > OWN * own[kind]:
+            found.append((share, word))
+    if not found:
+        return "linear in the motion"
+    found.sort(reverse=True)
+    if len(found) == 2 and found[1][0] < 0.5 * found[0][0]:
+        return f"mostly {found[0][1]}"
+    return " and ".join(word for _, word in found)
+
+
+def lines(stage: Board, after: Array) -> tuple[Lines, ...]:
+    """Return the lines of every equation and group excited by odd lines, the loudest first.
+
+    `after` (M,) is the averaged whitened residual of the model that the trace ended with.
+    """
+    loud = {(f.group, f.equation): f.ratio for f in stage.floors}
+    out = []
+    for scene, rows in zip(stage.scenes, stage.rows, strict=True):
+        record = scene.record
+        if not record.period or not record.lines or not all(k % 2 for k in record.lines):
+            continue
+        for s in stage.segments:
+            if s.group == scene.group:
+                left = stage.left[: s.repeats, s.where] * s.noise
+                rest = after[s.where] * s.noise / np.sqrt(s.repeats)
+                found = _of_segment(s, scene, rows[s.equation], np.vstack((left, rest)),
+                                    loud[s.group, s.equation])  # fmt: skip
+                if found is not None:
+                    out.append(found)
+    return tuple(sorted(out, key=lambda one: -one.loud))
+
+
+def _of_segment(
+    s: Segment, scene: Scene, rows: Rows, residuals: Array, loud: float
+) -> Lines | None:
+    """Return the lines of residuals (repeats + 1, m), the last of them what is left."""
+    record = scene.record
+    highest = max(record.lines)
+    per = record.period // scene.filtering.step
+    place = np.rint((rows.time - rows.time[0]) * record.sample_rate / scene.filtering.step)
+    pairs = _pairs(place.astype(np.int64), per)
+    base = record.sample_rate / record.period
+    K = int(min([ABOVE * lines_cutoff(record) / base, *(LINES_PER_PAIR * len(p) for p in pairs)]))
+    if not pairs or highest > K:
+        return None
+    joint = int(s.equation.rsplit("_", 1)[1]) - 1
+    speed = filtered({"v": scene.signals.sd[:, joint]}, scene, rows)["v"]
+    series = np.vstack((residuals, speed))
+    spectra = np.stack([spectrum(place[p[:, 0]] / per, series[:, p], K) for p in pairs])
+    single = spectra[:, :-2].reshape(-1, K + 1)  # periods of one repeat are repeats too
+    n = len(single)
+    # A single one does not tell its own noise: the floor's, spread evenly.
+    noise = single.var(axis=0, ddof=1) if n > 1 else np.full(K + 1, s.noise**2 / (K + 1))
+    excited = np.isin(np.arange(K + 1), record.lines)
+    own = np.abs(spectra[:, -1].mean(axis=0)) ** 2
+    own[0] = 0.0  # a mean velocity is what the ends of the record cut
+    before = np.abs(single.mean(axis=0)) ** 2 - noise / n
+    rest = np.abs(spectra[:, -2].mean(axis=0)) ** 2 - noise / n
+    frequency = np.asarray(np.arange(K + 1) * base, dtype=np.float64)
+    return Lines(
+        s.group, s.equation, frequency, before, noise, rest, excited,
+        _shares(before, noise / n, excited), _shares(rest, noise / n, excited),
+        _shares(own, np.zeros(K + 1), excited), loud,
+    )  # fmt: skip
+
+
+def _pairs(place: NDArray[np.int64], per: int) -> list[NDArray[np.int64]]:
+    """Return, for each period that is there nearly whole, its rows half a period apart (p, 2)."""
+    if per % 2:
+        return []
+    at = np.full(int(place[-1]) + 1 + per if len(place) else per, -1)
+    at[place] = np.arange(len(place))
+    whole = at[: len(at) // per * per].reshape(-1, 2, per // 2).transpose(0, 2, 1)
+    found = [p[(p >= 0).all(axis=1)] for p in whole]
+    return [p for p in found if len(p) >= PRESENT * per / 2]
+
+
+def spectrum(phase: Array, series: Array, K: int) -> NDArray[np.complex128]:
+    """Return the rms amplitudes (s, K + 1) of lines 0..K of series (s, p, 2).
+
+    `series` are pairs at phases (p,) [periods] and half a period later; |amplitude|^2 sums to the
+    mean square.
+    """
+    first, second = series[..., 0], series[..., 1]
+    out = np.zeros((len(series), K + 1), dtype=np.complex128)
+    for start, part in ((0, 0.5 * (first + second)), (1, 0.5 * (first - second))):
+        number = np.arange(start, K + 1, 2)
+        angle = 2 * np.pi * np.outer(phase, number)
+        X = np.sqrt(np.where(number, 2.0, 1.0)) * np.stack((np.cos(angle), np.sin(angle)))
+        X = np.concatenate(tuple(X), axis=1)
+        weight = X.T @ X / len(phase) + RIDGE * np.eye(X.shape[1])
+        found = np.linalg.solve(weight, X.T @ part.T / len(phase)).T
+        out[:, start::2] = found[:, : len(number)] - 1j * found[:, len(number) :]
+    return out
+
+
+def members(excited: NDArray[np.bool_]) -> dict[str, NDArray[np.bool_]]:
+    """Return which of the lines 0..K are of which kind, each (K + 1,)."""
+    number = np.arange(len(excited))
+    odd = (number % 2 == 1) & ~excited
+    even = (number % 2 == 0) & (number > 0)
+    return dict(zip(KINDS, (number == 0, excited, odd, even), strict=True))
+
+
+def _shares(power: Array, noise: Array, excited: NDArray[np.bool_]) -> dict[str, float]:
+    """Return the share of the power by kind of line; 0 of a kind that noise would explain."""
+    sums = {}
+    for kind, own in members(excited).items():
+        total = float(power[own].sum())
+        scatter = float(np.sqrt(np.sum(noise[own] ** 2)))
+        sums[kind] = total if total > STANDS * scatter else 0.0
+    whole = sum(sums.values())
+    return {kind: v / whole if whole > 0 else 0.0 for kind, v in sums.items()}
+
+
+def loudest(found: Sequence[Lines], least: float = 1.0, most: int = 3) -> list[Lines]:
+    """Return the loudest, one of each equation, where the residual is above its noise."""
+    best: dict[str, Lines] = {}
+    for one in found:
+        if one.loud >= least:
+            best.setdefault(one.equation, one)
+    return list(best.values())[:most]

@@ -1,0 +1,109 @@
+"""What is known to act beside the baseline and is no effect to be named: the oil's temperature.
+
+Oil warms from record to record, and its bulk modulus falls with it. On records that measure the
+temperature this is one column (`analysis.identify.estimators.nuisance.BulkTemperature`) with
+nothing to guess. Without it every long experiment leaves a residual that repeats, and true effects
+found in the same equations could not be taken to the noise floor.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from analysis.identify.estimators.nuisance import (
+    IMPLAUSIBLE,
+    KAPPA,
+    SLOPE,
+    SLOPE_STD,
+    BulkTemperature,
+)
+from analysis.simulation.model import Estimate, Model
+from analysis.terms import baseline_of
+from analysis.terms.base import Used
+from rig.model import channels as ch
+from rig.model.records import Run
+from rig.model.rig import Rig
+
+LEAST = 0.05  # [K] between all records: less moves b by a fraction of 0.001
+
+
+def base_terms(rig: Rig, runs: Sequence[Run]) -> tuple[Used, ...]:
+    """Return the rig's baseline terms with those that belong beside them on these records."""
+    terms = tuple(map(Used, baseline_of(rig)))
+    return (*terms, *beside(terms, runs))
+
+
+def beside(
+    terms: Sequence[Used], runs: Sequence[Run], holdout: Sequence[Run] = ()
+) -> tuple[Used, ...]:
+    """Return the terms that belong beside the baseline on these records, held-out ones included.
+
+    Their b is that of the mean temperature of `runs`: what these records know best, and what a
+    change of temperature in others turns about.
+    """
+    if "compressibility" not in {used.term.name for used in terms}:
+        return ()
+    train, judge = (_temperatures(x) for x in (runs, holdout))
+    if not train or not np.ptp([*train, *judge]) >= LEAST:  # nor where one was not measured
+        return ()
+    return (Used(BulkTemperature(reference=float(np.mean(train)))),)
+
+
+def _temperatures(runs: Sequence[Run]) -> list[float]:
+    """Return each record's mean oil temperature [degC], NaN where it was not measured."""
+    return [
+        float(np.nanmean(np.asarray(r.channels[ch.TEMPERATURE])))
+        if ch.TEMPERATURE in r.channels
+        else np.nan
+        for run in runs
+        for r in run.records
+    ]
+
+
+def plausible(kappa: float, beta: Mapping[str, float]) -> float:
+    """Return 1/b's change per kelvin [1/(Pa K)], held to what oil and hoses can do."""
+    size = abs(beta.get("b", 0.0))  # of the rows: 1/b
+    low, high = (-(SLOPE + sign * IMPLAUSIBLE * SLOPE_STD) * size for sign in (1.0, -1.0))
+    return float(np.clip(kappa, low, high))
+
+
+def stripped(model: Model) -> Model:
+    """Return the model at the rig's nominal temperature: the parameters without the nuisance."""
+    (term,) = [u.term for u in model.terms if isinstance(u.term, BulkTemperature)] or (None,)
+    names = list(model.parameters)
+    if term is None or KAPPA not in names:
+        return model
+    b, kappa = names.index("b"), names.index(KAPPA)
+    found = model.parameters["b"]
+    covariance = model.covariance.copy()
+    if found.identified and term.reference is not None:
+        kelvin = model.rig.oil.temperature - term.reference
+        found, more = _at(found, model.parameters[KAPPA], kelvin)
+        covariance[b, b] += more
+    kept = [k for k in range(len(names)) if k != kappa]
+    return replace(
+        model,
+        terms=tuple(u for u in model.terms if not isinstance(u.term, BulkTemperature)),
+        parameters={n: found if n == "b" else model.parameters[n] for n in names if n != KAPPA},
+        covariance=covariance[np.ix_(kept, kept)],
+    )
+
+
+def _at(b: Estimate, kappa: Estimate, kelvin: float) -> tuple[Estimate, float]:
+    """Return b `kelvin` warmer, and by how much its variance grows.
+
+    1/b(T) = 1/b + kappa (T - T0); kappa is the records' joined to what is known beforehand.
+    """
+    believed, spread = -SLOPE / b.value, SLOPE_STD / b.value
+    own = kappa.std if math.isfinite(kappa.std) else math.inf
+    weight = spread**2 / (spread**2 + own**2) if math.isfinite(kappa.value) else 0.0
+    slope = weight * kappa.value + (1.0 - weight) * believed if weight else believed
+    value = b.value / (1.0 + b.value * slope * kelvin)
+    more = (value**2 * kelvin * spread) ** 2 * (1.0 - weight)
+    std = math.hypot(b.std, math.sqrt(more))
+    half = 0.5 * (b.ci95[1] - b.ci95[0]) * (std / b.std if b.std > 0 else 1.0)
+    return replace(b, value=value, std=std, ci95=(value - half, value + half)), more

@@ -1,0 +1,1 @@
+"""Judgement of a named effect: gates, intervals, invariance, error on held-out records."""

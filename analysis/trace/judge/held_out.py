@@ -1,0 +1,156 @@
+"""Error before and after, on held-out records only."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.identify.estimators.nuisance import KAPPA
+from analysis.regression.rows import Rows
+from analysis.simulation.model import Model
+from analysis.simulation.validate import validate
+from analysis.trace.data.conditioned_record import Scene, residual, scene_rows
+from analysis.trace.data.noise_floor import floors
+from analysis.trace.data.regression_data import Board
+from analysis.trace.data.temperature_nuisance import plausible
+from analysis.trace.search.refinement import Fit, Table, table
+from rig.model.parse import InputError
+from rig.model.records import Run
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Errors:
+    """RMS of each equation's residual over the held-out records, SI, beside its noise floor.
+
+    `size` is the rms of the equation's right side (torque, force or flow) under the model before.
+    """
+
+    noise: Mapping[str, float]
+    size: Mapping[str, float]
+    before: Mapping[str, float]
+    after: Mapping[str, float]
+
+
+def left(judge: Board, model: Fit) -> Array:
+    """Return the whitened held-out residual (M,) of a model fitted to other records."""
+    rows = table(judge, model.terms)
+    return rows.left(_settled(rows, model).beta)
+
+
+def settled(judge: Board, model: Fit) -> Fit:
+    """Return the model with the oil's temperature part of 1/b as the held-out records have it.
+
+    Records at one temperature say nothing of it, and others then warm up: it is no parameter of
+    the model and no effect, so that one number may be fitted on either side.
+    """
+    return _settled(table(judge, model.terms), model)
+
+
+def _settled(rows: Table, model: Fit) -> Fit:
+    if KAPPA not in rows.names:
+        return model
+    column = rows.matrix[:, rows.names.index(KAPPA)]
+    size = float(column @ column)
+    step = float(column @ rows.left(model.beta)) / size if size > 0 else 0.0
+    kappa = plausible(model.beta.get(KAPPA, 0.0) + step, model.beta)
+    return replace(model, beta={**model.beta, KAPPA: kappa})
+
+
+def errors(rig: Rig, members: Sequence[Scene], before: Fit, after: Fit) -> Errors:
+    """Return every equation's error under both models, its size and noise floor, over all records.
+
+    The floor is what does not repeat under the model after: its columns carry the sensors' noise
+    into the residual as the baseline's do.
+    """
+    one, other = (
+        [scene_rows(rig, model.terms, scene) for scene in members] for model in (before, after)
+    )
+    split = floors(rig, after.terms, members, other, after.beta)
+    floor = {(f.group, f.equation): f.noise for f in split}
+    noise: dict[str, list[float]] = {}
+    counts: dict[str, list[int]] = {}
+    for scene, rows_of in zip(members, other, strict=True):
+        for equation, rows in rows_of.items():
+            noise.setdefault(equation, []).append(floor[scene.group, equation])
+            counts.setdefault(equation, []).append(len(rows.rhs))
+    return Errors(
+        {
+            e: float(np.sqrt(np.average(np.square(noise[e]), weights=np.maximum(counts[e], 1))))
+            for e in sorted(noise)
+        },
+        _by_equation(one, lambda rows: rows.rhs),
+        _by_equation(one, lambda rows: residual(rows, before.beta)),
+        _by_equation(other, lambda rows: residual(rows, after.beta)),
+    )
+
+
+def _by_equation(
+    built: Sequence[Mapping[str, Rows]], part: Callable[[Rows], Array]
+) -> dict[str, float]:
+    """Return the rms of a part of every equation's rows over all records."""
+    found: dict[str, list[Array]] = {}
+    for rows_of in built:
+        for equation, rows in rows_of.items():
+            found.setdefault(equation, []).append(part(rows))
+    return {e: _rms(parts) for e, parts in sorted(found.items())}
+
+
+def rms_of(judge: Board, model: Fit) -> dict[str, float]:
+    """Return the rms of every equation's held-out residual, SI, repeats averaged."""
+    rest = left(judge, model)
+    found: dict[str, list[Array]] = {}
+    for s in judge.segments:
+        found.setdefault(s.equation, []).append(rest[s.where] * s.noise / np.sqrt(s.repeats))
+    return {e: _rms(parts) for e, parts in sorted(found.items())}
+
+
+def _rms(parts: Sequence[Array]) -> float:
+    joined = np.concatenate(parts)
+    return float(np.sqrt(np.mean(joined**2))) if len(joined) else float("nan")
+
+
+@dataclass(frozen=True)
+class FreeRuns:
+    """Simulations of the held-out records, by channel: mean FIT [%] and RMSE [SI] of free runs.
+
+    `window_rmse` [SI] is of windows restarted from the data; NaN where the model failed.
+    """
+
+    fit: Mapping[str, float]
+    rmse: Mapping[str, float]
+    window_rmse: Mapping[str, float]
+
+
+def free_runs(holdout: Sequence[Run], before: Model, after: Model) -> tuple[FreeRuns, FreeRuns]:
+    """Return the free runs of both models, driven by the measured spool or drive alone."""
+    one = _free_runs(holdout, before)
+    return one, one if after is before else _free_runs(holdout, after)
+
+
+def _free_runs(holdout: Sequence[Run], model: Model) -> FreeRuns:
+    try:
+        results = validate(model, holdout)
+    except InputError:  # a parameter that is not identified: there is no simulation
+        return FreeRuns({}, {}, {})
+    fits: dict[str, list[float]] = {}
+    squares: dict[str, list[float]] = {}
+    windows: dict[str, list[float]] = {}
+    for r in results:
+        for channel in r.fit:
+            lost = bool(r.failure)
+            fits.setdefault(channel, []).append(float("nan") if lost else r.fit[channel])
+            squares.setdefault(channel, []).append(float("nan") if lost else r.rmse[channel] ** 2)
+            windows.setdefault(channel, []).append(r.window_rmse[channel] ** 2)
+    return FreeRuns(
+        {c: float(np.mean(v)) for c, v in sorted(fits.items())},
+        *(
+            {c: float(np.sqrt(np.mean(v))) for c, v in sorted(x.items())}
+            for x in (squares, windows)
+        ),
+    )

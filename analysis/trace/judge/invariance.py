@@ -1,0 +1,148 @@
+"""Invariance: a cause has the same size everywhere; a look-alike has another in every corner.
+
+The tangent of a fitted set is solved again on parts of the rows: each step, each half of the
+records, each direction of motion, fast and slow. A size that moves by more than noise, than what a
+catalogue's simpler form may cause, and than what a larger effect's form may spill onto it, is none.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.effects.base import Effect, shapes_of
+from analysis.terms.base import Used
+from analysis.trace.data.noise_floor import STATED
+from analysis.trace.data.regression_data import Board
+from analysis.trace.judge.inference import Spread, blocks, others
+from analysis.trace.search.linear_fit import FORM, orthonormal
+from analysis.trace.search.refinement import Fit, jacobian, table
+
+Array = NDArray[np.float64]
+
+TOLERANCE = 0.2  # relative disagreement that a catalogue's simpler form may cause
+DEVIATIONS = 3.5
+TELLS = 0.05  # of a column's energy off the others': a subset with less says nothing of a size
+POWER = 0.25  # a subset judges a parameter that it knows this well, relative
+
+
+def subsets(stage: Board, joint: int | None) -> dict[str, Array]:
+    """Return masks (M,) of rows: each step, each half of the records, each direction of motion."""
+    M = stage.base.shape[0]
+    out: dict[str, Array] = {}
+    index = {scene.group: k for k, scene in enumerate(stage.scenes)}
+    early, ahead = np.zeros(M, dtype=bool), np.zeros(M, dtype=bool)
+    outer = np.zeros(M, dtype=bool)
+    for s in stage.segments:
+        name = f"step {s.group[1]}"
+        out.setdefault(name, np.zeros(M, dtype=bool))[s.where] = True
+        scene = stage.scenes[index[s.group]]
+        time = stage.rows[index[s.group]][s.equation].time
+        early[s.where] = time < 0.5 * (time[0] + time[-1])
+        own = joint if joint is not None else int(s.equation.rsplit("_", 1)[1]) - 1
+        at = np.clip(
+            np.rint(time * scene.record.sample_rate).astype(int), 0, len(scene.signals.t) - 1
+        )
+        ahead[s.where] = scene.signals.sd[at, own] > 0
+        size = np.abs(scene.signals.sd[at, own])
+        outer[s.where] = size > np.median(size)
+    out |= {
+        "first half": early, "second half": ~early, "extending": ahead, "retracting": ~ahead,
+        "fast": outer, "slow": ~outer,
+    }  # fmt: skip
+    return out
+
+
+def _unmeasured(stage: Board) -> NDArray[np.int64] | None:
+    """Return the block of every row (M,) where some floor is the stated noise alone, else None.
+
+    Then nobody has measured the noise, and what is left has to stand for it, block by block.
+    """
+    if all(floor.source != STATED for floor in stage.floors):
+        return None
+    numbers = blocks(stage)
+    for k, s in enumerate(stage.segments):
+        numbers[s.where] += (int(numbers.max()) + 1) * k
+    return numbers
+
+
+def _clustered(own: Array, left: Array, clusters: NDArray[np.int64]) -> float:
+    """Return the root of the sum over blocks of (own . left)^2."""
+    _, index = np.unique(clusters, return_inverse=True)
+    return float(np.linalg.norm(np.bincount(index, weights=own * left)))
+
+
+def _larger(model: Fit, stage: Board, used: Used, mask: Array) -> float:
+    """Return the energy that the largest other effect has on a subset, 0 if none is larger.
+
+    What its catalogue form misses of it (`FORM`) spills onto a smaller effect's coefficient.
+    """
+    rows = table(stage, model.terms)
+    energy = {}
+    for u in model.terms:
+        if isinstance(u.term, Effect):
+            own = [rows.names.index(c.parameter) for c in u.term.coefficients(stage.rig)]
+            values = np.array([model.beta.get(rows.names[k], 0.0) for k in own])
+            part = rows.matrix[mask][:, own] @ values
+            energy[u.term.name, u.term.where] = float(part @ part)
+    mine = energy.pop((used.term.name, used.term.where), 0.0)
+    most = max(energy.values(), default=0.0)
+    return most if most > mine else 0.0
+
+
+def _alone(columns: Array, k: int) -> Array:
+    """Return column k (m,) without what the others say."""
+    rest, own = np.delete(columns, k, axis=1), columns[:, k]
+    if not rest.shape[1]:
+        return own
+    Q = orthonormal(rest)
+    return np.asarray(own - Q @ (Q.T @ own))
+
+
+def invariance(
+    stage: Board, model: Fit, used: Used, value: Spread, joint: int | None
+) -> list[tuple[str, str, float, float]]:
+    """Return where a parameter disagrees with itself: (subset, parameter, value there, error)."""
+    names, J = jacobian(stage, model, used)
+    base = others(stage, model, names)
+    left = model.left
+    # A shape such as the presliding distance is the form's, not the effect's size.
+    sizes = {c.parameter for c in used.term.coefficients(stage.rig)}
+    sizes |= {s.parameter for s in shapes_of(stage.rig, used) if s.neutral is not None}
+    units = {c.parameter: c.unit for c in used.term.coefficients(stage.rig)}
+    units |= {s.parameter: s.unit for s in shapes_of(stage.rig, used)}
+    nothing = {s.parameter: s.neutral or 0.0 for s in shapes_of(stage.rig, used)}
+    neutral = np.array([nothing.get(n, 0.0) for n in names])
+    out = []
+    clusters = _unmeasured(stage)
+    J_all = J - base @ (base.T @ J)
+    whole = [float(np.sum(_alone(J_all, k) ** 2)) for k in range(len(names))]
+    for label, mask in subsets(stage, joint).items():
+        if not mask.any():
+            continue
+        B = orthonormal(base[mask])
+        J_s = J[mask] - B @ (B.T @ J[mask])
+        for k, name in enumerate(names):
+            if name not in sizes:
+                continue
+            if np.linalg.norm(J_s[:, k]) < 0.1 * np.linalg.norm(J[mask][:, k]):
+                continue
+            own = _alone(J_s, k)
+            size = float(own @ own)
+            # What hardly acts there tells its form's tail, not its size.
+            if size < TELLS * whole[k] or size <= 0 or not np.isfinite(value.value[k]):
+                continue
+            shift = float(own @ left[mask]) / size
+            error = 1.0 / np.sqrt(size)
+            if clusters is not None:
+                rest_of = left[mask] - B @ (B.T @ left[mask]) - own * shift
+                error = max(error, _clustered(own, rest_of, clusters[mask]) / size)
+            spill = np.sqrt(FORM * _larger(model, stage, used, mask) / size)
+            # Two levels of one effect are judged by the larger: 2 N beside 100 N is a detail.
+            alike = [j for j, n in enumerate(names) if n in sizes and units[n] == units[name]]
+            full = float(np.max(np.abs(value.value[alike] - neutral[alike])))
+            if error > POWER * full:
+                continue
+            if abs(shift) > spill + DEVIATIONS * np.hypot(error, TOLERANCE / DEVIATIONS * full):
+                out.append((label, name, float(value.value[k]) + shift, error))
+    return out

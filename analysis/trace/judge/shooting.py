@@ -1,0 +1,100 @@
+"""Effects with a hidden state once more: by multiple shooting, and which estimate stays.
+
+What the rows found begins the search (`analysis.identify.output_error.hidden_states`). The shapes
+so found take the place of the rows' where the model with them runs closer to held-out records and
+their rows are met as well as before. Else the rows' stay, for the trace's errors are errors of
+rows; but the interval of a shape is widened to hold both, since two routes to one number that
+differ by more than either allows say that the effect's form is simpler than the real one's.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from analysis.effects.base import Effect
+from analysis.identify.output_error.hidden_states import (
+    Shot,
+    completed,
+    hidden_effects,
+    rest_of,
+    shot,
+)
+from analysis.simulation.model import Estimate, Model
+from analysis.terms.base import Used
+from analysis.trace.data.regression_data import Board
+from analysis.trace.judge.held_out import rms_of
+from analysis.trace.result import Found
+from analysis.trace.search import refinement
+from analysis.trace.search.hypothesis import Listed, excess_of
+from rig.model.records import Run
+
+log = logging.getLogger(__name__)
+
+CLOSER = 0.99  # of what windows of held-out records leave
+NO_WORSE = 1.02  # times the held-out rms of any equation's rows
+
+
+@dataclass(frozen=True)
+class Reshaped:
+    """The set with the shapes that stay, and every effect's shapes by shooting."""
+
+    winner: Listed
+    shots: tuple[Shot, ...]
+
+
+def reshaped(
+    runs: Sequence[Run], holdout: Sequence[Run], after: Model, stage: Board, judge: Board,
+    winner: Listed,
+) -> Reshaped:  # fmt: skip
+    """Shoot every effect of the winner that has a hidden state; `after` is its model."""
+    if after.rig.electric or not hidden_effects(after):
+        return Reshaped(winner, ())
+    ready = completed([*runs, *holdout], after)
+    if ready is None:
+        return Reshaped(winner, ())
+    shots, after = [], ready
+    for effect in hidden_effects(after):
+        found = shot(runs, after, effect)
+        if found is None:
+            continue
+        other = _with(after.terms, effect, found)
+        before, now = (
+            rest_of(holdout, model, effect) for model in (after, replace(after, terms=other))
+        )
+        fitted = refinement.fit(stage, _with(winner.fit.terms, effect, found))
+        rows, again = (rms_of(judge, fit) for fit in (winner.fit, fitted))
+        better = now < CLOSER * before and all(again[e] <= NO_WORSE * rows[e] for e in rows)
+        shots.append(replace(found, before=before, after=now, taken=better and found.settled))
+        if shots[-1].taken:
+            winner = replace(
+                winner, effects=_with(winner.effects, effect, found), fit=fitted,
+                excess=excess_of(stage, fitted.left),
+            )  # fmt: skip
+            after = replace(after, terms=other)
+    return Reshaped(winner, tuple(shots))
+
+
+def _with(terms: Sequence[Used], effect: Effect, found: Shot) -> tuple[Used, ...]:
+    shape = tuple(e.value for e in found.shapes.values())
+    return tuple(Used(u.term, shape) if u.term == effect else u for u in terms)
+
+
+def told(found: Found, shots: Sequence[Shot]) -> Found:
+    """Return an effect with what shooting says of its shapes: taken over, or in the interval."""
+    for one in shots:
+        if (one.name, one.where) == (found.name, found.where):
+            shapes = {
+                name: new if one.taken
+                else _wide(found.parameters[name], new)
+                for name, new in one.shapes.items()
+            }  # fmt: skip
+            return replace(found, parameters={**found.parameters, **shapes}, shot=one)
+    return found
+
+
+def _wide(rows: Estimate, new: Estimate) -> Estimate:
+    """Return the rows' estimate with an interval that holds the other's value too."""
+    low, high = rows.ci95
+    return replace(rows, ci95=(min(low, new.value), max(high, new.value)))

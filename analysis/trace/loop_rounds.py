@@ -1,0 +1,136 @@
+"""Rounds of a loop: what was run, what the trace then said, what the experiment was worth.
+
+An experiment's worth is measured as it was predicted (`discriminate`): both explanations are
+fitted to all records before and after it, and what one leaves more than the other in its rows is
+counted in units of one record's noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from analysis.effects.base import Effect
+from analysis.terms import known
+from analysis.terms.base import Used
+from analysis.trace.data.conditioned_record import scenes
+from analysis.trace.data.regression_data import Board, board
+from analysis.trace.data.temperature_nuisance import base_terms
+from analysis.trace.next_experiment.detectable_size import smallest
+from analysis.trace.next_experiment.discrimination import Ground, Hypothesis, Question, present
+from analysis.trace.next_experiment.proposal import SHOW
+from analysis.trace.result import Trace, to_json
+from analysis.trace.search.hypothesis import excess_of
+from analysis.trace.search.refinement import refine
+from rig.model.records import Run
+from rig.model.rig import Rig
+
+
+@dataclass(frozen=True)
+class Round:
+    """One turn: the `runs` taken in it, the `experiment` that led to it, and the trace after.
+
+    `achieved` is the experiment's separation as measured, None where there is none to measure.
+    """
+
+    number: int
+    runs: tuple[str, ...]
+    experiment: Mapping[str, Any] | None
+    result: Trace
+    achieved: float | None = None
+
+    @property
+    def predicted(self) -> float | None:
+        """What the experiment had promised, in units of one record's noise."""
+        return None if self.experiment is None else float(self.experiment["predicted"])
+
+    @property
+    def loudest(self) -> float:
+        """The largest repeatable residual of the baseline over its noise, over all records."""
+        return max(f.ratio for f in self.result.floors)
+
+    @property
+    def left(self) -> float:
+        """The largest held-out error over its noise floor, with what was found."""
+        return self.result.worst(self.result.after)
+
+
+def achieved(
+    rig: Rig, before: Sequence[Run], new: Run, experiment: Mapping[str, Any]
+) -> float | None:
+    """Return the separation [noise] that an experiment's records brought, None if none was asked.
+
+    What it was to make visible is not there to be measured; then this is how large it would stand
+    on the records as they were taken.
+    """
+    if not experiment.get("questions"):
+        return None
+    terms = base_terms(rig, [*before, new])
+    both = board(rig, terms, scenes(rig, [*before, new]))
+    if experiment["kind"] == SHOW:
+        ground = Ground(both)
+        asked = [_small(q["one"], rig) for q in experiment["questions"]]
+        return min(present(q, ground) for q in asked)
+    old = board(rig, terms, scenes(rig, before))
+    found = [
+        _one(old, both, terms, len(before), q["one"], q["other"]) for q in experiment["questions"]
+    ]
+    return min(found)
+
+
+def _one(
+    old: Board, both: Board, terms: tuple[Used, ...], index: int,
+    one: Sequence[Mapping[str, Any]], other: Sequence[Mapping[str, Any]],
+) -> float:  # fmt: skip
+    """Return one question's separation: the loudest equation's rms difference per new row."""
+    gap = {}
+    for stage in (old, both):
+        left = [refine(stage, (*terms, *effects_of(side))).left for side in (one, other)]
+        ends = [excess_of(stage, part) for part in left]
+        gap[stage is both] = {e: ends[1][e] - ends[0][e] for e in ends[0]}
+    rows: dict[str, int] = {}
+    for s in both.segments:
+        if s.group[0] == index:
+            count = (s.where.stop - s.where.start) * s.repeats
+            rows[s.equation] = rows.get(s.equation, 0) + count
+    return max(
+        (
+            float(np.sqrt(abs(gap[True][e] - gap[False].get(e, 0.0)) / count))
+            for e, count in rows.items()
+        ),
+        default=0.0,
+    )
+
+
+def _small(one: Sequence[Mapping[str, Any]], rig: Rig) -> Question:
+    (used,) = effects_of(one)
+    assert isinstance(used.term, Effect)
+    return Question(smallest(used.term, rig) or Hypothesis((used,)), Hypothesis(), False)
+
+
+def effects_of(side: Sequence[Mapping[str, Any]]) -> list[Used]:
+    """Return the terms that a result names, with the shapes it gives."""
+    return [Used(known()[k["name"]](k["at"]), tuple(k["shape"])) for k in side]
+
+
+def story_json(rounds: Sequence[Round], stopped: str) -> dict[str, Any]:
+    """Return the loop as plain data: the last trace's keys, `stopped`, and every round."""
+    last = to_json(rounds[-1].result) if rounds else {}
+    return {
+        **last,
+        "stopped": stopped,
+        "rounds": [
+            {
+                "round": r.number,
+                "runs": list(r.runs),
+                "experiment": dict(r.experiment) if r.experiment else None,
+                "predicted": r.predicted,
+                "achieved": r.achieved,
+                "trace": to_json(r.result),
+            }
+            for r in rounds
+        ],
+    }

@@ -1,0 +1,1 @@
+"""The experiment that would separate the explanations that remain."""

@@ -1,0 +1,250 @@
+"""How far apart two explanations would stand on records that have not been taken yet.
+
+The twin gives a candidate excitation's noise-free record, and the record its rows under the
+baseline. A hypothesis (effects with sizes) predicts what it would add to those rows and to the
+rows already taken, y = sum of its columns times its sizes. What another hypothesis would leave of
+that is y projected off the baseline's columns, its own, and the derivatives of its shapes: it may
+be fitted anew, so only what it cannot imitate counts. With E_e the whitened energy left in
+equation e, the separation is
+    s_e = sqrt(max(0, E_e(old and new rows) - E_e(old rows)) / (R n_e)),
+n_e new rows, R repeats: the rms that would stand out of one record, in units of its noise (the
+floor table's repeatable over noise). A pair is separated by the smaller of "one is true" and "the
+other is true", in the equation where that is largest. The criterion is T-optimality (Atkinson and
+Fedorov, Biometrika 62, 1975), the baseline's parameters profiled out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.design.twin_records import ideal
+from analysis.effects.base import Effect, shapes_of
+from analysis.regression.rows import Rows
+from analysis.signals.conditioning import Signals, condition
+from analysis.terms.base import Used
+from analysis.trace.data.candidates import Variant
+from analysis.trace.data.conditioned_record import (
+    Scene,
+    candidate_columns,
+    held,
+    prepared,
+    scene_rows,
+    trace_filtering,
+)
+from analysis.trace.data.noise_floor import stated_noise
+from analysis.trace.data.regression_data import Board, entries
+from analysis.trace.next_experiment.excitations import REPEATS, Excitation
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+
+SHAPE_STEP = 0.02  # of a shape's value, or of its range where it is zero
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """Effects with their shapes, and their coefficients by parameter name; none: the baseline."""
+
+    effects: tuple[Used, ...] = ()
+    beta: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def keys(self) -> tuple[dict[str, Any], ...]:
+        """Names and places for a result; `at` and `shape` as the catalogue has them."""
+        return tuple(
+            {
+                "name": u.term.name,
+                "where": str(getattr(u.term, "place", u.term.where)),
+                "at": u.term.where,
+                "shape": list(u.shape),
+            }
+            for u in self.effects
+        )
+
+
+@dataclass(frozen=True)
+class Question:
+    """What an experiment is to tell: `one` or `other`; `both_ways` unless `one` is only wanted
+    visible against `other`.
+    """
+
+    one: Hypothesis
+    other: Hypothesis
+    both_ways: bool = True
+
+
+@dataclass(frozen=True)
+class View:
+    """An excitation's rows on the twin under the baseline, and the `noise` by equation, SI."""
+
+    rig: Rig
+    terms: tuple[Used, ...]
+    beta: Mapping[str, float]
+    scene: Scene
+    seen: Signals
+    rows: Mapping[str, Rows]
+    noise: Mapping[str, float]
+
+    def columns(self, used: Used) -> Mapping[str, Mapping[str, Array]]:
+        """Return what an effect would add in SI: equation -> name -> column."""
+        if held(used.term, self.scene):
+            return {}
+        return candidate_columns(
+            self.rig, self.terms, self.scene, self.seen, self.rows, self.beta, used
+        )
+
+    def weight(self, equation: str) -> float:
+        """Return the factor that whitens an equation's averaged rows."""
+        return float(np.sqrt(REPEATS) / max(self.noise[equation], 1e-30))
+
+
+def calibration(stage: Board) -> dict[str, float]:
+    """Return, by equation, the measured noise over what the rig's stated sensor noise would make.
+
+    A faster excitation is filtered wider and so is noisier: the stated noise tells by how much.
+    """
+    found: dict[str, list[float]] = {}
+    for scene, rows in zip(stage.scenes, stage.rows, strict=True):
+        stated = stated_noise(stage.rig, stage.terms, scene, rows, stage.beta)
+        for floor in stage.floors:
+            if floor.group == scene.group and stated.get(floor.equation, 0.0) > 0:
+                found.setdefault(floor.equation, []).append(floor.noise / stated[floor.equation])
+    return {e: float(np.sqrt(np.mean(np.square(v)))) for e, v in found.items()}
+
+
+def view(stage: Board, excitation: Excitation, measured: Mapping[str, float]) -> View:
+    """Build the rows of an excitation as the trace would of its record.
+
+    `measured` is the board's `calibration`; of other equations nothing can be said: their joint
+    has never moved.
+    """
+    rig = ideal(stage.rig)
+    record = excitation.played.record
+    filters = trace_filtering(record)
+    scene = Scene(-1, record, condition(rig, record, filters.channels), filters)
+    every = scene_rows(rig, stage.terms, scene)
+    rows = {e: r for e, r in every.items() if e in measured and len(r.rhs)}
+    stated = stated_noise(rig, stage.terms, scene, rows, stage.beta)
+    noise = {e: measured[e] * stated[e] for e in rows}
+    seen = prepared(rig, stage.terms, scene)
+    return View(rig, tuple(stage.terms), stage.beta, scene, seen, rows, noise)
+
+
+class Ground:
+    """Whitened rows on which hypotheses are compared: the board's, then those of a view if any.
+
+    `base` (m, k) holds the baseline's columns, `equation` (m,) each row's equation.
+    """
+
+    def __init__(self, stage: Board, seen: View | None = None, old: Ground | None = None) -> None:
+        self.stage, self.seen, self._old = stage, seen, old
+        self._known: dict[Used, dict[str, Array]] = {}
+        label = np.empty(stage.base.shape[0], dtype=object)
+        for s in stage.segments:
+            label[s.where] = s.equation
+        parts, labels = [stage.base], [label]
+        if seen is not None:
+            for equation, rows in seen.rows.items():
+                part = np.zeros((len(rows.rhs), len(stage.names)))
+                part[:, [stage.names.index(n) for n in rows.names]] = rows.matrix
+                parts.append(part * seen.weight(equation))
+                labels.append(np.full(len(rows.rhs), equation, dtype=object))
+        self.base, self.equation = np.concatenate(parts), np.concatenate(labels)
+
+    def columns(self, used: Used) -> dict[str, Array]:
+        """Return an effect's columns (m,) by name; '' is the change of the signals it makes."""
+        if used not in self._known:
+            before = self._old.columns(used) if self._old is not None else self._on_board(used)
+            self._known[used] = before if self.seen is None else self._extended(used, before)
+        return self._known[used]
+
+    def _on_board(self, used: Used) -> dict[str, Array]:
+        assert isinstance(used.term, Effect)
+        found = entries(self.stage, [Variant(used.term, used.shape)])
+        return dict(zip(found[0].names, found[0].columns.T, strict=True)) if found else {}
+
+    def _extended(self, used: Used, before: Mapping[str, Array]) -> dict[str, Array]:
+        assert self.seen is not None
+        new = self.seen.columns(used)
+        out = {}
+        for name in dict.fromkeys([*before, *(n for c in new.values() for n in c)]):
+            parts = [before.get(name, np.zeros(self.stage.base.shape[0]))]
+            for equation, rows in self.seen.rows.items():
+                column = new.get(equation, {}).get(name, np.zeros(len(rows.rhs)))
+                parts.append(column * self.seen.weight(equation))
+            out[name] = np.concatenate(parts)
+        return out
+
+    def adds(self, what: Hypothesis) -> Array:
+        """Return what a hypothesis adds to the rows (m,) at its sizes."""
+        total = np.zeros(len(self.equation))
+        for used in what.effects:
+            for name, column in self.columns(used).items():
+                # The baseline's own parameters, which some effects have columns of, are free.
+                if name not in self.stage.names:
+                    total += column * (what.beta.get(name, 0.0) if name else 1.0)
+        return total
+
+    def spans(self, what: Hypothesis) -> Array:
+        """Return what a hypothesis can imitate with: its columns and its shapes' derivatives."""
+        found = [self.base]
+        for used in what.effects:
+            found += [c[:, None] for c in self.columns(used).values()]
+            for j, shape in enumerate(shapes_of(self.stage.rig, used)):
+                value = used.shape[j]
+                step = SHAPE_STEP * (abs(value) or shape.high - shape.low)
+                near = value + step if value + step <= shape.high else value - step
+                moved = Used(used.term, (*used.shape[:j], near, *used.shape[j + 1 :]))
+                ends = [self.adds(Hypothesis((u,), what.beta)) for u in (moved, used)]
+                found.append((ends[0] - ends[1])[:, None])
+        return np.column_stack(found)
+
+    def left(self, true: Hypothesis, wrong: Hypothesis) -> Array:
+        """Return the residual (m,) that `wrong` leaves where `true` is there, without noise."""
+        X, y = self.spans(wrong), self.adds(true)
+        scale = np.linalg.norm(X, axis=0)
+        scale[scale == 0] = 1.0
+        return np.asarray(y - X @ (np.linalg.lstsq(X / scale, y, rcond=1e-6)[0] / scale))
+
+    def energy(self, left: Array) -> dict[str, float]:
+        """Return a residual's energy by equation."""
+        return {
+            str(e): float(left[self.equation == e] @ left[self.equation == e])
+            for e in dict.fromkeys(self.equation)
+        }
+
+
+def separation(question: Question, old: Ground, new: Ground) -> tuple[float, str]:
+    """Return what an experiment separates [noise], and in which equation (see the module)."""
+    assert new.seen is not None
+    found = []
+    for true, wrong in _ways(question):
+        before = old.energy(old.left(true, wrong))
+        after = new.energy(new.left(true, wrong))
+        by_equation = {
+            e: float(np.sqrt(max(0.0, after[e] - before.get(e, 0.0)) / (REPEATS * len(r.rhs))))
+            for e, r in new.seen.rows.items()
+        }
+        loudest = max(by_equation, key=lambda e: by_equation[e], default="")
+        found.append((by_equation.get(loudest, 0.0), loudest))
+    return min(found)
+
+
+def present(question: Question, old: Ground) -> float:
+    """Return the same figure [noise] of the records already taken: their loudest segment's."""
+    return min(loudest(old.stage, old.left(true, wrong)) for true, wrong in _ways(question))
+
+
+def loudest(stage: Board, left: Array) -> float:
+    """Return the largest rms of a residual (M,) in one step and equation [noise of a record]."""
+    return max(float(np.sqrt(np.mean(left[s.where] ** 2) / s.repeats)) for s in stage.segments)
+
+
+def _ways(question: Question) -> Sequence[tuple[Hypothesis, Hypothesis]]:
+    there = (question.one, question.other)
+    return (there, there[::-1]) if question.both_ways else (there,)

@@ -1,0 +1,291 @@
+"""Excitations that a rig can stand: the candidates among which the next experiment is chosen.
+
+A candidate is one step: joints locked as in some step of the training records (or none locked),
+the others moved by one of a few families of lines. The families differ in what catalogue effects
+differ in: slow sweeps over the stroke (gravity, springs, offsets, leakage), small amplitudes about
+the valve's null (edges), fast lines (oil's softness, lags, delays), motion about a place off the
+middle of the stroke (volumes, levers), everything at once. Each is played on the twin and scaled
+until it fills its share of the tightest limit.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.design.limits import Spectrum, forecast_of, used
+from analysis.design.moves import Tone, with_tones
+from analysis.design.twin_records import PlannedStep, Played, play
+from analysis.trace.data.conditioned_record import Scene
+from rig.model import channels as ch
+from rig.model.parse import InputError
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+log = logging.getLogger(__name__)
+
+FILL = 0.9  # share of the tightest limit that an experiment uses on the twin
+PLAYS = 4  # on the twin, to find the amplitude
+FLATTEN = 40  # rounds of the search for phases
+FIRST = 0.1  # [V] rms of the first play
+AT_END = 2e-3  # [m] a locked piston so near to its end stands at it
+CLOSED_GIVES = 5e-3  # [m] of a joint behind a closed valve
+END_GIVES = 2e-3  # [m]
+OFFSET = 4e-3  # [m] that a record's centre may be off
+LOOP = 2.0  # [V/m] of the loop that centres before the records
+# Amplitude of the held-out variant. What an experiment brings out at its limits is soon gone below.
+HELD_OUT = 0.85
+REPEATS = 4
+HELD_OUT_REPEATS = 3
+DRAWS = 40  # of its phases
+
+
+@dataclass(frozen=True)
+class Family:
+    """Lines from `low` to `high` [Hz] at multiples of `base`, amplitudes f^-tilt.
+
+    `level` is the share of FILL that is used, `centre` the place in the stroke as a share of half
+    of it, `words` what it is for a person.
+    """
+
+    name: str
+    words: str
+    base: float
+    low: float
+    high: float
+    tilt: float
+    level: float = 1.0
+    centre: float = 0.0
+
+
+FAMILIES: Final = (
+    Family("wide", "at all frequencies, as far as the limits allow", 0.1, 0.5, 9.5, 0.25),
+    Family("slow", "slowly over the whole stroke", 0.1, 0.1, 0.9, 0.5),
+    Family("creep", "back and forth at creeping speed over the whole stroke", 0.1, 0.1, 0.3, 1.0),
+    # Its few slow lines move the piston, which the bench needs to centre it.
+    # Much faster, a joint that is held and one behind a closed valve resonate otherwise.
+    Family("fast", "up to 15 Hz, all frequencies alike", 0.2, 0.6, 15.0, 0.0),
+    Family("small", "by small amplitudes about the valve's null", 0.1, 0.3, 5.0, 0.25, 0.12),
+    Family(
+        "out", "at all frequencies a quarter of the stroke out of its middle", 0.1, 0.5, 9.5, 0.25,
+        centre=0.5,
+    ),
+    Family(
+        "in", "at all frequencies a quarter of the stroke into its middle", 0.1, 0.5, 9.5, 0.25,
+        centre=-0.5,
+    ),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Which joints (0-based) stand where [m], behind a closed valve or at an end; others move."""
+
+    closed: Mapping[int, float]
+    held: Mapping[int, float]
+
+    def moving(self, rig: Rig) -> tuple[int, ...]:
+        """The excited joints, 0-based."""
+        return tuple(
+            j for j in range(len(rig.joints)) if j not in self.closed and j not in self.held
+        )
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """One candidate as played on the twin, with what makes a protocol of it."""
+
+    family: Family
+    setting: Setting
+    tones: Mapping[int, Tone]
+    played: Played
+
+    @property
+    def step(self) -> PlannedStep:
+        """The step in device terms."""
+        return self.played.step
+
+    @property
+    def text(self) -> str:
+        """In plain words."""
+        moved = " and ".join(str(j + 1) for j in self.tones)
+        which = f"joint{'s' if len(self.tones) > 1 else ''} {moved} moved"
+        stand = [
+            *(f"joint {j + 1} locked at {1e3 * p:.0f} mm" for j, p in self.setting.closed.items()),
+            *(
+                f"joint {j + 1} at its {'minimum' if p < 0 else 'maximum'}"
+                for j, p in self.setting.held.items()
+            ),
+        ]
+        return ", ".join([f"{which} {self.family.words}", *stand])
+
+
+def settings(rig: Rig, scenes: Sequence[Scene]) -> list[Setting]:
+    """Return how the joints stood in each step of the records, and all of them free."""
+    out: list[Setting] = []
+    for scene in scenes:
+        closed, held = {}, {}
+        for joint in scene.record.locked:
+            piston = float(np.nanmean(scene.record.channels[ch.channel(ch.PISTON, joint)]))
+            half = 0.5 * rig.joints[joint - 1].cylinder.stroke
+            if half - abs(piston) < AT_END:
+                held[joint - 1] = float(np.copysign(half, piston))
+            else:
+                closed[joint - 1] = round(piston, 3) + 0.0  # no -0
+        out.append(Setting(closed, held))
+    out.append(Setting({}, {}))
+    return [s for k, s in enumerate(out) if s.moving(rig) and s not in out[:k]]
+
+
+def excitations(
+    rig: Rig, scenes: Sequence[Scene], rng: np.random.Generator,
+    families: Sequence[Family] = FAMILIES,
+) -> Iterator[Excitation]:  # fmt: skip
+    """Play every family in every setting on the twin; those it cannot follow are left out.
+
+    None for a rig without nominal values or with electric joints: there is no twin of it.
+    """
+    if rig.electric:
+        return
+    for setting in settings(rig, scenes):
+        for family in families:
+            found = excitation(rig, setting, family, rng)
+            if found is not None:
+                yield found
+
+
+def excitation(
+    rig: Rig, setting: Setting, family: Family, rng: np.random.Generator
+) -> Excitation | None:
+    """Return a family in a setting, scaled to its share of the limits; None where impossible."""
+    tones = {j: _tone(j, family, k, rng) for k, j in enumerate(setting.moving(rig))}
+    step = _step(rig, setting, family, tones)
+    goal = FILL * family.level
+    found: Excitation | None = None
+    try:
+        for attempt in range(PLAYS):
+            played = play(rig, with_tones(step, tones))
+            share = used(rig, played)[0]
+            step = played.step
+            if share <= 1.05 * goal:
+                found = Excitation(family, setting, tones, played)
+                if share >= 0.9 * goal:
+                    break
+            if attempt == 0 and len(tones) == 1:
+                tones = {j: _flattened(rig, played, t) for j, t in tones.items()}
+            factor = float(np.clip(goal / share, 0.1, 5.0))
+            tones = {j: replace(t, spectrum=t.spectrum * factor) for j, t in tones.items()}
+    except InputError as error:
+        log.info("%s is not possible: %s", family.name, error)
+    return found
+
+
+def _flattened(rig: Rig, played: Played, tone: Tone) -> Tone:
+    known = forecast_of(rig, played, tone.joint, tone.lines)
+    return replace(tone, spectrum=known.flattened(tone.spectrum, FLATTEN)[0])
+
+
+def _tone(joint: int, family: Family, turn: int, rng: np.random.Generator) -> Tone:
+    lines = np.arange(round(family.low / family.base), round(family.high / family.base) + 1)
+    lines = lines[lines % 2 == 1]
+    size = lines.astype(np.float64) ** -family.tilt
+    size *= FIRST * np.sqrt(2) * family.level / np.linalg.norm(size)
+    return Tone(joint, lines, size * np.exp(2j * np.pi * rng.random(len(lines))), ())
+
+
+def _step(
+    rig: Rig, setting: Setting, family: Family, tones: Mapping[int, Tone]
+) -> PlannedStep:  # fmt: skip
+    period = round(rig.sample_rate / family.base)
+    places = {j: family.centre * 0.5 * rig.joints[j].cylinder.stroke for j in tones}
+    return PlannedStep(
+        name=f"next_{family.name}",
+        waves={j: np.zeros(period) for j in tones},
+        lines=(),
+        held=dict(setting.held),
+        closed=dict(setting.closed),
+        centres=places,
+        biases={},
+        samples=period,
+        repeats=REPEATS,
+        gives=dict.fromkeys(setting.closed, CLOSED_GIVES),
+        offsets=dict.fromkeys(tones, OFFSET),
+        loops=dict.fromkeys(tones, LOOP),
+    )
+
+
+def protocol(
+    rig: Rig, chosen: Sequence[Excitation], name: str, scale: float = 1.0,
+    rng: np.random.Generator | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Return the protocol file's mapping that runs these steps; `rng` draws other phases."""
+    return {
+        "name": name,
+        "description": "; ".join(one.text for one in chosen),
+        "joints": len(rig.joints),
+        "steps": [_as_step(rig, one, k, scale, rng) for k, one in enumerate(chosen, start=1)],
+    }
+
+
+def _as_step(
+    rig: Rig, one: Excitation, number: int, scale: float, rng: np.random.Generator | None
+) -> dict[str, Any]:
+    locks = [
+        {"joint": j + 1, "at": "closed", "piston": f"{1e3 * p:.6g} mm",
+         "tolerance": f"{1e3 * CLOSED_GIVES:g} mm"}
+        for j, p in one.setting.closed.items()
+    ] + [
+        {"joint": j + 1, "at": "end_max" if p > 0 else "end_min",
+         "tolerance": f"{1e3 * END_GIVES:g} mm"}
+        for j, p in one.setting.held.items()
+    ]  # fmt: skip
+    offset = f"{1e3 * OFFSET:g} mm"
+    excite = []
+    for j, tone in one.tones.items():
+        n = one.step.period
+        spectrum = tone.spectrum if rng is None else _other_phases(tone, n, rng)
+        excite.append(
+            {
+                "joint": j + 1,
+                "signal": {
+                    "kind": "lines",
+                    "base_frequency": f"{rig.sample_rate / one.step.period:.9g} Hz",
+                    "lines": [int(k) for k in tone.lines],
+                    "amplitudes": [f"{scale * abs(a):.5g} V" for a in spectrum],
+                    "phases": [f"{np.angle(a):.5g} rad" for a in spectrum],
+                },
+                "centre": f"{1e3 * one.step.centres[j]:.6g} mm",
+                "centring": {
+                    "mode": "open-loop",
+                    "position_gain": f"{LOOP:g} V/m",
+                    "drift": offset,
+                    "offset": offset,
+                    "tries": 6,
+                },
+            }
+        )
+    return {
+        "name": f"next{number}_{one.family.name}",
+        "lock": locks,
+        "excite": excite,
+        "repeats": REPEATS if rng is None else HELD_OUT_REPEATS,
+    }
+
+
+def _other_phases(tone: Tone, n: int, rng: np.random.Generator) -> Spectrum:
+    """Return the tone's amplitudes with other phases: of some draws the flattest, n samples."""
+    size, best, least = np.abs(tone.spectrum), tone.spectrum, np.inf
+    for _ in range(DRAWS):
+        spectrum = size * np.exp(2j * np.pi * rng.random(len(size)))
+        full = np.zeros((2, n // 2 + 1), dtype=np.complex128)
+        full[0, tone.lines], full[1, tone.lines] = spectrum, spectrum / (1j * tone.lines)
+        # Of the command and of its integral, which the piston follows.
+        peak = float(np.prod(np.ptp(np.fft.irfft(full, n, axis=1), axis=1)))
+        if peak < least:
+            best, least = spectrum, peak
+    return best

@@ -1,0 +1,281 @@
+"""Which experiment to run next, or none: what survives, what would tell, on which excitation.
+
+`confounded`: the excitation on which the best set and its tied rivals differ most. `unexplained`:
+the one that tells the sets which leave least apart, else the one that carries a variable which the
+rest moves with farthest beyond the records, else one of many more lines than they hold. `clean`:
+the one on which effects of an interesting size that these records could not have shown would stand
+out. An experiment is only offered where it promises more than noise and clearly more than the
+records already hold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.terms import baseline_of, known
+from analysis.terms.base import Used
+from analysis.trace.data.regression_data import Board
+from analysis.trace.next_experiment import excitations as ex
+from analysis.trace.next_experiment.detectable_size import smallest
+from analysis.trace.next_experiment.discrimination import (
+    Ground,
+    Hypothesis,
+    Question,
+    View,
+    calibration,
+    loudest,
+    present,
+    separation,
+    view,
+)
+from analysis.trace.next_experiment.range_extension import LINES, farther, richer
+from analysis.trace.result import CLEAN, CONFOUNDED, UNEXPLAINED, Dependence, Found
+from analysis.trace.search.hypothesis import Listed, parameter_values
+from analysis.trace.search.hypothesis_set import Shortlist
+from analysis.trace.search.linear_fit import BAND
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+
+TELL, COVER, SHOW = "tell apart", "cover", "make visible"
+PROMISE: Final = BAND  # of the noise: less is nothing to explain
+MORE = 1.3  # times what the records hold already
+ENOUGH = 3.0  # times the noise; more tells no more
+STEPS = 3  # of an experiment
+WORTH = 0.3  # that a further step must add to the sum over questions
+NEAR = 2.0  # times the energy that the best set leaves: another is still in question
+RIVALS = 3
+LIKELY = 2.0  # times its nominal value that a parameter may be
+SEED = 0  # of the excitations' phases
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What the records hold on a question, and what an experiment promises, in units of noise."""
+
+    question: Question
+    present: float
+    promised: float = 0.0
+    equation: str = ""
+
+    @property
+    def open(self) -> bool:
+        """Whether the experiment promises an answer that the records do not hold."""
+        return self.promised >= max(PROMISE, MORE * self.present)
+
+
+def propose(
+    listed: Shortlist, winner: Listed, found: Sequence[Found], verdict: str,
+    moves: Sequence[Dependence], families: Sequence[ex.Family] = ex.FAMILIES,
+) -> Mapping[str, Any] | None:  # fmt: skip
+    """Return the next experiment as plain data, None where none promises anything.
+
+    `protocol` and `holdout` are what a protocol file holds; `present` and `predicted` are the
+    weakest question's separation in units of one record's noise.
+    """
+    stage = listed.stage
+    old = Ground(stage)
+    questions = _questions(listed, winner, found, verdict, old)
+    if not questions and not (verdict == UNEXPLAINED and moves):
+        return None
+    rng = np.random.default_rng(SEED)
+    tried = list(ex.excitations(learned(stage), stage.scenes, rng, families))
+    if not tried:
+        return _in_words(winner, questions) if verdict == CONFOUNDED else None
+    measured = calibration(stage)
+    views = [view(stage, one, measured) for one in tried]
+    kind = SHOW if verdict == CLEAN else TELL
+    best = _choose(questions, tried, views, old)
+    if best is not None:
+        return _told(stage, kind, *best)
+    if verdict == UNEXPLAINED and moves:
+        return _explored(stage, winner, moves, tried, views)
+    return None
+
+
+def learned(stage: Board) -> Rig:
+    """Return the rig with what the records say of its parameters: a twin that is nearer to it."""
+    plain = tuple(map(Used, baseline_of(stage.rig)))
+    found = parameter_values(stage.rig, plain, dict(stage.beta))
+    before = stage.rig.nominal
+    likely = {
+        name: value
+        for name, value in found.items()
+        # A parameter that the records hardly move may come out as anything.
+        if name in before and 1 / LIKELY < value / before[name] < LIKELY
+    }
+    return stage.rig.model_copy(update={"nominal": {**before, **likely}})
+
+
+def _questions(
+    listed: Shortlist, winner: Listed, found: Sequence[Found], verdict: str, old: Ground
+) -> list[Answer]:
+    if verdict == CLEAN:
+        asked = [Question(h, Hypothesis(), False) for h in _small(listed)]
+        answers = [Answer(q, present(q, old)) for q in asked]
+        return [a for a in answers if a.present < PROMISE]
+    if verdict == CONFOUNDED:
+        others = tied_sets(listed, winner, found)
+        pairs = [Question(hypothesis(winner), hypothesis(o)) for o in others]
+    elif verdict == UNEXPLAINED:
+        pairs = _unsettled(listed)
+    else:
+        return []
+    return [Answer(q, present(q, old)) for q in pairs]
+
+
+def hypothesis(one: Listed) -> Hypothesis:
+    """Return a fitted set as a hypothesis."""
+    return Hypothesis(one.effects, one.fit.beta)
+
+
+def tied_sets(listed: Shortlist, winner: Listed, found: Sequence[Found]) -> list[Listed]:
+    """Return the sets that the gates could not tell from the winner: one effect exchanged."""
+    out = []
+    for effect in found:
+        tied = {(r.name, r.where) for r in effect.rivals if r.tied}
+        others = [u for u in winner.effects if _key(u.term) != (effect.name, effect.where)]
+        for one in listed.listed.values():
+            fresh = [u for u in one.effects if u.term not in [w.term for w in winner.effects]]
+            kept = {u.term for u in one.effects} - {u.term for u in fresh}
+            if len(fresh) == 1 and _key(fresh[0].term) in tied and kept == {
+                u.term for u in others
+            }:  # fmt: skip
+                out.append(one)
+    return out
+
+
+def _key(term: Any) -> tuple[str, str]:
+    return term.name, str(getattr(term, "place", term.where))
+
+
+def _unsettled(listed: Shortlist) -> list[Question]:
+    """Return the best set against the others that leave about as little, and against none."""
+    allowed = [o for o in listed.listed.values() if o.effects and not listed.physical(o)]
+    allowed.sort(key=lambda o: o.total)
+    if not allowed or allowed[0].total >= listed.empty.total:
+        return []
+    best = allowed[0]
+    limit = max(NEAR * best.total, best.total + 0.1 * listed.limits.total)
+    # A set that only adds to the best is not another explanation.
+    near = [o for o in allowed[1:] if o.total <= limit and not best.keys <= o.keys][:RIVALS]
+    return [Question(hypothesis(best), hypothesis(o)) for o in near]
+
+
+def _small(listed: Shortlist) -> list[Hypothesis]:
+    rig = listed.stage.rig
+    effects = dict.fromkeys(v.effect for v in listed.variants)
+    found = (smallest(effect, rig) for effect in effects)
+    return [h for h in found if h is not None]
+
+
+def _choose(
+    asked: Sequence[Answer], tried: Sequence[ex.Excitation], views: Sequence[View], old: Ground
+) -> tuple[list[ex.Excitation], list[Answer]] | None:
+    """Return the steps that answer most, and what they promise; None if they promise nothing."""
+    if not asked:
+        return None
+    table: list[list[Answer]] = []
+    for seen in views:
+        new = Ground(old.stage, seen, old)
+        table.append(
+            [Answer(a.question, a.present, *separation(a.question, old, new)) for a in asked]
+        )
+    chosen: list[int] = []
+    while len(chosen) < min(STEPS, len(tried)):
+        worth = [_worth(_best(table, [*chosen, k])) for k in range(len(tried))]
+        k = int(np.argmax(worth))
+        if worth[k] - (_worth(_best(table, chosen)) if chosen else 0.0) < WORTH:
+            break
+        chosen.append(k)
+    if not chosen:
+        return None
+    told = [a for a in _best(table, chosen) if a.open]
+    return ([tried[k] for k in chosen], told) if told else None
+
+
+def _best(table: Sequence[Sequence[Answer]], chosen: Sequence[int]) -> list[Answer]:
+    rows = [table[k] for k in chosen]
+    return [max(column, key=lambda a: a.promised) for column in zip(*rows, strict=True)]
+
+
+def _worth(answers: Sequence[Answer]) -> float:
+    return sum(min(a.promised, ENOUGH) for a in answers if a.open)
+
+
+def _explored(
+    stage: Board, winner: Listed, moves: Sequence[Dependence], tried: Sequence[ex.Excitation],
+    views: Sequence[View],
+) -> Mapping[str, Any] | None:  # fmt: skip
+    """Return the experiment that shows what is unexplained where no record has been yet."""
+    found = farther(stage, moves, views, MORE) or richer(stage, moves, tried)
+    if found is None:
+        return None
+    now = loudest(stage, winner.fit.left)
+    return {
+        "kind": COVER,
+        "separates": [],
+        "covers": {"variable": found.variable, "times": found.times},
+        "present": now,
+        "predicted": now * (found.times if found.variable != LINES else 1.0),
+        "equation": found.equation,
+        "text": f"{tried[found.index].text}: {found.words}",
+        **_protocols(stage, [tried[found.index]]),
+    }
+
+
+def _told(
+    stage: Board, kind: str, chosen: Sequence[ex.Excitation], answers: Sequence[Answer]
+) -> Mapping[str, Any]:
+    weakest = min(answers, key=lambda a: a.promised)
+    separates = _names(answers)
+    what = f"predicted separation {weakest.promised:.1f} times the noise, {weakest.present:.1f} now"
+    if kind == SHOW:
+        names = ", ".join(dict.fromkeys(k["name"].replace("_", " ") for k in separates))
+        what = f"would show {names} of small size, which these records cannot"
+    return {
+        "kind": kind,
+        "separates": separates,
+        "questions": [
+            {
+                "one": list(a.question.one.keys), "other": list(a.question.other.keys),
+                "present": a.present, "predicted": a.promised, "equation": a.equation,
+            }
+            for a in answers
+        ],
+        "present": weakest.present,
+        "predicted": weakest.promised,
+        "equation": weakest.equation,
+        "text": f"{'; then '.join(one.text for one in chosen)} ({what})",
+        **_protocols(stage, chosen),
+    }  # fmt: skip
+
+
+def _names(answers: Sequence[Answer]) -> list[dict[str, str]]:
+    """Return names and places of all effects in question, each once."""
+    keys = [k for a in answers for h in (a.question.one, a.question.other) for k in h.keys]
+    found = dict.fromkeys((k["name"], k["where"]) for k in keys)
+    return [{"name": name, "where": where} for name, where in found]
+
+
+def _protocols(stage: Board, chosen: Sequence[ex.Excitation]) -> dict[str, Any]:
+    rng = np.random.default_rng([SEED, 1])
+    return {
+        "protocol": ex.protocol(stage.rig, chosen, "next"),
+        "holdout": ex.protocol(stage.rig, chosen, "next-holdout", ex.HELD_OUT, rng),
+    }
+
+
+def _in_words(winner: Listed, asked: Sequence[Answer]) -> Mapping[str, Any] | None:
+    """Say what separates tied effects where no twin can try it: the rig has no nominal values."""
+    texts = [getattr(known()[u.term.name], "separated_by", "") for u in winner.effects]
+    return {
+        "kind": TELL,
+        "separates": _names(asked),
+        "text": next((t for t in texts if t), "another amplitude and frequency"),
+    }

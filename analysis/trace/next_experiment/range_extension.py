@@ -1,0 +1,81 @@
+"""Where no explanation stands: excitations that go beyond the records, by reach or by lines."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from analysis.trace.clues.variables import variables
+from analysis.trace.data.regression_data import Board
+from analysis.trace.next_experiment.discrimination import View
+from analysis.trace.next_experiment.excitations import Excitation
+from analysis.trace.result import Dependence
+
+LINES: Final = "lines"
+TIME: Final = "time"  # goes on by itself
+RICHER = 5.0  # times as many lines as the records hold
+
+
+@dataclass(frozen=True)
+class Beyond:
+    """An excitation (its index) that carries a variable so many `times` as far as the records."""
+
+    index: int
+    variable: str
+    times: float
+    equation: str
+    words: str
+
+
+def farther(
+    stage: Board, moves: Sequence[Dependence], views: Sequence[View], least: float
+) -> Beyond | None:
+    """Return what carries a clue's variable farthest, for the first clue that can be carried so.
+
+    `least` times as far as the records, at least.
+    """
+    for clue in moves:
+        joint = int(clue.equation.rsplit("_", 1)[1]) - 1
+        own = [s for s in stage.scenes if joint + 1 not in s.record.locked]
+        for name in (n for n in (clue.variable, clue.by) if n and n != TIME):
+            seen = [variables(stage.rig, s.signals, joint).get(name) for s in own]
+            values = [v for v in seen if v is not None]
+            if not values:
+                continue
+            low, high = np.percentile(np.concatenate(values), [1, 99])
+            reach = [_reach(stage, one, joint, name, float(low), float(high)) for one in views]
+            k = int(np.argmax(reach))
+            if reach[k] >= least:
+                words = f"carries {name} {reach[k]:.1f} times as far, which what is left moves with"
+                return Beyond(k, name, reach[k], clue.equation, words)
+    return None
+
+
+def _reach(stage: Board, one: View, joint: int, name: str, low: float, high: float) -> float:
+    """Return a variable's range over the records' and a candidate's, over the records' alone."""
+    if joint + 1 in one.scene.record.locked:
+        return 0.0
+    least, most = np.percentile(variables(stage.rig, one.seen, joint)[name], [1, 99])
+    return float((max(most, high) - min(least, low)) / max(high - low, 1e-30))
+
+
+def richer(stage: Board, moves: Sequence[Dependence], tried: Sequence[Excitation]) -> Beyond | None:
+    """Return the excitation of most lines where the records of the clue's joint hold few.
+
+    One sine shows one path through every nonlinearity: many forms pass through it alike.
+    """
+    equation = moves[0].equation
+    joint = int(equation.rsplit("_", 1)[1]) - 1
+    held = [len(s.record.lines) for s in stage.scenes if joint + 1 not in s.record.locked]
+    counts = [len(one.tones[joint].lines) if joint in one.tones else 0 for one in tried]
+    if not held or not min(held) or not counts:
+        return None
+    k = int(np.argmax(counts))
+    times = counts[k] / max(held)
+    if times < RICHER:
+        return None
+    words = f"moves joint {joint + 1} by {counts[k]} lines where the records hold {max(held)}"
+    return Beyond(k, LINES, times, equation, words)

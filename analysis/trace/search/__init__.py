@@ -1,0 +1,1 @@
+"""The search for effects: linear fits of candidates, exact fits of sets of effects."""

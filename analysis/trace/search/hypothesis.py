@@ -1,0 +1,86 @@
+"""What a fitted set of effects leaves: energy above noise by equation, and what is nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.terms.base import Used
+from analysis.trace.data.regression_data import Board
+from analysis.trace.search import linear_fit
+from analysis.trace.search.refinement import Fit
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+Key = tuple[str, str]
+
+
+@dataclass(frozen=True)
+class Listed:
+    """A set of effects on the list: its exact fit and energy above noise by equation."""
+
+    effects: tuple[Used, ...]
+    fit: Fit
+    excess: dict[str, float]
+    size: tuple[int, int]
+
+    @property
+    def keys(self) -> frozenset[Key]:
+        """Names and places of its effects."""
+        return frozenset((u.term.name, u.term.where) for u in self.effects)
+
+    @property
+    def total(self) -> float:
+        """All energy left above noise, not below zero in any equation."""
+        return sum(max(0.0, e) for e in self.excess.values())
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Energy that counts as nothing, by equation, on a stage."""
+
+    band: dict[str, float]
+
+    @property
+    def total(self) -> float:
+        """The sum over equations."""
+        return sum(self.band.values())
+
+
+def parameter_values(rig: Rig, terms: Sequence[Used], beta: dict[str, float]) -> dict[str, float]:
+    """Return parameters from the rows' coefficients (b from 1/b)."""
+    out = {}
+    for used in terms:
+        for c in used.term.coefficients(rig):
+            value = float(beta.get(c.parameter, np.nan))
+            out[c.parameter] = 1.0 / value if c.reciprocal and value else value
+    return out
+
+
+def excess_of(stage: Board, left: Array, noise: float = 1.0) -> dict[str, float]:
+    """Return the energy above noise that a residual (M,) has in each equation of a stage."""
+    out: dict[str, float] = {}
+    for segment in stage.segments:
+        part = left[segment.where]
+        found = float(part @ part) - noise * len(part)
+        out[segment.equation] = out.get(segment.equation, 0.0) + found
+    return out
+
+
+def limits(stage: Board) -> Limits:
+    """Return the band of every equation (`linear_fit.BAND` times the noise, and chance)."""
+    band: dict[str, float] = {}
+    rows: dict[str, int] = {}
+    for s in stage.segments:
+        count = s.where.stop - s.where.start
+        band[s.equation] = band.get(s.equation, 0.0) + linear_fit.BAND**2 * s.repeats * count
+        rows[s.equation] = rows.get(s.equation, 0) + count
+    return Limits({e: max(v, 4 * np.sqrt(2 * rows[e])) for e, v in band.items()})
+
+
+def within(excess: dict[str, float], limit: Limits) -> bool:
+    """Tell whether nothing is left above the band in any equation."""
+    return all(value <= limit.band[e] for e, value in excess.items())

@@ -1,0 +1,291 @@
+"""Search: which candidates, alone, in pairs and in larger sets, take the residual down to noise.
+
+Everything is projected off the baseline's columns first: what least squares has absorbed already
+is no evidence for anything. On the projected columns D (M, V) and residual r (M,), with
+K = D'D and c = D'r, the gain of a candidate with columns j is c_j' K_jj^-1 c_j; taking it into the
+set updates K and c by a Schur complement, so that a search over the whole catalogue with pairs
+costs no more than products of small matrices. Of candidates that leave equally little, the one
+with the fewest free numbers is taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.trace.data.regression_data import Board, Entry
+
+Array = NDArray[np.float64]
+Key = tuple[str, str]
+
+BAND = 0.7  # repeatable rms over noise, below which there is nothing to explain
+LEFT = 1.0  # repeatable rms over noise that an explanation may leave
+FORM = 0.02  # of the energy before: what the catalogue's form of an effect may miss of the real one
+ADD_SHARE = 0.3  # of what is left in the equations it touches: less does not earn a place
+AS_GOOD = 1.25  # what a simpler candidate may leave over the best, before noise counts
+CHANCE = 20.0  # energy that each further free number must take: ten times what noise gives it
+VISIBLE = 0.03  # of a column's length must stand out of the baseline's columns
+LARGEST = 4  # effects in a set
+STARTS = 10  # single candidates from which pairs are tried
+MOST_TRIALS = 40  # best entries that are fitted in full
+PSEUDO = (0.3, 3.0)  # coefficient of a pseudo-column (1 if its shape were exact)
+
+
+@dataclass(frozen=True)
+class Field:
+    """Projected candidates: `columns` (M, V), groups of column numbers, what is admissible.
+
+    `equations` maps an equation to its rows; `admissible(entry, coefficients)` is the physics'
+    veto. `size` counts the free numbers of each entry.
+    """
+
+    entries: tuple[Entry, ...]
+    columns: Array
+    K: Array
+    basis: Array
+    groups: tuple[tuple[int, ...], ...]
+    raw: Array
+    rows: dict[str, Array]
+    band: dict[str, float]
+    size: tuple[int, ...]
+    admissible: Callable[[Entry, Array], bool]
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A set of entries, the `excess` energy above noise by equation, residual `left` (M,)."""
+
+    members: tuple[int, ...]
+    coefficients: tuple[Array, ...]
+    excess: dict[str, float]
+    left: Array
+
+    @property
+    def total(self) -> float:
+        """All energy left above noise, not below zero in any equation."""
+        return sum(max(0.0, e) for e in self.excess.values())
+
+
+def field(
+    stage: Board, found: Sequence[Entry], size: Callable[[Entry], int],
+    admissible: Callable[[Entry, Array], bool], mask: Array | None = None,
+) -> Field:  # fmt: skip
+    """Project the entries off the stage's own columns; `mask` (M,) switches rows off."""
+    keep = np.ones(stage.base.shape[0]) if mask is None else mask
+    basis = orthonormal(stage.base * keep[:, None])
+    groups, start = [], 0
+    for entry in found:
+        groups.append(tuple(range(start, start + entry.columns.shape[1])))
+        start += entry.columns.shape[1]
+    stack = np.column_stack([e.columns for e in found]) if found else np.zeros((len(keep), 0))
+    stack = stack * keep[:, None]
+    raw = np.sum(stack**2, axis=0)
+    projected = stack - basis @ (basis.T @ stack)
+    rows: dict[str, list[Array]] = {}
+    band: dict[str, float] = {}
+    for segment in stage.segments:
+        where = np.arange(segment.where.start, segment.where.stop)
+        where = where[keep[where] > 0]
+        rows.setdefault(segment.equation, []).append(where)
+        band[segment.equation] = band.get(segment.equation, 0.0) + BAND**2 * segment.repeats * len(
+            where
+        )
+    return Field(
+        tuple(found), projected, projected.T @ projected, basis, tuple(groups), raw,
+        {name: np.concatenate(parts) for name, parts in rows.items()}, band,
+        tuple(size(entry) for entry in found), admissible,
+    )  # fmt: skip
+
+
+def orthonormal(columns: Array) -> Array:
+    """Return an orthonormal basis (M, r) of the columns' span."""
+    scale = np.linalg.norm(columns, axis=0)
+    kept = columns[:, scale > 0] / scale[scale > 0]
+    U, sigma, _ = np.linalg.svd(kept, full_matrices=False)
+    return np.asarray(U[:, sigma > 1e-6 * sigma[0]]) if len(sigma) else U
+
+
+def gains(K: Array, c: Array, groups: Sequence[tuple[int, ...]], raw: Array) -> Array:
+    """Return the energy that each group of columns takes away, 0 for those that do not show."""
+    out = np.zeros(len(groups))
+    for g, group in enumerate(groups):
+        if len(group) == 1:
+            j = group[0]
+            if K[j, j] > VISIBLE**2 * raw[j] and raw[j] > 0:
+                out[g] = c[j] ** 2 / K[j, j]
+            continue
+        seen = [j for j in group if K[j, j] > VISIBLE**2 * raw[j] and raw[j] > 0]
+        if seen:
+            index = np.ix_(seen, seen)
+            out[g] = c[seen] @ np.linalg.pinv(K[index], rcond=1e-6, hermitian=True) @ c[seen]
+    return out
+
+
+def without(K: Array, c: Array, group: Sequence[int]) -> tuple[Array, Array]:
+    """Return K and c after the group's columns were taken into the set (Schur complement)."""
+    j = list(group)
+    inverse = np.linalg.pinv(K[np.ix_(j, j)], rcond=1e-8, hermitian=True)
+    return K - K[:, j] @ inverse @ K[j], c - K[:, j] @ (inverse @ c[j])
+
+
+def judged(board: Field, members: Sequence[int], r: Array, noise: float) -> Choice:
+    """Fit a set to the projected residual r (M,); `noise` is its noise energy per row."""
+    columns = [j for m in members for j in board.groups[m]]
+    left, parts = r, []
+    if columns:
+        D = board.columns[:, columns]
+        scale = np.sqrt(np.sum(D**2, axis=0))
+        scale[scale == 0] = 1.0
+        fit = np.linalg.lstsq(D / scale, r, rcond=1e-6)[0] / scale
+        left = r - D @ fit
+        at = 0
+        for m in members:
+            parts.append(fit[at : at + len(board.groups[m])])
+            at += len(board.groups[m])
+    excess = {e: float(left[w] @ left[w]) - noise * len(w) for e, w in board.rows.items()}
+    return Choice(tuple(members), tuple(parts), excess, left)
+
+
+def in_band(board: Field, chosen: Choice, noise: float) -> bool:
+    """Tell whether what is left of every equation is too little to explain."""
+    return all(
+        excess <= max(board.band[e], 4 * noise * np.sqrt(2 * len(board.rows[e])))
+        for e, excess in chosen.excess.items()
+    )
+
+
+def touched(board: Field, member: int, chosen: Choice) -> float:
+    """Return the energy above noise that a set leaves in the equations an entry touches."""
+    return sum(max(0.0, chosen.excess.get(e, 0.0)) for e in board.entries[member].touched)
+
+
+def options(board: Field, members: Sequence[int], r: Array, noise: float) -> list[Choice]:
+    """Return the sets with one more entry that earn their place, the best choice first.
+
+    Among sets that leave about equally little the simplest stands first, then the others by what
+    they leave.
+    """
+    now = judged(board, members, r, noise)
+    K, c = board.K, board.columns.T @ r
+    for m in members:
+        K, c = without(K, c, board.groups[m])
+    g = gains(K, c, board.groups, board.raw)
+    taken = {board.entries[m].variant.key for m in members}
+    trials: list[Choice] = []
+    for i in map(int, np.argsort(-g)[:MOST_TRIALS]):
+        if g[i] <= 0 or board.entries[i].variant.key in taken:
+            continue
+        if g[i] < ADD_SHARE * touched(board, i, now):
+            continue
+        trial = judged(board, (*members, i), r, noise)
+        if admissible(board, trial):
+            trials.append(trial)
+    if not trials:
+        return []
+    best = min(t.total for t in trials)
+    limit = max(AS_GOOD * best, best + 0.1 * sum(board.band.values()))
+    near = sorted((t for t in trials if t.total <= limit), key=lambda t: (_size(board, t), t.total))
+    return near + sorted((t for t in trials if t.total > limit), key=lambda t: t.total)
+
+
+def _size(board: Field, choice: Choice) -> int:
+    return sum(board.size[m] for m in choice.members)
+
+
+def admissible(board: Field, choice: Choice) -> bool:
+    """Tell whether physics allows every effect of a set at its fitted size."""
+    return all(
+        board.admissible(board.entries[m], k)
+        for m, k in zip(choice.members, choice.coefficients, strict=True)
+    )
+
+
+def search(board: Field, r: Array, noise: float = 1.0) -> Choice:
+    """Find the set: forward with swaps and backward pruning, from nothing and from pairs."""
+    empty = judged(board, (), r, noise)
+    if in_band(board, empty, noise) or not board.entries:
+        return empty
+    greedy = grow(board, (), r, noise)
+    if len(greedy.members) == 1 and in_band(board, greedy, noise):
+        return greedy
+    best, seen = greedy, set[Key]()
+    for first in options(board, (), r, noise)[: 3 * STARTS] or _blind(board, r):
+        key = board.entries[first.members[0]].variant.key
+        if key in seen or len(seen) >= STARTS:
+            continue
+        seen.add(key)
+        for pair in options(board, first.members, r, noise)[:1]:
+            other = grow(board, pair.members, r, noise)
+            if len(other.members) <= max(2, len(best.members)) and other.total < 0.7 * best.total:
+                best = other
+    return best
+
+
+def best_pairs(board: Field, r: Array, count: int) -> list[Choice]:
+    """Return the pairs of different candidates that leave least, whatever they are alone."""
+    starts: dict[Key, Choice] = {}
+    for first in _blind(board, r):
+        starts.setdefault(board.entries[first.members[0]].variant.key, first)
+    found: dict[frozenset[Key], Choice] = {}
+    for first in list(starts.values())[:STARTS]:
+        for pair in options(board, first.members, r, 1.0)[:3]:
+            keys = frozenset(board.entries[m].variant.key for m in pair.members)
+            if keys not in found or pair.total < found[keys].total:
+                found[keys] = pair
+    return sorted(found.values(), key=lambda p: p.total)[:count]
+
+
+def _blind(board: Field, r: Array) -> list[Choice]:
+    """Return the best single entries although none earns a place alone: a pair may."""
+    g = gains(board.K, board.columns.T @ r, board.groups, board.raw)
+    return [judged(board, (int(i),), r, 1.0) for i in np.argsort(-g)[: 6 * STARTS] if g[i] > 0]
+
+
+def grow(board: Field, members: Sequence[int], r: Array, noise: float) -> Choice:
+    """Add entries while they earn their place, swapping and dropping earlier ones."""
+    now = judged(board, members, r, noise)
+    while not in_band(board, now, noise) and len(now.members) < LARGEST:
+        more = options(board, now.members, r, noise)
+        if not more:
+            break
+        grown = prune(board, swap(board, more[0], r, noise), r, noise)
+        if grown.total > 0.95 * now.total:
+            break
+        now = grown
+    return prune(board, now, r, noise)
+
+
+def swap(board: Field, chosen: Choice, r: Array, noise: float) -> Choice:
+    """Exchange members for better ones, the others kept, until none is."""
+    for _ in range(2):
+        before = chosen
+        for m in chosen.members[:-1]:
+            others = tuple(k for k in chosen.members if k != m)
+            for trial in options(board, others, r, noise)[:1]:
+                if trial.total < 0.9 * chosen.total:
+                    chosen = trial
+                    break
+        if chosen is before:
+            break
+    return chosen
+
+
+def prune(board: Field, chosen: Choice, r: Array, noise: float) -> Choice:
+    """Drop members without which about as little is left in the equations they touch."""
+    while len(chosen.members) > 1:
+        shares = {m: share(board, chosen, m, r, noise) for m in chosen.members}
+        worst = min(shares, key=lambda m: shares[m])
+        if shares[worst] >= ADD_SHARE:
+            break
+        chosen = judged(board, tuple(m for m in chosen.members if m != worst), r, noise)
+    return chosen
+
+
+def share(board: Field, chosen: Choice, member: int, r: Array, noise: float) -> float:
+    """Return which share of the energy above noise goes with a member, the others kept."""
+    rest = judged(board, tuple(m for m in chosen.members if m != member), r, noise)
+    before, after = touched(board, member, rest), touched(board, member, chosen)
+    return (before - after) / before if before > 0 else 0.0

@@ -1,0 +1,63 @@
+"""Shapes of effects that somebody names: found on the records, where none are given."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+from analysis.effects.base import Effect, Shape, shapes_of
+from analysis.identify import checks as ck
+from analysis.terms.base import Used
+from analysis.trace.data.candidates import points
+from analysis.trace.data.conditioned_record import scenes
+from analysis.trace.data.regression_data import board
+from analysis.trace.data.temperature_nuisance import beside
+from analysis.trace.search.refinement import fit, refine
+from rig.model.records import Run
+from rig.model.rig import Rig
+
+STARTS: Final = 3  # points of an effect's grid that are searched from
+
+
+def open_shapes(rig: Rig, used: Used) -> bool:
+    """Tell whether a term is an effect that is nothing without a shape, and has none.
+
+    A contact's presliding is what data resolve: without one it is dry.
+    """
+    if len(used.shape) or not isinstance(used.term, Effect):
+        return False
+    return any(not s.resolution for s in used.term.shapes(rig))
+
+
+def with_shapes(runs: Sequence[Run], terms: Sequence[Used]) -> tuple[Used, ...]:
+    """Return the terms of a model with the shapes that leave least in the runs' rows.
+
+    By variable projection, one effect after the other joining, each from the points of its grid
+    that leave least; shapes that are given stay. Raises InputError for unusable records.
+    """
+    rig = ck.common_rig(runs)
+    wanted = [u for u in terms if open_shapes(rig, u)]
+    if not wanted:
+        return tuple(terms)
+    known = [u for u in terms if u not in wanted]
+    stage = board(rig, (*known, *beside(known, runs)), scenes(rig, runs))
+    found: tuple[Used, ...] = ()
+    for used in wanted:
+        assert isinstance(used.term, Effect)
+        trials = [(*stage.terms, *found, Used(used.term, p)) for p in points(used.term, rig)]
+        # The least before the search need not be it afterwards: edges that no spool reaches leave
+        # little, and nothing to search along.
+        near = sorted(trials, key=lambda trial: fit(stage, trial).energy)[:STARTS]
+        best = min((refine(stage, trial) for trial in near), key=lambda one: one.energy)
+        found = best.terms[len(stage.terms) :]
+    shaped = dict(zip(wanted, found, strict=True))
+    return tuple(shaped.get(u, u) for u in terms)
+
+
+def shapes_in(rig: Rig, terms: Sequence[Used]) -> Mapping[str, tuple[float, Shape]]:
+    """Return value and description of every shape that a model has, by its name."""
+    return {
+        s.parameter: (value, s)
+        for u in terms
+        for value, s in zip(u.shape, shapes_of(rig, u), strict=True)
+    }

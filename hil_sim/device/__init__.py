@@ -1,0 +1,1 @@
+"""The simulated device: sample clock, output laws, register map, server."""

@@ -1,0 +1,271 @@
+"""The device behind the wire: sample clock, output laws, blocks, watchdog, control.
+
+It knows registers' meaning, not Modbus: `hil_sim.device.register_map` gives addresses to its
+methods.
+
+Virtual time: the plant advances by one block when the host reads and nothing is queued; nothing
+runs while nobody asks. Real time: the sample clock follows the wall clock, whoever asks.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil_sim.device.laws import DeviceLaw, LawTable, Refused
+from hil_sim.device.queue import BlockQueue
+from rig.model import registers as reg
+from rig.model.registers import BlockHeader, Refusal, Status, TripCause
+from rig.model.rig import Rig
+
+logger = logging.getLogger(__name__)
+
+Codes = NDArray[np.int64]
+
+QUEUE_SECONDS = 4.0
+SETTLE_SECONDS = 0.2  # virtual time that passes with zero outputs after the host is gone
+VIRTUAL_SILENCE = 10.0  # nothing moves while a virtual host thinks, so it may think for long
+POLL_SECONDS = 0.05
+WATCHDOG_RANGE_MS = (20, 10_000)
+_U32 = 0xFFFF_FFFF
+
+
+class Plant(Protocol):
+    """What the device needs of a plant; it is deterministic and owns all physical state."""
+
+    tick: int
+
+    def advance(self, ticks: int, laws: Sequence[Any]) -> tuple[Codes, Codes]:
+        """Run `ticks` samples; return AD codes (ticks, channels), DA codes (ticks, joints)."""
+
+
+class Device:
+    """One bench: a plant with converters, a clock, laws, a queue and a watchdog.
+
+    `client` arguments are any hashable that stands for one connection. Methods that a client
+    calls raise `Refused` where the device does not obey.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        plant: Plant,
+        *,
+        realtime: bool,
+        clock: Callable[[], float] = time.monotonic,
+        virtual_silence: float = VIRTUAL_SILENCE,
+    ) -> None:
+        self.rig = rig
+        self.realtime = realtime
+        self.layout = reg.block_layout(len(rig.channels), len(rig.joints))
+        self.laws = LawTable(rig)
+        blocks = max(2, round(QUEUE_SECONDS * rig.sample_rate / self.layout.samples))
+        self.queue = BlockQueue(self.layout, blocks)
+        self.outputs = np.zeros(len(rig.joints), dtype=np.int64)
+        self.cause = TripCause.NONE
+        self.trip_tick = 0
+        self.apply_tick = 0
+        self.streaming = False
+        self.heartbeat = 0
+        self.acknowledged = 0
+        self.watchdog_ms = int(np.clip(round(rig.wire.watchdog * 1e3), *WATCHDOG_RANGE_MS))
+        self._virtual_silence = virtual_silence
+        self._plant = plant
+        self._clock = clock
+        self._controller: object | None = None
+        self._heard = self._polled = self._origin = clock()
+        self._first_tick = plant.tick
+        self._broken = False
+
+    # -- what a client may ask --------------------------------------------------------------
+
+    @property
+    def tick(self) -> int:
+        """Samples measured so far."""
+        return self._plant.tick
+
+    @property
+    def status(self) -> Status:
+        """The status bits, without BLOCK."""
+        status = Status(0)
+        for bit, holds in (
+            (Status.STREAMING, self.streaming),
+            (Status.TRIPPED, self.cause != TripCause.NONE),
+            (Status.ARMED, self.laws.armed),
+            (Status.CONTROLLED, self._controller is not None),
+        ):
+            if holds:
+                status |= bit
+        return status
+
+    def take_control(self, client: object) -> None:
+        """Give `client` control, which is also a sign of life; refused while another has it."""
+        if self._controller is None:
+            self._controller = client
+        elif self._controller is not client:
+            raise Refused(Refusal.NOT_IN_CONTROL)
+        self._heard = self._clock()
+
+    def beat(self, client: object, heartbeat: int) -> None:
+        """Feed the watchdog, if the heartbeat changed: a host repeating itself is not alive."""
+        before = self._heard
+        self.take_control(client)
+        if heartbeat == self.heartbeat:
+            self._heard = before
+        self.heartbeat = heartbeat
+
+    def set_watchdog(self, milliseconds: int) -> None:
+        """Set the silence after which the outputs are zeroed."""
+        low, high = WATCHDOG_RANGE_MS
+        if not low <= milliseconds <= high:
+            raise Refused(Refusal.OUT_OF_RANGE)
+        self.watchdog_ms = milliseconds
+
+    def zero(self) -> None:
+        """Zero all outputs now; any client may, at any time."""
+        self.catch_up()
+        self.laws.zero()
+        self.outputs[:] = 0
+
+    def apply(self, *, restart: bool) -> None:
+        """Let the staged laws act from the next sample on."""
+        if self.cause != TripCause.NONE and self.laws.would_arm():
+            raise Refused(Refusal.TRIPPED)
+        self.catch_up()
+        self.apply_tick = self.tick
+        self.laws.apply(self.tick, restart=restart)
+
+    def start(self) -> None:
+        """Stream from the next sample on, numbered from 0, waveforms at their first sample."""
+        self.catch_up()
+        self.queue.clear()
+        self.laws.restart(self.tick)
+        self.streaming = True
+
+    def stop(self) -> None:
+        """Stop streaming and drop what is queued."""
+        self.streaming = False
+        self.queue.clear()
+
+    def reset(self) -> None:
+        """Clear a latched trip; the outputs stay zero until laws are applied again."""
+        if self._broken:
+            raise Refused(Refusal.FAULT)
+        self.cause = TripCause.NONE
+
+    def acknowledge(self, sequence: int) -> None:
+        """Release the block that the host says it has."""
+        self.acknowledged = sequence
+        self.queue.acknowledge(sequence)
+
+    def read_block(self, client: object) -> bytes:
+        """Return the oldest block with its header, all zeros but the header if there is none."""
+        if client is not self._controller:
+            raise Refused(Refusal.NOT_IN_CONTROL)
+        self.catch_up()
+        if not self.realtime and self.streaming and not len(self.queue):
+            self._run(self.layout.samples)
+        block = self.queue.offer()
+        if block is None:
+            header = BlockHeader(0, self.tick & _U32, self.status, 0)
+            return reg.pack_header(header).ljust(2 * self.layout.words, b"\0")
+        header = BlockHeader(
+            block.sequence, block.tick & _U32, self.status | Status.BLOCK, len(self.queue) - 1
+        )
+        return reg.pack_header(header) + block.samples
+
+    # -- what happens by itself -------------------------------------------------------------
+
+    def disconnected(self, client: object) -> None:
+        """Note that a connection ended; without its controller the device makes itself safe."""
+        if client is not self._controller:
+            return
+        self._controller = None
+        if self.streaming or self.laws.armed:
+            self.trip(TripCause.HOST_LOST)
+            self.stop()
+            with suppress(Refused):
+                self._settle()
+
+    def idle_seconds(self) -> float:
+        """Return how long `poll` may wait: until the block being filled is due."""
+        if not self.realtime or self._broken:
+            return POLL_SECONDS
+        samples = self.tick - self._first_tick + self.queue.room
+        due = self._origin + samples / self.rig.sample_rate - self._clock()
+        return min(max(due, 0.0), POLL_SECONDS)
+
+    def poll(self) -> None:
+        """Do what is due by the clock; to be called again after `idle_seconds`."""
+        now = self._clock()
+        stall, self._polled = now - self._polled, now
+        if stall > 2 * POLL_SECONDS:
+            # Whoever could not listen cannot say that the other was silent.
+            self._heard += stall
+        with suppress(Refused):  # a fault: tripped and logged where it happened
+            self.catch_up()
+            if self._controller is not None and now - self._heard > self._silence_allowed():
+                self._controller = None
+                if self.streaming or self.laws.armed:
+                    self.trip(TripCause.WATCHDOG)
+                    self._settle()
+
+    def trip(self, cause: TripCause) -> None:
+        """Zero the outputs and latch why; the first cause stays until reset."""
+        self.laws.zero()
+        self.outputs[:] = 0
+        if self.cause == TripCause.NONE:
+            self.cause = cause
+            self.trip_tick = self.tick
+            logger.warning("tripped at tick %d: %s", self.tick, reg.TRIP_TEXT[cause])
+
+    def catch_up(self) -> None:
+        """In real time, run the plant up to the present."""
+        if not self.realtime or self._broken:
+            return
+        rate = self.rig.sample_rate
+        # A millionth of a sample early, so that rounding does not put off one that is due now.
+        elapsed = int((self._clock() - self._origin) * rate + 1e-6)
+        due = elapsed - (self.tick - self._first_tick)
+        most = int(QUEUE_SECONDS * rate)
+        if due > most:
+            # The machine slept: the device's clock pauses rather than racing through hours.
+            self._origin += (due - most) / rate
+            due = most
+        self._run(due)
+
+    def _silence_allowed(self) -> float:
+        seconds = self.watchdog_ms * 1e-3
+        return seconds if self.realtime else max(seconds, self._virtual_silence)
+
+    def _settle(self) -> None:
+        if not self.realtime:
+            self._run(round(SETTLE_SECONDS * self.rig.sample_rate))
+
+    def _run(self, ticks: int) -> None:
+        while ticks > 0:
+            count = min(ticks, self.queue.room)
+            tick = self.tick
+            measured, commands = self._advance(count, self.laws.active)
+            self.outputs = commands[-1].copy()
+            if self.streaming:
+                self.queue.add(tick, measured, commands)
+            ticks -= count
+
+    def _advance(self, count: int, laws: tuple[DeviceLaw, ...]) -> tuple[Codes, Codes]:
+        if self._broken:
+            raise Refused(Refusal.FAULT)
+        try:
+            return self._plant.advance(count, laws)
+        except Exception as error:
+            # Whatever went wrong in there: a bench that cannot be computed is a bench in fault.
+            self._broken = True
+            self.trip(TripCause.FAULT)
+            logger.exception("the plant failed at tick %d", self.tick)
+            raise Refused(Refusal.FAULT) from error

@@ -1,0 +1,187 @@
+"""The simulated bench as a server: a `Device` behind Modbus TCP, until told to end."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import signal
+from collections.abc import Callable
+from contextlib import suppress
+
+from pymodbus.constants import ExcCodes
+from pymodbus.pdu import ModbusPDU
+from pymodbus.server import ModbusTcpServer
+from pymodbus.server.requesthandler import ServerRequestHandler
+from pymodbus.simulator import DataType, SimData, SimDevice
+
+from hil_sim.device.device import Device, Plant
+from hil_sim.device.laws import LawTable
+from hil_sim.device.pdu import REQUESTS, Request
+from hil_sim.device.register_map import RegisterMap
+from rig.model import registers as reg
+from rig.model.rig import Rig
+
+logger = logging.getLogger(__name__)
+
+_PARENT_SECONDS = 0.25
+
+
+class EndpointError(Exception):
+    """The address cannot be listened on; the message names host, port and what to do."""
+
+
+class _Session:
+    """What one connection is to the device: an identity, and the news of its end."""
+
+    def __init__(self, device: Device, registers: RegisterMap) -> None:
+        self._device = device
+        self.registers = registers
+
+    def tag(self, sending: bool, pdu: ModbusPDU) -> ModbusPDU:
+        """Tell an incoming request which connection it came by."""
+        if not sending and isinstance(pdu, Request):
+            pdu.session = self
+        return pdu
+
+    def connection(self, connected: bool) -> None:
+        """Pass the end of the connection on."""
+        if not connected:
+            self._device.disconnected(self)
+
+
+class BenchServer(ModbusTcpServer):
+    """A Modbus TCP server whose registers are one device's."""
+
+    def __init__(self, device: Device, host: str, port: int) -> None:
+        # The library wants a store; ours answers every function that the map does not know.
+        nothing = SimData(0, count=1, values=0, datatype=DataType.REGISTERS)
+        store = SimDevice(0, simdata=nothing, action=_no_such_function)
+        super().__init__(store, address=(host, port), custom_pdu=REQUESTS)
+        self._address = (host, port)
+        self._device = device
+        self._registers = RegisterMap(device)
+
+    async def listen(self) -> bool:
+        """Open the socket; raises EndpointError with the reason, where the library only says no."""
+        host, port = self._address
+        self.is_closing = False
+        self.is_listener = True
+        try:
+            self.transport = await self.call_create()
+        except OSError as error:
+            reason = os.strerror(error.errno) if error.errno else str(error)
+            raise EndpointError(
+                f"cannot listen on {host}:{port}: {reason}; end what uses the port, "
+                "or choose another one (0: any free one)"
+            ) from error
+        return True
+
+    def callback_new_connection(self) -> ServerRequestHandler:
+        """Make the handler of one connection."""
+        session = _Session(self._device, self._registers)
+        return ServerRequestHandler(  # type: ignore[no-untyped-call]
+            self, None, session.tag, session.connection
+        )
+
+    @property
+    def endpoint(self) -> str:
+        """Where it really listens: ``modbus-tcp://127.0.0.1:40213``."""
+        host, port = self.transport.sockets[0].getsockname()[:2]  # type: ignore[attr-defined]
+        return f"modbus-tcp://{host}:{port}"
+
+
+async def serve_until(
+    stop: asyncio.Event,
+    device: Device,
+    host: str,
+    port: int,
+    on_ready: Callable[[str], None],
+) -> None:
+    """Serve `device` until `stop` is set; `on_ready` gets the endpoint; raises EndpointError."""
+    server = BenchServer(device, host, port)
+    await server.serve_forever(background=True)
+    try:
+        on_ready(server.endpoint)
+        while not stop.is_set():
+            device.poll()
+            await asyncio.sleep(device.idle_seconds())
+    finally:
+        device.zero()
+        await server.shutdown()  # type: ignore[no-untyped-call]
+
+
+def serve(
+    rig: Rig,
+    plant: Plant,
+    host: str = "127.0.0.1",
+    port: int = 0,
+    *,
+    realtime: bool = False,
+    on_ready: Callable[[str], None] = logger.info,
+    parent: int | None = None,
+) -> None:
+    """Serve a plant behind Modbus TCP until SIGTERM, SIGINT or the end of process `parent`.
+
+    `on_ready` is called once with the real endpoint, before any client is answered. The sample
+    clock starts with this call and a host waits no longer than its timeout: where a plant's first
+    ticks compile, `warm_up` a spare one before.
+    Raises EndpointError when the address cannot be listened on.
+    """
+    # The library's messages are about frames; what matters to people is raised or logged here.
+    logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
+    asyncio.run(_serve(rig, plant, host, port, realtime, on_ready, parent))
+
+
+def warm_up(rig: Rig, spare: Plant) -> None:
+    """Run one block on a plant that is not served, so that whatever compiles has compiled."""
+    table = LawTable(rig)
+    spare.advance(reg.block_layout(len(rig.channels), len(rig.joints)).samples, table.active)
+
+
+async def _serve(
+    rig: Rig,
+    plant: Plant,
+    host: str,
+    port: int,
+    realtime: bool,
+    on_ready: Callable[[str], None],
+    parent: int | None,
+) -> None:
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        # Only a main thread has signals; elsewhere the caller ends its process.
+        with suppress(RuntimeError, ValueError, NotImplementedError):
+            loop.add_signal_handler(number, stop.set)
+    watch = None if parent is None else loop.create_task(_end_with(parent, stop))
+    try:
+        await serve_until(stop, Device(rig, plant, realtime=realtime), host, port, on_ready)
+    finally:
+        if watch is not None:
+            watch.cancel()
+
+
+async def _end_with(parent: int, stop: asyncio.Event) -> None:
+    """Set `stop` when process `parent` is gone."""
+    child = os.getppid() == parent
+    while not stop.is_set():
+        # A child's view of its parent is safe from a process number used again.
+        if os.getppid() != parent if child else not _exists(parent):
+            logger.info("process %d, which this server served, has ended", parent)
+            stop.set()
+        await asyncio.sleep(_PARENT_SECONDS)
+
+
+def _exists(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+async def _no_such_function(*_args: object) -> ExcCodes:
+    return ExcCodes.ILLEGAL_FUNCTION

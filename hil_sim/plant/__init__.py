@@ -1,0 +1,1 @@
+"""The simulated plant: compiled equations, converters, effects."""

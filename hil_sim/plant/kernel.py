@@ -1,0 +1,252 @@
+"""The plant's equations, compiled: oil, metering edges, seals, end stops, arm, pump and relief.
+
+Glossary: cap (p) and rod (m) are the chambers; an edge is one metering edge of the spool; ahead
+is a positive spool, astern a negative one; z is a volume's compression (the strain its oil would
+have if it did not cavitate); theta are absolute angles. State of N joints, shape (5 N + 3,):
+q, q rate, z cap, z rod, bristle (N each), z supply, z manifold, tank pressure. SI throughout.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import copysign, cos, exp, sin, sqrt
+from typing import Any, ParamSpec, TypeVar
+
+import numba
+
+from hil_sim.plant.kernel_data import ATMOSPHERE, LEAK_WIDENING
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def jit(function: Callable[P, R]) -> Callable[P, R]:
+    """Compile `function`; NaN and infinity keep their meaning."""
+    compiled: Callable[P, R] = numba.njit(
+        cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp", "nsz"}
+    )(function)
+    return compiled
+
+
+@jit
+def pressure(z: float, bench: Any) -> float:
+    """Return the gauge pressure [Pa] of oil with a trace of gas at compression z.
+
+    z = p_abs / b - a p0 / p_abs solved for p_abs: b z when compressed, towards zero absolute (and
+    never past it) when the volume is drawn apart; oil and gas are conserved.
+    """
+    gauge: float = bench.half_bulk * (z + sqrt(z * z + bench.trapped)) - ATMOSPHERE
+    return gauge
+
+
+@jit
+def softening(z: float, warmth: float, bench: Any) -> float:
+    """Return the ratio of the present bulk modulus to dp/dz of `pressure`.
+
+    `warmth` is b(T)/b; entrained air adds V_g = a (p0 / p_abs) exp(-p / p_d) per volume of oil: an
+    isothermal gas (Wylie) that dissolves as the pressure rises (Henry's law).
+    """
+    if bench.air <= 0.0:
+        return warmth
+    root = sqrt(z * z + bench.trapped)
+    absolute = bench.half_bulk * (z + root) + 1e-3
+    stiff = absolute / root
+    free = bench.air * ATMOSPHERE / absolute * exp(-absolute / bench.air_dissolution)
+    gas = free * (1.0 / absolute + 1.0 / bench.air_dissolution)
+    ratio: float = warmth / (1.0 + warmth * stiff * gas)
+    return ratio
+
+
+@jit
+def orifice(drop: float, laminar: float) -> float:
+    """Return drop / (drop^2 + laminar^2)^(1/4): a square root that is linear near zero."""
+    return drop / sqrt(sqrt(drop * drop + laminar * laminar))
+
+
+@jit
+def opening(travel: float, lap: float, rounding: float) -> float:
+    """Return one edge's opening [V]; sharp at zero rounding, lap > 0 overlaps, < 0 underlaps.
+
+    A corner worn round over +- rounding of travel: a parabola there that meets both straight lines.
+    """
+    past = travel - lap
+    if abs(past) >= rounding:
+        return max(past, 0.0)
+    return (past + rounding) * (past + rounding) / (4.0 * rounding)
+
+
+@jit
+def contact(s: float, v: float, joint: Any) -> float:
+    """Return the end stops' force against extension [N] (Hunt and Crossley, exponent 3/2)."""
+    over = abs(s) - joint.half_stroke
+    if over <= 0.0:
+        return 0.0
+    side = copysign(1.0, s)
+    force = joint.contact_stiffness * over * sqrt(over)
+    against: float = side * force * max(1.0 + joint.contact_damping * v * side, 0.0)
+    return against
+
+
+@jit
+def bristle(deflection: float, s: float, v: float, p_cap: float, p_rod: float, joint: Any) -> Any:
+    """Return (seal friction [N], bristle rate [m/s]) after LuGre (Canudas de Wit 1995).
+
+    Its relaxation rate |v| sigma0 / g is bounded at `bristle_limit`, so that the fixed step holds
+    at any speed; the steady force stays g(v) sign(v).
+    """
+    level = joint.friction_plus if v >= 0.0 else joint.friction_minus
+    ratio = v / joint.stribeck_speed
+    level += joint.stribeck * exp(-ratio * ratio)
+    level += joint.friction_pressure * max(p_cap + p_rod, 0.0)
+    level = max(level * (1.0 + joint.friction_taper * s), 1e-3 * joint.friction_scale)
+    relax = abs(v) * joint.bristle_stiffness / level
+    rate = (v - relax * deflection) / (1.0 + relax / joint.bristle_limit)
+    return joint.bristle_stiffness * deflection + joint.bristle_damping * rate, rate
+
+
+@jit
+def relief(p: float, bench: Any) -> float:
+    """Return the relief valve's flow [m^3/s]: a slope above cracking, rounded at its foot."""
+    over = p - bench.relief_crack
+    rounding = bench.relief_rounding
+    flow: float = 0.5 * bench.relief_slope * (over + sqrt(over * over + rounding * rounding))
+    return flow
+
+
+@jit
+def port_flows(
+    x: float, s: float, p_cap: float, p_rod: float, port: float, tank: float, j: Any, lam: float
+) -> Any:
+    """Return the flows [m^3/s] into cap and rod, out of the supply and into the tank line.
+
+    C x sqrt(dp) on every open edge (NOTES, "Fluid", with a laminar region), and the leaks.
+    """
+    across = p_rod - p_cap
+    worn = s / j.leak_length
+    q_cap = j.leak_internal * exp(-worn * worn) * across * (1.0 + LEAK_WIDENING * abs(across))
+    q_rod = -q_cap - j.leak_rod * (p_rod - tank)
+    q_cap -= j.leak_cap * (p_cap - tank)
+    demand, returned = 0.0, 0.0
+    ahead = opening(x, j.lap_ahead, j.rounding)
+    if ahead > 0.0:
+        demand = j.c_pp * ahead * orifice(port - p_cap, lam)
+        returned = j.c_mp * ahead * orifice(p_rod - tank, lam)
+        q_cap, q_rod = q_cap + demand, q_rod - returned
+    astern = opening(-x, j.lap_astern, j.rounding)
+    if astern > 0.0:
+        feed = j.c_mm * astern * orifice(port - p_rod, lam)
+        drain = j.c_pm * astern * orifice(p_cap - tank, lam)
+        q_cap, q_rod = q_cap - drain, q_rod + feed
+        demand, returned = demand + feed, returned + drain
+    return q_cap, q_rod, demand, returned
+
+
+@jit
+def supply_rates(
+    y: Any, port: float, demand: float, returned: float, warmth: float, bench: Any, dy: Any
+) -> None:
+    """Write the rates of supply, manifold and tank pressure, the last three of the state.
+
+    Pump = relief + line; a turbulent line to the valves where there is one; the tank's pressure
+    follows the square of the returned flow with the line's lag.
+    """
+    at = len(y) - 3
+    p_supply, line = pressure(y[at], bench), demand
+    dy[at + 1] = 0.0
+    if bench.line_gain > 0.0:
+        line = bench.line_gain * orifice(p_supply - port, bench.laminar)
+        stiff = softening(y[at + 1], warmth, bench)
+        dy[at + 1] = stiff * (line - demand) / bench.manifold_volume
+    stiff = softening(y[at], warmth, bench)
+    dy[at] = stiff * (bench.pump - relief(p_supply, bench) - line) / bench.supply_volume
+    back = bench.tank_pressure + bench.tank_resistance * returned * abs(returned)
+    dy[at + 2] = (back - y[at + 2]) / bench.tank_lag
+
+
+@jit
+def angular(theta: Any, torque: Any, rate: Any, joints: Any, inertia: Any, m: Any) -> None:
+    """Solve for the absolute accelerations of a planar chain, left in `torque`.
+
+    R_ij cos(th_i - th_j) th_j'' + R_ij sin(th_i - th_j) th_j'^2 + W_i g sin th_i = tau_i - tau_i+1
+    (Lagrange of T and V in NOTES, "N DOF planar chain"), by L D L^T in place.
+    theta holds sine and cosine, (2, N); m is work, (N, N).
+    """
+    n = len(joints)
+    for i in range(n):
+        own = torque[i] - joints[i].weight * theta[0, i]
+        if i + 1 < n:
+            own -= torque[i + 1]
+        for k in range(i):
+            turned = theta[1, i] * theta[1, k] + theta[0, i] * theta[0, k]
+            twist = inertia[i, k] * (theta[0, i] * theta[1, k] - theta[1, i] * theta[0, k])
+            m[i, k] = inertia[i, k] * turned
+            own -= twist * rate[k] * rate[k]
+            torque[k] += twist * rate[i] * rate[i]
+        torque[i] = own
+    # m[i, i] keeps 1 / D_i, m[i, k] first L_ik D_k, then L_ik.
+    for i in range(n):
+        diagonal, own = inertia[i, i], torque[i]
+        for k in range(i):
+            scaled = m[i, k]
+            for r in range(k):
+                scaled -= m[i, r] * m[k, r] / m[r, r]
+            m[i, k] = scaled * m[k, k]
+            diagonal -= m[i, k] * scaled
+            own -= m[i, k] * torque[k]
+        m[i, i], torque[i] = 1.0 / diagonal, own
+    for i in range(n - 1, -1, -1):
+        own = torque[i] * m[i, i]
+        for k in range(i + 1, n):
+            own -= m[k, i] * torque[k]
+        torque[i] = own
+
+
+@jit
+def rates(
+    y: Any, spool: Any, warmth: float, joints: Any, bench: Any, inertia: Any, w: Any, dy: Any
+) -> None:
+    """Write the state's rate at effective openings `spool`, (N,) [V], into dy.
+
+    `warmth` is b(T)/b; w is work, (N + 4, N).
+    """
+    n = len(joints)
+    theta, torque, turns, m = w[n : n + 2], w[n + 2], w[n + 3], w[:n]
+    port = pressure(y[5 * n + 1 if bench.line_gain > 0.0 else 5 * n], bench)
+    tank, demand, returned = y[5 * n + 2], 0.0, 0.0
+    sine, cosine, turn = bench.sin_slope, bench.cos_slope, 0.0
+    for i in range(n):
+        j = joints[i]
+        sin_b, cos_b = sin(y[i] + j.offset), cos(y[i] + j.offset)
+        length = sqrt(j.pins - 2.0 * j.product * cos_b)
+        lever = j.product * sin_b / length
+        s, v = length - j.mid_length, lever * y[n + i]
+        p_cap, p_rod = pressure(y[2 * n + i], bench), pressure(y[3 * n + i], bench)
+
+        q_cap, q_rod, taken, given = port_flows(
+            spool[i], s, p_cap, p_rod, port, tank, j, bench.laminar
+        )
+        demand, returned = demand + taken, returned + given
+        stiff = softening(y[2 * n + i], warmth, bench)
+        dy[2 * n + i] = stiff * (q_cap - j.cap_area * v) / (j.cap_volume + s * j.cap_area)
+        stiff = softening(y[3 * n + i], warmth, bench)
+        dy[3 * n + i] = stiff * (q_rod + j.rod_area * v) / (j.rod_volume - s * j.rod_area)
+
+        force = j.cap_area * p_cap - j.rod_area * p_rod - contact(s, v, j)
+        dy[4 * n + i] = 0.0
+        if j.bristle_stiffness > 0.0:
+            friction, dy[4 * n + i] = bristle(y[4 * n + i], s, v, p_cap, p_rod, j)
+            force -= friction
+        twist = y[i] - j.spring_rest
+        spring = j.spring * twist * (1.0 + j.spring_hardening * twist * twist)
+        torque[i] = lever * force - j.viscous * y[n + i] - spring + j.torque_offset
+
+        dy[i] = y[n + i]
+        sin_q = sin_b * j.cos_offset - cos_b * j.sin_offset
+        cos_q = cos_b * j.cos_offset + sin_b * j.sin_offset
+        sine, cosine = sine * cos_q + cosine * sin_q, cosine * cos_q - sine * sin_q
+        turn += y[n + i]
+        theta[0, i], theta[1, i], turns[i] = sine, cosine, turn
+    angular(theta, torque, turns, joints, inertia, m)
+    for i in range(n):
+        dy[n + i] = torque[i] - (torque[i - 1] if i > 0 else 0.0)
+    supply_rates(y, port, demand, returned, warmth, bench, dy)

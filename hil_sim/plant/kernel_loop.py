@@ -1,0 +1,255 @@
+"""The plant's clock, compiled: spools, integration step, converters, output laws, ticks.
+
+Spool state, shape (3, N): LVDT voltage, its rate, effective opening of the edges.
+"""
+
+from __future__ import annotations
+
+from math import copysign, cos, sin, sqrt
+from typing import Any
+
+import numpy as np
+
+from hil_sim.plant.kernel import jit, pressure, rates
+from hil_sim.plant.kernel_data import ATMOSPHERE, KIND
+
+_PISTON = KIND["piston"]
+_CAP, _ROD = KIND["cap_pressure"], KIND["rod_pressure"]
+_SPOOL, _SUPPLY = KIND["spool"], KIND["supply_pressure"]
+
+
+@jit
+def spool_rates(u: float, w: float, x: float, target: float, joint: Any) -> Any:
+    """Return the rates of LVDT voltage, its unlimited rate and the effective opening.
+
+    u'' = omega^2 (target - u) - 2 zeta omega u', |u'| bounded; the opening may lag the LVDT.
+    """
+    slew = min(max(w, -joint.spool_rate), joint.spool_rate)
+    push = joint.omega * joint.omega * (target - u) - 2.0 * joint.zeta * joint.omega * w
+    return slew, push, (u - joint.null - x) * joint.opening_rate
+
+
+@jit
+def move_spool(start: Any, target: Any, h: float, joints: Any, end: Any) -> None:
+    """Advance every spool by h [s] (RK4 on its own three states), `start` to `end`, (3, N)."""
+    for i in range(len(joints)):
+        j = joints[i]
+        u, w, x, r = start[0, i], start[1, i], start[2, i], target[i]
+        if u == r and w == 0.0 and x == u - j.null:
+            end[0, i], end[1, i], end[2, i] = u, w, x
+            continue
+        g = 0.5 * h
+        a, b, c = spool_rates(u, w, x, r, j)
+        d, e, f = spool_rates(u + g * a, w + g * b, x + g * c, r, j)
+        k, m, o = spool_rates(u + g * d, w + g * e, x + g * f, r, j)
+        p, q, s = spool_rates(u + h * k, w + h * m, x + h * o, r, j)
+        u += h / 6.0 * (a + 2.0 * (d + k) + p)
+        w += h / 6.0 * (b + 2.0 * (e + m) + q)
+        x += h / 6.0 * (c + 2.0 * (f + o) + s)
+        if abs(u - r) < 1e-12 and abs(w) < 1e-9:
+            u, w = r, 0.0  # arrived; without this the tail runs into denormal numbers
+        if abs(u) > j.spool_stroke:
+            u, w = copysign(j.spool_stroke, u), 0.0
+        if j.opening_rate <= 0.0 or abs(x - u + j.null) < 1e-13:
+            x = u - j.null
+        end[0, i], end[1, i], end[2, i] = u, w, x
+
+
+@jit
+def crossing(start: Any, end: Any, h: float, joints: Any) -> float:
+    """Return the fraction of the step at which the first spool passes its edges' null, else 1.
+
+    There the flow's slope changes; a step that ends on it keeps its order. Cubic through both
+    ends' values and rates, by Newton from the secant.
+    """
+    first = 1.0
+    for i in range(len(joints)):
+        a, b = start[2, i], end[2, i]
+        if a * b >= 0.0 or joints[i].opening_rate > 0.0:
+            continue
+        da, db = start[1, i] * h, end[1, i] * h
+        c2, c3 = 3.0 * (b - a) - 2.0 * da - db, da + db - 2.0 * (b - a)
+        at = a / (a - b)
+        for _ in range(3):
+            slope = da + at * (2.0 * c2 + at * 3.0 * c3)
+            if slope != 0.0:
+                at -= (a + at * (da + at * (c2 + at * c3))) / slope
+        if 1e-6 < at < first:
+            first = at
+    return first if first < 1.0 - 1e-6 else 1.0
+
+
+@jit
+def step(
+    y: Any,
+    spool: Any,
+    target: Any,
+    h: float,
+    warmth: float,
+    joints: Any,
+    bench: Any,
+    inertia: Any,
+    w: Any,
+    k: Any,
+    ends: Any,
+) -> None:
+    """Advance state and spools in place by h [s]: classical RK4, split where a spool passes null.
+
+    The spools move on their own and are known ahead at half and full step. Work: k (6, states),
+    ends (2, 3, N).
+    """
+    size = len(y)
+    half, end, trial = ends[0], ends[1], k[4]
+    left = h
+    while left > 0.0:
+        d = left
+        move_spool(spool, target, 0.5 * d, joints, half)
+        move_spool(half, target, 0.5 * d, joints, end)
+        at = crossing(spool, end, d, joints)
+        if at < 1.0:
+            d *= at
+            move_spool(spool, target, 0.5 * d, joints, half)
+            move_spool(half, target, 0.5 * d, joints, end)
+        rates(y, spool[2], warmth, joints, bench, inertia, w, k[0])
+        for n in range(size):
+            trial[n] = y[n] + 0.5 * d * k[0, n]
+        rates(trial, half[2], warmth, joints, bench, inertia, w, k[1])
+        for n in range(size):
+            trial[n] = y[n] + 0.5 * d * k[1, n]
+        rates(trial, half[2], warmth, joints, bench, inertia, w, k[2])
+        for n in range(size):
+            trial[n] = y[n] + d * k[2, n]
+        rates(trial, end[2], warmth, joints, bench, inertia, w, k[3])
+        for n in range(size):
+            y[n] += d / 6.0 * (k[0, n] + 2.0 * (k[1, n] + k[2, n]) + k[3, n])
+        spool[:] = end
+        left = left - d if at < 1.0 else 0.0
+
+
+@jit
+def sense(
+    y: Any,
+    dy: Any,
+    spool: Any,
+    heat: float,
+    joints: Any,
+    bench: Any,
+    channels: Any,
+    period: float,
+    value: Any,
+    rate: Any,
+) -> None:
+    """Write the true value and change per tick of every channel, (channels,) each, SI."""
+    n = len(joints)
+    for c in range(len(channels)):
+        kind, i = channels[c].kind, channels[c].joint
+        if kind == _SPOOL:
+            value[c], rate[c] = spool[0, i], spool[1, i]
+        elif kind == _PISTON:
+            j = joints[i]
+            beta = y[i] + j.offset
+            length = sqrt(j.pins - 2.0 * j.product * cos(beta))
+            value[c], rate[c] = length - j.mid_length, j.product * sin(beta) / length * y[n + i]
+        elif kind in (_CAP, _ROD, _SUPPLY):
+            at = 5 * n if kind == _SUPPLY else (2 * n if kind == _CAP else 3 * n) + i
+            value[c] = pressure(y[at], bench)
+            stiff = (value[c] + ATMOSPHERE) / sqrt(y[at] * y[at] + bench.trapped)
+            rate[c] = stiff * dy[at]
+        else:
+            value[c], rate[c] = heat, 0.0
+        rate[c] *= period
+
+
+@jit
+def delayed(tick: int, c: int, lag: float, values: Any, slopes: Any) -> float:
+    """Return channel c at `lag` ticks before `tick`, from a ring of values and rates per tick.
+
+    Ahead of the tick (negative lag: the multiplexer's skew) along the tangent, behind it by cubic
+    Hermite interpolation.
+    """
+    ring = len(values)
+    whole = int(max(lag, 0.0)) + 1
+    t = whole - lag
+    if lag <= 0.0:
+        whole, t = 0, -lag
+    a, b = (tick - whole) % ring, (tick - whole + 1) % ring
+    v, d = values[a, c], slopes[a, c]
+    bend = 0.0
+    if whole > 0:
+        u, e = values[b, c], slopes[b, c]
+        bend = t * t * (3.0 * (u - v) - 2.0 * d - e + t * (d + e - 2.0 * (u - v)))
+    shown: float = v + t * d + bend
+    return shown
+
+
+@jit
+def temperature(time: float, bench: Any) -> float:
+    """Return the oil's temperature [degC]: two slow waves that stay within the band."""
+    a = sin(2.0 * np.pi * (time / bench.period_1 + bench.phase_1))
+    b = sin(2.0 * np.pi * (time / bench.period_2 + bench.phase_2))
+    heat: float = bench.temperature + bench.band * (0.7 * a + 0.3 * b)
+    return heat
+
+
+@jit
+def output(law: Any, waves: Any, tick: int, s: float, joint: Any) -> int:
+    """Return the DA code of the output law at a tick, s being the piston as measured [m]."""
+    v = law.bias + law.position_gain * (law.setpoint - s)
+    if law.period > 0:
+        v += law.gain * waves[law.first + (tick - law.start) % law.period]
+    v = min(max(v, -law.limit), law.limit)
+    code = np.rint(v * (joint.output_top / joint.output_range))
+    return int(min(max(code, -joint.output_top), joint.output_top))
+
+
+@jit
+def run(
+    tick: int,
+    period: float,
+    substeps: int,
+    y: Any,
+    spool: Any,
+    values: Any,
+    slopes: Any,
+    joints: Any,
+    bench_table: Any,
+    inertia: Any,
+    channels: Any,
+    laws: Any,
+    waves: Any,
+    noise: Any,
+    measured: Any,
+    codes: Any,
+) -> None:
+    """Run len(measured) ticks: measure, evaluate the laws, hold the outputs for one period.
+
+    In place: state y, spool, rings values and slopes (ring, channels). Out: measured SI values
+    before coding (ticks, channels), DA codes (ticks, joints). `noise` is standard normal.
+    """
+    n, bench = len(joints), bench_table[0]
+    w, k, ends = np.zeros((n + 4, n)), np.zeros((5, len(y))), np.zeros((2, 3, n))
+    target, position = np.zeros(n), np.zeros(n)
+    for row in range(len(measured)):
+        heat = temperature(tick * period, bench)
+        warmth = 1.0 + bench.bulk_temperature * (heat - bench.temperature)
+        ring = tick % len(values)
+        rates(y, spool[2], warmth, joints, bench, inertia, w, k[0])
+        sense(y, k[0], spool, heat, joints, bench, channels, period, values[ring], slopes[ring])
+        for c in range(len(channels)):
+            h = channels[c]
+            true = delayed(tick, c, h.lag / period, values, slopes)
+            read = h.gain * true + h.offset + h.noise * noise[row, c]
+            measured[row, c] = read
+            if h.kind == _PISTON:
+                code = min(max(np.rint((read - h.low) / h.step), 0.0), h.top)
+                position[h.joint] = h.low + code * h.step
+        for i in range(n):
+            codes[row, i] = output(laws[i], waves, tick, position[i], joints[i])
+            target[i] = codes[row, i] * (joints[i].output_range / joints[i].output_top)
+            target[i] = min(
+                max(target[i] * joints[i].spool_gain, -joints[i].spool_stroke),
+                joints[i].spool_stroke,
+            )
+        for _ in range(substeps):
+            step(y, spool, target, period / substeps, warmth, joints, bench, inertia, w, k, ends)
+        tick += 1

@@ -1,0 +1,76 @@
+"""What the bench's converters see: one row per channel for the compiled tick loop.
+
+Channel k of `rig.channels` is converted k skews after the tick (the multiplexer runs ahead of the
+tick: along the tangent of the true signal), and shows the world as it was `delay` before that
+(cubic Hermite through earlier ticks). Then gain, offset, noise, and the code of `rig.model.codes`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hil_sim.plant.kernel_data import CHANNEL, KIND, Table
+from rig.model import codes
+from rig.model.channels import kind_of
+from rig.model.rig import Rig
+
+
+def channel_table(rig: Rig, noise: float) -> Table:
+    """Return the sensors of `rig` in the order of its channels, noise scaled; shape (channels,)."""
+    table = np.zeros(len(rig.channels), CHANNEL)
+    for k, name in enumerate(rig.channels):
+        kind, joint = kind_of(name)
+        sensor = rig.sensors.of(kind)
+        low, high = sensor.range
+        top = (1 << sensor.bits) - 1
+        row = {
+            "kind": KIND[kind],
+            "joint": (joint or 1) - 1,
+            "noise": sensor.noise * noise,
+            "gain": 1.0,
+            "lag": sensor.delay - k * rig.sensors.skew,
+            "low": low,
+            "step": (high - low) / top,
+            "top": top,
+        }
+        for field, value in row.items():
+            table[field][k] = value
+    return table
+
+
+def ring_length(table: Table, period: float) -> int:
+    """Return how many ticks of history the longest lag needs."""
+    longest = float(np.max(table["lag"], initial=0.0))
+    return max(math.ceil(longest / period), 0) + 3
+
+
+@dataclass(frozen=True)
+class Converter:
+    """Channels that share one range and width: their columns, then low, high and bits."""
+
+    columns: tuple[int, ...]
+    low: float
+    high: float
+    bits: int
+
+
+def converters(rig: Rig) -> tuple[Converter, ...]:
+    """Return the AD converters of `rig`; together they cover every channel once."""
+    shared: dict[tuple[float, float, int], list[int]] = {}
+    for k, name in enumerate(rig.channels):
+        sensor = rig.sensors.of(kind_of(name)[0])
+        shared.setdefault((*sensor.range, sensor.bits), []).append(k)
+    return tuple(Converter(tuple(columns), *key) for key, columns in shared.items())
+
+
+def encode(measured: codes.Array, parts: Sequence[Converter]) -> codes.Codes:
+    """Return the AD codes of measured SI values, both (ticks, channels)."""
+    out = np.empty(measured.shape, dtype=np.int64)
+    for part in parts:
+        columns = list(part.columns)
+        out[:, columns] = codes.encode_input(measured[:, columns], part.low, part.high, part.bits)
+    return out

@@ -1,0 +1,93 @@
+"""What is wrong with the bench today: a scenario file of effects, none of which the analysis sees.
+
+    effects:
+      - {name: coulomb_friction, where: joint 2, force: 80 N}
+      - {name: channel_delay, channel: piston_1, time: 2 ms}
+    parameters: {b: 200 MPa}     # the machine itself, otherwise than its file says
+    noise: 0.5                   # of what the rig's sensors state
+
+`Scenario()` is a bench with nothing wrong. Names are those of CONTRACT, "Effects"; their forms
+here are the simulator's own (LuGre, rounded edges, lagging supply), finer than a regressor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import resources
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+
+from hil_sim.scenario.effects import AnyEffect
+from hil_sim.scenario.truth import with_units
+from rig.model.parameters import parameter_unit
+from rig.model.parse import InputError, parse_model
+from rig.model.quantity import Ratio
+from rig.model.rig import Rig
+
+
+class Scenario(BaseModel):
+    """Effects, parameter overrides [SI] and a noise scale; the default changes nothing."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    description: str = ""
+    effects: tuple[AnyEffect, ...] = ()
+    parameters: Mapping[str, float] = {}
+    noise: Annotated[Ratio, Field(ge=0, description="of the sensors' stated noise")] = 1.0
+
+    @field_validator("parameters", mode="before")
+    @classmethod
+    def _units(cls, value: Any, info: ValidationInfo) -> Any:
+        return with_units(_unit_of)(value, info)
+
+    @field_validator("effects")
+    @classmethod
+    def _each_once(cls, value: tuple[AnyEffect, ...]) -> tuple[AnyEffect, ...]:
+        seen = set()
+        for effect in value:
+            if (effect.name, effect.place) in seen:
+                raise ValueError(f"{effect.name} at {effect.place} stands here a second time")
+            seen.add((effect.name, effect.place))
+        return value
+
+
+def _unit_of(name: str) -> str:
+    if name != "b" and not name.startswith(("C_", "Fv", "M", "R", "W")):
+        raise ValueError(f"{name!r} is no parameter; expected one like M1 R12 Fv1 W1 b C_pp_1")
+    return parameter_unit(name)
+
+
+def shipped_scenarios() -> tuple[str, ...]:
+    """Name the scenarios that come with the simulator."""
+    folder = resources.files("hil_sim") / "scenarios"
+    return tuple(sorted(f.name[:-5] for f in folder.iterdir() if f.name.endswith(".yaml")))
+
+
+def load_shipped(name: str) -> Scenario:
+    """Return a scenario that comes with the simulator."""
+    source = f"{name}.yaml"
+    path = resources.files("hil_sim") / "scenarios" / source
+    return parse_scenario(path.read_text(encoding="utf-8"), source)
+
+
+def parse_scenario(text: str, source: str) -> Scenario:
+    """Read scenario YAML; raises InputError naming `source`, line, key and what was expected."""
+    return parse_model(Scenario, text, source)
+
+
+def check_fits(scenario: Scenario, rig: Rig) -> None:
+    """Raise InputError where an effect stands at a joint or channel that the rig has not."""
+    for effect in scenario.effects:
+        joint = effect.joint
+        if joint is not None and joint >= len(rig.joints):
+            raise InputError(
+                f"scenario: {effect.name} at {effect.place}, but rig {rig.name!r} has "
+                f"{len(rig.joints)} joint(s)"
+            )
+        channel = getattr(effect, "channel", None)
+        if channel is not None and channel not in rig.channels:
+            raise InputError(
+                f"scenario: {effect.name} at channel {channel!r}, but rig {rig.name!r} measures: "
+                f"{' '.join(rig.channels)}"
+            )

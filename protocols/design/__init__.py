@@ -1,0 +1,1 @@
+"""Protocols proved and generated: check on the twin, candidates, selection, sizing."""

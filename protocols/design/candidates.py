@@ -1,0 +1,105 @@
+"""Every lock-and-excite step that a rig of N joints allows within reason.
+
+One joint is excited. Joints below it (towards the base) only turn the whole arm: they stand at
+mid-stroke with closed valves, where gravity is as the linkage's middle has it. Joints beyond it
+set the inertia that the excited one feels: each stands at either end stop, held there by a push,
+or at mid-stroke by a closed valve.
+
+Lower bound. A joint that moves alone feels one inertia, M_kk at the pose of the joints beyond it;
+a chain of N links has N (N + 1) / 2 inertia parameters. So no fewer than N (N + 1) / 2 such steps
+determine them all: 1, 3, 6, 10 steps for 1, 2, 3, 4 joints.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+
+from protocols.files.schema import (
+    CLOSED,
+    END_MAX,
+    END_MIN,
+    Centring,
+    Excite,
+    Lock,
+    Multisine,
+    Step,
+)
+from rig.model.rig import Rig
+
+ALL_POSES = 3  # joints beyond the excited one, up to which every combination is a candidate
+DISPLACED = 2  # of more joints than that, at most so many stand at an end
+END_TOLERANCE, CLOSED_TOLERANCE = 2e-3, 5e-3  # [m] a closed valve is a spring of oil
+CENTRING = Centring(drift=4e-3, offset=4e-3, tries=6)
+AMPLITUDE = 0.4  # [V] rms to begin with; every step is sized on the twin
+REPEATS = 4
+
+
+def steps_needed(joints: int) -> int:
+    """Return the least number of steps with one excited joint that can determine all inertia."""
+    return joints * (joints + 1) // 2
+
+
+def candidates(rig: Rig) -> tuple[Step, ...]:
+    """Return all candidate steps, outermost joint first, with their first amplitude."""
+    N = len(rig.joints)
+    found: list[Step] = []
+    for excited in range(N, 0, -1):
+        for places in _places(N - excited):
+            beyond = tuple(zip(range(excited + 1, N + 1), places, strict=True))
+            found.append(_step(excited, beyond, f"c{len(found) + 1}"))
+    return tuple(found)
+
+
+def _places(count: int) -> Iterator[tuple[str, ...]]:
+    """Yield where `count` joints stand, end stops first."""
+    for places in itertools.product((END_MIN, END_MAX, CLOSED), repeat=count):
+        if count <= ALL_POSES or sum(place != CLOSED for place in places) <= DISPLACED:
+            yield places
+
+
+def _step(excited: int, beyond: tuple[tuple[int, str], ...], name: str) -> Step:
+    closed = tuple(
+        Lock(joint=joint, at=CLOSED, piston=0.0, tolerance=CLOSED_TOLERANCE)
+        for joint in [*range(1, excited), *(j for j, place in beyond if place == CLOSED)]
+    )
+    ends = tuple(
+        Lock(joint=joint, at=place, tolerance=END_TOLERANCE)
+        for joint, place in beyond
+        if place != CLOSED
+    )
+    signal = multisine(AMPLITUDE, 0)
+    excite = Excite(joint=excited, signal=signal, centre=0.0, centring=CENTRING)
+    return Step(name=name, lock=(*closed, *ends), excite=(excite,), repeats=REPEATS)
+
+
+def multisine(amplitude: float, seed: int, tilt: float = 0.4) -> Multisine:
+    """Return the shipped multisine: odd lines, 0.5 to 9.5 Hz, quarter of them left empty."""
+    return Multisine(
+        kind="multisine", base_frequency=0.1, f_min=0.5, f_max=9.5, amplitude=amplitude,
+        amplitude_is="rms", odd=True, detection_fraction=0.25, tilt=tilt, seed=seed,
+    )  # fmt: skip
+
+
+def played(step: Step, amplitude: float, tilt: float, seed: int) -> Step:
+    """Return a candidate with another multisine: amplitude [V] rms, tilt, seed of its phases."""
+    signal = multisine(float(f"{amplitude:.3g}"), seed, tilt)
+    excite = tuple(part.model_copy(update={"signal": signal}) for part in step.excite)
+    return step.model_copy(update={"excite": excite})
+
+
+def told(step: Step) -> str:
+    """Say a step in words: "excite joint 1; joint 2 at end_min, joint 3 closed"."""
+    moving = ", ".join(f"joint {part.joint}" for part in step.excite)
+    still = ", ".join(f"joint {lock.joint} {_at(lock)}" for lock in _sorted(step.lock))
+    return f"excite {moving}" + (f"; {still}" if still else "")
+
+
+def _sorted(locks: tuple[Lock, ...]) -> list[Lock]:
+    return sorted(locks, key=lambda lock: lock.joint)
+
+
+def _at(lock: Lock) -> str:
+    if lock.at != CLOSED:
+        return f"at {lock.at}"
+    return f"closed at {1e3 * lock.piston:g} mm"

@@ -1,0 +1,196 @@
+"""Proves a plan against the rig's limits on a twin, before anything moves.
+
+The twin simulates nominal parameters driven by commands; it is passed in, so that protocols and
+analysis stay apart. Centring is idealised: the bias is sought on the twin until the piston no
+longer drifts, and its motion is then judged as if centred to within the offset that the protocol
+allows.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping
+from typing import Protocol
+
+import numpy as np
+
+from protocols.design.check_report import CheckReport, Prediction, StepCheck
+from protocols.engine.centring import Array, follow, under_loop
+from protocols.files.plan import ExcitePlan, Plan, StepPlan
+from rig.model.parse import InputError
+from rig.model.rig import Rig
+
+log = logging.getLogger(__name__)
+
+BIAS_TRIES = 6
+SEEK_SECONDS = 3.0  # of simulation behind each bias but the last
+RAMP_SECONDS = 1.0  # in which the waveform grows on the twin
+SETTLE_SECONDS = 2.0  # simulated before the period that is judged
+DRIFT_LEFT = 0.2  # of the drift that the protocol allows
+WIDER = 1.05  # swing under the centring loop over the free one: told from there on
+
+
+class Twin(Protocol):
+    """Simulates commands (n, joints) [V] from pistons at `start` (joints,) [m].
+
+    `locked` maps 0-based joints to the piston [m] they are held at. Returns `piston`, `speed`,
+    `cap_pressure`, `rod_pressure`, each (n, joints), and may return `valid` (n,), 0 from where
+    the state ceased to exist.
+    """
+
+    def __call__(
+        self, rig: Rig, commands: Array, start: Array, locked: Mapping[int, float]
+    ) -> Mapping[str, Array]:
+        """Run the simulation."""
+
+
+def check(plan: Plan, rig: Rig, twin: Twin) -> CheckReport:
+    """Predict every step on the twin and compare with the rig's limits.
+
+    Raises InputError where the twin cannot follow the commands at all; whether limits are kept
+    is in the report.
+    """
+    steps = tuple(check_step(step, rig, twin) for step in plan.steps)
+    return CheckReport(plan.protocol.name, rig.name, plan.seconds, steps)
+
+
+def check_step(step: StepPlan, rig: Rig, twin: Twin) -> StepCheck:
+    """Predict one step; raises InputError where the twin cannot follow it."""
+    return judge_motion(step, rig, *centred(step, rig, twin))
+
+
+def judge_motion(
+    step: StepPlan, rig: Rig, biases: Mapping[int, float], moved: Mapping[str, Array]
+) -> StepCheck:
+    """Compare a step's motion on the twin (see `centred`) with the rig's limits."""
+    lines: list[Prediction] = []
+    for part in step.excite:
+        lines += _joint_lines(part, rig, biases[part.joint], moved)
+    lines.append(_flow_line(step, rig, moved))
+    return StepCheck(step.name, tuple(lines), {j + 1: v for j, v in biases.items()})
+
+
+def centred(
+    step: StepPlan, rig: Rig, twin: Twin
+) -> tuple[dict[int, float], Mapping[str, Array]]:  # fmt: skip
+    """Seek biases that keep the pistons centred; returns them and the last period's motion.
+
+    Raises InputError where the twin cannot follow.
+    """
+    rate, joints = rig.sample_rate, len(rig.joints)
+    locked = {part.joint: part.piston for part in step.locks}
+    biases = {part.joint: 0.0 for part in step.excite}
+    start = np.array([locked.get(j, 0.0) for j in range(joints)])
+    for part in step.excite:
+        start[part.joint] = part.centre
+    seek = round(SEEK_SECONDS * rate)
+    whole = math.ceil(SETTLE_SECONDS * rate / step.period) * step.period + step.period
+    for attempt in range(BIAS_TRIES):
+        samples = min(seek, whole) if attempt < 2 else whole
+        commands = _commands(step, joints, biases, samples, rate)
+        moved = twin(rig, commands, start, locked)
+        steady = True
+        for part in step.excite:
+            steady &= _improve(part, step, rate, commands, moved, biases, start)
+        if steady and samples == whole:
+            return biases, {name: values[-step.period :] for name, values in moved.items()}
+    which = ", ".join(str(part.joint + 1) for part in step.excite)
+    raise InputError(
+        f"{step.name}: on the twin joint {which} cannot be centred: after {BIAS_TRIES} biases it "
+        "still drifts, or its state ceases to exist (end of the linkage, vacuum); "
+        "lower the amplitude, or allow more drift"
+    )
+
+
+def _improve(
+    part: ExcitePlan, step: StepPlan, rate: float, commands: Array, moved: Mapping[str, Array],
+    biases: dict[int, float], start: Array,
+) -> bool:  # fmt: skip
+    """Correct bias and start of one joint from a simulation; says whether it was centred."""
+    j = part.joint
+    own = moved["piston"][:, j]
+    exists = np.isfinite(own) & (moved.get("valid", np.ones(len(own))) > 0.0)
+    good = len(own) if exists.all() else int(np.argmin(exists))
+    begin = round(RAMP_SECONDS * rate) if good > 2 * RAMP_SECONDS * rate else 0
+    span = slice(max(begin, good - step.period), good)
+    seen = follow(commands[span, j], own[span], rate)
+    if not seen.gain > 0.0:
+        raise InputError(
+            f"{step.name}: on the twin joint {j + 1} does not follow its command "
+            f"({seen.gain:.3g} m/s per volt); are the rig's nominal parameters right?"
+        )
+    allowed = DRIFT_LEFT * part.settings.centring.drift
+    off = float(np.mean(own[span])) - part.centre
+    steady = good == len(own) and abs(seen.drift) * step.record / rate <= allowed
+    biases[j] = seen.null
+    start[j] -= float(np.clip(off, -5e-3, 5e-3)) if good == len(own) else 0.0
+    return steady
+
+
+def _commands(
+    step: StepPlan, joints: int, biases: Mapping[int, float], samples: int, rate: float
+) -> Array:
+    """Return growing commands (samples, joints) [V] that end with the end of a period."""
+    commands = np.zeros((samples, joints))
+    ramp = np.minimum(1.0, np.arange(samples) / (RAMP_SECONDS * rate))
+    for part in step.excite:
+        wave = np.roll(np.resize(part.wave.samples, step.period), samples % step.period)
+        commands[:, part.joint] = ramp * (np.resize(wave, samples) + biases[part.joint])
+    return commands
+
+
+def _joint_lines(
+    part: ExcitePlan, rig: Rig, bias: float, moved: Mapping[str, Array]
+) -> list[Prediction]:
+    j, limits = part.joint, rig.joints[part.joint].limits
+    piston = moved["piston"][:, j]
+    # As if centred, and then off by what centring allows.
+    piston = piston - np.mean(piston) + part.centre
+    offset = part.settings.centring.offset
+    low, high = float(piston.min()) - offset, float(piston.max()) + offset
+    name = j + 1
+    lines = [
+        Prediction("piston", name, low, high, *limits.piston, "m"),
+        _either_way("piston speed", name, moved["speed"][:, j], limits.speed, "m/s"),
+        _either_way("command", name, part.wave.samples + bias, limits.command, "V"),
+    ]
+    loop = part.settings.centring.position_gain
+    wave = np.resize(part.wave.samples, len(piston)) + bias
+    pull = loop * max(follow(wave, piston, rig.sample_rate).gain, 1e-6)
+    looped = under_loop(piston, pull, rig.sample_rate) + part.centre
+    if np.ptp(looped) > WIDER * np.ptp(piston):
+        low, high = float(looped.min()) - offset, float(looped.max()) + offset
+        lines.append(Prediction("piston under the loop", name, low, high, *limits.piston, "m"))
+    for chamber in ("cap_pressure", "rod_pressure"):
+        pressure = moved[chamber][:, j]
+        span = float(pressure.min()), float(pressure.max())
+        rates = np.diff(pressure) * rig.sample_rate
+        lines += [
+            Prediction(chamber, name, *span, *limits.pressure, "Pa"),
+            _either_way(f"{chamber} rate", name, rates, limits.pressure_rate, "Pa/s"),
+            Prediction(
+                f"{chamber} (cavitation, supply)", name, *span, 0.0, rig.supply.pressure, "Pa",
+                binding=False,
+            ),
+        ]  # fmt: skip
+    return lines
+
+
+def _either_way(
+    quantity: str, joint: int, values: Array, limit: float, unit: str
+) -> Prediction:  # fmt: skip
+    return Prediction(
+        quantity, joint, float(np.min(values)), float(np.max(values)), -limit, limit, unit
+    )
+
+
+def _flow_line(step: StepPlan, rig: Rig, moved: Mapping[str, Array]) -> Prediction:
+    """Predict the pump flow: A_cap ds/dt extending, A_rod |ds/dt| retracting, of all joints."""
+    demand = np.zeros(len(moved["speed"]))
+    for part in step.excite:
+        cylinder = rig.joints[part.joint].cylinder
+        speed = moved["speed"][:, part.joint]
+        demand += np.where(speed > 0.0, cylinder.cap_area * speed, -cylinder.rod_area * speed)
+    peak = float(demand.max())
+    return Prediction("pump flow", None, 0.0, peak, 0.0, rig.supply.flow, "m^3/s", binding=False)

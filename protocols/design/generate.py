@@ -1,0 +1,130 @@
+"""Generates the lock-and-excite steps of a rig, with the proof that they determine everything.
+
+Every candidate (`protocols.design.candidates`) is sized on the twin until it keeps all limits
+(`protocols.design.sizing`); its motion there gives the rows that its record would give, and the
+smallest set is chosen by them (`protocols.design.selection`). Rows and verdicts come from a
+predictor that is passed in, so that protocols and analysis stay apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from protocols.design.candidates import candidates, told
+from protocols.design.check import Twin, centred
+from protocols.design.proof import Proof, Reason, Triangles, Verdicts
+from protocols.design.selection import WORTH, Judge, Sized, complete, extended, smallest
+from protocols.design.sizing import sized
+from protocols.engine.centring import Array
+from protocols.files.plan import resolve
+from protocols.files.schema import Protocol
+from rig.model.parse import InputError
+from rig.model.rig import Rig
+
+
+@dataclass(frozen=True)
+class Predictor:
+    """The twin, and what the analysis makes of its motion.
+
+    `rows(rig, moved, locked)` gives the triangle of each family's rows, `locked` being 1-based;
+    `judge(rig, rows of each step)` says what they determine together.
+    """
+
+    twin: Twin
+    rows: Callable[[Rig, Mapping[str, Array], Sequence[int]], Triangles]
+    judge: Callable[[Rig, Sequence[Triangles]], Verdicts]
+
+    def judge_of(self, rig: Rig) -> Judge:
+        """Return the judge of one rig."""
+        return lambda rows: self.judge(rig, rows)
+
+
+@dataclass(frozen=True)
+class Generated:
+    """A protocol and its proof."""
+
+    protocol: Protocol
+    proof: Proof
+
+
+def generate(rig: Rig, predictor: Predictor, name: str) -> Generated:
+    """Return the smallest set of steps found that determines every parameter of `rig`.
+
+    Raises InputError where no candidate can be run on the rig at all.
+    """
+    pool = _pool(rig, predictor)
+    if not pool:
+        raise InputError(
+            f"rig {rig.name!r}: no step keeps the rig's limits on the twin at any amplitude; "
+            "are limits, supply and nominal values right?"
+        )
+    chosen = smallest(pool, predictor.judge_of(rig))
+    steps = tuple(
+        one.step.model_copy(update={"name": f"step{n}"}) for n, one in enumerate(chosen, start=1)
+    )
+    protocol = Protocol(
+        name=name,
+        description=f"Generated for {rig.name}: one joint excited at a time, all others locked",
+        joints=len(rig.joints),
+        steps=steps,
+    )
+    return Generated(protocol, prove(protocol, rig, predictor))
+
+
+def prove(protocol: Protocol, rig: Rig, predictor: Predictor) -> Proof:
+    """Say what the steps of a protocol determine on the twin, and what would help if not all.
+
+    Raises InputError for a protocol that does not fit the rig or that the twin cannot follow.
+    """
+    plan, judge = resolve(protocol, rig), predictor.judge_of(rig)
+    done: list[Sized] = []
+    reasons: list[Reason] = []
+    before = judge([])
+    for step, planned in zip(plan.protocol.steps, plan.steps, strict=True):
+        _, moved = centred(planned, rig, predictor.twin)
+        rows = predictor.rows(rig, moved, [part.joint + 1 for part in planned.locks])
+        done.append(Sized(step, rows))
+        after = judge([one.rows for one in done])
+        reasons.append(Reason(step.name, told(step), _why(before, after), after))
+        before = after
+    return Proof(
+        protocol.name, rig.name, tuple(reasons), before,
+        () if complete(before) else _help(done, rig, predictor),
+    )  # fmt: skip
+
+
+def _pool(rig: Rig, predictor: Predictor) -> list[Sized]:
+    """Return every candidate that the rig bears, as large as it bears it."""
+    pool = []
+    for seed, step in enumerate(candidates(rig), start=1):
+        found = sized(step, seed, rig, predictor.twin)
+        if found is not None:
+            kept, moved = found
+            locked = [lock.joint for lock in kept.lock]
+            pool.append(Sized(kept, predictor.rows(rig, moved, locked)))
+    return pool
+
+
+def _why(before: Verdicts, after: Verdicts) -> str:
+    """Say what a step added: parameters now determined, combinations, or conditioning."""
+    learned: list[str] = []
+    words = []
+    for family, verdict in after.items():
+        old = before[family]
+        new = [name for name in verdict.known if name not in old.known]
+        learned += new
+        if not new and verdict.rank > old.rank:
+            more = verdict.rank - old.rank
+            words.append(f"{more} more combination{'s' if more > 1 else ''} of {family} parameters")
+        elif old.complete and verdict.condition < WORTH * old.condition:
+            words.append(f"{family} condition {old.condition:.3g} to {verdict.condition:.3g}")
+    words = [f"determines {' '.join(learned)}"] * bool(learned) + words
+    return "; ".join(words) or "more of what is known already"
+
+
+def _help(done: Sequence[Sized], rig: Rig, predictor: Predictor) -> tuple[str, ...]:
+    """Return the steps, in words, that would make the rest identifiable."""
+    pool = _pool(rig, predictor)
+    more = extended(done, pool, predictor.judge_of(rig))[len(done) :]
+    return tuple(told(one.step) for one in more)

@@ -1,0 +1,113 @@
+"""What a set of steps is proven to determine, and why each step is in it; plain data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from protocols.engine.centring import Array
+
+
+class Part(Protocol):
+    """A combination of parameters that can be told from the rest."""
+
+    @property
+    def text(self) -> str:
+        """As people write it."""
+
+
+class Verdict(Protocol):
+    """What rows determine (`analysis.regression.base_parameters.Determined` is one)."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The parameters of the family."""
+
+    @property
+    def rank(self) -> int:
+        """Rank of the rows."""
+
+    @property
+    def condition(self) -> float:
+        """Condition number of the rows with unit columns."""
+
+    @property
+    def known(self) -> tuple[str, ...]:
+        """Parameters determined alone."""
+
+    @property
+    def lost(self) -> tuple[str, ...]:
+        """Parameters that are not."""
+
+    @property
+    def base(self) -> Sequence[Part]:
+        """Combinations of those that are determined."""
+
+    @property
+    def complete(self) -> bool:
+        """Whether every parameter is determined."""
+
+
+Verdicts = Mapping[str, Verdict]
+Triangles = Mapping[str, Array]  # family -> triangle of a step's rows
+
+
+@dataclass(frozen=True)
+class Reason:
+    """Why a step is in the set: in words what it does, and the verdicts once it is added."""
+
+    step: str
+    told: str
+    why: str
+    verdicts: Verdicts
+
+
+@dataclass(frozen=True)
+class Proof:
+    """What the steps of a protocol determine on the twin of a rig.
+
+    `help` are further steps, in words, that would determine what is lost.
+    """
+
+    protocol: str
+    rig: str
+    reasons: tuple[Reason, ...]
+    verdicts: Verdicts
+    help: tuple[str, ...] = ()
+
+    @property
+    def complete(self) -> bool:
+        """Whether every parameter of every family is determined."""
+        return all(verdict.complete for verdict in self.verdicts.values())
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as plain data for JSON."""
+        return {
+            "protocol": self.protocol,
+            "rig": self.rig,
+            "complete": self.complete,
+            "families": {name: _plain(verdict) for name, verdict in self.verdicts.items()},
+            "steps": [
+                {
+                    "step": reason.step,
+                    "does": reason.told,
+                    "why": reason.why,
+                    "rank": {name: v.rank for name, v in reason.verdicts.items()},
+                    "condition_number": {name: v.condition for name, v in reason.verdicts.items()},
+                }
+                for reason in self.reasons
+            ],
+            "help": list(self.help),
+        }
+
+
+def _plain(verdict: Verdict) -> dict[str, Any]:
+    return {
+        "parameters": list(verdict.names),
+        "rank": verdict.rank,
+        "condition_number": verdict.condition,
+        "complete": verdict.complete,
+        "not_identifiable": list(verdict.lost),
+        "base_parameters": [part.text for part in verdict.base],
+    }

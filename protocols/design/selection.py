@@ -1,0 +1,143 @@
+"""Which of many steps to take: the fewest that determine all, then the best conditioned.
+
+Greedily the step is taken that adds most to log det of the information, with unit columns and a
+floor, so that a direction seen for the first time counts more than any seen better; until every
+parameter is determined. Further ones come only while the worse condition number is above what is
+wanted and falls by a tenth or more. Then every step that can go without harm goes, and single
+steps are exchanged while that betters the worse condition number (Fedorov's exchange).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from protocols.design.proof import Triangles, Verdicts
+from protocols.engine.centring import Array
+from protocols.files.schema import CLOSED, Step
+
+Judge = Callable[[Sequence[Triangles]], Verdicts]
+
+WANTED = 30.0  # condition number; the paper's are 10 to 27
+WORTH = 0.9  # a further step must bring it down to this share
+FLOOR = 1e-3  # of a unit column: what shows less does not show
+CLOSED_PRICE = 3.0  # in log det: a closed valve beyond the excited joint must show so much more
+
+
+@dataclass(frozen=True, eq=False)
+class Sized:
+    """A step with an amplitude that the rig bears, and the rows that it gives."""
+
+    step: Step
+    rows: Triangles
+
+
+def smallest(pool: Sequence[Sized], judge: Judge) -> list[Sized]:
+    """Return the fewest steps found in the pool that determine all it can, in the pool's order."""
+    chosen = _exchanged(_pruned(extended([], pool, judge), judge), pool, judge)
+    return sorted(chosen, key=pool.index)
+
+
+def extended(start: Sequence[Sized], pool: Sequence[Sized], judge: Judge) -> list[Sized]:
+    """Return `start` and what is added to it from the pool until all is determined."""
+    chosen = list(start)
+    scales = _scales([*start, *pool])
+    for _ in pool:
+        rest = [one for one in pool if one not in chosen]
+        now = _verdicts(chosen, judge)
+        if not complete(now):
+            before = _score(chosen, scales)
+            gain = {id(one): _score([*chosen, one], scales) - before for one in rest}
+            best = max(rest, key=lambda one: gain[id(one)] - CLOSED_PRICE * _cost(one))
+            if gain[id(best)] < 1.0:
+                break  # no step shows anything new
+        else:
+            if worst(now) <= WANTED:
+                break
+            best = min(rest, key=lambda one: worst(_verdicts([*chosen, one], judge)))
+            if worst(_verdicts([*chosen, best], judge)) > WORTH * worst(now):
+                break
+        chosen.append(best)
+    return chosen
+
+
+def complete(verdicts: Verdicts) -> bool:
+    """Say whether every parameter of every family is determined."""
+    return all(verdict.complete for verdict in verdicts.values())
+
+
+def worst(verdicts: Verdicts) -> float:
+    """Return the larger condition number."""
+    return max(verdict.condition for verdict in verdicts.values())
+
+
+def _verdicts(steps: Sequence[Sized], judge: Judge) -> Verdicts:
+    return judge([one.rows for one in steps])
+
+
+def _pruned(chosen: Sequence[Sized], judge: Judge) -> list[Sized]:
+    """Drop every step without which as much is determined, and as well as wanted."""
+    kept = list(chosen)
+    now = _verdicts(kept, judge)
+    allowed = max(WANTED, worst(now))
+    for one in sorted(chosen, key=_cost, reverse=True):
+        fewer = [other for other in kept if other is not one]
+        verdicts = _verdicts(fewer, judge)
+        same = all(verdicts[family].rank == now[family].rank for family in verdicts)
+        if fewer and same and (worst(verdicts) <= allowed or not complete(now)):
+            kept = fewer
+    return kept
+
+
+def _exchanged(chosen: Sequence[Sized], pool: Sequence[Sized], judge: Judge) -> list[Sized]:
+    """Exchange single steps for others while that betters the worse condition number."""
+    now = list(chosen)
+    for _ in pool:
+        trials = [
+            [*now[:place], other, *now[place + 1 :]]
+            for place in range(len(now))
+            for other in pool
+            if other not in now
+        ]
+        best = min(trials, key=lambda steps: _badness(steps, judge), default=now)
+        if not _badness(best, judge) < _badness(now, judge) + np.log(WORTH):
+            break
+        now = best
+    return now
+
+
+def _badness(steps: Sequence[Sized], judge: Judge) -> float:
+    """Return the log of the worse condition number, a tenth more for each valve closed beyond."""
+    verdicts = _verdicts(steps, judge)
+    if not complete(verdicts):
+        return float("inf")
+    return float(np.log(worst(verdicts)) - np.log(WORTH) * sum(_cost(one) for one in steps))
+
+
+def _cost(one: Sized) -> int:
+    """Count the valves closed beyond the excited joint: a lock of oil gives, a stop does not."""
+    excited = min(part.joint for part in one.step.excite)
+    return sum(lock.at == CLOSED and lock.joint > excited for lock in one.step.lock)
+
+
+def _scales(steps: Sequence[Sized]) -> dict[str, Array]:
+    """Return the columns' norms over all candidates: a measure that no choice changes."""
+    return {
+        family: np.maximum(
+            np.linalg.norm(np.vstack([one.rows[family] for one in steps]), axis=0), 1e-300
+        )
+        for family in steps[0].rows
+    }
+
+
+def _score(steps: Sequence[Sized], scales: Mapping[str, Array]) -> float:
+    total = 0.0
+    for family, scale in scales.items():
+        rows = np.vstack([np.zeros((1, len(scale))), *(one.rows[family] / scale for one in steps)])
+        sigma = np.zeros(len(scale))
+        found = np.linalg.svd(rows, compute_uv=False)
+        sigma[: len(found)] = found
+        total += float(np.sum(np.log(sigma**2 + FLOOR**2)))
+    return total

@@ -1,0 +1,72 @@
+"""Making a step as large as the rig bears, judged by its motion on the twin."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+
+from protocols.design.candidates import AMPLITUDE, played, told
+from protocols.design.check import Twin, centred, judge_motion
+from protocols.design.check_report import Prediction
+from protocols.engine.centring import Array
+from protocols.files.plan import resolve
+from protocols.files.schema import Multisine, Protocol, Step
+from rig.model.parse import InputError
+from rig.model.rig import Rig
+
+log = logging.getLogger(__name__)
+
+SMALLER, SIZES = 0.85, 12  # the amplitude is lowered so, at most so often
+TILTS = (0.4, 0.8, 1.2)
+MODEST = 0.25  # [V] rms below which a steeper multisine is tried
+# Share of a limit's range kept for what the bench does otherwise than the twin.
+SPARE = {"pump flow": 0.03, "cap_pressure (cavitation, supply)": 0.1,
+         "rod_pressure (cavitation, supply)": 0.1, "piston": 0.05}  # fmt: skip
+
+
+def motion_within(
+    step: Step, rig: Rig, twin: Twin, spare: Mapping[str, float] = SPARE
+) -> Mapping[str, Array] | None:
+    """Return one period of a step's motion on the twin, None where a limit would be passed.
+
+    `spare` is the share of a quantity's range that must stay free.
+    """
+    try:
+        alone = Protocol(name="candidate", joints=len(rig.joints), steps=(step,))
+        planned = resolve(alone, rig).steps[0]
+        biases, moved = centred(planned, rig, twin)
+    except InputError as error:
+        log.debug("%s", error)
+        return None
+    lines = judge_motion(planned, rig, biases, moved).predictions
+    return moved if all(_kept(line, spare) for line in lines) else None
+
+
+def sized(step: Step, seed: int, rig: Rig, twin: Twin) -> tuple[Step, Mapping[str, Array]] | None:
+    """Return a candidate as large as the rig bears, with its motion; None where it bears nothing.
+
+    Where the arm resonates, a multisine of little tilt must stay small: a steeper one is tried
+    next, and the largest is taken.
+    """
+    found: dict[float, tuple[Step, Mapping[str, Array]]] = {}
+    for tilt in TILTS:
+        for size in range(SIZES):
+            tried = played(step, AMPLITUDE * SMALLER**size, tilt, seed)
+            moved = motion_within(tried, rig, twin)
+            if moved is not None:
+                signal = tried.excite[0].signal
+                assert isinstance(signal, Multisine)  # as `played` makes them
+                found.setdefault(signal.amplitude, (tried, moved))
+                break
+        if found and max(found) >= MODEST:
+            break
+    if not found:
+        log.info("left out: %s", told(step))
+        return None
+    return found[max(found)]
+
+
+def _kept(line: Prediction, spare: Mapping[str, float]) -> bool:
+    least = spare.get(line.quantity, 0.0) * (line.allowed_high - line.allowed_low)
+    room = line.margin if line.joint is not None else line.allowed_high - line.high
+    return room >= least

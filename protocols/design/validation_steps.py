@@ -1,0 +1,63 @@
+"""New data to judge a model by, for a rig of any size: sines, which are never used for a fit."""
+
+from __future__ import annotations
+
+from protocols.design.candidates import CENTRING, CLOSED_TOLERANCE
+from protocols.design.check import Twin
+from protocols.design.sizing import SIZES, SMALLER, SPARE, motion_within
+from protocols.files.schema import CLOSED, Excite, Lock, Protocol, Sine, Step
+from rig.model.parse import InputError
+from rig.model.rig import Rig
+
+FREQUENCIES = (1.0, 3.0)  # [Hz] the paper's
+ALONE, TOGETHER = 1.0, 0.7  # [V] peak, to begin with; every step is sized on the twin
+# A slow sine swings as wide as the gain says, and a bench's gain is some percent off the twin's.
+ROOM = {**SPARE, "piston": 0.1}
+
+
+def validation(rig: Rig, twin: Twin, name: str) -> Protocol:
+    """Return each joint alone, then all at once, at 1 and 3 Hz, as large as the rig bears.
+
+    Raises InputError naming a step that the rig does not bear at any amplitude.
+    """
+    N = len(rig.joints)
+    steps = []
+    for frequency in FREQUENCIES:
+        for joint in range(N, 0, -1):
+            steps.append(_sized(f"joint{joint}_{frequency:g}hz", (joint,), frequency, rig, twin))
+        if N > 1:
+            every = tuple(range(1, N + 1))
+            steps.append(_sized(f"all_{frequency:g}hz", every, frequency, rig, twin))
+    return Protocol(
+        name=name,
+        description=f"Records to judge a model of {rig.name} by, 1 and 3 Hz sines",
+        joints=N,
+        steps=tuple(steps),
+    )
+
+
+def _sized(name: str, moving: tuple[int, ...], frequency: float, rig: Rig, twin: Twin) -> Step:
+    for size in range(SIZES):
+        amplitude = (ALONE if len(moving) == 1 else TOGETHER) * SMALLER**size
+        step = _step(name, moving, frequency, float(f"{amplitude:.3g}"), len(rig.joints))
+        if motion_within(step, rig, twin, ROOM) is not None:
+            return step
+    raise InputError(
+        f"rig {rig.name!r}: {name} passes a limit on the twin at any amplitude; are limits, "
+        "supply and nominal values right?"
+    )
+
+
+def _step(name: str, moving: tuple[int, ...], hertz: float, volts: float, joints: int) -> Step:
+    signal = Sine(kind="sine", frequency=hertz, amplitude=volts)
+    return Step(
+        name=name,
+        lock=tuple(
+            Lock(joint=joint, at=CLOSED, piston=0.0, tolerance=CLOSED_TOLERANCE)
+            for joint in range(1, joints + 1)
+            if joint not in moving
+        ),
+        excite=tuple(Excite(joint=joint, signal=signal, centring=CENTRING) for joint in moving),
+        duration=5.0,
+        warm_up=4,
+    )

@@ -1,0 +1,1 @@
+"""Running a plan on a bench: placing, locking, centring, playing waveforms, recording."""

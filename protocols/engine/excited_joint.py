@@ -1,0 +1,181 @@
+"""One excited joint in flight: what its bias is, how it moved, what its bias should become."""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from protocols.engine.centring import (
+    RECENTRE_CAP,
+    Array,
+    Motion,
+    follow,
+    forecast,
+    leaves,
+    motion,
+    moved_by,
+    recentring,
+    trim,
+)
+from protocols.engine.errors import ProtocolAborted
+from protocols.files.plan import ExcitePlan
+from protocols.files.schema import OPEN_LOOP, Centring
+
+log = logging.getLogger(__name__)
+
+AT_REST = Motion(0.0, 0.0, 0.0)
+FASTEST_RETURN = 0.03  # [m/s] by which a piston about to leave its limits is brought back
+SHORTEST_LINE = 100  # samples; a slope through less is noise
+SHORTEST_RETURN = 0.5  # [s] in which it is back
+
+
+@dataclass(frozen=True)
+class Driven:
+    """An excited joint: its plan, bias [V], gain k [m/(s V)], drift asked for [m/s], motion."""
+
+    plan: ExcitePlan
+    bias: float
+    gain: float = math.nan
+    wanted: float = 0.0
+    moved: Motion = AT_REST
+
+    @property
+    def joint(self) -> int:
+        """The joint, 0-based."""
+        return self.plan.joint
+
+    @property
+    def centring(self) -> Centring:
+        """How it is to be kept centred."""
+        return self.plan.settings.centring
+
+    @property
+    def loop(self) -> float:
+        """The position gain [V/m] while it is recorded; 0 in open loop."""
+        return 0.0 if self.centring.mode == OPEN_LOOP else self.centring.position_gain
+
+
+def found_under_loop(
+    driven: Driven, command: Array, piston: Array, period: int, rate: float, step: str
+) -> Driven:
+    """Return the joint with gain and bias as seen while a loop centred it; arrays of shape (n,).
+
+    Two whole periods give the drift exactly, less of them by the fit of `follow`. Raises
+    ProtocolAborted for a piston that does not follow its command.
+    """
+    seen = follow(command, piston, rate)
+    if not seen.gain > 0.0:
+        raise ProtocolAborted(
+            f"{step}: joint {driven.joint + 1} does not follow its command: "
+            f"{np.nanstd(command):.3g} V (rms) move the piston by {seen.gain:.3g} m/s per volt, "
+            "expected more than 0; is the pump on, and the valve connected the right way round?"
+        )
+    if len(piston) >= 2 * period:
+        moved = motion(piston, period, rate)
+        bias = float(np.nanmean(command[-period:])) - moved.drift / seen.gain
+    else:
+        moved = moved_by(piston, seen.drift, rate)
+        bias = seen.null
+    log.info("%s: joint %d moves %.4f m/s per volt, null %.4f V", step, driven.joint + 1, seen.gain,
+             bias)  # fmt: skip
+    return replace(driven, bias=bias, gain=seen.gain, moved=moved)
+
+
+def off_centre(driven: Driven) -> float:
+    """Return how far the piston was off its centre, as a share of the offset allowed."""
+    return abs(driven.moved.ends - driven.plan.centre) / driven.centring.offset
+
+
+def check_swing(
+    driven: Driven, period: Array, limits: tuple[float, float], step: str
+) -> None:  # fmt: skip
+    """Raise ProtocolAborted if a period (n,) of the piston has no room for its allowed offset."""
+    swing = period - np.nanmean(period) + driven.plan.centre
+    low, high = float(np.nanmin(swing)), float(np.nanmax(swing))
+    spare = driven.centring.offset
+    if low - spare < limits[0] or high + spare > limits[1]:
+        raise ProtocolAborted(
+            f"{step}: joint {driven.joint + 1} swings {1e3 * low:.1f} to {1e3 * high:.1f} mm; with "
+            f"the {1e3 * spare:g} mm that its centre may be off, that leaves its limits, "
+            f"{1e3 * limits[0]:g} to {1e3 * limits[1]:g} mm: lower the amplitude"
+        )
+
+
+def settled(driven: Driven, moved: Motion, record: float, step: str) -> bool:
+    """Say whether drift over a record of `record` seconds and offset are as small as allowed."""
+    off = moved.ends - driven.plan.centre
+    log.info(
+        "%s: joint %d at bias %.4f V drifts %.3f mm/s (asked %.3f), centre off by %.2f mm",
+        step, driven.joint + 1, driven.bias, 1e3 * moved.drift, 1e3 * driven.wanted, 1e3 * off,
+    )  # fmt: skip
+    wrong = abs(moved.drift - driven.wanted) * record
+    return wrong <= driven.centring.drift and abs(off) <= driven.centring.offset
+
+
+def trimmed(driven: Driven, moved: Motion, seconds: float, gently: bool) -> Driven:
+    """Return the joint with the bias for its next `seconds`; `gently` where that is a record."""
+    if driven.loop > 0.0:
+        # The loop stands off by what it has to add to the bias: take that over.
+        off = moved.mean - driven.plan.centre
+        bias = driven.bias - driven.loop * off - moved.drift / driven.gain
+        return replace(driven, bias=bias, moved=moved)
+    cap = RECENTRE_CAP * driven.centring.drift if gently else math.inf
+    wanted = recentring(moved, driven.plan.centre, seconds, cap)
+    bias = trim(driven.bias, moved.drift, wanted, driven.gain)
+    return replace(driven, bias=bias, wanted=wanted, moved=moved)
+
+
+def corrected(
+    driven: Driven,
+    reference: Array,
+    other_law: bool,
+    seen: Array,
+    horizon: int,
+    rate: float,
+    limits: tuple[float, float],
+    step: str,
+) -> Driven | None:  # fmt: skip
+    """Return the joint with a bias that keeps it within `limits` [m], None if it stays anyway.
+
+    `reference`, `seen` and `horizon` are those of `forecast`; `other_law`, if the reference was
+    measured under another law than this. The piston is sent back so as to be centred at the end
+    of the period.
+    """
+    if driven.loop > 0.0:
+        return None
+    # Another law gave the reference another shape, whose mismatch looks like a drift until a whole
+    # period has passed; and its own drift tells nothing of this one.
+    shortest = len(reference) if other_law else max(SHORTEST_LINE, len(reference) // 10)
+    ahead = forecast(reference, seen, horizon, rate, shortest)
+    if not leaves(ahead, *limits):
+        return None
+    rest = len(reference) - len(seen) % len(reference)
+    off = float(np.nanmean(reference)) + ahead.shift - driven.plan.centre
+    back = -off / max(SHORTEST_RETURN, rest / rate)
+    back = float(np.clip(back, -FASTEST_RETURN, FASTEST_RETURN))
+    drift = ahead.slope + (0.0 if other_law else driven.moved.drift)
+    log.warning(
+        "%s: joint %d would reach %.1f..%.1f mm; its bias is corrected at once",
+        step, driven.joint + 1, 1e3 * ahead.low, 1e3 * ahead.high,
+    )  # fmt: skip
+    return replace(driven, bias=trim(driven.bias, drift, back, driven.gain), wanted=back)
+
+
+def returned(driven: Driven) -> Driven:
+    """Return the joint with the way back taken out of its bias."""
+    return replace(driven, bias=trim(driven.bias, driven.wanted, 0.0, driven.gain), wanted=0.0)
+
+
+def not_centred(driven: Driven, record: float, tries: int, step: str) -> ProtocolAborted:
+    """Return the refusal to go on with a joint whose bias would not settle."""
+    allowed = driven.centring
+    return ProtocolAborted(
+        f"{step}: joint {driven.joint + 1} is not centred after {tries} trials: it drifts "
+        f"{1e3 * driven.moved.drift * record:.2f} mm in a record (allowed "
+        f"{1e3 * allowed.drift:g} mm) and its centre is at {1e3 * driven.moved.ends:.2f} mm "
+        f"(expected {1e3 * driven.plan.centre:g} +- {1e3 * allowed.offset:g} mm); "
+        "allow more drift, lower the amplitude, or centre by 'position-loop'"
+    )

@@ -1,0 +1,297 @@
+"""Playing the waveforms of one step: warm-up, trials of the bias, records.
+
+All boundaries are ticks: the waveforms start at `start`, and every later stretch begins a whole
+number of periods after it, so all records of a step begin at the same sample of the waveform. A
+law is changed when the block that holds the boundary has been read: a few samples after it.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping, Sequence
+
+from drivers.base import OutputLaw
+from protocols.engine.centring import Array, Motion, follow, free_path, motion, moved_by
+from protocols.engine.excited_joint import (
+    Driven,
+    check_swing,
+    corrected,
+    found_under_loop,
+    not_centred,
+    off_centre,
+    returned,
+    settled,
+    trimmed,
+)
+from protocols.engine.locking import Lock, verify
+from protocols.engine.session import Session
+from protocols.files.plan import FIRM_SECONDS, StepPlan
+from protocols.files.schema import Place
+
+log = logging.getLogger(__name__)
+
+RAMP_STEP = 0.05  # [s] between two sizes of the growing waveform
+WARM_UPS = 3  # at most; more than one only if the first left the piston off centre
+LOOSER = 0.8  # factor between two position gains while the loop is loosened
+RAMP_DOWN = 0.5  # [s] a moving arm is not stopped by closing its valve at once
+LOOK_AHEAD = 0.1  # [s] between two forecasts
+RELEASED = 0.25  # of the offset allowed: so near its free way a piston is let go
+
+
+class Excitation:
+    """One step's excitation in progress; `at` is the tick of the boundary reached."""
+
+    def __init__(
+        self, session: Session, step: StepPlan, place: Place, locks: Sequence[Lock]
+    ) -> None:
+        self.session = session
+        self.step = step
+        self.place = place
+        self.locks = tuple(locks)
+        self.joints: tuple[Driven, ...] = ()
+        self.start = 0
+        self.at = 0
+        self._alone = True  # the period before ran under other laws than this one
+        self._references: list[Array] = []  # the last period of each joint that went undisturbed
+        self._checked = 0  # locks are verified up to here
+
+    def warm_up(self, nulls: Mapping[int, float]) -> None:
+        """Let the waveforms grow under a firm position loop, then loosen it and find the biases.
+
+        `nulls` [V] are the commands that held the pistons still, by joint (0-based). A loop turns
+        the phase of the motion, so loosening it at once would leave the piston off centre: it is
+        loosened slowly. Raises ProtocolAborted for a piston that does not follow its command or
+        swings too far.
+        """
+        self.joints = tuple(Driven(e, nulls[e.joint]) for e in self.step.excite)
+        for driven in self.joints:
+            self.session.bench.upload(driven.joint, driven.plan.wave.samples)
+        firm = self.place.position_gain
+        silent = {d.joint: self._law(d, 0.0, firm) for d in self.joints}
+        self.start = self.session.apply(silent, restart=True)
+        self._checked = self.session.now
+        self._grow(firm)
+        self._go_on(FIRM_SECONDS)
+        self._find_biases(round(FIRM_SECONDS * self.session.rate))
+        self._play(loop=firm)
+        self._go_on(0.5 * FIRM_SECONDS)
+        self._loosen(firm)
+        passed = self.session.now - self.start
+        self.at = self.start + math.ceil(passed / self.step.period) * self.step.period
+        for _ in range(WARM_UPS):
+            self.hold()
+            self._advance(self.step.warm_up)
+            self._find_biases(self.step.warm_up)
+            if max(off_centre(driven) for driven in self.joints) < 0.5:
+                break
+        self._references = self._last_period()
+        for driven, period in zip(self.joints, self._references, strict=True):
+            limits = self.session.rig.joints[driven.joint].limits.piston
+            check_swing(driven, period, limits, self.step.name)
+
+    def settle_bias(self) -> None:
+        """Play trials until every piston is centred and its drift is what was asked for.
+
+        Raises ProtocolAborted after as many tries as the protocol allows.
+        """
+        record = self.step.record / self.session.rate
+        self._release()
+        for _ in range(self.step.tries + 1):
+            self._play()
+            moved = self._stretch(self.step.trial)
+            if moved is None:
+                continue
+            pairs = list(zip(self.joints, moved, strict=True))
+            good = all(settled(d, m, record, self.step.name) for d, m in pairs)
+            seconds = record if good else self.step.trial / self.session.rate
+            self.joints = tuple(trimmed(d, m, seconds, good) for d, m in pairs)
+            if good:
+                return
+        worst = max(self.joints, key=lambda d: abs(d.moved.ends - d.plan.centre))
+        raise not_centred(worst, record, self.step.tries + 1, self.step.name)
+
+    def _release(self) -> None:
+        """Let go of the slow loop, each joint where the free waveform would have its piston.
+
+        From elsewhere it would go the same way off centre: for a slow waveform, whose phase a loop
+        turns by a quarter, by as much as its whole swing. A fast one has no way to be off.
+        """
+        period, rate = self.step.period, self.session.rate
+        paths = {
+            d.joint: free_path(d.plan.wave.samples, period, d.gain, rate) + d.plan.centre
+            for d in self.joints
+            if d.loop == 0.0 and self.session.laws[d.joint].position_gain > 0.0
+        }
+        before = {j: self._off_path(j, path) for j, path in paths.items()}
+        allowed = {d.joint: RELEASED * d.centring.offset for d in self.joints}
+        if all(abs(off) <= 2 * allowed[j] for j, off in before.items()):
+            return
+        laws = {d.joint: self._law(d, 1.0, 0.0) for d in self.joints}
+        while before and self.session.now < self.at + period:
+            self._go_on(RAMP_STEP)
+            for j, off in list(before.items()):
+                now = self._off_path(j, paths[j])
+                if abs(now) <= allowed[j] or now * off < 0.0:
+                    self.session.apply({j: laws[j]})
+                    del before[j]
+        self.session.apply({j: laws[j] for j in before})
+        self._advance(math.ceil((self.session.now - self.at) / period) * period)
+        self._references = [
+            paths.get(d.joint, reference)
+            for d, reference in zip(self.joints, self._references, strict=True)
+        ]
+
+    def _off_path(self, joint: int, path: Array) -> float:
+        """Return how far [m] a piston is from its free way, at the last sample read."""
+        now = self.session.now
+        (piston,) = self.session.piston(joint, now - 1, now)
+        return float(piston - path[(now - 1 - self.start) % len(path)])
+
+    def record(self) -> bool:
+        """Play one record from the boundary reached; False if it had to be disturbed.
+
+        The biases are trimmed for the next one from what was seen in it.
+        """
+        self._play()
+        moved = self._stretch(self.step.record)
+        if moved is None:
+            return False
+        seconds = self.step.record / self.session.rate
+        self.joints = tuple(
+            trimmed(d, m, seconds, True) for d, m in zip(self.joints, moved, strict=True)
+        )
+        return True
+
+    def hold(self) -> None:
+        """Centre by the slow loop, until the next trial."""
+        self._play(loop=self._loose())
+        self._alone = True
+
+    def resume(self, locks: Sequence[Lock]) -> None:
+        """Go on at the next boundary, with locks that were made anew meanwhile."""
+        self.locks = tuple(locks)
+        self._checked = self.session.now
+        behind = self.session.now - self.at
+        self._advance(math.ceil(behind / self.step.period) * self.step.period)
+
+    def stop(self) -> None:
+        """Let the waveforms shrink under the firm loop, then close every valve."""
+        sizes = round(RAMP_DOWN / RAMP_STEP)
+        for size in range(sizes - 1, -1, -1):
+            self._play(size / sizes, self.place.position_gain)
+            self.session.wait(RAMP_STEP)
+        self.session.off()
+
+    def _law(self, driven: Driven, scale: float, position_gain: float) -> OutputLaw:
+        limit = self.session.rig.joints[driven.joint].limits.command
+        return OutputLaw(scale, driven.bias, position_gain, driven.plan.centre, limit)
+
+    def _play(self, scale: float = 1.0, loop: float | None = None) -> None:
+        """Put the laws of all excited joints in force; `loop` [V/m] overrides their own."""
+        self.session.apply(
+            {d.joint: self._law(d, scale, d.loop if loop is None else loop) for d in self.joints}
+        )
+
+    def _grow(self, loop: float) -> None:
+        """Let the waveforms grow to full size."""
+        sizes = max(1, round(self.step.ramp / RAMP_STEP))
+        for size in range(1, sizes + 1):
+            self._go_on(RAMP_STEP)
+            self._play(size / sizes, loop)
+
+    def _loosen(self, firm: float) -> None:
+        """Lower the position gain to the slow loop's, no faster than the loop itself settles."""
+        loop, loose = firm, self._loose()
+        slowest = min(d.gain for d in self.joints)
+        while loop * LOOSER > loose:
+            loop *= LOOSER
+            self._play(loop=loop)
+            self._go_on(0.5 / (slowest * loop))
+
+    def _loose(self) -> float:
+        return min(d.centring.position_gain for d in self.joints)
+
+    def _go_on(self, seconds: float) -> None:
+        """Play on for a time, wherever that ends, with an eye on the locks."""
+        self.session.wait(seconds, self._watch_locks)
+
+    def _watch_locks(self) -> None:
+        for held in self.locks:
+            verify(self.session, held, self.step.name, self._checked, self.session.now)
+        self._checked = self.session.now
+
+    def _advance(self, samples: int) -> None:
+        """Go on to the boundary `samples` later, with an eye on the locks."""
+        self.at += samples
+        self.session.until(self.at, self._watch_locks)
+
+    def _find_biases(self, samples: int) -> None:
+        """Take each bias from the last `samples`, or the last two periods if those are fewer."""
+        last = self.session.now
+        first = last - min(samples, 2 * self.step.period)
+        self.joints = tuple(
+            found_under_loop(
+                driven,
+                self.session.command(driven.joint, first, last),
+                self.session.piston(driven.joint, first, last),
+                self.step.period,
+                self.session.rate,
+                self.step.name,
+            )
+            for driven in self.joints
+        )
+
+    def _moved(self, driven: Driven) -> Motion:
+        """Measure the last stretch of one joint."""
+        j, period, rate = driven.joint, self.step.period, self.session.rate
+        if self._alone and self.step.trial < 2 * period:
+            piston = self.session.piston(j, self.at - period, self.at)
+            command = self.session.command(j, self.at - period, self.at)
+            return moved_by(piston, follow(command, piston, rate).drift, rate)
+        return motion(self.session.piston(j, self.at - 2 * period, self.at), period, rate)
+
+    def _last_period(self) -> list[Array]:
+        first = self.at - self.step.period
+        return [self.session.piston(d.joint, first, self.at) for d in self.joints]
+
+    def _stretch(self, samples: int) -> list[Motion] | None:
+        """Play on for whole periods; returns how each joint moved.
+
+        None, if a piston had to be kept from leaving its limits: then the biases were changed at
+        once, and the stretch ended with the period begun.
+        """
+        first, last = self.at, self.at + samples
+        while self.at < last:
+            self._advance(min(last - self.at, round(LOOK_AHEAD * self.session.rate)))
+            if self.at < last and self._correct(first, last):
+                past = (self.at - first) % self.step.period
+                self._advance(self.step.period - past if past else 0)
+                self.joints = tuple(returned(d) for d in self.joints)
+                self._alone = True
+                return None
+        moved = [self._moved(driven) for driven in self.joints]
+        self._alone = False
+        self._references = self._last_period()
+        return moved
+
+    def _correct(self, first: int, last: int) -> bool:
+        """Correct the biases of pistons about to leave their limits; says whether any was."""
+        found = [
+            corrected(
+                driven,
+                reference,
+                self._alone,
+                self.session.piston(driven.joint, first, self.at),
+                last - self.at,
+                self.session.rate,
+                self.session.rig.joints[driven.joint].limits.piston,
+                self.step.name,
+            )
+            for driven, reference in zip(self.joints, self._references, strict=True)
+        ]
+        if not any(found):
+            return False
+        self.joints = tuple(new or old for new, old in zip(found, self.joints, strict=True))
+        self._play()
+        return True

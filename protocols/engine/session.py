@@ -1,0 +1,122 @@
+"""A conversation with the bench: laws in force, samples read so far, waiting in device time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from types import TracebackType
+from typing import Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.base import OFF, DeviceInfo, OutputLaw, SampleBlock
+from rig.bench.guard import JointRole
+from rig.model import channels as ch
+from rig.model.rig import Rig
+from rig.runs.recorder import RecordMeta
+
+Array = NDArray[np.float64]
+Watch = Callable[[], None]
+
+
+class RecordHandle(Protocol):
+    """A record being taken: complete where its `with` block ends, partial if it is left early."""
+
+    def __enter__(self) -> Self:
+        """Begin the record."""
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """End the record."""
+
+    def note(self, **attributes: str | float | int) -> None:
+        """Add what is known of it only now."""
+
+    def discard(self, reason: str) -> None:
+        """Make it no record; its samples stay in the run."""
+
+
+class Bench(Protocol):
+    """What the engine needs of `rig.bench.session.Bench`."""
+
+    info: DeviceInfo
+
+    def upload(self, joint: int, wave: Array) -> None:
+        """Store one period of a joint's (0-based) waveform [V]."""
+
+    def apply(self, laws: Sequence[OutputLaw], restart: bool = False) -> int:
+        """Set all laws; returns the tick from which they hold."""
+
+    def exchange(self) -> SampleBlock:
+        """Read one block, checked and journalled; raises what ends a run, outputs zeroed."""
+
+    def guard(self, roles: Sequence[JointRole]) -> None:
+        """Say what each joint does, and so which limits hold."""
+
+    def record(
+        self, meta: RecordMeta | None = None, *, start_tick: int | None = None,
+        ticks: int | None = None,
+    ) -> RecordHandle:  # fmt: skip
+        """Make a record of `ticks` samples from `start_tick`, to be entered by `with`."""
+
+
+class Session:
+    """Holds the laws in force and the samples read lately; every wait is in device time."""
+
+    def __init__(self, bench: Bench, rig: Rig, keep: int) -> None:
+        """Remember the last `keep` samples."""
+        self.bench = bench
+        self.rig = rig
+        self.rate = rig.sample_rate
+        self.joints = len(rig.joints)
+        self.laws: list[OutputLaw] = [OFF] * self.joints
+        self.now = 0  # the tick after the last sample read
+        self._columns = {name: column for column, name in enumerate(rig.recorded)}
+        self._ring = np.full((keep, len(rig.recorded)), np.nan)
+        self._stamps = np.full(keep, -1, dtype=np.int64)
+
+    def apply(self, changes: Mapping[int, OutputLaw], restart: bool = False) -> int:
+        """Put new laws in force for some joints; returns the tick from which they hold."""
+        for joint, law in changes.items():
+            self.laws[joint] = law
+        return self.bench.apply(tuple(self.laws), restart)
+
+    def off(self) -> None:
+        """Put every output to zero."""
+        self.apply(dict.fromkeys(range(self.joints), OFF))
+
+    def until(self, tick: int, watch: Watch | None = None) -> None:
+        """Read blocks until sample `tick` - 1 is in; `watch` is called after each."""
+        while self.now < tick:
+            block = self.bench.exchange()
+            ticks = np.arange(block.tick, block.tick + len(block.data))
+            places = ticks % len(self._stamps)
+            self._ring[places], self._stamps[places] = block.data, ticks
+            self.now = block.tick + len(block.data)
+            if watch is not None:
+                watch()
+
+    def wait(self, seconds: float, watch: Watch | None = None) -> int:
+        """Read for a time from now on; returns the tick where it began."""
+        first = self.now
+        self.until(first + max(1, round(seconds * self.rate)), watch)
+        return first
+
+    def samples(self, kind: str, joint: int, first: int, last: int) -> Array:
+        """Return a channel of joint `joint` (0-based) over ticks [first, last), NaN where lost."""
+        ticks = np.arange(first, last)
+        places = ticks % len(self._stamps)
+        values = self._ring[places, self._columns[ch.channel(kind, joint + 1)]]
+        return np.where(self._stamps[places] == ticks, values, np.nan)
+
+    def piston(self, joint: int, first: int, last: int) -> Array:
+        """Return the piston [m] of joint `joint` (0-based) over ticks [first, last)."""
+        return self.samples(ch.PISTON, joint, first, last)
+
+    def command(self, joint: int, first: int, last: int) -> Array:
+        """Return the command [V] of joint `joint` (0-based) over ticks [first, last)."""
+        return self.samples(ch.COMMAND, joint, first, last)

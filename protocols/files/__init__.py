@@ -1,0 +1,1 @@
+"""Protocol files: schema, reading, writing, waveforms, the resolved plan."""

@@ -1,0 +1,70 @@
+"""Writes a protocol as a file that `protocols.files.library.load` reads back unchanged."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import yaml
+
+from protocols.files.schema import Protocol
+
+# Unit written beside each quantity, and how many of it make an SI unit.
+_UNITS: Mapping[str, tuple[str, float]] = {
+    "position_gain": ("V/m", 1.0),
+    "limit": ("V", 1.0),
+    "push": ("V", 1.0),
+    "tolerance": ("mm", 1e3),
+    "timeout": ("s", 1.0),
+    "piston": ("mm", 1e3),
+    "frequency": ("Hz", 1.0),
+    "base_frequency": ("Hz", 1.0),
+    "f_min": ("Hz", 1.0),
+    "f_max": ("Hz", 1.0),
+    "amplitude": ("V", 1.0),
+    "amplitudes": ("V", 1.0),
+    "phases": ("rad", 1.0),
+    "drift": ("mm", 1e3),
+    "offset": ("mm", 1e3),
+    "centre": ("mm", 1e3),
+    "duration": ("s", 1.0),
+    "ramp": ("s", 1.0),
+    "settle": ("s", 1.0),
+}
+
+
+_DIGITS: Mapping[str, int] = {"amplitudes": 5, "phases": 5}  # significant; others: 12
+
+
+class _Row(list[Any]):
+    """A list of plain values, written on one line."""
+
+
+class _Dumper(yaml.SafeDumper):
+    """A dumper of its own, so that the library's is left alone."""
+
+
+_Dumper.add_representer(
+    _Row, lambda dumper, row: dumper.represent_sequence("tag:yaml.org,2002:seq", row, True)
+)
+
+
+def protocol_text(protocol: Protocol, comment: str = "") -> str:
+    """Return the YAML of a protocol, `comment` above it; only what differs from the defaults."""
+    data = _quantities(protocol.model_dump(mode="json", exclude_defaults=True))
+    lines = [f"# {line}".rstrip() for line in comment.splitlines()]
+    body = yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100)
+    return "\n".join([*lines, body])
+
+
+def _quantities(value: Any, key: str = "") -> Any:
+    if isinstance(value, dict):
+        return {name: _quantities(item, name) for name, item in value.items()}
+    if isinstance(value, list):
+        items = [_quantities(item, key) for item in value]
+        return items if any(isinstance(item, dict) for item in items) else _Row(items)
+    if key in _UNITS and value is not None:
+        unit, scale = _UNITS[key]
+        digits = _DIGITS.get(key, 12)
+        return f"{float(f'{value * scale:.{digits}g}'):.{digits}g} {unit}"
+    return value

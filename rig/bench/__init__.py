@@ -1,0 +1,1 @@
+"""One session with a device: outputs, the guard on every sample, stops, the socket of screens."""

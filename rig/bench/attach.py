@@ -1,0 +1,235 @@
+"""The local sockets through which a screen watches a run and stops it; only their owner may.
+
+Two ZeroMQ sockets per session in a folder of mode 0700: `<rig>-<pid>.pub` (PUB: snapshots) and
+`<rig>-<pid>.cmd` (REP: "stop", "reset"). The run never waits for a screen: snapshots that nobody
+takes are dropped, commands are polled.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import logging
+import os
+import re
+import socket
+import stat
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import zmq
+
+from rig.bench.snapshot import ChannelView, Snapshot, from_json, to_json
+from rig.runs.runstate import process_alive
+
+__all__ = ["AttachError", "Attachment", "ChannelView", "Endpoint", "Publisher", "Snapshot"]
+
+log = logging.getLogger(__name__)
+
+COMMANDS = ("stop", "reset")
+_MAX_PATH = 100  # a Unix socket's address holds 107 bytes
+_MAX_NAME = 32
+_FILE = re.compile(r"^(?P<rig>.+)-(?P<pid>\d+)\.(?:pub|cmd)$")
+_COMMANDS_AT_ONCE = 16
+
+
+class AttachError(Exception):
+    """The local sockets cannot be made or trusted; the message says why."""
+
+
+@dataclass(frozen=True)
+class Endpoint:
+    """One running session."""
+
+    rig: str
+    pid: int
+    pub: Path
+    cmd: Path
+
+
+def session_folder() -> Path:
+    """Return this user's folder for sockets, made and checked: ours, mode 0700, short enough."""
+    fallback = Path("/tmp") / f"bramah-{os.getuid()}"
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    longest = _MAX_NAME + len("-4194304.pub/bramah")
+    if not runtime or not os.path.isabs(runtime) or len(os.fsencode(runtime)) + longest > _MAX_PATH:
+        return _private(fallback)
+    try:
+        return _private(Path(runtime) / "bramah")
+    except AttachError as error:
+        log.info("%s; using %s", error, fallback)
+        return _private(fallback)
+
+
+def _private(folder: Path) -> Path:
+    try:
+        with suppress(FileExistsError):
+            folder.mkdir(mode=0o700)
+        found = folder.lstat()
+        if not stat.S_ISDIR(found.st_mode):
+            raise AttachError(f"{folder}: is not a folder (a link?); remove it")
+        if found.st_uid != os.getuid():
+            raise AttachError(f"{folder}: belongs to user {found.st_uid}; sockets there are unsafe")
+        if stat.S_IMODE(found.st_mode) != 0o700:
+            folder.chmod(0o700)
+    except OSError as error:
+        raise AttachError(f"{folder}: cannot be used for sockets: {error.strerror}") from error
+    return folder
+
+
+def _address(path: Path) -> str:
+    return f"ipc://{path}"
+
+
+def _listening(path: Path) -> bool:
+    """Whether a process listens at a Unix socket; a file left by a dead one does not."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.setblocking(False)
+        found = probe.connect_ex(os.fspath(path))
+    return found in (0, errno.EAGAIN, errno.EINPROGRESS)
+
+
+def _sessions(folder: Path) -> list[Endpoint]:
+    """Return the live sessions; files of dead ones are removed."""
+    found = []
+    for pub in sorted(folder.glob("*.pub")):
+        match = _FILE.match(pub.name)
+        if match is None:
+            continue
+        cmd = pub.with_suffix(".cmd")
+        if process_alive(int(match["pid"])) and _listening(pub):
+            found.append(Endpoint(match["rig"], int(match["pid"]), pub, cmd))
+        else:
+            pub.unlink(missing_ok=True)
+            cmd.unlink(missing_ok=True)
+    return found
+
+
+class Publisher:
+    """The run's side; raises AttachError if its sockets cannot be made."""
+
+    def __init__(self, rig: str, folder: Path | None = None) -> None:
+        where = session_folder() if folder is None else _private(folder)
+        _sessions(where)
+        stem = f"{rig[:_MAX_NAME]}-{os.getpid()}"
+        self.endpoint = Endpoint(
+            rig[:_MAX_NAME], os.getpid(), where / f"{stem}.pub", where / f"{stem}.cmd"
+        )
+        self._context = zmq.Context(1)
+        self._closed = False
+        try:
+            self._pub = self._bind(zmq.PUB, self.endpoint.pub)
+            self._cmd = self._bind(zmq.REP, self.endpoint.cmd)
+        except zmq.ZMQError as error:
+            self._context.destroy(linger=0)
+            raise AttachError(f"{where}: sockets cannot be made: {error}") from error
+
+    def _bind(self, kind: int, path: Path) -> zmq.Socket[bytes]:
+        if len(os.fsencode(path)) > _MAX_PATH:
+            raise zmq.ZMQError(errno.ENAMETOOLONG)
+        path.unlink(missing_ok=True)
+        made = self._context.socket(kind)
+        made.setsockopt(zmq.SNDHWM, 8)
+        made.setsockopt(zmq.RCVHWM, _COMMANDS_AT_ONCE)
+        made.setsockopt(zmq.LINGER, 200)  # let the last snapshot and answer out, then go
+        made.setsockopt(zmq.MAXMSGSIZE, 1 << 16)
+        made.bind(_address(path))
+        return made
+
+    def publish(self, snapshot: Snapshot) -> None:
+        """Offer a snapshot to whoever watches; never waits."""
+        with suppress(zmq.ZMQError):
+            self._pub.send(to_json(snapshot), zmq.NOBLOCK)
+
+    def commands(self) -> list[str]:
+        """Return the commands that came since the last call, each answered; never waits."""
+        found: list[str] = []
+        for _ in range(_COMMANDS_AT_ONCE):
+            try:
+                raw = self._cmd.recv_multipart(zmq.NOBLOCK)[0]
+            except zmq.ZMQError:
+                break
+            command = _command(raw)
+            answer: dict[str, object] = {"ok": command is not None}
+            if command is None:
+                answer["error"] = f"expected one of: {', '.join(COMMANDS)}"
+            else:
+                found.append(command)
+            with suppress(zmq.ZMQError):
+                self._cmd.send(json.dumps(answer).encode(), zmq.NOBLOCK)
+        return found
+
+    def close(self) -> None:
+        """Close and remove the sockets; never raises."""
+        if self._closed:
+            return
+        self._closed = True
+        with suppress(zmq.ZMQError):
+            self._pub.close()
+            self._cmd.close()
+            self._context.term()
+        for path in (self.endpoint.pub, self.endpoint.cmd):
+            with suppress(OSError):
+                path.unlink(missing_ok=True)
+
+
+def _command(raw: bytes) -> str | None:
+    try:
+        word = json.loads(raw)["command"]
+    except (ValueError, TypeError, KeyError):
+        return None
+    return word if word in COMMANDS else None
+
+
+class Attachment:
+    """The screen's side of one session."""
+
+    def __init__(self, endpoint: Endpoint) -> None:
+        self.endpoint = endpoint
+        self._context = zmq.Context(1)
+        self._sub = self._context.socket(zmq.SUB)
+        self._sub.setsockopt(zmq.LINGER, 0)
+        self._sub.setsockopt(zmq.RCVHWM, 64)
+        self._sub.setsockopt(zmq.SUBSCRIBE, b"")
+        self._sub.connect(_address(endpoint.pub))
+
+    @staticmethod
+    def find(rig: str | None = None, folder: Path | None = None) -> list[Endpoint]:
+        """Return the live sessions (of one rig); raises AttachError for an unsafe folder."""
+        found = _sessions(session_folder() if folder is None else _private(folder))
+        return [e for e in found if rig is None or e.rig == rig[:_MAX_NAME]]
+
+    def receive(self, timeout: float) -> Snapshot | None:
+        """Return the next snapshot, None after `timeout` [s] without one."""
+        try:
+            if not self._sub.poll(max(0, round(timeout * 1000))):
+                return None
+            return from_json(self._sub.recv(zmq.NOBLOCK))
+        except (zmq.ZMQError, ValueError) as error:
+            log.debug("no snapshot: %s", error)
+            return None
+
+    def send(self, command: str, timeout: float = 2.0) -> bool:
+        """Send a command; True when the run has taken it, False without an answer in `timeout`."""
+        asking = self._context.socket(zmq.REQ)  # a new one: an unanswered one is of no use again
+        asking.setsockopt(zmq.LINGER, 0)
+        try:
+            asking.connect(_address(self.endpoint.cmd))
+            asking.send(json.dumps({"command": command}).encode(), zmq.NOBLOCK)
+            if not asking.poll(round(timeout * 1000)):
+                return False
+            return bool(json.loads(asking.recv(zmq.NOBLOCK)).get("ok"))
+        except (zmq.ZMQError, ValueError, AttributeError):
+            return False
+        finally:
+            asking.close()
+
+    @property
+    def alive(self) -> bool:
+        """Whether the run's process still lives."""
+        return process_alive(self.endpoint.pid)
+
+    def close(self) -> None:
+        """Detach; the run does not notice."""
+        self._context.destroy(linger=0)

@@ -1,0 +1,112 @@
+"""The bench's side of a screen: gathers samples, publishes snapshots, hears commands."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.base import SampleBlock
+from rig.bench.attach import Publisher
+from rig.bench.guard import JointRole, piston_bounds
+from rig.bench.snapshot import BenchView, Progress, take_snapshot
+from rig.model import channels as ch
+from rig.model.rig import Rig
+from rig.runs import runstate
+
+Array = NDArray[np.float64]
+Limits = dict[str, tuple[float | None, float | None]]
+
+_INTERVAL = 0.05  # [s] of wall time between snapshots
+
+
+class Display:
+    """Publishes at most twenty snapshots a second of wall time; without a publisher, nothing."""
+
+    def __init__(
+        self, rig: Rig, publisher: Publisher | None, run: str, clock: Callable[[], float]
+    ) -> None:
+        self.progress = Progress()
+        self.trip: str | None = None
+        self._rig = rig
+        self._publisher = publisher
+        self._run = run
+        self._clock = clock
+        self._units = {name: ch.unit_of(name) for name in rig.recorded}
+        self._waiting: list[Array] = []
+        self._next = -np.inf
+        self._tick = 0
+        self._first: int | None = None
+        self._lost = 0
+        self._roles: Sequence[JointRole] = ()
+
+    def commands(self) -> list[str]:
+        """Return what the screens asked for."""
+        return [] if self._publisher is None else self._publisher.commands()
+
+    def show(self, block: SampleBlock, age: float, lost: int, roles: Sequence[JointRole]) -> None:
+        """Take a block; publish if it is time."""
+        if self._publisher is None:
+            return
+        self._waiting.append(block.data)
+        if self._first is None:
+            self._first = block.tick
+        done = (block.tick - self._first) / self._rig.sample_rate
+        self.progress = replace(self.progress, done_s=done)
+        self._tick = block.tick + len(block.data)
+        self._lost, self._roles = lost, roles
+        if self.trip is not None or self._clock() >= self._next:
+            self._publish(runstate.RUNNING if self.trip is None else runstate.TRIPPED, age)
+            self._next = self._clock() + _INTERVAL
+
+    def _publish(self, state: str, age: float) -> None:
+        if self._publisher is None:
+            return
+        columns = len(self._units)
+        samples = np.concatenate(self._waiting) if self._waiting else np.empty((0, columns))
+        self._waiting = []
+        view = BenchView(
+            run=self._run,
+            rig=self._rig.name,
+            state=state,
+            tick=self._tick,
+            device_time=self._tick / self._rig.sample_rate,
+            wall_time=time.time(),
+            block_age=age,
+            lost_samples=self._lost,
+            trip=self.trip,
+        )
+        snapshot = take_snapshot(view, self.progress, samples, self._units, self._limits())
+        self._publisher.publish(snapshot)
+
+    def _limits(self) -> Limits:
+        found: Limits = {}
+        for name in self._units:
+            kind, joint = ch.kind_of(name)
+            found[name] = (None, None)
+            if joint is None:
+                continue
+            limits = self._rig.joints[joint - 1].limits
+            if kind in (ch.CAP, ch.ROD):
+                found[name] = limits.pressure
+            elif kind == ch.COMMAND:
+                found[name] = (-limits.command, limits.command)
+            elif kind == ch.PISTON and self._roles:
+                _, *ends = piston_bounds(self._roles[joint - 1], self._rig, joint - 1)
+                found[name] = (ends[0], ends[1])
+        return found
+
+    def ended(self, state: str, message: str) -> None:
+        """Publish how the run ended, as soon as the outputs are at zero."""
+        if message:
+            self.progress = replace(self.progress, message=message)
+        self._publish(state, 0.0)
+
+    def close(self) -> None:
+        """Close the sockets; never raises."""
+        if self._publisher is not None:
+            self._publisher.close()
+            self._publisher = None

@@ -1,0 +1,322 @@
+"""The bench: one session with a device, in which every way out begins with outputs at zero.
+
+Order on any exit: outputs to zero, the wire closed, data flushed, then the report. Signals set a
+flag that the exchange loop honours; nothing interrupts the zeroing. Trips latch.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import asdict, replace
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.base import DeviceError, DeviceInfo, Driver, OutputLaw, SampleBlock
+from rig.bench.attach import Publisher
+from rig.bench.display import Display
+from rig.bench.guard import Guard, GuardSettings, JointRole
+from rig.bench.handles import RecordHandle
+from rig.bench.lateness import ArrivalClock
+from rig.bench.observers import Observers
+from rig.bench.outputs import Outputs
+from rig.bench.stops import StopFlag
+from rig.model.rig import Rig
+from rig.model.trips import Latched, OperatorStop, RecordingFailed, SafetyTrip, Violation
+from rig.runs import runstate
+from rig.runs.recorder import Recorder, RecordMeta
+
+log = logging.getLogger(__name__)
+UNSURE = "outputs not confirmed at zero"
+Array = NDArray[np.float64]
+
+
+class Bench:
+    """A session with the device behind `driver`; a context manager that owns driver and publisher.
+
+    Call `exchange` (or `run_for`) at least as often as the rig's watchdog: nothing may wait
+    elsewhere. Raises InputError, DeviceError, DeviceLost, RecordingFailed on entry; SafetyTrip,
+    OperatorStop and the same from then on, each with the outputs already at zero.
+    """
+
+    info: DeviceInfo
+
+    def __init__(
+        self,
+        rig: Rig,
+        driver: Driver,
+        recorder: Recorder | None = None,
+        publisher: Publisher | None = None,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        settings: GuardSettings | None = None,
+        signals: bool = True,
+    ) -> None:
+        self.rig = rig
+        self.recorder = recorder
+        self.observers = Observers()
+        self.trip: SafetyTrip | None = None
+        self.lost_samples = 0
+        self.tick = 0
+        self._outputs = Outputs(rig, driver)
+        self._driver = driver
+        self._clock = clock
+        self._guard = Guard(rig, settings)
+        self._stop = StopFlag()
+        self._signals = signals
+        self._display = Display(rig, publisher, str(recorder.folder) if recorder else "", clock)
+        self._arrival: ArrivalClock | None = None
+        self._expected: int | None = None
+
+    # Entry and exit
+
+    def __enter__(self) -> Self:
+        if self._signals:
+            self._stop.install()
+        try:
+            self.info = self._outputs.connect()
+            cause = self._outputs.safely(self._driver.trip_cause)
+            if cause is not None:
+                raise Latched(cause, self.rig)
+            if self.recorder is not None:
+                self.recorder.open(self.info)
+            self.restart()
+        except BaseException as error:
+            self._leave(error)
+            raise
+        return self
+
+    def restart(self) -> None:
+        """Start (again) the device's stream of blocks and its waveforms."""
+        self._outputs.safely(self._driver.start)
+        self._expected = None
+        self._guard.forget()
+        self._arrival = None if self.info.virtual_time else ArrivalClock(self.info.sample_rate)
+        if self.recorder is not None:
+            self.recorder.begin_stream()
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._leave(error)
+        if error is None and self._stop.reason is not None:
+            raise OperatorStop(f"{self._stop.reason}; the run itself was complete")
+
+    def _leave(self, error: BaseException | None) -> None:
+        """Zero, close the wire, flush, report; the signals come back last."""
+        state, message = _outcome(error)
+        try:
+            if not self._outputs.close():
+                message = f"{message}; {UNSURE}".lstrip("; ")
+            # A screen waits for this, and flushing can take seconds.
+            self._display.ended(state, message)
+        finally:
+            try:
+                self._flush(state, message, error)
+            finally:
+                self._display.close()
+                self._stop.restore()
+
+    def _flush(self, state: str, message: str, error: BaseException | None) -> None:
+        if self.recorder is None:
+            return
+        try:
+            self.recorder.finish(state, message)
+        except RecordingFailed as problem:
+            if error is None:
+                raise
+            log.error("%s", problem)  # what went wrong first is what the user is told
+
+    # Outputs
+
+    def zero_outputs(self) -> bool:
+        """Put the outputs to zero now; False (and logged) if the device does not answer."""
+        return self._outputs.zero()
+
+    def upload(self, joint: int, wave: Array) -> None:
+        """Store one period of the waveform [V] of joint `joint` (0-based), shape (period,)."""
+        values = np.asarray(wave, dtype=np.float64)
+        if values.ndim != 1 or len(values) == 0 or not np.isfinite(values).all():
+            raise ValueError("a waveform is one row of at least one finite number")
+        self._heed()
+        self._outputs.safely(lambda: self._driver.upload(joint, values))
+
+    def apply(self, laws: Sequence[OutputLaw], restart: bool = False) -> int:
+        """Set the laws of all joints at one tick, bounded by each joint's limits.command.
+
+        `restart` starts the waveforms there. Returns that tick; raises ValueError for a wrong
+        number of laws or one that is not finite.
+        """
+        bounded = self._outputs.bounded(laws)
+        self._heed()
+        return self._outputs.safely(lambda: self._driver.apply(bounded, restart=restart))
+
+    # Samples
+
+    def exchange(self) -> SampleBlock:
+        """Take one block: check every sample, journal it, show it.
+
+        Raises SafetyTrip, OperatorStop, DeviceLost, DeviceError or RecordingFailed, each with the
+        outputs zeroed before; a block that trips is journalled all the same.
+        """
+        self._heed()
+        block = self._outputs.safely(self._driver.read_block)
+        late = None if self._arrival is None else self._arrival.late(block, self._clock())
+        lost = self._outputs.safely(lambda: self._continue(block))
+        violation = self._outputs.safely(lambda: self._inspect(block, lost, late))
+        trip = None
+        if violation is not None:
+            self.zero_outputs()
+            trip = self._latch(SafetyTrip(violation, self.rig))
+        self._keep(block, late, lost)
+        self.observers.block(block)
+        self._display.show(block, late or 0.0, self.lost_samples, self._guard.roles)
+        if trip is not None:
+            self._report(trip)
+            raise trip
+        self._heed()
+        return block
+
+    def _continue(self, block: SampleBlock) -> int:
+        """Return how many samples are missing before a block; raises DeviceError if it is odd."""
+        shape = (len(block.data), len(self.rig.recorded))
+        if block.data.shape != shape or len(block.data) == 0:
+            raise DeviceError(f"a block of shape {block.data.shape} came; expected (n, {shape[1]})")
+        lost = 0 if self._expected is None else block.tick - self._expected
+        if lost < 0:
+            raise DeviceError(
+                f"samples out of order: a block of tick {block.tick} came where {self._expected} "
+                "or later was due"
+            )
+        self._expected = self.tick = block.tick + len(block.data)
+        self.lost_samples += lost
+        return lost
+
+    def _inspect(self, block: SampleBlock, lost: int, late: float | None) -> Violation | None:
+        blind = self._guard.gap(lost, block.tick) if lost else None
+        found = blind or self._guard.check(block)
+        if found is None and late is not None:
+            found = self._guard.stale(late, block.tick)
+        if found is None and block.tripped:
+            found = self._guard.device_tripped(block.tick)
+        return found
+
+    def _keep(self, block: SampleBlock, late: float | None, lost: int) -> None:
+        if self.recorder is None:
+            return
+        recorder = self.recorder
+
+        def keep() -> None:
+            if lost:
+                recorder.event("samples lost", block.tick - lost, lost=lost)
+            recorder.append(block, late)
+
+        self._outputs.safely(keep)
+
+    def _latch(self, trip: SafetyTrip | None) -> SafetyTrip | None:
+        self.trip = trip
+        self._display.trip = None if trip is None else str(trip)
+        return trip
+
+    def _report(self, trip: SafetyTrip) -> None:
+        log.info("%s", trip)
+        about = {k: v for k, v in asdict(trip.violation).items() if k != "tick"}
+        with suppress(RecordingFailed):  # the trip is what the user must hear
+            self.event("trip", trip.tick, message=str(trip), **about)
+
+    def _heed(self) -> None:
+        """Honour a wish to stop and a latched trip before anything else is done."""
+        for command in self._display.commands():
+            if command == "stop":
+                self._stop.request("stopped by operator (from the screen)")
+            elif self.trip is not None:
+                self.reset()
+        if self._stop.reason is not None:
+            self.zero_outputs()
+            with suppress(RecordingFailed):
+                self.event("stop", self.tick, reason=self._stop.reason)
+            raise OperatorStop(self._stop.reason)
+        if self.trip is not None:
+            self.zero_outputs()
+            raise self.trip
+
+    def reset(self) -> None:
+        """Clear a latched trip, here and in the device; only on a person's word."""
+        self._outputs.safely(self._driver.reset)
+        self._latch(None)
+        self._guard.forget()
+        self.event("reset", self.tick)
+
+    def run_for(self, seconds: float, watch: Callable[[SampleBlock], None] | None = None) -> Array:
+        """Exchange until `seconds` of device time have passed; returns their samples.
+
+        Shape (n, channels) in the order of `Rig.recorded`, to the end of the last block; samples
+        lost on the wire are not in it. `watch` sees every block; if it raises, outputs are zeroed.
+        """
+        rate = self.rig.sample_rate
+        passed, taken = 0, []
+        wanted = math.ceil(seconds * rate - 1e-6)
+        while passed < wanted:
+            before = self._expected
+            block = self.exchange()
+            passed += len(block.data) if before is None else self.tick - before
+            taken.append(block.data)
+            if watch is not None:
+                self._outputs.safely(lambda b=block: watch(b))  # type: ignore[misc]
+        return np.concatenate(taken) if taken else np.empty((0, len(self.rig.recorded)))
+
+    # What the engine says
+
+    def guard(self, roles: Sequence[JointRole]) -> None:
+        """Say what each joint does from the next block on: one role per joint."""
+        self._guard.set_roles(roles)
+
+    def status(self, **changes: Any) -> None:
+        """Say where the protocol stands: step phase repeat repeats total_s message."""
+        self._display.progress = replace(self._display.progress, **changes)
+
+    def event(self, event: str, tick: int | None = None, **fields: Any) -> None:
+        """Note one event in the run's log."""
+        if self.recorder is not None and self.recorder.is_open:
+            self.recorder.event(event, tick, **fields)
+
+    def record(
+        self,
+        meta: RecordMeta | None = None,
+        *,
+        start_tick: int | None = None,
+        ticks: int | None = None,
+        **fields: Any,
+    ) -> RecordHandle:
+        """Mark a tick range as a record: ``with bench.record(step="step1", repeat=2) as record:``.
+
+        What the record is comes as a RecordMeta or as its fields. By default it spans the samples
+        taken within the `with` block; `start_tick` and `ticks` fix it in advance (as `apply`
+        returned it) or afterwards.
+        """
+        what = RecordMeta(**fields) if meta is None else meta
+        if start_tick is None:
+            if self._expected is None:
+                raise ValueError("exchange a block first, or give start_tick: no tick is known yet")
+            start_tick = self._expected
+        return RecordHandle(self, what, start_tick, ticks)
+
+
+def _outcome(error: BaseException | None) -> tuple[str, str]:
+    """Return the state a run ends in and the one line that says why."""
+    if error is None:
+        return runstate.DONE, ""
+    if isinstance(error, SafetyTrip):
+        return runstate.TRIPPED, str(error)
+    if isinstance(error, KeyboardInterrupt):
+        return runstate.ABORTED, "stopped by operator (Ctrl-C)"
+    return runstate.ABORTED, str(error) or type(error).__name__

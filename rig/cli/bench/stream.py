@@ -1,0 +1,161 @@
+"""Figures of scale: rows streamed against rows in memory, two workers against one."""
+
+from __future__ import annotations
+
+import importlib
+import resource
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.identify.out_of_core import identify_folders
+from analysis.regression.qr import Accumulator
+from analysis.workers.cluster import Cluster
+from analysis.workers.pool import ONE_THREAD, Processes, environment
+
+Array = NDArray[np.float64]
+
+COLUMNS = 9  # of the two-joint bench's fluid rows
+READ_ROWS = 16_384
+WRITE_ROWS = 100_000
+WARM_SECONDS = 0.3
+# Dask's own setting gives every freed array back to the system: twice the work (docs/scale.md).
+WORKER_ENVIRONMENT = {
+    **ONE_THREAD,
+    "MALLOC_TRIM_THRESHOLD_": "268435456",
+    "MALLOC_MMAP_THRESHOLD_": "33554432",
+}
+
+
+def write_rows(path: Path, rows: int, seed: int = 0) -> None:
+    """Write [X y] (rows, COLUMNS + 1) as plain float64 to a file, block by block."""
+    rng = np.random.default_rng(seed)
+    truth = np.arange(1.0, COLUMNS + 1)
+    with path.open("wb") as file:
+        for first in range(0, rows, WRITE_ROWS):
+            X = rng.standard_normal((min(WRITE_ROWS, rows - first), COLUMNS))
+            y = X @ truth + rng.standard_normal(len(X))
+            np.column_stack((X, y)).tofile(file)
+
+
+def streamed(path: str) -> dict[str, Any]:
+    """Fold a file of rows as it is read: seconds, peak memory of this process [B], solution."""
+    started = time.perf_counter()
+    whole = Accumulator(COLUMNS)
+    with Path(path).open("rb") as file:
+        while True:
+            block = np.fromfile(file, count=READ_ROWS * (COLUMNS + 1))
+            if not len(block):
+                break
+            block = block.reshape(-1, COLUMNS + 1)
+            whole.fold(block[:, :-1], block[:, -1])
+    R = whole.triangle
+    solution = np.linalg.solve(R[:-1, :-1], R[:-1, -1])
+    seconds = time.perf_counter() - started
+    peak = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return {"seconds": seconds, "peak": peak, "rows": whole.rows, "solution": solution}
+
+
+def in_memory(path: str) -> dict[str, Any]:
+    """Solve a file of rows by numpy's lstsq; only that is timed, the rows being in memory."""
+    every = np.fromfile(path).reshape(-1, COLUMNS + 1)
+    X, y = np.ascontiguousarray(every[:, :-1]), every[:, -1].copy()
+    del every
+    started = time.perf_counter()
+    solution = np.linalg.lstsq(X, y)[0]
+    seconds = time.perf_counter() - started
+    peak = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return {"seconds": seconds, "peak": peak, "rows": len(y), "solution": solution}
+
+
+def row_figures(folder: Path, rows: int = 10_000_000) -> dict[str, float]:
+    """Return the memory and the time of streaming rows from a file against numpy's lstsq.
+
+    Each is measured in a fresh process with one BLAS thread, best of three for the stream.
+    """
+    path = folder / "rows.f64"
+    write_rows(path, rows)
+    found = []
+    for function, repeats in ((streamed, 3), (in_memory, 1)):
+        with Processes(1) as pool:
+            results = list(pool.map(function, [str(path)] * repeats))
+            found.append(min(results, key=lambda result: float(result["seconds"])))
+    path.unlink()
+    stream, whole = found
+    off = np.abs(stream["solution"] / whole["solution"] - 1.0).max()
+    return {
+        "rows": float(stream["rows"]),
+        "stream_seconds": stream["seconds"],
+        "stream_peak_bytes": stream["peak"],
+        "lstsq_seconds": whole["seconds"],
+        "lstsq_peak_bytes": whole["peak"],
+        "ratio": stream["seconds"] / whole["seconds"],
+        "difference": float(off),
+    }
+
+
+def cluster_figures(folders: Sequence[str], tries: int = 3) -> dict[str, float]:
+    """Return how much faster two Dask workers identify run folders than one, on this machine.
+
+    Each worker is a process with one thread. Raises ImportError without dask.distributed.
+    """
+    distributed: Any = importlib.import_module("distributed")
+    best: dict[int, float] = {1: np.inf, 2: np.inf}
+    busiest = dict(best)  # processor seconds of the worker that used most
+    values = []
+    # No dashboard, nothing but loopback; workers end with the block.
+    for workers in (1, 2) * tries:
+        with (
+            environment(WORKER_ENVIRONMENT),
+            distributed.LocalCluster(
+                n_workers=workers,
+                threads_per_worker=1,
+                host="127.0.0.1",
+                dashboard_address=None,
+                silence_logs=50,
+            ) as local,
+            distributed.Client(local, set_as_default=False) as watcher,
+            Cluster(local.scheduler_address) as pool,
+        ):
+            list(pool.map(_warm, [WARM_SECONDS] * 4 * workers))
+            before = watcher.run(time.process_time)
+            started = time.perf_counter()
+            result = identify_folders(folders, pool=pool)
+            best[workers] = min(best[workers], time.perf_counter() - started)
+            used = [after - before[w] for w, after in watcher.run(time.process_time).items()]
+            busiest[workers] = min(busiest[workers], max(used))
+            values.append([estimate.value for estimate in result.estimates.values()])
+    here = identify_folders(folders)
+    expected = np.array([estimate.value for estimate in here.estimates.values()])
+    return {
+        "one_seconds": best[1],
+        "two_seconds": best[2],
+        "speedup": best[1] / best[2],
+        "processor_ratio": busiest[1] / busiest[2],
+        "difference": float(np.abs(np.array(values) / expected - 1.0).max()),
+    }
+
+
+def spin_figures(items: int = 16, tries: int = 3) -> float:
+    """Return how much faster two processes do bare arithmetic than one: what the machine gives."""
+    best = {1: np.inf, 2: np.inf}
+    for workers in (1, 2) * tries:
+        with Processes(workers) as pool:
+            list(pool.map(_warm, [WARM_SECONDS] * 4 * workers))
+            started = time.perf_counter()
+            list(pool.map(_spin, [1_000_000] * items))
+            best[workers] = min(best[workers], time.perf_counter() - started)
+    return best[1] / best[2]
+
+
+def _spin(rounds: int) -> int:
+    return sum(k & 3 for k in range(rounds))
+
+
+def _warm(seconds: float) -> None:
+    """Let a worker import this module, and be busy so that others have to do so too."""
+    time.sleep(seconds)

@@ -1,0 +1,44 @@
+"""The `bench` verb: the figures of README and docs, as ratios taken in one run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rig.cli.bench_commands import JsonOption
+from rig.cli.output import progress, write_json
+
+
+def bench(
+    json: JsonOption = None,
+    minutes: Annotated[
+        float, typer.Option(min=0.02, help="Of real-time acquisition over the wire.")
+    ] = 10.0,
+    seeds: Annotated[
+        int, typer.Option(min=1, help="Simulated benches to identify, from seed 100 on.")
+    ] = 10,
+    only: Annotated[
+        str | None,
+        typer.Option(help="One of: plant, analysis, stream, demo, acquisition."),
+    ] = None,
+    docs: Annotated[Path | None, typer.Option(help="Also write the table as a page.")] = None,
+) -> None:
+    """Measure this machine: plant, identification, ten unseen benches, acquisition.
+
+    Example: bramah bench --minutes 0.5 --seeds 2
+    """
+    from rig.cli.bench.figures import as_json, measure, page, text
+
+    figures = measure(minutes, seeds, only, progress)
+    write_json(json, as_json(figures))
+    if docs is not None:
+        docs.write_text(page(figures), encoding="utf-8")
+    if json != Path("-"):
+        typer.echo(text(figures))
+
+
+def register(app: typer.Typer) -> None:
+    """Add this verb to the command line."""
+    app.command()(bench)

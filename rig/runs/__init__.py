@@ -1,0 +1,1 @@
+"""Runs on disk: recorder, journal, archive, store, recovery; rig files."""

@@ -1,0 +1,200 @@
+"""records.h5: plain HDF5 that h5py and MATLAB open; one group per record, units as attributes.
+
+Layout: `/NAME` is a record with one float64 dataset per channel (attribute `units`); attributes of
+the group are its step, repeat, locked joints, period and lines, what was lost, and whatever the
+protocol noted. `/between/0001 ...` are the samples outside of every record, so that the journal
+may go. Lists are one-dimensional integer arrays, flags are 0 or 1, text is UTF-8.
+`rig.runs.archive_reader` reads it.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.model import channels as ch
+from rig.model.trips import RecordingFailed
+from rig.runs.archive_reader import FORMAT
+from rig.runs.files import sync_file, sync_folder
+from rig.runs.journal import Journal
+from rig.runs.runstate import BETWEEN
+from rig.runs.sections import Assembled, Section, Written, assemble, blocks_of, plan
+
+log = logging.getLogger(__name__)
+Array = NDArray[np.float64]
+
+NAME = "records.h5"
+
+
+def write_group(
+    file: h5py.File,
+    group: str,
+    columns: Mapping[str, Array],
+    attributes: Mapping[str, Any],
+    unit_of: Callable[[str], str] = ch.unit_of,
+) -> None:
+    """Write one group: a dataset with `units` per channel, attributes on the group."""
+    target = file.create_group(group)
+    for key, value in attributes.items():
+        target.attrs[key] = _plain(value)
+    for name, values in columns.items():
+        dataset = target.create_dataset(name, data=np.ascontiguousarray(values, dtype="<f8"))
+        dataset.attrs["units"] = unit_of(name)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, bool):
+        return int(value)  # HDF5 would make an enumeration of it
+    if isinstance(value, (tuple, list)):
+        return np.array(value, dtype=np.int64)
+    return value
+
+
+def record_attributes(
+    step: str,
+    repeat: int,
+    locked: Sequence[int],
+    sample_rate: float,
+    start: float,
+    period: int,
+    lines: Sequence[int],
+    complete: bool,
+) -> dict[str, Any]:
+    """Return the attributes that every record has."""
+    return {
+        "kind": "record",
+        "step": step,
+        "repeat": repeat,
+        "locked": list(locked),
+        "sample_rate": sample_rate,
+        "start_s": start,
+        "period": period,
+        "lines": list(lines),
+        "complete": int(complete),
+    }
+
+
+def _attributes(section: Section, sample_rate: float, counted: Assembled) -> dict[str, Any]:
+    meta = section.meta
+    start = section.start / sample_rate
+    found: dict[str, Any]
+    if meta:
+        found = record_attributes(
+            meta["step"],
+            meta["repeat"],
+            meta["locked"],
+            sample_rate,
+            start,
+            meta["period"],
+            meta["lines"],
+            section.complete,
+        )
+    else:
+        found = {"kind": BETWEEN, "sample_rate": sample_rate, "start_s": start}
+    return {
+        **meta.get("attributes", {}),
+        **found,
+        "stream": section.stream,
+        "start_tick": section.start,
+        "ticks": section.ticks,
+        "lost_samples": counted.lost,
+        "damaged_blocks": counted.damaged_blocks,
+        "late_blocks": counted.late_blocks,
+        "jitter_max_s": counted.jitter_max,
+        "saturated_samples": int(counted.saturated.sum()),
+    }
+
+
+def create(path: Path, rig_name: str) -> h5py.File:
+    """Open a fresh archive for writing, its root attributes set."""
+    file = h5py.File(path, "w", libver=("earliest", "v110"))
+    file.attrs["format"] = FORMAT
+    file.attrs["creator"] = "bramah"
+    file.attrs["rig"] = rig_name
+    return file
+
+
+def put_in_place(fresh: Path, path: Path) -> None:
+    """Give a finished archive its name, on the disk before anything relies on it."""
+    sync_file(fresh)
+    os.replace(fresh, path)
+    sync_folder(path.parent)
+
+
+def write_from_journal(journal: Journal, folder: Path, rig_name: str) -> Written:
+    """Write records.h5 and verify it against the journal, sample by sample.
+
+    Returns what it holds; raises RecordingFailed and leaves no archive if it cannot.
+    """
+    spans = journal.spans()
+    sections = plan(journal, spans)
+    columns = journal.meta("columns")
+    needed = sum(section.ticks for section in sections) * len(columns) * 8
+    fresh = folder / f"{NAME}.tmp"
+    lost = 0
+    try:
+        if shutil.disk_usage(folder).free < needed:
+            raise OSError(f"{needed / 1e6:.1f} MB are needed and not free")
+        with create(fresh, rig_name) as file:
+            for section in sections:
+                found = assemble(journal, spans, section)
+                attributes = _attributes(section, float(journal.meta("sample_rate")), found)
+                each = {name: found.data[:, i] for i, name in enumerate(columns)}
+                write_group(file, section.group, each, attributes)
+                _note_saturation(file[section.group], columns, found)
+                lost += found.lost if section.meta else 0
+        damaged = verify(journal, fresh, sections)
+        put_in_place(fresh, folder / NAME)
+    except (OSError, RuntimeError) as error:  # h5py reports a failed flush as RuntimeError
+        fresh.unlink(missing_ok=True)
+        raise RecordingFailed(
+            f"{folder / NAME}: cannot be written ({error}); the journal keeps every sample: free "
+            "some disk space, then `bramah recover` this run"
+        ) from error
+    records = [section for section in sections if section.meta]
+    partial = sum(not section.complete for section in records)
+    samples = sum(section.ticks for section in records)
+    return Written(len(records), partial, samples, lost, damaged)
+
+
+def _note_saturation(group: h5py.Group, columns: Sequence[str], found: Assembled) -> None:
+    for name, count in zip(columns, found.saturated, strict=False):  # commands do not saturate
+        group[name].attrs["saturated_samples"] = int(count)
+
+
+def verify(journal: Journal, path: Path, sections: Sequence[Section]) -> int:
+    """Compare every sample of the journal with the archive; raises OSError where they differ.
+
+    Returns the number of blocks whose checksum fails, which nothing can be compared with.
+    """
+    columns, spans = journal.meta("columns"), journal.spans()
+    total = damaged = 0
+    with h5py.File(path, "r") as file:
+        for section in sections:
+            kept = np.column_stack([file[section.group][name][:] for name in columns])
+            if kept.shape != (section.ticks, len(columns)):
+                raise OSError(f"group {section.group} has {len(kept)} samples, not {section.ticks}")
+            arrived = 0
+            for block, rows, part in blocks_of(journal, spans, section):
+                if block is None:
+                    damaged += 1
+                    continue
+                if not np.array_equal(kept[rows], block.data[part], equal_nan=True):
+                    raise OSError(f"group {section.group} differs at tick {block.tick}")
+                arrived += part.stop - part.start
+            if arrived + int(file[section.group].attrs["lost_samples"]) != section.ticks:
+                raise OSError(f"group {section.group} miscounts its lost samples")
+            total += arrived
+    if not damaged and total < int(spans.samples.sum()):
+        raise OSError(
+            f"only {total} of {int(spans.samples.sum())} samples of the journal are in it"
+        )
+    return damaged

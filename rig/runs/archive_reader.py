@@ -1,0 +1,94 @@
+"""Reading records.h5 (`rig.runs.archive` says what is in it): heads, records, parts of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from rig.model.parse import InputError
+from rig.model.records import Record, RecordHead
+from rig.runs.runstate import BETWEEN
+
+FORMAT = 1
+_OWN = ("step", "locked", "repeat", "sample_rate", "start_s", "period", "lines", "complete")
+
+
+def head_of(name: str, group: h5py.Group, path: Path) -> RecordHead:
+    """Return what a record's group says without its samples; raises InputError."""
+    attributes = {key: _python(value) for key, value in group.attrs.items()}
+    missing = [key for key in _OWN if key not in attributes]
+    if missing:
+        raise InputError(f"{path}: record {name} lacks the attribute {missing[0]!r}")
+    lengths = {str(key): group[key].shape for key in group}
+    if not lengths or len(set(lengths.values())) != 1:
+        raise InputError(f"{path}: record {name}: channels are missing or of unequal length")
+    return RecordHead(
+        name=name,
+        step=str(attributes["step"]),
+        locked=tuple(int(j) for j in attributes["locked"]),
+        repeat=int(attributes["repeat"]),
+        sample_rate=float(attributes["sample_rate"]),
+        samples=int(next(iter(lengths.values()))[0]),
+        channels=tuple(lengths),
+        start=float(attributes["start_s"]),
+        period=int(attributes["period"]),
+        lines=tuple(int(k) for k in attributes["lines"]),
+        attributes={k: v for k, v in attributes.items() if k not in _OWN[:-1] and k != "kind"},
+    )
+
+
+def samples_of(
+    group: h5py.Group, head: RecordHead, first: int = 0, last: int | None = None
+) -> Record:
+    """Read the samples [first, last) of a record's group."""
+    part = slice(first, last)
+    return head.record({n: np.asarray(group[n][part], dtype=np.float64) for n in head.channels})
+
+
+@contextmanager
+def readable(path: Path) -> Iterator[None]:
+    """Turn whatever a broken archive makes h5py raise into an InputError that names the file."""
+    try:
+        yield
+    except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: not a readable records.h5: {error}") from error
+
+
+def open_archive(path: Path) -> h5py.File:
+    """Open an archive for reading; raises InputError if the file is none."""
+    with readable(path):
+        file = h5py.File(path, "r")
+        if int(file.attrs.get("format", 0)) != FORMAT:
+            file.close()
+            raise InputError(f"{path}: not an archive of this version's format {FORMAT}")
+        return file
+
+
+def _python(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def read_heads(file: h5py.File, path: Path) -> list[RecordHead]:
+    """Return the heads of every record in the order it was taken."""
+    found = [head_of(name, group, path) for name, group in file.items() if name != BETWEEN]
+    return sorted(found, key=_taken)
+
+
+def read_records(path: Path) -> list[Record]:
+    """Read every record in the order it was taken; raises InputError if the file is no archive."""
+    with readable(path), open_archive(path) as file:
+        return [samples_of(file[head.name], head) for head in read_heads(file, path)]
+
+
+def _taken(record: RecordHead) -> tuple[int, int, str]:
+    stream, tick = record.attributes.get("stream", 0), record.attributes.get("start_tick", 0)
+    return int(stream), int(tick), record.name

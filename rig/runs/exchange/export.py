@@ -1,0 +1,185 @@
+"""Runs as files for other programs: CSV, MAT, Parquet or MDF 4, one file per record, SI units.
+
+CSV and MAT come with a manifest and the rig, so that `bramah import` makes the same run of them.
+"""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+import json
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from rig.model.parse import InputError
+from rig.model.records import Record
+from rig.model.rig import Rig
+from rig.runs import store
+from rig.runs.stream import RunHead, iterate_records, read_run_head
+
+Array = NDArray[np.float64]
+
+TIME: Final = "time"
+MODEL: Final = "model_"  # before a channel's name: as a model has it
+RIG_FILE: Final = "rig.yaml"
+MANIFEST: Final = "manifest.yaml"
+LIBRARIES: Final = {"parquet": "pyarrow", "mf4": "asammdf"}
+_RIG_NOTE = "# The rig as it was when this run was taken. Numbers are SI.\n"
+_MANIFEST_NOTE = "# bramah import {name} --out RUN makes a run of these files.\n"
+_LONG = 63  # characters of a name that MATLAB takes
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """One record for a file: columns (n,) by name, the time first; units; what it is."""
+
+    columns: Mapping[str, Array]
+    units: Mapping[str, str]
+    about: Mapping[str, Any]
+
+
+def library_missing(kind: str) -> str:
+    """Name the library that a format needs and this installation lacks ('' if it has it)."""
+    name = LIBRARIES.get(kind, "")
+    return name if name and importlib.util.find_spec(name) is None else ""
+
+
+def export_run(
+    run: Path, out: Path, kind: str,
+    more: Callable[[Record], Mapping[str, Array]] | None = None,
+) -> list[Path]:  # fmt: skip
+    """Write every complete record of a run into the folder `out`; returns the files.
+
+    `more` gives further channels of a record, each (n,), written as `model_NAME` in the unit of
+    `NAME`. One record is in memory at a time. Raises InputError for an unknown format, a run that
+    cannot be read, or a folder that is occupied.
+    """
+    if kind not in WRITERS:
+        raise InputError(f"--format {kind}: expected one of: {' '.join(WRITERS)}")
+    head = read_run_head(run)
+    store.refuse_occupied(out)
+    out.mkdir(parents=True, exist_ok=True)
+    try:
+        files = []
+        for record in iterate_records(run):
+            files.append(out / f"{record.name}.{kind}")
+            added = {} if more is None else more(record)
+            WRITERS[kind](files[-1], sheet(head.rig, record, added))
+        if kind in ("csv", "mat"):
+            files += _way_back(run, out, head, kind)
+    except BaseException:
+        shutil.rmtree(out)  # it was empty: half an export would pass for a whole one
+        raise
+    return files
+
+
+def sheet(rig: Rig, record: Record, more: Mapping[str, Array]) -> Sheet:
+    """Return a record as columns: time, its channels, then `model_NAME` of `more`."""
+    order = [name for name in rig.recorded if name in record.channels]
+    names = [*order, *(name for name in record.channels if name not in order)]
+    columns = {TIME: record.start + record.time} | {name: record.channels[name] for name in names}
+    units = {TIME: "s"} | {name: rig.unit_of(name) for name in names}
+    columns |= {MODEL + name: values for name, values in more.items()}
+    units |= {MODEL + name: rig.unit_of(name) for name in more}
+    about = {
+        **record.attributes,
+        "rig": rig.name,
+        "record": record.name,
+        "step": record.step,
+        "repeat": record.repeat,
+        "locked": list(record.locked),
+        "sample_rate": record.sample_rate,
+        "period": record.period,
+        "lines": list(record.lines),
+    }
+    return Sheet(columns, units, {name: _plain(value) for name, value in about.items()})
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    return value
+
+
+def _write_csv(path: Path, one: Sheet) -> None:
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(one.columns)
+        # Python writes the fewest digits that read back as the same number.
+        writer.writerows(zip(*(c.tolist() for c in one.columns.values()), strict=True))
+
+
+def _write_mat(path: Path, one: Sheet) -> None:
+    from scipy.io import savemat  # noqa: PLC0415 - slow to load
+
+    about = {name[:_LONG]: value for name, value in one.about.items()}
+    data = {**one.columns, "about": about, "units": dict(one.units)}
+    savemat(path, data, long_field_names=True, oned_as="column", do_compression=True)
+
+
+def _write_parquet(path: Path, one: Sheet) -> None:
+    import pyarrow as pa  # noqa: PLC0415 - an extra
+    from pyarrow import parquet  # noqa: PLC0415
+
+    fields = [pa.field(n, pa.float64(), metadata={"unit": one.units[n]}) for n in one.columns]
+    about = {name: json.dumps(value) for name, value in one.about.items()}
+    table = pa.table(list(one.columns.values()), schema=pa.schema(fields, metadata=about))
+    parquet.write_table(table, path)
+
+
+def _write_mf4(path: Path, one: Sheet) -> None:
+    from asammdf import MDF, Signal  # noqa: PLC0415 - an extra, and slow to load
+
+    time = one.columns[TIME]
+    signals = [
+        Signal(samples=values, timestamps=time, name=name, unit=one.units[name])
+        for name, values in one.columns.items()
+        if name != TIME
+    ]
+    with MDF(version="4.10") as file:
+        file.append(signals, comment=json.dumps(dict(one.about)), common_timebase=True)
+        file.save(path)
+
+
+WRITERS: Final[Mapping[str, Callable[[Path, Sheet], None]]] = {
+    "csv": _write_csv,
+    "mat": _write_mat,
+    "parquet": _write_parquet,
+    "mf4": _write_mf4,
+}
+
+
+def _way_back(run: Path, out: Path, head: RunHead, kind: str) -> list[Path]:
+    """Write the rig and the manifest that `import` takes."""
+    header = store.read_header(run)
+    resolved = {
+        "format": header.format,
+        "created": header.created,
+        "rig": head.rig.model_dump(mode="json"),
+    }
+    records = []
+    for r in head.records:
+        entry: dict[str, Any] = {
+            "file": f"{r.name}.{kind}", "name": r.name, "step": r.step, "repeat": r.repeat,
+            "locked": list(r.locked),
+        }  # fmt: skip
+        if r.period:
+            entry |= {"period": r.period, "lines": list(r.lines)}
+        records.append(entry)
+    manifest = {"rig": RIG_FILE, "records": records}
+    written = {
+        out / RIG_FILE: _RIG_NOTE + yaml.safe_dump(resolved, sort_keys=False),
+        out / MANIFEST: _MANIFEST_NOTE.format(name=MANIFEST) + yaml.safe_dump(
+            manifest, sort_keys=False, default_flow_style=None, width=100
+        ),
+    }  # fmt: skip
+    for path, text in written.items():
+        path.write_text(text, encoding="utf-8")
+    return list(written)

@@ -1,0 +1,250 @@
+"""Foreign records, described by a manifest, as a run folder like any other."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.model.parse import InputError
+from rig.model.rig import Rig
+from rig.model.trips import RecordingFailed
+from rig.runs import archive, store
+from rig.runs.exchange.columns import read_table
+from rig.runs.exchange.manifest import (
+    TIME,
+    Entry,
+    Manifest,
+    channels_of,
+    check_against_rig,
+    load_manifest,
+)
+from rig.runs.rigs import load_rig
+from rig.runs.runstate import DONE, EventLog, give_up_ownership, write_state
+
+log = logging.getLogger(__name__)
+Array = NDArray[np.float64]
+
+_UNEVEN = 0.1  # of the mean step: what rounded time stamps may differ from it
+
+
+@dataclass(frozen=True)
+class ImportReport:
+    """What was imported, and what a user should know about it."""
+
+    path: Path
+    records: int
+    samples: int
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Source:
+    """A manifest with everything needed to read one file."""
+
+    path: Path
+    manifest: Manifest
+    rig: Rig
+    maps: Mapping[str, tuple[float, float]]
+
+    def column(self, channel: str) -> str:
+        """Return the name that a channel's column has in the files."""
+        found = self.manifest.columns.get(channel)
+        return channel if found is None or found.column is None else found.column
+
+
+@dataclass(frozen=True)
+class _Imported:
+    entry: Entry
+    sample_rate: float
+    start: float
+    channels: dict[str, Array]
+
+
+def import_records(manifest_path: str | Path, out: str | Path) -> ImportReport:
+    """Import every record of a manifest into a new run folder.
+
+    Raises InputError naming file, column and row, before anything is written; RecordingFailed if
+    the disk does not take it.
+    """
+    path, folder = Path(manifest_path), Path(out)
+    store.refuse_occupied(folder)
+    manifest, lines = load_manifest(path)
+    try:
+        rig = load_rig(manifest.rig, relative_to=path.parent)
+    except InputError as error:
+        raise InputError(f"{path}:{lines.get(('rig',), 1)}: rig: {error}") from error
+    source = _Source(path, manifest, rig, check_against_rig(manifest, lines, path, rig))
+    records = [_read(source, entry) for entry in manifest.records]
+    warnings = _warnings(source, records)
+    _write(source, records, folder, warnings)
+    samples = sum(len(next(iter(r.channels.values()))) for r in records)
+    return ImportReport(folder, len(records), samples, warnings)
+
+
+def _read(source: _Source, entry: Entry) -> _Imported:
+    file = source.path.parent / entry.file
+    required, optional = channels_of(source.rig)
+    # What the manifest maps by name is meant to be there, optional or not.
+    needed = [n for n in (*required, *optional) if n in required or n in source.manifest.columns]
+    timed = source.manifest.sample_rate is None or TIME in source.manifest.columns
+    every = (*required, *optional, TIME)
+    if timed:
+        needed.append(TIME)
+    columns = _read_columns(source, file, every, needed)
+    found = {}
+    for name, raw in columns.items():
+        scale, offset = source.maps.get(name, (1.0, 0.0))
+        found[name] = raw * scale + offset if (scale, offset) != (1.0, 0.0) else raw
+    rate, start = _time_base(source, file, found.pop(TIME, None))
+    part = _part(entry, file, rate, len(next(iter(found.values()))))
+    channels = {n: found[n][part] for n in every if n in found}
+    return _Imported(entry, rate, start + part.start / rate, channels)
+
+
+def _part(entry: Entry, file: Path, rate: float, samples: int) -> slice:
+    """Return the samples between the entry's `begin` and `end`; raises InputError if none are."""
+    first = round(entry.begin * rate)
+    last = samples if entry.end is None else round(entry.end * rate)
+    if first >= samples - 1 or last > samples:
+        wanted = f"{entry.begin:g} s to {'the end' if entry.end is None else f'{entry.end:g} s'}"
+        raise InputError(
+            f"{file}: has {samples / rate:g} s of samples; the record asks for {wanted}"
+        )
+    return slice(first, last)
+
+
+def _read_columns(
+    source: _Source, file: Path, channels: tuple[str, ...], needed: list[str]
+) -> dict[str, Array]:
+    if TIME in needed and source.manifest.sample_rate is None:
+        try:
+            return _by_channel(source, file, channels, needed)
+        except InputError as error:
+            if f"has no column {source.column(TIME)!r}" not in str(error):
+                raise
+            raise InputError(
+                f"{file}: has no column {source.column(TIME)!r}, and the manifest "
+                f"{source.path} gives no sample_rate; give one of the two"
+            ) from error
+    return _by_channel(source, file, channels, needed)
+
+
+def _by_channel(
+    source: _Source, file: Path, channels: tuple[str, ...], needed: list[str]
+) -> dict[str, Array]:
+    names = {channel: source.column(channel) for channel in channels}
+    wanted = list(dict.fromkeys(names.values()))
+    table = read_table(file, wanted, [names[channel] for channel in needed])
+    return {channel: table[name] for channel, name in names.items() if name in table}
+
+
+def _time_base(source: _Source, file: Path, time: Array | None) -> tuple[float, float]:
+    """Return (sample rate [Hz], time of the first sample [s]); refuses uneven time."""
+    given = source.manifest.sample_rate
+    if time is None:
+        return float(given or 0.0), 0.0
+    column = source.column(TIME)
+    first = 1 if file.suffix.lower() == ".mat" else 2  # the row of the first sample
+    if len(time) < 2:
+        raise InputError(f"{file}: column {column!r} has one row only; expected a time series")
+    steps = np.diff(time)
+    back = np.flatnonzero(steps <= 0)
+    if len(back):
+        row = int(back[0]) + 1
+        raise InputError(
+            f"{file}:{row + first}: column {column!r}, row {row + first}: time goes from "
+            f"{time[row - 1]:.9g} to {time[row]:.9g} s; expected it to increase"
+        )
+    step = float(np.median(steps))
+    uneven = np.flatnonzero(np.abs(steps - step) > _UNEVEN * step)
+    if len(uneven):
+        row = int(uneven[0]) + 1
+        raise InputError(
+            f"{file}:{row + first}: column {column!r}, row {row + first}: a step of "
+            f"{steps[row - 1]:.6g} s among steps of {step:.6g} s; expected even sampling"
+        )
+    mean = float((time[-1] - time[0]) / (len(time) - 1))
+    rate = float(f"{1.0 / mean:.6g}")  # rounded time stamps know it no better
+    if given is not None and abs(rate - given) > 1e-3 * given:
+        raise InputError(
+            f"{file}: column {column!r} steps at {rate:.6g} Hz, but the manifest's sample_rate is "
+            f"{given:.6g} Hz"
+        )
+    return given or rate, float(time[0])
+
+
+def _warnings(source: _Source, records: list[_Imported]) -> tuple[str, ...]:
+    found = []
+    rig = source.rig
+    for name in rig.channels:
+        lacking = [r.entry.file for r in records if name not in r.channels]
+        if lacking:
+            more = "" if len(lacking) == len(records) else f" in {len(lacking)} file(s)"
+            found.append(f"{name}: the rig has it, the data does not{more}; imported without")
+    for rate in sorted({r.sample_rate for r in records}):
+        if abs(rate - rig.sample_rate) > 1e-6 * rig.sample_rate:
+            found.append(f"sampled at {rate:g} Hz, the rig samples at {rig.sample_rate:g} Hz")
+    lengths: dict[str, set[int]] = {}
+    for r in records:
+        lengths.setdefault(r.entry.step, set()).add(len(next(iter(r.channels.values()))))
+    for step, sizes in lengths.items():
+        if len(sizes) > 1:
+            few, many = min(sizes), max(sizes)
+            found.append(f"step {step!r}: its repeats have {few} to {many} samples")
+    return tuple(found)
+
+
+def _write(
+    source: _Source, records: list[_Imported], folder: Path, warnings: tuple[str, ...]
+) -> None:
+    about = f"imported from {source.path.name}"
+    store.create_run(folder, source.rig, source=about)
+    try:
+        events = EventLog(folder)
+        events.append("import", None, {"manifest": str(source.path), "warnings": warnings})
+        _write_archive(source, records, folder)
+        for r in records:
+            events.append("record complete", None, {"record": r.entry.meta().name})
+        write_state(folder, DONE)
+        events.append("end", None, {"state": DONE, "message": "", "records": len(records)})
+        events.close()
+    except (OSError, RuntimeError) as error:  # h5py reports a failed flush as RuntimeError
+        raise RecordingFailed(f"{folder}: cannot be written: {error}") from error
+    finally:
+        with suppress(OSError):
+            give_up_ownership(folder)
+
+
+def _write_archive(source: _Source, records: list[_Imported], folder: Path) -> None:
+
+    fresh = folder / f"{archive.NAME}.tmp"
+    with archive.create(fresh, source.rig.name) as file:
+        for order, r in enumerate(records):
+            meta = r.entry.meta()
+            about = archive.record_attributes(
+                meta.step,
+                meta.repeat,
+                meta.locked,
+                r.sample_rate,
+                r.start,
+                meta.period,
+                meta.lines,
+                True,
+            )
+            more = {
+                "stream": order,
+                "start_tick": 0,
+                "lost_samples": 0,
+                "late_blocks": 0,
+                "jitter_max_s": 0.0,
+                "saturated_samples": 0,
+                "file": r.entry.file,
+            }
+            archive.write_group(file, meta.name, r.channels, {**about, **more}, source.rig.unit_of)
+    archive.put_in_place(fresh, folder / archive.NAME)

@@ -1,0 +1,155 @@
+"""The import manifest (CONTRACT, "Import manifest") as data, every refusal with its line."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from rig.model import channels as ch
+from rig.model.parse import InputError, load_yaml, validate_model
+from rig.model.quantity import Frequency, Time, UnitError, unit_map
+from rig.model.rig import Rig
+from rig.runs.files import read_text
+from rig.runs.recorder import RecordMeta
+
+TIME = "time"
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Column(_Part):
+    """Where a channel stands: value = to_SI(raw * scale + offset).
+
+    `scale` and `offset` apply to the raw number, their result is in `unit` (default: SI).
+    """
+
+    column: str | None = Field(default=None, min_length=1)
+    unit: str | None = None
+    scale: float = 1.0
+    offset: float = 0.0
+
+    @model_validator(mode="after")
+    def _scale_is_a_scale(self) -> Self:
+        if self.scale == 0.0:
+            raise ValueError("scale 0 leaves nothing of the column")
+        return self
+
+
+class Entry(_Part):
+    """One file, one record, or the part of it from `begin` to `end`.
+
+    `period` [samples] and `lines` describe a periodic excitation.
+    """
+
+    file: str = Field(min_length=1)
+    step: str = Field(min_length=1)
+    locked: tuple[int, ...] = ()
+    repeat: int = Field(default=1, ge=1)
+    name: str = ""
+    period: int = Field(default=0, ge=0)
+    lines: tuple[int, ...] = ()
+    begin: Time = Field(default=0.0, ge=0, description="first sample, from the file's start [s]")
+    end: Time | None = Field(default=None, gt=0, description="last sample is before this [s]")
+
+    @model_validator(mode="after")
+    def _can_be_named(self) -> Self:
+        self.meta()
+        if self.end is not None and self.end <= self.begin:
+            raise ValueError(f"end {self.end:g} s is not after begin {self.begin:g} s")
+        if any(line < 1 for line in self.lines):
+            raise ValueError("lines are multiples of 1/period, 1 and up")
+        return self
+
+    def meta(self) -> RecordMeta:
+        """Return what the record is."""
+        return RecordMeta(self.step, self.repeat, self.locked, self.period, self.lines, self.name)
+
+
+class Manifest(_Part):
+    """A whole manifest."""
+
+    rig: str = Field(min_length=1)
+    sample_rate: Frequency | None = Field(default=None, gt=0)
+    records: tuple[Entry, ...] = Field(min_length=1)
+    columns: dict[str, Column] = {}
+
+
+def load_manifest(path: Path) -> tuple[Manifest, dict[tuple[str | int, ...], int]]:
+    """Read a manifest; returns it with the line of each key; raises InputError."""
+    text = read_text(path, "an import manifest (YAML)")
+    data, lines = load_yaml(text, str(path))
+    manifest = validate_model(Manifest, data, lines, str(path))
+    _refuse_duplicates(manifest.records, lines, path)
+    return manifest, lines
+
+
+def _refuse_duplicates(
+    records: Sequence[Entry], lines: dict[tuple[str | int, ...], int], path: Path
+) -> None:
+    seen: dict[tuple[str, int], int] = {}
+    names: set[str] = set()
+    for index, entry in enumerate(records):
+        line = lines.get(("records", index), 1)
+        key = (entry.step, entry.repeat)
+        if key in seen:
+            raise InputError(
+                f"{path}:{line}: records: step {entry.step!r} repeat {entry.repeat} stands in "
+                f"line {seen[key]} already; give this one another repeat"
+            )
+        name = entry.meta().name
+        if name in names:
+            raise InputError(f"{path}:{line}: records: name {name!r} stands there twice")
+        seen[key] = line
+        names.add(name)
+
+
+def check_against_rig(
+    manifest: Manifest, lines: dict[tuple[str | int, ...], int], path: Path, rig: Rig
+) -> dict[str, tuple[float, float]]:
+    """Check joints, channels and units; returns (scale, offset) to SI of each mapped channel."""
+    joints = len(rig.joints)
+    for index, entry in enumerate(manifest.records):
+        wrong = [j for j in entry.locked if not 1 <= j <= joints]
+        if wrong or len(set(entry.locked)) != len(entry.locked):
+            line = lines.get(("records", index, "locked"), lines.get(("records", index), 1))
+            raise InputError(
+                f"{path}:{line}: records.{index}.locked: {list(entry.locked)} is no list of "
+                f"different joints of rig {rig.name!r}, which has 1 to {joints}"
+            )
+    maps = {}
+    known = (TIME, *_all_channels(rig))
+    for name, column in manifest.columns.items():
+        line = lines.get(("columns", name), 1)
+        if name not in known:
+            raise InputError(
+                f"{path}:{line}: columns.{name}: no channel of rig {rig.name!r}; expected one of: "
+                f"{', '.join(known)}"
+            )
+        si = "s" if name == TIME else rig.unit_of(name)
+        try:
+            factor, shift = unit_map(si if column.unit is None else column.unit, si)
+        except UnitError as error:
+            at = lines.get(("columns", name, "unit"), line)
+            raise InputError(f"{path}:{at}: columns.{name}.unit: {error}") from error
+        maps[name] = (factor * column.scale, factor * column.offset + shift)
+    return maps
+
+
+def _all_channels(rig: Rig) -> tuple[str, ...]:
+    if rig.electric:
+        return rig.channels
+    commands = [ch.channel(ch.COMMAND, i + 1) for i in range(len(rig.joints))]
+    return (*ch.measured(len(rig.joints), supply=True, temperature=True), *commands)
+
+
+def channels_of(rig: Rig) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return (channels a record must have, channels it may have) of an import."""
+    if rig.electric:
+        return rig.channels, ()
+    required = ch.measured(len(rig.joints), supply=False, temperature=False)
+    return required, tuple(name for name in _all_channels(rig) if name not in required)

@@ -1,0 +1,242 @@
+"""The journal of a run: every block, checksummed, in SQLite's write-ahead log.
+
+A block is acknowledged when `append` returns; it then survives the death of the process at any
+moment (the write-ahead log drops a torn transaction whole, the checksum finds a damaged blob).
+
+Glossary: a *stream* is an unbroken count of device ticks (a restart of the device's streaming
+begins another); a *mark* says that a tick range of a stream is a record.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import sqlite3
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.base import SampleBlock
+from rig.model.parse import InputError
+from rig.model.trips import RecordingFailed
+
+log = logging.getLogger(__name__)
+Array = NDArray[np.float64]
+Ticks = NDArray[np.int64]
+
+_FORMAT = 1
+_LAST = (1 << 63) - 1  # the largest number SQLite gives a row
+_SCHEMA = """
+CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
+CREATE TABLE block (
+    id INTEGER PRIMARY KEY, stream INTEGER NOT NULL, sequence INTEGER NOT NULL,
+    tick INTEGER NOT NULL, samples INTEGER NOT NULL, late REAL, crc INTEGER NOT NULL,
+    data BLOB NOT NULL, saturated BLOB NOT NULL);
+CREATE TABLE mark (
+    id INTEGER PRIMARY KEY, stream INTEGER NOT NULL, start INTEGER NOT NULL, ticks INTEGER,
+    state TEXT NOT NULL, meta TEXT NOT NULL);
+"""
+
+
+@dataclass(frozen=True)
+class Block:
+    """A block as it stands in the journal; `late` [s] is None in virtual time."""
+
+    stream: int
+    sequence: int
+    tick: int
+    late: float | None
+    data: Array
+    saturated: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Spans:
+    """Where blocks lie, without their samples: one entry per block in the order of arrival."""
+
+    id: Ticks
+    stream: Ticks
+    tick: Ticks
+    samples: Ticks
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A tick range of a stream that is a record; `ticks` is None while it is open."""
+
+    id: int
+    stream: int
+    start: int
+    ticks: int | None
+    state: str
+    meta: dict[str, Any] = field(default_factory=dict)
+
+
+def _checksum(stream: int, sequence: int, tick: int, data: bytes, saturated: bytes) -> int:
+    head = f"{stream} {sequence} {tick} {len(data)}".encode()
+    return zlib.crc32(saturated, zlib.crc32(data, zlib.crc32(head)))
+
+
+class Journal:
+    """One open journal; `create` to write, `open` to read; every failed write is RecordingFailed.
+
+    `max_pages` bounds its size in pages of 4 KiB (for tests of a full disk).
+    """
+
+    def __init__(self, connection: sqlite3.Connection, path: Path) -> None:
+        self._db = connection
+        self.path = path
+        self._next_mark = 1
+
+    @classmethod
+    def create(
+        cls,
+        path: Path,
+        columns: Sequence[str],
+        measured: int,
+        sample_rate: float,
+        max_pages: int | None = None,
+    ) -> Journal:
+        """Start the journal of `columns` (the first `measured` are sensors); RecordingFailed."""
+        try:
+            db = sqlite3.connect(path, isolation_level=None)
+            db.execute("PRAGMA journal_mode=WAL")
+            # NORMAL: a kill loses nothing, a power cut at most the blocks since the last sync;
+            # FULL would hold up the acquisition by a disk sync for every block.
+            db.execute("PRAGMA synchronous=NORMAL")
+            if max_pages is not None:
+                db.execute(f"PRAGMA max_page_count={int(max_pages)}")
+            db.executescript(_SCHEMA)
+            meta = {
+                "format": _FORMAT,
+                "columns": list(columns),
+                "measured": measured,
+                "sample_rate": sample_rate,
+            }
+            rows = [(key, json.dumps(value)) for key, value in meta.items()]
+            db.executemany("INSERT INTO meta VALUES (?, ?)", rows)
+        except sqlite3.Error as error:
+            raise RecordingFailed(f"{path}: the journal cannot be written: {error}") from error
+        return cls(db, path)
+
+    @classmethod
+    def open(cls, path: Path) -> Journal:
+        """Open a journal to read and finish it; raises InputError if it is none."""
+        if not path.is_file():
+            raise InputError(f"{path}: no such journal")
+        try:
+            db = sqlite3.connect(path, isolation_level=None)
+            found = cls(db, path)
+            if found.meta("format") != _FORMAT:
+                db.close()
+                raise InputError(f"{path}: no journal of this format")
+        except sqlite3.Error as error:
+            raise InputError(f"{path}: not a readable journal: {error}") from error
+        return found
+
+    def _write(self, sql: str, values: tuple[Any, ...]) -> None:
+        try:
+            self._db.execute(sql, values)
+        except sqlite3.Error as error:
+            raise RecordingFailed(
+                f"{self.path}: cannot be written any more ({error}; is the disk full?); what was "
+                "recorded until then is kept"
+            ) from error
+
+    def append(self, stream: int, block: SampleBlock, late: float | None) -> None:
+        """Keep one block (samples as float64); returns when it is safe; RecordingFailed."""
+        data = np.ascontiguousarray(block.data, dtype="<f8").tobytes()
+        marks = np.packbits(block.saturated).tobytes() if block.saturated.any() else b""
+        crc = _checksum(stream, block.sequence, block.tick, data, marks)
+        values = (stream, block.sequence, block.tick, len(block.data), late, crc, data, marks)
+        self._write("INSERT INTO block VALUES (NULL, ?, ?, ?, ?, ?, ?, ?, ?)", values)
+
+    def begin_mark(self, stream: int, start: int, meta: dict[str, Any]) -> int:
+        """Open a mark at a tick; returns its number."""
+        number = self._next_mark
+        text = json.dumps(meta)
+        self._write(
+            "INSERT INTO mark VALUES (?, ?, ?, NULL, 'open', ?)", (number, stream, start, text)
+        )
+        self._next_mark += 1
+        return number
+
+    def end_mark(self, number: int, ticks: int, state: str, meta: dict[str, Any]) -> None:
+        """Close a mark: `state` is complete, partial or discarded."""
+        self._write(
+            "UPDATE mark SET ticks = ?, state = ?, meta = ? WHERE id = ?",
+            (ticks, state, json.dumps(meta), number),
+        )
+
+    def set_meta(self, key: str, value: Any) -> None:
+        """Note one fact about the run."""
+        self._write("INSERT OR REPLACE INTO meta VALUES (?, ?)", (key, json.dumps(value)))
+
+    def meta(self, key: str) -> Any:
+        """Return a noted fact, None if there is none."""
+        row = self._db.execute("SELECT value FROM meta WHERE key = ?", (key,)).fetchone()
+        return None if row is None else json.loads(row[0])
+
+    def marks(self) -> list[Mark]:
+        """Return all marks in the order they began."""
+        rows = self._db.execute(
+            "SELECT id, stream, start, ticks, state, meta FROM mark ORDER BY id"
+        )
+        return [
+            Mark(number, stream, start, ticks, state, json.loads(meta))
+            for number, stream, start, ticks, state, meta in rows
+        ]
+
+    def spans(self) -> Spans:
+        """Return where every readable block lies, in the order of arrival."""
+        found: list[tuple[int, int, int, int]] = []
+        rows = self._db.execute("SELECT id, stream, tick, samples FROM block ORDER BY id")
+        try:
+            found.extend(rows)
+        except sqlite3.DatabaseError as error:  # a damaged page: keep what stands before it
+            log.warning("%s: unreadable after %d blocks: %s", self.path, len(found), error)
+        table = np.array(found, dtype=np.int64).reshape(len(found), 4)
+        return Spans(*table.T)
+
+    def blocks(self, first: int = 0, last: int = _LAST) -> Iterator[tuple[int, Block | None]]:
+        """Yield (id, block) in the order of arrival; None for a block whose checksum fails."""
+        measured, columns = int(self.meta("measured")), len(self.meta("columns"))
+        rows = self._db.execute(
+            "SELECT id, stream, sequence, tick, samples, late, crc, data, saturated FROM block "
+            "WHERE id BETWEEN ? AND ? ORDER BY id",
+            (first, last),
+        )
+        with suppress(sqlite3.DatabaseError):  # reported by `spans`
+            for row in rows:
+                yield int(row[0]), _decode(row[1:], columns, measured)
+
+    def close(self) -> None:
+        """Close the files; never raises."""
+        with suppress(sqlite3.Error):
+            self._db.close()
+
+    def delete(self) -> None:
+        """Close and remove the journal with its write-ahead log."""
+        self.close()
+        for suffix in ("", "-wal", "-shm"):
+            self.path.with_name(self.path.name + suffix).unlink(missing_ok=True)
+
+
+def _decode(row: tuple[Any, ...], columns: int, measured: int) -> Block | None:
+    stream, sequence, tick, samples, late, crc, data, marks = row
+    if not isinstance(data, bytes) or len(data) != samples * columns * 8:
+        return None
+    if _checksum(stream, sequence, tick, data, marks) != crc:
+        return None
+    values = np.frombuffer(data, dtype="<f8").reshape(samples, columns)
+    bits = np.zeros(samples * measured, dtype=bool)
+    if marks:
+        packed = np.frombuffer(marks, dtype=np.uint8)
+        bits = np.unpackbits(packed, count=samples * measured).astype(bool)
+    return Block(stream, sequence, tick, late, values, bits.reshape(samples, measured))

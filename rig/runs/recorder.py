@@ -1,0 +1,222 @@
+"""The recorder of one run: opens the folder, journals every block, finishes into records.h5."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from drivers.base import DeviceInfo, SampleBlock
+from rig.model.rig import Rig
+from rig.model.trips import RecordingFailed
+from rig.runs import store
+from rig.runs.journal import Journal
+from rig.runs.runstate import (
+    ABORTED,
+    BETWEEN,
+    JOURNAL,
+    RUNNING,
+    STATES,
+    EventLog,
+    give_up_ownership,
+    write_state,
+)
+from rig.runs.sections import Written
+
+log = logging.getLogger(__name__)
+
+_STEP = re.compile(r"^[A-Za-z0-9][A-Za-z0-9 ._+-]*$")
+Attribute = str | float | int
+
+
+@dataclass(frozen=True)
+class RecordMeta:
+    """What a record is: its step and repeat, what was locked, what excited it.
+
+    `locked` holds 1-based joints; `period` [samples] and `lines` describe the excitation;
+    `name` defaults to ``{step}_r{repeat}``. Raises ValueError for a name no file could bear.
+    """
+
+    step: str
+    repeat: int = 1
+    locked: tuple[int, ...] = ()
+    period: int = 0
+    lines: tuple[int, ...] = ()
+    name: str = ""
+    attributes: Mapping[str, Attribute] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not self.name:
+            object.__setattr__(self, "name", f"{self.step}_r{self.repeat}")
+        for text in (self.step, self.name):
+            if not _STEP.match(text) or text == BETWEEN:
+                raise ValueError(f"{text!r} cannot name a record; use letters, digits, '_', '-'")
+
+    def as_dict(self, more: Mapping[str, Attribute] | None = None) -> dict[str, Any]:
+        """Return it as plain data, with further attributes."""
+        return {
+            "name": self.name,
+            "step": self.step,
+            "repeat": self.repeat,
+            "locked": list(self.locked),
+            "period": self.period,
+            "lines": list(self.lines),
+            "attributes": {**self.attributes, **(more or {})},
+        }
+
+
+class Recorder:
+    """Writes one run folder; nothing exists on the disk before `open`.
+
+    Raises InputError at once if the folder is occupied, RecordingFailed when the disk fails.
+    """
+
+    def __init__(
+        self,
+        folder: str | Path,
+        rig: Rig,
+        *,
+        protocol: Mapping[str, Any] | None = None,
+        seed: int | None = None,
+        operator: str | None = None,
+        max_pages: int | None = None,
+    ) -> None:
+        self.folder = Path(folder)
+        self.rig = rig
+        self._about = {"protocol": protocol, "seed": seed, "operator": operator}
+        self._max_pages = max_pages
+        self._journal: Journal | None = None
+        self._events: EventLog | None = None
+        self._names: set[str] = set()
+        self._stream = 0
+        store.refuse_occupied(self.folder)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether blocks can be kept."""
+        return self._journal is not None
+
+    def open(self, info: DeviceInfo) -> None:
+        """Make the folder and its journal; the run is `running` from here on."""
+        about: Any = self._about
+        store.create_run(self.folder, self.rig, device=info.identity, **about)
+        try:
+            self._open_files(info)
+        except RecordingFailed:
+            with suppress(OSError):
+                write_state(self.folder, ABORTED)
+                give_up_ownership(self.folder)
+            raise
+
+    def _open_files(self, info: DeviceInfo) -> None:
+        self._events = EventLog(self.folder)
+        self.event("start", device=info.identity, virtual_time=info.virtual_time)
+        self._journal = Journal.create(
+            self.folder / JOURNAL,
+            self.rig.recorded,
+            len(self.rig.channels),
+            info.sample_rate,
+            self._max_pages,
+        )
+
+    def _open_journal(self) -> Journal:
+        if self._journal is None:
+            raise RecordingFailed(f"{self.folder}: the run is not open for recording")
+        return self._journal
+
+    def begin_stream(self) -> None:
+        """Note that the device counts its ticks anew from the next block on."""
+        self._stream += 1
+
+    def append(self, block: SampleBlock, late: float | None) -> None:
+        """Keep one block, `late` [s] behind its time (None in virtual time)."""
+        self._open_journal().append(self._stream, block, late)
+
+    def event(self, event: str, tick: int | None = None, **fields: Any) -> None:
+        """Note one event; it is on the disk when this returns."""
+        if self._events is None:
+            raise RecordingFailed(f"{self.folder}: the run is not open for recording")
+        self._events.append(event, tick, fields)
+
+    def begin_record(self, meta: RecordMeta, start: int) -> int:
+        """Open a record at a tick; raises ValueError if its name was used before."""
+        if meta.name in self._names:
+            raise ValueError(f"record {meta.name!r} stands in this run already")
+        number = self._open_journal().begin_mark(self._stream, start, meta.as_dict())
+        self._names.add(meta.name)
+        self.event("record begins", start, record=meta.name)
+        return number
+
+    def end_record(
+        self,
+        number: int,
+        meta: RecordMeta,
+        ticks: int,
+        state: str,
+        more: Mapping[str, Attribute],
+    ) -> None:
+        """Close a record after `ticks` samples: `state` is complete, partial or discarded."""
+        self._open_journal().end_mark(number, ticks, state, meta.as_dict(more))
+        if state == "discarded":
+            self._names.discard(meta.name)
+        self.event(f"record {state}", record=meta.name, ticks=ticks)
+
+    def finish(self, state: str, message: str = "") -> None:
+        """End the run: write and verify records.h5, set the state, drop the journal.
+
+        If the archive cannot be written the state is `aborted`, the journal stays, and
+        RecordingFailed says what to do. Calling it again does nothing.
+        """
+        if state not in STATES or state == RUNNING:
+            raise ValueError(f"{state!r} is no state to end in")
+        journal, self._journal = self._journal, None
+        if journal is None:
+            return
+        try:
+            with suppress(RecordingFailed):  # a full disk: recover then says interrupted
+                journal.set_meta("outcome", state)
+            self._finalise(journal, state, message)
+        finally:
+            if self._events is not None:
+                self._events.close()
+            with suppress(OSError):
+                give_up_ownership(self.folder)
+
+    def _finalise(self, journal: Journal, state: str, message: str) -> None:
+        try:
+            written = finalise(journal, self.folder, self.rig.name, state)
+        except RecordingFailed as error:
+            journal.close()
+            with suppress(RecordingFailed):
+                self.event("end", state=ABORTED, message=str(error))
+            try:
+                write_state(self.folder, ABORTED)
+            except OSError as problem:
+                log.error("%s: state cannot be written: %s", self.folder, problem)
+            raise
+        self.event("end", state=state, message=message, records=written.records)
+
+
+def finalise(journal: Journal, folder: Path, rig_name: str, state: str) -> Written:
+    """Turn a journal into records.h5, set the state, then let the journal go.
+
+    A journal with damaged blocks is kept beside as `journal.damaged.sqlite`. Raises
+    RecordingFailed; the journal is then untouched.
+    """
+    from rig.runs.archive import write_from_journal  # noqa: PLC0415 - h5py loads slowly
+
+    written = write_from_journal(journal, folder, rig_name)
+    try:
+        write_state(folder, state)
+    except OSError as error:
+        raise RecordingFailed(f"{folder}: state cannot be written: {error.strerror}") from error
+    if written.damaged_blocks:
+        journal.close()
+        journal.path.replace(folder / "journal.damaged.sqlite")
+    else:
+        journal.delete()
+    return written

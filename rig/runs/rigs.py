@@ -1,0 +1,65 @@
+"""Rig files: shipped ones by name, others by path."""
+
+from __future__ import annotations
+
+import os
+import re
+from importlib import resources
+from pathlib import Path
+
+from rig.model.parse import InputError, parse_model
+from rig.model.rig import Rig
+from rig.runs.files import read_text
+from rig.runs.store import parse_header
+
+_WHAT = "a rig file (YAML)"
+_RESOLVED = re.compile(r"^format:", re.MULTILINE)  # of a run.yaml; no rig file has that key
+
+
+def shipped_rigs() -> tuple[str, ...]:
+    """Name the rigs that come with the software."""
+    entries = resources.files("rig").joinpath("shipped").iterdir()
+    return tuple(sorted(e.name.removesuffix(".yaml") for e in entries if e.name.endswith(".yaml")))
+
+
+def rig_text(name_or_path: str | Path, relative_to: Path | None = None) -> tuple[str, str]:
+    """Return (text, where it was read) of a rig; a shipped name goes before a file of that name.
+
+    `relative_to` is the folder that a relative path starts from (default: the current one).
+    Raises InputError.
+    """
+    wanted = os.fspath(name_or_path)
+    names = shipped_rigs()
+    if wanted in names:
+        entry = resources.files("rig").joinpath("shipped", f"{wanted}.yaml")
+        return entry.read_text(encoding="utf-8"), f"{wanted}.yaml (shipped)"
+    path = Path(wanted).expanduser()
+    if relative_to is not None:
+        path = relative_to / path
+    try:
+        return read_text(path, _WHAT), str(path)
+    except InputError as error:
+        known = ", ".join(names)
+        raise InputError(f"{error}, or the name of a shipped rig: {known}") from error
+
+
+def load_bench(name: str | Path) -> Rig:
+    """Load a rig that this software can drive; raises InputError, also for an electric one."""
+    rig = load_rig(name)
+    if rig.electric:
+        raise InputError(
+            f"rig {rig.name!r} is electric: its records can be imported, identified and "
+            "validated, but only hydraulic benches are driven and simulated over a wire"
+        )
+    return rig
+
+
+def load_rig(name_or_path: str | Path, relative_to: Path | None = None) -> Rig:
+    """Load a rig by shipped name, rig file, or the run.yaml of a run that was taken on it.
+
+    Raises InputError naming file, line and expectation.
+    """
+    text, source = rig_text(name_or_path, relative_to)
+    if _RESOLVED.search(text):
+        return parse_header(text, source).rig
+    return parse_model(Rig, text, source)

@@ -1,0 +1,180 @@
+"""The small files of a run folder that say how it stands: state, owner, events.
+
+`state` is one word, replaced atomically. `owner.json` names the process that writes the folder,
+with its start time so that a reused process number is not mistaken for it. `events.jsonl` has one
+JSON object per line, each on the disk before the next begins; a torn last line is ignored.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import socket
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final
+
+from rig.model.trips import RecordingFailed
+from rig.runs.files import replace_text
+
+log = logging.getLogger(__name__)
+
+RUNNING: Final = "running"
+DONE: Final = "done"
+ABORTED: Final = "aborted"
+TRIPPED: Final = "tripped"
+INTERRUPTED: Final = "interrupted"
+STATES: Final = (RUNNING, DONE, ABORTED, TRIPPED, INTERRUPTED)
+
+HEADER: Final = "run.yaml"
+JOURNAL: Final = "journal.sqlite"
+EVENTS: Final = "events.jsonl"
+BETWEEN: Final = "between"  # the group of records.h5 for samples outside of every record
+_STATE, _OWNER = "state", "owner.json"
+
+
+def here() -> str:
+    """Return this computer's name."""
+    return socket.gethostname()
+
+
+def now() -> str:
+    """Return the wall clock as ISO 8601 in UTC."""
+    return datetime.now(UTC).isoformat(timespec="milliseconds")
+
+
+@dataclass(frozen=True)
+class Owner:
+    """The process that writes a run."""
+
+    pid: int
+    started: str
+    host: str
+
+
+def _started(pid: int) -> str | None:
+    """Return when a process started, in its kernel's words; None if there is no such process."""
+    try:
+        stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
+    except FileNotFoundError:
+        if Path("/proc/self/stat").exists():
+            return None
+    except OSError:
+        return ""
+    else:
+        fields = stat.rpartition(")")[2].split()
+        return None if fields[0] in ("Z", "X") else fields[19]
+    try:  # no /proc here: ask by signal 0
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return None
+    except OSError:
+        return ""
+    return ""
+
+
+def process_alive(pid: int, started: str = "") -> bool:
+    """Whether process `pid` lives; with `started`, whether it is still the same one."""
+    found = _started(pid)
+    if found is None:
+        return False
+    return not (found and started) or found == started
+
+
+def take_ownership(folder: Path) -> None:
+    """Note this process as the one that writes the run."""
+    owner = Owner(os.getpid(), _started(os.getpid()) or "", here())
+    replace_text(folder / _OWNER, json.dumps(asdict(owner)) + "\n")
+
+
+def give_up_ownership(folder: Path) -> None:
+    """Remove the note of who writes the run."""
+    (folder / _OWNER).unlink(missing_ok=True)
+
+
+def read_owner(folder: Path) -> Owner | None:
+    """Return who writes the run, None if nobody says so."""
+    try:
+        return Owner(**json.loads((folder / _OWNER).read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError):
+        return None
+
+
+def owner_alive(owner: Owner | None) -> bool:
+    """Whether the run's writer lives, as far as this machine can tell."""
+    if owner is None or owner.host != here():
+        return False
+    return process_alive(owner.pid, owner.started)
+
+
+def write_state(folder: Path, state: str) -> None:
+    """Replace the state; raises OSError."""
+    replace_text(folder / _STATE, state + "\n")
+
+
+def read_state(folder: Path) -> str:
+    """Return the state as it is: a run whose writer died while running is `interrupted`."""
+    try:
+        word = (folder / _STATE).read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError):
+        word = RUNNING
+    if word in STATES and word != RUNNING:
+        return word
+    return RUNNING if owner_alive(read_owner(folder)) else INTERRUPTED
+
+
+class EventLog:
+    """Appends events to a run; raises RecordingFailed when it cannot."""
+
+    def __init__(self, folder: Path) -> None:
+        self.path = folder / EVENTS
+        try:
+            self._stream = self.path.open("ab+")
+            self._end_torn_line()
+        except OSError as error:
+            raise RecordingFailed(f"{self.path}: cannot be written: {error.strerror}") from error
+
+    def _end_torn_line(self) -> None:
+        if self._stream.seek(0, os.SEEK_END) == 0:
+            return
+        self._stream.seek(-1, os.SEEK_END)
+        if self._stream.read(1) != b"\n":
+            self._stream.write(b"\n")
+
+    def append(self, event: str, tick: int | None, fields: Mapping[str, Any]) -> None:
+        """Write one event, on the disk when this returns."""
+        entry = {"time": now(), "event": event, "tick": tick, **fields}
+        line = json.dumps(entry, default=str) + "\n"
+        try:
+            self._stream.write(line.encode())
+            self._stream.flush()
+            os.fsync(self._stream.fileno())
+        except OSError as error:
+            raise RecordingFailed(f"{self.path}: cannot be written: {error.strerror}") from error
+
+    def close(self) -> None:
+        """Close the file; never raises."""
+        try:
+            self._stream.close()
+        except OSError as error:
+            log.warning("%s: %s", self.path, error)
+
+
+def read_events(folder: Path) -> list[dict[str, Any]]:
+    """Return the events of a run; a line torn by a kill is left out."""
+    try:
+        raw = (folder / EVENTS).read_bytes()
+    except OSError:
+        return []
+    found = []
+    for line in raw.splitlines():
+        try:
+            entry = json.loads(line)
+        except ValueError:
+            continue
+        if isinstance(entry, dict):
+            found.append(entry)
+    return found

@@ -1,0 +1,234 @@
+"""Run folders: make one, list them with their state, load one as data."""
+
+from __future__ import annotations
+
+import getpass
+import json
+import logging
+import os
+import socket
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from rig.model.parse import InputError, load_yaml
+from rig.model.records import Record, RecordHead, Run
+from rig.model.rig import Rig
+from rig.runs.files import read_text, replace_text
+from rig.runs.runstate import (
+    DONE,
+    HEADER,
+    INTERRUPTED,
+    JOURNAL,
+    RUNNING,
+    now,
+    read_events,
+    read_owner,
+    read_state,
+    take_ownership,
+    write_state,
+)
+from rig.runs.versions import versions
+
+log = logging.getLogger(__name__)
+T = TypeVar("T", Record, RecordHead)
+
+ARCHIVE = "records.h5"
+_FORMAT = 1
+_NOTE = "# How this run was taken. Numbers are SI: m, Pa, V, s, Hz, rad, degC.\n"
+
+
+class Header(BaseModel):
+    """What run.yaml holds; keys of later versions are ignored."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    format: int
+    created: str
+    operator: str = ""
+    host: str = ""
+    seed: int | None = None
+    source: str = ""
+    device: str = ""
+    versions: dict[str, str] = {}
+    rig: Rig
+    protocol: dict[str, Any] | None = None
+
+
+@dataclass(frozen=True)
+class RunSummary:
+    """One line of a list of runs; `records` are the complete ones, -1 if not known."""
+
+    path: Path
+    state: str
+    rig: str
+    protocol: str
+    created: str
+    records: int
+    message: str
+
+
+def refuse_occupied(folder: Path) -> None:
+    """Raise InputError unless `folder` is new or an empty folder."""
+    try:
+        if not folder.exists() and not folder.is_symlink():
+            return
+        if not folder.is_dir():
+            raise InputError(f"{folder}: is not a folder; name a new folder for the run")
+        if any(folder.iterdir()):
+            raise InputError(f"{folder}: is not empty; name a new folder for the run")
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be used for a run: {error.strerror}") from error
+
+
+def _operator() -> str:
+    try:
+        return getpass.getuser()
+    except (OSError, KeyError):  # a user number without a name, as in containers
+        return str(os.getuid())
+
+
+def create_run(
+    folder: Path,
+    rig: Rig,
+    *,
+    protocol: Mapping[str, Any] | None = None,
+    seed: int | None = None,
+    operator: str | None = None,
+    source: str = "",
+    device: str = "",
+) -> Path:
+    """Make a run folder in state `running`, owned by this process.
+
+    `protocol` is the resolved protocol as plain data, with a `name`. Raises InputError if the
+    folder is occupied or cannot be made.
+    """
+    refuse_occupied(folder)
+    head = {
+        "format": _FORMAT,
+        "created": now(),
+        "operator": _operator() if operator is None else operator,
+        "host": socket.gethostname(),
+        "seed": seed,
+        "source": source,
+        "device": device,
+        "versions": versions(),
+        "protocol": None if protocol is None else json.loads(json.dumps(dict(protocol))),
+        "rig": rig.model_dump(mode="json"),
+    }
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        take_ownership(folder)
+        write_state(folder, RUNNING)
+        replace_text(folder / HEADER, _NOTE + yaml.safe_dump(head, sort_keys=False))
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made: {error.strerror}") from error
+    return folder
+
+
+def is_run(folder: Path) -> bool:
+    """Whether a folder holds a run."""
+    return (folder / HEADER).is_file()
+
+
+def read_header(folder: Path) -> Header:
+    """Read run.yaml; raises InputError naming file, line and key."""
+    path = folder / HEADER
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such run folder")
+    if not is_run(folder):
+        raise InputError(f"{folder}: not a run folder: it has no {HEADER}")
+    return parse_header(read_text(path, "the head of a run", limit=64 << 20), str(path))
+
+
+def parse_header(text: str, source: str) -> Header:
+    """Read the text of a run.yaml; raises InputError naming `source`, line and key."""
+    data, _ = load_yaml(text, source)
+    if not isinstance(data, dict):
+        raise InputError(f"{source}:1: expected keys and values")
+    if data.get("format") != _FORMAT:
+        raise InputError(f"{source}: format {data.get('format')!r}, this version reads {_FORMAT}")
+    try:
+        return Header.model_validate(data)
+    except ValidationError as error:
+        problem = error.errors()[0]
+        where = ".".join(str(part) for part in problem["loc"])
+        raise InputError(f"{source}: {where}: {problem['msg']}") from error
+
+
+def finished(folder: Path) -> tuple[Header, str]:
+    """Return head and state of a run whose records can be read; raises InputError otherwise."""
+    header = read_header(folder)
+    state = read_state(folder)
+    if state == RUNNING:
+        owner = read_owner(folder)
+        who = f" (process {owner.pid})" if owner else ""
+        raise InputError(f"{folder}: is still being recorded{who}; load it when it has ended")
+    unfinished = state == INTERRUPTED and (folder / JOURNAL).exists()
+    if unfinished or not (folder / ARCHIVE).exists():
+        raise InputError(
+            f"{folder}: {state}, its records were not finalised; run `bramah recover {folder}`"
+        )
+    return header, state
+
+
+def chosen_of(folder: Path, state: str, records: Sequence[T], partial: bool) -> tuple[T, ...]:
+    """Return the complete records, with `partial` all; raises InputError where there are none."""
+    chosen = tuple(r for r in records if partial or r.attributes["complete"])
+    if not chosen:
+        kept = f"; it keeps {len(records)} unfinished one(s)" if records else ""
+        raise InputError(f"{folder}: {state} before any record was complete{kept}")
+    return chosen
+
+
+def load_run(path: str | Path, *, partial: bool = False) -> Run:
+    """Load a run's complete records, with `partial` the unfinished ones as well.
+
+    A sample lost on the wire is NaN in every channel (attribute `lost_samples` counts them).
+    Raises InputError with a one-line message for anything that cannot be read.
+    `rig.runs.stream` reads them one by one.
+    """
+    folder = Path(path)
+    header, state = finished(folder)
+    from rig.runs.archive_reader import read_records  # noqa: PLC0415 - keeps this module light
+
+    chosen = chosen_of(folder, state, read_records(folder / ARCHIVE), partial)
+    return Run(header.rig, chosen, source=str(folder), state=state)
+
+
+def summarise(folder: Path) -> RunSummary:
+    """Summarise one run; never raises: what cannot be read is said in the message."""
+    try:
+        header = read_header(folder)
+    except InputError as error:
+        return RunSummary(folder, "unreadable", "", "", "", -1, str(error))
+    events = read_events(folder)
+    ends = [e for e in events if e.get("event") == "end"]
+    message = str(ends[-1].get("message", "")) if ends else ""
+    records = sum(e.get("event") == "record complete" for e in events)
+    state = read_state(folder)
+    if state == INTERRUPTED and not ends:
+        message = f"finalise it with `bramah recover {folder}`"
+    protocol = str((header.protocol or {}).get("name", "")) or header.source
+    return RunSummary(folder, state, header.rig.name, protocol, header.created, records, message)
+
+
+def list_runs(folder: str | Path) -> list[RunSummary]:
+    """List the runs in a folder (or the one it is), oldest first; raises InputError."""
+    root = Path(folder)
+    if not root.is_dir():
+        raise InputError(f"{root}: no such folder")
+    try:
+        children = [root] if is_run(root) else [c for c in root.iterdir() if is_run(c)]
+    except OSError as error:
+        raise InputError(f"{root}: cannot be read: {error.strerror}") from error
+    return sorted((summarise(c) for c in children), key=lambda s: (s.created, s.path.name))
+
+
+def mark_done(folder: Path) -> None:
+    """Set the state of a run that needed no journal (an import) to done."""
+    write_state(folder, DONE)

@@ -1,0 +1,1 @@
+"""Evidence: studies of the method, the paper's reproduction, measured machines."""

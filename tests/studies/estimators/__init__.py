@@ -1,0 +1,1 @@
+"""Studies of estimators, intervals, filters and predicted errors."""

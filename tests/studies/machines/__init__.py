@@ -1,0 +1,1 @@
+"""Measured machines, and a simulated electric arm."""

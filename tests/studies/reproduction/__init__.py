@@ -1,0 +1,1 @@
+"""The paper's sections IV and V, run on a simulated bench."""

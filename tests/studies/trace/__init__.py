@@ -1,0 +1,1 @@
+"""The trace on benches with hidden effects: right names, wrong names, abstentions."""
