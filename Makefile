@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 OUT ?= demo-out
 
-.PHONY: all demo test lint bench clean
+.PHONY: all demo test lint bench study clean
 
 all: $(STAMP)
 
@@ -35,6 +35,10 @@ test: lint
 
 bench: $(STAMP)
 	@$(BIN)/bramah bench
+
+# Slow evidence: `make study` lists the studies, `make study NAME="trace --quick"` runs one.
+study: $(STAMP)
+	@$(BIN)/python -m tests.studies $(or $(NAME),--help)
 
 clean:
 	rm -rf $(VENV) $(OUT) .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,1 +1,1 @@
-"""The bench: its vocabulary (`rig.model`), its services (`rig.services`) and its faces."""
+"""The bench: vocabulary, sessions with a device, runs on disk, command line and screen."""

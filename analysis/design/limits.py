@@ -119,7 +119,7 @@ def used(rig: Rig, played: Played) -> tuple[float, str]:
 
 
 @dataclass(frozen=True)
-class Forecast:
+class LimitForecast:
     """The linear response of every bounded signal to one joint's command, about its mean.
 
     `lines` (k,) are those it knows, `responses` (b, k), `low` and `high` (b,) how far below and
@@ -169,7 +169,7 @@ def _nonzero(values: Spectrum) -> Spectrum:
     return np.where(np.abs(values) > 0, values, 1.0)
 
 
-def forecast_of(rig: Rig, played: Played, joint: int, lines: NDArray[np.int64]) -> Forecast:
+def forecast_of(rig: Rig, played: Played, joint: int, lines: NDArray[np.int64]) -> LimitForecast:
     """Measure the responses at the lines that are excited and interpolate them to the others."""
     n = played.step.period
     command = np.fft.rfft(played.motion["command"][-n:, joint])
@@ -184,4 +184,4 @@ def forecast_of(rig: Rig, played: Played, joint: int, lines: NDArray[np.int64]) 
         )
         low.append(bound.signal.mean() - bound.low)
         high.append(bound.high - bound.signal.mean())
-    return Forecast(n, lines, np.array(responses), np.array(low), np.array(high))
+    return LimitForecast(n, lines, np.array(responses), np.array(low), np.array(high))

@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 
 from analysis.design.sensor_noise import score_covariance
 from analysis.design.twin_records import PlannedStep, Played, ideal, play
-from analysis.identify.identify import build_rows
 from analysis.identify.reduction import SEGMENTS
+from analysis.identify.stacked_rows import build_rows
 from analysis.regression.noise import noise_moments
 from analysis.regression.rows import Filtering, Rows, default_filtering, parameters_of
-from analysis.regression.solve import Cluster, half_width, solve, triangle
+from analysis.regression.solve import RowCluster, half_width, solve, triangle
 from analysis.signals.conditioning import condition
 from analysis.simulation.model import finite
 from analysis.terms import baseline
@@ -186,7 +186,7 @@ def combine(rig: Rig, terms: Sequence[Used], found: Sequence[StepInformation]) -
     for family in FAMILIES:
         names = parameters_of(rig, terms, family)
         clusters = [
-            Cluster(one.step, r, one.triangle[family], one.rows[family])
+            RowCluster(one.step, r, one.triangle[family], one.rows[family])
             for one in found
             for r in range(max(one.repeats, 2))
         ]

@@ -174,3 +174,13 @@ def _nothing(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-de
 
 
 NO_KERNEL: Kernel = _nothing  # of effects that the plant does not feel
+
+
+def open_shapes(rig: Rig, used: Used) -> bool:
+    """Tell whether a term is an effect that is nothing without a shape, and has none.
+
+    A contact's presliding is what data resolve: without one it is dry.
+    """
+    if len(used.shape) or not isinstance(used.term, Effect):
+        return False
+    return any(not s.resolution for s in used.term.shapes(rig))

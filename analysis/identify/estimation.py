@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from analysis.identify.checks import Check
 from analysis.identify.estimators import nuisance as nu
 from analysis.identify.estimators.bootstrap import bootstrap
-from analysis.identify.estimators.covariance import Spread, spread
+from analysis.identify.estimators.covariance import CovarianceParts, spread
 from analysis.identify.estimators.equations import (
-    Block,
-    Fit,
+    EquationFit,
     HasRows,
     Prepared,
+    RepeatBlock,
     blocks_of,
     least_squares,
     levelled,
@@ -48,7 +48,7 @@ NEED_REPEATS = ("wls", "iv")
 # times the stated noise it is the most biased of all (docs/estimators.md).
 UNBIASED = ("iv",)
 
-_FITS: Mapping[str, Callable[[Sequence[Block]], Fit]] = {
+_FITS: Mapping[str, Callable[[Sequence[RepeatBlock]], EquationFit]] = {
     "ls": least_squares,
     "wls": weighted_least_squares,
     "iv": instrumental_variables,
@@ -58,7 +58,7 @@ RowsWith = Callable[[Sequence[Used]], Sequence[HasRows]]
 
 
 @dataclass(frozen=True)
-class Job:
+class EstimationJob:
     """What to estimate from: rig, runs, the model's terms, and how to build rows with more."""
 
     rig: Rig
@@ -90,7 +90,7 @@ def refuse_unknown(estimator: str) -> None:
         raise InputError(f"unknown estimator {estimator!r}; known: {' '.join(ESTIMATORS)}")
 
 
-def refine(job: Job, solutions: Mapping[str, Solution]) -> Refined:
+def refine(job: EstimationJob, solutions: Mapping[str, Solution]) -> Refined:
     """Solve again by the job's estimator, nuisances beside the parameters, with honest intervals.
 
     `solutions` are those of plain least squares; what they found unidentifiable stays so. Raises
@@ -148,7 +148,7 @@ def refine(job: Job, solutions: Mapping[str, Solution]) -> Refined:
 
 
 def _drawn(
-    job: Job, p: Prepared, estimator: str, fit: Fit, shift: Array
+    job: EstimationJob, p: Prepared, estimator: str, fit: EquationFit, shift: Array
 ) -> dict[str, tuple[float, float]]:
     """Return the bootstrap's intervals by name, extended by a shift (k,) that no draw can show."""
     rng = job.rng or np.random.default_rng(0)
@@ -161,7 +161,7 @@ def _drawn(
     return {name: (float(a), float(b)) for name, a, b in ends}
 
 
-def _repeats(job: Job) -> dict[tuple[int, str], int]:
+def _repeats(job: EstimationJob) -> dict[tuple[int, str], int]:
     seen: dict[tuple[int, str], set[int]] = {}
     for i, run in enumerate(job.runs):
         for r in run.records:
@@ -169,7 +169,9 @@ def _repeats(job: Job) -> dict[tuple[int, str], int]:
     return {k: len(v) for k, v in seen.items()}
 
 
-def _prepare(job: Job, solutions: Mapping[str, Solution]) -> tuple[list[Prepared], list[Check]]:
+def _prepare(
+    job: EstimationJob, solutions: Mapping[str, Solution]
+) -> tuple[list[Prepared], list[Check]]:
     """Build rows with the nuisances; one that the data contradict is left out, and said."""
     values: dict[str, float] = {}
     for s in solutions.values():
@@ -204,7 +206,7 @@ def _prepare(job: Job, solutions: Mapping[str, Solution]) -> tuple[list[Prepared
 
 
 def _family(
-    job: Job,
+    job: EstimationJob,
     per_record: Sequence[HasRows],
     family: str,
     columns: Sequence[str],
@@ -222,7 +224,7 @@ def _family(
     return Prepared(family, names, len(mine), tuple(blocks))
 
 
-def _solve(p: Prepared, estimator: str) -> tuple[Array, Spread, Fit]:
+def _solve(p: Prepared, estimator: str) -> tuple[Array, CovarianceParts, EquationFit]:
     fit = _FITS[estimator](p.blocks)
     error = spread([pieces(fit), pieces(fit, "level")], fit.inverse)
     beta, inverse = fit.beta, fit.inverse
@@ -232,11 +234,11 @@ def _solve(p: Prepared, estimator: str) -> tuple[Array, Spread, Fit]:
 
 
 def _redo(
-    p: Prepared, kind: Callable[[Sequence[Block]], Fit], error: Spread
-) -> Callable[[Sequence[Block]], Array]:
+    p: Prepared, kind: Callable[[Sequence[RepeatBlock]], EquationFit], error: CovarianceParts
+) -> Callable[[Sequence[RepeatBlock]], Array]:
     """Return the estimate of resampled blocks; what is known beforehand weighs as before."""
 
-    def estimate(blocks: Sequence[Block]) -> Array:
+    def estimate(blocks: Sequence[RepeatBlock]) -> Array:
         fit = kind(blocks)
         beta, inverse, after = fit.beta, fit.inverse, error
         for belief in nu.beliefs(p.names, beta):
@@ -246,12 +248,12 @@ def _redo(
     return estimate
 
 
-def _first(s: Spread, k: int) -> Spread:
-    return Spread(s.covariance[:k, :k], s.dof[:k], s.systematic[:k])
+def _first(s: CovarianceParts, k: int) -> CovarianceParts:
+    return CovarianceParts(s.covariance[:k, :k], s.dof[:k], s.systematic[:k])
 
 
 def _named(
-    prepared: Sequence[Prepared], found: Mapping[str, tuple[Array, Spread, Fit]]
+    prepared: Sequence[Prepared], found: Mapping[str, tuple[Array, CovarianceParts, EquationFit]]
 ) -> dict[str, float]:
     return {
         name: float(v)
@@ -260,7 +262,9 @@ def _named(
     }
 
 
-def merged(solution: Solution, names: Sequence[str], beta: Array, error: Spread) -> Solution:
+def merged(
+    solution: Solution, names: Sequence[str], beta: Array, error: CovarianceParts
+) -> Solution:
     """Return the solution with new values, covariance and dof for the parameters `names`."""
     place = [solution.names.index(n) for n in names]
     value, dof = solution.value.copy(), solution.dof.copy()

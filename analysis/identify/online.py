@@ -27,11 +27,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.identify.estimates import estimates_of
+from analysis.identify.result import estimates_of
 from analysis.regression.chunks import Locks, divisible, overlap, stretch_rows
 from analysis.regression.qr import Accumulator
 from analysis.regression.rows import Filtering, Rows, default_filtering, parameters_of
-from analysis.regression.solve import Cluster, Solution, merge, solve
+from analysis.regression.solve import RowCluster, Solution, merge, solve
 from analysis.simulation.model import Estimate
 from analysis.terms import baseline_of
 from analysis.terms.base import Term, Used, family_of
@@ -156,7 +156,7 @@ class _Filter:
         faint = size < least
         self.held = frozenset(n for n, low in zip(self.names, faint, strict=True) if low)
         if self.held:
-            value = np.nan_to_num(solve(self.names, [Cluster(0, 0, R, 1)]).value)
+            value = np.nan_to_num(solve(self.names, [RowCluster(0, 0, R, 1)]).value)
             lift = np.diag(np.sqrt(np.maximum(least**2 - size**2, 0.0)))[faint]
             self._sum.merge(np.column_stack((lift, lift @ value)), 0)
 
@@ -195,8 +195,8 @@ class _Filter:
             alone = count[step] == 1 and others
             stratum, cluster = (others[0], (step, key)) if alone else (step, key)
             triangle = one.triangle * np.sqrt(self._weight(one))
-            scatter.append(Cluster(stratum, cluster, triangle, one.rows))
-        whole = Cluster("all", "all", self._sum.triangle, self._sum.rows)
+            scatter.append(RowCluster(stratum, cluster, triangle, one.rows))
+        whole = RowCluster("all", "all", self._sum.triangle, self._sum.rows)
         return solve(self.names, [whole], scatter=scatter)
 
 

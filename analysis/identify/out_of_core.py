@@ -4,21 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from analysis.effects.base import open_shapes
 from analysis.identify import checks as ck
-from analysis.identify.identify import Identification, conclude
+from analysis.identify.coupled import conclude
 from analysis.identify.reduction import (
-    Task,
+    RecordTask,
     first_of_steps,
     moving_task,
     path_of,
     reduce_task,
     steps_of,
 )
+from analysis.identify.result import Identification
 from analysis.regression.rows import Filtering, default_filtering
 from analysis.simulation.model import Model, refuse_other_rig
 from analysis.terms import with_effects
 from analysis.terms.base import Used
-from analysis.trace.search.shapes import open_shapes
 from analysis.workers.pool import Pool, Serial
 from rig.model.parse import InputError
 from rig.model.records import Record
@@ -61,7 +62,7 @@ def identify_folders(
     found = workers.map(moving_task, [one for _, one in steps], reads=path_of)
     moving = {(n, one.step): moves for (n, one), moves in zip(steps, found, strict=True)}
     tasks = [
-        Task(
+        RecordTask(
             rig,
             number,
             folder,

@@ -28,9 +28,8 @@ from numpy.typing import NDArray
 from scipy.stats import f as fisher
 
 from analysis.identify.checks import Check
-from analysis.identify.constrained import Feasible, Minimum, minimise
-from analysis.identify.estimates import estimates_of
-from analysis.identify.identify import Identification
+from analysis.identify.result import Identification, estimates_of
+from analysis.regression.constrained import Feasible, Minimum, minimise
 from analysis.regression.solve import Solution
 from analysis.simulation.model import Estimate, estimate_json, finite
 from analysis.terms.inertia import chain_matrix, inertia_map

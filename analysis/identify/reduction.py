@@ -23,7 +23,7 @@ from analysis.regression.noise import record_moments
 from analysis.regression.nonlinear import reduced
 from analysis.regression.qr import Accumulator
 from analysis.regression.rows import Filtering, Rows, parameters_of
-from analysis.regression.solve import Cluster, Solution, merge, solve
+from analysis.regression.solve import RowCluster, Solution, merge, solve
 from analysis.signals.conditioning import Mask, lost_samples, moving_joints
 from analysis.signals.locks import moving_of
 from analysis.terms.base import FAMILIES, Used, family_of
@@ -39,7 +39,7 @@ SEGMENTS = 10  # parts of a record
 
 
 @dataclass(frozen=True)
-class Reduction:
+class RecordReduction:
     """What one record says: by family, one triangle per part; what was left out; its noise.
 
     `run` numbers the run; `noise` is the part of [X y]'[X y] that sensor noise makes, by family,
@@ -56,7 +56,7 @@ class Reduction:
 
 
 @dataclass(frozen=True)
-class Task:
+class RecordTask:
     """One record to reduce, by where it is; picklable as long as terms and filtering are."""
 
     rig: Rig
@@ -70,7 +70,7 @@ class Task:
     moving: tuple[bool, ...] | None = None
 
 
-def reduce_task(task: Task) -> Reduction:
+def reduce_task(task: RecordTask) -> RecordReduction:
     """Reduce a record of a run folder; raises InputError naming record and channel."""
     with open_record(task.path, task.record) as reader:
         short = reader.head.samples <= task.stretch
@@ -129,7 +129,7 @@ def _moving_here(rig: Rig, run: Run) -> dict[str, Mask]:
     }  # fmt: skip
 
 
-def path_of(task: Task | StepTask) -> str:
+def path_of(task: RecordTask | StepTask) -> str:
     """Return the run folder that a task reads."""
     return task.path
 
@@ -139,7 +139,7 @@ def reduce_runs(
     runs: Sequence[Run],
     terms: tuple[Used, ...],
     filtering: Callable[[Record], Filtering],
-) -> list[Reduction]:
+) -> list[RecordReduction]:
     """Reduce all records of runs at hand."""
     return [
         reduce_record(
@@ -174,7 +174,7 @@ def reduce_record(
     with_noise: bool,
     stretch: int = STRETCH,
     moving: Mask | None = None,
-) -> Reduction:
+) -> RecordReduction:
     """Reduce one record, a long one in stretches; raises InputError for one that cannot be used.
 
     `moving` (N,) as for `source_rows`.
@@ -198,7 +198,7 @@ def reduce_record(
         # Of a long record a stretch stands for the whole.
         count = min(head.samples, stretch) if divisible(filters) else head.samples
         noise = _noise(rig, source, count, terms, filtering, moving)
-    return Reduction(run, head, parts, masked, lost, clipped, noise)
+    return RecordReduction(run, head, parts, masked, lost, clipped, noise)
 
 
 def parts_of(rows: Rows, duration: float) -> list[slice]:
@@ -243,7 +243,7 @@ def _noise(
     return {family: moment * (head.samples / count) for family, moment in found.items()}
 
 
-def repeats_of(reductions: Sequence[Reduction]) -> dict[tuple[int, str], int]:
+def repeats_of(reductions: Sequence[RecordReduction]) -> dict[tuple[int, str], int]:
     """Count the repeats of every (run, step)."""
     seen: dict[tuple[int, str], set[int]] = {}
     for one in reductions:
@@ -251,10 +251,10 @@ def repeats_of(reductions: Sequence[Reduction]) -> dict[tuple[int, str], int]:
     return {key: len(values) for key, values in seen.items()}
 
 
-def clusters_of(reductions: Sequence[Reduction], family: str) -> list[Cluster]:
+def clusters_of(reductions: Sequence[RecordReduction], family: str) -> list[RowCluster]:
     """Return one cluster per record, or one per part where its step has this record only."""
     repeats = repeats_of(reductions)
-    out: list[Cluster] = []
+    out: list[RowCluster] = []
     for one in reductions:
         stratum = (one.run, one.head.step)
         filled = [(n, R, rows) for n, (R, rows) in enumerate(one.parts[family]) if rows]
@@ -262,15 +262,15 @@ def clusters_of(reductions: Sequence[Reduction], family: str) -> list[Cluster]:
             if filled:
                 whole = merge(R for _, R, _ in filled)
                 rows = sum(rows for *_, rows in filled)
-                out.append(Cluster(stratum, one.head.repeat, whole, rows))
+                out.append(RowCluster(stratum, one.head.repeat, whole, rows))
             continue
         for n, R, rows in filled:
             key: Hashable = (one.head.repeat, n)
-            out.append(Cluster(stratum, key, R, rows))
+            out.append(RowCluster(stratum, key, R, rows))
     return out
 
 
-def noise_of(reductions: Sequence[Reduction], family: str) -> Array | None:
+def noise_of(reductions: Sequence[RecordReduction], family: str) -> Array | None:
     """Return the noise moments of all records, each step's by the record that stands for it."""
     counts: dict[tuple[int, str], int] = {}
     for one in reductions:
@@ -285,7 +285,10 @@ def noise_of(reductions: Sequence[Reduction], family: str) -> Array | None:
 
 
 def solve_reductions(
-    rig: Rig, terms: Sequence[Used], reductions: Sequence[Reduction], reject_noise: bool = True
+    rig: Rig,
+    terms: Sequence[Used],
+    reductions: Sequence[RecordReduction],
+    reject_noise: bool = True,
 ) -> dict[str, Solution]:
     """Solve each family once from the triangles of all records."""
     out = {}

@@ -19,8 +19,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.regression.solve import Cluster, Solution, merge, solve
-from analysis.terms.base import Reduction, Used
+from analysis.regression.solve import RowCluster, Solution, merge, solve
+from analysis.terms.base import ParameterReduction, Used
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
@@ -34,7 +34,7 @@ def reduced(
     rig: Rig,
     terms: Sequence[Used],
     linear: Solution,
-    clusters: Sequence[Cluster],
+    clusters: Sequence[RowCluster],
     noise: Array | None = None,
     reject_noise: bool = True,
 ) -> Solution:
@@ -48,12 +48,12 @@ def reduced(
 
 
 def _reduce(
-    reduction: Reduction,
+    reduction: ParameterReduction,
     linear: Solution,
-    clusters: Sequence[Cluster],
+    clusters: Sequence[RowCluster],
     noise: Array | None,
     reject_noise: bool,
-) -> tuple[Solution, Sequence[Cluster], Array | None]:
+) -> tuple[Solution, Sequence[RowCluster], Array | None]:
     names = linear.names
     places = [names.index(name) for name in reduction.linear]
     others = [i for i in range(len(names)) if i not in places]
@@ -61,7 +61,7 @@ def _reduce(
     x = np.nan_to_num(linear.value)
     p = np.concatenate((x[others], reduction.start(x[places])))
     # All clusters as one: the step needs the sum only, the scatter comes at the end.
-    whole = [Cluster("all", "all", merge(c.triangle for c in clusters), linear.rows)]
+    whole = [RowCluster("all", "all", merge(c.triangle for c in clusters), linear.rows)]
     for _ in range(ROUNDS):
         change = _transform(reduction, places, others, p)
         stepped = solve(new, _transformed(whole, change), None, False)
@@ -78,7 +78,7 @@ def _reduce(
 
 
 def _transform(
-    reduction: Reduction, places: Sequence[int], others: Sequence[int], p: Array
+    reduction: ParameterReduction, places: Sequence[int], others: Sequence[int], p: Array
 ) -> Array:
     """Return S (k+1, m+1) at p."""
     k, kept = len(places) + len(others), len(others)
@@ -92,5 +92,5 @@ def _transform(
     return S
 
 
-def _transformed(clusters: Sequence[Cluster], change: Array) -> list[Cluster]:
+def _transformed(clusters: Sequence[RowCluster], change: Array) -> list[RowCluster]:
     return [replace(c, triangle=merge([c.triangle @ change])) for c in clusters]

@@ -30,7 +30,7 @@ SHARE_OF_NULL = 0.05  # a parameter with more of a null direction than this is n
 
 
 @dataclass(frozen=True)
-class Cluster:
+class RowCluster:
     """The reduced rows of one independent cluster: a repeat (or a segment of the only repeat)."""
 
     stratum: Hashable
@@ -81,10 +81,10 @@ def _square(stacked: Array) -> Array:
 
 def solve(
     names: Sequence[str],
-    clusters: Sequence[Cluster],
+    clusters: Sequence[RowCluster],
     noise: Array | None = None,
     reject_noise: bool = True,
-    scatter: Sequence[Cluster] | None = None,
+    scatter: Sequence[RowCluster] | None = None,
 ) -> Solution:
     """Solve all clusters at once; parameters that the rows do not determine come out as NaN.
 
@@ -148,14 +148,14 @@ def _confounded(names: Sequence[str], null: Array) -> dict[str, str]:
     return lost
 
 
-def scores(beta: Array, cluster: Cluster) -> Array:
+def scores(beta: Array, cluster: RowCluster) -> Array:
     """Return X'(y - X beta) (k,) of a cluster from its triangle alone."""
     k = len(beta)
     X, y = cluster.triangle[:, :k], cluster.triangle[:, k]
     return np.asarray(X.T @ (y - X @ beta))
 
 
-def _clustered(beta: Array, bread: Array, clusters: Sequence[Cluster]) -> tuple[Array, Array]:
+def _clustered(beta: Array, bread: Array, clusters: Sequence[RowCluster]) -> tuple[Array, Array]:
     """Return the stratified cluster covariance (k, k) and Satterthwaite's dof (k,)."""
     k = len(beta)
     strata: dict[Hashable, dict[Hashable, Array]] = {}

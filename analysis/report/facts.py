@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from analysis.identify.checks import Check
-from analysis.identify.identify import Identification
 from analysis.identify.plausibility import LENGTH_TOLERANCE
+from analysis.identify.result import Identification
 from analysis.report import format as fm
 from analysis.report import paper
 from analysis.report.plots.interval_plots import relative_half_width

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from markupsafe import Markup
 
-from analysis.identify.identify import Identification
+from analysis.identify.result import Identification
 from analysis.report import format as fm
 from analysis.report.machine import steps
 from analysis.report.plots import arm_plot, interval_plots, record_plots, validation_plots
@@ -23,7 +23,7 @@ MOST = 18  # figures of one kind: the tables hold the rest
 
 
 @dataclass(frozen=True)
-class Shown:
+class ReportFigure:
     """A figure with its caption: heading and explanation, plain text."""
 
     svg: Markup
@@ -35,7 +35,7 @@ class Shown:
 class Gallery:
     """Figures of one kind and how many more there would have been."""
 
-    figures: tuple[Shown, ...]
+    figures: tuple[ReportFigure, ...]
     left_out: int = 0
 
 
@@ -52,21 +52,21 @@ def parameters(
             else "Zero is the rig file's nominal value: a design figure, not the truth."
         )  # fmt: skip
         found.append(
-            Shown(interval_plots.against_reference(estimates, reference, kind),
+            ReportFigure(interval_plots.against_reference(estimates, reference, kind),
                   f"Parameters against the {kind}", text)
         )  # fmt: skip
     found.append(
-        Shown(interval_plots.interval_widths(estimates), "Width of the intervals",
+        ReportFigure(interval_plots.interval_widths(estimates), "Width of the intervals",
               "Scatter is not accuracy: a narrow interval says nothing of what the model lacks.")
     )  # fmt: skip
     return Gallery(tuple(found))
 
 
-def arm(rig: Rig) -> Shown | None:
+def arm(rig: Rig) -> ReportFigure | None:
     """Return the drawing of the arm; None of an electric one, which has no linkage to draw."""
     if rig.electric:
         return None
-    return Shown(
+    return ReportFigure(
         arm_plot.arm(rig), "The arm, from its linkage",
         "Pistons at mid-stroke; dashed, each joint alone at either end of its stroke. Angles are "
         "relative to the link before, the first to the vertical below.",
@@ -89,7 +89,7 @@ def excitations(rig: Rig, runs: Sequence[Run]) -> Gallery:
     ]  # fmt: skip
     return Gallery(
         tuple(
-            Shown(
+            ReportFigure(
                 _excitation(rig)(rig, step.records[0], joint, f"exc{n}"),
                 f"{step.name}, joint {joint}",
                 f"record {step.records[0].name}",
@@ -111,7 +111,7 @@ def residuals(found: Sequence[Residual]) -> Gallery:
     """Return one figure per step and equation."""
     return Gallery(
         tuple(
-            Shown(
+            ReportFigure(
                 record_plots.residual(one, f"res{n}"),
                 f"{one.step}, joint {one.joint}: {equation_text(one)}",
             )
@@ -146,7 +146,7 @@ def comparisons(rig: Rig, validation: Sequence[RecordValidation], runs: Sequence
         if result.failure:
             text += f"; {result.failure}"
         svg = validation_plots.comparison(rig, result, record, joint, f"val{n}")
-        figures.append(Shown(svg, f"{result.record}, joint {joint}", text))
+        figures.append(ReportFigure(svg, f"{result.record}, joint {joint}", text))
     return Gallery(tuple(figures), max(0, len(wanted) - MOST))
 
 

@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from analysis.identify.identify import Identification, RecordRows, build_rows
+from analysis.identify.result import Identification
+from analysis.identify.stacked_rows import RecordRows, build_rows
 from analysis.report import facts, figures, machine, paper, tables
 from analysis.report import format as fm
 from analysis.report.page import page, write

@@ -59,7 +59,7 @@ def _round(r: Round, run: Run | None, last: bool) -> dict[str, Any]:
         "predicted": fm.significant(r.predicted),
         "achieved": fm.significant(r.achieved),
         "loudest": fm.significant(r.loudest),
-        "left": fm.significant(r.left),
+        "left": fm.significant(r.residual),
         "did": "The protocol as it was given." if r.experiment is None
         else f"{_capital(str(r.experiment['text']))}.",
         "runs": " and ".join(r.runs),
@@ -102,7 +102,7 @@ def worth(rounds: Sequence[Round]) -> Markup | None:
         numbers = [r.number for r in rounds]
         before = [r.result.worst(r.result.before) for r in rounds]
         axes.plot(numbers, before, "o-", color=GREY)
-        axes.plot(numbers, [r.left for r in rounds], "o-", color=BLUE)
+        axes.plot(numbers, [r.residual for r in rounds], "o-", color=BLUE)
         axes.axhline(1.0, color=INK, lw=0.8, ls="--")
         axes.set_xticks(numbers)
         axes.set_ylim(0.0, 1.2 * axes.get_ylim()[1])

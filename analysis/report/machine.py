@@ -108,7 +108,7 @@ def joint_constants(rig: Rig) -> list[tuple[str, list[str]]]:
 
 
 @dataclass(frozen=True)
-class Step:
+class StepSummary:
     """All repeats of one step of one run."""
 
     run: int
@@ -118,7 +118,7 @@ class Step:
     records: tuple[Record, ...]
 
 
-def steps(rig: Rig, runs: Sequence[Run]) -> list[Step]:
+def steps(rig: Rig, runs: Sequence[Run]) -> list[StepSummary]:
     """Group records by run and step, in the order they were taken."""
     groups: dict[tuple[int, str], list[Record]] = {}
     for index, run in enumerate(runs):
@@ -126,7 +126,7 @@ def steps(rig: Rig, runs: Sequence[Run]) -> list[Step]:
             groups.setdefault((index, record.step), []).append(record)
     joints = range(1, len(rig.joints) + 1)
     return [
-        Step(run, name, records[0].locked,
+        StepSummary(run, name, records[0].locked,
              tuple(i for i in joints if i not in records[0].locked), tuple(records))
         for (run, name), records in groups.items()
     ]  # fmt: skip
@@ -157,7 +157,7 @@ def step_rows(rig: Rig, runs: Sequence[Run]) -> list[StepRow]:
     return [_step_row(runs, step) for step in steps(rig, runs)]
 
 
-def _step_row(runs: Sequence[Run], step: Step) -> StepRow:
+def _step_row(runs: Sequence[Run], step: StepSummary) -> StepRow:
     first = step.records[0]
     attributes = [record.attributes for record in step.records]
     gives = [g for i in step.locked if (g := _largest(attributes, f"lock_give_m_{i}")) is not None]
@@ -212,7 +212,7 @@ def _total(attributes: Attributes, key: str) -> str:
     return f"{sum(found):.0f}" if found else fm.DASH
 
 
-def _per_joint(step: Step, kind: str, scale: float, figure: object) -> str:
+def _per_joint(step: StepSummary, kind: str, scale: float, figure: object) -> str:
     out = []
     for joint in step.excited:
         name = ch.channel(kind, joint)

@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import welch
 
-from analysis.identify.identify import Identification, RecordRows
+from analysis.identify.result import Identification
+from analysis.identify.stacked_rows import RecordRows
 from analysis.regression.rows import Rows
-from analysis.regression.solve import Cluster, solve, triangle
+from analysis.regression.solve import RowCluster, solve, triangle
 from analysis.terms.base import FAMILIES, family_of
 
 Array = NDArray[np.float64]
@@ -192,7 +193,7 @@ def _solve_once(
             matrix = np.concatenate([r.matrix for r in rows])
             rhs = np.concatenate([r.rhs for r in rows])
             clusters.append(
-                Cluster((one.run, one.step), one.repeat, triangle(matrix, rhs), len(rhs))
+                RowCluster((one.run, one.step), one.repeat, triangle(matrix, rhs), len(rhs))
             )
     if not clusters or family not in FAMILIES:
         return {}

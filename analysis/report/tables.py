@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from analysis.identify.identify import Identification
+from analysis.identify.result import Identification
 from analysis.report import format as fm
 from analysis.report import paper
 from analysis.report.residuals import Scatter

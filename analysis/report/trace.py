@@ -109,7 +109,7 @@ def _pictures(rig: Rig, holdout: Sequence[Run], result: Trace) -> list[dict[str,
 
 
 def _pair(
-    rig: Rig, here: Sequence[trace_figures.Lines], result: Trace, effect: Effect | None,
+    rig: Rig, here: Sequence[trace_figures.ResidualSeries], result: Trace, effect: Effect | None,
     variable: str, equation: str, key: str, timed: bool,
 ) -> dict[str, Any]:  # fmt: skip
     unit = unit_of_equation(rig, equation)
@@ -125,7 +125,7 @@ def _pair(
         "text": f"{equation}, held-out records; the band is ± one rms of noise, red the mean.",
         "against": trace_figures.against(x, here, noise, unit, label, f"{key}x", changed),
         "time": trace_figures.in_time(longest, noise, unit, f"{key}t", changed) if timed else None,
-        "record": longest.scene.record.name,
+        "record": longest.conditioned.record.name,
     }
 
 

@@ -32,17 +32,17 @@ from analysis.simulation.model import Model
 from analysis.terms.base import family_of
 from analysis.trace.clues.variables import variables
 from analysis.trace.data.conditioned_record import (
-    Scene,
+    ConditionedRecord,
+    conditioned_records,
     filtered,
+    model_rows,
     prepared,
-    residual,
-    scene_rows,
-    scenes,
+    row_residual,
 )
 from analysis.trace.data.spectral_lines import CONSTANT, EVEN, EXCITED, ODD, members
-from analysis.trace.data.spectral_lines import Lines as Spectrum
+from analysis.trace.data.spectral_lines import SpectralLines as Spectrum
 from analysis.trace.result import Trace
-from analysis.trace.search.refinement import Fit
+from analysis.trace.search.refinement import ExactFit
 from analysis.trace.words import loudest
 from rig.model import channels as ch
 from rig.model.channels import kind_of
@@ -56,38 +56,40 @@ SECONDS = 4.0  # of a time trace
 
 
 @dataclass(frozen=True)
-class Lines:
+class ResidualSeries:
     """Held-out residuals of one equation of one record, SI, at the instants of its rows."""
 
-    scene: Scene
+    conditioned: ConditionedRecord
     rows: Rows
     before: Array
     after: Array
 
 
-def held_out(rig: Rig, holdout: Sequence[Run], result: Trace) -> dict[str, list[Lines]]:
+def held_out(rig: Rig, holdout: Sequence[Run], result: Trace) -> dict[str, list[ResidualSeries]]:
     """Return, by equation, every held-out record's residual under both models."""
-    out: dict[str, list[Lines]] = {}
+    out: dict[str, list[ResidualSeries]] = {}
     families = tuple({family_of(e): None for e in result.before})
-    for scene in scenes(rig, holdout, families=families):
-        before = _left(rig, scene, result.rows_before)
-        after = _left(rig, scene, result.rows_after)
+    for conditioned in conditioned_records(rig, holdout, families=families):
+        before = _left(rig, conditioned, result.rows_before)
+        after = _left(rig, conditioned, result.rows_after)
         for name, (rows, r) in before.items():
             later, q = after[name]
             _, here, there = np.intersect1d(rows.time, later.time, return_indices=True)
             part = Rows(name, rows.names, rows.matrix[here], rows.rhs[here], rows.time[here], 0)
-            out.setdefault(name, []).append(Lines(scene, part, r[here], q[there]))
+            out.setdefault(name, []).append(ResidualSeries(conditioned, part, r[here], q[there]))
     return out
 
 
-def _left(rig: Rig, scene: Scene, model: Fit) -> dict[str, tuple[Rows, Array]]:
-    built = scene_rows(rig, model.terms, scene)
-    return {name: (rows, residual(rows, model.beta)) for name, rows in built.items()}
+def _left(
+    rig: Rig, conditioned: ConditionedRecord, model: ExactFit
+) -> dict[str, tuple[Rows, Array]]:
+    built = model_rows(rig, model.terms, conditioned)
+    return {name: (rows, row_residual(rows, model.beta)) for name, rows in built.items()}
 
 
 def abscissae(
     rig: Rig,
-    lines: Sequence[Lines],
+    lines: Sequence[ResidualSeries],
     effect: Effect | None,
     variable: str,
     equation: str,
@@ -98,16 +100,22 @@ def abscissae(
     out = []
     for line in lines:
         if effect is not None:
-            seen = prepared(rig, model.terms, line.scene)
+            seen = prepared(rig, model.terms, line.conditioned)
             raw = effect.abscissa(rig, seen)[equation]
         else:
-            raw = variables(rig, line.scene.signals, joint)[variable]
-        out.append(filtered({"x": np.asarray(raw)}, line.scene, line.rows)["x"])
+            raw = variables(rig, line.conditioned.signals, joint)[variable]
+        out.append(filtered({"x": np.asarray(raw)}, line.conditioned, line.rows)["x"])
     return np.concatenate(out)
 
 
 def against(
-    x: Array, lines: Sequence[Lines], noise: float, unit: str, label: str, key: str, after: bool
+    x: Array,
+    lines: Sequence[ResidualSeries],
+    noise: float,
+    unit: str,
+    label: str,
+    key: str,
+    after: bool,
 ) -> Markup:
     """Draw the residual over a variable, before beside after on one scale, with binned means."""
     parts = [("before", np.concatenate([line.before for line in lines]))]
@@ -135,7 +143,7 @@ def against(
         return svg(made, key, f"Residual against {label}, before and after")
 
 
-def in_time(line: Lines, noise: float, unit: str, key: str, after: bool) -> Markup:
+def in_time(line: ResidualSeries, noise: float, unit: str, key: str, after: bool) -> Markup:
     """Draw a few seconds of the residual before and after."""
     t = line.rows.time
     middle = 0.5 * (t[0] + t[-1])
@@ -242,17 +250,17 @@ def unit_of_variable(rig: Rig, name: str) -> str:
 
 
 def equation_of(
-    effect: Effect, rig: Rig, result: Trace, lines: Mapping[str, Sequence[Lines]]
+    effect: Effect, rig: Rig, result: Trace, lines: Mapping[str, Sequence[ResidualSeries]]
 ) -> str:
     """Return the equation whose residual shows an effect best: most over its noise before."""
-    scene = next(iter(lines.values()))[0].scene
-    own = [e for e in effect.abscissa(rig, scene.signals) if e in lines]
+    conditioned = next(iter(lines.values()))[0].conditioned
+    own = [e for e in effect.abscissa(rig, conditioned.signals) if e in lines]
     if not own:
         return loudest(result)
     return max(own, key=lambda e: result.before[e] / max(result.noise_floor[e], 1e-30))
 
 
 __all__ = [
-    "Lines", "abscissae", "against", "equation_of", "held_out", "in_time", "kind_of",
+    "ResidualSeries", "abscissae", "against", "equation_of", "held_out", "in_time", "kind_of",
     "over_noise", "spectrum", "unit_of_variable",
 ]  # fmt: skip

@@ -31,7 +31,7 @@ _REASONS = {
 
 
 @dataclass(frozen=True)
-class Drive:
+class DrivingInput:
     """What drives a simulation: samples (n,) or (n, N) at `rate`.
 
     `q qd qdd` are used for the joints that `locked` (N,) marks.
@@ -97,9 +97,9 @@ class Simulation:
         return out
 
 
-def drive_of(signals: Signals) -> Drive:
+def drive_of(signals: Signals) -> DrivingInput:
     """Return the drive of a record: its measured spool, supply, and locked joints' motion."""
-    return Drive(
+    return DrivingInput(
         signals.rate, signals.u, signals.p_s, signals.temperature, ~signals.excited,
         signals.q, signals.qd, signals.qdd,
     )  # fmt: skip
@@ -164,7 +164,11 @@ def _geometry(rig: Rig) -> Array:
 
 
 def simulate(
-    model: Model | Compiled, drive: Drive, start: State, first: int = 0, samples: int | None = None
+    model: Model | Compiled,
+    drive: DrivingInput,
+    start: State,
+    first: int = 0,
+    samples: int | None = None,
 ) -> Simulation:
     """Simulate `samples` samples of the drive from sample `first` on, beginning in `start`.
 
@@ -198,7 +202,7 @@ def simulate(
 
 
 def _result(
-    geometry: Array, drive: Drive, inputs: Array, ys: Array, failure: str, filled: int,
+    geometry: Array, drive: DrivingInput, inputs: Array, ys: Array, failure: str, filled: int,
     evaluations: int,
 ) -> Simulation:  # fmt: skip
     N = drive.u.shape[1]
@@ -224,7 +228,7 @@ def _result(
     )  # fmt: skip
 
 
-def rates_of(ready: Compiled, drive: Drive) -> Callable[[float, Array], Array]:
+def rates_of(ready: Compiled, drive: DrivingInput) -> Callable[[float, Array], Array]:
     """Return dy/dt(t, y) of a compiled model under a drive, for other integrators to use."""
     N = drive.u.shape[1]
     inputs = np.ascontiguousarray(_inputs(drive))
@@ -239,7 +243,7 @@ def rates_of(ready: Compiled, drive: Drive) -> Callable[[float, Array], Array]:
     return rates
 
 
-def _inputs(drive: Drive) -> Array:
+def _inputs(drive: DrivingInput) -> Array:
     return np.column_stack((drive.p_s, drive.temperature, drive.u, drive.q, drive.qd, drive.qdd))
 
 

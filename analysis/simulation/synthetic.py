@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.signal import resample
 
 from analysis.simulation.model import Model, nominal_model
-from analysis.simulation.simulate import Drive, Simulation, simulate
+from analysis.simulation.simulate import DrivingInput, Simulation, simulate
 from analysis.simulation.twin import holding_state
 from analysis.terms import baseline
 from analysis.terms.base import Used
@@ -113,7 +113,9 @@ def synthetic_run(
     return Run(ideal, tuple(records), source="synthetic")
 
 
-def _centred(model: Model, spool: Array, locked: dict[int, float]) -> tuple[Drive, Simulation]:
+def _centred(
+    model: Model, spool: Array, locked: dict[int, float]
+) -> tuple[DrivingInput, Simulation]:
     """Simulate with the bias that keeps the moving joint's stroke level."""
     rig = model.rig
     N, n, rate = len(rig.joints), len(spool), FINER * rig.sample_rate
@@ -129,7 +131,7 @@ def _centred(model: Model, spool: Array, locked: dict[int, float]) -> tuple[Driv
     before: tuple[Array, Array] | None = None
     for attempt in range(TRIM_ROUNDS + 1):
         u = np.where(held, 0.0, spool[:, None] + bias)
-        drive = Drive(
+        drive = DrivingInput(
             rate, u, np.full(n, rig.supply.pressure), np.full(n, rig.oil.temperature), held,
             np.tile(state.q, (n, 1)), still, still,
         )  # fmt: skip
@@ -145,7 +147,7 @@ def _centred(model: Model, spool: Array, locked: dict[int, float]) -> tuple[Driv
     return drive, result
 
 
-def _channels(rig: Rig, drive: Drive, result: Simulation, lead: int) -> dict[str, Array]:
+def _channels(rig: Rig, drive: DrivingInput, result: Simulation, lead: int) -> dict[str, Array]:
     every = result.channels()
     for i in range(len(rig.joints)):
         every[ch.channel(ch.SPOOL, i + 1)] = drive.u[:, i]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.signal import cont2discrete, lfilter
 
 from analysis.simulation.model import Model, nominal_model
-from analysis.simulation.simulate import Drive, State, simulate
+from analysis.simulation.simulate import DrivingInput, State, simulate
 from analysis.terms import baseline
 from analysis.terms.base import Used
 from rig.model.parse import InputError
@@ -85,7 +85,7 @@ def simulate_commands(
     )
     spool[:, held] = 0.0
     still = np.zeros((n, N))
-    drive = Drive(
+    drive = DrivingInput(
         rate, spool, np.full(n, rig.supply.pressure), np.full(n, rig.oil.temperature), held,
         np.tile(state.q, (n, 1)), still, still,
     )  # fmt: skip

@@ -90,7 +90,7 @@ class Coefficient:
 
 
 @dataclass(frozen=True)
-class Reduction:
+class ParameterReduction:
     """Linear unknowns x = h(p) of fewer parameters p: names of both, a start, h and dh/dp.
 
     `start` maps x (k,) to p (m,); `value` maps p to x; `slope` maps p to (k, m).
@@ -129,7 +129,7 @@ class Term:
         """Return the model's parameters (default: the linear unknowns themselves)."""
         return self.coefficients(rig)
 
-    def reduction(self, rig: Rig) -> Reduction | None:
+    def reduction(self, rig: Rig) -> ParameterReduction | None:
         """Return how fewer parameters make the linear unknowns, where they do."""
         return None
 

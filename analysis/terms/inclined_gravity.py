@@ -18,7 +18,7 @@ from analysis.terms.base import (
     Coefficient,
     Columns,
     Kernel,
-    Reduction,
+    ParameterReduction,
     Term,
     equation,
     kernel,
@@ -55,7 +55,7 @@ class InclinedGravity(Term):
         named = tuple(Coefficient(name, "kg*m", "mechanical") for name in weights)
         return (*named, Coefficient(PARAMETER, "rad", "mechanical"))
 
-    def reduction(self, rig: Rig) -> Reduction:
+    def reduction(self, rig: Rig) -> ParameterReduction:
         """Return x = (W cos(alpha), W sin(alpha)) of p = (W, alpha), W positive in sum."""
         N = len(rig.joints)
 
@@ -73,7 +73,7 @@ class InclinedGravity(Term):
             return np.column_stack((np.vstack((c * eye, s * eye)), by_angle))
 
         names = tuple(c.parameter for c in self.parameters(rig))
-        return Reduction(_linear(N), names, start, value, slope)
+        return ParameterReduction(_linear(N), names, start, value, slope)
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return g sin(theta_k) and g cos(theta_k) in the rows of joints 1 .. k."""

@@ -17,13 +17,12 @@ from analysis.identify.identify import identify
 from analysis.simulation.model import Model
 from analysis.terms import baseline_of
 from analysis.terms.base import FAMILIES, Used
-from analysis.trace.clues.formula import Formula
 from analysis.trace.data.candidates import catalogue, variants
-from analysis.trace.data.conditioned_record import Scene, scenes
+from analysis.trace.data.conditioned_record import ConditionedRecord, conditioned_records
 from analysis.trace.data.noise_floor import STATED
-from analysis.trace.data.regression_data import Board, board
+from analysis.trace.data.regression_data import RegressionData, regression_data
 from analysis.trace.data.spectral_lines import lines
-from analysis.trace.data.temperature_nuisance import beside, stripped
+from analysis.trace.data.temperature_nuisance import stripped, temperature_terms
 from analysis.trace.judge import gates, held_out
 from analysis.trace.judge.shooting import reshaped, told
 from analysis.trace.next_experiment.proposal import propose
@@ -34,11 +33,12 @@ from analysis.trace.result import (
     EXPLAINED,
     UNEXPLAINED,
     Dependence,
+    Formula,
     Found,
     Trace,
 )
-from analysis.trace.search.hypothesis import Listed, within
-from analysis.trace.search.hypothesis_set import Shortlist
+from analysis.trace.search.hypothesis import Hypothesis, within
+from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.words import sentence
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
@@ -78,50 +78,53 @@ def trace(
     _refuse_same(runs, holdout)
     rng = np.random.default_rng(seed)
     known = tuple(map(Used, baseline_of(rig))) if terms is None else tuple(terms)
-    terms = ordered((*known, *beside(known, runs, holdout)))
-    train = scenes(rig, runs, families=tuple(families))
-    judged = scenes(rig, holdout, families=tuple(families))
-    stage = board(rig, terms, train)
-    _refuse_short(stage, train)
-    judge = board(rig, terms, judged, stage.beta)
+    terms = ordered((*known, *temperature_terms(known, runs, holdout)))
+    train = conditioned_records(rig, runs, families=tuple(families))
+    judged = conditioned_records(rig, holdout, families=tuple(families))
+    train_data = regression_data(rig, terms, train)
+    _refuse_short(train_data, train)
+    holdout_data = regression_data(rig, terms, judged, train_data.beta)
     candidates = _unknown(catalogue(rig) if effects is None else effects, known)
-    listed = Shortlist(stage, variants(rig, candidates))
+    hypotheses = HypothesisSet(train_data, variants(rig, candidates))
     before = stripped(identify(runs, terms=terms, estimator=PLAIN).model)
-    notes = _notes(stage, judge)
-    quiet = within(listed.empty.excess, listed.limits)
-    if quiet and not gates.remaining(listed, listed.empty, judge):
+    notes = _notes(train_data, holdout_data)
+    quiet = within(hypotheses.empty.excess_energy, hypotheses.limits)
+    if quiet and not gates.remaining(hypotheses, hypotheses.empty, holdout_data):
         found: tuple[Found, ...] = ()
         refused: tuple[Found, ...] = ()
-        winner, verdict = listed.empty, CLEAN
+        winner, verdict = hypotheses.empty, CLEAN
     else:
-        winner = listed.run()
-        found, winner, verdict, rest = _named(listed, winner, judge, rng)
+        winner = hypotheses.run()
+        found, winner, verdict, rest = _named(hypotheses, winner, holdout_data, rng)
         refused = tuple(f for f in found if not gates.stands(f))
         found = tuple(f for f in found if gates.stands(f))
         if quiet and verdict == UNEXPLAINED:
             notes.append(ELSEWHERE)
         if verdict == UNEXPLAINED and (found or quiet):
             notes += [f"{e}: {words}" for e, words in rest]
-    split = lines(stage, winner.fit.left)
+    split = lines(train_data, winner.fit.residual)
     moves: tuple[Dependence, ...] = ()
     formulas: tuple[Formula, ...] = ()
     if verdict not in (CLEAN, EXPLAINED):
-        moves, formulas = clues_to(stage, judge, winner, split)
-    further = propose(listed, winner, found, verdict, moves) if look_ahead else None
+        moves, formulas = clues_to(train_data, holdout_data, winner, split)
+    further = propose(hypotheses, winner, found, verdict, moves) if look_ahead else None
     after = _extended(runs, terms, winner, before)
-    again = reshaped(runs, holdout, after, stage, judge, winner)
+    again = reshaped(runs, holdout, after, train_data, holdout_data, winner)
     if again.winner is not winner:
         winner = again.winner
         after = _extended(runs, terms, winner, before)
-        split = lines(stage, winner.fit.left)
+        split = lines(train_data, winner.fit.residual)
     found = tuple(told(f, again.shots) for f in found)
-    first, last = held_out.settled(judge, listed.empty.fit), held_out.settled(judge, winner.fit)
+    first, last = (
+        held_out.settled(holdout_data, hypotheses.empty.fit),
+        held_out.settled(holdout_data, winner.fit),
+    )
     error = held_out.errors(rig, judged, first, last)
     runs_before, runs_after = held_out.free_runs(holdout, before, after)
     result = Trace(
         verdict, found, error.noise, error.before, error.after,
         runs_before.fit, runs_after.fit, before, after,
-        _fraction(listed, winner), moves, further, stage.floors,
+        _fraction(hypotheses, winner), moves, further, train_data.floors,
         first, last, tuple(notes), refused=refused, size=error.size,
         rmse_before=runs_before.rmse, rmse_after=runs_after.rmse,
         window_before=runs_before.window_rmse, window_after=runs_after.window_rmse,
@@ -157,8 +160,8 @@ def _digest(record: Record) -> str:
     return found.hexdigest()
 
 
-def _refuse_short(stage: Board, train: Sequence[Scene]) -> None:
-    for s in stage.segments:
+def _refuse_short(train_data: RegressionData, train: Sequence[ConditionedRecord]) -> None:
+    for s in train_data.segments:
         count = s.where.stop - s.where.start
         if count < LEAST_ROWS:
             seconds = next(
@@ -171,31 +174,34 @@ def _refuse_short(stage: Board, train: Sequence[Scene]) -> None:
             )
 
 
-def _notes(stage: Board, judge: Board) -> list[str]:
+def _notes(train_data: RegressionData, holdout_data: RegressionData) -> list[str]:
     """State where the evidence is weaker than it should be."""
     out = []
-    single = sorted({f.group[1] for f in stage.floors if f.count < 2})
+    single = sorted({f.group[1] for f in train_data.floors if f.count < 2})
     if single:
         out.append(
             f"one repeat of {' '.join(single)} and no whole periods to compare: the noise floor is "
             "the rig file's stated sensor noise; noise that the file does not state would pass "
             "for model error, so nothing is named with full confidence"
         )
-    elif any(f.source != "repeats" for f in stage.floors):
+    elif any(f.source != "repeats" for f in train_data.floors):
         out.append("one repeat per step: the noise floor comes from periods within the record")
-    few = min((f.count for f in stage.floors if f.count > 1), default=0)
+    few = min((f.count for f in train_data.floors if f.count > 1), default=0)
     if 0 < few < 4:
         out.append(
             f"{few} repeats: stability is judged on few half-samples; four or more tell more"
         )
-    if all(f.source == STATED for f in judge.floors):
+    if all(f.source == STATED for f in holdout_data.floors):
         out.append("the held-out noise floor is the rig file's stated sensor noise")
     return out
 
 
 def _named(
-    listed: Shortlist, winner: Listed, judge: Board, rng: np.random.Generator
-) -> tuple[tuple[Found, ...], Listed, str, list[tuple[str, str]]]:
+    hypotheses: HypothesisSet,
+    winner: Hypothesis,
+    holdout_data: RegressionData,
+    rng: np.random.Generator,
+) -> tuple[tuple[Found, ...], Hypothesis, str, list[tuple[str, str]]]:
     """Put the winner through the gates.
 
     Returns what was judged, the set that stands, the verdict, and the equations that keep more than
@@ -205,20 +211,25 @@ def _named(
     refused: tuple[Found, ...] = ()
     # What stands beside others may fall without them: judged again until all that is left stands.
     while winner.effects:
-        found = gates.judge(listed, winner, judge, rng)
+        found = gates.judge(hypotheses, winner, holdout_data, rng)
         fallen = tuple(f for f in found if not gates.stands(f))
         if not fallen:
             break
         refused += fallen
         smaller = [u for u, f in zip(winner.effects, found, strict=True) if gates.stands(f)]
         if not smaller:
-            return refused, listed.empty, UNEXPLAINED, left_over(listed, listed.empty, judge)
-        winner = listed.exact(smaller)
-    rest = left_over(listed, winner, judge)
+            return (
+                refused,
+                hypotheses.empty,
+                UNEXPLAINED,
+                left_over(hypotheses, hypotheses.empty, holdout_data),
+            )
+        winner = hypotheses.exact(smaller)
+    rest = left_over(hypotheses, winner, holdout_data)
     while rest:
-        more = listed.closer(winner, {equation for equation, _ in rest})
-        wider = gates.judge(listed, more, judge, rng) if more else ()
-        later = left_over(listed, more, judge) if more else rest
+        more = hypotheses.closer(winner, {equation for equation, _ in rest})
+        wider = gates.judge(hypotheses, more, holdout_data, rng) if more else ()
+        later = left_over(hypotheses, more, holdout_data) if more else rest
         if more is None or len(later) >= len(rest) or not all(map(gates.stands, wider)):
             return (*found, *refused), winner, UNEXPLAINED, rest
         found, winner, rest = wider, more, later
@@ -226,9 +237,9 @@ def _named(
     return found, winner, CONFOUNDED if tied else EXPLAINED, rest
 
 
-def _fraction(listed: Shortlist, winner: Listed) -> float:
+def _fraction(hypotheses: HypothesisSet, winner: Hypothesis) -> float:
     """Return the share of the training records' repeatable energy that is left."""
-    start = listed.empty.total
+    start = hypotheses.empty.total
     return float(min(1.0, winner.total / start)) if start > 0 else 0.0
 
 
@@ -238,7 +249,9 @@ def _unknown(candidates: Sequence[Effect], known: Sequence[Used]) -> list[Effect
     return [c for c in candidates if (c.name, c.where) not in there]
 
 
-def _extended(runs: Sequence[Run], terms: Sequence[Used], winner: Listed, before: Model) -> Model:
+def _extended(
+    runs: Sequence[Run], terms: Sequence[Used], winner: Hypothesis, before: Model
+) -> Model:
     """Identify everything again together with the effects."""
     if not winner.effects:
         return before

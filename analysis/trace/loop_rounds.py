@@ -16,11 +16,11 @@ import numpy as np
 from analysis.effects.base import Effect
 from analysis.terms import known
 from analysis.terms.base import Used
-from analysis.trace.data.conditioned_record import scenes
-from analysis.trace.data.regression_data import Board, board
+from analysis.trace.data.conditioned_record import conditioned_records
+from analysis.trace.data.regression_data import RegressionData, regression_data
 from analysis.trace.data.temperature_nuisance import base_terms
 from analysis.trace.next_experiment.detectable_size import smallest
-from analysis.trace.next_experiment.discrimination import Ground, Hypothesis, Question, present
+from analysis.trace.next_experiment.discrimination import Explanation, Ground, Question, present
 from analysis.trace.next_experiment.proposal import SHOW
 from analysis.trace.result import Trace, to_json
 from analysis.trace.search.hypothesis import excess_of
@@ -53,7 +53,7 @@ class Round:
         return max(f.ratio for f in self.result.floors)
 
     @property
-    def left(self) -> float:
+    def residual(self) -> float:
         """The largest held-out error over its noise floor, with what was found."""
         return self.result.worst(self.result.after)
 
@@ -69,12 +69,12 @@ def achieved(
     if not experiment.get("questions"):
         return None
     terms = base_terms(rig, [*before, new])
-    both = board(rig, terms, scenes(rig, [*before, new]))
+    both = regression_data(rig, terms, conditioned_records(rig, [*before, new]))
     if experiment["kind"] == SHOW:
         ground = Ground(both)
         asked = [_small(q["one"], rig) for q in experiment["questions"]]
         return min(present(q, ground) for q in asked)
-    old = board(rig, terms, scenes(rig, before))
+    old = regression_data(rig, terms, conditioned_records(rig, before))
     found = [
         _one(old, both, terms, len(before), q["one"], q["other"]) for q in experiment["questions"]
     ]
@@ -82,15 +82,17 @@ def achieved(
 
 
 def _one(
-    old: Board, both: Board, terms: tuple[Used, ...], index: int,
+    old: RegressionData, both: RegressionData, terms: tuple[Used, ...], index: int,
     one: Sequence[Mapping[str, Any]], other: Sequence[Mapping[str, Any]],
 ) -> float:  # fmt: skip
     """Return one question's separation: the loudest equation's rms difference per new row."""
     gap = {}
-    for stage in (old, both):
-        left = [refine(stage, (*terms, *effects_of(side))).left for side in (one, other)]
-        ends = [excess_of(stage, part) for part in left]
-        gap[stage is both] = {e: ends[1][e] - ends[0][e] for e in ends[0]}
+    for train_data in (old, both):
+        residual = [
+            refine(train_data, (*terms, *effects_of(side))).residual for side in (one, other)
+        ]
+        ends = [excess_of(train_data, part) for part in residual]
+        gap[train_data is both] = {e: ends[1][e] - ends[0][e] for e in ends[0]}
     rows: dict[str, int] = {}
     for s in both.segments:
         if s.group[0] == index:
@@ -108,7 +110,7 @@ def _one(
 def _small(one: Sequence[Mapping[str, Any]], rig: Rig) -> Question:
     (used,) = effects_of(one)
     assert isinstance(used.term, Effect)
-    return Question(smallest(used.term, rig) or Hypothesis((used,)), Hypothesis(), False)
+    return Question(smallest(used.term, rig) or Explanation((used,)), Explanation(), False)
 
 
 def effects_of(side: Sequence[Mapping[str, Any]]) -> list[Used]:
@@ -116,7 +118,7 @@ def effects_of(side: Sequence[Mapping[str, Any]]) -> list[Used]:
     return [Used(known()[k["name"]](k["at"]), tuple(k["shape"])) for k in side]
 
 
-def story_json(rounds: Sequence[Round], stopped: str) -> dict[str, Any]:
+def rounds_json(rounds: Sequence[Round], stopped: str) -> dict[str, Any]:
     """Return the loop as plain data: the last trace's keys, `stopped`, and every round."""
     last = to_json(rounds[-1].result) if rounds else {}
     return {

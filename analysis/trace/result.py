@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -10,15 +11,49 @@ import numpy as np
 
 from analysis.identify.output_error.hidden_states import Shot
 from analysis.simulation.model import Estimate, Model, estimate_json, finite
-from analysis.trace.clues.formula import Formula
 from analysis.trace.data.noise_floor import Floor
-from analysis.trace.data.spectral_lines import Lines
-from analysis.trace.search.refinement import Fit
+from analysis.trace.data.spectral_lines import SpectralLines
+from analysis.trace.search.refinement import ExactFit
 
 CLEAN: Final = "clean"
 EXPLAINED: Final = "explained"
 CONFOUNDED: Final = "confounded"
 UNEXPLAINED: Final = "unexplained"
+SURE: Final = 0.9  # share from which a formula goes before free curves
+FEW: Final = 2  # monomials of such a one: three bend to much
+_NAME: Final = re.compile(r"[a-z]+(?:_[a-z]+)*(?:_[0-9]+)?")
+
+
+@dataclass(frozen=True)
+class Formula:
+    """What an equation lacks, about: coefficient [SI] by monomial, and the held-out share taken."""
+
+    equation: str
+    terms: Mapping[str, float]
+    share: float
+    at_piston: bool
+
+    @property
+    def text(self) -> str:
+        """The formula in one line."""
+        parts = [f"{value:+.3g} {name}".replace("e-0", "e-") for name, value in self.terms.items()]
+        line = " ".join(parts).removeprefix("+")
+        what = "force at the piston [N]" if self.at_piston else f"{self.equation} [SI]"
+        return f"{what} ≈ {line}"
+
+    @property
+    def sure(self) -> bool:
+        """Whether it goes before free curves: a few monomials that leave next to nothing."""
+        return self.share >= SURE and len(self.terms) <= FEW and bool(self.variables)
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """The variables of its first monomial that has any, in the order they stand there."""
+        for name in self.terms:
+            found = [word for word in _NAME.findall(name) if word != "sign"]
+            if found:
+                return tuple(dict.fromkeys(found))
+        return ()
 
 
 @dataclass(frozen=True)
@@ -117,8 +152,8 @@ class Trace:
     depends_on: tuple[Dependence, ...]
     next_experiment: Mapping[str, Any] | None
     floors: tuple[Floor, ...]
-    rows_before: Fit
-    rows_after: Fit
+    rows_before: ExactFit
+    rows_after: ExactFit
     notes: tuple[str, ...] = ()
     sentence: str = ""
     seconds: float = 0.0
@@ -128,7 +163,7 @@ class Trace:
     rmse_after: Mapping[str, float] = field(default_factory=dict)
     window_before: Mapping[str, float] = field(default_factory=dict)
     window_after: Mapping[str, float] = field(default_factory=dict)
-    lines: tuple[Lines, ...] = ()
+    lines: tuple[SpectralLines, ...] = ()
     formulas: tuple[Formula, ...] = ()
 
     @property
@@ -225,7 +260,7 @@ def _shot(one: Shot) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _lines(one: Lines) -> dict[str, Any]:
+def _lines(one: SpectralLines) -> dict[str, Any]:
     return {
         "step": one.group[1], "equation": one.equation, "above_noise": finite(one.loud),
         "shares": _numbers(one.shares), "shares_after": _numbers(one.shares_after),

@@ -23,7 +23,7 @@ U = TypeVar("U")
 CONNECT_SECONDS = 10.0
 
 
-class Cluster:
+class DaskCluster:
     """A pool of the workers behind a Dask scheduler at ``tcp://HOST:PORT``.
 
     Entering raises InputError where dask.distributed is not installed, where nothing answers at

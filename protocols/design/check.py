@@ -15,7 +15,7 @@ from typing import Protocol
 
 import numpy as np
 
-from protocols.design.check_report import CheckReport, Prediction, StepCheck
+from protocols.design.check_report import CheckReport, MotionPrediction, StepCheck
 from protocols.engine.centring import Array, follow, under_loop
 from protocols.files.plan import ExcitePlan, Plan, StepPlan
 from rig.model.parse import InputError
@@ -64,7 +64,7 @@ def judge_motion(
     step: StepPlan, rig: Rig, biases: Mapping[int, float], moved: Mapping[str, Array]
 ) -> StepCheck:
     """Compare a step's motion on the twin (see `centred`) with the rig's limits."""
-    lines: list[Prediction] = []
+    lines: list[MotionPrediction] = []
     for part in step.excite:
         lines += _joint_lines(part, rig, biases[part.joint], moved)
     lines.append(_flow_line(step, rig, moved))
@@ -142,7 +142,7 @@ def _commands(
 
 def _joint_lines(
     part: ExcitePlan, rig: Rig, bias: float, moved: Mapping[str, Array]
-) -> list[Prediction]:
+) -> list[MotionPrediction]:
     j, limits = part.joint, rig.joints[part.joint].limits
     piston = moved["piston"][:, j]
     # As if centred, and then off by what centring allows.
@@ -151,7 +151,7 @@ def _joint_lines(
     low, high = float(piston.min()) - offset, float(piston.max()) + offset
     name = j + 1
     lines = [
-        Prediction("piston", name, low, high, *limits.piston, "m"),
+        MotionPrediction("piston", name, low, high, *limits.piston, "m"),
         _either_way("piston speed", name, moved["speed"][:, j], limits.speed, "m/s"),
         _either_way("command", name, part.wave.samples + bias, limits.command, "V"),
     ]
@@ -161,15 +161,17 @@ def _joint_lines(
     looped = under_loop(piston, pull, rig.sample_rate) + part.centre
     if np.ptp(looped) > WIDER * np.ptp(piston):
         low, high = float(looped.min()) - offset, float(looped.max()) + offset
-        lines.append(Prediction("piston under the loop", name, low, high, *limits.piston, "m"))
+        lines.append(
+            MotionPrediction("piston under the loop", name, low, high, *limits.piston, "m")
+        )
     for chamber in ("cap_pressure", "rod_pressure"):
         pressure = moved[chamber][:, j]
         span = float(pressure.min()), float(pressure.max())
         rates = np.diff(pressure) * rig.sample_rate
         lines += [
-            Prediction(chamber, name, *span, *limits.pressure, "Pa"),
+            MotionPrediction(chamber, name, *span, *limits.pressure, "Pa"),
             _either_way(f"{chamber} rate", name, rates, limits.pressure_rate, "Pa/s"),
-            Prediction(
+            MotionPrediction(
                 f"{chamber} (cavitation, supply)", name, *span, 0.0, rig.supply.pressure, "Pa",
                 binding=False,
             ),
@@ -179,13 +181,13 @@ def _joint_lines(
 
 def _either_way(
     quantity: str, joint: int, values: Array, limit: float, unit: str
-) -> Prediction:  # fmt: skip
-    return Prediction(
+) -> MotionPrediction:  # fmt: skip
+    return MotionPrediction(
         quantity, joint, float(np.min(values)), float(np.max(values)), -limit, limit, unit
     )
 
 
-def _flow_line(step: StepPlan, rig: Rig, moved: Mapping[str, Array]) -> Prediction:
+def _flow_line(step: StepPlan, rig: Rig, moved: Mapping[str, Array]) -> MotionPrediction:
     """Predict the pump flow: A_cap ds/dt extending, A_rod |ds/dt| retracting, of all joints."""
     demand = np.zeros(len(moved["speed"]))
     for part in step.excite:
@@ -193,4 +195,6 @@ def _flow_line(step: StepPlan, rig: Rig, moved: Mapping[str, Array]) -> Predicti
         speed = moved["speed"][:, part.joint]
         demand += np.where(speed > 0.0, cylinder.cap_area * speed, -cylinder.rod_area * speed)
     peak = float(demand.max())
-    return Prediction("pump flow", None, 0.0, peak, 0.0, rig.supply.flow, "m^3/s", binding=False)
+    return MotionPrediction(
+        "pump flow", None, 0.0, peak, 0.0, rig.supply.flow, "m^3/s", binding=False
+    )

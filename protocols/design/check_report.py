@@ -10,7 +10,7 @@ from rig.model.parse import InputError
 
 
 @dataclass(frozen=True)
-class Prediction:
+class MotionPrediction:
     """One line of the report, like a test sheet: quantity, predicted range, allowed range, unit.
 
     `joint` is 1-based, None for the bench. Only a `binding` line can refuse the plan; the others
@@ -42,7 +42,7 @@ class StepCheck:
     """The predictions of one step, and the bias [V] of each excited joint (1-based) on the twin."""
 
     step: str
-    predictions: tuple[Prediction, ...]
+    predictions: tuple[MotionPrediction, ...]
     biases: Mapping[int, float]
 
 
@@ -119,7 +119,7 @@ class CheckReport:
 _SHOWN = {"m": (1e3, "mm"), "Pa": (1e-6, "MPa"), "Pa/s": (1e-9, "GPa/s"), "m^3/s": (6e4, "L/min")}
 
 
-def _text(step: str, line: Prediction) -> str:
+def _text(step: str, line: MotionPrediction) -> str:
     scale, unit = _SHOWN.get(line.unit, (1.0, line.unit))
     who = "the bench" if line.joint is None else f"joint {line.joint}"
     low, high = scale * line.low, scale * line.high
@@ -129,7 +129,7 @@ def _text(step: str, line: Prediction) -> str:
     )
 
 
-def worst(report: CheckReport) -> Sequence[tuple[str, Prediction]]:
+def worst(report: CheckReport) -> Sequence[tuple[str, MotionPrediction]]:
     """Return, step by step, the binding line with the least margin as a share of its range."""
     found = []
     for entry in report.steps:

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 from protocols.engine.centring import Array
 
 
-class Part(Protocol):
+class ProofPart(Protocol):
     """A combination of parameters that can be told from the rest."""
 
     @property
@@ -41,7 +41,7 @@ class Verdict(Protocol):
         """Parameters that are not."""
 
     @property
-    def base(self) -> Sequence[Part]:
+    def base(self) -> Sequence[ProofPart]:
         """Combinations of those that are determined."""
 
     @property

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from protocols.design.candidates import AMPLITUDE, played, told
 from protocols.design.check import Twin, centred, judge_motion
-from protocols.design.check_report import Prediction
+from protocols.design.check_report import MotionPrediction
 from protocols.engine.centring import Array
 from protocols.files.plan import resolve
 from protocols.files.schema import Multisine, Protocol, Step
@@ -66,7 +66,7 @@ def sized(step: Step, seed: int, rig: Rig, twin: Twin) -> tuple[Step, Mapping[st
     return found[max(found)]
 
 
-def _kept(line: Prediction, spare: Mapping[str, float]) -> bool:
+def _kept(line: MotionPrediction, spare: Mapping[str, float]) -> bool:
     least = spare.get(line.quantity, 0.0) * (line.allowed_high - line.allowed_low)
     room = line.margin if line.joint is not None else line.allowed_high - line.high
     return room >= least

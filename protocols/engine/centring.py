@@ -118,7 +118,7 @@ def trim(bias: float, drift: float, wanted: float, gain: float) -> float:
 
 
 @dataclass(frozen=True)
-class Forecast:
+class BiasForecast:
     """Lowest and highest piston [m] expected until the end.
 
     `shift` [m] is how far the piston is now from where it was a period ago, `slope` [m/s] how
@@ -131,7 +131,9 @@ class Forecast:
     shift: float
 
 
-def forecast(reference: Array, seen: Array, horizon: int, rate: float, shortest: int) -> Forecast:
+def forecast(
+    reference: Array, seen: Array, horizon: int, rate: float, shortest: int
+) -> BiasForecast:
     """Predict the way of a piston from one period that it is known, or believed, to repeat.
 
     `reference` (period,) is that period; `seen` (m,) what came since, from phase 0; `horizon`
@@ -151,9 +153,9 @@ def forecast(reference: Array, seen: Array, horizon: int, rate: float, shortest:
     reach = max(1, min(horizon, m))
     ahead = np.arange(0, reach, max(1, reach // 1000))
     path = reference[(m + ahead) % period] + shift + slope * ahead / rate
-    return Forecast(float(np.nanmin(path)), float(np.nanmax(path)), slope, shift)
+    return BiasForecast(float(np.nanmin(path)), float(np.nanmax(path)), slope, shift)
 
 
-def leaves(expected: Forecast, low: float, high: float) -> bool:
+def leaves(expected: BiasForecast, low: float, high: float) -> bool:
     """Say whether the forecast passes a piston limit [m], less a margin."""
     return expected.low < low + MARGIN or expected.high > high - MARGIN

@@ -11,10 +11,10 @@ from collections.abc import Callable, Sequence
 
 from protocols.engine.errors import ProtocolAborted
 from protocols.engine.excited_joint import Driven
-from protocols.engine.locking import Hold, Lock, give, lock
+from protocols.engine.locking import Hold, JointLock, give, lock
 from protocols.engine.placing import look, move
-from protocols.engine.playback import Excitation
-from protocols.engine.session import Bench, Session
+from protocols.engine.playback import Playback
+from protocols.engine.session import BenchSession, Session
 from protocols.files.plan import LockPlan, Plan, StepPlan
 from protocols.files.schema import CLOSED
 from rig.bench.guard import EXCITED, FREE, JointRole
@@ -31,7 +31,7 @@ RELOCK_SHARE = 0.5  # of the tolerance; a closed valve that gave more is closed 
 SPARE = 5.0  # [s] of samples remembered beyond a record and the two periods before it
 
 
-def run(plan: Plan, rig: Rig, bench: Bench, on_phase: OnPhase | None = None) -> None:
+def run(plan: Plan, rig: Rig, bench: BenchSession, on_phase: OnPhase | None = None) -> None:
     """Run every step of a plan; the records are in the bench's recorder when it returns.
 
     `on_phase` is told every phase: "place", "lock", "warm-up", "centre", "record", "stop",
@@ -58,7 +58,7 @@ class _StepRun:
         self.place = plan.place
         self.step = step
         self._tell = tell
-        self.locks: list[Lock] = []
+        self.locks: list[JointLock] = []
 
     def tell(self, phase: str, message: str, repeat: int = 0) -> None:
         log.info("%s: %s %s", self.step.name, phase, message)
@@ -69,7 +69,7 @@ class _StepRun:
         nulls = self._place()
         self.locks = self._lock()
         self.session.bench.guard(self._roles())
-        excitation = Excitation(self.session, self.step, self.place, self.locks)
+        excitation = Playback(self.session, self.step, self.place, self.locks)
         self.tell("warm-up", "waveforms grow under the position loop")
         excitation.warm_up(nulls)
         self.tell("centre", "open loop; biases are trimmed")
@@ -101,7 +101,7 @@ class _StepRun:
         settle, name = self.step.settle, self.step.name
         return move(self.session, targets, self.place, tolerance, settle, name)
 
-    def _lock(self) -> list[Lock]:
+    def _lock(self) -> list[JointLock]:
         """Lock the joints: end stops first, because the push shakes what is merely closed."""
         hold = Hold(self.step.name, self.step.settle, self.step.record / self.session.rate)
         locks = []
@@ -110,7 +110,7 @@ class _StepRun:
             locks.append(lock(self.session, part, self.place, hold))
         return locks
 
-    def _records(self, excitation: Excitation) -> None:
+    def _records(self, excitation: Playback) -> None:
         disturbed = 0
         repeat = 1
         while repeat <= self.step.repeats:
@@ -128,7 +128,7 @@ class _StepRun:
             self.tell("centre", f"record {repeat} was disturbed and is taken again", repeat)
             excitation.settle_bias()
 
-    def _record(self, excitation: Excitation, repeat: int) -> bool:
+    def _record(self, excitation: Playback, repeat: int) -> bool:
         """Take one record; False if it was disturbed, and so is none."""
         self.tell("record", f"record {repeat} of {self.step.repeats}", repeat)
         first, driven = excitation.at, excitation.joints
@@ -158,7 +158,7 @@ class _StepRun:
         )
 
     def _attributes(
-        self, first: int, driven: Sequence[Driven], excitation: Excitation
+        self, first: int, driven: Sequence[Driven], excitation: Playback
     ) -> dict[str, str | float | int]:
         """Return what is known of a record only when it has been taken."""
         found: dict[str, str | float | int] = {}
@@ -177,7 +177,7 @@ class _StepRun:
             found[f"centre_m_{j}"] = after.moved.mean
         return found
 
-    def _relock(self, excitation: Excitation) -> bool:
+    def _relock(self, excitation: Playback) -> bool:
         """Close a valve anew that let its piston creep; says whether one had to be."""
         changed = False
         for n, held in enumerate(self.locks):

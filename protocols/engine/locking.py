@@ -26,7 +26,7 @@ CREEP_SHARE = 0.25  # of the tolerance, that a closed joint may creep during one
 
 
 @dataclass(frozen=True)
-class Lock:
+class JointLock:
     """A joint (0-based) that is locked: where [m], by which law, how far it may give [m]."""
 
     joint: int
@@ -45,14 +45,14 @@ class Hold:
     record: float
 
 
-def lock(session: Session, plan: LockPlan, place: Place, hold: Hold) -> Lock:
+def lock(session: Session, plan: LockPlan, place: Place, hold: Hold) -> JointLock:
     """Lock one joint as planned; raises LockFailed where the piston does not prove it."""
     if plan.at == CLOSED:
         return close_valve(session, plan, place, hold)
     return push_to_end(session, plan, place, hold)
 
 
-def push_to_end(session: Session, plan: LockPlan, place: Place, hold: Hold) -> Lock:
+def push_to_end(session: Session, plan: LockPlan, place: Place, hold: Hold) -> JointLock:
     """Drive a piston against its end stop and keep pushing.
 
     One law does both: far from the end the position gain drives at `place.limit`, at the end
@@ -78,13 +78,13 @@ def push_to_end(session: Session, plan: LockPlan, place: Place, hold: Hold) -> L
     session.apply({plan.joint: law})
     first = session.wait(hold.settle)
     stands = look(session, plan.joint, first, session.now).piston
-    held = Lock(plan.joint, plan.at, stands, law, plan.tolerance)
+    held = JointLock(plan.joint, plan.at, stands, law, plan.tolerance)
     verify(session, held, hold.step, first, session.now)
     log.info("%s: joint %d held at %s, %.2f mm", hold.step, plan.joint + 1, plan.at, 1e3 * stands)
     return held
 
 
-def close_valve(session: Session, plan: LockPlan, place: Place, hold: Hold) -> Lock:
+def close_valve(session: Session, plan: LockPlan, place: Place, hold: Hold) -> JointLock:
     """Bring a piston to its place, close the valve there, and watch that it stays.
 
     If it creeps so that more than a quarter of the tolerance were gone by the end of a record,
@@ -96,7 +96,7 @@ def close_valve(session: Session, plan: LockPlan, place: Place, hold: Hold) -> L
     creep = abs(seen.speed) * hold.record
     log.info("%s: joint %d closed creeps %.3f mm/s", hold.step, joint + 1, 1e3 * seen.speed)
     if creep <= CREEP_SHARE * plan.tolerance and _near(seen, plan):
-        return Lock(joint, plan.at, seen.piston, OFF, plan.tolerance)
+        return JointLock(joint, plan.at, seen.piston, OFF, plan.tolerance)
     law = position_law(place, plan.piston, null)
     log.warning("%s: joint %d creeps with its valve closed; its position loop holds it",
                 hold.step, joint + 1)  # fmt: skip
@@ -110,7 +110,7 @@ def close_valve(session: Session, plan: LockPlan, place: Place, hold: Hold) -> L
             seen.piston,
             f"{1e3 * plan.piston:.2f} mm +- {1e3 * plan.tolerance:g} mm; does the valve leak?",
         )
-    return Lock(joint, plan.at, seen.piston, law, plan.tolerance)
+    return JointLock(joint, plan.at, seen.piston, law, plan.tolerance)
 
 
 def _stand(session: Session, joint: int, law: OutputLaw, hold: Hold) -> Look:
@@ -125,13 +125,13 @@ def _near(seen: Look, plan: LockPlan) -> bool:
     return abs(seen.piston - plan.piston) <= 0.5 * plan.tolerance
 
 
-def give(session: Session, held: Lock, first: int, last: int) -> float:
+def give(session: Session, held: JointLock, first: int, last: int) -> float:
     """Return how far a locked piston left its place over ticks [first, last) at most [m]."""
     moved = np.abs(session.piston(held.joint, first, last) - held.piston)
     return float(np.nanmax(moved, initial=0.0))
 
 
-def verify(session: Session, held: Lock, step: str, first: int, last: int) -> None:
+def verify(session: Session, held: JointLock, step: str, first: int, last: int) -> None:
     """Raise LockFailed if a locked piston left its place by more than the tolerance."""
     piston = session.piston(held.joint, first, last)
     moved = np.abs(piston - held.piston)

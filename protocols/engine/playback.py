@@ -24,7 +24,7 @@ from protocols.engine.excited_joint import (
     settled,
     trimmed,
 )
-from protocols.engine.locking import Lock, verify
+from protocols.engine.locking import JointLock, verify
 from protocols.engine.session import Session
 from protocols.files.plan import FIRM_SECONDS, StepPlan
 from protocols.files.schema import Place
@@ -39,11 +39,11 @@ LOOK_AHEAD = 0.1  # [s] between two forecasts
 RELEASED = 0.25  # of the offset allowed: so near its free way a piston is let go
 
 
-class Excitation:
+class Playback:
     """One step's excitation in progress; `at` is the tick of the boundary reached."""
 
     def __init__(
-        self, session: Session, step: StepPlan, place: Place, locks: Sequence[Lock]
+        self, session: Session, step: StepPlan, place: Place, locks: Sequence[JointLock]
     ) -> None:
         self.session = session
         self.step = step
@@ -168,7 +168,7 @@ class Excitation:
         self._play(loop=self._loose())
         self._alone = True
 
-    def resume(self, locks: Sequence[Lock]) -> None:
+    def resume(self, locks: Sequence[JointLock]) -> None:
         """Go on at the next boundary, with locks that were made anew meanwhile."""
         self.locks = tuple(locks)
         self._checked = self.session.now

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 Watch = Callable[[], None]
 
 
-class RecordHandle(Protocol):
+class OpenRecord(Protocol):
     """A record being taken: complete where its `with` block ends, partial if it is left early."""
 
     def __enter__(self) -> Self:
@@ -40,7 +40,7 @@ class RecordHandle(Protocol):
         """Make it no record; its samples stay in the run."""
 
 
-class Bench(Protocol):
+class BenchSession(Protocol):
     """What the engine needs of `rig.bench.session.Bench`."""
 
     info: DeviceInfo
@@ -60,14 +60,14 @@ class Bench(Protocol):
     def record(
         self, meta: RecordMeta | None = None, *, start_tick: int | None = None,
         ticks: int | None = None,
-    ) -> RecordHandle:  # fmt: skip
+    ) -> OpenRecord:  # fmt: skip
         """Make a record of `ticks` samples from `start_tick`, to be entered by `with`."""
 
 
 class Session:
     """Holds the laws in force and the samples read lately; every wait is in device time."""
 
-    def __init__(self, bench: Bench, rig: Rig, keep: int) -> None:
+    def __init__(self, bench: BenchSession, rig: Rig, keep: int) -> None:
         """Remember the last `keep` samples."""
         self.bench = bench
         self.rig = rig

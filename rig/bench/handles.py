@@ -4,21 +4,40 @@ from __future__ import annotations
 
 import logging
 from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import Protocol, Self
 
+from rig.bench.observers import Observers
 from rig.model.trips import RecordingFailed
-from rig.runs.recorder import Attribute, RecordMeta
-
-if TYPE_CHECKING:
-    from rig.bench.session import Bench
+from rig.runs.recorder import Attribute, Recorder, RecordMeta
 
 log = logging.getLogger(__name__)
+
+
+class RecordedBench(Protocol):
+    """What a record needs of the bench that takes it."""
+
+    @property
+    def tick(self) -> int:
+        """Tick of the newest sample."""
+
+    @property
+    def recorder(self) -> Recorder | None:
+        """The run's recorder, None where nothing is kept."""
+
+    @property
+    def observers(self) -> Observers:
+        """Who is told when a record begins and ends."""
+
+    def zero_outputs(self) -> bool:
+        """Put all outputs to zero; whether the device confirmed it."""
 
 
 class RecordHandle:
     """Opened by `with` (or `open`), closed at its end; left by an exception it is unfinished."""
 
-    def __init__(self, bench: Bench, meta: RecordMeta, start_tick: int, ticks: int | None) -> None:
+    def __init__(
+        self, bench: RecordedBench, meta: RecordMeta, start_tick: int, ticks: int | None
+    ) -> None:
         self.meta = meta
         self.start_tick = start_tick
         self._bench = bench

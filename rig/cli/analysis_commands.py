@@ -14,7 +14,7 @@ from rig.model.parse import InputError
 from rig.model.records import Record, Run
 
 if TYPE_CHECKING:
-    from analysis.identify.identify import Identification
+    from analysis.identify.result import Identification
     from analysis.regression.rows import Filtering
     from analysis.terms.base import Used
 
@@ -66,12 +66,12 @@ def _streamed(
 ) -> Identification:
     from analysis.identify.out_of_core import identify_folders
     from analysis.simulation.model import load_model
-    from analysis.workers.cluster import Cluster
+    from analysis.workers.cluster import DaskCluster
     from analysis.workers.pool import Serial
 
     model = None if like is None else load_model(like)
     # What the folders hold is read by who works on them: they need not exist here.
-    with Serial() if cluster is None else Cluster(cluster) as pool:
+    with Serial() if cluster is None else DaskCluster(cluster) as pool:
         return identify_folders(
             [str(run) for run in runs], filtering=filtering, pool=pool, effects=effects, like=model
         )
@@ -155,8 +155,8 @@ def identify(
     import numpy as np
 
     from analysis.identify.identify import identify as identify_runs
-    from analysis.identify.identify import to_json
     from analysis.identify.methods import SearchOptions
+    from analysis.identify.result import to_json
     from analysis.regression.rows import FILTERINGS
     from analysis.simulation.model import save_model
     from analysis.trace.search.shapes import shapes_in

@@ -115,10 +115,10 @@ def run(
 
     Example: bramah run lock-and-excite-multisine --rig shinshu-2dof --out runs/monday
     """
-    from rig.cli.running import Job, overridden, run_protocol
+    from rig.cli.running import ProtocolJob, overridden, run_protocol
 
     changes = overridden(repeats, duration, amplitude_scale, wave_seed, step)
-    job = Job(protocol, rig, out, endpoint, changes, operator, track, memory)
+    job = ProtocolJob(protocol, rig, out, endpoint, changes, operator, track, memory)
     folder = run_protocol(job, progress)
     typer.echo(str(folder))
 

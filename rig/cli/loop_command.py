@@ -94,13 +94,13 @@ def _asked(experiment: Mapping[str, Any]) -> bool:
 
 def _tell(going: Any, json: Path | None, report: Path) -> None:
     from analysis.simulation.model import save_model
-    from analysis.trace.loop_rounds import story_json
+    from analysis.trace.loop_rounds import rounds_json
     from rig.cli.trace_reporting import write_story
     from rig.cli.trace_text import story_text
 
     if not going.rounds and not going.wanted.out.is_dir():
         return  # ended before anything was taken
-    told = story_json(going.rounds, going.stopped)
+    told = rounds_json(going.rounds, going.stopped)
     write_json(going.wanted.out / "loop.json", told)
     write_json(json, told)
     if going.rounds:

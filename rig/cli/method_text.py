@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from analysis.identify.identify import Identification
+from analysis.identify.result import Identification
 from rig.cli.output import table
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from analysis.identify.identify import Identification
-from analysis.identify.identify import to_json as identification_json
 from analysis.identify.physical import Physical, physical, with_physics
 from analysis.identify.physical import to_json as physical_json
+from analysis.identify.result import Identification
+from analysis.identify.result import to_json as identification_json
 from rig.cli.output import table
 
 

@@ -8,30 +8,16 @@ from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 
-from analysis.identify.identify import Identification
+from analysis.identify.result import Identification
 from analysis.report.identification import Provenance, write_report
-from rig.cli.story import Experiment
 from rig.model.records import Run
 from rig.runs.versions import versions
 
 
-def _provenance(commands: tuple[str, ...], seeds: dict[str, str | int]) -> Provenance:
+def provenance(commands: tuple[str, ...], seeds: dict[str, str | int]) -> Provenance:
+    """Return date, commands, software versions and seeds for the foot of a report."""
     date = datetime.now().astimezone().strftime("%Y-%m-%d %H:%M")
     return Provenance(date=date, commands=commands, versions=versions(), seeds=seeds)
-
-
-def write_experiment(path: Path, done: Experiment, command: str, seed: int) -> None:
-    """Write the report of a whole loop on a simulated bench."""
-    write_report(
-        path,
-        runs=done.runs,
-        identification=done.identification,
-        validation=done.validation,
-        validation_runs=done.judged,
-        truth=done.truth,
-        title="A simulated bench, identified and validated",
-        provenance=_provenance((command,), {"simulated bench": seed}),
-    )
 
 
 def write_identification(path: Path, runs: Sequence[Run], result: Identification) -> None:
@@ -42,5 +28,5 @@ def write_identification(path: Path, runs: Sequence[Run], result: Identification
         runs=runs,
         identification=result,
         title=f"Identification of {result.model.rig.name}",
-        provenance=_provenance((line,), {}),
+        provenance=provenance((line,), {}),
     )

@@ -32,7 +32,7 @@ Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
-class Job:
+class ProtocolJob:
     """One unattended run: what, where, into which folder."""
 
     protocol: str
@@ -106,7 +106,7 @@ def _publisher(rig: Rig, say: Say) -> Publisher | None:
         return None
 
 
-def _tracking(job: Job, rig: Rig, say: Say, stack: ExitStack) -> Tracking | None:
+def _tracking(job: ProtocolJob, rig: Rig, say: Say, stack: ExitStack) -> Tracking | None:
     if not job.track:
         return None
     from rig.cli.tracking import Tracking
@@ -114,7 +114,7 @@ def _tracking(job: Job, rig: Rig, say: Say, stack: ExitStack) -> Tracking | None
     return stack.enter_context(Tracking(rig, job.out, say, job.memory))
 
 
-def run_protocol(job: Job, say: Say) -> Path:
+def run_protocol(job: ProtocolJob, say: Say) -> Path:
     """Run a protocol into its folder and return that; raises what ended it, outputs at zero."""
     rig, plan = _plan(job.protocol, job.rig, job.overrides)
     wire = rig.wire if job.endpoint is None else wire_at(job.endpoint, rig.wire)

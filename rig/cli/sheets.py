@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from protocols.design.check_report import CheckReport, Prediction
+from protocols.design.check_report import CheckReport, MotionPrediction
 from protocols.design.proof import Proof, Verdicts
 from rig.cli.output import table
 from rig.model.quantity import unit_map
@@ -10,7 +10,7 @@ from rig.model.quantity import unit_map
 _SHOWN = {"m": "mm", "Pa": "MPa", "Pa/s": "GPa/s", "m^3/s": "L/min"}
 
 
-def _cells(step: str, line: Prediction) -> list[str]:
+def _cells(step: str, line: MotionPrediction) -> list[str]:
     unit = _SHOWN.get(line.unit, line.unit)
     scale = 1.0 / unit_map(unit, line.unit)[0]
     place = "bench" if line.joint is None else f"joint {line.joint}"

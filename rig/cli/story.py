@@ -10,8 +10,10 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from analysis.identify.identify import Identification, identify
-from analysis.identify.identify import to_json as identification_json
+from analysis.identify.identify import identify
+from analysis.identify.result import Identification
+from analysis.identify.result import to_json as identification_json
+from analysis.report.identification import write_report
 from analysis.simulation.model import save_model
 from analysis.simulation.validate import RecordValidation, validate
 from analysis.simulation.validate import to_json as validation_json
@@ -19,7 +21,8 @@ from analysis.trace.engine import trace
 from analysis.trace.result import to_json as trace_json
 from protocols.files.plan import Overrides
 from rig.cli.output import progress, write_json
-from rig.cli.running import Job, run_protocol
+from rig.cli.reporting import provenance
+from rig.cli.running import ProtocolJob, run_protocol
 from rig.cli.simulated import simulated_bench
 from rig.cli.tables import identification_text, parameter_table, validation_text
 from rig.cli.truth_file import read_truth
@@ -62,11 +65,13 @@ def experiment(
     say(f"starting the simulated bench {RIG}, seed {seed}")
     with simulated_bench(RIG, seed=seed, truth=truth, scenario=scenario) as endpoint:
         say(f"it listens on {endpoint}")
-        first = run_protocol(Job(IDENTIFY, RIG, folder / "identify", endpoint, overrides), say)
-        second = run_protocol(Job(VALIDATE, RIG, folder / "validate", endpoint), say)
+        first = run_protocol(
+            ProtocolJob(IDENTIFY, RIG, folder / "identify", endpoint, overrides), say
+        )
+        second = run_protocol(ProtocolJob(VALIDATE, RIG, folder / "validate", endpoint), say)
         unseen: tuple[Path, ...] = ()
         if scenario is not None:
-            third = Job(IDENTIFY, RIG, folder / "other-wave", endpoint, HELD_OUT)
+            third = ProtocolJob(IDENTIFY, RIG, folder / "other-wave", endpoint, HELD_OUT)
             unseen = (run_protocol(third, say),)
     runs, judged = (load_run(first),), (load_run(second),)
     say("identifying from the first run")
@@ -78,7 +83,6 @@ def experiment(
 
 def tell(out: Path, seed: int, repeats: int | None) -> None:
     """Run the demo into a new folder of `out`, print its results and write its reports."""
-    from rig.cli.reporting import write_experiment
     from rig.cli.trace_reporting import write_trace
 
     started = time.monotonic()
@@ -109,3 +113,17 @@ def tell(out: Path, seed: int, repeats: int | None) -> None:
     print(f"report: {out / 'report.html'}")
     print(f"trace: {out / 'trace.html'}")
     progress(f"the whole loop took {time.monotonic() - started:.0f} s")
+
+
+def write_experiment(path: Path, done: Experiment, command: str, seed: int) -> None:
+    """Write the report of a whole loop on a simulated bench."""
+    write_report(
+        path,
+        runs=done.runs,
+        identification=done.identification,
+        validation=done.validation,
+        validation_runs=done.judged,
+        truth=done.truth,
+        title="A simulated bench, identified and validated",
+        provenance=provenance((command,), {"simulated bench": seed}),
+    )

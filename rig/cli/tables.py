@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from analysis.effects.base import Shape
-from analysis.identify.identify import Identification
+from analysis.identify.result import Identification
 from analysis.simulation.model import Estimate
 from analysis.simulation.validate import RecordValidation
 from rig.cli.output import table

@@ -124,7 +124,7 @@ def story_text(rounds: Sequence[Round], stopped: str) -> str:
     rows = [
         [
             str(r.number), r.result.verdict, named(r.result), _figure(r.predicted),
-            _figure(r.achieved), f"{r.loudest:.2g}", f"{r.left:.2g}",
+            _figure(r.achieved), f"{r.loudest:.2g}", f"{r.residual:.2g}",
         ]
         for r in rounds
     ]  # fmt: skip

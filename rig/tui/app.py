@@ -15,11 +15,11 @@ from textual.app import App, ComposeResult
 from textual.binding import Binding, BindingType
 from textual.widgets import ContentSwitcher, Footer, OptionList, RichLog
 
-from rig.tui.link import FRAME, Frame, Link, LocalSessions, Sessions, Stage
-from rig.tui.panels import Bench, Header, Look, Notices
+from rig.tui.link import FRAME, Frame, Link, LinkStage, LocalSessions, Sessions
+from rig.tui.panels import BenchPanel, HeaderPanel, Notices, PanelLook
 from rig.tui.screens import Chooser, Help, Waiting
 from rig.tui.units import age_text
-from rig.tui.words import OLD, Answer, Stop, is_live, notices
+from rig.tui.words import OLD, KeyAnswer, Stop, is_live, notices
 
 SPANS: Final = (5.0, 10.0, 30.0, 60.0, 120.0, 300.0, 600.0)  # of the plots [s of device time]
 CROSSING: Final = 5.0  # least wall time in which a curve crosses its plot [s]
@@ -71,14 +71,14 @@ class Monitor(App[int]):
         self._rig, self._clock, self._threaded = rig, clock, threaded
         self.link = Link(sessions or LocalSessions(rig), clock)
         self._span: float | None = None  # None: automatic
-        self._look = Look()
+        self._look = PanelLook()
         self._held: Frame | None = None  # what a paused display shows
         self._drawn: object = None
         self._slow = -float("inf")
         self.stop_asked: Stop | None = None  # the newest stop and what became of it
         self._told = 0
-        self._header, self._notices = Header(id="header"), Notices(id="notices")
-        self._chooser, self._bench = Chooser(id="chooser"), Bench(id="bench")
+        self._header, self._notices = HeaderPanel(id="header"), Notices(id="notices")
+        self._chooser, self._bench = Chooser(id="chooser"), BenchPanel(id="bench")
         self._events = RichLog(id="log", markup=False, wrap=True, min_width=20, max_lines=500)
         self._events.can_focus = False
 
@@ -132,7 +132,7 @@ class Monitor(App[int]):
 
     def _draw_main(self, frame: Frame, now: float) -> None:
         main = self.query_one(ContentSwitcher)
-        if frame.stage is Stage.CHOOSING:
+        if frame.stage is LinkStage.CHOOSING:
             self._chooser.show(frame.sessions, appearing=main.current != "chooser")
             main.current = "chooser"
         elif frame.snapshot is None:
@@ -161,10 +161,10 @@ class Monitor(App[int]):
     def action_stop(self) -> None:
         """Zero the outputs of the run on the screen, or of the one marked in the chooser."""
         frame = self.link.frame
-        choosing = frame.stage is Stage.CHOOSING
+        choosing = frame.stage is LinkStage.CHOOSING
         endpoint = self._chooser.marked if choosing else frame.endpoint
         if endpoint is None:
-            self.stop_asked = Stop(self._clock(), None, Answer.NOWHERE)
+            self.stop_asked = Stop(self._clock(), None, KeyAnswer.NOWHERE)
         else:
             self.stop_asked = stop = Stop(self._clock(), endpoint)
             self.link.stop(endpoint, lambda answered: self._answered(stop, answered))
@@ -175,7 +175,7 @@ class Monitor(App[int]):
     def _answered(self, stop: Stop, answered: bool) -> None:
         # Called by the sending thread; replacing one attribute needs no lock.
         if self.stop_asked is stop:
-            self.stop_asked = replace(stop, answer=Answer.TAKEN if answered else Answer.NONE)
+            self.stop_asked = replace(stop, answer=KeyAnswer.TAKEN if answered else KeyAnswer.NONE)
             self._slow = -float("inf")
 
     def action_pause(self) -> None:

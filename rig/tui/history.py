@@ -19,7 +19,7 @@ CAPACITY: Final = 16384  # buckets: 100 s at 20 snapshots a second
 
 
 @dataclass(frozen=True)
-class Window:
+class HistoryWindow:
     """The newest stretch of a run, read-only: bucket ends `time` (n,) [s] of device time.
 
     `low` and `high`, shape (n, channels), are the buckets' smallest and largest samples in SI;
@@ -47,7 +47,7 @@ class Window:
         return (float(low[recent].min()), float(high[recent].max())) if recent.any() else None
 
 
-EMPTY: Final = Window(np.empty(0), np.empty((0, 0)), np.empty((0, 0)), {}, {})
+EMPTY: Final = HistoryWindow(np.empty(0), np.empty((0, 0)), np.empty((0, 0)), {}, {})
 
 
 def regroup(minimum: Array, maximum: Array, count: int) -> tuple[Array, Array]:
@@ -111,7 +111,7 @@ class History:
         self._values[:, at] = values
         self._count += len(ends)
 
-    def window(self, seconds: float) -> Window:
+    def window(self, seconds: float) -> HistoryWindow:
         """Return a copy of the newest `seconds` of device time (and the bucket before them)."""
         held = min(self._count, self._capacity)
         order = (self._count - held + np.arange(held)) % self._capacity
@@ -121,7 +121,7 @@ class History:
         low, high = self._values[0, order], self._values[1, order]
         for array in (time, low, high):
             array.flags.writeable = False
-        return Window(time[first:], low, high, self._columns, self._reach)
+        return HistoryWindow(time[first:], low, high, self._columns, self._reach)
 
 
 def _stack(views: list[ChannelView], count: int) -> Array:

@@ -15,7 +15,7 @@ from enum import Enum
 from typing import Final, Protocol
 
 from rig.bench.attach import Attachment, Endpoint, Snapshot
-from rig.tui.history import EMPTY, History, Window
+from rig.tui.history import EMPTY, History, HistoryWindow
 from rig.tui.story import Line, tell
 
 log = logging.getLogger(__name__)
@@ -70,7 +70,7 @@ class LocalSessions:
         return Attachment(endpoint)
 
 
-class Stage(Enum):
+class LinkStage(Enum):
     """What the link is doing."""
 
     WAITING = "waiting"  # no session: looking for one
@@ -86,12 +86,12 @@ class Frame:
     A snapshot without new samples does not make those before it any younger.
     """
 
-    stage: Stage = Stage.WAITING
+    stage: LinkStage = LinkStage.WAITING
     sessions: tuple[Endpoint, ...] = ()
     endpoint: Endpoint | None = None
     snapshot: Snapshot | None = None
     received: float = 0.0
-    window: Window = EMPTY
+    window: HistoryWindow = EMPTY
     speed: float = 1.0  # device seconds per wall second
     story: tuple[Line, ...] = ()  # what happened, oldest first, the newest STORY lines of it
     told: int = 0  # how many lines there have ever been
@@ -106,7 +106,7 @@ class Frame:
     def over(self) -> bool:
         """Whether the run has ended: it said so, or its process has gone."""
         said = self.snapshot is not None and self.snapshot.state in ENDED_STATES
-        return self.stage is Stage.ENDED or said
+        return self.stage is LinkStage.ENDED or said
 
 
 class Link:
@@ -224,20 +224,20 @@ class Link:
             self._attach(chosen)
         elif choosing and len(live) > 1:
             self._detach()
-            self._frame = self._blank(Stage.CHOOSING)
+            self._frame = self._blank(LinkStage.CHOOSING)
         elif self._source is not None:
             if self._frame.endpoint not in live:
                 self._drain()
                 self._detach()
-                self._frame = replace(self._frame, stage=Stage.ENDED)
+                self._frame = replace(self._frame, stage=LinkStage.ENDED)
         elif len(live) == 1:
             self._attach(live[0])
         elif live:
-            self._frame = self._blank(Stage.CHOOSING)
-        elif self._frame.stage is Stage.CHOOSING:
-            self._frame = self._blank(Stage.WAITING)
+            self._frame = self._blank(LinkStage.CHOOSING)
+        elif self._frame.stage is LinkStage.CHOOSING:
+            self._frame = self._blank(LinkStage.WAITING)
 
-    def _blank(self, stage: Stage, endpoint: Endpoint | None = None) -> Frame:
+    def _blank(self, stage: LinkStage, endpoint: Endpoint | None = None) -> Frame:
         """Return a frame without a run's picture; what happened so far stays in the log."""
         kept = self._frame
         return Frame(
@@ -260,7 +260,7 @@ class Link:
         self._detach()
         self._source = source
         self._history = History()
-        self._frame = self._blank(Stage.ATTACHED, endpoint)
+        self._frame = self._blank(LinkStage.ATTACHED, endpoint)
 
     def _detach(self) -> None:
         source, self._source = self._source, None

@@ -17,7 +17,7 @@ from rig.bench.attach import ChannelView
 from rig.model import channels as ch
 from rig.tui.gauge import LABEL, gauge
 from rig.tui.link import Frame
-from rig.tui.plot import LivePlot, Trace
+from rig.tui.plot import LivePlot, PlotTrace
 from rig.tui.units import limit, shown
 from rig.tui.words import OLD, Notice, header, value
 
@@ -35,7 +35,7 @@ GAUGES: Final = (ch.PISTON, ch.SPOOL, ch.COMMAND)
 
 
 @dataclass(frozen=True)
-class Look:
+class PanelLook:
     """How the operator wants the bench shown: seconds of the past, and zoomed to the data."""
 
     seconds: float = 10.0
@@ -53,7 +53,7 @@ def joints_in(channels: Iterable[str]) -> dict[int, list[str]]:
     return dict(sorted(found.items()))
 
 
-class Header(Static):
+class HeaderPanel(Static):
     """The three lines on top."""
 
     DEFAULT_CSS = "Header { height: 3; }"
@@ -119,7 +119,7 @@ class Curve(Vertical):
         yield self._words
         yield self._plot
 
-    def show(self, name: str, view: ChannelView, frame: Frame, look: Look) -> None:
+    def show(self, name: str, view: ChannelView, frame: Frame, look: PanelLook) -> None:
         """Draw the channel as of this frame."""
         window = frame.window
         stop = float(window.time[-1]) if len(window.time) else 0.0
@@ -132,7 +132,7 @@ class Curve(Vertical):
             line.append(f"   {how.number(span[0])} … {how.number(span[1])}", OLD)
         self._words.update(line, layout=False)
         self._plot.show(
-            Trace(
+            PlotTrace(
                 window.time,
                 low,
                 high,
@@ -172,7 +172,7 @@ class JointPanel(Vertical):
         yield from self._curves.values()
         yield self._bars
 
-    def show(self, frame: Frame, look: Look, remark: str) -> None:
+    def show(self, frame: Frame, look: PanelLook, remark: str) -> None:
         """Draw the joint as of this frame; `remark` says beside its name when it is not live."""
         snapshot = frame.snapshot
         if snapshot is None:
@@ -205,7 +205,7 @@ class JointPanel(Vertical):
             self.border_subtitle = subtitle
 
 
-class Bench(ItemGrid):
+class BenchPanel(ItemGrid):
     """The joints side by side, as many as fit; made anew when a run has others."""
 
     DEFAULT_CSS = "Bench { height: 1fr; overflow-y: auto; scrollbar-size-vertical: 1; }"
@@ -222,7 +222,7 @@ class Bench(ItemGrid):
         share = max(self.size.height // rows, HEIGHT)
         self.styles.grid_rows = "1fr" if rows == 1 else str(share)
 
-    def show(self, frame: Frame, look: Look, remark: str) -> bool:
+    def show(self, frame: Frame, look: PanelLook, remark: str) -> bool:
         """Draw the bench as of this frame; False when its panels have first to be mounted."""
         joints = joints_in(frame.snapshot.channels) if frame.snapshot else {}
         if joints != self._joints:

@@ -28,7 +28,7 @@ OLD: Final = Style(color="grey42")
 
 
 @dataclass(frozen=True)
-class Trace:
+class PlotTrace:
     """What a plot draws: buckets in SI (see `braille.decimate`), limits [SI], how to show it."""
 
     time: Array
@@ -62,7 +62,7 @@ class Trace:
         return braille.scale_around([low - spare, high + spare])
 
 
-def draw(trace: Trace, width: int, height: int) -> list[Strip]:
+def draw(trace: PlotTrace, width: int, height: int) -> list[Strip]:
     """Return `height` strips of `width` characters: axis with the limits' numbers, then curve."""
     columns = max(width - GUTTER, 0)
     scale = trace.scale()
@@ -97,7 +97,7 @@ def _beyond(low: Array, high: Array, limits: tuple[float | None, float | None]) 
     return np.asarray(columns.reshape(-1, 2).any(axis=1), dtype=np.int_)
 
 
-def _axis(trace: Trace, scale: braille.Scale, height: int) -> list[list[Segment]]:
+def _axis(trace: PlotTrace, scale: braille.Scale, height: int) -> list[list[Segment]]:
     """Return the gutter, line by line: numbers of limits on the scale, else of the scale's ends."""
     labels: dict[int, tuple[str, Style]] = {}
     if trace.zoomed:
@@ -127,11 +127,11 @@ class LivePlot(Widget):
 
     def __init__(self, id: str | None = None) -> None:
         super().__init__(id=id)
-        self._trace: Trace | None = None
+        self._trace: PlotTrace | None = None
         self._strips: list[Strip] = []
         self._drawn: tuple[int, int] | None = None
 
-    def show(self, trace: Trace) -> None:
+    def show(self, trace: PlotTrace) -> None:
         """Draw this trace from now on."""
         self._trace, self._drawn = trace, None
         self.refresh()

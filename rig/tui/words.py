@@ -10,7 +10,7 @@ from rich.text import Text
 
 from rig.bench.attach import ChannelView, Endpoint, Snapshot
 from rig.model import channels as ch
-from rig.tui.link import ENDED_STATES, QUIET, Frame, Stage
+from rig.tui.link import ENDED_STATES, QUIET, Frame, LinkStage
 from rig.tui.story import trip_text
 from rig.tui.units import Band, age_text, band, clock_text, limit, shown
 
@@ -36,7 +36,7 @@ LINGER: Final = 10.0  # what became of a stop of another run than the one shown 
 EMERGENCY: Final = "Use the emergency stop of the bench."
 
 
-class Answer(Enum):
+class KeyAnswer(Enum):
     """What became of a stop."""
 
     SENDING = 0
@@ -51,7 +51,7 @@ class Stop:
 
     at: float
     endpoint: Endpoint | None
-    answer: Answer = Answer.SENDING
+    answer: KeyAnswer = KeyAnswer.SENDING
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ def notices(frame: Frame, stop: Stop | None, now: float, *, paused: bool) -> lis
         found.append(stop_notice(frame, stop, now))
     if frame.over:
         found.append(_ended(frame))
-    elif frame.stage is Stage.ATTACHED and (age := frame.age(now)) > QUIET:
+    elif frame.stage is LinkStage.ATTACHED and (age := frame.age(now)) > QUIET:
         level = "alarm" if age > VERY_OLD else "warn"
         what = "what is shown is old" if snapshot else "nothing received yet"
         found.append(Notice(level, f"NO DATA for {age_text(age)}: {what}"))
@@ -90,15 +90,15 @@ def notices(frame: Frame, stop: Stop | None, now: float, *, paused: bool) -> lis
 
 def stop_notice(frame: Frame, stop: Stop, now: float) -> Notice:
     """Return what became of the operator's stop; only the run's own word confirms it."""
-    if stop.answer is Answer.NOWHERE:
+    if stop.answer is KeyAnswer.NOWHERE:
         return Notice("alarm", "STOP: NOTHING SENT, no run is attached to this screen.")
-    if stop.answer is Answer.NONE:
+    if stop.answer is KeyAnswer.NONE:
         if frame.snapshot is not None and frame.snapshot.state in ENDED_STATES:
             return Notice("warn", f"STOP: no answer, the run had ended ({frame.snapshot.state})")
         return Notice("alarm", f"STOP: NO ANSWER from the run. {EMERGENCY}")
     if stop.endpoint is not None and stop.endpoint != frame.endpoint:
         whom = f"{stop.endpoint.rig} (process {stop.endpoint.pid})"
-        became = "sending ..." if stop.answer is Answer.SENDING else "taken"
+        became = "sending ..." if stop.answer is KeyAnswer.SENDING else "taken"
         return Notice("warn", f"STOP to {whom}, which is not the run shown: {became}")
     return _stop_of_the_shown(frame, stop, now)
 
@@ -106,7 +106,7 @@ def stop_notice(frame: Frame, stop: Stop, now: float) -> Notice:
 def _stop_of_the_shown(frame: Frame, stop: Stop, now: float) -> Notice:
     if frame.snapshot is not None and _zeroed(frame.snapshot):
         return Notice("good", "STOP SENT, OUTPUTS ZEROED: the run confirmed it")
-    if stop.answer is Answer.SENDING:
+    if stop.answer is KeyAnswer.SENDING:
         return Notice("warn", "STOP: sending ...")
     if frame.over:
         why = frame.snapshot.message if frame.snapshot is not None else ""
@@ -151,7 +151,7 @@ def header(frame: Frame, now: float, width: int) -> list[Text]:
 
 
 def _who(snapshot: Snapshot, frame: Frame, width: int) -> Text:
-    gone = frame.stage is Stage.ENDED and snapshot.state == "running"
+    gone = frame.stage is LinkStage.ENDED and snapshot.state == "running"
     state = "GONE" if gone else snapshot.state.upper()
     badge = (f" {state} ", STATES["tripped"] if gone else STATES.get(snapshot.state, "reverse"))
     rig = f" {snapshot.rig}"

@@ -13,15 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import lstsq
 
-from analysis.identify.identify import (
-    PLAIN,
-    Identification,
-    build_rows,
-    identify,
-    solve_rows,
-)
+from analysis.identify.identify import identify
 from analysis.identify.out_of_core import identify_folders
 from analysis.identify.reduction import reduce_record, solve_reductions
+from analysis.identify.result import PLAIN, Identification
+from analysis.identify.stacked_rows import build_rows, solve_rows
 from analysis.regression.chunks import InMemory, locks_of, source_rows
 from analysis.regression.qr import Accumulator, accumulate
 from analysis.regression.rows import default_filtering, paper_filtering

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from analysis.identify.advice import base_statements
-from analysis.identify.identify import Identification, identify
+from analysis.identify.identify import identify
+from analysis.identify.result import Identification
 from analysis.regression.base_parameters import determined
-from analysis.regression.solve import Cluster, solve, triangle
+from analysis.regression.solve import RowCluster, solve, triangle
 from rig.model.parse import InputError
 from rig.model.records import Run
 from rig.runs.rigs import load_rig
@@ -89,7 +90,7 @@ def test_all_steps_leave_nothing_to_say(multisine_run: Run) -> None:
 def test_an_electric_robot_is_told_its_combinations_as_well() -> None:
     robot = load_rig("electric-2dof")
     X = np.array([[1.0, 1.0, 0.0], [2.0, 2.0, 1.0], [1.0, 1.0, 3.0]])
-    solution = solve(("M1", "M2", "W1"), [Cluster("s", 1, triangle(X, np.ones(3)), 3)])
+    solution = solve(("M1", "M2", "W1"), [RowCluster("s", 1, triangle(X, np.ones(3)), 3)])
     (said,) = base_statements(robot, {"mechanical": solution})
     assert not said.ok
     assert "M1 + M2" in said.detail

@@ -16,9 +16,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.identify.identify import PLAIN, identify
+from analysis.identify.identify import identify
 from analysis.identify.out_of_core import identify_folders
-from analysis.workers.cluster import Cluster
+from analysis.identify.result import PLAIN
+from analysis.workers.cluster import DaskCluster
 from analysis.workers.pool import Pool, Processes, Serial, local_pool
 from rig.model.parse import InputError
 from rig.model.records import Run
@@ -141,7 +142,7 @@ def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         deadline = time.monotonic() + 60.0
         while True:
             try:
-                with Cluster(address):
+                with DaskCluster(address):
                     break
             except InputError:
                 assert time.monotonic() < deadline
@@ -153,7 +154,7 @@ def test_a_cluster_identifies_what_one_process_does(
     scheduler: str, tmp_path: Path, multisine_run: Run
 ) -> None:
     folders = [str(write_run(tmp_path / name, multisine_run)) for name in ("monday", "tuesday")]
-    with Cluster(scheduler) as pool:
+    with DaskCluster(scheduler) as pool:
         assert pool.workers == 1
         both = identify([multisine_run, multisine_run], estimator=PLAIN)
         assert_same(identify_folders(folders, pool=pool), both)
@@ -213,15 +214,15 @@ def test_an_address_where_nobody_answers_is_said() -> None:
         taken.bind(("127.0.0.1", 0))
         address = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
         with pytest.raises(InputError, match=r"no scheduler answers within 0\.3 s"):
-            Cluster(address, timeout=0.3).__enter__()
+            DaskCluster(address, timeout=0.3).__enter__()
 
 
 def test_an_address_of_another_kind_is_said() -> None:
     with pytest.raises(InputError, match="expected one like tcp://"):
-        Cluster("here").__enter__()
+        DaskCluster("here").__enter__()
 
 
 def test_without_dask_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match=r"install bramah\[cluster\]"):
-        Cluster("tcp://127.0.0.1:1").__enter__()
+        DaskCluster("tcp://127.0.0.1:1").__enter__()

@@ -9,9 +9,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from analysis.identify.constrained import minimise
-from analysis.identify.identify import Identification, identify
+from analysis.identify.identify import identify
 from analysis.identify.physical import feasible, links_of, physical, to_json, with_physics
+from analysis.identify.result import Identification
+from analysis.regression.constrained import minimise
 from analysis.terms.inertia import inertia_map
 from rig.model.parameters import mechanical_names
 from rig.model.parse import InputError

@@ -7,11 +7,13 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
-from analysis.identify.identify import build_rows, identify, to_json
+from analysis.identify.identify import identify
+from analysis.identify.result import to_json
+from analysis.identify.stacked_rows import build_rows
 from analysis.signals.conditioning import condition
 from analysis.signals.filters import butterworth, channel_filter
 from analysis.simulation.model import Estimate, Model, load_model, save_model
-from analysis.simulation.simulate import Drive, State, compiled, rates_of, simulate
+from analysis.simulation.simulate import DrivingInput, State, compiled, rates_of, simulate
 from analysis.simulation.validate import validate
 from analysis.terms import with_effects
 from analysis.terms.base import Used
@@ -53,11 +55,11 @@ def model_of(robot: Rig, effects: tuple[str, ...], **values: float) -> Model:
     return Model(robot, tuple(used(robot, *effects)), estimates, np.full((k, k), np.nan))
 
 
-def drive_of(robot: Rig, u: np.ndarray) -> Drive:
+def drive_of(robot: Rig, u: np.ndarray) -> DrivingInput:
     n, joints = u.shape
     flat, still = np.zeros(n), np.zeros((n, joints))
     free = np.zeros(joints, dtype=bool)
-    return Drive(robot.sample_rate, u, flat, flat, free, still, still, still)
+    return DrivingInput(robot.sample_rate, u, flat, flat, free, still, still, still)
 
 
 def at_rest(joints: int) -> State:

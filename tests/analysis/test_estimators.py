@@ -11,8 +11,9 @@ from scipy.stats import t as student
 from analysis.identify.checks import Check
 from analysis.identify.estimators.covariance import by_parts, lack_of_fit, spread
 from analysis.identify.estimators.equations import least_squares, pieces
-from analysis.identify.identify import Identification, identify, to_json
+from analysis.identify.identify import identify
 from analysis.identify.output_error.fit import output_error
+from analysis.identify.result import Identification, to_json
 from analysis.terms import baseline
 from analysis.terms.base import Used
 from rig.model.parse import InputError

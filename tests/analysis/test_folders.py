@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from analysis.identify.identify import PLAIN, identify
+from analysis.identify.identify import identify
 from analysis.identify.out_of_core import identify_folders
+from analysis.identify.result import PLAIN
 from analysis.terms import with_effects
 from analysis.terms.base import Used
 from rig.model.electric import ElectricRig

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from analysis.identify.identify import Identification, identify
+from analysis.identify.identify import identify
+from analysis.identify.result import Identification
 from analysis.simulation.validate import validate
 from analysis.terms import with_effects
 from analysis.terms.base import Used

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.identify.identify import Identification, identify, to_json
+from analysis.identify.identify import identify
+from analysis.identify.result import Identification, to_json
 from analysis.regression.rows import FILTERINGS, Filtering
 from analysis.signals.conditioning import condition, gives
 from analysis.signals.filters import channel_filter, row_filter, row_step

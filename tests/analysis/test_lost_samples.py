@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.identify.identify import build_rows, identify
+from analysis.identify.identify import identify
+from analysis.identify.stacked_rows import build_rows
 from analysis.regression.rows import default_filtering
 from analysis.report.identification import write_report
 from analysis.simulation.model import Model

@@ -8,18 +8,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.identify.identify import Identification, identify, to_json
+from analysis.identify.identify import identify
 from analysis.identify.methods.search import (
     COMPLEX,
     DEAD,
     DIVERGED,
     SearchOptions,
-    Task,
+    SearchTask,
     make_task,
     score,
     searched_names,
     step_one,
 )
+from analysis.identify.result import Identification, to_json
 from analysis.regression.rows import default_filtering
 from analysis.terms import baseline
 from analysis.terms.base import Used
@@ -141,13 +142,13 @@ def test_simultaneous_without_such_records_says_what_is_needed(multisine_run: Ru
 
 
 @pytest.fixture(scope="module")
-def task(rig: Rig, sine_run: Run) -> Task:
+def task(rig: Rig, sine_run: Run) -> SearchTask:
     record = step_one([sine_run])
     terms = tuple(Used(term) for term in baseline())
     return make_task(rig, record, terms, default_filtering(record), SMALL)
 
 
-def test_the_truth_scores_well_and_a_wrong_machine_badly_or_not_at_all(task: Task) -> None:
+def test_the_truth_scores_well_and_a_wrong_machine_badly_or_not_at_all(task: SearchTask) -> None:
     truth = {name: TRUTH[name] for name in STEP1}
     assert task.record == "step1_r1"
     assert score(task, truth).fate == ""

@@ -7,8 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.identify.identify import PLAIN, build_rows, identify, solve_rows
+from analysis.identify.identify import identify
 from analysis.identify.online import FLOOR, RowFeed, Tracker, track
+from analysis.identify.result import PLAIN
+from analysis.identify.stacked_rows import build_rows, solve_rows
 from analysis.regression.chunks import Locks, stretch_rows
 from analysis.regression.rows import default_filtering
 from analysis.terms import baseline

@@ -10,7 +10,7 @@ import pytest
 from analysis.design.predict import Prediction, predict, to_json
 from analysis.design.sensor_noise import moved
 from analysis.design.twin_records import Played, ideal, play
-from analysis.identify.identify import build_rows, solve_rows
+from analysis.identify.stacked_rows import build_rows, solve_rows
 from analysis.regression.rows import default_filtering
 from analysis.signals.conditioning import condition
 from analysis.terms import baseline

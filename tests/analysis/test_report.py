@@ -10,7 +10,8 @@ import matplotlib as mpl
 import pytest
 
 from analysis.identify.checks import Check
-from analysis.identify.identify import Identification, identify
+from analysis.identify.identify import identify
+from analysis.identify.result import Identification
 from analysis.report.identification import Provenance, render_report, write_report
 from analysis.simulation.model import Model
 from analysis.simulation.validate import RecordValidation, validate

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis.identify.identify import RecordRows, build_rows, identify
+from analysis.identify.identify import identify
+from analysis.identify.stacked_rows import RecordRows, build_rows
 from analysis.regression.rows import Rows
 from analysis.report import facts, paper
 from analysis.report import format as fm

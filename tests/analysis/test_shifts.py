@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import t as student
 
 from analysis.identify.estimators.covariance import spread
-from analysis.identify.estimators.equations import Block, Prepared, least_squares, pieces
+from analysis.identify.estimators.equations import Prepared, RepeatBlock, least_squares, pieces
 from analysis.identify.estimators.instruments import hausman
 from analysis.identify.estimators.nuisance import Belief, joined
 from analysis.identify.estimators.shifts import Shift, certain_shift, including, shifts_of
@@ -81,7 +81,7 @@ def test_what_is_known_beforehand_narrows_intervals_no_more_than_it_may(known: f
     for _ in range(400):
         truth = np.array([1.0, known * rng.standard_normal()])
         blocks = [
-            Block(0, step, r, f"{step}_r{r}", "flow_cap_1", X,
+            RepeatBlock(0, step, r, f"{step}_r{r}", "flow_cap_1", X,
                   X @ truth + size * np.repeat(rng.standard_normal(40), 5), t, parts, parts)
             for step, size in (("a", 0.5), ("b", 0.35)) for r in range(4)
         ]  # fmt: skip

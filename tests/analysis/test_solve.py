@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import lstsq
 
-from analysis.regression.solve import Cluster, half_width, merge, solve, triangle
+from analysis.regression.solve import RowCluster, half_width, merge, solve, triangle
 
 NAMES = ("a", "b", "c")
 
@@ -22,9 +22,9 @@ def data(rng: np.random.Generator, clusters: int, rows: int = 200) -> list[tuple
     return out
 
 
-def as_clusters(blocks: list[tuple], per_stratum: int) -> list[Cluster]:
+def as_clusters(blocks: list[tuple], per_stratum: int) -> list[RowCluster]:
     return [
-        Cluster(k // per_stratum, k % per_stratum, triangle(X, y), len(y))
+        RowCluster(k // per_stratum, k % per_stratum, triangle(X, y), len(y))
         for k, (X, y) in enumerate(blocks)
     ]
 

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.identify.identify import Identification, identify
+from analysis.identify.identify import identify
+from analysis.identify.result import Identification
 from analysis.simulation.model import load_model, save_model
 from analysis.simulation.twin import simulate_commands, spool_response
 from analysis.simulation.validate import fit_percent, to_json, validate

@@ -13,7 +13,7 @@ from analysis.report.loop import render
 from analysis.simulation.twin import simulate_commands
 from analysis.trace.data.candidates import catalogue
 from analysis.trace.engine import trace
-from analysis.trace.loop_rounds import Round, story_json
+from analysis.trace.loop_rounds import Round, rounds_json
 from protocols.design.check import check
 from protocols.files import library
 from protocols.files.plan import resolve
@@ -50,7 +50,7 @@ def test_air_that_a_sine_cannot_show_is_brought_to_light_and_named(air: Inside) 
     (found,) = second.result.effects
     assert (found.name, found.where) == ("entrained_air", "bench")
     assert found.parameters["alpha_air"].value == pytest.approx(0.01, rel=0.1)
-    assert second.left < 1.3
+    assert second.residual < 1.3
     assert air.stopped == FLOOR
 
 
@@ -73,7 +73,7 @@ def test_the_designed_protocol_is_one_that_run_takes_and_the_twin_proves(air: In
 
 
 def test_the_story_is_told_in_json_in_words_and_on_one_page(air: Inside) -> None:
-    told = json.loads(json.dumps(story_json(air.rounds, air.stopped), allow_nan=False))
+    told = json.loads(json.dumps(rounds_json(air.rounds, air.stopped), allow_nan=False))
     assert told["verdict"] == "explained"
     assert [r["trace"]["verdict"] for r in told["rounds"]] == ["clean", "explained"]
     assert told["rounds"][1]["runs"] == ["run-2", "holdout-2"]

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.identify.identify import Identification, identify
+from analysis.identify.identify import identify
+from analysis.identify.result import Identification
 from analysis.simulation.validate import validate
 from hil_sim.plant.plant import Law, Plant
 from hil_sim.plant.sensors import converters

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from analysis.workers.cluster import Cluster
+from analysis.workers.cluster import DaskCluster
 from rig.model.parse import InputError
 
 Job = TypeVar("Job")
@@ -78,7 +78,7 @@ def _results(
 ) -> Iterator[tuple[Job, Result | Exception]]:
     """Yield jobs with what they gave or, of the kinds `left_out`, raised."""
     if isinstance(workers, str):
-        with Cluster(workers) as pool:
+        with DaskCluster(workers) as pool:
             yield from zip(work, pool.map(_Caught(perform, left_out), work), strict=True)
         return
     context = multiprocessing.get_context("spawn")

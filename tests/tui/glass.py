@@ -12,7 +12,7 @@ from textual.pilot import Pilot
 from rig.bench.attach import Endpoint, Snapshot
 from rig.tui.app import Monitor
 from rig.tui.link import SnapshotSource
-from rig.tui.words import Answer
+from rig.tui.words import KeyAnswer
 
 
 def endpoint(rig: str = "shinshu-2dof", pid: int = 4711) -> Endpoint:
@@ -87,7 +87,7 @@ class Glass:
 
     async def answered(self) -> None:
         """Wait until the stop that was pressed has an answer, and draw."""
-        while self.app.stop_asked is None or self.app.stop_asked.answer is Answer.SENDING:
+        while self.app.stop_asked is None or self.app.stop_asked.answer is KeyAnswer.SENDING:
             await self.pilot.pause(0.005)
         await self.watch()
 

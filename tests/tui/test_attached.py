@@ -13,7 +13,7 @@ import pytest
 from textual.pilot import Pilot
 
 from rig.tui.app import Monitor
-from rig.tui.link import Stage
+from rig.tui.link import LinkStage
 from rig.tui.words import notices
 
 ROOT = Path(__file__).parents[2]
@@ -62,7 +62,7 @@ async def test_the_screen_waits_joins_the_run_that_appears_and_stops_it(
 ) -> None:
     app = Monitor("shinshu-2dof")
     async with app.run_test(size=(80, 24)) as pilot:
-        assert app.link.frame.stage is Stage.WAITING
+        assert app.link.frame.stage is LinkStage.WAITING
         process = start()
         await until(pilot, lambda: len(app.link.frame.window.time) > 40)
         assert app.link.frame.snapshot is not None
@@ -70,7 +70,7 @@ async def test_the_screen_waits_joins_the_run_that_appears_and_stops_it(
         await pilot.press("s")
         await until(pilot, lambda: "STOP SENT, OUTPUTS ZEROED" in told(app))
         assert process.wait(PATIENCE) == 0
-        await until(pilot, lambda: app.link.frame.stage is Stage.ENDED)
+        await until(pilot, lambda: app.link.frame.stage is LinkStage.ENDED)
         assert app.link.frame.snapshot.state == "aborted"
 
 

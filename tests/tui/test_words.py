@@ -11,16 +11,16 @@ from hypothesis import strategies as st
 from rig.bench.attach import ChannelView
 from rig.tui.app import farewell
 from rig.tui.gauge import bar, gauge
-from rig.tui.link import Frame, Stage
+from rig.tui.link import Frame, LinkStage
 from rig.tui.story import tell
 from rig.tui.units import Band, age_text, band, clock_text, limit, shown
-from rig.tui.words import Answer, Stop, notices
+from rig.tui.words import KeyAnswer, Stop, notices
 from tests.tui.glass import endpoint
 from tests.tui.recorded import Bench, snapshot, stopped, tripped
 
 HERE = endpoint()
 VIEW = snapshot(Bench(), 80)
-LIVE = Frame(Stage.ATTACHED, (HERE,), HERE, VIEW, received=100.0)
+LIVE = Frame(LinkStage.ATTACHED, (HERE,), HERE, VIEW, received=100.0)
 
 
 def said(frame: Frame, stop: Stop | None = None, now: float = 100.0) -> list[tuple[str, str]]:
@@ -44,18 +44,18 @@ def test_the_age_includes_how_late_the_block_already_was() -> None:
 @pytest.mark.parametrize(
     ("answer", "state", "later", "level", "words"),
     [
-        (Answer.SENDING, "running", 0.1, "warn", "sending"),
-        (Answer.TAKEN, "running", 0.1, "warn", "waiting for the run to confirm"),
-        (Answer.TAKEN, "running", 2.5, "alarm", "NOT CONFIRMED for 2.5 s"),
-        (Answer.TAKEN, "tripped", 0.1, "good", "OUTPUTS ZEROED"),
-        (Answer.TAKEN, "done", 0.1, "alarm", "NOT CONFIRMED: the run ended"),
-        (Answer.NONE, "running", 0.1, "alarm", "NO ANSWER"),
-        (Answer.NONE, "done", 0.1, "warn", "the run had ended (done)"),
-        (Answer.NOWHERE, "running", 0.1, "alarm", "NOTHING SENT"),
+        (KeyAnswer.SENDING, "running", 0.1, "warn", "sending"),
+        (KeyAnswer.TAKEN, "running", 0.1, "warn", "waiting for the run to confirm"),
+        (KeyAnswer.TAKEN, "running", 2.5, "alarm", "NOT CONFIRMED for 2.5 s"),
+        (KeyAnswer.TAKEN, "tripped", 0.1, "good", "OUTPUTS ZEROED"),
+        (KeyAnswer.TAKEN, "done", 0.1, "alarm", "NOT CONFIRMED: the run ended"),
+        (KeyAnswer.NONE, "running", 0.1, "alarm", "NO ANSWER"),
+        (KeyAnswer.NONE, "done", 0.1, "warn", "the run had ended (done)"),
+        (KeyAnswer.NOWHERE, "running", 0.1, "alarm", "NOTHING SENT"),
     ],
 )
 def test_a_stop_is_called_what_it_is(
-    answer: Answer, state: str, later: float, level: str, words: str
+    answer: KeyAnswer, state: str, later: float, level: str, words: str
 ) -> None:
     frame = replace(LIVE, snapshot=replace(VIEW, state=state), received=100.0 + later)
     notice = next(
@@ -75,12 +75,12 @@ def test_a_stop_is_called_what_it_is(
 )
 def test_only_a_run_that_says_it_stopped_confirms_a_stop(message: str, level: str) -> None:
     frame = replace(LIVE, snapshot=replace(VIEW, state="aborted", message=message))
-    notice = next(n for n in said(frame, Stop(100.0, HERE, Answer.TAKEN)) if "STOP" in n[1])
+    notice = next(n for n in said(frame, Stop(100.0, HERE, KeyAnswer.TAKEN)) if "STOP" in n[1])
     assert notice[0] == level
 
 
 def test_a_stop_of_another_run_is_never_confirmed_by_the_one_shown() -> None:
-    elsewhere = Stop(100.0, endpoint("press", 7), Answer.TAKEN)
+    elsewhere = Stop(100.0, endpoint("press", 7), KeyAnswer.TAKEN)
     frame = replace(LIVE, snapshot=stopped(VIEW))
     texts = [text for _, text in said(frame, elsewhere)]
     assert any("press (process 7), which is not the run shown: taken" in text for text in texts)

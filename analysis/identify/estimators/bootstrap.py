@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 from scipy.stats import t as student
 
-from analysis.identify.estimators.equations import Block
+from analysis.identify.estimators.equations import RepeatBlock
 
 Array = NDArray[np.float64]
 
@@ -32,8 +32,8 @@ class Drawn:
 
 
 def bootstrap(
-    blocks: Sequence[Block],
-    estimate: Callable[[Sequence[Block]], Array],
+    blocks: Sequence[RepeatBlock],
+    estimate: Callable[[Sequence[RepeatBlock]], Array],
     draws: int,
     rng: np.random.Generator,
 ) -> Drawn:
@@ -50,7 +50,7 @@ def bootstrap(
     return Drawn(std, value + stretch * low, value + stretch * high)
 
 
-def _units(blocks: Sequence[Block]) -> dict[tuple[int, str], list[tuple[int, int]]]:
+def _units(blocks: Sequence[RepeatBlock]) -> dict[tuple[int, str], list[tuple[int, int]]]:
     """Return what may be drawn in each stratum: (repeat, -1), or (repeat, part) of the only one."""
     repeats: dict[tuple[int, str], set[int]] = {}
     for b in blocks:
@@ -66,7 +66,7 @@ def _units(blocks: Sequence[Block]) -> dict[tuple[int, str], list[tuple[int, int
     return out
 
 
-def _resampled(blocks: Sequence[Block], rng: np.random.Generator) -> list[Block]:
+def _resampled(blocks: Sequence[RepeatBlock], rng: np.random.Generator) -> list[RepeatBlock]:
     out = []
     for stratum, units in _units(blocks).items():
         for copy, pick in enumerate(rng.integers(0, len(units), len(units))):
@@ -77,7 +77,7 @@ def _resampled(blocks: Sequence[Block], rng: np.random.Generator) -> list[Block]
     return out
 
 
-def _piece(b: Block, part: int, copy: int) -> Block:
+def _piece(b: RepeatBlock, part: int, copy: int) -> RepeatBlock:
     # A repeat drawn twice counts as two.
     named = replace(b, repeat=copy, record=f"{b.record}#{copy}")
     if part < 0:

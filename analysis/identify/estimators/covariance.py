@@ -31,7 +31,7 @@ VISIBLE = 0.01  # level of the F test below which lack of fit counts as seen
 
 
 @dataclass(frozen=True)
-class Spread:
+class CovarianceParts:
     """A covariance (k, k), the degrees of freedom (k,), and the systematic share of variance."""
 
     covariance: Array
@@ -39,7 +39,7 @@ class Spread:
     systematic: Array
 
 
-def spread(groupings: Sequence[Pieces], inverse: Array) -> Spread:
+def spread(groupings: Sequence[Pieces], inverse: Array) -> CovarianceParts:
     """Return V_repeats + visible lack of fit; the first grouping is that of the period.
 
     Where a step has one repeat only there is no scatter, and the parts of the period stand for it.
@@ -56,16 +56,16 @@ def spread(groupings: Sequence[Pieces], inverse: Array) -> Spread:
     with np.errstate(divide="ignore", invalid="ignore"):
         dof = np.where(scatter > 0, repeats.dof * (variance / scatter) ** 2, 1.0)
         share = np.where(variance > 0, worst / variance, 0.0)
-    return Spread(total * np.outer(scale, scale), dof, share)
+    return CovarianceParts(total * np.outer(scale, scale), dof, share)
 
 
-def by_repeats(pieces: Pieces, inverse: Array) -> Spread | None:
+def by_repeats(pieces: Pieces, inverse: Array) -> CovarianceParts | None:
     """Return the scatter between repeats within their steps; None where a step has only one."""
     stratum, score, _ = pieces.grouped(pieces.repeat)
     return stratified(stratum, score @ inverse.T)
 
 
-def stratified(stratum: Indices, influence: Array) -> Spread | None:
+def stratified(stratum: Indices, influence: Array) -> CovarianceParts | None:
     """Return sum over strata of n/(n-1) sum (u - mean)(u - mean)' of influences u (c, k).
 
     Degrees of freedom are Satterthwaite's; None where a stratum has one member only.
@@ -81,7 +81,7 @@ def stratified(stratum: Indices, influence: Array) -> Spread | None:
         part = u.T @ u * (n / (n - 1))
         total += part
         squares += np.diag(part) ** 2 / (n - 1)
-    return Spread(total, _satterthwaite(np.diag(total), squares), np.zeros(k))
+    return CovarianceParts(total, _satterthwaite(np.diag(total), squares), np.zeros(k))
 
 
 def lack_of_fit(pieces: Pieces, inverse: Array) -> Array:
@@ -102,7 +102,7 @@ def lack_of_fit(pieces: Pieces, inverse: Array) -> Array:
     return np.asarray(found * np.outer(scale, scale))
 
 
-def by_parts(pieces: Pieces, inverse: Array) -> Spread:
+def by_parts(pieces: Pieces, inverse: Array) -> CovarianceParts:
     """Return the jackknife over the parts of the period, all repeats of a part together."""
     stratum, score, information = pieces.grouped(pieces.part)
     A: Array = np.asarray(np.linalg.inv(inverse))
@@ -115,7 +115,7 @@ def by_parts(pieces: Pieces, inverse: Array) -> Spread:
         part = u.T @ u * ((n - 1) / n if n > 1 else 1.0)
         total += part
         squares += np.diag(part) ** 2 / max(n - 1, 1)
-    return Spread(total, _satterthwaite(np.diag(total), squares), np.zeros(k))
+    return CovarianceParts(total, _satterthwaite(np.diag(total), squares), np.zeros(k))
 
 
 def _without(A: Array, part: Array, score: Array) -> Array:

@@ -53,7 +53,7 @@ class HasRows(Protocol):
 
 
 @dataclass(frozen=True)
-class Block:
+class RepeatBlock:
     """One equation of one record: X (m, k), y (m,), time (m,) [s], where each row lies (m,).
 
     `segment` is the part of the excitation's period, `level` the bin of the equation's own state
@@ -84,14 +84,14 @@ class Prepared:
     family: str
     names: tuple[str, ...]
     parameters: int
-    blocks: tuple[Block, ...]
+    blocks: tuple[RepeatBlock, ...]
 
 
 @dataclass(frozen=True)
-class Fit:
+class EquationFit:
     """A solution beta (k,) with A^-1 (k, k), and the instruments and weights that made it."""
 
-    blocks: tuple[Block, ...]
+    blocks: tuple[RepeatBlock, ...]
     Z: tuple[Array, ...]
     w: tuple[Array, ...]
     beta: Array
@@ -116,14 +116,14 @@ def segments(time: Array, period: float, segments_wanted: int = SEGMENTS) -> Ind
 
 def blocks_of(
     per_record: Sequence[HasRows], family: str, kept: Sequence[int], periods: Sequence[float]
-) -> list[Block]:
+) -> list[RepeatBlock]:
     """Return the blocks of one family with the columns `kept`; `periods` [s] per record."""
     found = []
     for one, period in zip(per_record, periods, strict=True):
         for name, rows in one.rows.items():
             if family_of(name) == family and len(rows.rhs):
                 found.append(
-                    Block(
+                    RepeatBlock(
                         one.run, one.step, one.repeat, one.record, name,
                         rows.matrix[:, list(kept)], rows.rhs, rows.time,
                         segments(rows.time, period), np.zeros(len(rows.rhs), dtype=np.int64),
@@ -132,7 +132,7 @@ def blocks_of(
     return found
 
 
-def solve(blocks: Sequence[Block], Z: Sequence[Array], w: Sequence[Array]) -> Fit:
+def solve(blocks: Sequence[RepeatBlock], Z: Sequence[Array], w: Sequence[Array]) -> EquationFit:
     """Solve the estimating equations, columns scaled to unit norm first."""
     k = blocks[0].X.shape[1]
     A, c = np.zeros((k, k)), np.zeros(k)
@@ -143,10 +143,10 @@ def solve(blocks: Sequence[Block], Z: Sequence[Array], w: Sequence[Array]) -> Fi
     scale = np.sqrt(np.abs(np.diag(A)))
     scale[scale == 0.0] = 1.0
     inverse = np.linalg.inv(A / np.outer(scale, scale)) / np.outer(scale, scale)
-    return Fit(tuple(blocks), tuple(Z), tuple(w), inverse @ c, inverse)
+    return EquationFit(tuple(blocks), tuple(Z), tuple(w), inverse @ c, inverse)
 
 
-def least_squares(blocks: Sequence[Block], w: Sequence[Array] | None = None) -> Fit:
+def least_squares(blocks: Sequence[RepeatBlock], w: Sequence[Array] | None = None) -> EquationFit:
     """Solve with Z = X and weights w (default 1)."""
     weights = [np.ones(len(b.y)) for b in blocks] if w is None else w
     return solve(blocks, [b.X for b in blocks], weights)
@@ -177,7 +177,7 @@ class Pieces:
         return unique[:, 0], score, information
 
 
-def pieces(fit: Fit, by: str = "segment") -> Pieces:
+def pieces(fit: EquationFit, by: str = "segment") -> Pieces:
     """Return scores and information of a fit by stratum, repeat and `segment` or `level`."""
     strata = {s: i for i, s in enumerate(sorted({b.stratum for b in fit.blocks}))}
     found: dict[tuple[int, int, int], tuple[Array, Array]] = {}
@@ -198,7 +198,7 @@ def pieces(fit: Fit, by: str = "segment") -> Pieces:
     )  # fmt: skip
 
 
-def common(blocks: Sequence[Block]) -> list[Block]:
+def common(blocks: Sequence[RepeatBlock]) -> list[RepeatBlock]:
     """Return the blocks cut to the rows that every repeat of their step and equation kept."""
     shared: dict[tuple[int, str, str], Array] = {}
     for b in blocks:
@@ -215,14 +215,16 @@ def common(blocks: Sequence[Block]) -> list[Block]:
     return out
 
 
-def _rows_of(b: Block, here: NDArray[np.bool_]) -> Block:
+def _rows_of(b: RepeatBlock, here: NDArray[np.bool_]) -> RepeatBlock:
     return replace(
         b, X=b.X[here], y=b.y[here], time=b.time[here], segment=b.segment[here],
         level=b.level[here],
     )  # fmt: skip
 
 
-def levelled(blocks: Sequence[Block], records: Mapping[tuple[int, str], Record]) -> list[Block]:
+def levelled(
+    blocks: Sequence[RepeatBlock], records: Mapping[tuple[int, str], Record]
+) -> list[RepeatBlock]:
     """Return the blocks with `level`: the bin of the state that the equation's law depends on.
 
     Flow rows are sorted by their chamber's pressure, torque rows by their piston's place, into
@@ -252,7 +254,7 @@ def levelled(blocks: Sequence[Block], records: Mapping[tuple[int, str], Record])
     ]
 
 
-def _state(b: Block, record: Record) -> Array:
+def _state(b: RepeatBlock, record: Record) -> Array:
     kind, joint = b.equation.rsplit("_", 1)
     place = ch.POSITION if ch.channel(ch.POSITION, int(joint)) in record.channels else ch.PISTON
     channel = {"flow_cap": ch.CAP, "flow_rod": ch.ROD}.get(kind, place)
@@ -262,7 +264,7 @@ def _state(b: Block, record: Record) -> Array:
     return np.asarray(np.interp(b.time, record.time, smooth))
 
 
-def residual_scatter(blocks: Sequence[Block], residuals: Sequence[Array]) -> list[Array]:
+def residual_scatter(blocks: Sequence[RepeatBlock], residuals: Sequence[Array]) -> list[Array]:
     """Return each block's residuals less the mean over its repeats, scaled to the noise's size.
 
     The blocks must share their rows (`common`). With n repeats the deviations are sqrt((n-1)/n)

@@ -19,9 +19,9 @@ from scipy.stats import t as student
 
 from analysis.identify.estimators.covariance import stratified
 from analysis.identify.estimators.equations import (
-    Block,
-    Fit,
+    EquationFit,
     Indices,
+    RepeatBlock,
     common,
     least_squares,
     pieces,
@@ -48,7 +48,7 @@ class Hausman:
         return np.asarray(self.p < LEVEL / len(self.p))
 
 
-def instrumental_variables(blocks: Sequence[Block]) -> Fit:
+def instrumental_variables(blocks: Sequence[RepeatBlock]) -> EquationFit:
     """Solve with the other repeats' mean rows as instruments; every step needs two repeats."""
     blocks = common(blocks)
     total: dict[tuple[int, str, str], Array] = {}
@@ -63,7 +63,7 @@ def instrumental_variables(blocks: Sequence[Block]) -> Fit:
     return solve(blocks, Z, [np.ones(len(b.y)) for b in blocks])
 
 
-def hausman(blocks: Sequence[Block]) -> Hausman:
+def hausman(blocks: Sequence[RepeatBlock]) -> Hausman:
     """Compare least squares with instruments on the same rows.
 
     The difference scatters by noise, which parts of the period show separately: its covariance is

@@ -26,7 +26,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.identify.estimators.covariance import Spread
+from analysis.identify.estimators.covariance import CovarianceParts
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import Coefficient, Columns, Term, Used, equation
 from rig.model import channels as ch
@@ -150,8 +150,8 @@ def implausible(belief: Belief, beta: Array, covariance: Array) -> bool:
 
 
 def joined(
-    beta: Array, spread: Spread, belief: Belief, inverse: Array
-) -> tuple[Array, Spread, Array]:
+    beta: Array, spread: CovarianceParts, belief: Belief, inverse: Array
+) -> tuple[Array, CovarianceParts, Array]:
     """Join one observation into beta (k,), its spread and its A^-1 (k, k), which is `inverse`.
 
     The gain g of Kalman's update is taken from A^-1, sized to the spread V:
@@ -172,5 +172,5 @@ def joined(
         # What is known beforehand needs no repeats: its part of the variance counts as known.
         grown = np.where(left > 0, np.minimum(np.diag(after) / left, 1e3), 1.0)
         systematic = np.minimum(spread.systematic, 1.0) / grown
-    new = Spread(after, spread.dof * grown**2, systematic)
+    new = CovarianceParts(after, spread.dof * grown**2, systematic)
     return beta - gain * (h @ beta), new, move @ inverse

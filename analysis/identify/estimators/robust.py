@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.identify.estimators.equations import Block, Fit, least_squares
+from analysis.identify.estimators.equations import EquationFit, RepeatBlock, least_squares
 
 Array = NDArray[np.float64]
 
@@ -27,7 +27,7 @@ GAUSSIAN = 1.4826  # standard deviation over median absolute deviation
 FEW = 3  # repeats below this have no median worth the name
 
 
-def robust(blocks: Sequence[Block]) -> Fit:
+def robust(blocks: Sequence[RepeatBlock]) -> EquationFit:
     """Solve with weights that fall for outlying rows."""
     before = leverage_weights(blocks)
     fit = least_squares(blocks, before)
@@ -44,7 +44,7 @@ def robust(blocks: Sequence[Block]) -> Fit:
     return fit
 
 
-def outlying(fit: Fit) -> dict[str, float]:
+def outlying(fit: EquationFit) -> dict[str, float]:
     """Return the share of rows that have lost nine tenths of their weight, by record."""
     lost: dict[str, list[float]] = {}
     for b, w in zip(fit.blocks, fit.w, strict=True):
@@ -61,7 +61,7 @@ def _tukey(r: Array) -> Array:
 
 
 def _scales(
-    blocks: Sequence[Block], residuals: Sequence[Array], weights: Sequence[Array]
+    blocks: Sequence[RepeatBlock], residuals: Sequence[Array], weights: Sequence[Array]
 ) -> list[float]:
     found: dict[tuple[int, str, str], list[Array]] = {}
     for b, e, w in zip(blocks, residuals, weights, strict=True):
@@ -72,7 +72,7 @@ def _scales(
     return [scale[*b.stratum, b.equation] for b in blocks]
 
 
-def leverage_weights(blocks: Sequence[Block]) -> list[Array]:
+def leverage_weights(blocks: Sequence[RepeatBlock]) -> list[Array]:
     """Return weights (m,) of rows by their distance from the repeats' median, 1 for most."""
     groups: dict[tuple[int, str, str], list[int]] = {}
     for i, b in enumerate(blocks):

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.identify.estimators.covariance import Spread
-from analysis.identify.estimators.equations import Fit, Prepared
+from analysis.identify.estimators.covariance import CovarianceParts
+from analysis.identify.estimators.equations import EquationFit, Prepared
 from analysis.identify.estimators.instruments import Hausman
 from analysis.regression.solve import half_width
 
@@ -56,7 +56,7 @@ class Shift:
 def shifts_of(
     prepared: Sequence[Prepared],
     tests: Mapping[str, Hausman],
-    reference: Mapping[str, tuple[Array, Spread, Fit]],
+    reference: Mapping[str, tuple[Array, CovarianceParts, EquationFit]],
 ) -> list[Shift]:
     """Return the shift of every parameter; `reference` is least squares, by family."""
     found = []
@@ -84,11 +84,11 @@ def certain_shift(test: Hausman, p: Prepared) -> Array:
     return np.where(test.certain, test.difference, 0.0)[: p.parameters]
 
 
-def including(error: Spread, shift: Array) -> Spread:
+def including(error: CovarianceParts, shift: Array) -> CovarianceParts:
     """Return the spread (k,) of least squares with every certain shift as a systematic part."""
     before = np.diag(error.covariance)
     after = before + shift**2
     with np.errstate(divide="ignore", invalid="ignore"):
         grown = np.where(before > 0, after / before, 1.0)
         share = np.where(after > 0, (error.systematic * before + shift**2) / after, 0.0)
-    return Spread(error.covariance + np.outer(shift, shift), error.dof * grown**2, share)
+    return CovarianceParts(error.covariance + np.outer(shift, shift), error.dof * grown**2, share)

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from analysis.identify.checks import Check
 from analysis.identify.estimators import nuisance as nu
-from analysis.identify.estimators.covariance import Spread
-from analysis.identify.estimators.equations import Fit
+from analysis.identify.estimators.covariance import CovarianceParts
+from analysis.identify.estimators.equations import EquationFit
 from analysis.identify.estimators.robust import outlying
 from analysis.identify.estimators.shifts import LEAST, SHARE, Shift
 
@@ -21,7 +21,7 @@ NOISE_CHECK = "noise in regressors"
 
 
 def nuisance_statement(
-    belief: nu.Belief, names: Sequence[str], beta: Array, error: Spread, wrong: bool
+    belief: nu.Belief, names: Sequence[str], beta: Array, error: CovarianceParts, wrong: bool
 ) -> Check:
     """State what the records say of a nuisance, and whether that can be."""
     i = list(names).index(belief.name)
@@ -99,7 +99,7 @@ def _bounds(s: Shift) -> str:
     )
 
 
-def outlier_statement(family: str, fit: Fit) -> Check:
+def outlier_statement(family: str, fit: EquationFit) -> Check:
     """State the share of rows that the robust loss set aside, in the worst record."""
     shares = outlying(fit)
     record, share = max(shares.items(), key=lambda item: item[1])

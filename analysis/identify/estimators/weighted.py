@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.identify.estimators.equations import (
-    Block,
-    Fit,
+    EquationFit,
+    RepeatBlock,
     common,
     least_squares,
     residual_scatter,
@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 ROUNDS = 2  # of weights from residuals; the first solution is close already
 
 
-def weighted_least_squares(blocks: Sequence[Block]) -> Fit:
+def weighted_least_squares(blocks: Sequence[RepeatBlock]) -> EquationFit:
     """Solve with weights 1 / sigma^2 of each step's equation; blocks need repeats."""
     blocks = common(blocks)
     fit = least_squares(blocks)
@@ -36,7 +36,7 @@ def weighted_least_squares(blocks: Sequence[Block]) -> Fit:
     return fit
 
 
-def _whitened(blocks: Sequence[Block], fit: Fit) -> list[Block]:
+def _whitened(blocks: Sequence[RepeatBlock], fit: EquationFit) -> list[RepeatBlock]:
     """Return the blocks with unit noise, those of a pair of chambers mixed by inv(cholesky)."""
     residuals = fit.residuals()
     deviation = residual_scatter(blocks, residuals)
@@ -67,12 +67,14 @@ def _whitened(blocks: Sequence[Block], fit: Fit) -> list[Block]:
     return out
 
 
-def _paired(blocks: Sequence[Block], place: dict[tuple[int, str, str], int], b: Block) -> bool:
+def _paired(
+    blocks: Sequence[RepeatBlock], place: dict[tuple[int, str, str], int], b: RepeatBlock
+) -> bool:
     cap = place.get((b.run, b.record, b.equation.replace("flow_rod", "flow_cap")))
     return cap is not None and len(blocks[cap].y) == len(b.y)
 
 
-def _whitener(deviation: Array, b: Block) -> Array:
+def _whitener(deviation: Array, b: RepeatBlock) -> Array:
     """Return inv(cholesky(covariance)) of deviations (rows, equations of the pair)."""
     covariance = deviation.T @ deviation / len(deviation)
     try:

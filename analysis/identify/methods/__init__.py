@@ -14,11 +14,11 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from analysis.identify.identify import Identification
 from analysis.identify.methods.search import SearchOptions
 from analysis.identify.methods.sequential import sequential
 from analysis.identify.methods.simultaneous import simultaneous
 from analysis.identify.methods.swarm import search
+from analysis.identify.result import Identification
 from analysis.regression.rows import Filtering
 from analysis.terms.base import Used
 from rig.model.records import Record, Run

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from analysis.regression.rows import Filtering
 from analysis.signals.conditioning import Mask, aligned_channels, condition
 from analysis.simulation.model import Estimate, Model
-from analysis.simulation.simulate import Drive, State, compiled, drive_of, simulate, state_at
+from analysis.simulation.simulate import DrivingInput, State, compiled, drive_of, simulate, state_at
 from analysis.simulation.validate import arrived
 from analysis.terms.base import Used
 from rig.model import channels as ch
@@ -65,7 +65,7 @@ class SearchOptions:
 
 
 @dataclass(frozen=True)
-class Window:
+class SearchWindow:
     """A stretch of the record: where it starts, the state there, what was measured by channel.
 
     `here` (samples,) is false where a sample was lost and nothing is compared.
@@ -80,7 +80,7 @@ class Window:
 
 
 @dataclass(frozen=True)
-class Task:
+class SearchTask:
     """A search's task: the model to fill in, the names searched, their bounds, the data."""
 
     record: str
@@ -88,8 +88,8 @@ class Task:
     names: tuple[str, ...]
     low: Array
     high: Array
-    drive: Drive
-    windows: tuple[Window, ...]
+    drive: DrivingInput
+    windows: tuple[SearchWindow, ...]
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ def step_one(runs: Sequence[Run]) -> Record:
 
 def make_task(
     rig: Rig, record: Record, terms: Sequence[Used], filtering: Filtering, options: SearchOptions
-) -> Task:
+) -> SearchTask:
     """Lay out the search on one record; raises InputError for a rig without nominal values.
 
     Also for a record with a gap of lost samples that a model cannot be simulated through.
@@ -152,8 +152,8 @@ def make_task(
         here = every[first : first + length]
         spread = {n: float(here.sum() * y[here].var()) for n, y in measured.items()}
         start = state_at(signals, int(first))
-        windows.append(Window(int(first), length, start, measured, spread, here))
-    return Task(
+        windows.append(SearchWindow(int(first), length, start, measured, spread, here))
+    return SearchTask(
         record.name, model, names, nominal / options.factor, nominal * options.factor,
         drive, tuple(windows),
     )  # fmt: skip
@@ -179,7 +179,7 @@ def _template(rig: Rig, terms: Sequence[Used], names: Sequence[str]) -> Model:
     return Model(rig, tuple(terms), parameters, np.full((k, k), np.nan))
 
 
-def _stilled(drive: Drive) -> Drive:
+def _stilled(drive: DrivingInput) -> DrivingInput:
     """Hold the locked joints at their mean, without velocity: what STEP1's equations assume."""
     mean = np.where(drive.locked, drive.q.mean(axis=0), drive.q)
     still = np.where(drive.locked, 0.0, 1.0)
@@ -194,7 +194,7 @@ def with_values(model: Model, values: Mapping[str, float]) -> Model:
     return replace(model, parameters=parameters)
 
 
-def score(task: Task, values: Mapping[str, float]) -> Score:
+def score(task: SearchTask, values: Mapping[str, float]) -> Score:
     """Simulate a candidate over all windows and return its error and its fate."""
     ready = compiled(with_values(task.model, values))
     total, lost, samples, fate = 0.0, 0, 0, ""

@@ -22,19 +22,13 @@ import numpy as np
 
 from analysis.identify import checks as ck
 from analysis.identify.checks import Check
-from analysis.identify.estimates import estimates_of
-from analysis.identify.identify import (
-    Identification,
-    RecordRows,
-    build_rows,
-    clusters_of,
-    repeats_of,
-)
-from analysis.identify.methods.stages import Outcome, Stage, as_solution, solve_stages
+from analysis.identify.methods.stages import Outcome, StepRows, as_solution, solve_stages
 from analysis.identify.plausibility import consistency
+from analysis.identify.result import Identification, estimates_of
+from analysis.identify.stacked_rows import RecordRows, build_rows, clusters_of, repeats_of
 from analysis.regression.noise import noise_moments
 from analysis.regression.rows import Filtering, parameters_of
-from analysis.regression.solve import Cluster
+from analysis.regression.solve import RowCluster
 from analysis.signals.conditioning import lost_samples
 from analysis.simulation.model import Estimate, Model, estimate_json, finite
 from analysis.terms.base import FAMILIES, Used
@@ -105,9 +99,9 @@ def _stages(
     runs: Sequence[Run],
     terms: Sequence[Used],
     filtering: Callable[[Record], Filtering],
-) -> tuple[dict[str, list[Stage]], int, list[str]]:
+) -> tuple[dict[str, list[StepRows]], int, list[str]]:
     """Return the stages of each family in the order of the steps, rows masked, records' names."""
-    out: dict[str, list[Stage]] = {family: [] for family in FAMILIES}
+    out: dict[str, list[StepRows]] = {family: [] for family in FAMILIES}
     masked, names = 0, []
     for step in dict.fromkeys(record.step for run in runs for record in run.records):
         part = [
@@ -120,14 +114,14 @@ def _stages(
         for family in FAMILIES:
             clusters = _clusters(built, family)
             if clusters:
-                out[family].append(Stage(step, clusters, noise[family]))
+                out[family].append(StepRows(step, clusters, noise[family]))
     for family, found in out.items():
         if not found:
             raise InputError(f"no {family} row of any record can be used; all of them are masked")
     return out, masked, names
 
 
-def _clusters(built: Sequence[RecordRows], family: str) -> tuple[Cluster, ...]:
+def _clusters(built: Sequence[RecordRows], family: str) -> tuple[RowCluster, ...]:
     repeats = repeats_of(built)
     return tuple(c for one in built for c in clusters_of(one, family, repeats))
 

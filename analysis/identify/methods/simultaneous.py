@@ -11,7 +11,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from analysis.identify.checks import Check, common_rig
-from analysis.identify.identify import Identification, identify
+from analysis.identify.coupled import coupled
+from analysis.identify.result import Identification
 from analysis.regression.rows import Filtering
 from analysis.simulation.model import Estimate
 from analysis.terms.base import Used
@@ -39,7 +40,7 @@ def simultaneous(
         )
     chosen = [run for run in kept if run.records]
     # Least squares as in the paper, whatever noise makes of it: that is what is compared.
-    result = identify(chosen, "coupled", terms, filtering, reject_noise, estimator="ls")
+    result = coupled(chosen, tuple(terms), filtering, reject_noise, estimator="ls")
     statements = (
         Check(
             "records used", used == every,

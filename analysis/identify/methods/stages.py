@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.regression.solve import Cluster, Solution, half_width, merge, solve, triangle
+from analysis.regression.solve import RowCluster, Solution, half_width, merge, solve, triangle
 
 Array = NDArray[np.float64]
 
@@ -40,11 +40,11 @@ class Value:
 
 
 @dataclass(frozen=True)
-class Stage:
+class StepRows:
     """One family's rows of one step, reduced, with the noise moments of its columns."""
 
     step: str
-    clusters: tuple[Cluster, ...]
+    clusters: tuple[RowCluster, ...]
     noise: Array
 
 
@@ -62,7 +62,7 @@ class Outcome:
     lost: Mapping[str, str] = field(default_factory=dict)
 
 
-def solve_stages(names: tuple[str, ...], stages: Sequence[Stage], reject_noise: bool) -> Outcome:
+def solve_stages(names: tuple[str, ...], stages: Sequence[StepRows], reject_noise: bool) -> Outcome:
     """Solve one family step by step in both ways."""
     own: dict[str, list[Value]] = {name: [] for name in names}
     condition = {}
@@ -91,12 +91,12 @@ def _values(step: str, solution: Solution) -> dict[str, Value]:
 
 
 def _use_first(
-    names: tuple[str, ...], stages: Sequence[Stage], reject_noise: bool
+    names: tuple[str, ...], stages: Sequence[StepRows], reject_noise: bool
 ) -> tuple[dict[str, Value], dict[str, str]]:
     """E1: let each step fix what it can, given what the steps before it fixed."""
     known: dict[str, Value] = {}
     lost: dict[str, str] = {}
-    waiting: list[Stage] = []
+    waiting: list[StepRows] = []
     for place, stage in enumerate(stages):
         waiting.append(stage)
         unknown = tuple(name for name in names if name not in known)
@@ -112,7 +112,7 @@ def _use_first(
     return known, {name: why for name, why in lost.items() if name not in known}
 
 
-def _shows(names: tuple[str, ...], stage: Stage, known: Mapping[str, Value]) -> bool:
+def _shows(names: tuple[str, ...], stage: StepRows, known: Mapping[str, Value]) -> bool:
     """Tell whether a stage's rows contain anything that is still unknown."""
     columns = [i for i, name in enumerate(names) if name not in known]
     return any(np.any(c.triangle[:, columns] != 0.0) for c in stage.clusters)
@@ -120,7 +120,7 @@ def _shows(names: tuple[str, ...], stage: Stage, known: Mapping[str, Value]) -> 
 
 def _average(
     names: tuple[str, ...],
-    stages: Sequence[Stage],
+    stages: Sequence[StepRows],
     own: Mapping[str, Sequence[Value]],
     reject_noise: bool,
 ) -> dict[str, Value]:
@@ -141,7 +141,7 @@ def _average(
 
 def _solve_rest(
     names: tuple[str, ...],
-    stages: Sequence[Stage],
+    stages: Sequence[StepRows],
     known: Mapping[str, Value],
     reject_noise: bool,
 ) -> Solution:

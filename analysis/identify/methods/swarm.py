@@ -22,18 +22,17 @@ from numpy.typing import NDArray
 
 from analysis.identify import checks as ck
 from analysis.identify.checks import Check
-from analysis.identify.estimates import estimates_of
-from analysis.identify.identify import Identification
 from analysis.identify.methods.search import (
     COMPLEX,
     DEAD,
     DIVERGED,
     SearchOptions,
-    Task,
+    SearchTask,
     make_task,
     score,
     step_one,
 )
+from analysis.identify.result import Identification, estimates_of
 from analysis.regression.rows import Filtering, parameters_of
 from analysis.regression.solve import Solution
 from analysis.simulation.model import Model
@@ -102,7 +101,9 @@ def search(
     return _identification(method, runs, task, trail, options)
 
 
-def run_search(method: str, task: Task, options: SearchOptions, rng: np.random.Generator) -> Trail:
+def run_search(
+    method: str, task: SearchTask, options: SearchOptions, rng: np.random.Generator
+) -> Trail:
     """Let the algorithm propose generations until the evaluations are spent."""
     started = time.perf_counter()
     algorithm, evaluator, wrap = _pymoo(method, task, options, rng)
@@ -139,7 +140,7 @@ def run_search(method: str, task: Task, options: SearchOptions, rng: np.random.G
 
 
 def _pymoo(
-    method: str, task: Task, options: SearchOptions, rng: np.random.Generator
+    method: str, task: SearchTask, options: SearchOptions, rng: np.random.Generator
 ) -> tuple[Any, Any, Callable[[Array], Any]]:
     """Return pymoo's algorithm, its evaluator, and how it wants to be told errors (n,)."""
     # An extra: who never searches need not install it.
@@ -165,12 +166,12 @@ def _pymoo(
     )
 
 
-def _values(task: Task, point: Array) -> dict[str, float]:
+def _values(task: SearchTask, point: Array) -> dict[str, float]:
     return dict(zip(task.names, map(float, task.low * 10.0**point), strict=True))
 
 
 def _identification(
-    method: str, runs: Sequence[Run], task: Task, trail: Trail, options: SearchOptions
+    method: str, runs: Sequence[Run], task: SearchTask, trail: Trail, options: SearchOptions
 ) -> Identification:
     rig, used = task.model.rig, task.model.terms
     solutions = {family: _as_solution(method, task, trail, family) for family in FAMILIES}
@@ -191,7 +192,7 @@ def _identification(
     )
 
 
-def _as_solution(method: str, task: Task, trail: Trail, family: str) -> Solution:
+def _as_solution(method: str, task: SearchTask, trail: Trail, family: str) -> Solution:
     """Return a family's values as a solution of no rows: no interval, no condition number."""
     coefficients = {
         c.parameter: c for u in task.model.terms for c in u.term.coefficients(task.model.rig)
@@ -211,7 +212,9 @@ def _fates(trail: Trail) -> str:
     return ", ".join(f"{count} {fate}" for fate, count in trail.lost.items())
 
 
-def _statements(method: str, runs: Sequence[Run], task: Task, trail: Trail) -> tuple[Check, ...]:
+def _statements(
+    method: str, runs: Sequence[Run], task: SearchTask, trail: Trail
+) -> tuple[Check, ...]:
     gone = sum(trail.lost.values())
     share = 100.0 * gone / trail.evaluations
     parameters = len(task.model.parameters)
@@ -252,7 +255,7 @@ def _statements(method: str, runs: Sequence[Run], task: Task, trail: Trail) -> t
     )
 
 
-def trail_json(task: Task, trail: Trail, options: SearchOptions) -> dict[str, Any]:
+def trail_json(task: SearchTask, trail: Trail, options: SearchOptions) -> dict[str, Any]:
     """Return the search as plain data."""
     return {
         "record": task.record,

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from analysis.identify.checks import Check
 from analysis.identify.estimators import nuisance as nu
-from analysis.identify.estimators.covariance import Spread, spread
+from analysis.identify.estimators.covariance import CovarianceParts, spread
 from analysis.identify.estimators.equations import Pieces
 from analysis.identify.output_error.window_data import Reduced
 from analysis.identify.output_error.windows import WINDOW, Windows
@@ -45,7 +45,7 @@ class OutputErrorFit:
 
     names: tuple[str, ...]
     value: Array
-    spread: Spread
+    spread: CovarianceParts
     check: Check
 
     def solution(self, family: str, solution: Solution) -> Solution:
@@ -187,7 +187,9 @@ class Search:
             moves = inverse @ belief.h / belief.std
             covariance = covariance + np.outer(moves, moves)
         grown = np.diag(covariance) / np.maximum(np.diag(error.covariance), 1e-300)
-        error = Spread(covariance, error.dof * np.minimum(grown, 1e6) ** 2, error.systematic)
+        error = CovarianceParts(
+            covariance, error.dof * np.minimum(grown, 1e6) ** 2, error.systematic
+        )
         failed = len(self.stretches) - len(pairs)
         settled = moved < 1.0
         detail = (

@@ -30,7 +30,7 @@ from analysis.regression.rows import default_filtering
 from analysis.regression.solve import Solution
 from analysis.signals.conditioning import Mask, aligned_channels, condition
 from analysis.simulation.model import Estimate, Model
-from analysis.simulation.simulate import Drive, State, compiled, drive_of, simulate
+from analysis.simulation.simulate import DrivingInput, State, compiled, drive_of, simulate
 from analysis.simulation.validate import arrived, first_state
 from analysis.terms.base import Used
 from rig.model import channels as ch
@@ -52,7 +52,7 @@ class _Record:
         signals = condition(rig, record, default_filtering(record).channels)
         channels = aligned_channels(rig, record)
         self.key, self.repeat = (run, record.step), record.repeat
-        self.drive: Drive = drive_of(signals)
+        self.drive: DrivingInput = drive_of(signals)
         self.start: State = first_state(rig, record, signals, channels)
         self.names = [
             ch.channel(rig.position_kind, i + 1) for i in map(int, np.flatnonzero(signals.excited))

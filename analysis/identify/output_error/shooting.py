@@ -64,7 +64,7 @@ def parts_of(terms: Sequence[Used], rate: float) -> int:
 
 
 @dataclass(frozen=True)
-class Window:
+class ShootingWindow:
     """A stretch of a record: its first sample and how many points are compared."""
 
     first: int
@@ -78,7 +78,7 @@ def shoot(
     inputs: Array,
     rate: float,
     locked: NDArray[np.bool_],
-    window: Window,
+    window: ShootingWindow,
     every: int,
     parts: int = 1,
 ) -> Array | None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.identify.output_error.shooting import Window
+from analysis.identify.output_error.shooting import ShootingWindow
 from analysis.signals.conditioning import Mask, Signals
 from analysis.simulation.simulate import Compiled
 
@@ -22,12 +22,12 @@ class Stretch:
     stratum: int
     repeat: int
     part: int
-    window: Window
+    window: ShootingWindow
     measured: Array
 
 
 @dataclass(frozen=True)
-class Source:
+class WindowSource:
     """One record: signals and inputs of the integrator, oil temperature less nominal [K].
 
     The signals are free of what the model says of sensors.

@@ -11,8 +11,13 @@ from numpy.typing import NDArray
 
 from analysis.effects.base import ordered
 from analysis.identify.estimators import nuisance as nu
-from analysis.identify.output_error.shooting import SAMPLES_PER_STEP, Window, parts_of, shoot
-from analysis.identify.output_error.window_data import Nudged, Reduced, Source, Stretch
+from analysis.identify.output_error.shooting import (
+    SAMPLES_PER_STEP,
+    ShootingWindow,
+    parts_of,
+    shoot,
+)
+from analysis.identify.output_error.window_data import Nudged, Reduced, Stretch, WindowSource
 from analysis.regression.rows import default_filtering
 from analysis.signals.conditioning import Mask, condition
 from analysis.signals.filters import channel_filter
@@ -65,7 +70,7 @@ class Windows:
             and all(ch.TEMPERATURE in r.channels for run in runs for r in run.records)
         )
         self.names = (*names, nu.KAPPA) if self.warm else names
-        self.sources: list[Source] = []
+        self.sources: list[WindowSource] = []
         self.stretches: list[Stretch] = []
         self._idle: dict[int, set[int]] = {}
         self._cut(runs)
@@ -82,7 +87,9 @@ class Windows:
                 (drive.p_s, drive.temperature, drive.u, drive.q, drive.qd, drive.qdd)
             )
             kelvin = float(np.mean(signals.temperature)) - self.rig.oil.temperature
-            self.sources.append(Source(signals, np.ascontiguousarray(inputs), drive.locked, kelvin))
+            self.sources.append(
+                WindowSource(signals, np.ascontiguousarray(inputs), drive.locked, kelvin)
+            )
             free = ~drive.locked
             every = self.every
             points = round(WINDOW * record.sample_rate) // (SAMPLES_PER_STEP * every)
@@ -99,7 +106,7 @@ class Windows:
                 at = first + SAMPLES_PER_STEP * every * np.arange(points)
                 self.stretches.append(
                     Stretch(len(self.sources) - 1, strata[i, record.step], record.repeat, part,
-                             Window(first, points), measured[at])
+                             ShootingWindow(first, points), measured[at])
                 )  # fmt: skip
         if not self.stretches:
             raise InputError(
@@ -161,7 +168,7 @@ class Windows:
         moved[self._state_places(stretch)] += change
         return moved
 
-    def _nudged(self, theta: Array, source: Source) -> Nudged:
+    def _nudged(self, theta: Array, source: WindowSource) -> Nudged:
         """Compile the model with every parameter nudged, and find where its own states stand."""
         nudges = NUDGE * np.where(theta == 0.0, 1.0, np.abs(theta))
         if self.warm:

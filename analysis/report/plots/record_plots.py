@@ -42,7 +42,7 @@ FEWEST_LINES = 10  # of the period's multiples that a spectrum shows: a sine's h
 
 
 @dataclass(frozen=True)
-class Lines:
+class LineSpectrum:
     """Amplitudes [V] at multiples of 1/period: frequency [Hz], amplitude, which were excited."""
 
     frequency: Array
@@ -51,7 +51,7 @@ class Lines:
     even: NDArray[np.bool_]
 
 
-def line_spectrum(record: Record, x: Array) -> Lines | None:
+def line_spectrum(record: Record, x: Array) -> LineSpectrum | None:
     """Return a channel's amplitude [V peak] at the period's multiples; None if not periodic.
 
     Over whole periods only, so that no line leaks into its neighbours.
@@ -63,7 +63,7 @@ def line_spectrum(record: Record, x: Array) -> Lines | None:
     spectrum = 2.0 * np.abs(np.fft.rfft(whole)) / len(whole)
     shown = max(round(1.35 * max(record.lines)), FEWEST_LINES)
     k = np.arange(1, min(shown, record.period // 2) + 1)
-    return Lines(
+    return LineSpectrum(
         k * record.sample_rate / record.period, spectrum[k * periods],
         np.isin(k, record.lines), k % 2 == 0,
     )  # fmt: skip

@@ -15,9 +15,15 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.trace.clues.equation_rows import Part, Side, columns_of, judged, side_of
+from analysis.trace.clues.equation_rows import (
+    EquationPart,
+    EquationRows,
+    columns_of,
+    judged,
+    side_of,
+)
 from analysis.trace.clues.variables import factor_of, factors, variables
-from analysis.trace.data.regression_data import Board
+from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.result import Dependence
 from analysis.trace.search.hypothesis import excess_of
 from rig.model import channels as ch
@@ -47,17 +53,21 @@ def hats(v: Array, knots: Array) -> Array:
 
 
 def dependence(
-    train: Board, left: Array, judge: Board, judge_left: Array, equations: Sequence[str]
+    train: RegressionData,
+    residual: Array,
+    holdout_data: RegressionData,
+    judge_left: Array,
+    equations: Sequence[str],
 ) -> list[Dependence]:
     """Return what the residual moves with by share of the energy above noise, most telling first.
 
-    `left` (M,) and `judge_left` are residuals under the model of `train` (rebased to it).
+    `residual` (M,) and `judge_left` are residuals under the model of `train` (rebased to it).
     """
-    weight = {e: max(0.0, v) for e, v in excess_of(train, left).items() if e in equations}
+    weight = {e: max(0.0, v) for e, v in excess_of(train, residual).items() if e in equations}
     total = sum(weight.values()) or 1.0
     found: dict[tuple[str, str], dict[str, float]] = {}
     for equation in equations:
-        sides = side_of(train, left, equation), side_of(judge, judge_left, equation)
+        sides = side_of(train, residual, equation), side_of(holdout_data, judge_left, equation)
         for key, share in _shares(train.rig, equation, *sides).items():
             found.setdefault(key, {})[equation] = share
     sums = {k: sum(s * weight[e] / total for e, s in by.items()) for k, by in found.items()}
@@ -109,7 +119,7 @@ def _telling(name: str, equation: str, shares: Mapping[tuple[str, str], float]) 
 
 
 def _shares(
-    rig: Rig, equation: str, first: Side | None, second: Side | None
+    rig: Rig, equation: str, first: EquationRows | None, second: EquationRows | None
 ) -> dict[tuple[str, str], float]:
     """Return the share of every curve alone, factor alone (variable ''), and product of both.
 
@@ -120,7 +130,7 @@ def _shares(
         return {}
     joint = int(equation.rsplit("_", 1)[1]) - 1
     every = [*first.parts, *second.parts]
-    travel = max(float(np.ptp(p.scene.signals.s[:, joint])) for p in every)
+    travel = max(float(np.ptp(p.conditioned.signals.s[:, joint])) for p in every)
     values = [variables(rig, p.seen, joint) for p in every]
     by = factors(equation)
     scales = [
@@ -149,8 +159,8 @@ def _shares(
     return out
 
 
-def _moves(part: Part, joint: int) -> bool:
-    return joint + 1 not in part.scene.record.locked
+def _moves(part: EquationPart, joint: int) -> bool:
+    return joint + 1 not in part.conditioned.record.locked
 
 
 def _knots(values: Array) -> Array | None:

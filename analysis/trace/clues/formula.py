@@ -10,18 +10,17 @@ monomials are forces at the piston, times the linkage's G.
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analysis.signals.conditioning import Signals
-from analysis.trace.clues.equation_rows import Side, columns_of, fitted_to, judged, side_of
+from analysis.trace.clues.equation_rows import EquationRows, columns_of, fitted_to, judged, side_of
 from analysis.trace.clues.variables import factor_of
-from analysis.trace.data.regression_data import Board
+from analysis.trace.data.regression_data import RegressionData
+from analysis.trace.result import Formula
 from rig.model import channels as ch
 from rig.model.rig import Rig
 
@@ -31,41 +30,6 @@ MOST: Final = 3  # monomials
 ADDS: Final = 0.05  # of the held-out energy above noise that one more must take
 OFFERED: Final = 0.5  # share that a formula must take to be worth reading
 ALIKE: Final = 0.999  # correlation from which two columns are one
-SURE: Final = 0.9  # share from which a formula goes before free curves
-FEW: Final = 2  # monomials of such a one: three bend to much
-_NAME: Final = re.compile(r"[a-z]+(?:_[a-z]+)*(?:_[0-9]+)?")
-
-
-@dataclass(frozen=True)
-class Formula:
-    """What an equation lacks, about: coefficient [SI] by monomial, and the held-out share taken."""
-
-    equation: str
-    terms: Mapping[str, float]
-    share: float
-    at_piston: bool
-
-    @property
-    def text(self) -> str:
-        """The formula in one line."""
-        parts = [f"{value:+.3g} {name}".replace("e-0", "e-") for name, value in self.terms.items()]
-        line = " ".join(parts).removeprefix("+")
-        what = "force at the piston [N]" if self.at_piston else f"{self.equation} [SI]"
-        return f"{what} ≈ {line}"
-
-    @property
-    def sure(self) -> bool:
-        """Whether it goes before free curves: a few monomials that leave next to nothing."""
-        return self.share >= SURE and len(self.terms) <= FEW and bool(self.variables)
-
-    @property
-    def variables(self) -> tuple[str, ...]:
-        """The variables of its first monomial that has any, in the order they stand there."""
-        for name in self.terms:
-            found = [word for word in _NAME.findall(name) if word != "sign"]
-            if found:
-                return tuple(dict.fromkeys(found))
-        return ()
 
 
 def surest(formulas: Sequence[Formula]) -> Formula | None:
@@ -74,18 +38,22 @@ def surest(formulas: Sequence[Formula]) -> Formula | None:
 
 
 def formula(
-    train: Board, left: Array, judge: Board, judge_left: Array, equation: str
+    train: RegressionData,
+    residual: Array,
+    holdout_data: RegressionData,
+    judge_left: Array,
+    equation: str,
 ) -> Formula | None:
     """Return the formula of what is left of an equation, None where none takes half of it.
 
-    `left` (M,) and `judge_left` are residuals under the model of `train` (rebased to it).
+    `residual` (M,) and `judge_left` are residuals under the model of `train` (rebased to it).
     """
-    first = side_of(train, left, equation)
-    second = side_of(judge, judge_left, equation)
+    first = side_of(train, residual, equation)
+    second = side_of(holdout_data, judge_left, equation)
     if first is None or second is None:
         return None
     names, one, two = _library(train.rig, equation, first, second)
-    both = Side((), np.concatenate((first.rest, second.rest)), np.zeros((0, 0)))
+    both = EquationRows((), np.concatenate((first.rest, second.rest)), np.zeros((0, 0)))
     chosen = _selected(np.concatenate((one, two)), both)
     share = judged(one[:, chosen], first, two[:, chosen], second) if chosen else 0.0
     if share < OFFERED:
@@ -97,12 +65,12 @@ def formula(
 
 
 def _library(
-    rig: Rig, equation: str, one: Side, two: Side
+    rig: Rig, equation: str, one: EquationRows, two: EquationRows
 ) -> tuple[list[str], Array, Array]:  # fmt: skip
     """Return the monomials' names and their columns on either side, what is one left out."""
     joint = int(equation.rsplit("_", 1)[1]) - 1
     every = [*one.parts, *two.parts]
-    travel = max(float(np.ptp(p.scene.signals.s[:, joint])) for p in every)
+    travel = max(float(np.ptp(p.conditioned.signals.s[:, joint])) for p in every)
     made = [_monomials(rig, equation, p.seen, joint, travel) for p in every]
     names = list(made[0])
     stacks = [np.column_stack([m[n] for n in names]) for m in made]
@@ -154,7 +122,7 @@ def _monomials(
     return out | {f"{place} {spool}": x * u, f"{spool} time": u * t}
 
 
-def _selected(columns: Array, side: Side) -> list[int]:
+def _selected(columns: Array, side: EquationRows) -> list[int]:
     """Return the columns chosen, in the order they were; none idle."""
     chosen: list[int] = []
     share = 0.0
@@ -172,6 +140,6 @@ def _selected(columns: Array, side: Side) -> list[int]:
     return chosen
 
 
-def _share(chosen: list[int], columns: Array, side: Side) -> float:
+def _share(chosen: list[int], columns: Array, side: EquationRows) -> float:
     """Return the share of a side's energy above noise that the chosen columns take of it."""
     return judged(columns[:, chosen], side, columns[:, chosen], side)

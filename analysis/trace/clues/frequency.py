@@ -13,8 +13,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.trace.data.regression_data import Board
-from analysis.trace.data.spectral_lines import Lines
+from analysis.trace.data.regression_data import RegressionData
+from analysis.trace.data.spectral_lines import SpectralLines
 from analysis.trace.result import Dependence
 from analysis.trace.search.hypothesis import excess_of
 
@@ -30,11 +30,15 @@ STEPS = 41  # of the search, over one line on either side
 
 
 def frequency_clue(
-    found: Sequence[Lines], train: Board, left: Array, judge: Board, judge_left: Array
+    found: Sequence[SpectralLines],
+    train: RegressionData,
+    residual: Array,
+    holdout_data: RegressionData,
+    judge_left: Array,
 ) -> Dependence | None:
     """Return the clue of the loudest equation that repeats at one frequency, None of none.
 
-    `left` (M,) and `judge_left` are whitened residuals of averaged records, as in `clues`.
+    `residual` (M,) and `judge_left` are whitened residuals of averaged records, as in `clues`.
     """
     for one in sorted(found, key=lambda one: -one.loud_after):
         near = _peak(one) if one.loud_after >= 1.0 else None
@@ -42,16 +46,16 @@ def frequency_clue(
             continue
         width = one.frequency[1]
         tried = np.linspace(near - width, near + width, STEPS)
-        f = max(tried, key=lambda f: _taken(train, left, one.equation, float(f)))
-        energy = excess_of(judge, judge_left)[one.equation]
-        share = _taken(judge, judge_left, one.equation, float(f)) / max(energy, 1e-300)
+        f = max(tried, key=lambda f: _taken(train, residual, one.equation, float(f)))
+        energy = excess_of(holdout_data, judge_left)[one.equation]
+        share = _taken(holdout_data, judge_left, one.equation, float(f)) / max(energy, 1e-300)
         if energy > 0 and share >= LEAST:
             words = f"a frequency of {f:.3g} Hz"
             return Dependence(FREQUENCY, min(1.0, share), one.equation, words=words)
     return None
 
 
-def _peak(one: Lines) -> float | None:
+def _peak(one: SpectralLines) -> float | None:
     """Return where [Hz] most of what is left stands, None where it is spread."""
     power = np.maximum(one.after, 0.0)
     power[0] = 0.0
@@ -66,14 +70,14 @@ def _peak(one: Lines) -> float | None:
     return float(np.average(one.frequency[here], weights=power[here]))
 
 
-def _taken(stage: Board, left: Array, equation: str, f: float) -> float:
+def _taken(data: RegressionData, residual: Array, equation: str, f: float) -> float:
     """Return the energy above chance that a sine and a cosine of f [Hz] take in all records."""
     total = 0.0
-    for scene, rows in zip(stage.scenes, stage.rows, strict=True):
-        for s in stage.segments:
-            if s.group == scene.group and s.equation == equation:
+    for conditioned, rows in zip(data.records, data.rows, strict=True):
+        for s in data.segments:
+            if s.group == conditioned.group and s.equation == equation:
                 angle = 2 * np.pi * f * rows[equation].time
                 waves = np.column_stack((np.sin(angle), np.cos(angle)))
                 Q, _ = np.linalg.qr(waves)
-                total += float(np.sum((Q.T @ left[s.where]) ** 2)) - 2.0
+                total += float(np.sum((Q.T @ residual[s.where]) ** 2)) - 2.0
     return total

@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Scene:
+class ConditionedRecord:
     """One record made ready: its signals under the channel filter, its filters, its equations.
 
     `families` are the families of rows that are looked at, by default all.
@@ -58,12 +58,12 @@ def trace_filtering(record: Record) -> Filtering:
     return replace(chosen, step=max(step, (chosen.step + 1) // 2))
 
 
-def scenes(
+def conditioned_records(
     rig: Rig,
     runs: Sequence[Run],
     filtering: Callable[[Record], Filtering] = trace_filtering,
     families: tuple[str, ...] = tuple(FAMILIES),
-) -> list[Scene]:
+) -> list[ConditionedRecord]:
     """Condition every record of the runs; raises InputError for a record that cannot be used."""
     out = []
     for index, run in enumerate(runs):
@@ -71,11 +71,11 @@ def scenes(
             ck.refuse_dead_channels(rig, record)
             filters = filtering(record)
             signals = condition(rig, record, filters.channels)
-            out.append(Scene(index, record, signals, filters, families))
+            out.append(ConditionedRecord(index, record, signals, filters, families))
     return out
 
 
-def held(term: Term, scene: Scene) -> bool:
+def held(term: Term, conditioned: ConditionedRecord) -> bool:
     """Tell whether an effect at a joint cannot show because the joint is locked.
 
     A sensor of a locked joint still tells where that joint stands.
@@ -83,7 +83,7 @@ def held(term: Term, scene: Scene) -> bool:
     where = term.where
     if not where.startswith("joint ") or getattr(term, "stage", None) == SENSOR:
         return False
-    return int(where.split()[1]) in scene.record.locked
+    return int(where.split()[1]) in conditioned.record.locked
 
 
 def changes_signals(term: Term) -> bool:
@@ -99,26 +99,30 @@ def acts_on(rig: Rig, term: Term, family: str) -> bool:
     return changes_signals(term) and family in getattr(term, "alters", FAMILIES)
 
 
-def scene_rows(rig: Rig, terms: Sequence[Used], scene: Scene) -> dict[str, Rows]:
+def model_rows(rig: Rig, terms: Sequence[Used], conditioned: ConditionedRecord) -> dict[str, Rows]:
     """Return the rows of one record under a model (see `analysis.regression.rows.record_rows`)."""
-    return record_rows(rig, ordered(terms), scene.signals, scene.filtering, scene.families)
+    return record_rows(
+        rig, ordered(terms), conditioned.signals, conditioned.filtering, conditioned.families
+    )
 
 
-def prepared(rig: Rig, terms: Sequence[Used], scene: Scene) -> Signals:
+def prepared(rig: Rig, terms: Sequence[Used], conditioned: ConditionedRecord) -> Signals:
     """Return the signals of a record as the terms of a model see them."""
-    signals = scene.signals
+    signals = conditioned.signals
     for used in ordered(terms):
         signals = used.term.prepare(rig, signals, used.shape)
     return signals
 
 
-def filtered(columns: Mapping[str, Array], scene: Scene, rows: Rows) -> dict[str, Array]:
+def filtered(
+    columns: Mapping[str, Array], conditioned: ConditionedRecord, rows: Rows
+) -> dict[str, Array]:
     """Filter point-by-point columns (n,) as `rows` were, at the instants of `rows`."""
     names = list(columns)
-    reach, filters = scene.filtering.channels.reach, scene.filtering
-    n = scene.record.samples
+    reach, filters = conditioned.filtering.channels.reach, conditioned.filtering
+    n = conditioned.record.samples
     stack = np.column_stack([columns[name] for name in names])[reach : n - reach]
-    time = scene.signals.t[reach : n - reach]
+    time = conditioned.signals.t[reach : n - reach]
     if filters.rows is not None:
         stack_out = filters.rows.decimate(stack, filters.step)
         first = -(-2 * filters.rows.reach // filters.step) * filters.step - filters.rows.reach
@@ -132,7 +136,7 @@ def filtered(columns: Mapping[str, Array], scene: Scene, rows: Rows) -> dict[str
 def candidate_columns(
     rig: Rig,
     terms: Sequence[Used],
-    scene: Scene,
+    conditioned: ConditionedRecord,
     seen: Signals,
     rows: Mapping[str, Rows],
     beta: Mapping[str, float],
@@ -146,18 +150,18 @@ def candidate_columns(
     if not changes_signals(used.term):
         raw: Columns = used.term.columns(rig, seen, used.shape)
         return {
-            name: filtered(raw[name], scene, rows[name])
+            name: filtered(raw[name], conditioned, rows[name])
             for name in rows
             if name in raw and any(np.any(v) for v in raw[name].values())
         }
-    changed = scene_rows(rig, (*terms, used), scene)
+    changed = model_rows(rig, (*terms, used), conditioned)
     own = [c.parameter for c in used.term.coefficients(rig)]
     out: dict[str, dict[str, Array]] = {}
     for name, before in rows.items():
         after = changed[name]
         _, here, there = np.intersect1d(before.time, after.time, return_indices=True)
         difference = np.zeros(len(before.rhs))
-        difference[here] = residual(before, beta)[here] - residual(after, beta)[there]
+        difference[here] = row_residual(before, beta)[here] - row_residual(after, beta)[there]
         found = {"": difference}
         for k, parameter in enumerate(after.names):
             if parameter in own and np.any(after.matrix[:, k]):
@@ -169,7 +173,7 @@ def candidate_columns(
     return out
 
 
-def residual(rows: Rows, beta: Mapping[str, float]) -> Array:
+def row_residual(rows: Rows, beta: Mapping[str, float]) -> Array:
     """Return y - X beta (m,), coefficients that `beta` lacks being zero."""
     vector = np.array([beta.get(name, 0.0) for name in rows.names])
     return np.asarray(rows.rhs - rows.matrix @ vector)

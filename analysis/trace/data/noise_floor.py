@@ -23,7 +23,7 @@ from analysis.regression.noise import disturbed
 from analysis.regression.rows import Rows
 from analysis.signals.conditioning import condition, moving_joints
 from analysis.terms.base import Used
-from analysis.trace.data.conditioned_record import Scene, residual, scene_rows
+from analysis.trace.data.conditioned_record import ConditionedRecord, model_rows, row_residual
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
@@ -66,23 +66,23 @@ def split(repeats: Array) -> tuple[float, float]:
 def floors(
     rig: Rig,
     terms: Sequence[Used],
-    members: Sequence[Scene],
+    members: Sequence[ConditionedRecord],
     rows: Sequence[Mapping[str, Rows]],
     beta: Mapping[str, float],
 ) -> list[Floor]:
     """Return the split of every equation of every group of records under a model."""
     groups: dict[Group, list[int]] = {}
-    for index, scene in enumerate(members):
-        groups.setdefault(scene.group, []).append(index)
+    for index, conditioned in enumerate(members):
+        groups.setdefault(conditioned.group, []).append(index)
     out = []
     for group, indices in groups.items():
         stated = stated_noise(rig, terms, members[indices[0]], rows[indices[0]], beta)
         for equation in rows[indices[0]]:
             parts = [rows[i][equation] for i in indices if equation in rows[i]]
-            left = [residual(r, beta) for r in parts]
-            every = np.concatenate(left)
+            residual = [row_residual(r, beta) for r in parts]
+            every = np.concatenate(residual)
             total = float(np.sqrt(np.mean(every**2))) if len(every) else 0.0  # all rows masked
-            table, source = repeats_of(members[indices[0]], parts, left)
+            table, source = repeats_of(members[indices[0]], parts, residual)
             if table is not None:
                 noise, repeatable = split(table)
                 noise = max(noise, LEAST * stated[equation])
@@ -95,7 +95,7 @@ def floors(
 
 
 def repeats_of(
-    scene: Scene, parts: Sequence[Rows], left: Sequence[Array]
+    conditioned: ConditionedRecord, parts: Sequence[Rows], residual: Sequence[Array]
 ) -> tuple[Array | None, str]:
     """Return residuals of repeats, or of one record's periods, one under the other (n, m)."""
     if len(parts) > 1:
@@ -103,26 +103,26 @@ def repeats_of(
         for rows in parts[1:]:
             common = np.intersect1d(common, rows.time)
         if len(common) >= 10:
-            picked = [r[np.isin(p.time, common)] for p, r in zip(parts, left, strict=True)]
+            picked = [r[np.isin(p.time, common)] for p, r in zip(parts, residual, strict=True)]
             return np.array(picked), REPEATS
     if len(parts) == 1:
-        table = _periods(scene, parts[0], left[0])
+        table = _periods(conditioned, parts[0], residual[0])
         if table is not None:
             return table, PERIODS
     return None, STATED
 
 
-def _periods(scene: Scene, rows: Rows, left: Array) -> Array | None:
+def _periods(conditioned: ConditionedRecord, rows: Rows, residual: Array) -> Array | None:
     """Cut a record's residual into whole periods, one under the other.
 
     Of a record of less than three, what the first two have in common, if that is a quarter of a
     period or more; None where there is less than that, or periods of fewer than five rows.
     """
-    period, step = scene.record.period, scene.filtering.step
+    period, step = conditioned.record.period, conditioned.filtering.step
     if not period or period % step or not len(rows.time):
         return None
     per = period // step
-    index = np.rint((rows.time - rows.time[0]) * scene.record.sample_rate / step).astype(int)
+    index = np.rint((rows.time - rows.time[0]) * conditioned.record.sample_rate / step).astype(int)
     whole = (int(index[-1]) + 1) // per
     if whole < 3:
         least, whole = max(5, per // 4), 2
@@ -132,7 +132,7 @@ def _periods(scene: Scene, rows: Rows, left: Array) -> Array | None:
         return None
     grid = np.full(whole * per, np.nan)
     inside = index < whole * per
-    grid[index[inside]] = left[inside]
+    grid[index[inside]] = residual[inside]
     table = grid.reshape(whole, per)
     table = table[:, np.isfinite(table).all(axis=0)]
     return table if table.shape[1] >= least else None
@@ -141,19 +141,19 @@ def _periods(scene: Scene, rows: Rows, left: Array) -> Array | None:
 def stated_noise(
     rig: Rig,
     terms: Sequence[Used],
-    scene: Scene,
+    conditioned: ConditionedRecord,
     rows: Mapping[str, Rows],
     beta: Mapping[str, float],
 ) -> dict[str, float]:
     """Return the rms that the rig's stated sensor noise alone puts into each residual."""
     rng = np.random.default_rng(0)  # a prediction, the same every time
-    record = disturbed(rig, scene.record, rng)
-    moving = moving_joints(rig, scene.record)
-    signals = condition(rig, record, scene.filtering.channels, moving)
-    again = scene_rows(rig, terms, replace(scene, record=record, signals=signals))
+    record = disturbed(rig, conditioned.record, rng)
+    moving = moving_joints(rig, conditioned.record)
+    signals = condition(rig, record, conditioned.filtering.channels, moving)
+    again = model_rows(rig, terms, replace(conditioned, record=record, signals=signals))
     out = {}
     for name, before in rows.items():
         _, a, b = np.intersect1d(before.time, again[name].time, return_indices=True)
-        change = residual(again[name], beta)[b] - residual(before, beta)[a]
+        change = row_residual(again[name], beta)[b] - row_residual(before, beta)[a]
         out[name] = float(np.sqrt(np.mean(change**2))) if len(change) else NO_ROWS
     return out

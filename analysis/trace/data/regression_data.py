@@ -22,12 +22,12 @@ from analysis.signals.conditioning import Signals, condition, moving_joints
 from analysis.terms.base import Used
 from analysis.trace.data.candidates import Variant
 from analysis.trace.data.conditioned_record import (
-    Scene,
+    ConditionedRecord,
     candidate_columns,
     held,
+    model_rows,
     prepared,
-    residual,
-    scene_rows,
+    row_residual,
 )
 from analysis.trace.data.noise_floor import Floor, Group, floors
 from rig.model.parse import InputError
@@ -53,10 +53,10 @@ class Segment:
 
 
 @dataclass(frozen=True)
-class Board:
-    """Whitened rows: `base` (M, k) of `names`, `left` (R, M) residuals of the repeats.
+class RegressionData:
+    """Whitened rows: `base` (M, k) of `names`, `residual` (R, M) residuals of the repeats.
 
-    `left[r]` is NaN on segments with fewer repeats. `scenes` are the averaged records.
+    `residual[r]` is NaN on segments with fewer repeats. `records` are the averaged records.
     """
 
     rig: Rig
@@ -64,35 +64,35 @@ class Board:
     beta: Mapping[str, float]
     names: tuple[str, ...]
     base: Array
-    left: Array
+    residual: Array
     segments: tuple[Segment, ...]
     floors: tuple[Floor, ...]
-    scenes: tuple[Scene, ...]
+    records: tuple[ConditionedRecord, ...]
     rows: tuple[Mapping[str, Rows], ...]
     memo: dict[Hashable, dict[str, Rows]] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def mean(self) -> Array:
         """The averaged residual (M,), in units of its own noise."""
-        weights = np.zeros(self.left.shape[1])
+        weights = np.zeros(self.residual.shape[1])
         for segment in self.segments:
             weights[segment.where] = np.sqrt(segment.repeats)
-        return np.asarray(np.nanmean(self.left, axis=0) * weights)
+        return np.asarray(np.nanmean(self.residual, axis=0) * weights)
 
 
-def averaged(rig: Rig, members: Sequence[Scene]) -> list[Scene]:
+def averaged(rig: Rig, members: Sequence[ConditionedRecord]) -> list[ConditionedRecord]:
     """Return one scene per group: the repeats' channels averaged, filtered as they were."""
-    groups: dict[Group, list[Scene]] = {}
-    for scene in members:
-        groups.setdefault(scene.group, []).append(scene)
+    groups: dict[Group, list[ConditionedRecord]] = {}
+    for conditioned in members:
+        groups.setdefault(conditioned.group, []).append(conditioned)
     return [_average(rig, repeats) for repeats in groups.values()]
 
 
-def _average(rig: Rig, repeats: Sequence[Scene]) -> Scene:
+def _average(rig: Rig, repeats: Sequence[ConditionedRecord]) -> ConditionedRecord:
     first = repeats[0]
     if len(repeats) == 1:
         return first
-    n = min(scene.record.samples for scene in repeats)
+    n = min(conditioned.record.samples for conditioned in repeats)
     names = [c for c in first.record.channels if all(c in s.record.channels for s in repeats)]
     channels = {
         name: np.mean([np.asarray(s.record.channels[name])[:n] for s in repeats], axis=0)
@@ -121,25 +121,25 @@ def least_squares(rig: Rig, rows: Sequence[Mapping[str, Rows]]) -> dict[str, flo
     return out
 
 
-def board(
+def regression_data(
     rig: Rig,
     terms: Sequence[Used],
-    members: Sequence[Scene],
+    members: Sequence[ConditionedRecord],
     beta: Mapping[str, float] | None = None,
-) -> Board:
+) -> RegressionData:
     """Lay out records under a model with coefficients `beta`, or fitted here; see the module."""
-    every = [scene_rows(rig, terms, scene) for scene in members]
+    every = [model_rows(rig, terms, conditioned) for conditioned in members]
     beta = least_squares(rig, every) if beta is None else beta
     split = floors(rig, terms, members, every, beta)
     mean_scenes = averaged(rig, members)
-    mean_rows = [scene_rows(rig, terms, scene) for scene in mean_scenes]
+    mean_rows = [model_rows(rig, terms, conditioned) for conditioned in mean_scenes]
     names = tuple(dict.fromkeys(n for one in mean_rows for r in one.values() for n in r.names))
     noise = {(f.group, f.equation): f.noise for f in split}
-    most = max(sum(s.group == scene.group for s in members) for scene in mean_scenes)
-    base, left, segments, start = [], [], [], 0
+    most = max(sum(s.group == conditioned.group for s in members) for conditioned in mean_scenes)
+    base, residual, segments, start = [], [], [], 0
     kept_rows: list[dict[str, Rows]] = []
-    for scene, rows in zip(mean_scenes, mean_rows, strict=True):
-        own = [one for s, one in zip(members, every, strict=True) if s.group == scene.group]
+    for conditioned, rows in zip(mean_scenes, mean_rows, strict=True):
+        own = [one for s, one in zip(members, every, strict=True) if s.group == conditioned.group]
         kept_rows.append({})
         for equation, mean in rows.items():
             time = mean.time
@@ -149,23 +149,25 @@ def board(
                 continue
             cut = _at(mean, time)
             kept_rows[-1][equation] = cut
-            sigma = max(noise[scene.group, equation], 1e-30)
+            sigma = max(noise[conditioned.group, equation], 1e-30)
             base.append(_spread(cut, names) * np.sqrt(len(own)) / sigma)
             table = np.full((most, len(time)), np.nan)
             for k, one in enumerate(own):
-                table[k] = residual(_at(one[equation], time), beta) / sigma
-            left.append(table)
+                table[k] = row_residual(_at(one[equation], time), beta) / sigma
+            residual.append(table)
             where = slice(start, start + len(time))
             segments.append(
-                Segment(scene.group, equation, where, sigma, len(own), scene.record.locked)
+                Segment(
+                    conditioned.group, equation, where, sigma, len(own), conditioned.record.locked
+                )
             )
             start = where.stop
     if not segments:
         raise InputError(
             "the records are too short: no rows are left behind the filters' edges; record longer"
         )
-    return Board(
-        rig, tuple(terms), beta, names, np.concatenate(base), np.concatenate(left, axis=1),
+    return RegressionData(
+        rig, tuple(terms), beta, names, np.concatenate(base), np.concatenate(residual, axis=1),
         tuple(segments), tuple(split), tuple(mean_scenes), tuple(kept_rows),
     )  # fmt: skip
 
@@ -183,7 +185,7 @@ def _spread(rows: Rows, names: Sequence[str]) -> Array:
 
 
 @dataclass(frozen=True)
-class Entry:
+class VariantColumns:
     """A variant on the board: its whitened columns (M, c), named, and the equations it touches."""
 
     variant: Variant
@@ -192,39 +194,41 @@ class Entry:
     touched: frozenset[str]
 
 
-def entries(stage: Board, chosen: Sequence[Variant]) -> list[Entry]:
+def variant_columns(data: RegressionData, chosen: Sequence[Variant]) -> list[VariantColumns]:
     """Return the columns of every variant that shows on the board, in the variants' order."""
-    seen = [prepared(stage.rig, stage.terms, scene) for scene in stage.scenes]
+    seen = [prepared(data.rig, data.terms, conditioned) for conditioned in data.records]
     with ThreadPoolExecutor(WORKERS) as pool:
-        found = pool.map(lambda v: _entry(stage, v, seen), chosen)
+        found = pool.map(lambda v: _entry(data, v, seen), chosen)
     return [entry for entry in found if entry is not None]
 
 
-def _entry(stage: Board, variant: Variant, seen: Sequence[Signals]) -> Entry | None:
+def _entry(
+    data: RegressionData, variant: Variant, seen: Sequence[Signals]
+) -> VariantColumns | None:
     columns: dict[str, Array] = {}
     touched = set()
-    M = stage.base.shape[0]
-    for index, scene in enumerate(stage.scenes):
-        if held(variant.effect, scene):
+    M = data.base.shape[0]
+    for index, conditioned in enumerate(data.records):
+        if held(variant.effect, conditioned):
             continue
-        rows = stage.rows[index]
+        rows = data.rows[index]
         found = candidate_columns(
-            stage.rig,
-            stage.terms,
-            scene,
+            data.rig,
+            data.terms,
+            conditioned,
             seen[index],
             rows,
-            stage.beta,
+            data.beta,
             variant.used,
         )
-        for segment in stage.segments:
-            if segment.group == scene.group and segment.equation in found:
+        for segment in data.segments:
+            if segment.group == conditioned.group and segment.equation in found:
                 touched.add(segment.equation)
                 for name, column in found[segment.equation].items():
                     whole = columns.setdefault(name, np.zeros(M))
                     whole[segment.where] += column * np.sqrt(segment.repeats) / segment.noise
     if not columns or not all(np.isfinite(c).all() for c in columns.values()):
         return None
-    return Entry(
+    return VariantColumns(
         variant, tuple(columns), np.column_stack(list(columns.values())), frozenset(touched)
     )

@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.regression.rows import Rows, lines_cutoff
-from analysis.trace.data.conditioned_record import Scene, filtered
+from analysis.trace.data.conditioned_record import ConditionedRecord, filtered
 from analysis.trace.data.noise_floor import Group
-from analysis.trace.data.regression_data import Board, Segment
+from analysis.trace.data.regression_data import RegressionData, Segment
 
 Array = NDArray[np.float64]
 
@@ -44,7 +44,7 @@ OWN = 3.0  # times the velocity's own share
 
 
 @dataclass(frozen=True)
-class Lines:
+class SpectralLines:
     """The lines 0..K of one equation's residual in one group of records, powers (rms squared, SI).
 
     `frequency` [Hz], `repeatable` and `noise` of one repeat, each (K + 1,); `after` is what repeats
@@ -114,22 +114,22 @@ def meaning(shares: Mapping[str, float], own: Mapping[str, float]) -> str:
     return " and ".join(word for _, word in found)
 
 
-def lines(stage: Board, after: Array) -> tuple[Lines, ...]:
+def lines(data: RegressionData, after: Array) -> tuple[SpectralLines, ...]:
     """Return the lines of every equation and group excited by odd lines, the loudest first.
 
     `after` (M,) is the averaged whitened residual of the model that the trace ended with.
     """
-    loud = {(f.group, f.equation): f.ratio for f in stage.floors}
+    loud = {(f.group, f.equation): f.ratio for f in data.floors}
     out = []
-    for scene, rows in zip(stage.scenes, stage.rows, strict=True):
-        record = scene.record
+    for conditioned, rows in zip(data.records, data.rows, strict=True):
+        record = conditioned.record
         if not record.period or not record.lines or not all(k % 2 for k in record.lines):
             continue
-        for s in stage.segments:
-            if s.group == scene.group:
-                left = stage.left[: s.repeats, s.where] * s.noise
+        for s in data.segments:
+            if s.group == conditioned.group:
+                residual = data.residual[: s.repeats, s.where] * s.noise
                 rest = after[s.where] * s.noise / np.sqrt(s.repeats)
-                found = _of_segment(s, scene, rows[s.equation], np.vstack((left, rest)),
+                found = _of_segment(s, conditioned, rows[s.equation], np.vstack((residual, rest)),
                                     loud[s.group, s.equation])  # fmt: skip
                 if found is not None:
                     out.append(found)
@@ -137,20 +137,20 @@ def lines(stage: Board, after: Array) -> tuple[Lines, ...]:
 
 
 def _of_segment(
-    s: Segment, scene: Scene, rows: Rows, residuals: Array, loud: float
-) -> Lines | None:
+    s: Segment, conditioned: ConditionedRecord, rows: Rows, residuals: Array, loud: float
+) -> SpectralLines | None:
     """Return the lines of residuals (repeats + 1, m), the last of them what is left."""
-    record = scene.record
+    record = conditioned.record
     highest = max(record.lines)
-    per = record.period // scene.filtering.step
-    place = np.rint((rows.time - rows.time[0]) * record.sample_rate / scene.filtering.step)
+    per = record.period // conditioned.filtering.step
+    place = np.rint((rows.time - rows.time[0]) * record.sample_rate / conditioned.filtering.step)
     pairs = _pairs(place.astype(np.int64), per)
     base = record.sample_rate / record.period
     K = int(min([ABOVE * lines_cutoff(record) / base, *(LINES_PER_PAIR * len(p) for p in pairs)]))
     if not pairs or highest > K:
         return None
     joint = int(s.equation.rsplit("_", 1)[1]) - 1
-    speed = filtered({"v": scene.signals.sd[:, joint]}, scene, rows)["v"]
+    speed = filtered({"v": conditioned.signals.sd[:, joint]}, conditioned, rows)["v"]
     series = np.vstack((residuals, speed))
     spectra = np.stack([spectrum(place[p[:, 0]] / per, series[:, p], K) for p in pairs])
     single = spectra[:, :-2].reshape(-1, K + 1)  # periods of one repeat are repeats too
@@ -163,7 +163,7 @@ def _of_segment(
     before = np.abs(single.mean(axis=0)) ** 2 - noise / n
     rest = np.abs(spectra[:, -2].mean(axis=0)) ** 2 - noise / n
     frequency = np.asarray(np.arange(K + 1) * base, dtype=np.float64)
-    return Lines(
+    return SpectralLines(
         s.group, s.equation, frequency, before, noise, rest, excited,
         _shares(before, noise / n, excited), _shares(rest, noise / n, excited),
         _shares(own, np.zeros(K + 1), excited), loud,
@@ -219,9 +219,11 @@ def _shares(power: Array, noise: Array, excited: NDArray[np.bool_]) -> dict[str,
     return {kind: v / whole if whole > 0 else 0.0 for kind, v in sums.items()}
 
 
-def loudest(found: Sequence[Lines], least: float = 1.0, most: int = 3) -> list[Lines]:
+def loudest(
+    found: Sequence[SpectralLines], least: float = 1.0, most: int = 3
+) -> list[SpectralLines]:
     """Return the loudest, one of each equation, where the residual is above its noise."""
-    best: dict[str, Lines] = {}
+    best: dict[str, SpectralLines] = {}
     for one in found:
         if one.loud >= least:
             best.setdefault(one.equation, one)

@@ -34,10 +34,10 @@ LEAST = 0.05  # [K] between all records: less moves b by a fraction of 0.001
 def base_terms(rig: Rig, runs: Sequence[Run]) -> tuple[Used, ...]:
     """Return the rig's baseline terms with those that belong beside them on these records."""
     terms = tuple(map(Used, baseline_of(rig)))
-    return (*terms, *beside(terms, runs))
+    return (*terms, *temperature_terms(terms, runs))
 
 
-def beside(
+def temperature_terms(
     terms: Sequence[Used], runs: Sequence[Run], holdout: Sequence[Run] = ()
 ) -> tuple[Used, ...]:
     """Return the terms that belong beside the baseline on these records, held-out ones included.
@@ -47,8 +47,8 @@ def beside(
     """
     if "compressibility" not in {used.term.name for used in terms}:
         return ()
-    train, judge = (_temperatures(x) for x in (runs, holdout))
-    if not train or not np.ptp([*train, *judge]) >= LEAST:  # nor where one was not measured
+    train, holdout_data = (_temperatures(x) for x in (runs, holdout))
+    if not train or not np.ptp([*train, *holdout_data]) >= LEAST:  # nor where one was not measured
         return ()
     return (Used(BulkTemperature(reference=float(np.mean(train)))),)
 

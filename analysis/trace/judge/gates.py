@@ -16,13 +16,13 @@ from analysis.effects.base import Effect, shapes_of
 from analysis.regression.solve import half_width
 from analysis.simulation.model import Estimate
 from analysis.terms.base import Used
-from analysis.trace.data.regression_data import Board
+from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge import inference
-from analysis.trace.judge.held_out import left as held_left
+from analysis.trace.judge.held_out import residual as held_left
 from analysis.trace.judge.invariance import invariance
 from analysis.trace.result import Found, Gate, Rival
-from analysis.trace.search.hypothesis import Listed, excess_of, parameter_values
-from analysis.trace.search.hypothesis_set import Shortlist
+from analysis.trace.search.hypothesis import Hypothesis, excess_of, parameter_values
+from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.linear_fit import FORM
 
 Array = NDArray[np.float64]
@@ -49,27 +49,32 @@ def stands(found: Found) -> bool:
 
 
 def judge(
-    listed: Shortlist, winner: Listed, held: Board, rng: np.random.Generator
+    hypotheses: HypothesisSet,
+    winner: Hypothesis,
+    holdout_data: RegressionData,
+    rng: np.random.Generator,
 ) -> tuple[Found, ...]:
     """Put every effect of the winner through the gates."""
-    stage = listed.stage
-    values = parameter_values(stage.rig, winner.fit.terms, dict(winner.fit.beta))
-    null = inference.null_maximum(listed.field, stage, _noise_like(stage, winner.fit.left), rng)
-    steady = inference.stability(listed, winner, rng)
-    after = held_left(held, winner.fit)
-    physical = listed.physical(winner)
+    train_data = hypotheses.stage
+    values = parameter_values(train_data.rig, winner.fit.terms, dict(winner.fit.beta))
+    null = inference.null_maximum(
+        hypotheses.field, train_data, _noise_like(train_data, winner.fit.residual), rng
+    )
+    steady = inference.stability(hypotheses, winner, rng)
+    after = held_left(holdout_data, winner.fit)
+    physical = hypotheses.physical(winner)
     out = []
     for used in winner.effects:
         assert isinstance(used.term, Effect)
         key = (used.term.name, used.term.where)
-        rest = listed.exact(tuple(u for u in winner.effects if u is not used))
-        rivals = _rivals(listed, winner, key, held, after)
-        removed = _removed(held, rest, after, _touched(listed, winner, rest))
-        worse = _worse(listed, winner, rest)
+        rest = hypotheses.exact(tuple(u for u in winner.effects if u is not used))
+        rivals = _rivals(hypotheses, winner, key, holdout_data, after)
+        removed = _removed(holdout_data, rest, after, _touched(hypotheses, winner, rest))
+        worse = _worse(hypotheses, winner, rest)
         p = inference.p_value(rest.fit.energy - winner.fit.energy, null)
-        errors = inference.spread(stage, winner.fit, used, values)
+        errors = inference.spread(train_data, winner.fit, used, values)
         share, others = steady[key]
-        differing = invariance(stage, winner.fit, used, errors, _joint(used.term))
+        differing = invariance(train_data, winner.fit, used, errors, _joint(used.term))
         tied = [r for r in rivals if r.tied]
         twins = [Rival(name, where, 1.0, 1.0, True) for name, where in used.term.twins()]
         gates = (
@@ -82,29 +87,37 @@ def judge(
         )
         out.append(
             Found(
-                used.term.name, _place(used.term), _parameters(stage, used, errors), p, removed,
-                (*twins, *rivals), gates, used.term.variable,
+                used.term.name,
+                _place(used.term),
+                _parameters(train_data, used, errors),
+                p,
+                removed,
+                (*twins, *rivals),
+                gates,
+                used.term.variable,
             )
-        )  # fmt: skip
+        )
     return tuple(out)
 
 
-def remaining(listed: Shortlist, winner: Listed, held: Board) -> list[tuple[str, str]]:
+def remaining(
+    hypotheses: HypothesisSet, winner: Hypothesis, holdout_data: RegressionData
+) -> list[tuple[str, str]]:
     """Return the equations that keep more than the noise floor's band, and say on which records.
 
     What a catalogue's simpler form leaves in the training records may be somewhat more where the
     held-out error of that equation is the noise's.
     """
-    after = held_left(held, winner.fit)
-    start = excess_of(held, held_left(held, listed.empty.fit))
-    now = excess_of(held, after)
-    ratio = _held_ratio(held, after)
+    after = held_left(holdout_data, winner.fit)
+    start = excess_of(holdout_data, held_left(holdout_data, hypotheses.empty.fit))
+    now = excess_of(holdout_data, after)
+    ratio = _held_ratio(holdout_data, after)
     out = []
-    for e, left in winner.excess.items():
-        share = left / max(listed.empty.excess[e], 1e-30)
+    for e, residual in winner.excess_energy.items():
+        share = residual / max(hypotheses.empty.excess_energy[e], 1e-30)
         quiet = share <= HELD_FORM and ratio.get(e, np.inf) <= HELD_QUIET
-        if not (quiet or listed.negligible(e, left)):
-            times = left / listed.limits.band[e]
+        if not (quiet or hypotheses.negligible(e, residual)):
+            times = residual / hypotheses.limits.band[e]
             out.append(
                 (e, f"{100 * share:.2g} % of what repeated stays, {times:.2g} times the band")
             )
@@ -116,33 +129,33 @@ def remaining(listed: Shortlist, winner: Listed, held: Board) -> list[tuple[str,
     return out
 
 
-def _held_ratio(held: Board, left: Array) -> dict[str, float]:
+def _held_ratio(holdout_data: RegressionData, residual: Array) -> dict[str, float]:
     """Return the held-out error of single records over the noise floor, by equation."""
     floor: dict[str, float] = {}
     energy: dict[str, float] = {}
-    for s in held.segments:
+    for s in holdout_data.segments:
         count = (s.where.stop - s.where.start) * s.repeats
         floor[s.equation] = floor.get(s.equation, 0.0) + count * s.noise**2
         # Averaging has taken noise out: put back what a single record would show.
-        part = left[s.where]
+        part = residual[s.where]
         found = float(part @ part) + count * (1 - 1 / s.repeats)
         energy[s.equation] = energy.get(s.equation, 0.0) + found * s.noise**2
     return {e: float(np.sqrt(energy[e] / floor[e])) for e in floor}
 
 
-def _noise_like(stage: Board, left: Array) -> Array:
+def _noise_like(train_data: RegressionData, residual: Array) -> Array:
     """Return the repeats' residuals without what repeats: (R, M), scaled to the full noise.
 
     Of a step with one repeat, what the winner leaves (M,).
     """
-    out = stage.left.copy()
-    for s in stage.segments:
+    out = train_data.residual.copy()
+    for s in train_data.segments:
         if s.repeats > 1:
             part = out[: s.repeats, s.where]
             scale = np.sqrt(s.repeats / (s.repeats - 1))
             out[: s.repeats, s.where] = (part - part.mean(axis=0)) * scale
         else:
-            out[0, s.where] = left[s.where]
+            out[0, s.where] = residual[s.where]
     return out
 
 
@@ -155,21 +168,21 @@ def _place(effect: Effect) -> str:
     return str(getattr(effect, "place", effect.where))
 
 
-def _touched(listed: Shortlist, winner: Listed, rest: Listed) -> set[str]:
+def _touched(hypotheses: HypothesisSet, winner: Hypothesis, rest: Hypothesis) -> set[str]:
     """Return the equations in which an effect changes the training residual visibly."""
-    change = {e: rest.excess[e] - winner.excess[e] for e in rest.excess}
+    change = {e: rest.excess_energy[e] - winner.excess_energy[e] for e in rest.excess_energy}
     most = max(change.values())
     return {e for e, v in change.items() if v > 0.05 * most}
 
 
-def _worse(listed: Shortlist, winner: Listed, rest: Listed) -> list[str]:
+def _worse(hypotheses: HypothesisSet, winner: Hypothesis, rest: Hypothesis) -> list[str]:
     """Return equations that were quieter under the baseline and that this effect disturbs."""
     return [
         e
-        for e, now in winner.excess.items()
-        if not listed.negligible(e, now)
-        and now > HARM * max(0.0, listed.empty.excess[e])
-        and now > rest.excess[e]
+        for e, now in winner.excess_energy.items()
+        if not hypotheses.negligible(e, now)
+        and now > HARM * max(0.0, hypotheses.empty.excess_energy[e])
+        and now > rest.excess_energy[e]
     ]
 
 
@@ -178,31 +191,39 @@ def _taken(removed: float, worse: Sequence[str]) -> str:
     return f"{text}, but more is left of {' '.join(worse)} than before" if worse else text
 
 
-def _removed(held: Board, rest: Listed, after: Array, touched: set[str]) -> float:
-    before = excess_of(held, held_left(held, rest.fit))
-    now = excess_of(held, after)
+def _removed(
+    holdout_data: RegressionData, rest: Hypothesis, after: Array, touched: set[str]
+) -> float:
+    before = excess_of(holdout_data, held_left(holdout_data, rest.fit))
+    now = excess_of(holdout_data, after)
     start = sum(max(0.0, before[e]) for e in touched if e in before)
     end = sum(max(0.0, now[e]) for e in touched if e in now)
     return (start - end) / start if start > 0 else 0.0
 
 
-def _rivals(listed: Shortlist, winner: Listed, key: Key, held: Board, after: Array) -> list[Rival]:
+def _rivals(
+    hypotheses: HypothesisSet,
+    winner: Hypothesis,
+    key: Key,
+    holdout_data: RegressionData,
+    after: Array,
+) -> list[Rival]:
     """Return the sets that have another effect in place of one, those that leave least first."""
     others = winner.keys - {key}
-    rest = listed.exact([u for u in winner.effects if (u.term.name, u.term.where) != key])
-    equations = _touched(listed, winner, rest)
+    rest = hypotheses.exact([u for u in winner.effects if (u.term.name, u.term.where) != key])
+    equations = _touched(hypotheses, winner, rest)
     out = []
-    mine = _energy(held, after)
-    own = _energy(listed.stage, winner.fit.left)
-    for one in listed.listed.values():
+    mine = _energy(holdout_data, after)
+    own = _energy(hypotheses.stage, winner.fit.residual)
+    for one in hypotheses.listed.values():
         fresh = one.keys - winner.keys
         if key in one.keys or not others <= one.keys or len(fresh) != 1:
             continue
-        if one.size[1] > winner.size[1] or listed.physical(one):
+        if one.size[1] > winner.size[1] or hypotheses.physical(one):
             continue
-        theirs = _energy(held, held_left(held, one.fit))
+        theirs = _energy(holdout_data, held_left(holdout_data, one.fit))
         ratio = _ratio(theirs, mine, equations)
-        training = _ratio(_energy(listed.stage, one.fit.left), own, equations)
+        training = _ratio(_energy(hypotheses.stage, one.fit.residual), own, equations)
         name, _ = next(iter(fresh))
         tied = ratio < TIE and (training < TIE_TRAINING or ratio < 0.95)
         place = next(_place(u.term) for u in one.effects if (u.term.name, u.term.where) in fresh)  # type: ignore[arg-type]
@@ -211,10 +232,10 @@ def _rivals(listed: Shortlist, winner: Listed, key: Key, held: Board, after: Arr
     return out[:SHOWN]
 
 
-def _energy(stage: Board, left: Array) -> dict[str, tuple[float, int]]:
+def _energy(train_data: RegressionData, residual: Array) -> dict[str, tuple[float, int]]:
     out: dict[str, tuple[float, int]] = {}
-    for s in stage.segments:
-        part = left[s.where]
+    for s in train_data.segments:
+        part = residual[s.where]
         energy, rows = out.get(s.equation, (0.0, 0))
         out[s.equation] = energy + float(part @ part), rows + len(part)
     return out
@@ -229,9 +250,11 @@ def _ratio(
     return float(np.sqrt(above / below)) if below > 0 else float("nan")
 
 
-def _parameters(stage: Board, used: Used, errors: inference.Spread) -> dict[str, Estimate]:
-    units = {c.parameter: c.unit for c in used.term.coefficients(stage.rig)}
-    units |= {s.parameter: s.unit for s in shapes_of(stage.rig, used)}
+def _parameters(
+    train_data: RegressionData, used: Used, errors: inference.EffectErrors
+) -> dict[str, Estimate]:
+    units = {c.parameter: c.unit for c in used.term.coefficients(train_data.rig)}
+    units |= {s.parameter: s.unit for s in shapes_of(train_data.rig, used)}
     half = half_width(errors.std, np.full(len(errors.std), errors.dof))
     return {
         name: Estimate(float(v), units.get(name, ""), float(s), (float(v - h), float(v + h)))

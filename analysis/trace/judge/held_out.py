@@ -12,11 +12,11 @@ from analysis.identify.estimators.nuisance import KAPPA
 from analysis.regression.rows import Rows
 from analysis.simulation.model import Model
 from analysis.simulation.validate import validate
-from analysis.trace.data.conditioned_record import Scene, residual, scene_rows
+from analysis.trace.data.conditioned_record import ConditionedRecord, model_rows, row_residual
 from analysis.trace.data.noise_floor import floors
-from analysis.trace.data.regression_data import Board
+from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.temperature_nuisance import plausible
-from analysis.trace.search.refinement import Fit, Table, table
+from analysis.trace.search.refinement import DesignMatrix, ExactFit, table
 from rig.model.parse import InputError
 from rig.model.records import Run
 from rig.model.rig import Rig
@@ -37,47 +37,50 @@ class Errors:
     after: Mapping[str, float]
 
 
-def left(judge: Board, model: Fit) -> Array:
+def residual(holdout_data: RegressionData, model: ExactFit) -> Array:
     """Return the whitened held-out residual (M,) of a model fitted to other records."""
-    rows = table(judge, model.terms)
-    return rows.left(_settled(rows, model).beta)
+    rows = table(holdout_data, model.terms)
+    return rows.residual(_settled(rows, model).beta)
 
 
-def settled(judge: Board, model: Fit) -> Fit:
+def settled(holdout_data: RegressionData, model: ExactFit) -> ExactFit:
     """Return the model with the oil's temperature part of 1/b as the held-out records have it.
 
     Records at one temperature say nothing of it, and others then warm up: it is no parameter of
     the model and no effect, so that one number may be fitted on either side.
     """
-    return _settled(table(judge, model.terms), model)
+    return _settled(table(holdout_data, model.terms), model)
 
 
-def _settled(rows: Table, model: Fit) -> Fit:
+def _settled(rows: DesignMatrix, model: ExactFit) -> ExactFit:
     if KAPPA not in rows.names:
         return model
     column = rows.matrix[:, rows.names.index(KAPPA)]
     size = float(column @ column)
-    step = float(column @ rows.left(model.beta)) / size if size > 0 else 0.0
+    step = float(column @ rows.residual(model.beta)) / size if size > 0 else 0.0
     kappa = plausible(model.beta.get(KAPPA, 0.0) + step, model.beta)
     return replace(model, beta={**model.beta, KAPPA: kappa})
 
 
-def errors(rig: Rig, members: Sequence[Scene], before: Fit, after: Fit) -> Errors:
+def errors(
+    rig: Rig, members: Sequence[ConditionedRecord], before: ExactFit, after: ExactFit
+) -> Errors:
     """Return every equation's error under both models, its size and noise floor, over all records.
 
     The floor is what does not repeat under the model after: its columns carry the sensors' noise
     into the residual as the baseline's do.
     """
     one, other = (
-        [scene_rows(rig, model.terms, scene) for scene in members] for model in (before, after)
+        [model_rows(rig, model.terms, conditioned) for conditioned in members]
+        for model in (before, after)
     )
     split = floors(rig, after.terms, members, other, after.beta)
     floor = {(f.group, f.equation): f.noise for f in split}
     noise: dict[str, list[float]] = {}
     counts: dict[str, list[int]] = {}
-    for scene, rows_of in zip(members, other, strict=True):
+    for conditioned, rows_of in zip(members, other, strict=True):
         for equation, rows in rows_of.items():
-            noise.setdefault(equation, []).append(floor[scene.group, equation])
+            noise.setdefault(equation, []).append(floor[conditioned.group, equation])
             counts.setdefault(equation, []).append(len(rows.rhs))
     return Errors(
         {
@@ -85,8 +88,8 @@ def errors(rig: Rig, members: Sequence[Scene], before: Fit, after: Fit) -> Error
             for e in sorted(noise)
         },
         _by_equation(one, lambda rows: rows.rhs),
-        _by_equation(one, lambda rows: residual(rows, before.beta)),
-        _by_equation(other, lambda rows: residual(rows, after.beta)),
+        _by_equation(one, lambda rows: row_residual(rows, before.beta)),
+        _by_equation(other, lambda rows: row_residual(rows, after.beta)),
     )
 
 
@@ -101,11 +104,11 @@ def _by_equation(
     return {e: _rms(parts) for e, parts in sorted(found.items())}
 
 
-def rms_of(judge: Board, model: Fit) -> dict[str, float]:
+def rms_of(holdout_data: RegressionData, model: ExactFit) -> dict[str, float]:
     """Return the rms of every equation's held-out residual, SI, repeats averaged."""
-    rest = left(judge, model)
+    rest = residual(holdout_data, model)
     found: dict[str, list[Array]] = {}
-    for s in judge.segments:
+    for s in holdout_data.segments:
         found.setdefault(s.equation, []).append(rest[s.where] * s.noise / np.sqrt(s.repeats))
     return {e: _rms(parts) for e, parts in sorted(found.items())}
 
@@ -116,7 +119,7 @@ def _rms(parts: Sequence[Array]) -> float:
 
 
 @dataclass(frozen=True)
-class FreeRuns:
+class FreeRunErrors:
     """Simulations of the held-out records, by channel: mean FIT [%] and RMSE [SI] of free runs.
 
     `window_rmse` [SI] is of windows restarted from the data; NaN where the model failed.
@@ -127,17 +130,19 @@ class FreeRuns:
     window_rmse: Mapping[str, float]
 
 
-def free_runs(holdout: Sequence[Run], before: Model, after: Model) -> tuple[FreeRuns, FreeRuns]:
+def free_runs(
+    holdout: Sequence[Run], before: Model, after: Model
+) -> tuple[FreeRunErrors, FreeRunErrors]:
     """Return the free runs of both models, driven by the measured spool or drive alone."""
     one = _free_runs(holdout, before)
     return one, one if after is before else _free_runs(holdout, after)
 
 
-def _free_runs(holdout: Sequence[Run], model: Model) -> FreeRuns:
+def _free_runs(holdout: Sequence[Run], model: Model) -> FreeRunErrors:
     try:
         results = validate(model, holdout)
     except InputError:  # a parameter that is not identified: there is no simulation
-        return FreeRuns({}, {}, {})
+        return FreeRunErrors({}, {}, {})
     fits: dict[str, list[float]] = {}
     squares: dict[str, list[float]] = {}
     windows: dict[str, list[float]] = {}
@@ -147,7 +152,7 @@ def _free_runs(holdout: Sequence[Run], model: Model) -> FreeRuns:
             fits.setdefault(channel, []).append(float("nan") if lost else r.fit[channel])
             squares.setdefault(channel, []).append(float("nan") if lost else r.rmse[channel] ** 2)
             windows.setdefault(channel, []).append(r.window_rmse[channel] ** 2)
-    return FreeRuns(
+    return FreeRunErrors(
         {c: float(np.mean(v)) for c, v in sorted(fits.items())},
         *(
             {c: float(np.sqrt(np.mean(v))) for c, v in sorted(x.items())}

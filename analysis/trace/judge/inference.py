@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from analysis.effects.base import Effect, shape_values, shapes_of
 from analysis.terms.base import Used
-from analysis.trace.data.regression_data import Board
+from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.search import linear_fit
-from analysis.trace.search.hypothesis import Listed, excess_of
-from analysis.trace.search.hypothesis_set import Shortlist
-from analysis.trace.search.linear_fit import Field, orthonormal
-from analysis.trace.search.refinement import Fit, jacobian, table
+from analysis.trace.search.hypothesis import Hypothesis, excess_of
+from analysis.trace.search.hypothesis_set import HypothesisSet
+from analysis.trace.search.linear_fit import CandidateColumns, orthonormal
+from analysis.trace.search.refinement import ExactFit, jacobian, table
 
 Array = NDArray[np.float64]
 
@@ -34,55 +34,64 @@ ABOUT_TWO = 1.9  # periods that a record must hold to be halved by them: the las
 EDGE = 1e-3  # of its range: a shape nearer to its bound is at it
 
 
-def blocks(stage: Board, seconds: float = BLOCK, fewest: float = 3.0) -> NDArray[np.int64]:
+def blocks(
+    train_data: RegressionData, seconds: float = BLOCK, fewest: float = 3.0
+) -> NDArray[np.int64]:
     """Return for each row of the board the number of its block within its record (M,).
 
     A block is a period of a record that holds the `fewest` of them.
     """
-    out = np.zeros(stage.base.shape[0], dtype=np.int64)
-    index = {scene.group: k for k, scene in enumerate(stage.scenes)}
-    for segment in stage.segments:
+    out = np.zeros(train_data.base.shape[0], dtype=np.int64)
+    index = {conditioned.group: k for k, conditioned in enumerate(train_data.records)}
+    for segment in train_data.segments:
         if segment.repeats >= ENOUGH_REPEATS:
             continue
-        scene = stage.scenes[index[segment.group]]
-        rate, period = scene.record.sample_rate, scene.record.period
-        time = stage.rows[index[segment.group]][segment.equation].time
+        conditioned = train_data.records[index[segment.group]]
+        rate, period = conditioned.record.sample_rate, conditioned.record.period
+        time = train_data.rows[index[segment.group]][segment.equation].time
         length = seconds
-        if period and fewest * period <= scene.record.samples:
+        if period and fewest * period <= conditioned.record.samples:
             length = period / rate
         out[segment.where] = np.floor((time - time[0]) / length).astype(np.int64)
     return out
 
 
-def flipped(stage: Board, count: int, rng: np.random.Generator, left: Array) -> Array:
+def flipped(
+    train_data: RegressionData, count: int, rng: np.random.Generator, residual: Array
+) -> Array:
     """Return residuals (M, count), averaged after random signs of every repeat's blocks."""
-    numbers = blocks(stage)
-    M = stage.base.shape[0]
+    numbers = blocks(train_data)
+    M = train_data.base.shape[0]
     out = np.zeros((M, count))
-    groups = sorted({s.group for s in stage.segments})
+    groups = sorted({s.group for s in train_data.segments})
     most = int(numbers.max()) + 1
     for group in groups:
-        parts = [s for s in stage.segments if s.group == group]
+        parts = [s for s in train_data.segments if s.group == group]
         signs = rng.choice([-1.0, 1.0], size=(parts[0].repeats, most, count))
         for s in parts:
-            repeats = left[: s.repeats, s.where]
+            repeats = residual[: s.repeats, s.where]
             mixed = np.einsum("rm,rmc->mc", repeats, signs[:, numbers[s.where], :])
             out[s.where] = mixed / np.sqrt(s.repeats)
     return out
 
 
-def null_maximum(board: Field, stage: Board, left: Array, rng: np.random.Generator) -> Array:
+def null_maximum(
+    candidates: CandidateColumns,
+    train_data: RegressionData,
+    residual: Array,
+    rng: np.random.Generator,
+) -> Array:
     """Return the largest gain of any candidate at any shape under each flip (FLIPS,)."""
-    r = flipped(stage, FLIPS, rng, left)
-    r = r - board.basis @ (board.basis.T @ r)
-    c = board.columns.T @ r
-    diagonal = np.diag(board.K)
-    shows = (diagonal > linear_fit.VISIBLE**2 * board.raw) & (board.raw > 0)
+    r = flipped(train_data, FLIPS, rng, residual)
+    r = r - candidates.basis @ (candidates.basis.T @ r)
+    c = candidates.columns.T @ r
+    diagonal = np.diag(candidates.K)
+    shows = (diagonal > linear_fit.VISIBLE**2 * candidates.raw) & (candidates.raw > 0)
     best = np.max(c[shows] ** 2 / diagonal[shows, None], axis=0) if shows.any() else np.zeros(FLIPS)
-    for group in board.groups:
+    for group in candidates.groups:
         j = [k for k in group if shows[k]]
         if len(j) > 1:
-            inverse = np.linalg.pinv(board.K[np.ix_(j, j)], rcond=1e-6, hermitian=True)
+            inverse = np.linalg.pinv(candidates.K[np.ix_(j, j)], rcond=1e-6, hermitian=True)
             best = np.maximum(best, np.einsum("ib,ij,jb->b", c[j], inverse, c[j]))
     return np.asarray(best)
 
@@ -96,31 +105,31 @@ def p_value(gain: float, null: Array) -> float:
 class Linear:
     """A fitted set in first order: its tangent space's basis (M, k) and residual (M,)."""
 
-    one: Listed
+    one: Hypothesis
     basis: Array
-    left: Array
+    residual: Array
 
 
-def linear(stage: Board, one: Listed) -> Linear:
+def linear(train_data: RegressionData, one: Hypothesis) -> Linear:
     """Return the tangent of a set: columns of all coefficients and derivatives by the shapes.
 
     A shape that lies at a bound cannot move freely, and counts as fixed.
     """
-    rows = table(stage, one.fit.terms)
+    rows = table(train_data, one.fit.terms)
     extra = []
     for u in one.effects:
-        names, J = jacobian(stage, one.fit, u)
+        names, J = jacobian(train_data, one.fit, u)
         fixed = {
             s.parameter
-            for s, v in zip(shapes_of(stage.rig, u), u.shape, strict=True)
+            for s, v in zip(shapes_of(train_data.rig, u), u.shape, strict=True)
             if not s.low + EDGE * (s.high - s.low) < v < s.high - EDGE * (s.high - s.low)
         }
         extra.append(J[:, [k for k, n in enumerate(names) if n in rows.names or n not in fixed]])
-    return Linear(one, orthonormal(np.column_stack([rows.matrix, *extra])), one.fit.left)
+    return Linear(one, orthonormal(np.column_stack([rows.matrix, *extra])), one.fit.residual)
 
 
 def halves(
-    stage: Board, rng: np.random.Generator, count: int = HALVES
+    train_data: RegressionData, rng: np.random.Generator, count: int = HALVES
 ) -> list[tuple[Array, Array, float]]:
     """Return random half-samples: change (M,) of the averaged residual, weights (M,), noise energy.
 
@@ -128,20 +137,20 @@ def halves(
     others without weight.
     """
     # A part of a period may lack the very speeds that tell two effects apart.
-    numbers = blocks(stage, fewest=ABOUT_TWO)
-    mean = stage.mean
+    numbers = blocks(train_data, fewest=ABOUT_TWO)
+    mean = train_data.mean
     out = []
     for _ in range(count):
         r, weight = mean.copy(), np.ones(len(mean))
         noise = 1.0
-        for group in sorted({s.group for s in stage.segments}):
-            parts = [s for s in stage.segments if s.group == group]
+        for group in sorted({s.group for s in train_data.segments}):
+            parts = [s for s in train_data.segments if s.group == group]
             R = parts[0].repeats
             if R > 1:
                 picked = rng.choice(R, size=R // 2, replace=False)
                 noise = max(noise, R / len(picked))
                 for s in parts:
-                    r[s.where] = stage.left[picked, s.where].mean(axis=0) * np.sqrt(R)
+                    r[s.where] = train_data.residual[picked, s.where].mean(axis=0) * np.sqrt(R)
                 continue
             keep = rng.permutation(int(numbers.max()) + 1) % 2 == 0
             for s in parts:
@@ -152,21 +161,23 @@ def halves(
 
 
 def stability(
-    listed: Shortlist, winner: Listed, rng: np.random.Generator
+    hypotheses: HypothesisSet, winner: Hypothesis, rng: np.random.Generator
 ) -> dict[tuple[str, str], tuple[float, dict[str, int]]]:
     """Return, by effect, in which share of half-samples it is chosen, and who else was."""
-    stage = listed.stage
-    near = sorted(listed.listed.values(), key=lambda o: o.total)
-    near = [o for o in near if not listed.physical(o)][:12]
+    train_data = hypotheses.stage
+    near = sorted(hypotheses.listed.values(), key=lambda o: o.total)
+    near = [o for o in near if not hypotheses.physical(o)][:12]
     if winner.keys not in [o.keys for o in near]:
         near.append(winner)
-    tangents = [linear(stage, o) for o in near]
+    tangents = [linear(train_data, o) for o in near]
     counts = dict.fromkeys(winner.keys, 0)
     others: dict[str, int] = {}
-    samples = halves(stage, rng)
+    samples = halves(train_data, rng)
     for change, weight, noise in samples:
-        refitted = [_again(stage, t.one, _refitted(t, change, weight), noise) for t in tangents]
-        best = listed.best(refitted)
+        refitted = [
+            _again(train_data, t.one, _refitted(t, change, weight), noise) for t in tangents
+        ]
+        best = hypotheses.best(refitted)
         said = best.keys | _included(best)
         for key in winner.keys & said:
             counts[key] += 1
@@ -176,7 +187,7 @@ def stability(
     return {key: (count / len(samples), others) for key, count in counts.items()}
 
 
-def _included(one: Listed) -> set[tuple[str, str]]:
+def _included(one: Hypothesis) -> set[tuple[str, str]]:
     """Return what a set says beside its own names: an effect with more numbers includes another."""
     effects = [u.term for u in one.effects if isinstance(u.term, Effect)]
     return {(name, effect.where) for effect in effects for name in effect.includes}
@@ -184,7 +195,7 @@ def _included(one: Listed) -> set[tuple[str, str]]:
 
 def _refitted(one: Linear, change: Array, weight: Array) -> Array:
     """Return the weighted residual (M,) of a set fitted again to a half-sample."""
-    r = weight * (one.left + change)
+    r = weight * (one.residual + change)
     if np.all(weight == 1.0):
         return np.asarray(r - one.basis @ (one.basis.T @ r))
     basis = weight[:, None] * one.basis
@@ -192,12 +203,14 @@ def _refitted(one: Linear, change: Array, weight: Array) -> Array:
     return np.asarray(r - basis @ (inverse @ (basis.T @ r)))
 
 
-def _again(stage: Board, one: Listed, left: Array, noise: float) -> Listed:
-    return Listed(one.effects, one.fit, excess_of(stage, left, noise), one.size)
+def _again(
+    train_data: RegressionData, one: Hypothesis, residual: Array, noise: float
+) -> Hypothesis:
+    return Hypothesis(one.effects, one.fit, excess_of(train_data, residual, noise), one.size)
 
 
 @dataclass(frozen=True)
-class Spread:
+class EffectErrors:
     """An effect's parameters with standard errors over repeats, and the t distribution's dof."""
 
     names: tuple[str, ...]
@@ -206,38 +219,42 @@ class Spread:
     dof: float
 
 
-def spread(stage: Board, model: Fit, used: Used, values: Mapping[str, float]) -> Spread:
+def spread(
+    train_data: RegressionData, model: ExactFit, used: Used, values: Mapping[str, float]
+) -> EffectErrors:
     """Return an effect's parameters with errors from the scatter between repeats."""
-    names, J = jacobian(stage, model, used)
-    base = others(stage, model, names)
+    names, J = jacobian(train_data, model, used)
+    base = others(train_data, model, names)
     J_p = J - base @ (base.T @ J)
     scale = np.linalg.norm(J_p, axis=0)  # units differ by many powers of ten
     scale[scale == 0] = 1.0
     pinv = np.linalg.pinv(J_p / scale, rcond=1e-8) / scale[:, None]
     variance, dof = np.zeros(len(names)), 0
-    for group in sorted({s.group for s in stage.segments}):
-        parts = [s for s in stage.segments if s.group == group]
+    for group in sorted({s.group for s in train_data.segments}):
+        parts = [s for s in train_data.segments if s.group == group]
         R = parts[0].repeats
         if R < 2:
             variance += sum(np.sum(pinv[:, s.where] ** 2, axis=1) for s in parts)
             continue
-        each = sum(pinv[:, s.where] @ stage.left[:R, s.where].T / np.sqrt(R) for s in parts)
+        each = sum(
+            pinv[:, s.where] @ train_data.residual[:R, s.where].T / np.sqrt(R) for s in parts
+        )
         variance += R * np.var(each, axis=1, ddof=1)
         dof += R - 1
-    known = {**shape_values(stage.rig, used), **values}
+    known = {**shape_values(train_data.rig, used), **values}
     value = np.array([known.get(n, np.nan) for n in names])
-    return Spread(names, value, np.sqrt(variance), float(max(dof, 1)))
+    return EffectErrors(names, value, np.sqrt(variance), float(max(dof, 1)))
 
 
-def others(stage: Board, model: Fit, own: Sequence[str]) -> Array:
+def others(train_data: RegressionData, model: ExactFit, own: Sequence[str]) -> Array:
     """Return a basis of everything in the model but the named parameters, other shapes included."""
-    rows = table(stage, model.terms)
+    rows = table(train_data, model.terms)
     kept = [k for k, n in enumerate(rows.names) if n not in own]
     extra = []
     for other in model.terms:
         if not other.shape:
             continue
-        names, J = jacobian(stage, model, other)
+        names, J = jacobian(train_data, model, other)
         picked = [k for k, n in enumerate(names) if n not in own and n not in rows.names]
         extra.append(J[:, picked])
     return orthonormal(np.column_stack([rows.matrix[:, kept], *extra]))

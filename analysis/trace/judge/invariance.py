@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from analysis.effects.base import Effect, shapes_of
 from analysis.terms.base import Used
 from analysis.trace.data.noise_floor import STATED
-from analysis.trace.data.regression_data import Board
-from analysis.trace.judge.inference import Spread, blocks, others
+from analysis.trace.data.regression_data import RegressionData
+from analysis.trace.judge.inference import EffectErrors, blocks, others
 from analysis.trace.search.linear_fit import FORM, orthonormal
-from analysis.trace.search.refinement import Fit, jacobian, table
+from analysis.trace.search.refinement import ExactFit, jacobian, table
 
 Array = NDArray[np.float64]
 
@@ -26,25 +26,27 @@ TELLS = 0.05  # of a column's energy off the others': a subset with less says no
 POWER = 0.25  # a subset judges a parameter that it knows this well, relative
 
 
-def subsets(stage: Board, joint: int | None) -> dict[str, Array]:
+def subsets(train_data: RegressionData, joint: int | None) -> dict[str, Array]:
     """Return masks (M,) of rows: each step, each half of the records, each direction of motion."""
-    M = stage.base.shape[0]
+    M = train_data.base.shape[0]
     out: dict[str, Array] = {}
-    index = {scene.group: k for k, scene in enumerate(stage.scenes)}
+    index = {conditioned.group: k for k, conditioned in enumerate(train_data.records)}
     early, ahead = np.zeros(M, dtype=bool), np.zeros(M, dtype=bool)
     outer = np.zeros(M, dtype=bool)
-    for s in stage.segments:
+    for s in train_data.segments:
         name = f"step {s.group[1]}"
         out.setdefault(name, np.zeros(M, dtype=bool))[s.where] = True
-        scene = stage.scenes[index[s.group]]
-        time = stage.rows[index[s.group]][s.equation].time
+        conditioned = train_data.records[index[s.group]]
+        time = train_data.rows[index[s.group]][s.equation].time
         early[s.where] = time < 0.5 * (time[0] + time[-1])
         own = joint if joint is not None else int(s.equation.rsplit("_", 1)[1]) - 1
         at = np.clip(
-            np.rint(time * scene.record.sample_rate).astype(int), 0, len(scene.signals.t) - 1
+            np.rint(time * conditioned.record.sample_rate).astype(int),
+            0,
+            len(conditioned.signals.t) - 1,
         )
-        ahead[s.where] = scene.signals.sd[at, own] > 0
-        size = np.abs(scene.signals.sd[at, own])
+        ahead[s.where] = conditioned.signals.sd[at, own] > 0
+        size = np.abs(conditioned.signals.sd[at, own])
         outer[s.where] = size > np.median(size)
     out |= {
         "first half": early, "second half": ~early, "extending": ahead, "retracting": ~ahead,
@@ -53,35 +55,35 @@ def subsets(stage: Board, joint: int | None) -> dict[str, Array]:
     return out
 
 
-def _unmeasured(stage: Board) -> NDArray[np.int64] | None:
+def _unmeasured(train_data: RegressionData) -> NDArray[np.int64] | None:
     """Return the block of every row (M,) where some floor is the stated noise alone, else None.
 
     Then nobody has measured the noise, and what is left has to stand for it, block by block.
     """
-    if all(floor.source != STATED for floor in stage.floors):
+    if all(floor.source != STATED for floor in train_data.floors):
         return None
-    numbers = blocks(stage)
-    for k, s in enumerate(stage.segments):
+    numbers = blocks(train_data)
+    for k, s in enumerate(train_data.segments):
         numbers[s.where] += (int(numbers.max()) + 1) * k
     return numbers
 
 
-def _clustered(own: Array, left: Array, clusters: NDArray[np.int64]) -> float:
+def _clustered(own: Array, residual: Array, clusters: NDArray[np.int64]) -> float:
     """Return the root of the sum over blocks of (own . left)^2."""
     _, index = np.unique(clusters, return_inverse=True)
-    return float(np.linalg.norm(np.bincount(index, weights=own * left)))
+    return float(np.linalg.norm(np.bincount(index, weights=own * residual)))
 
 
-def _larger(model: Fit, stage: Board, used: Used, mask: Array) -> float:
+def _larger(model: ExactFit, train_data: RegressionData, used: Used, mask: Array) -> float:
     """Return the energy that the largest other effect has on a subset, 0 if none is larger.
 
     What its catalogue form misses of it (`FORM`) spills onto a smaller effect's coefficient.
     """
-    rows = table(stage, model.terms)
+    rows = table(train_data, model.terms)
     energy = {}
     for u in model.terms:
         if isinstance(u.term, Effect):
-            own = [rows.names.index(c.parameter) for c in u.term.coefficients(stage.rig)]
+            own = [rows.names.index(c.parameter) for c in u.term.coefficients(train_data.rig)]
             values = np.array([model.beta.get(rows.names[k], 0.0) for k in own])
             part = rows.matrix[mask][:, own] @ values
             energy[u.term.name, u.term.where] = float(part @ part)
@@ -100,24 +102,24 @@ def _alone(columns: Array, k: int) -> Array:
 
 
 def invariance(
-    stage: Board, model: Fit, used: Used, value: Spread, joint: int | None
+    train_data: RegressionData, model: ExactFit, used: Used, value: EffectErrors, joint: int | None
 ) -> list[tuple[str, str, float, float]]:
     """Return where a parameter disagrees with itself: (subset, parameter, value there, error)."""
-    names, J = jacobian(stage, model, used)
-    base = others(stage, model, names)
-    left = model.left
+    names, J = jacobian(train_data, model, used)
+    base = others(train_data, model, names)
+    residual = model.residual
     # A shape such as the presliding distance is the form's, not the effect's size.
-    sizes = {c.parameter for c in used.term.coefficients(stage.rig)}
-    sizes |= {s.parameter for s in shapes_of(stage.rig, used) if s.neutral is not None}
-    units = {c.parameter: c.unit for c in used.term.coefficients(stage.rig)}
-    units |= {s.parameter: s.unit for s in shapes_of(stage.rig, used)}
-    nothing = {s.parameter: s.neutral or 0.0 for s in shapes_of(stage.rig, used)}
+    sizes = {c.parameter for c in used.term.coefficients(train_data.rig)}
+    sizes |= {s.parameter for s in shapes_of(train_data.rig, used) if s.neutral is not None}
+    units = {c.parameter: c.unit for c in used.term.coefficients(train_data.rig)}
+    units |= {s.parameter: s.unit for s in shapes_of(train_data.rig, used)}
+    nothing = {s.parameter: s.neutral or 0.0 for s in shapes_of(train_data.rig, used)}
     neutral = np.array([nothing.get(n, 0.0) for n in names])
     out = []
-    clusters = _unmeasured(stage)
+    clusters = _unmeasured(train_data)
     J_all = J - base @ (base.T @ J)
     whole = [float(np.sum(_alone(J_all, k) ** 2)) for k in range(len(names))]
-    for label, mask in subsets(stage, joint).items():
+    for label, mask in subsets(train_data, joint).items():
         if not mask.any():
             continue
         B = orthonormal(base[mask])
@@ -132,12 +134,12 @@ def invariance(
             # What hardly acts there tells its form's tail, not its size.
             if size < TELLS * whole[k] or size <= 0 or not np.isfinite(value.value[k]):
                 continue
-            shift = float(own @ left[mask]) / size
+            shift = float(own @ residual[mask]) / size
             error = 1.0 / np.sqrt(size)
             if clusters is not None:
-                rest_of = left[mask] - B @ (B.T @ left[mask]) - own * shift
+                rest_of = residual[mask] - B @ (B.T @ residual[mask]) - own * shift
                 error = max(error, _clustered(own, rest_of, clusters[mask]) / size)
-            spill = np.sqrt(FORM * _larger(model, stage, used, mask) / size)
+            spill = np.sqrt(FORM * _larger(model, train_data, used, mask) / size)
             # Two levels of one effect are judged by the larger: 2 N beside 100 N is a detail.
             alike = [j for j, n in enumerate(names) if n in sizes and units[n] == units[name]]
             full = float(np.max(np.abs(value.value[alike] - neutral[alike])))

@@ -23,11 +23,11 @@ from analysis.identify.output_error.hidden_states import (
 )
 from analysis.simulation.model import Estimate, Model
 from analysis.terms.base import Used
-from analysis.trace.data.regression_data import Board
+from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.held_out import rms_of
 from analysis.trace.result import Found
 from analysis.trace.search import refinement
-from analysis.trace.search.hypothesis import Listed, excess_of
+from analysis.trace.search.hypothesis import Hypothesis, excess_of
 from rig.model.records import Run
 
 log = logging.getLogger(__name__)
@@ -40,14 +40,18 @@ NO_WORSE = 1.02  # times the held-out rms of any equation's rows
 class Reshaped:
     """The set with the shapes that stay, and every effect's shapes by shooting."""
 
-    winner: Listed
+    winner: Hypothesis
     shots: tuple[Shot, ...]
 
 
 def reshaped(
-    runs: Sequence[Run], holdout: Sequence[Run], after: Model, stage: Board, judge: Board,
-    winner: Listed,
-) -> Reshaped:  # fmt: skip
+    runs: Sequence[Run],
+    holdout: Sequence[Run],
+    after: Model,
+    train_data: RegressionData,
+    holdout_data: RegressionData,
+    winner: Hypothesis,
+) -> Reshaped:
     """Shoot every effect of the winner that has a hidden state; `after` is its model."""
     if after.rig.electric or not hidden_effects(after):
         return Reshaped(winner, ())
@@ -63,14 +67,14 @@ def reshaped(
         before, now = (
             rest_of(holdout, model, effect) for model in (after, replace(after, terms=other))
         )
-        fitted = refinement.fit(stage, _with(winner.fit.terms, effect, found))
-        rows, again = (rms_of(judge, fit) for fit in (winner.fit, fitted))
+        fitted = refinement.fit(train_data, _with(winner.fit.terms, effect, found))
+        rows, again = (rms_of(holdout_data, fit) for fit in (winner.fit, fitted))
         better = now < CLOSER * before and all(again[e] <= NO_WORSE * rows[e] for e in rows)
         shots.append(replace(found, before=before, after=now, taken=better and found.settled))
         if shots[-1].taken:
             winner = replace(
                 winner, effects=_with(winner.effects, effect, found), fit=fitted,
-                excess=excess_of(stage, fitted.left),
+                excess_energy=excess_of(train_data, fitted.residual),
             )  # fmt: skip
             after = replace(after, terms=other)
     return Reshaped(winner, tuple(shots))

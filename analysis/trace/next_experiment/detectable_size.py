@@ -12,7 +12,7 @@ from typing import Final
 
 from analysis.effects.base import Effect
 from analysis.terms.base import Used
-from analysis.trace.next_experiment.discrimination import Hypothesis
+from analysis.trace.next_experiment.discrimination import Explanation
 from rig.model import channels as ch
 from rig.model.rig import Rig
 
@@ -42,7 +42,7 @@ GAIN: Final = 1.01  # of a sensor
 OFFSETS: Final = {ch.CAP: 0.03e6, ch.ROD: 0.03e6, ch.SUPPLY: 0.03e6, ch.PISTON: 0.3e-3}
 
 
-def smallest(effect: Effect, rig: Rig) -> Hypothesis | None:
+def smallest(effect: Effect, rig: Rig) -> Explanation | None:
     """Return an effect at its smallest interesting size, None where it has none or cannot show."""
     if effect.absorbed(rig):
         return None
@@ -60,7 +60,7 @@ def smallest(effect: Effect, rig: Rig) -> Hypothesis | None:
     known = effect.name in COEFFICIENTS or effect.name in SHAPES
     if not known and effect.name not in ("sensor_gain", "sensor_offset"):
         return None
-    return Hypothesis((Used(effect, shape),), dict(zip(names, sizes, strict=False)))
+    return Explanation((Used(effect, shape),), dict(zip(names, sizes, strict=False)))
 
 
 def _sensor(effect: Effect) -> str:

@@ -29,16 +29,16 @@ from analysis.signals.conditioning import Signals, condition
 from analysis.terms.base import Used
 from analysis.trace.data.candidates import Variant
 from analysis.trace.data.conditioned_record import (
-    Scene,
+    ConditionedRecord,
     candidate_columns,
     held,
+    model_rows,
     prepared,
-    scene_rows,
     trace_filtering,
 )
 from analysis.trace.data.noise_floor import stated_noise
-from analysis.trace.data.regression_data import Board, entries
-from analysis.trace.next_experiment.excitations import REPEATS, Excitation
+from analysis.trace.data.regression_data import RegressionData, variant_columns
+from analysis.trace.next_experiment.excitations import REPEATS, CandidateExcitation
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
@@ -47,7 +47,7 @@ SHAPE_STEP = 0.02  # of a shape's value, or of its range where it is zero
 
 
 @dataclass(frozen=True)
-class Hypothesis:
+class Explanation:
     """Effects with their shapes, and their coefficients by parameter name; none: the baseline."""
 
     effects: tuple[Used, ...] = ()
@@ -73,8 +73,8 @@ class Question:
     visible against `other`.
     """
 
-    one: Hypothesis
-    other: Hypothesis
+    one: Explanation
+    other: Explanation
     both_ways: bool = True
 
 
@@ -85,17 +85,17 @@ class View:
     rig: Rig
     terms: tuple[Used, ...]
     beta: Mapping[str, float]
-    scene: Scene
+    conditioned: ConditionedRecord
     seen: Signals
     rows: Mapping[str, Rows]
     noise: Mapping[str, float]
 
     def columns(self, used: Used) -> Mapping[str, Mapping[str, Array]]:
         """Return what an effect would add in SI: equation -> name -> column."""
-        if held(used.term, self.scene):
+        if held(used.term, self.conditioned):
             return {}
         return candidate_columns(
-            self.rig, self.terms, self.scene, self.seen, self.rows, self.beta, used
+            self.rig, self.terms, self.conditioned, self.seen, self.rows, self.beta, used
         )
 
     def weight(self, equation: str) -> float:
@@ -103,36 +103,38 @@ class View:
         return float(np.sqrt(REPEATS) / max(self.noise[equation], 1e-30))
 
 
-def calibration(stage: Board) -> dict[str, float]:
+def calibration(train_data: RegressionData) -> dict[str, float]:
     """Return, by equation, the measured noise over what the rig's stated sensor noise would make.
 
     A faster excitation is filtered wider and so is noisier: the stated noise tells by how much.
     """
     found: dict[str, list[float]] = {}
-    for scene, rows in zip(stage.scenes, stage.rows, strict=True):
-        stated = stated_noise(stage.rig, stage.terms, scene, rows, stage.beta)
-        for floor in stage.floors:
-            if floor.group == scene.group and stated.get(floor.equation, 0.0) > 0:
+    for conditioned, rows in zip(train_data.records, train_data.rows, strict=True):
+        stated = stated_noise(train_data.rig, train_data.terms, conditioned, rows, train_data.beta)
+        for floor in train_data.floors:
+            if floor.group == conditioned.group and stated.get(floor.equation, 0.0) > 0:
                 found.setdefault(floor.equation, []).append(floor.noise / stated[floor.equation])
     return {e: float(np.sqrt(np.mean(np.square(v)))) for e, v in found.items()}
 
 
-def view(stage: Board, excitation: Excitation, measured: Mapping[str, float]) -> View:
+def view(
+    train_data: RegressionData, excitation: CandidateExcitation, measured: Mapping[str, float]
+) -> View:
     """Build the rows of an excitation as the trace would of its record.
 
     `measured` is the board's `calibration`; of other equations nothing can be said: their joint
     has never moved.
     """
-    rig = ideal(stage.rig)
+    rig = ideal(train_data.rig)
     record = excitation.played.record
     filters = trace_filtering(record)
-    scene = Scene(-1, record, condition(rig, record, filters.channels), filters)
-    every = scene_rows(rig, stage.terms, scene)
+    conditioned = ConditionedRecord(-1, record, condition(rig, record, filters.channels), filters)
+    every = model_rows(rig, train_data.terms, conditioned)
     rows = {e: r for e, r in every.items() if e in measured and len(r.rhs)}
-    stated = stated_noise(rig, stage.terms, scene, rows, stage.beta)
+    stated = stated_noise(rig, train_data.terms, conditioned, rows, train_data.beta)
     noise = {e: measured[e] * stated[e] for e in rows}
-    seen = prepared(rig, stage.terms, scene)
-    return View(rig, tuple(stage.terms), stage.beta, scene, seen, rows, noise)
+    seen = prepared(rig, train_data.terms, conditioned)
+    return View(rig, tuple(train_data.terms), train_data.beta, conditioned, seen, rows, noise)
 
 
 class Ground:
@@ -141,17 +143,19 @@ class Ground:
     `base` (m, k) holds the baseline's columns, `equation` (m,) each row's equation.
     """
 
-    def __init__(self, stage: Board, seen: View | None = None, old: Ground | None = None) -> None:
-        self.stage, self.seen, self._old = stage, seen, old
+    def __init__(
+        self, train_data: RegressionData, seen: View | None = None, old: Ground | None = None
+    ) -> None:
+        self.stage, self.seen, self._old = train_data, seen, old
         self._known: dict[Used, dict[str, Array]] = {}
-        label = np.empty(stage.base.shape[0], dtype=object)
-        for s in stage.segments:
+        label = np.empty(train_data.base.shape[0], dtype=object)
+        for s in train_data.segments:
             label[s.where] = s.equation
-        parts, labels = [stage.base], [label]
+        parts, labels = [train_data.base], [label]
         if seen is not None:
             for equation, rows in seen.rows.items():
-                part = np.zeros((len(rows.rhs), len(stage.names)))
-                part[:, [stage.names.index(n) for n in rows.names]] = rows.matrix
+                part = np.zeros((len(rows.rhs), len(train_data.names)))
+                part[:, [train_data.names.index(n) for n in rows.names]] = rows.matrix
                 parts.append(part * seen.weight(equation))
                 labels.append(np.full(len(rows.rhs), equation, dtype=object))
         self.base, self.equation = np.concatenate(parts), np.concatenate(labels)
@@ -165,7 +169,7 @@ class Ground:
 
     def _on_board(self, used: Used) -> dict[str, Array]:
         assert isinstance(used.term, Effect)
-        found = entries(self.stage, [Variant(used.term, used.shape)])
+        found = variant_columns(self.stage, [Variant(used.term, used.shape)])
         return dict(zip(found[0].names, found[0].columns.T, strict=True)) if found else {}
 
     def _extended(self, used: Used, before: Mapping[str, Array]) -> dict[str, Array]:
@@ -180,7 +184,7 @@ class Ground:
             out[name] = np.concatenate(parts)
         return out
 
-    def adds(self, what: Hypothesis) -> Array:
+    def adds(self, what: Explanation) -> Array:
         """Return what a hypothesis adds to the rows (m,) at its sizes."""
         total = np.zeros(len(self.equation))
         for used in what.effects:
@@ -190,7 +194,7 @@ class Ground:
                     total += column * (what.beta.get(name, 0.0) if name else 1.0)
         return total
 
-    def spans(self, what: Hypothesis) -> Array:
+    def spans(self, what: Explanation) -> Array:
         """Return what a hypothesis can imitate with: its columns and its shapes' derivatives."""
         found = [self.base]
         for used in what.effects:
@@ -200,21 +204,21 @@ class Ground:
                 step = SHAPE_STEP * (abs(value) or shape.high - shape.low)
                 near = value + step if value + step <= shape.high else value - step
                 moved = Used(used.term, (*used.shape[:j], near, *used.shape[j + 1 :]))
-                ends = [self.adds(Hypothesis((u,), what.beta)) for u in (moved, used)]
+                ends = [self.adds(Explanation((u,), what.beta)) for u in (moved, used)]
                 found.append((ends[0] - ends[1])[:, None])
         return np.column_stack(found)
 
-    def left(self, true: Hypothesis, wrong: Hypothesis) -> Array:
+    def residual(self, true: Explanation, wrong: Explanation) -> Array:
         """Return the residual (m,) that `wrong` leaves where `true` is there, without noise."""
         X, y = self.spans(wrong), self.adds(true)
         scale = np.linalg.norm(X, axis=0)
         scale[scale == 0] = 1.0
         return np.asarray(y - X @ (np.linalg.lstsq(X / scale, y, rcond=1e-6)[0] / scale))
 
-    def energy(self, left: Array) -> dict[str, float]:
+    def energy(self, residual: Array) -> dict[str, float]:
         """Return a residual's energy by equation."""
         return {
-            str(e): float(left[self.equation == e] @ left[self.equation == e])
+            str(e): float(residual[self.equation == e] @ residual[self.equation == e])
             for e in dict.fromkeys(self.equation)
         }
 
@@ -224,8 +228,8 @@ def separation(question: Question, old: Ground, new: Ground) -> tuple[float, str
     assert new.seen is not None
     found = []
     for true, wrong in _ways(question):
-        before = old.energy(old.left(true, wrong))
-        after = new.energy(new.left(true, wrong))
+        before = old.energy(old.residual(true, wrong))
+        after = new.energy(new.residual(true, wrong))
         by_equation = {
             e: float(np.sqrt(max(0.0, after[e] - before.get(e, 0.0)) / (REPEATS * len(r.rhs))))
             for e, r in new.seen.rows.items()
@@ -237,14 +241,16 @@ def separation(question: Question, old: Ground, new: Ground) -> tuple[float, str
 
 def present(question: Question, old: Ground) -> float:
     """Return the same figure [noise] of the records already taken: their loudest segment's."""
-    return min(loudest(old.stage, old.left(true, wrong)) for true, wrong in _ways(question))
+    return min(loudest(old.stage, old.residual(true, wrong)) for true, wrong in _ways(question))
 
 
-def loudest(stage: Board, left: Array) -> float:
+def loudest(train_data: RegressionData, residual: Array) -> float:
     """Return the largest rms of a residual (M,) in one step and equation [noise of a record]."""
-    return max(float(np.sqrt(np.mean(left[s.where] ** 2) / s.repeats)) for s in stage.segments)
+    return max(
+        float(np.sqrt(np.mean(residual[s.where] ** 2) / s.repeats)) for s in train_data.segments
+    )
 
 
-def _ways(question: Question) -> Sequence[tuple[Hypothesis, Hypothesis]]:
+def _ways(question: Question) -> Sequence[tuple[Explanation, Explanation]]:
     there = (question.one, question.other)
     return (there, there[::-1]) if question.both_ways else (there,)

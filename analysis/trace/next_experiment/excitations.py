@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from analysis.design.limits import Spectrum, forecast_of, used
 from analysis.design.moves import Tone, with_tones
 from analysis.design.twin_records import PlannedStep, Played, play
-from analysis.trace.data.conditioned_record import Scene
+from analysis.trace.data.conditioned_record import ConditionedRecord
 from rig.model import channels as ch
 from rig.model.parse import InputError
 from rig.model.rig import Rig
@@ -97,7 +97,7 @@ class Setting:
 
 
 @dataclass(frozen=True)
-class Excitation:
+class CandidateExcitation:
     """One candidate as played on the twin, with what makes a protocol of it."""
 
     family: Family
@@ -125,13 +125,13 @@ class Excitation:
         return ", ".join([f"{which} {self.family.words}", *stand])
 
 
-def settings(rig: Rig, scenes: Sequence[Scene]) -> list[Setting]:
+def settings(rig: Rig, records: Sequence[ConditionedRecord]) -> list[Setting]:
     """Return how the joints stood in each step of the records, and all of them free."""
     out: list[Setting] = []
-    for scene in scenes:
+    for conditioned in records:
         closed, held = {}, {}
-        for joint in scene.record.locked:
-            piston = float(np.nanmean(scene.record.channels[ch.channel(ch.PISTON, joint)]))
+        for joint in conditioned.record.locked:
+            piston = float(np.nanmean(conditioned.record.channels[ch.channel(ch.PISTON, joint)]))
             half = 0.5 * rig.joints[joint - 1].cylinder.stroke
             if half - abs(piston) < AT_END:
                 held[joint - 1] = float(np.copysign(half, piston))
@@ -143,16 +143,16 @@ def settings(rig: Rig, scenes: Sequence[Scene]) -> list[Setting]:
 
 
 def excitations(
-    rig: Rig, scenes: Sequence[Scene], rng: np.random.Generator,
+    rig: Rig, records: Sequence[ConditionedRecord], rng: np.random.Generator,
     families: Sequence[Family] = FAMILIES,
-) -> Iterator[Excitation]:  # fmt: skip
+) -> Iterator[CandidateExcitation]:  # fmt: skip
     """Play every family in every setting on the twin; those it cannot follow are left out.
 
     None for a rig without nominal values or with electric joints: there is no twin of it.
     """
     if rig.electric:
         return
-    for setting in settings(rig, scenes):
+    for setting in settings(rig, records):
         for family in families:
             found = excitation(rig, setting, family, rng)
             if found is not None:
@@ -161,19 +161,19 @@ def excitations(
 
 def excitation(
     rig: Rig, setting: Setting, family: Family, rng: np.random.Generator
-) -> Excitation | None:
+) -> CandidateExcitation | None:
     """Return a family in a setting, scaled to its share of the limits; None where impossible."""
     tones = {j: _tone(j, family, k, rng) for k, j in enumerate(setting.moving(rig))}
     step = _step(rig, setting, family, tones)
     goal = FILL * family.level
-    found: Excitation | None = None
+    found: CandidateExcitation | None = None
     try:
         for attempt in range(PLAYS):
             played = play(rig, with_tones(step, tones))
             share = used(rig, played)[0]
             step = played.step
             if share <= 1.05 * goal:
-                found = Excitation(family, setting, tones, played)
+                found = CandidateExcitation(family, setting, tones, played)
                 if share >= 0.9 * goal:
                     break
             if attempt == 0 and len(tones) == 1:
@@ -220,7 +220,7 @@ def _step(
 
 
 def protocol(
-    rig: Rig, chosen: Sequence[Excitation], name: str, scale: float = 1.0,
+    rig: Rig, chosen: Sequence[CandidateExcitation], name: str, scale: float = 1.0,
     rng: np.random.Generator | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Return the protocol file's mapping that runs these steps; `rng` draws other phases."""
@@ -233,7 +233,7 @@ def protocol(
 
 
 def _as_step(
-    rig: Rig, one: Excitation, number: int, scale: float, rng: np.random.Generator | None
+    rig: Rig, one: CandidateExcitation, number: int, scale: float, rng: np.random.Generator | None
 ) -> dict[str, Any]:
     locks = [
         {"joint": j + 1, "at": "closed", "piston": f"{1e3 * p:.6g} mm",

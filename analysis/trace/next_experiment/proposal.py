@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 
 from analysis.terms import baseline_of, known
 from analysis.terms.base import Used
-from analysis.trace.data.regression_data import Board
+from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.next_experiment import excitations as ex
 from analysis.trace.next_experiment.detectable_size import smallest
 from analysis.trace.next_experiment.discrimination import (
+    Explanation,
     Ground,
-    Hypothesis,
     Question,
     View,
     calibration,
@@ -35,8 +35,8 @@ from analysis.trace.next_experiment.discrimination import (
 )
 from analysis.trace.next_experiment.range_extension import LINES, farther, richer
 from analysis.trace.result import CLEAN, CONFOUNDED, UNEXPLAINED, Dependence, Found
-from analysis.trace.search.hypothesis import Listed, parameter_values
-from analysis.trace.search.hypothesis_set import Shortlist
+from analysis.trace.search.hypothesis import Hypothesis, parameter_values
+from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.linear_fit import BAND
 from rig.model.rig import Rig
 
@@ -70,7 +70,7 @@ class Answer:
 
 
 def propose(
-    listed: Shortlist, winner: Listed, found: Sequence[Found], verdict: str,
+    hypotheses: HypothesisSet, winner: Hypothesis, found: Sequence[Found], verdict: str,
     moves: Sequence[Dependence], families: Sequence[ex.Family] = ex.FAMILIES,
 ) -> Mapping[str, Any] | None:  # fmt: skip
     """Return the next experiment as plain data, None where none promises anything.
@@ -78,69 +78,71 @@ def propose(
     `protocol` and `holdout` are what a protocol file holds; `present` and `predicted` are the
     weakest question's separation in units of one record's noise.
     """
-    stage = listed.stage
-    old = Ground(stage)
-    questions = _questions(listed, winner, found, verdict, old)
+    train_data = hypotheses.stage
+    old = Ground(train_data)
+    questions = _questions(hypotheses, winner, found, verdict, old)
     if not questions and not (verdict == UNEXPLAINED and moves):
         return None
     rng = np.random.default_rng(SEED)
-    tried = list(ex.excitations(learned(stage), stage.scenes, rng, families))
+    tried = list(ex.excitations(learned(train_data), train_data.records, rng, families))
     if not tried:
         return _in_words(winner, questions) if verdict == CONFOUNDED else None
-    measured = calibration(stage)
-    views = [view(stage, one, measured) for one in tried]
+    measured = calibration(train_data)
+    views = [view(train_data, one, measured) for one in tried]
     kind = SHOW if verdict == CLEAN else TELL
     best = _choose(questions, tried, views, old)
     if best is not None:
-        return _told(stage, kind, *best)
+        return _told(train_data, kind, *best)
     if verdict == UNEXPLAINED and moves:
-        return _explored(stage, winner, moves, tried, views)
+        return _explored(train_data, winner, moves, tried, views)
     return None
 
 
-def learned(stage: Board) -> Rig:
+def learned(train_data: RegressionData) -> Rig:
     """Return the rig with what the records say of its parameters: a twin that is nearer to it."""
-    plain = tuple(map(Used, baseline_of(stage.rig)))
-    found = parameter_values(stage.rig, plain, dict(stage.beta))
-    before = stage.rig.nominal
+    plain = tuple(map(Used, baseline_of(train_data.rig)))
+    found = parameter_values(train_data.rig, plain, dict(train_data.beta))
+    before = train_data.rig.nominal
     likely = {
         name: value
         for name, value in found.items()
         # A parameter that the records hardly move may come out as anything.
         if name in before and 1 / LIKELY < value / before[name] < LIKELY
     }
-    return stage.rig.model_copy(update={"nominal": {**before, **likely}})
+    return train_data.rig.model_copy(update={"nominal": {**before, **likely}})
 
 
 def _questions(
-    listed: Shortlist, winner: Listed, found: Sequence[Found], verdict: str, old: Ground
+    hypotheses: HypothesisSet, winner: Hypothesis, found: Sequence[Found], verdict: str, old: Ground
 ) -> list[Answer]:
     if verdict == CLEAN:
-        asked = [Question(h, Hypothesis(), False) for h in _small(listed)]
+        asked = [Question(h, Explanation(), False) for h in _small(hypotheses)]
         answers = [Answer(q, present(q, old)) for q in asked]
         return [a for a in answers if a.present < PROMISE]
     if verdict == CONFOUNDED:
-        others = tied_sets(listed, winner, found)
-        pairs = [Question(hypothesis(winner), hypothesis(o)) for o in others]
+        others = tied_sets(hypotheses, winner, found)
+        pairs = [Question(explanation(winner), explanation(o)) for o in others]
     elif verdict == UNEXPLAINED:
-        pairs = _unsettled(listed)
+        pairs = _unsettled(hypotheses)
     else:
         return []
     return [Answer(q, present(q, old)) for q in pairs]
 
 
-def hypothesis(one: Listed) -> Hypothesis:
+def explanation(one: Hypothesis) -> Explanation:
     """Return a fitted set as a hypothesis."""
-    return Hypothesis(one.effects, one.fit.beta)
+    return Explanation(one.effects, one.fit.beta)
 
 
-def tied_sets(listed: Shortlist, winner: Listed, found: Sequence[Found]) -> list[Listed]:
+def tied_sets(
+    hypotheses: HypothesisSet, winner: Hypothesis, found: Sequence[Found]
+) -> list[Hypothesis]:
     """Return the sets that the gates could not tell from the winner: one effect exchanged."""
     out = []
     for effect in found:
         tied = {(r.name, r.where) for r in effect.rivals if r.tied}
         others = [u for u in winner.effects if _key(u.term) != (effect.name, effect.where)]
-        for one in listed.listed.values():
+        for one in hypotheses.listed.values():
             fresh = [u for u in one.effects if u.term not in [w.term for w in winner.effects]]
             kept = {u.term for u in one.effects} - {u.term for u in fresh}
             if len(fresh) == 1 and _key(fresh[0].term) in tied and kept == {
@@ -154,29 +156,32 @@ def _key(term: Any) -> tuple[str, str]:
     return term.name, str(getattr(term, "place", term.where))
 
 
-def _unsettled(listed: Shortlist) -> list[Question]:
+def _unsettled(hypotheses: HypothesisSet) -> list[Question]:
     """Return the best set against the others that leave about as little, and against none."""
-    allowed = [o for o in listed.listed.values() if o.effects and not listed.physical(o)]
+    allowed = [o for o in hypotheses.listed.values() if o.effects and not hypotheses.physical(o)]
     allowed.sort(key=lambda o: o.total)
-    if not allowed or allowed[0].total >= listed.empty.total:
+    if not allowed or allowed[0].total >= hypotheses.empty.total:
         return []
     best = allowed[0]
-    limit = max(NEAR * best.total, best.total + 0.1 * listed.limits.total)
+    limit = max(NEAR * best.total, best.total + 0.1 * hypotheses.limits.total)
     # A set that only adds to the best is not another explanation.
     near = [o for o in allowed[1:] if o.total <= limit and not best.keys <= o.keys][:RIVALS]
-    return [Question(hypothesis(best), hypothesis(o)) for o in near]
+    return [Question(explanation(best), explanation(o)) for o in near]
 
 
-def _small(listed: Shortlist) -> list[Hypothesis]:
-    rig = listed.stage.rig
-    effects = dict.fromkeys(v.effect for v in listed.variants)
+def _small(hypotheses: HypothesisSet) -> list[Explanation]:
+    rig = hypotheses.stage.rig
+    effects = dict.fromkeys(v.effect for v in hypotheses.variants)
     found = (smallest(effect, rig) for effect in effects)
     return [h for h in found if h is not None]
 
 
 def _choose(
-    asked: Sequence[Answer], tried: Sequence[ex.Excitation], views: Sequence[View], old: Ground
-) -> tuple[list[ex.Excitation], list[Answer]] | None:
+    asked: Sequence[Answer],
+    tried: Sequence[ex.CandidateExcitation],
+    views: Sequence[View],
+    old: Ground,
+) -> tuple[list[ex.CandidateExcitation], list[Answer]] | None:
     """Return the steps that answer most, and what they promise; None if they promise nothing."""
     if not asked:
         return None
@@ -209,14 +214,17 @@ def _worth(answers: Sequence[Answer]) -> float:
 
 
 def _explored(
-    stage: Board, winner: Listed, moves: Sequence[Dependence], tried: Sequence[ex.Excitation],
+    train_data: RegressionData,
+    winner: Hypothesis,
+    moves: Sequence[Dependence],
+    tried: Sequence[ex.CandidateExcitation],
     views: Sequence[View],
-) -> Mapping[str, Any] | None:  # fmt: skip
+) -> Mapping[str, Any] | None:
     """Return the experiment that shows what is unexplained where no record has been yet."""
-    found = farther(stage, moves, views, MORE) or richer(stage, moves, tried)
+    found = farther(train_data, moves, views, MORE) or richer(train_data, moves, tried)
     if found is None:
         return None
-    now = loudest(stage, winner.fit.left)
+    now = loudest(train_data, winner.fit.residual)
     return {
         "kind": COVER,
         "separates": [],
@@ -225,12 +233,15 @@ def _explored(
         "predicted": now * (found.times if found.variable != LINES else 1.0),
         "equation": found.equation,
         "text": f"{tried[found.index].text}: {found.words}",
-        **_protocols(stage, [tried[found.index]]),
+        **_protocols(train_data, [tried[found.index]]),
     }
 
 
 def _told(
-    stage: Board, kind: str, chosen: Sequence[ex.Excitation], answers: Sequence[Answer]
+    train_data: RegressionData,
+    kind: str,
+    chosen: Sequence[ex.CandidateExcitation],
+    answers: Sequence[Answer],
 ) -> Mapping[str, Any]:
     weakest = min(answers, key=lambda a: a.promised)
     separates = _names(answers)
@@ -252,7 +263,7 @@ def _told(
         "predicted": weakest.promised,
         "equation": weakest.equation,
         "text": f"{'; then '.join(one.text for one in chosen)} ({what})",
-        **_protocols(stage, chosen),
+        **_protocols(train_data, chosen),
     }  # fmt: skip
 
 
@@ -263,15 +274,17 @@ def _names(answers: Sequence[Answer]) -> list[dict[str, str]]:
     return [{"name": name, "where": where} for name, where in found]
 
 
-def _protocols(stage: Board, chosen: Sequence[ex.Excitation]) -> dict[str, Any]:
+def _protocols(
+    train_data: RegressionData, chosen: Sequence[ex.CandidateExcitation]
+) -> dict[str, Any]:
     rng = np.random.default_rng([SEED, 1])
     return {
-        "protocol": ex.protocol(stage.rig, chosen, "next"),
-        "holdout": ex.protocol(stage.rig, chosen, "next-holdout", ex.HELD_OUT, rng),
+        "protocol": ex.protocol(train_data.rig, chosen, "next"),
+        "holdout": ex.protocol(train_data.rig, chosen, "next-holdout", ex.HELD_OUT, rng),
     }
 
 
-def _in_words(winner: Listed, asked: Sequence[Answer]) -> Mapping[str, Any] | None:
+def _in_words(winner: Hypothesis, asked: Sequence[Answer]) -> Mapping[str, Any] | None:
     """Say what separates tied effects where no twin can try it: the rig has no nominal values."""
     texts = [getattr(known()[u.term.name], "separated_by", "") for u in winner.effects]
     return {

@@ -9,9 +9,9 @@ from typing import Final
 import numpy as np
 
 from analysis.trace.clues.variables import variables
-from analysis.trace.data.regression_data import Board
+from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.next_experiment.discrimination import View
-from analysis.trace.next_experiment.excitations import Excitation
+from analysis.trace.next_experiment.excitations import CandidateExcitation
 from analysis.trace.result import Dependence
 
 LINES: Final = "lines"
@@ -31,7 +31,7 @@ class Beyond:
 
 
 def farther(
-    stage: Board, moves: Sequence[Dependence], views: Sequence[View], least: float
+    train_data: RegressionData, moves: Sequence[Dependence], views: Sequence[View], least: float
 ) -> Beyond | None:
     """Return what carries a clue's variable farthest, for the first clue that can be carried so.
 
@@ -39,14 +39,14 @@ def farther(
     """
     for clue in moves:
         joint = int(clue.equation.rsplit("_", 1)[1]) - 1
-        own = [s for s in stage.scenes if joint + 1 not in s.record.locked]
+        own = [s for s in train_data.records if joint + 1 not in s.record.locked]
         for name in (n for n in (clue.variable, clue.by) if n and n != TIME):
-            seen = [variables(stage.rig, s.signals, joint).get(name) for s in own]
+            seen = [variables(train_data.rig, s.signals, joint).get(name) for s in own]
             values = [v for v in seen if v is not None]
             if not values:
                 continue
             low, high = np.percentile(np.concatenate(values), [1, 99])
-            reach = [_reach(stage, one, joint, name, float(low), float(high)) for one in views]
+            reach = [_reach(train_data, one, joint, name, float(low), float(high)) for one in views]
             k = int(np.argmax(reach))
             if reach[k] >= least:
                 words = f"carries {name} {reach[k]:.1f} times as far, which what is left moves with"
@@ -54,22 +54,26 @@ def farther(
     return None
 
 
-def _reach(stage: Board, one: View, joint: int, name: str, low: float, high: float) -> float:
+def _reach(
+    train_data: RegressionData, one: View, joint: int, name: str, low: float, high: float
+) -> float:
     """Return a variable's range over the records' and a candidate's, over the records' alone."""
-    if joint + 1 in one.scene.record.locked:
+    if joint + 1 in one.conditioned.record.locked:
         return 0.0
-    least, most = np.percentile(variables(stage.rig, one.seen, joint)[name], [1, 99])
+    least, most = np.percentile(variables(train_data.rig, one.seen, joint)[name], [1, 99])
     return float((max(most, high) - min(least, low)) / max(high - low, 1e-30))
 
 
-def richer(stage: Board, moves: Sequence[Dependence], tried: Sequence[Excitation]) -> Beyond | None:
+def richer(
+    train_data: RegressionData, moves: Sequence[Dependence], tried: Sequence[CandidateExcitation]
+) -> Beyond | None:
     """Return the excitation of most lines where the records of the clue's joint hold few.
 
     One sine shows one path through every nonlinearity: many forms pass through it alike.
     """
     equation = moves[0].equation
     joint = int(equation.rsplit("_", 1)[1]) - 1
-    held = [len(s.record.lines) for s in stage.scenes if joint + 1 not in s.record.locked]
+    held = [len(s.record.lines) for s in train_data.records if joint + 1 not in s.record.locked]
     counts = [len(one.tones[joint].lines) if joint in one.tones else 0 for one in tried]
     if not held or not min(held) or not counts:
         return None

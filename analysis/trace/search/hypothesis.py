@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.terms.base import Used
-from analysis.trace.data.regression_data import Board
+from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.search import linear_fit
-from analysis.trace.search.refinement import Fit
+from analysis.trace.search.refinement import ExactFit
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
@@ -19,12 +19,12 @@ Key = tuple[str, str]
 
 
 @dataclass(frozen=True)
-class Listed:
+class Hypothesis:
     """A set of effects on the list: its exact fit and energy above noise by equation."""
 
     effects: tuple[Used, ...]
-    fit: Fit
-    excess: dict[str, float]
+    fit: ExactFit
+    excess_energy: dict[str, float]
     size: tuple[int, int]
 
     @property
@@ -35,11 +35,11 @@ class Listed:
     @property
     def total(self) -> float:
         """All energy left above noise, not below zero in any equation."""
-        return sum(max(0.0, e) for e in self.excess.values())
+        return sum(max(0.0, e) for e in self.excess_energy.values())
 
 
 @dataclass(frozen=True)
-class Limits:
+class NoiseBand:
     """Energy that counts as nothing, by equation, on a stage."""
 
     band: dict[str, float]
@@ -60,27 +60,27 @@ def parameter_values(rig: Rig, terms: Sequence[Used], beta: dict[str, float]) ->
     return out
 
 
-def excess_of(stage: Board, left: Array, noise: float = 1.0) -> dict[str, float]:
+def excess_of(data: RegressionData, residual: Array, noise: float = 1.0) -> dict[str, float]:
     """Return the energy above noise that a residual (M,) has in each equation of a stage."""
     out: dict[str, float] = {}
-    for segment in stage.segments:
-        part = left[segment.where]
+    for segment in data.segments:
+        part = residual[segment.where]
         found = float(part @ part) - noise * len(part)
         out[segment.equation] = out.get(segment.equation, 0.0) + found
     return out
 
 
-def limits(stage: Board) -> Limits:
+def limits(data: RegressionData) -> NoiseBand:
     """Return the band of every equation (`linear_fit.BAND` times the noise, and chance)."""
     band: dict[str, float] = {}
     rows: dict[str, int] = {}
-    for s in stage.segments:
+    for s in data.segments:
         count = s.where.stop - s.where.start
         band[s.equation] = band.get(s.equation, 0.0) + linear_fit.BAND**2 * s.repeats * count
         rows[s.equation] = rows.get(s.equation, 0) + count
-    return Limits({e: max(v, 4 * np.sqrt(2 * rows[e])) for e, v in band.items()})
+    return NoiseBand({e: max(v, 4 * np.sqrt(2 * rows[e])) for e, v in band.items()})
 
 
-def within(excess: dict[str, float], limit: Limits) -> bool:
+def within(excess_energy: dict[str, float], limit: NoiseBand) -> bool:
     """Tell whether nothing is left above the band in any equation."""
-    return all(value <= limit.band[e] for e, value in excess.items())
+    return all(value <= limit.band[e] for e, value in excess_energy.items())

@@ -16,17 +16,17 @@ from numpy.typing import NDArray
 from analysis.effects.base import Effect
 from analysis.terms.base import Used
 from analysis.trace.data.candidates import Variant, complexity
-from analysis.trace.data.regression_data import Board, Entry, entries
+from analysis.trace.data.regression_data import RegressionData, VariantColumns, variant_columns
 from analysis.trace.search import linear_fit
 from analysis.trace.search.hypothesis import (
+    Hypothesis,
     Key,
-    Listed,
     excess_of,
     limits,
     parameter_values,
     within,
 )
-from analysis.trace.search.refinement import Fit, fit, rebased, refine
+from analysis.trace.search.refinement import ExactFit, fit, rebased, refine
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
@@ -38,22 +38,24 @@ NEXT = 6  # extensions of a set that are refined exactly
 DEEPEST = 3  # effects in a set found by extension
 
 
-class Shortlist:
+class HypothesisSet:
     """Sets of effects on one stage, fitted exactly once each."""
 
-    def __init__(self, stage: Board, effects: Sequence[Variant]) -> None:
-        self.stage = stage
-        self.base = tuple(stage.terms)
+    def __init__(self, data: RegressionData, effects: Sequence[Variant]) -> None:
+        self.stage = data
+        self.base = tuple(data.terms)
         self.variants = tuple(effects)
-        self.limits = limits(stage)
-        self.listed: dict[frozenset[Key], Listed] = {}
-        self.empty = self._listed((), fit(stage, self.base))
+        self.limits = limits(data)
+        self.listed: dict[frozenset[Key], Hypothesis] = {}
+        self.empty = self._listed((), fit(data, self.base))
 
-    def _listed(self, effects: tuple[Used, ...], found: Fit) -> Listed:
+    def _listed(self, effects: tuple[Used, ...], found: ExactFit) -> Hypothesis:
         rig = self.stage.rig
-        return Listed(effects, found, excess_of(self.stage, found.left), complexity(rig, effects))
+        return Hypothesis(
+            effects, found, excess_of(self.stage, found.residual), complexity(rig, effects)
+        )
 
-    def physical(self, one: Listed) -> str:
+    def physical(self, one: Hypothesis) -> str:
         """Say why a set is not physical ('' if it is)."""
         rig = self.stage.rig
         values = parameter_values(rig, one.fit.terms, dict(one.fit.beta))
@@ -66,7 +68,7 @@ class Shortlist:
                 return problem
         return ""
 
-    def exact(self, effects: Sequence[Used]) -> Listed:
+    def exact(self, effects: Sequence[Used]) -> Hypothesis:
         """Return the set refined exactly (once per set of names and places)."""
         key = frozenset((u.term.name, u.term.where) for u in effects)
         if key not in self.listed:
@@ -74,7 +76,7 @@ class Shortlist:
             self.listed[key] = self._listed(found.terms[len(self.base) :], found)
         return self.listed[key]
 
-    def better(self, one: Listed, other: Listed) -> bool:
+    def better(self, one: Hypothesis, other: Hypothesis) -> bool:
         """Tell whether `one` is to be preferred: much less left, or as little and simpler."""
         slack = linear_fit.CHANCE * max(1, abs(one.size[1] - other.size[1]))
         if one.size < other.size:
@@ -83,7 +85,7 @@ class Shortlist:
             return one.total < min(other.total / linear_fit.AS_GOOD, other.total - slack)
         return one.total < other.total
 
-    def best(self, among: Sequence[Listed]) -> Listed:
+    def best(self, among: Sequence[Hypothesis]) -> Hypothesis:
         """Return the preferred of several physical sets."""
         allowed = [o for o in among if not self.physical(o)]
         if not allowed:
@@ -92,22 +94,22 @@ class Shortlist:
         near = [o for o in allowed if o is least or self.better(o, least)]
         return min(near, key=lambda o: (o.size[1], o.size[0], o.total))
 
-    def run(self) -> Listed:
+    def run(self) -> Hypothesis:
         """Search: singles and pairs from the first board, then extensions; returns the winner."""
-        found = entries(self.stage, self.variants)
+        found = variant_columns(self.stage, self.variants)
         field = self._field(self.stage, found)
         r = self.stage.mean
         r = r - field.basis @ (field.basis.T @ r)
         self.field, self.projected = field, r
         singles = [self.exact(e) for e in self._singles(field, r)]
         now = self.prune(self.best([self.empty, *singles]))
-        if within(now.excess, self.limits):
+        if within(now.excess_energy, self.limits):
             return now
         if self.formed(now):
             return self.completed(now)
         pairs = [self.exact(e) for e in self._pairs(field, r, singles)]
         now = self.prune(self.best([self.empty, *singles, *pairs]))
-        while not within(now.excess, self.limits) and len(now.effects) < DEEPEST:
+        while not within(now.excess_energy, self.limits) and len(now.effects) < DEEPEST:
             grown = self.prune(self.best([now, *self.extensions(now)]))
             if grown.keys == now.keys or grown.total > 0.9 * now.total:
                 break
@@ -116,30 +118,30 @@ class Shortlist:
                 return self.completed(now)
         return now
 
-    def formed(self, one: Listed) -> bool:
+    def formed(self, one: Hypothesis) -> bool:
         """Tell whether what is left may be the difference of form between effect and catalogue."""
-        return all(self.negligible(e, left) for e, left in one.excess.items())
+        return all(self.negligible(e, residual) for e, residual in one.excess_energy.items())
 
-    def negligible(self, equation: str, left: float) -> bool:
+    def negligible(self, equation: str, residual: float) -> bool:
         """Tell whether so much energy above noise may be left in an equation."""
         allowed = (linear_fit.LEFT / linear_fit.BAND) ** 2 * self.limits.band[equation]
-        return left <= max(allowed, linear_fit.FORM * self.empty.excess[equation])
+        return residual <= max(allowed, linear_fit.FORM * self.empty.excess_energy[equation])
 
-    def completed(self, now: Listed) -> Listed:
+    def completed(self, now: Hypothesis) -> Hypothesis:
         """Add one more effect only if that leaves nothing but noise: else it fits a form."""
-        if within(now.excess, self.limits) or len(now.effects) >= DEEPEST:
+        if within(now.excess_energy, self.limits) or len(now.effects) >= DEEPEST:
             return now
-        more = [o for o in self.extensions(now) if within(o.excess, self.limits)]
+        more = [o for o in self.extensions(now) if within(o.excess_energy, self.limits)]
         best = self.best(more) if more else now
         return best if best.effects and self.prune(best).keys == best.keys else now
 
     def _field(
-        self, stage: Board, found: Sequence[Entry], mask: Array | None = None
-    ) -> linear_fit.Field:
-        rig = stage.rig
-        values = parameter_values(rig, stage.terms, dict(stage.beta))
+        self, data: RegressionData, found: Sequence[VariantColumns], mask: Array | None = None
+    ) -> linear_fit.CandidateColumns:
+        rig = data.rig
+        values = parameter_values(rig, data.terms, dict(data.beta))
 
-        def allowed(entry: Entry, coefficients: Array) -> bool:
+        def allowed(entry: VariantColumns, coefficients: Array) -> bool:
             own = dict(zip(entry.names, map(float, coefficients), strict=True))
             low, high = linear_fit.PSEUDO
             if "" in own and not low <= own[""] <= high:
@@ -148,12 +150,12 @@ class Shortlist:
                 own.setdefault(c.parameter, 0.0)
             return not entry.variant.effect.problem(rig, {**values, **own}, entry.variant.shape)
 
-        def size(entry: Entry) -> int:
+        def size(entry: VariantColumns) -> int:
             return complexity(rig, [entry.variant.used])[1]
 
-        return linear_fit.field(stage, found, size, allowed, mask)
+        return linear_fit.project(data, found, size, allowed, mask)
 
-    def _singles(self, field: linear_fit.Field, r: Array) -> list[tuple[Used, ...]]:
+    def _singles(self, field: linear_fit.CandidateColumns, r: Array) -> list[tuple[Used, ...]]:
         g = linear_fit.gains(field.K, field.columns.T @ r, field.groups, field.raw)
         out: dict[Key, tuple[Used, ...]] = {}
         least = NEAR * float(np.max(g, initial=0.0))
@@ -168,7 +170,7 @@ class Shortlist:
         return list(out.values())
 
     def _pairs(
-        self, field: linear_fit.Field, r: Array, singles: Sequence[Listed]
+        self, field: linear_fit.CandidateColumns, r: Array, singles: Sequence[Hypothesis]
     ) -> list[tuple[Used, ...]]:
         chosen = linear_fit.search(field, r)
         out = [tuple(field.entries[m].variant.used for m in chosen.members[:DEEPEST])]
@@ -178,22 +180,22 @@ class Shortlist:
         ]
         return [effects for effects in out if len(effects) > 1]
 
-    def extensions(self, now: Listed, equations: Collection[str] = ()) -> list[Listed]:
+    def extensions(self, now: Hypothesis, equations: Collection[str] = ()) -> list[Hypothesis]:
         """Return sets with one more effect, found on a board that has the set in its model.
 
         With `equations` the search looks at these alone.
         """
-        stage = rebased(self.stage, now.fit)
+        data = rebased(self.stage, now.fit)
         taken = now.keys
-        found = entries(stage, [v for v in self.variants if v.key not in taken])
-        mask = np.ones(len(now.fit.left))
-        for s in stage.segments:
+        found = variant_columns(data, [v for v in self.variants if v.key not in taken])
+        mask = np.ones(len(now.fit.residual))
+        for s in data.segments:
             mask[s.where] = not equations or s.equation in equations
-        field = self._field(stage, found, mask)
-        r = now.fit.left * mask
+        field = self._field(data, found, mask)
+        r = now.fit.residual * mask
         r = r - field.basis @ (field.basis.T @ r)
         more = linear_fit.options(field, (), r, 1.0)
-        out: list[Listed] = []
+        out: list[Hypothesis] = []
         seen: set[Key] = set()
         for trial in more:
             variant = field.entries[trial.members[0]].variant
@@ -202,7 +204,7 @@ class Shortlist:
                 out.append(self.exact((*now.effects, variant.used)))
         return out
 
-    def closer(self, now: Listed, equations: Collection[str]) -> Listed | None:
+    def closer(self, now: Hypothesis, equations: Collection[str]) -> Hypothesis | None:
         """Return the set with the effect added that some equations ask for, None where none is.
 
         What is left of a loud equation, the form of its effect, hides what a quiet one lacks as
@@ -211,23 +213,23 @@ class Shortlist:
         if len(now.effects) >= DEEPEST:
             return None
 
-        def left(one: Listed) -> float:
-            return sum(one.excess[e] for e in equations)
+        def residual(one: Hypothesis) -> float:
+            return sum(one.excess_energy[e] for e in equations)
 
-        def earned(one: Listed) -> bool:
-            drop, start = left(now) - left(one), max(0.0, left(now))
+        def earned(one: Hypothesis) -> bool:
+            drop, start = residual(now) - residual(one), max(0.0, residual(now))
             least = linear_fit.CHANCE * (one.size[1] - now.size[1])
             return drop > max(least, linear_fit.ADD_SHARE * start)
 
         more = [o for o in self.extensions(now, equations) if earned(o) and not self.physical(o)]
         if not more:
             return None
-        best = min(map(left, more))
+        best = min(map(residual, more))
         slack = max((linear_fit.AS_GOOD - 1.0) * max(0.0, best), linear_fit.CHANCE)
-        near = [o for o in more if left(o) <= best + slack]
-        return min(near, key=lambda o: (o.size[1], left(o)))
+        near = [o for o in more if residual(o) <= best + slack]
+        return min(near, key=lambda o: (o.size[1], residual(o)))
 
-    def prune(self, one: Listed) -> Listed:
+    def prune(self, one: Hypothesis) -> Hypothesis:
         """Drop effects without which about as little is left."""
         while len(one.effects) > 1:
             rest = [
@@ -240,7 +242,7 @@ class Shortlist:
             one = min(simpler, key=lambda o: o.total)
         return one
 
-    def idle(self, without: Listed, one: Listed) -> bool:
+    def idle(self, without: Hypothesis, one: Hypothesis) -> bool:
         """Tell whether the effect that `without` lacks takes too small a share away."""
         drop = without.total - one.total
         return drop < linear_fit.ADD_SHARE * without.total

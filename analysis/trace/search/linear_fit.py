@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.trace.data.regression_data import Board, Entry
+from analysis.trace.data.regression_data import RegressionData, VariantColumns
 
 Array = NDArray[np.float64]
 Key = tuple[str, str]
@@ -35,14 +35,14 @@ PSEUDO = (0.3, 3.0)  # coefficient of a pseudo-column (1 if its shape were exact
 
 
 @dataclass(frozen=True)
-class Field:
+class CandidateColumns:
     """Projected candidates: `columns` (M, V), groups of column numbers, what is admissible.
 
     `equations` maps an equation to its rows; `admissible(entry, coefficients)` is the physics'
     veto. `size` counts the free numbers of each entry.
     """
 
-    entries: tuple[Entry, ...]
+    entries: tuple[VariantColumns, ...]
     columns: Array
     K: Array
     basis: Array
@@ -51,31 +51,31 @@ class Field:
     rows: dict[str, Array]
     band: dict[str, float]
     size: tuple[int, ...]
-    admissible: Callable[[Entry, Array], bool]
+    admissible: Callable[[VariantColumns, Array], bool]
 
 
 @dataclass(frozen=True)
-class Choice:
-    """A set of entries, the `excess` energy above noise by equation, residual `left` (M,)."""
+class LinearFit:
+    """A set of candidates: energy above noise by equation, and the residual (M,)."""
 
     members: tuple[int, ...]
     coefficients: tuple[Array, ...]
-    excess: dict[str, float]
-    left: Array
+    excess_energy: dict[str, float]
+    residual: Array
 
     @property
     def total(self) -> float:
         """All energy left above noise, not below zero in any equation."""
-        return sum(max(0.0, e) for e in self.excess.values())
+        return sum(max(0.0, e) for e in self.excess_energy.values())
 
 
-def field(
-    stage: Board, found: Sequence[Entry], size: Callable[[Entry], int],
-    admissible: Callable[[Entry, Array], bool], mask: Array | None = None,
-) -> Field:  # fmt: skip
+def project(
+    data: RegressionData, found: Sequence[VariantColumns], size: Callable[[VariantColumns], int],
+    admissible: Callable[[VariantColumns, Array], bool], mask: Array | None = None,
+) -> CandidateColumns:  # fmt: skip
     """Project the entries off the stage's own columns; `mask` (M,) switches rows off."""
-    keep = np.ones(stage.base.shape[0]) if mask is None else mask
-    basis = orthonormal(stage.base * keep[:, None])
+    keep = np.ones(data.base.shape[0]) if mask is None else mask
+    basis = orthonormal(data.base * keep[:, None])
     groups, start = [], 0
     for entry in found:
         groups.append(tuple(range(start, start + entry.columns.shape[1])))
@@ -86,14 +86,14 @@ def field(
     projected = stack - basis @ (basis.T @ stack)
     rows: dict[str, list[Array]] = {}
     band: dict[str, float] = {}
-    for segment in stage.segments:
+    for segment in data.segments:
         where = np.arange(segment.where.start, segment.where.stop)
         where = where[keep[where] > 0]
         rows.setdefault(segment.equation, []).append(where)
         band[segment.equation] = band.get(segment.equation, 0.0) + BAND**2 * segment.repeats * len(
             where
         )
-    return Field(
+    return CandidateColumns(
         tuple(found), projected, projected.T @ projected, basis, tuple(groups), raw,
         {name: np.concatenate(parts) for name, parts in rows.items()}, band,
         tuple(size(entry) for entry in found), admissible,
@@ -131,140 +131,150 @@ def without(K: Array, c: Array, group: Sequence[int]) -> tuple[Array, Array]:
     return K - K[:, j] @ inverse @ K[j], c - K[:, j] @ (inverse @ c[j])
 
 
-def judged(board: Field, members: Sequence[int], r: Array, noise: float) -> Choice:
+def judged(
+    candidates: CandidateColumns, members: Sequence[int], r: Array, noise: float
+) -> LinearFit:
     """Fit a set to the projected residual r (M,); `noise` is its noise energy per row."""
-    columns = [j for m in members for j in board.groups[m]]
-    left, parts = r, []
+    columns = [j for m in members for j in candidates.groups[m]]
+    residual, parts = r, []
     if columns:
-        D = board.columns[:, columns]
+        D = candidates.columns[:, columns]
         scale = np.sqrt(np.sum(D**2, axis=0))
         scale[scale == 0] = 1.0
         fit = np.linalg.lstsq(D / scale, r, rcond=1e-6)[0] / scale
-        left = r - D @ fit
+        residual = r - D @ fit
         at = 0
         for m in members:
-            parts.append(fit[at : at + len(board.groups[m])])
-            at += len(board.groups[m])
-    excess = {e: float(left[w] @ left[w]) - noise * len(w) for e, w in board.rows.items()}
-    return Choice(tuple(members), tuple(parts), excess, left)
+            parts.append(fit[at : at + len(candidates.groups[m])])
+            at += len(candidates.groups[m])
+    excess_energy = {
+        e: float(residual[w] @ residual[w]) - noise * len(w) for e, w in candidates.rows.items()
+    }
+    return LinearFit(tuple(members), tuple(parts), excess_energy, residual)
 
 
-def in_band(board: Field, chosen: Choice, noise: float) -> bool:
+def in_band(candidates: CandidateColumns, chosen: LinearFit, noise: float) -> bool:
     """Tell whether what is left of every equation is too little to explain."""
     return all(
-        excess <= max(board.band[e], 4 * noise * np.sqrt(2 * len(board.rows[e])))
-        for e, excess in chosen.excess.items()
+        excess_energy <= max(candidates.band[e], 4 * noise * np.sqrt(2 * len(candidates.rows[e])))
+        for e, excess_energy in chosen.excess_energy.items()
     )
 
 
-def touched(board: Field, member: int, chosen: Choice) -> float:
+def touched(candidates: CandidateColumns, member: int, chosen: LinearFit) -> float:
     """Return the energy above noise that a set leaves in the equations an entry touches."""
-    return sum(max(0.0, chosen.excess.get(e, 0.0)) for e in board.entries[member].touched)
+    return sum(
+        max(0.0, chosen.excess_energy.get(e, 0.0)) for e in candidates.entries[member].touched
+    )
 
 
-def options(board: Field, members: Sequence[int], r: Array, noise: float) -> list[Choice]:
+def options(
+    candidates: CandidateColumns, members: Sequence[int], r: Array, noise: float
+) -> list[LinearFit]:
     """Return the sets with one more entry that earn their place, the best choice first.
 
     Among sets that leave about equally little the simplest stands first, then the others by what
     they leave.
     """
-    now = judged(board, members, r, noise)
-    K, c = board.K, board.columns.T @ r
+    now = judged(candidates, members, r, noise)
+    K, c = candidates.K, candidates.columns.T @ r
     for m in members:
-        K, c = without(K, c, board.groups[m])
-    g = gains(K, c, board.groups, board.raw)
-    taken = {board.entries[m].variant.key for m in members}
-    trials: list[Choice] = []
+        K, c = without(K, c, candidates.groups[m])
+    g = gains(K, c, candidates.groups, candidates.raw)
+    taken = {candidates.entries[m].variant.key for m in members}
+    trials: list[LinearFit] = []
     for i in map(int, np.argsort(-g)[:MOST_TRIALS]):
-        if g[i] <= 0 or board.entries[i].variant.key in taken:
+        if g[i] <= 0 or candidates.entries[i].variant.key in taken:
             continue
-        if g[i] < ADD_SHARE * touched(board, i, now):
+        if g[i] < ADD_SHARE * touched(candidates, i, now):
             continue
-        trial = judged(board, (*members, i), r, noise)
-        if admissible(board, trial):
+        trial = judged(candidates, (*members, i), r, noise)
+        if admissible(candidates, trial):
             trials.append(trial)
     if not trials:
         return []
     best = min(t.total for t in trials)
-    limit = max(AS_GOOD * best, best + 0.1 * sum(board.band.values()))
-    near = sorted((t for t in trials if t.total <= limit), key=lambda t: (_size(board, t), t.total))
+    limit = max(AS_GOOD * best, best + 0.1 * sum(candidates.band.values()))
+    near = sorted(
+        (t for t in trials if t.total <= limit), key=lambda t: (_size(candidates, t), t.total)
+    )
     return near + sorted((t for t in trials if t.total > limit), key=lambda t: t.total)
 
 
-def _size(board: Field, choice: Choice) -> int:
-    return sum(board.size[m] for m in choice.members)
+def _size(candidates: CandidateColumns, choice: LinearFit) -> int:
+    return sum(candidates.size[m] for m in choice.members)
 
 
-def admissible(board: Field, choice: Choice) -> bool:
+def admissible(candidates: CandidateColumns, choice: LinearFit) -> bool:
     """Tell whether physics allows every effect of a set at its fitted size."""
     return all(
-        board.admissible(board.entries[m], k)
+        candidates.admissible(candidates.entries[m], k)
         for m, k in zip(choice.members, choice.coefficients, strict=True)
     )
 
 
-def search(board: Field, r: Array, noise: float = 1.0) -> Choice:
+def search(candidates: CandidateColumns, r: Array, noise: float = 1.0) -> LinearFit:
     """Find the set: forward with swaps and backward pruning, from nothing and from pairs."""
-    empty = judged(board, (), r, noise)
-    if in_band(board, empty, noise) or not board.entries:
+    empty = judged(candidates, (), r, noise)
+    if in_band(candidates, empty, noise) or not candidates.entries:
         return empty
-    greedy = grow(board, (), r, noise)
-    if len(greedy.members) == 1 and in_band(board, greedy, noise):
+    greedy = grow(candidates, (), r, noise)
+    if len(greedy.members) == 1 and in_band(candidates, greedy, noise):
         return greedy
     best, seen = greedy, set[Key]()
-    for first in options(board, (), r, noise)[: 3 * STARTS] or _blind(board, r):
-        key = board.entries[first.members[0]].variant.key
+    for first in options(candidates, (), r, noise)[: 3 * STARTS] or _blind(candidates, r):
+        key = candidates.entries[first.members[0]].variant.key
         if key in seen or len(seen) >= STARTS:
             continue
         seen.add(key)
-        for pair in options(board, first.members, r, noise)[:1]:
-            other = grow(board, pair.members, r, noise)
+        for pair in options(candidates, first.members, r, noise)[:1]:
+            other = grow(candidates, pair.members, r, noise)
             if len(other.members) <= max(2, len(best.members)) and other.total < 0.7 * best.total:
                 best = other
     return best
 
 
-def best_pairs(board: Field, r: Array, count: int) -> list[Choice]:
+def best_pairs(candidates: CandidateColumns, r: Array, count: int) -> list[LinearFit]:
     """Return the pairs of different candidates that leave least, whatever they are alone."""
-    starts: dict[Key, Choice] = {}
-    for first in _blind(board, r):
-        starts.setdefault(board.entries[first.members[0]].variant.key, first)
-    found: dict[frozenset[Key], Choice] = {}
+    starts: dict[Key, LinearFit] = {}
+    for first in _blind(candidates, r):
+        starts.setdefault(candidates.entries[first.members[0]].variant.key, first)
+    found: dict[frozenset[Key], LinearFit] = {}
     for first in list(starts.values())[:STARTS]:
-        for pair in options(board, first.members, r, 1.0)[:3]:
-            keys = frozenset(board.entries[m].variant.key for m in pair.members)
+        for pair in options(candidates, first.members, r, 1.0)[:3]:
+            keys = frozenset(candidates.entries[m].variant.key for m in pair.members)
             if keys not in found or pair.total < found[keys].total:
                 found[keys] = pair
     return sorted(found.values(), key=lambda p: p.total)[:count]
 
 
-def _blind(board: Field, r: Array) -> list[Choice]:
+def _blind(candidates: CandidateColumns, r: Array) -> list[LinearFit]:
     """Return the best single entries although none earns a place alone: a pair may."""
-    g = gains(board.K, board.columns.T @ r, board.groups, board.raw)
-    return [judged(board, (int(i),), r, 1.0) for i in np.argsort(-g)[: 6 * STARTS] if g[i] > 0]
+    g = gains(candidates.K, candidates.columns.T @ r, candidates.groups, candidates.raw)
+    return [judged(candidates, (int(i),), r, 1.0) for i in np.argsort(-g)[: 6 * STARTS] if g[i] > 0]
 
 
-def grow(board: Field, members: Sequence[int], r: Array, noise: float) -> Choice:
+def grow(candidates: CandidateColumns, members: Sequence[int], r: Array, noise: float) -> LinearFit:
     """Add entries while they earn their place, swapping and dropping earlier ones."""
-    now = judged(board, members, r, noise)
-    while not in_band(board, now, noise) and len(now.members) < LARGEST:
-        more = options(board, now.members, r, noise)
+    now = judged(candidates, members, r, noise)
+    while not in_band(candidates, now, noise) and len(now.members) < LARGEST:
+        more = options(candidates, now.members, r, noise)
         if not more:
             break
-        grown = prune(board, swap(board, more[0], r, noise), r, noise)
+        grown = prune(candidates, swap(candidates, more[0], r, noise), r, noise)
         if grown.total > 0.95 * now.total:
             break
         now = grown
-    return prune(board, now, r, noise)
+    return prune(candidates, now, r, noise)
 
 
-def swap(board: Field, chosen: Choice, r: Array, noise: float) -> Choice:
+def swap(candidates: CandidateColumns, chosen: LinearFit, r: Array, noise: float) -> LinearFit:
     """Exchange members for better ones, the others kept, until none is."""
     for _ in range(2):
         before = chosen
         for m in chosen.members[:-1]:
             others = tuple(k for k in chosen.members if k != m)
-            for trial in options(board, others, r, noise)[:1]:
+            for trial in options(candidates, others, r, noise)[:1]:
                 if trial.total < 0.9 * chosen.total:
                     chosen = trial
                     break
@@ -273,19 +283,21 @@ def swap(board: Field, chosen: Choice, r: Array, noise: float) -> Choice:
     return chosen
 
 
-def prune(board: Field, chosen: Choice, r: Array, noise: float) -> Choice:
+def prune(candidates: CandidateColumns, chosen: LinearFit, r: Array, noise: float) -> LinearFit:
     """Drop members without which about as little is left in the equations they touch."""
     while len(chosen.members) > 1:
-        shares = {m: share(board, chosen, m, r, noise) for m in chosen.members}
+        shares = {m: share(candidates, chosen, m, r, noise) for m in chosen.members}
         worst = min(shares, key=lambda m: shares[m])
         if shares[worst] >= ADD_SHARE:
             break
-        chosen = judged(board, tuple(m for m in chosen.members if m != worst), r, noise)
+        chosen = judged(candidates, tuple(m for m in chosen.members if m != worst), r, noise)
     return chosen
 
 
-def share(board: Field, chosen: Choice, member: int, r: Array, noise: float) -> float:
+def share(
+    candidates: CandidateColumns, chosen: LinearFit, member: int, r: Array, noise: float
+) -> float:
     """Return which share of the energy above noise goes with a member, the others kept."""
-    rest = judged(board, tuple(m for m in chosen.members if m != member), r, noise)
-    before, after = touched(board, member, rest), touched(board, member, chosen)
+    rest = judged(candidates, tuple(m for m in chosen.members if m != member), r, noise)
+    before, after = touched(candidates, member, rest), touched(candidates, member, chosen)
     return (before - after) / before if before > 0 else 0.0

@@ -18,8 +18,8 @@ from scipy.optimize import least_squares as search_shapes
 from analysis.effects.base import Effect, Shape, shapes_of
 from analysis.regression.rows import Rows
 from analysis.terms.base import Used
-from analysis.trace.data.conditioned_record import Scene, acts_on, held, scene_rows
-from analysis.trace.data.regression_data import Board
+from analysis.trace.data.conditioned_record import ConditionedRecord, acts_on, held, model_rows
+from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.search.linear_fit import CHANCE, orthonormal
 from rig.model.rig import Rig
 
@@ -32,45 +32,45 @@ REMEMBERED = 300  # families of rows of scenes under a model, about 0.1 MB each
 
 
 @dataclass(frozen=True)
-class Table:
+class DesignMatrix:
     """Whitened rows of a model on a board: matrix (M, k) of `names`, right side (M,)."""
 
     names: tuple[str, ...]
     matrix: Array
     rhs: Array
 
-    def left(self, beta: Mapping[str, float]) -> Array:
+    def residual(self, beta: Mapping[str, float]) -> Array:
         """Return the residual (M,) under coefficients of the rows."""
         return np.asarray(self.rhs - self.matrix @ np.array([beta.get(n, 0.0) for n in self.names]))
 
 
 @dataclass(frozen=True)
-class Fit:
+class ExactFit:
     """A model with shapes found: terms, the rows' coefficients, residual (M,) on the board."""
 
     terms: tuple[Used, ...]
     beta: Mapping[str, float]
-    left: Array
+    residual: Array
 
     @property
     def energy(self) -> float:
         """Whitened energy of the residual."""
-        return float(self.left @ self.left)
+        return float(self.residual @ self.residual)
 
 
-def table(stage: Board, terms: Sequence[Used]) -> Table:
+def table(data: RegressionData, terms: Sequence[Used]) -> DesignMatrix:
     """Return the whitened rows of a model on the stage's averaged records and instants.
 
     Instants that the model masks become zero rows.
     """
-    built = [_rows(stage, terms, scene) for scene in stage.scenes]
-    names = tuple(dict.fromkeys(c.parameter for u in terms for c in u.term.coefficients(stage.rig)))
-    M = stage.base.shape[0]
+    built = [_rows(data, terms, conditioned) for conditioned in data.records]
+    names = tuple(dict.fromkeys(c.parameter for u in terms for c in u.term.coefficients(data.rig)))
+    M = data.base.shape[0]
     X, y = np.zeros((M, len(names))), np.zeros(M)
-    index = {scene.group: k for k, scene in enumerate(stage.scenes)}
-    for segment in stage.segments:
+    index = {conditioned.group: k for k, conditioned in enumerate(data.records)}
+    for segment in data.segments:
         k = index[segment.group]
-        rows, before = built[k][segment.equation], stage.rows[k][segment.equation]
+        rows, before = built[k][segment.equation], data.rows[k][segment.equation]
         _, here, there = np.intersect1d(before.time, rows.time, return_indices=True)
         size = np.linalg.norm(before.rhs[here]) / max(
             float(np.linalg.norm(rows.rhs[there])), 1e-300
@@ -80,61 +80,63 @@ def table(stage: Board, terms: Sequence[Used]) -> Table:
         columns = [names.index(n) for n in rows.names]
         X[np.ix_(at, columns)] = rows.matrix[there] * weight
         y[at] = rows.rhs[there] * weight
-    return Table(names, X, y)
+    return DesignMatrix(names, X, y)
 
 
-def _rows(stage: Board, terms: Sequence[Used], scene: Scene) -> dict[str, Rows]:
+def _rows(
+    data: RegressionData, terms: Sequence[Used], conditioned: ConditionedRecord
+) -> dict[str, Rows]:
     """Return a scene's rows, remembered: many sets share what acts on a family of its rows."""
-    here = [u for u in terms if not held(u.term, scene)]
+    here = [u for u in terms if not held(u.term, conditioned)]
     found: dict[str, Rows] = {}
-    for family in scene.families:
-        acting = tuple(u for u in here if acts_on(stage.rig, u.term, family))
-        key = (scene.group, family, acting)
-        if key not in stage.memo:
-            if len(stage.memo) >= REMEMBERED:
-                stage.memo.clear()
-            stage.memo[key] = scene_rows(stage.rig, acting, replace(scene, families=(family,)))
-        found |= stage.memo[key]
+    for family in conditioned.families:
+        acting = tuple(u for u in here if acts_on(data.rig, u.term, family))
+        key = (conditioned.group, family, acting)
+        if key not in data.memo:
+            if len(data.memo) >= REMEMBERED:
+                data.memo.clear()
+            data.memo[key] = model_rows(data.rig, acting, replace(conditioned, families=(family,)))
+        found |= data.memo[key]
     return found
 
 
-def fit(stage: Board, terms: Sequence[Used]) -> Fit:
+def fit(data: RegressionData, terms: Sequence[Used]) -> ExactFit:
     """Solve a model's coefficients on the board, shapes as they are."""
-    rows = table(stage, terms)
+    rows = table(data, terms)
     scale = np.linalg.norm(rows.matrix, axis=0)
     scale[scale == 0] = 1.0
     value = np.linalg.lstsq(rows.matrix / scale, rows.rhs, rcond=1e-6)[0] / scale
     beta = dict(zip(rows.names, value, strict=True))
-    return Fit(tuple(terms), beta, rows.left(beta))
+    return ExactFit(tuple(terms), beta, rows.residual(beta))
 
 
-def refine(stage: Board, terms: Sequence[Used], steps: int = MOST_STEPS) -> Fit:
+def refine(data: RegressionData, terms: Sequence[Used], steps: int = MOST_STEPS) -> ExactFit:
     """Search the shape parameters that the board's own terms do not have, from where they are.
 
     Then details of forms join, one after another, that take more away than chance, and a share of
     what is left.
     """
-    found = _searched(stage, terms, steps)
+    found = _searched(data, terms, steps)
     for k in range(len(terms)):
         used = found.terms[k]
-        opened = used if used in stage.terms else _in_detail(stage.rig, used)
-        asked = max(CHANCE, DETAIL * (found.energy - len(found.left)))
+        opened = used if used in data.terms else _in_detail(data.rig, used)
+        asked = max(CHANCE, DETAIL * (found.energy - len(found.residual)))
         # Half, since in a straight line a detail promises less than it takes.
-        if opened == used or _promise(stage, found, used, opened) < 0.5 * asked:
+        if opened == used or _promise(data, found, used, opened) < 0.5 * asked:
             continue
-        more = _searched(stage, _with(found.terms, used, opened), steps)
+        more = _searched(data, _with(found.terms, used, opened), steps)
         found = more if found.energy - more.energy > asked else found
     return found
 
 
-def _promise(stage: Board, found: Fit, used: Used, opened: Used) -> float:
+def _promise(data: RegressionData, found: ExactFit, used: Used, opened: Used) -> float:
     """Return the energy that a term with its details would take, were all linear in them."""
-    column = table(stage, _with(found.terms, used, opened)).left(found.beta) - found.left
-    absorbed = np.hstack((table(stage, found.terms).matrix, jacobian(stage, found, used)[1]))
+    column = table(data, _with(found.terms, used, opened)).residual(found.beta) - found.residual
+    absorbed = np.hstack((table(data, found.terms).matrix, jacobian(data, found, used)[1]))
     basis = orthonormal(absorbed)
     column = column - basis @ (basis.T @ column)
     size = float(column @ column)
-    return float(column @ found.left) ** 2 / size if size > 0 else 0.0
+    return float(column @ found.residual) ** 2 / size if size > 0 else 0.0
 
 
 def _with(terms: Sequence[Used], used: Used, other: Used) -> tuple[Used, ...]:
@@ -150,11 +152,11 @@ def _in_detail(rig: Rig, used: Used) -> Used:
     return Used(used.term, (*used.shape, *more))
 
 
-def _searched(stage: Board, terms: Sequence[Used], steps: int) -> Fit:
-    free = _free(stage, terms)
+def _searched(data: RegressionData, terms: Sequence[Used], steps: int) -> ExactFit:
+    free = _free(data, terms)
     if not free:
-        return fit(stage, terms)
-    terms = _on_the_right_side(stage, terms, free)
+        return fit(data, terms)
+    terms = _on_the_right_side(data, terms, free)
     start = np.array([_to_unit(terms[k].shape[j], s) for k, j, s in free])
 
     def at(x: Array) -> tuple[Used, ...]:
@@ -164,25 +166,25 @@ def _searched(stage: Board, terms: Sequence[Used], steps: int) -> Fit:
         return tuple(Used(u.term, tuple(v)) for u, v in zip(terms, shapes, strict=True))
 
     found = search_shapes(
-        lambda x: fit(stage, at(x)).left, np.clip(start, 1e-6, 1 - 1e-6), bounds=(0.0, 1.0),
+        lambda x: fit(data, at(x)).residual, np.clip(start, 1e-6, 1 - 1e-6), bounds=(0.0, 1.0),
         diff_step=1e-3, xtol=TOLERANCE, ftol=TOLERANCE, gtol=1e-12,
         max_nfev=steps,
     )  # fmt: skip
-    return fit(stage, at(found.x))
+    return fit(data, at(found.x))
 
 
-def _free(stage: Board, terms: Sequence[Used]) -> list[tuple[int, int, Shape]]:
+def _free(data: RegressionData, terms: Sequence[Used]) -> list[tuple[int, int, Shape]]:
     """Return the shapes to be searched: place of the term, of the shape in it, and what it is."""
     return [
         (k, j, s)
         for k, u in enumerate(terms)
-        if u not in stage.terms
-        for j, s in enumerate(shapes_of(stage.rig, u))
+        if u not in data.terms
+        for j, s in enumerate(shapes_of(data.rig, u))
     ]
 
 
 def _on_the_right_side(
-    stage: Board, terms: Sequence[Used], free: Sequence[tuple[int, int, Shape]]
+    data: RegressionData, terms: Sequence[Used], free: Sequence[tuple[int, int, Shape]]
 ) -> tuple[Used, ...]:
     """Return the terms with every free shape on the side of its neutral value that leaves less.
 
@@ -198,8 +200,8 @@ def _on_the_right_side(
         shape = (*used.shape[:j], mirrored, *used.shape[j + 1 :])
         other = (*terms[:k], Used(used.term, shape), *terms[k + 1 :])
         if np.isnan(least):  # few effects lie on either side of nothing
-            least = fit(stage, terms).energy
-        energy = fit(stage, other).energy
+            least = fit(data, terms).energy
+        energy = fit(data, other).energy
         if energy < least:
             terms, least = other, energy
     return terms
@@ -222,15 +224,15 @@ def _from_unit(x: float, shape: Shape) -> float:
     return shape.low + x * (shape.high - shape.low)
 
 
-def jacobian(stage: Board, model: Fit, used: Used) -> tuple[tuple[str, ...], Array]:
+def jacobian(data: RegressionData, model: ExactFit, used: Used) -> tuple[tuple[str, ...], Array]:
     """Return names and whitened columns (M, p) of an effect's coefficients and shapes.
 
     A column is what a unit more of the parameter adds to the model's side of the rows.
     """
-    rows = table(stage, model.terms)
-    own = [c.parameter for c in used.term.coefficients(stage.rig)]
+    rows = table(data, model.terms)
+    own = [c.parameter for c in used.term.coefficients(data.rig)]
     names, columns = list(own), [rows.matrix[:, rows.names.index(n)] for n in own]
-    for j, shape in enumerate(shapes_of(stage.rig, used)):
+    for j, shape in enumerate(shapes_of(data.rig, used)):
         step = 1e-3 * (shape.high - shape.low)
         if _logarithmic(shape):
             step = 1e-2 * used.shape[j]
@@ -239,19 +241,19 @@ def jacobian(stage: Board, model: Fit, used: Used) -> tuple[tuple[str, ...], Arr
         ends = []
         for value in (up, down):
             changed = Used(used.term, (*used.shape[:j], value, *used.shape[j + 1 :]))
-            ends.append(table(stage, _with(model.terms, used, changed)).left(model.beta))
+            ends.append(table(data, _with(model.terms, used, changed)).residual(model.beta))
         names.append(shape.parameter)
         columns.append(-(ends[0] - ends[1]) / (up - down))
-    stack = np.column_stack(columns) if columns else np.zeros((len(model.left), 0))
+    stack = np.column_stack(columns) if columns else np.zeros((len(model.residual), 0))
     return tuple(names), stack
 
 
-def rebased(stage: Board, model: Fit) -> Board:
+def rebased(data: RegressionData, model: ExactFit) -> RegressionData:
     """Return the stage with a fitted model in place of its own."""
-    rows = table(stage, model.terms)
+    rows = table(data, model.terms)
     built = []
-    for scene, before in zip(stage.scenes, stage.rows, strict=True):
-        now = scene_rows(stage.rig, model.terms, scene)
+    for conditioned, before in zip(data.records, data.rows, strict=True):
+        now = model_rows(data.rig, model.terms, conditioned)
         kept = {}
         for equation, old in before.items():
             _, here, there = np.intersect1d(old.time, now[equation].time, return_indices=True)
@@ -261,6 +263,6 @@ def rebased(stage: Board, model: Fit) -> Board:
             kept[equation] = replace(now[equation], matrix=matrix, rhs=rhs, time=old.time)
         built.append(kept)
     return replace(
-        stage, terms=model.terms, beta=dict(model.beta), names=rows.names, base=rows.matrix,
+        data, terms=model.terms, beta=dict(model.beta), names=rows.names, base=rows.matrix,
         rows=tuple(built),
     )  # fmt: skip

@@ -5,28 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-from analysis.effects.base import Effect, Shape, shapes_of
+from analysis.effects.base import Effect, Shape, open_shapes, shapes_of
 from analysis.identify import checks as ck
 from analysis.terms.base import Used
 from analysis.trace.data.candidates import points
-from analysis.trace.data.conditioned_record import scenes
-from analysis.trace.data.regression_data import board
-from analysis.trace.data.temperature_nuisance import beside
+from analysis.trace.data.conditioned_record import conditioned_records
+from analysis.trace.data.regression_data import regression_data
+from analysis.trace.data.temperature_nuisance import temperature_terms
 from analysis.trace.search.refinement import fit, refine
 from rig.model.records import Run
 from rig.model.rig import Rig
 
 STARTS: Final = 3  # points of an effect's grid that are searched from
-
-
-def open_shapes(rig: Rig, used: Used) -> bool:
-    """Tell whether a term is an effect that is nothing without a shape, and has none.
-
-    A contact's presliding is what data resolve: without one it is dry.
-    """
-    if len(used.shape) or not isinstance(used.term, Effect):
-        return False
-    return any(not s.resolution for s in used.term.shapes(rig))
 
 
 def with_shapes(runs: Sequence[Run], terms: Sequence[Used]) -> tuple[Used, ...]:
@@ -40,16 +30,18 @@ def with_shapes(runs: Sequence[Run], terms: Sequence[Used]) -> tuple[Used, ...]:
     if not wanted:
         return tuple(terms)
     known = [u for u in terms if u not in wanted]
-    stage = board(rig, (*known, *beside(known, runs)), scenes(rig, runs))
+    data = regression_data(
+        rig, (*known, *temperature_terms(known, runs)), conditioned_records(rig, runs)
+    )
     found: tuple[Used, ...] = ()
     for used in wanted:
         assert isinstance(used.term, Effect)
-        trials = [(*stage.terms, *found, Used(used.term, p)) for p in points(used.term, rig)]
+        trials = [(*data.terms, *found, Used(used.term, p)) for p in points(used.term, rig)]
         # The least before the search need not be it afterwards: edges that no spool reaches leave
         # little, and nothing to search along.
-        near = sorted(trials, key=lambda trial: fit(stage, trial).energy)[:STARTS]
-        best = min((refine(stage, trial) for trial in near), key=lambda one: one.energy)
-        found = best.terms[len(stage.terms) :]
+        near = sorted(trials, key=lambda trial: fit(data, trial).energy)[:STARTS]
+        best = min((refine(data, trial) for trial in near), key=lambda one: one.energy)
+        found = best.terms[len(data.terms) :]
     shaped = dict(zip(wanted, found, strict=True))
     return tuple(shaped.get(u, u) for u in terms)
 

@@ -12,7 +12,7 @@ from analysis.identify.identify import identify
 from analysis.signals.conditioning import condition
 from analysis.simulation.model import Model
 from analysis.simulation.simulate import (
-    Drive,
+    DrivingInput,
     State,
     compiled,
     drive_of,
@@ -72,7 +72,7 @@ def simulation_figures(run: Run, model: Model, repeats: int = 5) -> dict[str, An
     }
 
 
-def _lsoda(ready: Any, drive: Drive, start: State) -> tuple[float, float]:
+def _lsoda(ready: Any, drive: DrivingInput, start: State) -> tuple[float, float]:
     """Return LSODA's wall seconds per simulated second and the largest piston difference [m]."""
     samples = min(len(drive.u), round(2 * drive.rate))
     own = simulate(ready, drive, start, 0, samples)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from analysis.identify.out_of_core import identify_folders
 from analysis.regression.qr import Accumulator
-from analysis.workers.cluster import Cluster
+from analysis.workers.cluster import DaskCluster
 from analysis.workers.pool import ONE_THREAD, Processes, environment
 
 Array = NDArray[np.float64]
@@ -119,7 +119,7 @@ def cluster_figures(folders: Sequence[str], tries: int = 3) -> dict[str, float]:
                 silence_logs=50,
             ) as local,
             distributed.Client(local, set_as_default=False) as watcher,
-            Cluster(local.scheduler_address) as pool,
+            DaskCluster(local.scheduler_address) as pool,
         ):
             list(pool.map(_warm, [WARM_SECONDS] * 4 * workers))
             before = watcher.run(time.process_time)

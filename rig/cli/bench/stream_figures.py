@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from analysis.identify.identify import PLAIN, identify
+from analysis.identify.identify import identify
 from analysis.identify.online import Tracker, track
+from analysis.identify.result import PLAIN
 from drivers.base import SampleBlock
 from rig.cli.bench.analysis import bench_run
 from rig.cli.bench.figure import Figure

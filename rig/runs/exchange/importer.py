@@ -18,8 +18,8 @@ from rig.runs import archive, store
 from rig.runs.exchange.columns import read_table
 from rig.runs.exchange.manifest import (
     TIME,
-    Entry,
     Manifest,
+    ManifestRecord,
     channels_of,
     check_against_rig,
     load_manifest,
@@ -60,7 +60,7 @@ class _Source:
 
 @dataclass(frozen=True)
 class _Imported:
-    entry: Entry
+    entry: ManifestRecord
     sample_rate: float
     start: float
     channels: dict[str, Array]
@@ -87,7 +87,7 @@ def import_records(manifest_path: str | Path, out: str | Path) -> ImportReport:
     return ImportReport(folder, len(records), samples, warnings)
 
 
-def _read(source: _Source, entry: Entry) -> _Imported:
+def _read(source: _Source, entry: ManifestRecord) -> _Imported:
     file = source.path.parent / entry.file
     required, optional = channels_of(source.rig)
     # What the manifest maps by name is meant to be there, optional or not.
@@ -107,7 +107,7 @@ def _read(source: _Source, entry: Entry) -> _Imported:
     return _Imported(entry, rate, start + part.start / rate, channels)
 
 
-def _part(entry: Entry, file: Path, rate: float, samples: int) -> slice:
+def _part(entry: ManifestRecord, file: Path, rate: float, samples: int) -> slice:
     """Return the samples between the entry's `begin` and `end`; raises InputError if none are."""
     first = round(entry.begin * rate)
     last = samples if entry.end is None else round(entry.end * rate)

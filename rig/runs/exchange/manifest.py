@@ -40,7 +40,7 @@ class Column(_Part):
         return self
 
 
-class Entry(_Part):
+class ManifestRecord(_Part):
     """One file, one record, or the part of it from `begin` to `end`.
 
     `period` [samples] and `lines` describe a periodic excitation.
@@ -75,7 +75,7 @@ class Manifest(_Part):
 
     rig: str = Field(min_length=1)
     sample_rate: Frequency | None = Field(default=None, gt=0)
-    records: tuple[Entry, ...] = Field(min_length=1)
+    records: tuple[ManifestRecord, ...] = Field(min_length=1)
     columns: dict[str, Column] = {}
 
 
@@ -89,7 +89,7 @@ def load_manifest(path: Path) -> tuple[Manifest, dict[tuple[str | int, ...], int
 
 
 def _refuse_duplicates(
-    records: Sequence[Entry], lines: dict[tuple[str | int, ...], int], path: Path
+    records: Sequence[ManifestRecord], lines: dict[tuple[str | int, ...], int], path: Path
 ) -> None:
     seen: dict[tuple[str, int], int] = {}
     names: set[str] = set()

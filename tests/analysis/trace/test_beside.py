@@ -11,9 +11,9 @@ from analysis.identify.identify import identify
 from analysis.simulation.synthetic import multisine, synthetic_run
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
-from analysis.trace.data.conditioned_record import scenes
-from analysis.trace.data.regression_data import board
-from analysis.trace.data.temperature_nuisance import beside, plausible, stripped
+from analysis.trace.data.conditioned_record import conditioned_records
+from analysis.trace.data.regression_data import regression_data
+from analysis.trace.data.temperature_nuisance import plausible, stripped, temperature_terms
 from analysis.trace.judge import held_out
 from analysis.trace.search.refinement import fit
 from rig.model.records import Run
@@ -43,8 +43,8 @@ def test_the_column_is_there_where_temperature_was_measured_and_moved(
     rig: Rig, days: tuple[Run, Run]
 ) -> None:
     terms = tuple(map(Used, baseline_of(rig)))
-    assert [u.term.name for u in beside(terms, days)] == ["bulk_temperature_nuisance"]
-    assert beside(terms, days[:1]) == ()
+    assert [u.term.name for u in temperature_terms(terms, days)] == ["bulk_temperature_nuisance"]
+    assert temperature_terms(terms, days[:1]) == ()
     blind = [
         replace(run, records=tuple(
             replace(r, channels={k: v for k, v in r.channels.items() if k != "oil_temperature"})
@@ -52,17 +52,17 @@ def test_the_column_is_there_where_temperature_was_measured_and_moved(
         ))
         for run in days
     ]  # fmt: skip
-    assert beside(terms, blind) == ()
+    assert temperature_terms(terms, blind) == ()
 
 
 def test_a_warmer_day_is_judged_at_its_own_temperature(rig: Rig, days: tuple[Run, Run]) -> None:
     terms = tuple(map(Used, baseline_of(rig)))
-    train, judged = (scenes(rig, [run]) for run in days)
+    train, judged = (conditioned_records(rig, [run]) for run in days)
     found = {}
-    for label, extra in (("without", ()), ("with", beside(terms, days[:1], days[1:]))):
-        stage = board(rig, (*terms, *extra), train)
-        judge = board(rig, (*terms, *extra), judged, stage.beta)
-        model = held_out.settled(judge, fit(stage, stage.terms))
+    for label, extra in (("without", ()), ("with", temperature_terms(terms, days[:1], days[1:]))):
+        train_data = regression_data(rig, (*terms, *extra), train)
+        holdout_data = regression_data(rig, (*terms, *extra), judged, train_data.beta)
+        model = held_out.settled(holdout_data, fit(train_data, train_data.terms))
         found[label] = held_out.errors(rig, judged, model, model)
     floor = found["with"].noise
     assert found["without"].after["flow_cap_2"] > 1.3 * floor["flow_cap_2"]
@@ -74,11 +74,11 @@ def test_a_cold_morning_is_judged_though_the_fit_knows_warm_oil_alone(rig: Rig) 
     terms = tuple(map(Used, baseline_of(rig)))
     warm = [day(rig, 1, 6.0), day(rig, 2, 6.2)]  # a fifth of a kelvin says nothing of the slope
     cold = [day(rig, 3, 0.0, 0.02)]
-    every = (*terms, *beside(terms, warm, cold))
-    train, judged = (scenes(rig, runs) for runs in (warm, cold))
-    stage = board(rig, every, train)
-    judge = board(rig, every, judged, stage.beta)
-    model = held_out.settled(judge, fit(stage, stage.terms))
+    every = (*terms, *temperature_terms(terms, warm, cold))
+    train, judged = (conditioned_records(rig, runs) for runs in (warm, cold))
+    train_data = regression_data(rig, every, train)
+    holdout_data = regression_data(rig, every, judged, train_data.beta)
+    model = held_out.settled(holdout_data, fit(train_data, train_data.terms))
     found = held_out.errors(rig, judged, model, model)
     for equation, error in found.after.items():
         assert error < 1.15 * found.noise[equation], equation
@@ -96,7 +96,7 @@ def test_oil_can_do_only_so_much() -> None:
 
 def test_the_model_file_is_that_of_the_rigs_temperature(rig: Rig, days: tuple[Run, Run]) -> None:
     terms = tuple(map(Used, baseline_of(rig)))
-    full = identify(days, terms=(*terms, *beside(terms, days)), estimator="plain").model
+    full = identify(days, terms=(*terms, *temperature_terms(terms, days)), estimator="plain").model
     kept = stripped(full)
     assert set(full.parameters) - set(kept.parameters) == {"1/b per kelvin"}
     assert kept.parameters["b"].value == pytest.approx(rig.nominal["b"], rel=0.01)

@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.trace.clues.formula import Formula
 from analysis.trace.data.candidates import catalogue
 from analysis.trace.engine import trace
-from analysis.trace.result import Trace, to_json
+from analysis.trace.result import Formula, Trace, to_json
 from rig.cli.trace_text import trace_text
 from rig.model.records import Record, Run
 from rig.model.rig import Rig

@@ -10,8 +10,8 @@ import pytest
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from analysis.trace.clues.frequency import FREQUENCY, frequency_clue
-from analysis.trace.data.conditioned_record import scenes
-from analysis.trace.data.regression_data import Board, board
+from analysis.trace.data.conditioned_record import conditioned_records
+from analysis.trace.data.regression_data import RegressionData, regression_data
 from analysis.trace.data.spectral_lines import lines
 from analysis.trace.result import Dependence
 from rig.model.records import Run
@@ -36,15 +36,23 @@ def humming(run: Run, hertz: float, pascal: float) -> Run:
 
 
 def clue_of(rig: Rig, train: Run, held_out: Run) -> Dependence | None:
-    def laid_out(run: Run, stage: Board | None = None) -> Board:
+    def laid_out(run: Run, train_data: RegressionData | None = None) -> RegressionData:
         # Two periods a record: the lines are those that the wave says it has.
         run = replace(run, records=tuple(replace(r, period=4000) for r in run.records))
         terms = tuple(map(Used, baseline_of(rig)))
-        return board(rig, terms, scenes(rig, [run]), stage.beta if stage else None)
+        return regression_data(
+            rig, terms, conditioned_records(rig, [run]), train_data.beta if train_data else None
+        )
 
-    stage = laid_out(train)
-    judge = laid_out(held_out, stage)
-    return frequency_clue(lines(stage, stage.mean), stage, stage.mean, judge, judge.mean)
+    train_data = laid_out(train)
+    holdout_data = laid_out(held_out, train_data)
+    return frequency_clue(
+        lines(train_data, train_data.mean),
+        train_data,
+        train_data.mean,
+        holdout_data,
+        holdout_data.mean,
+    )
 
 
 def test_hum_between_two_lines_is_told_by_its_frequency(rig: Rig, quiet: tuple[Run, Run]) -> None:

@@ -13,8 +13,8 @@ from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from analysis.trace.clues.dependence import dependence
 from analysis.trace.clues.variables import factor_of
-from analysis.trace.data.conditioned_record import filtered, prepared, scenes
-from analysis.trace.data.regression_data import Board, board
+from analysis.trace.data.conditioned_record import conditioned_records, filtered, prepared
+from analysis.trace.data.regression_data import RegressionData, regression_data
 from analysis.trace.result import Dependence
 from rig.model.rig import Rig
 from tests.analysis.trace.hidden import pair_of_runs
@@ -24,40 +24,50 @@ Force = Callable[[Signals], Array]
 
 
 @pytest.fixture(scope="module")
-def boards(rig: Rig) -> tuple[Board, Board]:
+def boards(rig: Rig) -> tuple[RegressionData, RegressionData]:
     train, held_out = pair_of_runs(rig)
     terms = tuple(map(Used, baseline_of(rig)))
-    stage = board(rig, terms, scenes(rig, [train]))
-    return stage, board(rig, terms, scenes(rig, [held_out]), stage.beta)
+    train_data = regression_data(rig, terms, conditioned_records(rig, [train]))
+    return train_data, regression_data(
+        rig, terms, conditioned_records(rig, [held_out]), train_data.beta
+    )
 
 
-def left(stage: Board, equation: str, force: Force, rng: np.random.Generator) -> Array:
+def residual(
+    train_data: RegressionData, equation: str, force: Force, rng: np.random.Generator
+) -> Array:
     """Return a whitened residual of noise, and of `force` [SI] in one equation."""
-    out = rng.normal(size=stage.base.shape[0])
-    index = {scene.group: k for k, scene in enumerate(stage.scenes)}
-    for s in stage.segments:
+    out = rng.normal(size=train_data.base.shape[0])
+    index = {conditioned.group: k for k, conditioned in enumerate(train_data.records)}
+    for s in train_data.segments:
         if s.equation == equation:
             k = index[s.group]
-            scene, rows = stage.scenes[k], stage.rows[k][equation]
-            raw = force(prepared(stage.rig, stage.terms, scene))
-            found = filtered({"x": raw}, scene, rows)["x"]
+            conditioned, rows = train_data.records[k], train_data.rows[k][equation]
+            raw = force(prepared(train_data.rig, train_data.terms, conditioned))
+            found = filtered({"x": raw}, conditioned, rows)["x"]
             out[s.where] += np.sqrt(s.repeats) / s.noise * found
     return out
 
 
-def clues(boards: tuple[Board, Board], equation: str, force: Force) -> list[Dependence]:
+def clues(
+    boards: tuple[RegressionData, RegressionData], equation: str, force: Force
+) -> list[Dependence]:
     rng = np.random.default_rng(3)
-    one, other = (left(b, equation, force, rng) for b in boards)
+    one, other = (residual(b, equation, force, rng) for b in boards)
     return dependence(boards[0], one, boards[1], other, [equation])
 
 
-def test_a_spring_that_hardens_moves_with_the_piston_alone(boards: tuple[Board, Board]) -> None:
+def test_a_spring_that_hardens_moves_with_the_piston_alone(
+    boards: tuple[RegressionData, RegressionData],
+) -> None:
     best, *_ = clues(boards, "torque_2", lambda x: 4e5 * x.s[:, 1] ** 3)
     assert (best.variable, best.by) == ("piston_2", "")
     assert best.share > 0.5
 
 
-def test_friction_that_grows_along_the_bore_is_a_product(boards: tuple[Board, Board]) -> None:
+def test_friction_that_grows_along_the_bore_is_a_product(
+    boards: tuple[RegressionData, RegressionData],
+) -> None:
     best, *_ = clues(
         boards, "torque_2", lambda x: 5.0 * (1 + 60 * x.s[:, 1]) * np.tanh(x.sd[:, 1] / 2e-3)
     )
@@ -66,7 +76,9 @@ def test_friction_that_grows_along_the_bore_is_a_product(boards: tuple[Board, Bo
     assert best.share > 0.8
 
 
-def test_a_contact_that_gives_before_it_slides_has_a_memory(boards: tuple[Board, Board]) -> None:
+def test_a_contact_that_gives_before_it_slides_has_a_memory(
+    boards: tuple[RegressionData, RegressionData],
+) -> None:
     def force(x: Signals) -> Array:  # of Coulomb springs in parallel (Iwan 1966), no Dahl state
         s = x.s[:, 1]
         out = np.zeros(len(s))
@@ -84,7 +96,9 @@ def test_a_contact_that_gives_before_it_slides_has_a_memory(boards: tuple[Board,
     assert any(d.variable.startswith(("pressure", "rod", "cap")) for d in found[1:])
 
 
-def test_a_leak_past_a_worn_place_is_a_product_in_the_flow(boards: tuple[Board, Board]) -> None:
+def test_a_leak_past_a_worn_place_is_a_product_in_the_flow(
+    boards: tuple[RegressionData, RegressionData],
+) -> None:
     found = clues(
         boards, "flow_cap_2",
         lambda x: 3e-12 * (x.p_cap[:, 1] - x.p_rod[:, 1]) * np.exp(-((x.s[:, 1] / 8e-3) ** 2)),
@@ -92,7 +106,7 @@ def test_a_leak_past_a_worn_place_is_a_product_in_the_flow(boards: tuple[Board, 
     assert (found[0].variable, found[0].by) == ("piston_2", "pressure_difference_2")
 
 
-def test_noise_alone_gives_no_clue(boards: tuple[Board, Board]) -> None:
+def test_noise_alone_gives_no_clue(boards: tuple[RegressionData, RegressionData]) -> None:
     assert clues(boards, "torque_2", lambda x: np.zeros(len(x.t))) == []
 
 

@@ -6,22 +6,27 @@ import numpy as np
 import pytest
 
 from analysis.trace.next_experiment.discrimination import View, calibration, view
-from analysis.trace.next_experiment.excitations import FAMILIES, Excitation, excitation, settings
+from analysis.trace.next_experiment.excitations import (
+    FAMILIES,
+    CandidateExcitation,
+    excitation,
+    settings,
+)
 from analysis.trace.next_experiment.range_extension import LINES, farther, richer
 from analysis.trace.result import Dependence
 from tests.analysis.trace.test_next_experiment import sine
 
 
 @pytest.fixture(scope="module")
-def candidates() -> tuple[list[Excitation], list[View]]:
+def candidates() -> tuple[list[CandidateExcitation], list[View]]:
     """Joint 2 moved at creeping speed and at all frequencies, on the twin of the bench."""
-    rig, stage = sine()
-    first = settings(rig, stage.scenes)[0]
+    rig, train_data = sine()
+    first = settings(rig, train_data.records)[0]
     families = [f for f in FAMILIES if f.name in ("creep", "wide")]
     tried = [excitation(rig, first, family, np.random.default_rng(1)) for family in families]
     found = [one for one in tried if one is not None]
     assert [one.family.name for one in found] == ["wide", "creep"]
-    return found, [view(stage, one, calibration(stage)) for one in found]
+    return found, [view(train_data, one, calibration(train_data)) for one in found]
 
 
 def clue(variable: str, by: str = "") -> Dependence:
@@ -29,10 +34,10 @@ def clue(variable: str, by: str = "") -> Dependence:
 
 
 def test_what_moves_with_the_acceleration_asks_for_faster_lines(
-    candidates: tuple[list[Excitation], list[View]],
+    candidates: tuple[list[CandidateExcitation], list[View]],
 ) -> None:
-    _, stage = sine()
-    found = farther(stage, [clue("acceleration_2")], candidates[1], 1.3)
+    _, train_data = sine()
+    found = farther(train_data, [clue("acceleration_2")], candidates[1], 1.3)
     assert found is not None
     assert candidates[0][found.index].family.name == "wide"
     assert found.times > 1.3
@@ -40,22 +45,24 @@ def test_what_moves_with_the_acceleration_asks_for_faster_lines(
 
 
 def test_a_clue_that_cannot_be_carried_farther_yields_to_the_next(
-    candidates: tuple[list[Excitation], list[View]],
+    candidates: tuple[list[CandidateExcitation], list[View]],
 ) -> None:
-    _, stage = sine()
+    _, train_data = sine()
     moves = [clue("time"), clue("piston_2", "acceleration_2")]
-    found = farther(stage, moves, candidates[1], 1.3)
+    found = farther(train_data, moves, candidates[1], 1.3)
     assert found is not None
     assert found.variable == "acceleration_2"  # the sine has been all over the stroke
-    assert farther(stage, moves, candidates[1], 1e3) is None
+    assert farther(train_data, moves, candidates[1], 1e3) is None
 
 
 def test_records_of_one_sine_ask_for_many_lines(
-    candidates: tuple[list[Excitation], list[View]],
+    candidates: tuple[list[CandidateExcitation], list[View]],
 ) -> None:
-    _, stage = sine()
-    found = richer(stage, [clue("supply_pressure")], candidates[0])
+    _, train_data = sine()
+    found = richer(train_data, [clue("supply_pressure")], candidates[0])
     assert found is not None
     assert (found.variable, candidates[0][found.index].family.name) == (LINES, "wide")
     assert "where the records hold 1" in found.words
-    assert richer(stage, [clue("supply_pressure")], candidates[0][1:]) is None  # creep has 2 lines
+    assert (
+        richer(train_data, [clue("supply_pressure")], candidates[0][1:]) is None
+    )  # creep has 2 lines

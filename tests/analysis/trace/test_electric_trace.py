@@ -90,15 +90,15 @@ def test_an_electric_joint_has_no_lever_to_tell_asymmetry_from_an_offset() -> No
 def test_the_same_command_writes_result_model_and_report(
     two_hidden: tuple[Run, Run], tmp_path: Path
 ) -> None:
-    train, judge = (
+    train, holdout_data = (
         str(write_run(tmp_path / name, run)) for name, run in zip("ab", two_hidden, strict=True)
     )
     paths = {key: str(tmp_path / f"trace.{key}") for key in ("json", "model", "html")}
-    words = ["trace", train, "--holdout", judge, "--json", paths["json"], "--model"]
+    words = ["trace", train, "--holdout", holdout_data, "--json", paths["json"], "--model"]
     done = CliRunner().invoke(app, [*words, paths["model"], "--report", paths["html"]])
     assert done.exit_code == 0, done.output
     assert json.loads(Path(paths["json"]).read_text())["verdict"] == EXPLAINED
-    validated = CliRunner().invoke(app, ["validate", paths["model"], judge, "--json", "-"])
+    validated = CliRunner().invoke(app, ["validate", paths["model"], holdout_data, "--json", "-"])
     assert json.loads(validated.stdout)["records"][0]["rmse"]["position_1"] < 1e-3
     page = Path(paths["html"]).read_text()
     assert "coulomb friction" in page
@@ -107,9 +107,9 @@ def test_the_same_command_writes_result_model_and_report(
 
 @pytest.mark.skipif(not FILE.exists(), reason=f"no measured record at {FILE}")
 @pytest.mark.parametrize(("train", "judge"), [("first", "second"), ("second", "first")])
-def test_on_the_measured_carriage_both_are_found(train: str, judge: str) -> None:
+def test_on_the_measured_carriage_both_are_found(train: str, holdout_data: str) -> None:
     data = study.load(FILE, period=study.PERIOD)
-    result = trace([getattr(data, train)], [getattr(data, judge)])
+    result = trace([getattr(data, train)], [getattr(data, holdout_data)])
     assert named(result) == BOTH
     assert result.before["torque_1"] > 0.17 * result.size["torque_1"]
     assert result.after["torque_1"] <= 0.05 * result.size["torque_1"]

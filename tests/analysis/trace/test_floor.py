@@ -10,9 +10,9 @@ import pytest
 from analysis.simulation.synthetic import multisine, synthetic_run
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
-from analysis.trace.data.conditioned_record import scenes
+from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.noise_floor import LEAST, STATED, floors, stated_noise
-from analysis.trace.data.regression_data import board
+from analysis.trace.data.regression_data import regression_data
 from rig.model.rig import Rig
 
 
@@ -20,14 +20,16 @@ def floor_over_stated(rig: Rig, noise: float) -> dict[str, float]:
     """Return each equation's floor over the stated noise, with sensors of `noise` times it."""
     wave = multisine(np.random.default_rng(1), rig.sample_rate, 4.0, 9.5)
     run = synthetic_run(rig, np.random.default_rng(2), wave, rms=0.025, repeats=4, noise=noise)
-    stage = board(rig, tuple(map(Used, baseline_of(rig))), scenes(rig, [run]))
-    found = {(f.group, f.equation): f.noise for f in stage.floors}
+    train_data = regression_data(
+        rig, tuple(map(Used, baseline_of(rig))), conditioned_records(rig, [run])
+    )
+    found = {(f.group, f.equation): f.noise for f in train_data.floors}
     out: dict[str, float] = {}
-    for scene, rows in zip(stage.scenes, stage.rows, strict=True):
-        if scene.record.repeat == 1:
-            stated = stated_noise(rig, stage.terms, scene, rows, stage.beta)
+    for conditioned, rows in zip(train_data.records, train_data.rows, strict=True):
+        if conditioned.record.repeat == 1:
+            stated = stated_noise(rig, train_data.terms, conditioned, rows, train_data.beta)
             for e in rows:
-                out[f"{scene.group[1]} {e}"] = found[scene.group, e] / stated[e]
+                out[f"{conditioned.group[1]} {e}"] = found[conditioned.group, e] / stated[e]
     return out
 
 
@@ -48,14 +50,14 @@ def test_a_record_whose_rows_are_all_masked_has_the_stated_floor_and_nothing_lef
     wave = multisine(np.random.default_rng(1), rig.sample_rate, 4.0, 9.5)
     run = synthetic_run(rig, np.random.default_rng(2), wave, rms=0.025, repeats=1)
     terms = tuple(map(Used, baseline_of(rig)))
-    stage = board(rig, terms, scenes(rig, [run]))
+    train_data = regression_data(rig, terms, conditioned_records(rig, [run]))
     none = [
         {
             e: replace(r, matrix=r.matrix[:0], rhs=r.rhs[:0], time=r.time[:0])
             for e, r in rows.items()
         }
-        for rows in stage.rows
+        for rows in train_data.rows
     ]
-    for floor in floors(rig, terms, stage.scenes, none, stage.beta):
+    for floor in floors(rig, terms, train_data.records, none, train_data.beta):
         assert (floor.total, floor.repeatable, floor.source) == (0.0, 0.0, STATED)
         assert floor.noise > 0.0

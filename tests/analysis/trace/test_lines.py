@@ -98,8 +98,8 @@ def traced(rig: Rig, **wrong: float) -> Trace:
 
 def test_a_single_sine_is_followed_to_where_the_row_filter_ends() -> None:
     """Its harmonics are what tells: the odd ones are all empty lines."""
-    _, stage = sine()
-    found = lines(stage, stage.mean)
+    _, train_data = sine()
+    found = lines(train_data, train_data.mean)
     assert {one.equation for one in found} == {"torque_2", "flow_cap_2", "flow_rod_2"}
     for one in found:
         assert np.flatnonzero(one.excited).tolist() == [1]

@@ -10,12 +10,12 @@ import pytest
 from analysis.terms import baseline_of, known
 from analysis.terms.base import Used
 from analysis.trace.data.candidates import catalogue
-from analysis.trace.data.conditioned_record import scenes
-from analysis.trace.data.regression_data import Board, board
+from analysis.trace.data.conditioned_record import conditioned_records
+from analysis.trace.data.regression_data import RegressionData, regression_data
 from analysis.trace.next_experiment.detectable_size import smallest
 from analysis.trace.next_experiment.discrimination import (
+    Explanation,
     Ground,
-    Hypothesis,
     Question,
     calibration,
     loudest,
@@ -37,40 +37,42 @@ from rig.runs.rigs import load_rig
 from tests.studies.direct_bench import simulated_run
 
 FAST = next(f for f in FAMILIES if f.name == "fast")
-AIR = Hypothesis((Used(known()["entrained_air"]("bench")),), {"alpha_air": 3e-3})
-LEAK = Hypothesis((Used(known()["internal_leakage"]("joint 2")),), {"c_internal_2": 1e-12})
+AIR = Explanation((Used(known()["entrained_air"]("bench")),), {"alpha_air": 3e-3})
+LEAK = Explanation((Used(known()["internal_leakage"]("joint 2")),), {"c_internal_2": 1e-12})
 
 
 @cache
-def sine() -> tuple[Rig, Board]:
+def sine() -> tuple[Rig, RegressionData]:
     """Three records of the paper's first step on a bench with nothing wrong, laid out."""
     rig = load_rig("shinshu-2dof")
     change = Overrides(repeats=3, duration=5.0, steps=("step1",))
     run, _ = simulated_run(rig, "lock-and-excite", 5, Scenario(), change)
-    return rig, board(rig, tuple(map(Used, baseline_of(rig))), scenes(rig, [run]))
+    return rig, regression_data(
+        rig, tuple(map(Used, baseline_of(rig))), conditioned_records(rig, [run])
+    )
 
 
 @cache
 def grounds(family: str = "fast") -> tuple[Ground, Ground]:
-    rig, stage = sine()
+    rig, train_data = sine()
     chosen = next(f for f in FAMILIES if f.name == family)
-    found = excitation(rig, settings(rig, stage.scenes)[0], chosen, np.random.default_rng(1))
+    found = excitation(rig, settings(rig, train_data.records)[0], chosen, np.random.default_rng(1))
     assert found is not None
-    old = Ground(stage)
-    return old, Ground(stage, view(stage, found, calibration(stage)), old)
+    old = Ground(train_data)
+    return old, Ground(train_data, view(train_data, found, calibration(train_data)), old)
 
 
 def test_how_the_joints_stood_is_read_from_the_records() -> None:
-    rig, stage = sine()
-    assert settings(rig, stage.scenes) == [Setting({0: 0.0}, {}), Setting({}, {})]
+    rig, train_data = sine()
+    assert settings(rig, train_data.records) == [Setting({0: 0.0}, {}), Setting({}, {})]
 
 
 def test_what_an_explanation_can_imitate_is_no_separation() -> None:
     old, new = grounds()
-    half = Hypothesis(LEAK.effects, {"c_internal_2": 5e-13})
+    half = Explanation(LEAK.effects, {"c_internal_2": 5e-13})
     assert separation(Question(LEAK, half), old, new)[0] < 1e-3
     # Against the baseline alone the same leak stands out far above the noise.
-    assert separation(Question(LEAK, Hypothesis(), False), old, new)[0] > 3.0
+    assert separation(Question(LEAK, Explanation(), False), old, new)[0] > 3.0
 
 
 def test_the_separation_is_the_rms_that_stands_out_of_the_new_rows() -> None:
@@ -97,7 +99,7 @@ def test_the_separation_is_the_rms_that_stands_out_of_the_new_rows() -> None:
 
 def test_air_hardly_shows_on_the_sine_and_shows_on_fast_lines() -> None:
     old, new = grounds()
-    question = Question(AIR, Hypothesis(), False)
+    question = Question(AIR, Explanation(), False)
     assert present(question, old) < 0.5
     assert separation(question, old, new)[0] > 2 * present(question, old)
     _, small = grounds("small")
@@ -112,8 +114,8 @@ def test_faster_lines_are_noisier_than_the_sine_and_it_is_foreseen() -> None:
 
 
 def test_an_excitation_fills_its_share_of_the_limits_and_is_a_protocol() -> None:
-    rig, stage = sine()
-    one = excitation(rig, settings(rig, stage.scenes)[0], FAST, np.random.default_rng(2))
+    rig, train_data = sine()
+    one = excitation(rig, settings(rig, train_data.records)[0], FAST, np.random.default_rng(2))
     assert one is not None
     piston = one.played.motion["piston"][:, 1]
     low, high = rig.joints[1].limits.piston
@@ -127,15 +129,15 @@ def test_an_excitation_fills_its_share_of_the_limits_and_is_a_protocol() -> None
 
 
 def test_a_rig_without_a_twin_offers_nothing() -> None:
-    rig, stage = sine()
+    rig, train_data = sine()
     blind = rig.model_copy(update={"nominal": {}})
-    where = settings(rig, stage.scenes)[0]
+    where = settings(rig, train_data.records)[0]
     assert excitation(blind, where, FAST, np.random.default_rng(0)) is None
 
 
 def test_every_effect_that_can_show_has_a_size_worth_knowing() -> None:
-    rig, stage = sine()
+    rig, train_data = sine()
     without = [e for e in catalogue(rig) if smallest(e, rig) is None]
     assert "payload" in {e.name for e in without}
     assert all(e.absorbed(rig) for e in without)
-    assert loudest(stage, np.zeros(stage.base.shape[0])) == 0.0
+    assert loudest(train_data, np.zeros(train_data.base.shape[0])) == 0.0

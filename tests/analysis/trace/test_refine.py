@@ -11,8 +11,8 @@ import pytest
 
 from analysis.terms import baseline, make
 from analysis.terms.base import Used
-from analysis.trace.data.conditioned_record import scenes
-from analysis.trace.data.regression_data import board
+from analysis.trace.data.conditioned_record import conditioned_records
+from analysis.trace.data.regression_data import regression_data
 from analysis.trace.search import refinement
 from rig.model.rig import Rig
 from tests.analysis.effects import one_joint as bench
@@ -24,15 +24,15 @@ def test_a_gain_is_found_from_the_wrong_side_of_one_too(
 ) -> None:
     """Below one the residual falls towards the bound, as it did on a bench moved by a sine."""
 
-    def fit(stage: Any, terms: Sequence[Used]) -> refinement.Fit:
+    def fit(train_data: Any, terms: Sequence[Used]) -> refinement.ExactFit:
         gain = terms[-1].shape[0]
-        left = 50.0 * (gain - 1.01) if gain >= 1.0 else 9.0 / (1.6 - gain)
-        return refinement.Fit(tuple(terms), {}, np.array([left, 0.1]))
+        residual = 50.0 * (gain - 1.01) if gain >= 1.0 else 9.0 / (1.6 - gain)
+        return refinement.ExactFit(tuple(terms), {}, np.array([residual, 0.1]))
 
     monkeypatch.setattr(refinement, "fit", fit)
-    stage: Any = SimpleNamespace(rig=rig, terms=())
+    train_data: Any = SimpleNamespace(rig=rig, terms=())
     used = Used(make("sensor_gain", "joint 2 cap"), (start,))
-    found = refinement.refine(stage, (used,))
+    found = refinement.refine(train_data, (used,))
     assert found.terms[-1].shape[0] == pytest.approx(1.01, abs=1e-3)
 
 
@@ -41,9 +41,9 @@ def test_a_contact_stiffens_in_the_model_where_it_does_on_the_bench_and_else_say
     rig: Rig, stiffening: float
 ) -> None:
     wrong = bench.Wrong.of(Fc=80, presliding=150e-6, stiffening=stiffening)
-    records = scenes(rig, [bench.run(rig, wrong, 0.03, 1)])
-    stage = board(rig, tuple(map(Used, baseline())), records)
+    records = conditioned_records(rig, [bench.run(rig, wrong, 0.03, 1)])
+    train_data = regression_data(rig, tuple(map(Used, baseline())), records)
     friction = Used(make("coulomb_friction", "joint 2"), (40e-6,))
-    distance, *more = refinement.refine(stage, (*stage.terms, friction)).terms[-1].shape
+    distance, *more = refinement.refine(train_data, (*train_data.terms, friction)).terms[-1].shape
     assert distance == pytest.approx(150e-6, rel=0.15)
     assert more == ([pytest.approx(stiffening, rel=0.25)] if stiffening else [])

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import pytest
 
+from analysis.effects.base import open_shapes
 from analysis.identify.identify import identify
 from analysis.terms import with_effects
 from analysis.terms.base import Used
-from analysis.trace.search.shapes import open_shapes, shapes_in, with_shapes
+from analysis.trace.search.shapes import shapes_in, with_shapes
 from rig.model.records import Run
 from rig.model.rig import Rig
 from tests.analysis.small_bench import TRUTH

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import beta as beta_law
 
 from analysis.identify.estimators.statements import NOISE_CHECK
-from analysis.identify.identify import Identification
+from analysis.identify.result import Identification
 
 GOAL = (0.92, 0.98)
 MOST_BIAS, MOST_BIAS_OF_B = 0.005, 0.02  # relative

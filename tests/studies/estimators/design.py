@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from analysis.design.predict import Expected
-from analysis.identify.identify import PLAIN, identify
+from analysis.identify.identify import identify
+from analysis.identify.result import PLAIN
 from protocols.files import library
 from protocols.files.plan import resolve
 from rig.cli.foresight import of_plan, percent

@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from analysis.identify.identify import PLAIN, identify
+from analysis.identify.identify import identify
+from analysis.identify.result import PLAIN
 from analysis.regression.rows import Filtering, default_filtering
 from analysis.signals.filters import (
     FourierSmoother,

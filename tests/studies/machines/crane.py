@@ -21,13 +21,13 @@ from analysis.identify.identify import identify
 from analysis.simulation.validate import validate
 from analysis.terms import baseline_of, make
 from analysis.terms.base import Used
-from analysis.trace.data.conditioned_record import scenes
-from analysis.trace.data.regression_data import board
+from analysis.trace.data.conditioned_record import conditioned_records
+from analysis.trace.data.regression_data import regression_data
 from analysis.trace.engine import trace
 from analysis.trace.judge import held_out
 from analysis.trace.result import Trace
-from analysis.trace.search.hypothesis import Listed
-from analysis.trace.search.hypothesis_set import Shortlist
+from analysis.trace.search.hypothesis import Hypothesis
+from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.shapes import shapes_in, with_shapes
 from rig.cli.output import table
 from rig.cli.trace_text import trace_text
@@ -109,7 +109,7 @@ def part(run: Run, name: str, begin: float = 0.0, end: float = np.inf) -> Run:
 
 
 def effects_table(
-    runs: Sequence[Run], judge: Sequence[Run], family: str, chain: Sequence[tuple[str, str]]
+    runs: Sequence[Run], holdout_data: Sequence[Run], family: str, chain: Sequence[tuple[str, str]]
 ) -> str:
     """Return the held-out error of every equation as effects of a chain join one by one.
 
@@ -118,16 +118,16 @@ def effects_table(
     """
     rig = runs[0].rig
     terms = tuple(map(Used, baseline_of(rig)))
-    train, judged = (scenes(rig, x, families=(family,)) for x in (runs, judge))
-    stage = board(rig, terms, train)
-    listed = Shortlist(stage, ())
-    bench = board(rig, terms, judged, stage.beta)
-    size = held_out.errors(rig, judged, listed.empty.fit, listed.empty.fit).size
+    train, judged = (conditioned_records(rig, x, families=(family,)) for x in (runs, holdout_data))
+    train_data = regression_data(rig, terms, train)
+    hypotheses = HypothesisSet(train_data, ())
+    bench = regression_data(rig, terms, judged, train_data.beta)
+    size = held_out.errors(rig, judged, hypotheses.empty.fit, hypotheses.empty.fit).size
     rows = []
-    one = listed.empty
+    one = hypotheses.empty
     for name, where in (("", ""), *chain):
         if name:
-            one = listed.exact((*one.effects, _start(rig, name, where)))
+            one = hypotheses.exact((*one.effects, _start(rig, name, where)))
         error = held_out.rms_of(bench, one.fit)
         words = f"+ {name} at {where}" if name else "baseline"
         shares = [f"{100 * error[e] / size[e]:.1f} %" for e in size]
@@ -141,7 +141,7 @@ def _start(rig: Rig, name: str, where: str) -> Used:
     return Used(term, term.shape_of(rig, ()))
 
 
-def _own(rig: Rig, one: Listed) -> str:
+def _own(rig: Rig, one: Hypothesis) -> str:
     found: list[tuple[str, float]] = []
     for used in one.effects:
         found += [(c.parameter, one.fit.beta[c.parameter]) for c in used.term.coefficients(rig)]
@@ -149,8 +149,8 @@ def _own(rig: Rig, one: Listed) -> str:
     return ", ".join(f"{name} {value:.3g}" for name, value in found)
 
 
-def known_band(runs: Sequence[Run], judge: Sequence[Run]) -> tuple[str, Trace]:
-    """Return the free runs of `judge` without and with a dead band whose edges `runs` give.
+def known_band(runs: Sequence[Run], holdout_data: Sequence[Run]) -> tuple[str, Trace]:
+    """Return the free runs of `holdout_data` without and with a dead band whose edges `runs` give.
 
     And the trace of what the flows lack when the dead band is taken as known.
     """
@@ -158,12 +158,12 @@ def known_band(runs: Sequence[Run], judge: Sequence[Run]) -> tuple[str, Trace]:
     band = with_shapes(runs, [*plain, *(Used(make(name, where)) for name, where in FLOW)])
     rows = []
     for name, terms in (("baseline", plain), ("dead band known", band)):
-        (found,) = validate(identify(runs, terms=terms).model, judge)
+        (found,) = validate(identify(runs, terms=terms).model, holdout_data)
         error = f"{1e3 * found.rmse['piston_1']:.1f} mm"
         shapes = shapes_in(runs[0].rig, terms).items()
         edges = ", ".join(f"{n} {value:.3g}" for n, (value, _) in shapes)
         rows.append([name, f"{found.fit['piston_1']:.1f} %", error, edges])
-    told = trace(runs, judge, families=("fluid",), terms=band)
+    told = trace(runs, holdout_data, families=("fluid",), terms=band)
     return table(["model", "piston FIT", "RMSE", "edges"], rows), told
 
 

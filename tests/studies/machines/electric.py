@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from analysis.identify.identify import Identification, identify
+from analysis.identify.identify import identify
+from analysis.identify.result import Identification
 from analysis.simulation.validate import RecordValidation, validate
 from analysis.terms import with_effects
 from analysis.terms.base import Used

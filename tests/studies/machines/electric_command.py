@@ -33,7 +33,7 @@ def electric(
     """
     import math
 
-    from analysis.identify.identify import to_json
+    from analysis.identify.result import to_json
     from rig.cli.tables import identification_text, validation_text
     from tests.studies.machines import electric as study
 

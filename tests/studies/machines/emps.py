@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.effects.contact import TRANSITION
-from analysis.identify.identify import Identification, identify
+from analysis.identify.identify import identify
+from analysis.identify.result import Identification
 from analysis.regression.rows import Filtering, default_filtering
 from analysis.signals.filters import butterworth, channel_filter, row_filter, row_step
 from analysis.simulation.model import Model

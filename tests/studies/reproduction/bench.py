@@ -15,12 +15,13 @@ from pathlib import Path
 
 import numpy as np
 
-from analysis.identify.identify import Identification, identify
+from analysis.identify.identify import identify
 from analysis.identify.methods import SearchOptions
+from analysis.identify.result import Identification
 from analysis.regression.rows import default_filtering, paper_filtering
 from analysis.simulation.validate import RecordValidation, validate
 from protocols.files.plan import Overrides
-from rig.cli.running import Job, run_protocol
+from rig.cli.running import ProtocolJob, run_protocol
 from rig.cli.simulated import simulated_bench
 from rig.model.records import Run
 from rig.model.rig import Rig
@@ -122,15 +123,17 @@ def _record(folder: Path, seed: int, scale: Scale, say: Say) -> Runs:
     say(f"starting the simulated bench {RIG}, seed {seed}")
     with simulated_bench(RIG, seed=seed, truth=truth) as endpoint:
         jobs = (
-            Job(IDENTIFY, RIG, folder / "steps", endpoint, repeats),
-            Job(VALIDATE, RIG, folder / "validate", endpoint),
-            Job(VALIDATE, RIG, folder / "both", endpoint, together),
+            ProtocolJob(IDENTIFY, RIG, folder / "steps", endpoint, repeats),
+            ProtocolJob(VALIDATE, RIG, folder / "validate", endpoint),
+            ProtocolJob(VALIDATE, RIG, folder / "both", endpoint, together),
         )
         paths = [run_protocol(job, say) for job in jobs]
     say(f"the same bench with {PAYLOAD:g} kg at the tip")
     with simulated_bench(RIG, seed=seed + 1, scenario=scenario) as endpoint:
         less = Overrides(repeats=scale.payload_repeats)
-        paths.append(run_protocol(Job(IDENTIFY, RIG, folder / "payload", endpoint, less), say))
+        paths.append(
+            run_protocol(ProtocolJob(IDENTIFY, RIG, folder / "payload", endpoint, less), say)
+        )
     steps, judged, both, loaded = (load_run(path) for path in paths)
     return Runs(steps, judged, both, loaded, json.loads(truth.read_text()))
 

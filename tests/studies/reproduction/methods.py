@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from analysis.identify.identify import Identification
+from analysis.identify.result import Identification
 from analysis.simulation.validate import RecordValidation
 from rig.model import channels as ch
 from tests.studies.pages import Section, Table

@@ -14,16 +14,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from analysis.identify.estimates import estimates_of
-from analysis.identify.identify import (
-    Identification,
-    build_rows,
-    clusters_of,
-    repeats_of,
-)
 from analysis.identify.methods.search import with_values
+from analysis.identify.result import Identification, estimates_of
+from analysis.identify.stacked_rows import build_rows, clusters_of, repeats_of
 from analysis.regression.rows import Filtering, default_filtering, parameters_of
-from analysis.regression.solve import Cluster, Solution, merge, solve
+from analysis.regression.solve import RowCluster, Solution, merge, solve
 from analysis.simulation.model import Model
 from analysis.simulation.validate import RecordValidation, validate
 from analysis.terms import baseline
@@ -171,7 +166,7 @@ def spread(values: Sequence[float]) -> Spread:
     return Spread(float(x.min()), mean, float(x.max()), rsd)
 
 
-def plain_condition(clusters: Sequence[Cluster]) -> float:
+def plain_condition(clusters: Sequence[RowCluster]) -> float:
     """Return the condition number of the stacked rows in SI, columns not scaled.
 
     The paper does not say how its matrices are scaled; in SI, 1/b in 1/Pa, nothing is.

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from analysis.identify.identify import Identification
+from analysis.identify.result import Identification
 from analysis.report import paper
 from analysis.simulation.validate import RecordValidation
 from rig.model import channels as ch

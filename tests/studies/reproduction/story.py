@@ -9,7 +9,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from analysis.identify.identify import to_json as identification_json
+from analysis.identify.result import to_json as identification_json
 from analysis.report import paper
 from analysis.simulation.validate import to_json as validation_json
 from rig.cli.output import progress, write_json

@@ -1,19 +1,56 @@
-"""From the rows' coefficients to the parameters that a person is told, with intervals."""
+"""What an identification found, as data and as the contract's JSON."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.identify.checks import Check
 from analysis.regression.solve import Solution, half_width
-from analysis.simulation.model import Estimate
+from analysis.simulation.model import Estimate, Model, estimate_json, finite
 from analysis.terms.base import Coefficient, Used
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
+
+PLAIN = "plain"  # least squares as in the paper: no nuisances, scatter between repeats only
+
+
+@dataclass(frozen=True)
+class Identification:
+    """What an identification found: estimates, conditioning, rows used and left out, checks."""
+
+    method: str
+    estimates: Mapping[str, Estimate]
+    solutions: Mapping[str, Solution]
+    rows: Mapping[str, int]
+    masked_rows: int
+    solve_seconds: float
+    checks: tuple[Check, ...]
+    model: Model
+    extra: Mapping[str, Any] = field(default_factory=dict)  # a method's own figures, plain data
+
+
+def to_json(result: Identification) -> dict[str, Any]:
+    """Return the identification as the contract's JSON; null where a number does not exist."""
+    return {
+        "method": result.method,
+        "estimator": str(result.model.provenance.get("estimator", PLAIN)),
+        "parameters": {name: estimate_json(p) for name, p in result.estimates.items()},
+        "condition_number": {
+            family: finite(s.condition_number) for family, s in result.solutions.items()
+        },
+        "rows": dict(result.rows),
+        "masked_rows": result.masked_rows,
+        "solve_seconds": result.solve_seconds,
+        "checks": [{"name": c.name, "ok": bool(c.ok), "detail": c.detail} for c in result.checks],
+        "residual_rms": {family: finite(s.residual_rms) for family, s in result.solutions.items()},
+        **result.extra,
+    }
 
 
 def estimates_of(

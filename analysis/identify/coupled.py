@@ -1,0 +1,151 @@
+"""The coupled method (the paper's STEP4): the rows of all steps stacked and solved once."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from analysis.identify import checks as ck
+from analysis.identify.advice import base_statements
+from analysis.identify.checks import Check
+from analysis.identify.estimation import UNBIASED, EstimationJob, Refined, refine
+from analysis.identify.plausibility import consistency
+from analysis.identify.reduction import RecordReduction, reduce_runs, solve_reductions
+from analysis.identify.reduction import repeats_of as reduced_repeats
+from analysis.identify.result import PLAIN, Identification, estimates_of, with_ends
+from analysis.identify.stacked_rows import build_rows
+from analysis.regression.rows import Filtering, default_filtering
+from analysis.regression.solve import Solution
+from analysis.simulation.model import Estimate, Model
+from analysis.terms.base import Used
+from rig.model.parse import InputError
+from rig.model.records import Record, Run
+from rig.model.rig import Rig
+
+log = logging.getLogger(__name__)
+
+_UNREFINED = Check(
+    "estimator",
+    True,
+    "plain: least squares with intervals from the scatter between repeats alone; what the other "
+    "estimators refine (every row in memory, parameters linear in them) was not applied",
+)
+
+
+def coupled(
+    runs: Sequence[Run],
+    used: tuple[Used, ...],
+    filtering: Callable[[Record], Filtering] = default_filtering,
+    reject_noise: bool = True,
+    estimator: str = "auto",
+    bootstrap: int = 0,
+    rng: np.random.Generator | None = None,
+) -> Identification:
+    """Identify all parameters of the terms `used` from all records of the runs at once.
+
+    The arguments are those of `analysis.identify.identify.identify`, checked there. Raises
+    InputError for runs of different rigs and for records that cannot be used.
+    """
+    rig = ck.common_rig(runs)
+    estimator = _fitting_estimator(rig, used, estimator, bootstrap)
+
+    def refined(solutions: Mapping[str, Solution]) -> Refined:
+        if rig.electric:
+            from analysis.identify.output_error.free_run import free_run_fit  # noqa: PLC0415 - compiles
+
+            found, check = free_run_fit(rig, runs, used, solutions)
+            return Refined(found, (check,), estimator)
+        job = EstimationJob(
+            rig, runs, used, lambda extra: build_rows(rig, runs, (*used, *extra), filtering),
+            estimator, bootstrap, rng or np.random.default_rng(0),
+        )  # fmt: skip
+        return refine(job, solutions)
+
+    reductions = reduce_runs(rig, runs, used, filtering)
+    sources = [run.source for run in runs]
+    return conclude(
+        rig, sources, used, reductions, reject_noise, None if estimator == PLAIN else refined
+    )
+
+
+def conclude(
+    rig: Rig,
+    sources: Sequence[str],
+    used: tuple[Used, ...],
+    reductions: Sequence[RecordReduction],
+    reject_noise: bool,
+    refined: Callable[[Mapping[str, Solution]], Refined] | None = None,
+) -> Identification:
+    """Solve the reductions of all records of the runs `sources`, and judge what comes out."""
+    started = time.perf_counter()
+    solutions = solve_reductions(rig, used, reductions, reject_noise)
+    seconds = time.perf_counter() - started
+    found = Refined(solutions, (_UNREFINED,), PLAIN) if refined is None else refined(solutions)
+    solutions = found.solutions
+    estimates, covariance = estimates_of(rig, used, solutions)
+    if found.bootstrap:
+        estimates = with_ends(estimates, found.bootstrap)
+    rows = {family: solution.rows for family, solution in solutions.items()}
+    masked = sum(one.masked for one in reductions)
+    statements = (
+        *_statements(rig, reductions, found, estimates, rows, masked),
+        *found.checks,
+    )
+    provenance = {
+        "method": "coupled",
+        "estimator": found.estimator,
+        "runs": list(sources),
+        "records": [one.head.name for one in reductions],
+        "rows": rows,
+        "checks_failed": [c.name for c in statements if not c.ok],
+    }
+    model = Model(rig, used, estimates, covariance, provenance)
+    log.info("identified %d parameters from %d records", len(estimates), len(reductions))
+    return Identification("coupled", estimates, solutions, rows, masked, seconds, statements, model)
+
+
+def _statements(
+    rig: Rig,
+    reductions: Sequence[RecordReduction],
+    found: Refined,
+    estimates: Mapping[str, Estimate],
+    rows: Mapping[str, int],
+    masked: int,
+) -> tuple[Check, ...]:
+    return (
+        ck.repeats(reduced_repeats(reductions)),
+        ck.joints_excited(rig, [one.head for one in reductions]),
+        *ck.clipping(rig, [(one.head, one.clipped) for one in reductions]),
+        ck.lost_samples([(one.head, one.lost) for one in reductions]),
+        ck.masked(sum(rows.values()), masked),
+        *ck.identifiability(found.solutions),
+        *base_statements(rig, found.solutions),
+        ck.noise_bias(found.solutions, found.estimator in UNBIASED),
+        *consistency(rig, estimates),
+    )
+
+
+def _fitting_estimator(rig: Rig, used: Sequence[Used], estimator: str, bootstrap: int) -> str:
+    """Return the estimator for a model: what refines the fluid's rows has none on electric rigs.
+
+    Those have plain least squares and output error. None but the plain one is for parameters that
+    are not linear in the rows (`Term.reduction`).
+    """
+    reducing = [one.term.name for one in used if one.term.reduction(rig) is not None]
+    if estimator == PLAIN or not (rig.electric or reducing):
+        return estimator
+    if estimator == "output-error" and not reducing and not bootstrap:
+        return estimator
+    if estimator not in ("ls", "auto") or bootstrap:
+        asked = "--bootstrap" if estimator in ("ls", "auto") else f"--estimator {estimator}"
+        why = (
+            f"is for hydraulic rigs; {rig.name!r} is electric"
+            if rig.electric
+            else f"does not go with {' '.join(reducing)}, not linear in the rows"
+        )
+        also = " or output-error" if rig.electric and not reducing else ""
+        raise InputError(f"{asked} {why}: take ls{also} without a bootstrap")
+    return PLAIN
