@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from hil_sim.effects.base import Tables
 from hil_sim.plant import kernel, kernel_loop
-from hil_sim.plant.effects import Tables
 from hil_sim.plant.kernel_data import ATMOSPHERE, LAW, record
 from hil_sim.plant.sensors import converters, encode, ring_length
 from hil_sim.plant.tables import build

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from hil_sim.plant.effects import APPLY, Tables, set_relief
+from hil_sim.effects.base import Tables, set_relief
 from hil_sim.plant.kernel_data import ATMOSPHERE, BENCH, JOINT, Table
 from hil_sim.plant.sensors import channel_table
 from hil_sim.scenario.file import Scenario, check_fits
@@ -61,7 +61,7 @@ def build(rig: Rig, machine: Machine, scenario: Scenario, periods: Mapping[str, 
         _fill_joint(tables.joints, i, joint, rig, machine)
     _fill_bench(tables, machine.parameters["b"], machine.constants, periods)
     for effect in scenario.effects:
-        APPLY[type(effect)](tables, effect)
+        effect.apply(tables)
     return tables
 
 

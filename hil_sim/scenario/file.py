@@ -18,8 +18,8 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
-from hil_sim.scenario.effects import AnyEffect
-from hil_sim.scenario.truth import with_units
+from hil_sim.effects import AnyEffect
+from hil_sim.effects.base import with_units
 from rig.model.parameters import parameter_unit
 from rig.model.parse import InputError, parse_model
 from rig.model.quantity import Ratio

@@ -6,45 +6,17 @@ own `nominal` values. Nothing of this crosses the wire.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from importlib import resources
 from typing import Annotated, Any
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
+from hil_sim.effects.base import in_unit, with_units
 from rig.model.parameters import parameter_names, parameter_unit
 from rig.model.parse import InputError, parse_model
-from rig.model.quantity import Pressure, Ratio, UnitError, Volume, parse_quantity
+from rig.model.quantity import Pressure, Ratio, Volume
 from rig.model.rig import Rig
-
-
-def in_unit(si: str) -> BeforeValidator:
-    """Return a validator that reads ``"80 N"`` in the SI unit `si`; a bare number is SI in code."""
-
-    def read(value: Any, info: ValidationInfo) -> Any:
-        if isinstance(value, str) or (info.context and si):
-            return read_with_unit(value, si)
-        return value
-
-    return BeforeValidator(read)
-
-
-def read_with_unit(value: Any, si: str) -> float:
-    """Read a file's value in the SI unit `si`; raises UnitError where the unit is missing."""
-    if not isinstance(value, str):
-        raise UnitError(f"{value!r} has no unit; write one beside the number, like '1 {si}'")
-    return parse_quantity(value, si)
-
-
-def with_units(read: Callable[[str], str]) -> Callable[[Any, ValidationInfo], Any]:
-    """Return a reader of a mapping of quantities whose SI unit follows from the key."""
-
-    def convert(value: Any, info: ValidationInfo) -> Any:
-        if not isinstance(value, dict) or not info.context:
-            return value
-        return {str(k): read_with_unit(v, read(str(k))) for k, v in value.items()}
-
-    return convert
 
 
 class Constants(BaseModel):

@@ -10,13 +10,14 @@ from typing import Any
 import pytest
 import yaml
 
-from hil_sim.scenario.random_draw import KINDS, draw
+from hil_sim.effects import CLASSES
+from hil_sim.scenario.random_draw import draw
 from rig.runs.rigs import load_rig
 from tests.cli.bench import SHORT, bramah, simulated
 from tests.cli.recording_proxy import tapped
 
 RIG = "shinshu-2dof"
-WORDS = [kind.name for kind in KINDS] + ["scenario", "drawn", "effect"]
+WORDS = [kind.effect_name() for kind in CLASSES] + ["scenario", "drawn", "effect"]
 
 
 def two_effects_seed() -> int:
@@ -49,7 +50,7 @@ def traces_of(hidden: dict[str, Any], data: bytes) -> list[str]:
     return found
 
 
-DRAWN = {kind.name: set(kind.sizes) for kind in KINDS}
+DRAWN = {kind.effect_name(): set(kind.sizes) for kind in CLASSES}
 
 
 @pytest.fixture(scope="module")

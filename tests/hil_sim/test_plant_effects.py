@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hil_sim.plant.effects import APPLY
+from hil_sim.effects import CLASSES
 from hil_sim.plant.plant import Law, Plant
 from hil_sim.scenario.file import Scenario
 from tests.hil_sim.plant_trace import CLOSED, Array, Trace, bench, scenario, sine, story
@@ -28,7 +28,7 @@ def slope(x: Array, y: Array) -> float:
 
 
 def test_the_catalogue_is_the_contracts() -> None:
-    names = {str(kind.model_fields["name"].annotation).split("'")[1] for kind in APPLY}
+    names = {kind.effect_name() for kind in CLASSES}
     contract = """coulomb_friction stribeck_friction asymmetric_friction pressure_dependent_friction
         base_inclination payload joint_spring torque_offset valve_deadband spool_offset
         underlap_leakage spool_lag internal_leakage external_leakage supply_sag tank_pressure

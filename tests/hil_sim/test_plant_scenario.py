@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hil_sim.effects.friction import CoulombFriction
+from hil_sim.effects.measurement import SensorOffset
 from hil_sim.plant.plant import Plant
-from hil_sim.scenario.effects import CoulombFriction, SensorOffset
 from hil_sim.scenario.file import Scenario, parse_scenario
 from rig.model.parse import InputError
 from tests.hil_sim.plant_trace import bench

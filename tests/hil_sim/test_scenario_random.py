@@ -6,9 +6,10 @@ from collections import Counter
 
 import pytest
 
+from hil_sim.effects import CLASSES
 from hil_sim.plant.plant import Law, Plant
 from hil_sim.scenario.file import Scenario
-from hil_sim.scenario.random_draw import KINDS, STRANGERS, draw
+from hil_sim.scenario.random_draw import STRANGERS, draw
 from rig.model.rig import Rig
 from rig.runs.rigs import load_rig
 
@@ -29,15 +30,18 @@ def test_all_kinds_come_up_and_every_place_with_them(rig: Rig) -> None:
     assert {"drawn: none", "drawn: one", "drawn: two", "drawn: strange"} == set(counts)
     assert min(counts.values()) > 50
     names = {effect.name for scenario in drawn for effect in scenario.effects}
-    assert names == {kind.name for kind in KINDS}
+    assert names == {kind.effect_name() for kind in CLASSES}
     places = {effect.place for scenario in drawn for effect in scenario.effects}
     assert {"bench", "joint 1", "joint 2", "joint 1 cap", "joint 2 rod"} <= places
     assert {"cap_pressure_1", "rod_pressure_2"} <= places
 
 
 def test_sizes_stay_within_what_such_a_bench_shows(rig: Rig) -> None:
-    ranges = [(k.name, key, low, high) for k in (*KINDS, *STRANGERS) for key, (low, high) in
-              k.sizes.items()]  # fmt: skip
+    ranges = [
+        (kind.effect_name(), key, low, high)
+        for kind, sizes in (*((c, c.sizes) for c in CLASSES), *STRANGERS)
+        for key, (low, high) in sizes.items()
+    ]
     for seed in range(300):
         for effect in draw(rig, seed).effects:
             allowed = [r for r in ranges if r[0] == effect.name]

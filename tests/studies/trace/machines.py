@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from hil_sim.scenario.file import Scenario
-from hil_sim.scenario.random_draw import KINDS, STRANGE, draw
+from hil_sim.scenario.random_draw import STRANGE, draw
 from protocols.files.schema import Protocol
 from rig.model.parts import Joint
 from rig.model.rig import Rig
@@ -127,8 +127,7 @@ def _place(effect: Any) -> str:
 
 def _size(effect: Any) -> float:
     """Return the size [SI] that was drawn."""
-    (kind,) = [kind for kind in KINDS if kind.name == effect.name]
-    return float(getattr(effect, next(iter(kind.sizes))))
+    return float(getattr(effect, next(iter(effect.sizes))))
 
 
 def protocols_of(rig: Rig) -> tuple[Protocol, Protocol]:

@@ -1,0 +1,132 @@
+"""What every effect of the simulated bench is: frozen data, a place, and what it does to the plant.
+
+An effect is one class of a module of this package, found by itself (`hil_sim.effects.CLASSES`).
+`where` is ``joint I``, ``bench`` or ``joint I cap|rod``; effects of measurement name a channel.
+Quantities are SI.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, get_args
+
+from numpy.typing import NDArray
+from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationInfo, field_validator
+
+from rig.model.quantity import UnitError, parse_quantity
+from rig.model.rig import Rig
+
+Table = NDArray[Any]  # structured, one row per joint or channel (`hil_sim.plant.kernel_data`)
+Size = tuple[float, float]  # smallest and largest, SI
+
+
+def in_unit(si: str) -> BeforeValidator:
+    """Return a validator that reads ``"80 N"`` in the SI unit `si`; a bare number is SI in code."""
+
+    def read(value: Any, info: ValidationInfo) -> Any:
+        if isinstance(value, str) or (info.context and si):
+            return read_with_unit(value, si)
+        return value
+
+    return BeforeValidator(read)
+
+
+def read_with_unit(value: Any, si: str) -> float:
+    """Read a file's value in the SI unit `si`; raises UnitError where the unit is missing."""
+    if not isinstance(value, str):
+        raise UnitError(f"{value!r} has no unit; write one beside the number, like '1 {si}'")
+    return parse_quantity(value, si)
+
+
+def with_units(read: Callable[[str], str]) -> Callable[[Any, ValidationInfo], Any]:
+    """Return a reader of a mapping of quantities whose SI unit follows from the key."""
+
+    def convert(value: Any, info: ValidationInfo) -> Any:
+        if not isinstance(value, dict) or not info.context:
+            return value
+        return {str(k): read_with_unit(v, read(str(k))) for k, v in value.items()}
+
+    return convert
+
+
+@dataclass(frozen=True)
+class Tables:
+    """The plant's tables while they are being made; the arrays are filled in place."""
+
+    rig: Rig
+    joints: Table
+    bench: Table
+    inertia: Table
+    channels: Table
+
+
+_WHERE = re.compile(r"^(?:bench|joint (?P<joint>[1-9])(?: (?P<chamber>cap|rod))?)$")
+_FORMS = {"bench": "bench", "joint": "joint I", "chamber": "joint I cap|rod"}
+
+
+class PlantEffect(BaseModel):
+    """One effect: where it can be, how it is drawn at random, what it does to the tables.
+
+    `places` are the forms of place where it can be. `drawn_at` is where a random scenario puts it:
+    ``bench``, ``joint``, ``chamber`` or ``pressure`` (a pressure's channel); `sizes` are the ranges
+    [SI] of its keys, drawn evenly in their logarithm; keys in `signed` are drawn either way.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    places: ClassVar[tuple[str, ...]] = ("joint",)
+    drawn_at: ClassVar[str]
+    sizes: ClassVar[Mapping[str, Size]]
+    signed: ClassVar[tuple[str, ...]] = ()
+    name: str
+
+    @classmethod
+    def effect_name(cls) -> str:
+        """Return the effect's name in scenario files."""
+        return str(get_args(cls.model_fields["name"].annotation)[0])
+
+    @property
+    def place(self) -> str:
+        """Where it is, as text."""
+        return str(getattr(self, "where", None) or getattr(self, "channel", ""))
+
+    @property
+    def joint(self) -> int | None:
+        """Its joint, 0-based; None for the bench."""
+        match = _WHERE.match(self.place)
+        return int(match["joint"]) - 1 if match and match["joint"] else None
+
+    @property
+    def chamber(self) -> str | None:
+        """``cap``, ``rod`` or None for both or neither."""
+        match = _WHERE.match(self.place)
+        return match["chamber"] if match else None
+
+    @field_validator("where", check_fields=False)
+    @classmethod
+    def _known_place(cls, value: str) -> str:
+        match = _WHERE.match(value)
+        form = None
+        if match is not None:
+            form = "chamber" if match["chamber"] else "joint" if match["joint"] else "bench"
+        if form not in cls.places:
+            expected = " or ".join(f"'{_FORMS[place]}'" for place in cls.places)
+            raise ValueError(f"{value!r} is not where this effect can be; expected {expected}")
+        return value
+
+    def apply(self, t: Tables) -> None:
+        """Put the effect into the plant's tables."""
+        raise NotImplementedError
+
+
+def set_relief(t: Tables, override: float) -> None:
+    """Set the relief valve so that the idle pump's whole flow passes at the rig's set pressure.
+
+    slope over cracking, rounded by w: k (x + sqrt(x^2 + w^2)) / 2 = Q_pump at x = D - w^2 / 4 D
+    with D = Q_pump / k, the override.
+    """
+    rounding = t.bench["relief_rounding"]
+    t.bench["relief_slope"] = t.rig.supply.flow / override
+    t.bench["relief_crack"] = t.rig.supply.pressure - (override - rounding**2 / (4.0 * override))

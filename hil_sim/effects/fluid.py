@@ -1,0 +1,135 @@
+"""Effects on the oil: leakage, supply and return, free air, volume."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, ClassVar, Literal, Self
+
+from pydantic import Field, model_validator
+
+from hil_sim.effects.base import PlantEffect, Tables, in_unit, set_relief
+from rig.model.quantity import Flow, Length, Pressure, Ratio, Time, Volume
+
+Conductance = Annotated[float, in_unit("m^3/(s*Pa)")]
+
+
+class InternalLeakage(PlantEffect):
+    """Past the piston, cap to rod; in a bore worn about its middle, only there."""
+
+    drawn_at = "joint"
+    sizes: ClassVar = {"conductance": (5e-13, 3e-12)}
+
+    name: Literal["internal_leakage"]
+    where: str
+    conductance: Conductance = Field(gt=0)
+    worn: Length | None = Field(default=None, gt=0, description="half length of the wear [m]")
+
+    def apply(self, t: Tables) -> None:
+        """Put the effect into the plant's tables."""
+        t.joints["leak_internal"][self.joint] += self.conductance
+        t.joints["leak_length"][self.joint] = self.worn or math.inf
+
+
+class ExternalLeakage(PlantEffect):
+    """From one chamber, or both, to tank."""
+
+    drawn_at = "chamber"
+    sizes: ClassVar = {"conductance": (5e-13, 3e-12)}
+
+    places = ("joint", "chamber")
+    name: Literal["external_leakage"]
+    where: str
+    conductance: Conductance = Field(gt=0)
+
+    def apply(self, t: Tables) -> None:
+        """Put the effect into the plant's tables."""
+        for chamber in (self.chamber,) if self.chamber else ("cap", "rod"):
+            t.joints[f"leak_{chamber}"][self.joint] += self.conductance
+
+
+class SupplySag(PlantEffect):
+    """A worse supply: less pump flow, a softer relief valve, a line that drops pressure."""
+
+    drawn_at = "bench"
+    sizes: ClassVar = {"line_drop": (0.3e6, 1e6)}
+
+    places = ("bench",)
+    name: Literal["supply_sag"]
+    where: str = "bench"
+    flow: Flow | None = Field(default=None, gt=0, description="what the pump still gives")
+    override: Pressure | None = Field(default=None, gt=0, description="relief, cracking to full")
+    line_drop: Pressure | None = Field(
+        default=None, gt=0, description="between pump and valves at the rig's pump flow"
+    )
+    manifold_volume: Volume = Field(default=0.2e-3, gt=0)
+
+    @model_validator(mode="after")
+    def _some(self) -> Self:
+        if self.flow is None and self.override is None and self.line_drop is None:
+            raise ValueError("give at least one of flow, override, line_drop")
+        return self
+
+    def apply(self, t: Tables) -> None:
+        """Put the effect into the plant's tables."""
+        rated = t.rig.supply.flow
+        if self.flow is not None:
+            t.bench["pump"] = self.flow
+        if self.override is not None:
+            set_relief(t, self.override)
+        if self.line_drop is not None:
+            t.bench["line_gain"] = rated / math.sqrt(self.line_drop)
+            t.bench["manifold_volume"] = self.manifold_volume
+
+
+class TankPressure(PlantEffect):
+    """Return pressure: a constant part and one that follows the returned flow's square."""
+
+    drawn_at = "bench"
+    sizes: ClassVar = {"pressure": (0.1e6, 0.4e6)}
+
+    places = ("bench",)
+    name: Literal["tank_pressure"]
+    where: str = "bench"
+    pressure: Pressure = Field(ge=0)
+    back_pressure: Pressure = Field(default=0.0, ge=0, description="more at the rig's pump flow")
+    lag: Time = Field(default=5e-3, ge=5e-4)
+
+    def apply(self, t: Tables) -> None:
+        """Put the effect into the plant's tables."""
+        t.bench["tank_pressure"] = self.pressure
+        t.bench["tank_resistance"] = self.back_pressure / t.rig.supply.flow**2
+        t.bench["tank_lag"] = self.lag
+
+
+class EntrainedAir(PlantEffect):
+    """Free air by volume at atmospheric pressure; it dissolves over `dissolution`."""
+
+    drawn_at = "bench"
+    sizes: ClassVar = {"fraction": (3e-3, 3e-2)}
+
+    places = ("bench",)
+    name: Literal["entrained_air"]
+    where: str = "bench"
+    fraction: Ratio = Field(gt=0, lt=0.2)
+    dissolution: Pressure = Field(default=10e6, gt=0)
+
+    def apply(self, t: Tables) -> None:
+        """Put the effect into the plant's tables."""
+        t.bench["air"] = self.fraction
+        t.bench["air_dissolution"] = self.dissolution
+
+
+class DeadVolume(PlantEffect):
+    """Oil between valve and chamber that the rig file does not know."""
+
+    drawn_at = "chamber"
+    sizes: ClassVar = {"volume": (20e-6, 100e-6)}
+
+    places = ("chamber",)
+    name: Literal["dead_volume"]
+    where: str
+    volume: Volume = Field(gt=0)
+
+    def apply(self, t: Tables) -> None:
+        """Put the effect into the plant's tables."""
+        t.joints[f"{self.chamber}_volume"][self.joint] += self.volume

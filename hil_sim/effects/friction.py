@@ -1,0 +1,104 @@
+"""Dry friction of the cylinders' seals: bristles (LuGre) with levels by cause."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, Literal, Self
+
+from pydantic import Field, model_validator
+
+from hil_sim.effects.base import PlantEffect, Tables, in_unit
+from rig.model.quantity import Length, Speed
+
+Force = Annotated[float, in_unit("N")]
+ForcePerPressure = Annotated[float, in_unit("N/Pa")]
+PerLength = Annotated[float, in_unit("m^-1")]
+# The bristle's relaxation is kept below this rate [1/s] for the fixed step's sake.
+BRISTLE_LIMIT = 8e3
+
+
+class _Friction(PlantEffect):
+    where: str
+    presliding: Length = Field(default=40e-6, gt=0, description="bristle deflection at slip [m]")
+
+
+class CoulombFriction(_Friction):
+    """Dry friction of the cylinder's seals; in a tapered bore it grows along the stroke."""
+
+    drawn_at = "joint"
+    sizes: ClassVar = {"force": (20.0, 120.0)}
+
+    name: Literal["coulomb_friction"]
+    force: Force = Field(gt=0)
+    taper: PerLength = Field(default=0.0, description="growth from mid-stroke [1/m]")
+
+    def apply(self, t: Tables) -> None:
+        """Put the effect into the plant's tables."""
+        t.joints["friction_plus"][self.joint] += self.force
+        t.joints["friction_minus"][self.joint] += self.force
+        t.joints["friction_taper"][self.joint] += self.taper
+        _bristles(t, self.joint, self.force, self.presliding)
+
+
+class StribeckFriction(_Friction):
+    """Breakaway force above Coulomb's that falls off over `speed`."""
+
+    drawn_at = "joint"
+    sizes: ClassVar = {"force": (40.0, 120.0), "speed": (0.01, 0.04)}
+
+    name: Literal["stribeck_friction"]
+    force: Force = Field(gt=0)
+    speed: Speed = Field(gt=0)
+
+    def apply(self, t: Tables) -> None:
+        """Put the effect into the plant's tables."""
+        t.joints["stribeck"][self.joint] += self.force
+        t.joints["stribeck_speed"][self.joint] = self.speed
+        _bristles(t, self.joint, self.force, self.presliding)
+
+
+class AsymmetricFriction(_Friction):
+    """Dry friction that differs with direction."""
+
+    drawn_at = "joint"
+    sizes: ClassVar = {"extending": (40.0, 120.0), "retracting": (5.0, 20.0)}
+
+    name: Literal["asymmetric_friction"]
+    extending: Force = Field(ge=0)
+    retracting: Force = Field(ge=0)
+
+    @model_validator(mode="after")
+    def _some(self) -> Self:
+        if self.extending == self.retracting == 0:
+            raise ValueError("extending and retracting are both zero; give one of them")
+        return self
+
+    def apply(self, t: Tables) -> None:
+        """Put the effect into the plant's tables."""
+        t.joints["friction_plus"][self.joint] += self.extending
+        t.joints["friction_minus"][self.joint] += self.retracting
+        _bristles(t, self.joint, max(self.extending, self.retracting), self.presliding)
+
+
+class PressureDependentFriction(_Friction):
+    """Dry friction that grows with what the seals hold: coefficient (p_cap + p_rod)."""
+
+    drawn_at = "joint"
+    sizes: ClassVar = {"coefficient": (6e-6, 3e-5)}
+
+    name: Literal["pressure_dependent_friction"]
+    coefficient: ForcePerPressure = Field(gt=0)
+
+    def apply(self, t: Tables) -> None:
+        """Put the effect into the plant's tables."""
+        t.joints["friction_pressure"][self.joint] += self.coefficient
+        _bristles(t, self.joint, self.coefficient * t.rig.supply.pressure, self.presliding)
+
+
+def _bristles(t: Tables, joint: int | None, force: float, presliding: float) -> None:
+    # Friction of several causes shares one set of bristles: their stiffnesses add.
+    row = t.joints[joint : joint + 1] if joint is not None else t.joints
+    row["friction_scale"] += force
+    row["bristle_stiffness"] += force / presliding
+    row["bristle_limit"] = BRISTLE_LIMIT
+    # Enough micro-damping that presliding does not ring, little against Fv G^-2.
+    row["bristle_damping"] += 2e-3 * force / presliding

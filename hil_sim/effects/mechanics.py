@@ -1,0 +1,90 @@
+"""Effects on the arm: an inclined base, a payload, a spring, a constant torque."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from hil_sim.effects.base import PlantEffect, Tables, in_unit
+from rig.model.quantity import Angle
+
+Torque = Annotated[float, in_unit("N*m")]
+Mass = Annotated[float, in_unit("kg")]
+SpringRate = Annotated[float, in_unit("N*m/rad")]
+
+
+class BaseInclination(PlantEffect):
+    """The base tilts about the joints' axis; positive adds to the first angle."""
+
+    drawn_at = "bench"
+    sizes: ClassVar = {"angle": (0.017, 0.07)}
+    signed = ("angle",)
+
+    places = ("bench",)
+    name: Literal["base_inclination"]
+    where: str = "bench"
+    angle: Angle
+
+    def apply(self, t: Tables) -> None:
+        """Put the effect into the plant's tables."""
+        t.bench["sin_slope"], t.bench["cos_slope"] = math.sin(self.angle), math.cos(self.angle)
+
+
+class Payload(PlantEffect):
+    """A mass at the tip of the last link."""
+
+    drawn_at = "bench"
+    sizes: ClassVar = {"mass": (0.5, 6.5)}
+
+    places = ("bench",)
+    name: Literal["payload"]
+    where: str = "bench"
+    mass: Mass = Field(gt=0)
+
+    def apply(self, t: Tables) -> None:
+        """Put the effect into the plant's tables."""
+        # A point mass at the tip: R_ij += m l_i l_j, W_i += m l_i.
+        lengths = np.array([j.link_length for j in t.rig.joints])
+        t.inertia[:] += self.mass * np.outer(lengths, lengths)
+        t.joints["weight"] += self.mass * t.rig.gravity * lengths
+
+
+class JointSpring(PlantEffect):
+    """A hose that pulls the joint back to `rest` (default: mid-stroke), hardening [1/rad^2]."""
+
+    drawn_at = "joint"
+    sizes: ClassVar = {"stiffness": (30.0, 150.0)}
+
+    name: Literal["joint_spring"]
+    where: str
+    stiffness: SpringRate = Field(gt=0)
+    rest: Angle | None = None
+    hardening: Annotated[float, in_unit("rad^-2")] = Field(default=0.25, ge=0)
+
+    def apply(self, t: Tables) -> None:
+        """Put the effect into the plant's tables."""
+        rest = self.rest
+        if rest is None:
+            rest = float(t.rig.joints[self.joint or 0].linkage.angle(0.0))
+        t.joints["spring"][self.joint] = self.stiffness
+        t.joints["spring_rest"][self.joint] = rest
+        t.joints["spring_hardening"][self.joint] = self.hardening
+
+
+class TorqueOffset(PlantEffect):
+    """A constant torque, positive opening."""
+
+    drawn_at = "joint"
+    sizes: ClassVar = {"torque": (3.0, 15.0)}
+    signed = ("torque",)
+
+    name: Literal["torque_offset"]
+    where: str
+    torque: Torque
+
+    def apply(self, t: Tables) -> None:
+        """Put the effect into the plant's tables."""
+        t.joints["torque_offset"][self.joint] += self.torque

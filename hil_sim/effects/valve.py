@@ -1,0 +1,78 @@
+"""Effects between the spool's LVDT and the metering edges."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+from pydantic import Field
+
+from hil_sim.effects.base import PlantEffect, Tables
+from rig.model.quantity import Time, Voltage
+
+
+class ValveDeadband(PlantEffect):
+    """Overlapped edges: `width` either way (`astern`: the other way, if it differs), rounded."""
+
+    drawn_at = "joint"
+    sizes: ClassVar = {"width": (4e-3, 20e-3)}
+
+    name: Literal["valve_deadband"]
+    where: str
+    width: Voltage = Field(gt=0, description="of the spool's LVDT [V]")
+    astern: Voltage | None = Field(default=None, gt=0)
+    rounding: Voltage | None = Field(default=None, gt=0, description="default: a fifth of width")
+
+    def apply(self, t: Tables) -> None:
+        """Put the effect into the plant's tables."""
+        t.joints["lap_ahead"][self.joint] += self.width
+        t.joints["lap_astern"][self.joint] += self.astern or self.width
+        t.joints["rounding"][self.joint] += self.rounding or 0.2 * self.width
+
+
+class UnderlapLeakage(PlantEffect):
+    """Underlapped edges: near the null both pass oil, from pump to tank as well."""
+
+    drawn_at = "joint"
+    sizes: ClassVar = {"width": (4e-3, 15e-3)}
+
+    name: Literal["underlap_leakage"]
+    where: str
+    width: Voltage = Field(gt=0)
+    rounding: Voltage | None = Field(default=None, gt=0, description="default: half of width")
+
+    def apply(self, t: Tables) -> None:
+        """Put the effect into the plant's tables."""
+        t.joints["lap_ahead"][self.joint] -= self.width
+        t.joints["lap_astern"][self.joint] -= self.width
+        t.joints["rounding"][self.joint] += self.rounding or 0.5 * self.width
+
+
+class SpoolOffset(PlantEffect):
+    """The edges' null lies at this LVDT voltage."""
+
+    drawn_at = "joint"
+    sizes: ClassVar = {"voltage": (2e-3, 10e-3)}
+    signed = ("voltage",)
+
+    name: Literal["spool_offset"]
+    where: str
+    voltage: Voltage
+
+    def apply(self, t: Tables) -> None:
+        """Put the effect into the plant's tables."""
+        t.joints["null"][self.joint] += self.voltage
+
+
+class SpoolLag(PlantEffect):
+    """The metered opening follows the LVDT with this time constant."""
+
+    drawn_at = "joint"
+    sizes: ClassVar = {"time": (1e-3, 5e-3)}
+
+    name: Literal["spool_lag"]
+    where: str
+    time: Time = Field(ge=2e-4)
+
+    def apply(self, t: Tables) -> None:
+        """Put the effect into the plant's tables."""
+        t.joints["opening_rate"][self.joint] = 1.0 / self.time
