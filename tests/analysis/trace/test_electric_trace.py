@@ -106,7 +106,7 @@ def test_the_same_command_writes_result_model_and_report(
 
 
 @pytest.mark.skipif(not FILE.exists(), reason=f"no measured record at {FILE}")
-@pytest.mark.parametrize(("train", "judge"), [("first", "second"), ("second", "first")])
+@pytest.mark.parametrize(("train", "holdout_data"), [("first", "second"), ("second", "first")])
 def test_on_the_measured_carriage_both_are_found(train: str, holdout_data: str) -> None:
     data = study.load(FILE, period=study.PERIOD)
     result = trace([getattr(data, train)], [getattr(data, holdout_data)])
