@@ -9,12 +9,18 @@ so that waveforms are device-timed, and streams what it measured as numbered blo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, ClassVar, Protocol, Self
+from urllib.parse import SplitResult
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from rig.model.parse import InputError
+from rig.model.parts import Part, Wire
+from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
@@ -76,8 +82,47 @@ class SampleBlock:
     tripped: bool
 
 
+class WireSettings(Part):
+    """The keys of a rig file's section `wire` that one kind of driver reads."""
+
+    @classmethod
+    def of(cls, wire: Wire) -> Self:
+        """Read the settings of a wire; raises InputError naming the key and what was expected."""
+        try:
+            return cls.model_validate(wire.settings)
+        except ValidationError as error:
+            first = error.errors()[0]
+            key = ".".join(str(part) for part in first["loc"])
+            known = " ".join(cls.model_fields)
+            if first["type"] == "extra_forbidden":
+                text = f"unknown key of wire {wire.kind}; expected: kind timeout watchdog {known}"
+            elif first["type"] == "missing":
+                text = f"wire {wire.kind} needs it"
+            else:
+                text = f"{first['msg'].removeprefix('Value error, ')}, found {first['input']!r}"
+            raise InputError(f"wire: {key}: {text}") from error
+
+    @classmethod
+    def of_endpoint(cls, url: SplitResult) -> Mapping[str, Any]:
+        """Return the settings that an endpoint such as ``modbus-tcp://127.0.0.1:5020`` stands for.
+
+        Raises ValueError where it does not have the form of `example`.
+        """
+        raise NotImplementedError
+
+    example: ClassVar[str] = ""
+
+
 class Driver(Protocol):
-    """A device behind a wire. Every call raises DeviceLost or DeviceError, nothing else."""
+    """A device behind a wire. Every call raises DeviceLost or DeviceError, nothing else.
+
+    A driver is a class of `(wire, rig)`, found by the entry point group ``bramah.drivers`` under
+    the name of its kind of wire; its class attribute `settings` is the `WireSettings` it reads.
+    """
+
+    settings: ClassVar[type[WireSettings]]
+
+    def __init__(self, wire: Wire, rig: Rig) -> None: ...
 
     def connect(self) -> DeviceInfo:
         """Open the wire, check that the device fits the rig, leave its outputs at zero."""

@@ -5,11 +5,14 @@ from __future__ import annotations
 import logging
 import struct
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import astuple
+from typing import Any, ClassVar
+from urllib.parse import SplitResult
 
 import numpy as np
+from pydantic import Field
 
 from drivers.base import (
     Array,
@@ -18,6 +21,7 @@ from drivers.base import (
     DeviceLost,
     OutputLaw,
     SampleBlock,
+    WireSettings,
 )
 from drivers.modbus_blocks import BlockDecoder, unwrap
 from drivers.modbus_transport import DeviceRefused, DeviceSilent, ModbusConnection, unpack
@@ -34,8 +38,26 @@ VIRTUAL_PATIENCE = 10.0
 _TOLERANCE = 1e-6  # registers hold single precision
 
 
+class TcpSettings(WireSettings):
+    """Where a device listens."""
+
+    example: ClassVar = "modbus-tcp://127.0.0.1:5020"
+
+    host: str = "127.0.0.1"
+    port: int = Field(default=5020, ge=0, le=65535)
+
+    @classmethod
+    def of_endpoint(cls, url: SplitResult) -> Mapping[str, Any]:
+        """Return host and port; raises ValueError where one is missing."""
+        if not url.hostname or not url.port:
+            raise ValueError("no host or no port")
+        return {"host": url.hostname, "port": url.port}
+
+
 class ModbusTcpDriver:
     """`drivers.base.Driver` over Modbus TCP; see there for what each call promises."""
+
+    settings: ClassVar[type[WireSettings]] = TcpSettings
 
     def __init__(
         self, wire: Wire, rig: Rig, *, sleep: Callable[[float], None] = time.sleep
@@ -44,12 +66,18 @@ class ModbusTcpDriver:
         self._rig = rig
         self._sleep = sleep
         # Two tries within the time after which a silent device counts as lost.
-        self._link = ModbusConnection(wire.host, wire.port, wire.timeout / 2)
+        self._link = self.connection(wire, wire.timeout / 2)
         self._layout = reg.block_layout(len(rig.channels), len(rig.joints))
         self._decoder = BlockDecoder(rig)
         self._heartbeat = 0
         self._arrived: float | None = None
         self.info: DeviceInfo | None = None
+
+    @staticmethod
+    def connection(wire: Wire, timeout: float) -> ModbusConnection:
+        """Return the closed connection to the device, which waits `timeout` [s] for an answer."""
+        at = TcpSettings.of(wire)
+        return ModbusConnection(at.host, at.port, timeout)
 
     # -- session ----------------------------------------------------------------------------
 
@@ -162,10 +190,14 @@ class ModbusTcpDriver:
         while True:
             answer = self._exchange()
             header = reg.unpack_header(answer)
-            if header.status & Status.BLOCK:
+            if header.status & Status.BLOCK and header.sequence == self._decoder.acknowledge:
+                # The device offers no block again that it knows to have arrived: a late answer.
+                logger.warning("block %d came a second time; asking again", header.sequence)
+                self._link.settle()
+            elif header.status & Status.BLOCK:
                 self._arrived = time.monotonic()
                 return self._decoder.decode(header, answer)
-            if not header.status & Status.STREAMING:
+            elif not header.status & Status.STREAMING:
                 raise DeviceError(
                     f"the device at {self._link.where} does not stream "
                     f"({self.trip_cause() or 'not started'})"
@@ -189,6 +221,7 @@ class ModbusTcpDriver:
             # The block stays in the device until acknowledged, so the same one comes again.
             logger.warning("%s; asking again", silent)
             try:
+                self._link.settle()
                 return self._exchange_once()
             except DeviceSilent:
                 self._link.close()

@@ -5,8 +5,9 @@ from __future__ import annotations
 import logging
 import socket
 import struct
+from typing import Any
 
-from pymodbus.client import ModbusTcpClient
+from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 from pymodbus.exceptions import ConnectionException, ModbusException, ModbusIOException
 from pymodbus.pdu import ExceptionResponse, ModbusPDU
 from pymodbus.pdu.register_message import (
@@ -58,7 +59,7 @@ class ModbusConnection:
     def __init__(self, host: str, port: int, timeout: float) -> None:
         self.where = f"{host}:{port}"
         self._host, self._port, self._timeout = host, port, timeout
-        self._client: ModbusTcpClient | None = None
+        self._client: ModbusTcpClient | ModbusSerialClient | None = None
         self._received = 0
         # What the library logs is raised here as well, in words for people.
         logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
@@ -71,22 +72,31 @@ class ModbusConnection:
     def open(self) -> None:
         """Connect; raises DeviceLost when nothing listens there."""
         self.close()
-        client = ModbusTcpClient(
+        client = self._new_client()
+        client.set_max_no_responses(1_000_000)  # when to give up is decided by the driver
+        client.register(_Read)
+        client.register(_ReadWrite)
+        if not client.connect() or client.socket is None:
+            raise DeviceLost(
+                f"nothing answers at {self.where}; is the device (or `bramah sim`) running there?"
+            )
+        self._connected(client)
+        self._client = client
+
+    def _new_client(self) -> ModbusTcpClient | ModbusSerialClient:
+        return ModbusTcpClient(
             self._host,
             port=self._port,
             timeout=self._timeout,
             retries=0,
             trace_packet=self._note,
         )
-        client.set_max_no_responses(1_000_000)  # when to give up is decided by the driver
-        client.register(_Read)
-        client.register(_ReadWrite)
-        if not client.connect() or client.socket is None:  # type: ignore[no-untyped-call]
-            raise DeviceLost(
-                f"nothing answers at {self.where}; is the device (or `bramah sim`) running there?"
-            )
+
+    def _connected(self, client: Any) -> None:
         client.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._client = client
+
+    def settle(self) -> None:
+        """Let a late answer pass before the next request; TCP's transaction numbers need none."""
 
     def be_patient(self, factor: float) -> None:
         """Wait `factor` times as long for every answer of the open connection."""
@@ -144,7 +154,7 @@ class ModbusConnection:
             )
         return payload
 
-    def _usable(self) -> ModbusTcpClient:
+    def _usable(self) -> ModbusTcpClient | ModbusSerialClient:
         # The library would reconnect by itself, to a device that has tripped meanwhile.
         client = self._client
         if client is None or not client.connected:

@@ -1,4 +1,4 @@
-"""The simulated bench as a server: a `Device` behind Modbus TCP, until told to end."""
+"""The simulated bench as a server: a `Device` behind a wire, until told to end."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import asyncio
 import logging
 import os
 import signal
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from contextlib import suppress
+from typing import Final
 
 from pymodbus.constants import ExcCodes
 from pymodbus.pdu import ModbusPDU
@@ -19,11 +20,15 @@ from hil_sim.device.device import Device, Plant
 from hil_sim.device.laws import LawTable
 from hil_sim.device.pdu import REQUESTS, Request
 from hil_sim.device.register_map import RegisterMap
+from hil_sim.device.rtu_server import serve_line
 from rig.model import registers as reg
 from rig.model.rig import Rig
 
 logger = logging.getLogger(__name__)
 
+TCP: Final = "modbus-tcp"
+RTU: Final = "modbus-rtu"
+WIRES: Final = (TCP, RTU)
 _PARENT_SECONDS = 0.25
 
 
@@ -94,11 +99,15 @@ class BenchServer(ModbusTcpServer):
 async def serve_until(
     stop: asyncio.Event,
     device: Device,
+    *,
     host: str,
     port: int,
     on_ready: Callable[[str], None],
 ) -> None:
-    """Serve `device` until `stop` is set; `on_ready` gets the endpoint; raises EndpointError."""
+    """Serve `device` behind Modbus TCP until `stop` is set; `on_ready` gets the endpoint.
+
+    Raises EndpointError.
+    """
     server = BenchServer(device, host, port)
     await server.serve_forever(background=True)
     try:
@@ -120,8 +129,9 @@ def serve(
     realtime: bool = False,
     on_ready: Callable[[str], None] = logger.info,
     parent: int | None = None,
+    wire: str = TCP,
 ) -> None:
-    """Serve a plant behind Modbus TCP until SIGTERM, SIGINT or the end of process `parent`.
+    """Serve a plant on a wire of `WIRES` until SIGTERM, SIGINT or the end of process `parent`.
 
     `on_ready` is called once with the real endpoint, before any client is answered. The sample
     clock starts with this call and a host waits no longer than its timeout: where a plant's first
@@ -130,7 +140,14 @@ def serve(
     """
     # The library's messages are about frames; what matters to people is raised or logged here.
     logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
-    asyncio.run(_serve(rig, plant, host, port, realtime, on_ready, parent))
+
+    async def on_wire(stop: asyncio.Event, device: Device) -> None:
+        if wire == RTU:
+            await serve_line(stop, device, on_ready=on_ready)
+        else:
+            await serve_until(stop, device, host=host, port=port, on_ready=on_ready)
+
+    asyncio.run(_serve(on_wire, rig, plant, realtime, parent))
 
 
 def warm_up(rig: Rig, spare: Plant) -> None:
@@ -140,12 +157,10 @@ def warm_up(rig: Rig, spare: Plant) -> None:
 
 
 async def _serve(
+    on_wire: Callable[[asyncio.Event, Device], Awaitable[None]],
     rig: Rig,
     plant: Plant,
-    host: str,
-    port: int,
     realtime: bool,
-    on_ready: Callable[[str], None],
     parent: int | None,
 ) -> None:
     stop = asyncio.Event()
@@ -156,7 +171,7 @@ async def _serve(
             loop.add_signal_handler(number, stop.set)
     watch = None if parent is None else loop.create_task(_end_with(parent, stop))
     try:
-        await serve_until(stop, Device(rig, plant, realtime=realtime), host, port, on_ready)
+        await on_wire(stop, Device(rig, plant, realtime=realtime))
     finally:
         if watch is not None:
             watch.cancel()

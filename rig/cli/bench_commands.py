@@ -10,7 +10,6 @@ from typing import Annotated
 import typer
 
 from rig.cli.output import progress, table, write_json
-from rig.model.parse import InputError
 
 log = logging.getLogger(__name__)
 
@@ -37,7 +36,9 @@ JsonOption = Annotated[
 
 def sim(
     rig: RigOption,
-    wire: Annotated[str, typer.Option(help="Only modbus-tcp for now.")] = "modbus-tcp",
+    wire: Annotated[
+        str, typer.Option(help="modbus-tcp or modbus-rtu (on a pseudo-terminal).")
+    ] = "modbus-tcp",
     scenario: Annotated[
         str | None,
         typer.Option(help="A file of hidden effects, worn-seal, or random: drawn by the seed."),
@@ -61,9 +62,7 @@ def sim(
     """
     from rig.cli.simulator import Served, serve_bench
 
-    if wire != "modbus-tcp":
-        raise InputError(f"--wire {wire}: this version speaks modbus-tcp only")
-    serve_bench(Served(rig, seed, scenario, port, real_time, truth, parent))
+    serve_bench(Served(rig, seed, scenario, port, real_time, truth, parent, wire))
 
 
 def check(

@@ -9,17 +9,14 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from urllib.parse import urlsplit
 
-from drivers import make_driver
+from drivers import make_driver, wire_at
 from protocols.design.check import check
 from protocols.engine import engine
 from protocols.files import library
 from protocols.files.plan import Overrides, Plan, resolve
 from rig.bench.attach import AttachError, Publisher
 from rig.bench.session import Bench
-from rig.model.parse import InputError
-from rig.model.parts import Wire
 from rig.model.rig import Rig
 from rig.runs.recorder import Recorder
 from rig.runs.rigs import load_bench
@@ -43,19 +40,6 @@ class ProtocolJob:
     operator: str | None = None
     track: bool = False
     memory: float = math.inf
-
-
-def wire_at(endpoint: str, wire: Wire) -> Wire:
-    """Return the wire to an endpoint like ``modbus-tcp://127.0.0.1:5020``; raises InputError."""
-    try:
-        parts = urlsplit(endpoint)
-        host, port = parts.hostname, parts.port
-    except ValueError:
-        host = port = None
-        parts = urlsplit("")
-    if parts.scheme != wire.kind or not host or not port:
-        raise InputError(f"--endpoint {endpoint}: expected one like {wire.kind}://127.0.0.1:5020")
-    return wire.model_copy(update={"host": host, "port": port})
 
 
 def _plan(protocol: str, rig: str, overrides: Overrides) -> tuple[Rig, Plan]:

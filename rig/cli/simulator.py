@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from hil_sim.device.server import EndpointError, serve, warm_up
+from drivers.modbus_tcp import TcpSettings
+from hil_sim.device.server import TCP, WIRES, EndpointError, serve, warm_up
 from hil_sim.plant.plant import Plant
 from hil_sim.scenario.file import Scenario, load_shipped, parse_scenario, shipped_scenarios
 from hil_sim.scenario.random_draw import RANDOM, draw
 from rig.cli.errors import WorkError
 from rig.cli.truth_file import write_truth
+from rig.model.parse import InputError
 from rig.model.rig import Rig
 from rig.runs.files import read_text
 from rig.runs.rigs import load_bench
@@ -31,6 +33,7 @@ class Served:
     real_time: bool = False
     truth: Path | None = None
     parent: int | None = None
+    wire: str = TCP
 
 
 def _endpoint_first(endpoint: str) -> None:
@@ -51,19 +54,22 @@ def hidden(what: Served, rig: Rig) -> Scenario:
 
 def serve_bench(what: Served) -> None:
     """Serve a simulated bench; raises InputError for bad files, WorkError for a busy port."""
+    if what.wire not in WIRES:
+        raise InputError(f"--wire {what.wire}: expected one of: {' '.join(WIRES)}")
     rig = load_bench(what.rig)
     scenario = hidden(what, rig)
     plant = Plant(rig, scenario, what.seed)
     # Compiled before anybody waits for an answer, on a spare so that this one starts at rest.
     warm_up(rig, Plant(rig, scenario, what.seed))
     write_truth(what.truth, plant.truth(), scenario.model_dump(mode="json"))
-    port = rig.wire.port if what.port is None else what.port
+    tcp = TcpSettings.of(rig.wire) if rig.wire.kind == TCP else TcpSettings()
     try:
         serve(
             rig,
             plant,
-            host=rig.wire.host,
-            port=port,
+            host=tcp.host,
+            port=tcp.port if what.port is None else what.port,
+            wire=what.wire,
             realtime=what.real_time,
             on_ready=_endpoint_first,
             parent=what.parent,

@@ -5,7 +5,8 @@ Source of the geometry and constants: NOTES of the method, "Linkage" and "Bench 
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from collections.abc import Mapping
+from typing import Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -242,10 +243,22 @@ class Oil(Part):
 
 
 class Wire(Part):
-    """How the bench is reached."""
+    """How the bench is reached: the kind of wire, times, and the settings of that kind's driver.
 
-    kind: Literal["modbus-tcp"] = "modbus-tcp"
-    host: str = "127.0.0.1"
-    port: int = Field(default=5020, ge=0, le=65535)
+    Keys beyond these are kept as the file has them and read by the driver (`drivers.registry`).
+    """
+
+    model_config = ConfigDict(frozen=True, extra="allow", allow_inf_nan=False)
+
+    kind: str = Field(default="modbus-tcp", pattern=r"^[a-z][a-z0-9-]*$")
     timeout: Time = Field(default=1.0, gt=0, description="answer expected within [s]")
     watchdog: Time = Field(default=0.5, gt=0, description="host silence after which outputs zero")
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The keys that the driver of this kind reads."""
+        return dict(self.model_extra or {})
+
+    def reached_by(self, kind: str, settings: Mapping[str, Any]) -> Wire:
+        """Return a wire with the same times, of this kind and with these settings."""
+        return Wire(kind=kind, timeout=self.timeout, watchdog=self.watchdog, **settings)

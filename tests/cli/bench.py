@@ -11,8 +11,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from drivers import wire_at
 from drivers.modbus_tcp import ModbusTcpDriver
-from rig.cli.running import wire_at
 from rig.runs.rigs import load_rig
 
 START = "from rig.cli.main import run; run()"

@@ -230,7 +230,7 @@ def test_reading_without_a_stream_says_so(driver: ModbusTcpDriver) -> None:
 def test_a_second_host_cannot_take_over_but_can_make_it_safe(driver: ModbusTcpDriver) -> None:
     driver.start()
     driver.apply([OutputLaw(bias=1.0, limit=2.0), OFF])
-    rig = seed_rig(port=driver._wire.port)
+    rig = seed_rig(port=driver._wire.settings["port"])
     other = ModbusTcpDriver(rig.wire, rig)
     with pytest.raises(DeviceError, match="another client has control"):
         other.connect()

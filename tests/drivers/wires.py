@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import os
+import pty
+import select
 import socket
 import struct
 import subprocess
 import sys
 import threading
+import tty
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -18,13 +21,19 @@ ROOT = Path(__file__).parents[2]
 @contextmanager
 def device_process(mode: str = "virtual") -> Iterator[tuple[subprocess.Popen[str], int]]:
     """The integrator's bench as a process; gives (process, port) and ends it afterwards."""
-    command = [sys.executable, "-m", "tests.hil_sim.integrator", mode, str(os.getpid())]
+    with device_at(mode, "modbus-tcp") as (process, endpoint):
+        assert endpoint.startswith("modbus-tcp://127.0.0.1:"), endpoint
+        yield process, int(endpoint.rsplit(":", 1)[1])
+
+
+@contextmanager
+def device_at(mode: str, wire: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """The integrator's bench as a process on a wire; gives (process, endpoint)."""
+    command = [sys.executable, "-m", "tests.hil_sim.integrator", mode, str(os.getpid()), wire]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT) as process:
         try:
             assert process.stdout is not None
-            endpoint = process.stdout.readline().strip()
-            assert endpoint.startswith("modbus-tcp://127.0.0.1:"), endpoint
-            yield process, int(endpoint.rsplit(":", 1)[1])
+            yield process, process.stdout.readline().strip()
         finally:
             process.terminate()
             process.wait(10)
@@ -102,3 +111,62 @@ class BadWire:
             "fewer": data[:4] + struct.pack(">HBBB", 7, data[6], data[7], 4) + data[9:13],
             "miscounted": data[:8] + bytes([data[8] ^ 2]) + data[9:],
         }[fault]
+
+
+class BadLine:
+    """A pseudo-terminal in front of another one, whose way back does what `fault` says.
+
+    "pass" hands answers on; "lose one" swallows the next one; "silent" swallows all; "late" keeps
+    the next answer until the host asks again, then sends it before the right one; "flip" turns one
+    bit of the next answer; "split" sends the next answer in two pieces; "twice" sends it twice.
+    """
+
+    def __init__(self, target: str) -> None:
+        self.fault = "pass"
+        self._device = os.open(target, os.O_RDWR | os.O_NOCTTY)
+        tty.setraw(self._device)
+        self._master, self._slave = pty.openpty()
+        tty.setraw(self._slave)
+        self.path = os.ttyname(self._slave)
+        self._held = b""
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._pump, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End everything."""
+        self._ended.set()
+        self._thread.join(5)
+        for end in (self._device, self._master, self._slave):
+            os.close(end)
+
+    def _pump(self) -> None:
+        while not self._ended.is_set():
+            ready, _, _ = select.select([self._master, self._device], [], [], 0.02)
+            if self._master in ready:
+                if self._held:
+                    os.write(self._master, self._held)
+                    self._held = b""
+                os.write(self._device, os.read(self._master, 4096))
+            if self._device in ready:
+                self._back(self._whole_answer())
+
+    def _whole_answer(self) -> bytes:
+        data = os.read(self._device, 4096)
+        while select.select([self._device], [], [], 0.005)[0]:
+            data += os.read(self._device, 4096)
+        return data
+
+    def _back(self, data: bytes) -> None:
+        fault, self.fault = self.fault, self.fault if self.fault in ("pass", "silent") else "pass"
+        if fault in ("lose one", "silent"):
+            return
+        if fault == "late":
+            self._held = data
+            return
+        if fault == "flip":
+            data = data[:7] + bytes([data[7] ^ 4]) + data[8:]
+        if fault == "split":
+            os.write(self._master, data[:9])
+            data = data[9:]
+        os.write(self._master, data * (2 if fault == "twice" else 1))

@@ -1,7 +1,7 @@
 """A plant whose answer is known by heart: each piston's speed is proportional to its voltage.
 
 Run as a program it is a whole simulated bench in a process of its own:
-``python -m tests.hil_sim.integrator realtime|virtual [parent]`` prints its endpoint.
+``python -m tests.hil_sim.integrator realtime|virtual [parent [wire]]`` prints its endpoint.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from hil_sim.device.server import serve
 from rig.model import channels as ch
 from rig.model.codes import decode_output, encode_input, encode_output
 from rig.model.parse import parse_model
+from rig.model.parts import Wire
 from rig.model.rig import Rig
 
 SPEED_PER_VOLT = 0.02  # [m/(s V)]
@@ -30,7 +31,8 @@ def seed_rig(**wire: object) -> Rig:
     """The shipped two-joint rig, its wire changed where asked."""
     text = (resources.files("rig") / "shipped" / "shinshu-2dof.yaml").read_text("utf-8")
     rig = parse_model(Rig, text, "shinshu-2dof.yaml")
-    return rig.model_copy(update={"wire": rig.wire.model_copy(update=wire)})
+    changed = Wire(**{**rig.wire.model_dump(), **wire})  # type: ignore[arg-type]
+    return rig.model_copy(update={"wire": changed})
 
 
 class IntegratorPlant:
@@ -92,6 +94,7 @@ def main() -> None:
         realtime=sys.argv[1] == "realtime",
         on_ready=lambda endpoint: print(endpoint, flush=True),  # noqa: T201
         parent=parent,
+        wire=sys.argv[3] if len(sys.argv) > 3 else "modbus-tcp",
     )
 
 

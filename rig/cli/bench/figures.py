@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from analysis.report import paper
-from drivers import make_driver
+from drivers import make_driver, wire_at
 from protocols.files.plan import Overrides
 from rig.cli.bench import plant
 from rig.cli.bench.acquisition import measure_acquisition
@@ -20,7 +20,6 @@ from rig.cli.bench.analysis import identify_figures, simulation_figures
 from rig.cli.bench.figure import Figure
 from rig.cli.bench.stream_figures import stream_figures
 from rig.cli.output import table
-from rig.cli.running import wire_at
 from rig.cli.simulated import simulated_bench
 from rig.cli.story import RIG, Experiment, experiment
 from rig.model import channels as ch

@@ -1,0 +1,101 @@
+"""The driver of a bench behind Modbus RTU on a serial line (docs/wire-modbus-rtu.md).
+
+The register map is that of Modbus TCP. RTU frames carry no transaction number, so that a late
+answer to an earlier request may pass for the next one: after a request without an answer the line
+is listened to until it is quiet, and blocks carry a sequence number that only the right one has.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Mapping
+from typing import Any, ClassVar
+from urllib.parse import SplitResult, parse_qs
+
+from pydantic import Field
+from pymodbus.client import ModbusSerialClient
+from serial import SerialException
+
+from drivers.base import DeviceLost, WireSettings
+from drivers.modbus_tcp import ModbusTcpDriver
+from drivers.modbus_transport import ModbusConnection
+from rig.model.parts import Wire
+
+logger = logging.getLogger(__name__)
+
+QUIET = 0.05  # [s] without a byte after which nothing more of a late answer is coming
+LONGEST = 1.0  # [s] that a line may keep talking before it counts as garbage
+
+
+class RtuSettings(WireSettings):
+    """The serial line: its device file or port, and its speed; 8 data bits, 1 stop bit."""
+
+    example: ClassVar = "modbus-rtu:///dev/ttyUSB0?baud=921600"
+
+    device: str = Field(min_length=1)
+    baud: int = Field(default=921_600, ge=1200)
+    parity: str = Field(default="N", pattern="^[NEO]$")
+
+    @classmethod
+    def of_endpoint(cls, url: SplitResult) -> Mapping[str, Any]:
+        """Return device and speed; raises ValueError where the device is missing."""
+        if not url.path:
+            raise ValueError("no device")
+        query = {key: values[-1] for key, values in parse_qs(url.query).items()}
+        return {"device": url.path, **query}
+
+
+class RtuConnection(ModbusConnection):
+    """A serial line that is opened once and, broken once, stays closed until opened again."""
+
+    def __init__(self, at: RtuSettings, timeout: float) -> None:
+        super().__init__(at.device, 0, timeout)
+        self.where = at.device
+        self._at = at
+
+    def _new_client(self) -> ModbusSerialClient:
+        return ModbusSerialClient(
+            self._at.device,
+            baudrate=self._at.baud,
+            parity=self._at.parity,
+            timeout=self._timeout,
+            retries=0,
+            trace_packet=self._note,
+        )
+
+    def _connected(self, client: Any) -> None:
+        client.socket.reset_input_buffer()
+
+    def settle(self) -> None:
+        """Read and drop what still arrives, until the line is quiet.
+
+        Raises DeviceLost where the line is gone or does not fall silent.
+        """
+        line: Any = self._usable().socket
+        began = heard = time.monotonic()
+        try:
+            while time.monotonic() - heard < QUIET:
+                if line.in_waiting:
+                    line.read(line.in_waiting)
+                    heard = time.monotonic()
+                if heard - began > LONGEST:
+                    self.close()
+                    raise DeviceLost(
+                        f"{self.where} sends without end; does another host talk on it?"
+                    )
+                time.sleep(QUIET / 20)
+        except (SerialException, OSError) as error:
+            self.close()
+            raise DeviceLost(f"the serial line {self.where} is gone: {error}") from error
+
+
+class ModbusRtuDriver(ModbusTcpDriver):
+    """`drivers.base.Driver` over Modbus RTU; see there for what each call promises."""
+
+    settings: ClassVar[type[WireSettings]] = RtuSettings
+
+    @staticmethod
+    def connection(wire: Wire, timeout: float) -> ModbusConnection:
+        """Return the closed line to the device, which waits `timeout` [s] for an answer."""
+        return RtuConnection(RtuSettings.of(wire), timeout)

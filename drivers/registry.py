@@ -1,0 +1,52 @@
+"""Drivers by the kind of their wire: classes found by the entry point group ``bramah.drivers``."""
+
+from __future__ import annotations
+
+from importlib.metadata import EntryPoint, entry_points
+from typing import Final
+from urllib.parse import urlsplit
+
+from drivers.base import Driver
+from rig.model.parse import InputError
+from rig.model.parts import Wire
+from rig.model.rig import Rig
+
+GROUP: Final = "bramah.drivers"
+
+
+def wire_kinds() -> tuple[str, ...]:
+    """Name the kinds of wire that an installed driver serves."""
+    return tuple(sorted({found.name for found in entry_points(group=GROUP)}))
+
+
+def driver_class(kind: str) -> type[Driver]:
+    """Return the driver of a kind of wire; raises InputError for one that nothing serves."""
+    found: list[EntryPoint] = list(entry_points(group=GROUP, name=kind))
+    if not found:
+        raise InputError(f"wire: kind: {kind!r} has no driver; installed: {' '.join(wire_kinds())}")
+    loaded: type[Driver] = found[0].load()
+    return loaded
+
+
+def make_driver(wire: Wire, rig: Rig) -> Driver:
+    """Return the unconnected driver of a wire; raises InputError for settings it cannot read."""
+    return driver_class(wire.kind)(wire, rig)
+
+
+def wire_at(endpoint: str, wire: Wire) -> Wire:
+    """Return the wire to an endpoint such as ``modbus-tcp://127.0.0.1:5020``; times as in `wire`.
+
+    Raises InputError for another form, naming the one expected.
+    """
+    kinds = wire_kinds()
+    url = urlsplit(endpoint)
+    if url.scheme not in kinds:
+        raise InputError(
+            f"--endpoint {endpoint}: expected KIND://..., the kind one of: {' '.join(kinds)}"
+        )
+    settings = driver_class(url.scheme).settings
+    try:
+        found = settings.of_endpoint(url)
+    except ValueError as error:
+        raise InputError(f"--endpoint {endpoint}: expected one like {settings.example}") from error
+    return wire.reached_by(url.scheme, found)
