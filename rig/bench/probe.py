@@ -1,0 +1,99 @@
+"""One block read from a device that is left as it is found: what every channel says now."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.base import Driver, SampleBlock
+from rig.model import channels as ch
+from rig.model.codes import encode_input
+from rig.model.rig import Rig
+
+GOOD: Final = "ok"
+EMPTY_PRESSURE: Final = 0.1e6  # [Pa] gauge below which a chamber counts as without pressure
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One channel over one block: mean, extremes [SI unit], converter codes, and a mark.
+
+    `mark` is ``ok`` or says what is not plausible.
+    """
+
+    channel: str
+    unit: str
+    mean: float
+    low: float
+    high: float
+    codes: tuple[int, int]
+    mark: str
+
+
+def probe(driver: Driver, rig: Rig) -> list[Reading]:
+    """Connect, read one block, close; outputs stay at zero. Raises DeviceError, DeviceLost."""
+    try:
+        driver.connect()
+        driver.start()
+        block = driver.read_block()
+        driver.stop()
+    finally:
+        driver.close()
+    return readings(block, rig)
+
+
+def readings(block: SampleBlock, rig: Rig) -> list[Reading]:
+    """Return what each channel of a block says, in the order of the rig's channels."""
+    supply = _supply(block, rig)
+    return [_reading(name, k, block, rig, supply) for k, name in enumerate(rig.channels)]
+
+
+def pressurised(found: list[Reading]) -> list[str]:
+    """Name the chambers and the supply that are still under pressure: `joint 1 cap 3.50 MPa`."""
+    out = []
+    for one in found:
+        kind, joint = ch.kind_of(one.channel)
+        if kind in (ch.CAP, ch.ROD, ch.SUPPLY) and one.mean > EMPTY_PRESSURE:
+            place = "supply" if kind == ch.SUPPLY else f"joint {joint} {kind.split('_')[0]}"
+            out.append(f"{place} {one.mean / 1e6:.2f} MPa")
+    return out
+
+
+def _supply(block: SampleBlock, rig: Rig) -> float:
+    if ch.SUPPLY in rig.channels:
+        return float(np.mean(block.data[:, rig.channels.index(ch.SUPPLY)]))
+    return rig.supply.pressure
+
+
+def _reading(name: str, column: int, block: SampleBlock, rig: Rig, supply: float) -> Reading:
+    x = block.data[:, column]
+    kind = ch.kind_of(name)[0]
+    sensor = rig.sensors.of(kind)
+    finite = np.nan_to_num(x)
+    codes = encode_input([finite.min(), finite.max()], *sensor.range, sensor.bits)
+    return Reading(
+        name,
+        rig.unit_of(name),
+        float(x.mean()),
+        float(x.min()),
+        float(x.max()),
+        (int(codes[0]), int(codes[1])),
+        _mark(kind, x, block.saturated[:, column], supply, sensor.noise),
+    )
+
+
+def _mark(
+    kind: str, x: NDArray[np.float64], saturated: NDArray[np.bool_], supply: float, noise: float
+) -> str:
+    if not np.isfinite(x).all():
+        return "not a number"
+    if saturated.any():
+        return "at the end of its converter's range: broken wire, or out of range?"
+    if kind in (ch.CAP, ch.ROD) and x.mean() > supply + 5 * noise:
+        return f"above the supply pressure of {supply / 1e6:.2f} MPa"
+    if kind in (ch.CAP, ch.ROD, ch.SUPPLY) and x.mean() < -5 * noise - EMPTY_PRESSURE:
+        return "below zero"
+    return GOOD
