@@ -39,7 +39,9 @@ _U32 = 0xFFFF_FFFF
 class Plant(Protocol):
     """What the device needs of a plant; it is deterministic and owns all physical state."""
 
-    tick: int
+    @property
+    def tick(self) -> int:
+        """Samples measured so far."""
 
     def advance(self, ticks: int, laws: Sequence[Any]) -> tuple[Codes, Codes]:
         """Run `ticks` samples; return AD codes (ticks, channels), DA codes (ticks, joints)."""

@@ -109,6 +109,11 @@ class Plant:
         self.tick += ticks
         return encode(measured, self._converters), outputs
 
+    @property
+    def tables(self) -> Tables:
+        """The tables that the compiled loop reads; a change acts from the next tick on."""
+        return self._tables
+
     def truth(self) -> dict[str, float]:
         """Return the true parameters [SI] by the names of rig.model.parameters.
 

@@ -4,6 +4,8 @@
       - {name: coulomb_friction, where: joint 2, force: 80 N}
       - {name: channel_delay, channel: piston_1, time: 2 ms}
     parameters: {b: 200 MPa}     # the machine itself, otherwise than its file says
+    faults:                      # what breaks while the bench runs, by the device's time
+      - {name: sensor_stuck, channel: cap_pressure_1, at: 12 s}
     noise: 0.5                   # of what the rig's sensors state
 
 `Scenario()` is a bench with nothing wrong. Names are those of CONTRACT, "Effects"; their forms
@@ -20,6 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validat
 
 from hil_sim.effects import AnyEffect
 from hil_sim.effects.base import with_units
+from hil_sim.faults import AnyFault
 from rig.model.parameters import parameter_unit
 from rig.model.parse import InputError, parse_model
 from rig.model.quantity import Ratio
@@ -33,6 +36,7 @@ class Scenario(BaseModel):
 
     description: str = ""
     effects: tuple[AnyEffect, ...] = ()
+    faults: tuple[AnyFault, ...] = ()
     parameters: Mapping[str, float] = {}
     noise: Annotated[Ratio, Field(ge=0, description="of the sensors' stated noise")] = 1.0
 
@@ -77,17 +81,19 @@ def parse_scenario(text: str, source: str) -> Scenario:
 
 
 def check_fits(scenario: Scenario, rig: Rig) -> None:
-    """Raise InputError where an effect stands at a joint or channel that the rig has not."""
-    for effect in scenario.effects:
-        joint = effect.joint
+    """Raise InputError where an effect or fault is at a joint or channel that the rig lacks."""
+    members: tuple[AnyEffect | AnyFault, ...] = (*scenario.effects, *scenario.faults)
+    for one in members:
+        joint = getattr(one, "joint", None)
         if joint is not None and joint >= len(rig.joints):
             raise InputError(
-                f"scenario: {effect.name} at {effect.place}, but rig {rig.name!r} has "
+                f"scenario: {one.name} at {one.place}, but rig {rig.name!r} has "
                 f"{len(rig.joints)} joint(s)"
             )
-        channel = getattr(effect, "channel", None)
-        if channel is not None and channel not in rig.channels:
-            raise InputError(
-                f"scenario: {effect.name} at channel {channel!r}, but rig {rig.name!r} measures: "
-                f"{' '.join(rig.channels)}"
-            )
+        for key in ("channel", "other"):
+            channel = getattr(one, key, None)
+            if channel is not None and channel not in rig.channels:
+                raise InputError(
+                    f"scenario: {one.name} at channel {channel!r}, but rig {rig.name!r} measures: "
+                    f"{' '.join(rig.channels)}"
+                )

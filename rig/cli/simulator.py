@@ -7,6 +7,7 @@ from pathlib import Path
 
 from drivers.modbus_tcp import TcpSettings
 from hil_sim.device.server import TCP, WIRES, EndpointError, serve, warm_up
+from hil_sim.plant.faulty import FaultyPlant
 from hil_sim.plant.plant import Plant
 from hil_sim.scenario.file import Scenario, load_shipped, parse_scenario, shipped_scenarios
 from hil_sim.scenario.random_draw import RANDOM, draw
@@ -58,10 +59,10 @@ def serve_bench(what: Served) -> None:
         raise InputError(f"--wire {what.wire}: expected one of: {' '.join(WIRES)}")
     rig = load_bench(what.rig)
     scenario = hidden(what, rig)
-    plant = Plant(rig, scenario, what.seed)
+    plant = FaultyPlant(rig, scenario, what.seed)
     # Compiled before anybody waits for an answer, on a spare so that this one starts at rest.
     warm_up(rig, Plant(rig, scenario, what.seed))
-    write_truth(what.truth, plant.truth(), scenario.model_dump(mode="json"))
+    write_truth(what.truth, plant.plant.truth(), scenario.model_dump(mode="json"))
     tcp = TcpSettings.of(rig.wire) if rig.wire.kind == TCP else TcpSettings()
     try:
         serve(

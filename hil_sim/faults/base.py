@@ -1,0 +1,73 @@
+"""What every fault of the simulated bench is: frozen data, when it acts, and what it then does.
+
+A fault breaks the bench while it runs, at `at` seconds of the device's time, and mends at `until`
+(never, where none is given). It is one class of a module of this package. Two ways to act: on the
+plant's tables (`begin` changes them, what it returns mends them) and on the converter codes of a
+block (`distort`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Self, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from hil_sim.effects.base import Tables
+from rig.model.quantity import Time
+from rig.model.rig import Rig
+
+Codes = NDArray[np.int64]
+Mend = Callable[[], None]
+
+
+class Fault(BaseModel):
+    """One fault: its name, and when it acts [s of the device's time]."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    name: str
+    at: Time = Field(default=0.0, ge=0)
+    until: Time | None = None
+
+    @model_validator(mode="after")
+    def _order(self) -> Self:
+        if self.until is not None and self.until <= self.at:
+            raise ValueError(f"until {self.until:g} s is not after at {self.at:g} s")
+        return self
+
+    @classmethod
+    def fault_name(cls) -> str:
+        """Return the fault's name in scenario files."""
+        return str(get_args(cls.model_fields["name"].annotation)[0])
+
+    @property
+    def place(self) -> str:
+        """Where it is, as text."""
+        return str(getattr(self, "where", None) or getattr(self, "channel", None) or "bench")
+
+    def begin(self, tables: Tables) -> Mend | None:
+        """Change the plant's tables; returns what mends them, None where nothing was changed."""
+        return None
+
+    def distort(
+        self, codes: Codes, last: Codes, seconds: NDArray[np.float64], rig: Rig,
+        rng: np.random.Generator,
+    ) -> None:  # fmt: skip
+        """Change codes (n, channels) in place; `last` (channels,) stood before the fault began.
+
+        `seconds` (n,) have passed since then at each row.
+        """
+
+
+def changed(row: Any, field: str, value: float) -> Mend:
+    """Set a field of a table's row; returns what restores it."""
+    before = row[field].copy()
+
+    def mend() -> None:
+        row[field] = before
+
+    row[field] = value
+    return mend

@@ -1,0 +1,84 @@
+"""A plant that breaks while it runs: the faults of its scenario begin and end at their times."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from hil_sim.faults.base import Codes, Fault, Mend
+from hil_sim.plant.plant import Law, Plant
+from hil_sim.scenario.file import Scenario
+from rig.model.rig import Rig
+
+STREAM: Final = 3  # of a bench's seed; 0 and 1 are the plant's, 2 is that of drawn scenarios
+
+
+@dataclass
+class _Timed:
+    """A fault with its first and last tick, and what it has changed while it acts."""
+
+    fault: Fault
+    first: int
+    end: float
+    mend: Mend | None = None
+    last: Codes = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+
+
+class FaultyPlant:
+    """A `Plant` with the faults of a scenario; without any it is that plant."""
+
+    def __init__(self, rig: Rig, scenario: Scenario, seed: int) -> None:
+        self.plant = Plant(rig, scenario, seed)
+        self._rig = rig
+        self._rng = np.random.default_rng([seed, STREAM])
+        self._last = np.zeros(len(rig.channels), dtype=np.int64)
+        self._faults = [
+            _Timed(
+                fault,
+                round(fault.at * rig.sample_rate),
+                math.inf if fault.until is None else round(fault.until * rig.sample_rate),
+            )
+            for fault in scenario.faults
+        ]
+
+    @property
+    def tick(self) -> int:
+        """Samples measured so far."""
+        return self.plant.tick
+
+    def advance(self, ticks: int, laws: Sequence[Law]) -> tuple[Codes, Codes]:
+        """Run `ticks` ticks as `Plant.advance` does, faults beginning and ending in between."""
+        parts = [self.plant.advance(0, laws)]
+        while ticks > 0:
+            self._switch()
+            count = min(ticks, self._until_next())
+            parts.append(self._distorted(*self.plant.advance(count, laws)))
+            ticks -= count
+        measured, outputs = zip(*parts, strict=True)
+        return np.concatenate(measured), np.concatenate(outputs)
+
+    def _until_next(self) -> int:
+        edges = [edge for one in self._faults for edge in (one.first, one.end) if edge > self.tick]
+        return int(min(edges) - self.tick) if edges and min(edges) < math.inf else 1 << 62
+
+    def _switch(self) -> None:
+        for one in self._faults:
+            if one.first == self.tick:
+                one.last = self._last.copy()
+                one.mend = one.fault.begin(self.plant.tables)
+            elif one.end == self.tick and one.mend is not None:
+                one.mend()
+
+    def _distorted(self, codes: Codes, outputs: Codes) -> tuple[Codes, Codes]:
+        first = self.tick - len(codes)
+        for one in self._faults:
+            if one.first <= first < one.end:
+                seconds = (first - one.first + np.arange(len(codes))) / self._rig.sample_rate
+                one.fault.distort(codes, one.last, seconds, self._rig, self._rng)
+        if len(codes):
+            self._last = codes[-1].copy()
+        return codes, outputs
