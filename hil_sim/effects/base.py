@@ -72,6 +72,7 @@ class PlantEffect(BaseModel):
     `places` are the forms of place where it can be. `drawn_at` is where a random scenario puts it:
     ``bench``, ``joint``, ``chamber`` or ``pressure`` (a pressure's channel); `sizes` are the ranges
     [SI] of its keys, drawn evenly in their logarithm; keys in `signed` are drawn either way.
+    `forms` are the values of its key `form`: other physics of the same cause, the first by default.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -80,6 +81,7 @@ class PlantEffect(BaseModel):
     drawn_at: ClassVar[str]
     sizes: ClassVar[Mapping[str, Size]]
     signed: ClassVar[tuple[str, ...]] = ()
+    forms: ClassVar[tuple[str, ...]] = ()
     name: str
 
     @classmethod

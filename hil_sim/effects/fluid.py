@@ -12,6 +12,8 @@ from rig.model.quantity import Flow, Length, Pressure, Ratio, Time, Volume
 
 Conductance = Annotated[float, in_unit("m^3/(s*Pa)")]
 
+ACCUMULATOR = 5e-3  # volume of oil as soft as the accumulator [m^3]
+
 
 class InternalLeakage(PlantEffect):
     """Past the piston, cap to rod; in a bore worn about its middle, only there."""
@@ -54,6 +56,7 @@ class SupplySag(PlantEffect):
     sizes: ClassVar = {"line_drop": (0.3e6, 1e6)}
 
     places = ("bench",)
+    forms = ("turbulent", "laminar", "accumulator")
     name: Literal["supply_sag"]
     where: str = "bench"
     flow: Flow | None = Field(default=None, gt=0, description="what the pump still gives")
@@ -62,6 +65,7 @@ class SupplySag(PlantEffect):
         default=None, gt=0, description="between pump and valves at the rig's pump flow"
     )
     manifold_volume: Volume = Field(default=0.2e-3, gt=0)
+    form: Literal["turbulent", "laminar", "accumulator"] = "turbulent"
 
     @model_validator(mode="after")
     def _some(self) -> Self:
@@ -79,6 +83,11 @@ class SupplySag(PlantEffect):
         if self.line_drop is not None:
             t.bench["line_gain"] = rated / math.sqrt(self.line_drop)
             t.bench["manifold_volume"] = self.manifold_volume
+            if self.form == "laminar":
+                t.bench["line_laminar"] = rated / self.line_drop
+            elif self.form == "accumulator":
+                # Its gas yields: the manifold's pressure follows the line's within about 50 ms.
+                t.bench["manifold_volume"] = ACCUMULATOR
 
 
 class TankPressure(PlantEffect):
@@ -108,15 +117,18 @@ class EntrainedAir(PlantEffect):
     sizes: ClassVar = {"fraction": (3e-3, 3e-2)}
 
     places = ("bench",)
+    forms = ("isothermal", "polytropic", "undissolved")
     name: Literal["entrained_air"]
     where: str = "bench"
     fraction: Ratio = Field(gt=0, lt=0.2)
     dissolution: Pressure = Field(default=10e6, gt=0)
+    form: Literal["isothermal", "polytropic", "undissolved"] = "isothermal"
 
     def apply(self, t: Tables) -> None:
         """Put the effect into the plant's tables."""
         t.bench["air"] = self.fraction
-        t.bench["air_dissolution"] = self.dissolution
+        t.bench["air_dissolution"] = 1e12 if self.form == "undissolved" else self.dissolution
+        t.bench["air_exponent"] = 1.4 if self.form == "polytropic" else 1.0
 
 
 class DeadVolume(PlantEffect):

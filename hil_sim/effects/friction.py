@@ -1,4 +1,4 @@
-"""Dry friction of the cylinders' seals: bristles (LuGre) with levels by cause."""
+"""Dry friction of the cylinders' seals: levels by cause, in one of four forms."""
 
 from __future__ import annotations
 
@@ -17,8 +17,32 @@ BRISTLE_LIMIT = 8e3
 
 
 class _Friction(PlantEffect):
+    """Dry friction in one of four forms.
+
+    ``bristle`` (LuGre, with micro-damping), ``dahl`` (bristles without damping), and two without
+    memory, smooth over the speed `width`: ``tanh`` and ``root``, v / sqrt(v^2 + width^2).
+    """
+
+    forms = ("bristle", "dahl", "tanh", "root")
     where: str
+    form: Literal["bristle", "dahl", "tanh", "root"] = "bristle"
     presliding: Length = Field(default=40e-6, gt=0, description="bristle deflection at slip [m]")
+    width: Speed = Field(default=1e-3, gt=0, description="of tanh and root [m/s]")
+
+    def seal(self, t: Tables, force: float) -> None:
+        """Add the contact of a friction of `force` [N]; one joint's frictions share one form."""
+        row = t.joints[self.joint : (self.joint or 0) + 1]
+        row["friction_scale"] += force
+        if self.form in ("tanh", "root"):
+            row["friction_width"] = self.width
+            row["friction_corner"] = float(self.form == "root")
+            return
+        # Friction of several causes shares one set of bristles: their stiffnesses add.
+        row["bristle_stiffness"] += force / self.presliding
+        row["bristle_limit"] = BRISTLE_LIMIT
+        if self.form == "bristle":
+            # Enough micro-damping that presliding does not ring, little against Fv G^-2.
+            row["bristle_damping"] += 2e-3 * force / self.presliding
 
 
 class CoulombFriction(_Friction):
@@ -36,7 +60,7 @@ class CoulombFriction(_Friction):
         t.joints["friction_plus"][self.joint] += self.force
         t.joints["friction_minus"][self.joint] += self.force
         t.joints["friction_taper"][self.joint] += self.taper
-        _bristles(t, self.joint, self.force, self.presliding)
+        self.seal(t, self.force)
 
 
 class StribeckFriction(_Friction):
@@ -53,7 +77,7 @@ class StribeckFriction(_Friction):
         """Put the effect into the plant's tables."""
         t.joints["stribeck"][self.joint] += self.force
         t.joints["stribeck_speed"][self.joint] = self.speed
-        _bristles(t, self.joint, self.force, self.presliding)
+        self.seal(t, self.force)
 
 
 class AsymmetricFriction(_Friction):
@@ -76,7 +100,7 @@ class AsymmetricFriction(_Friction):
         """Put the effect into the plant's tables."""
         t.joints["friction_plus"][self.joint] += self.extending
         t.joints["friction_minus"][self.joint] += self.retracting
-        _bristles(t, self.joint, max(self.extending, self.retracting), self.presliding)
+        self.seal(t, max(self.extending, self.retracting))
 
 
 class PressureDependentFriction(_Friction):
@@ -91,14 +115,4 @@ class PressureDependentFriction(_Friction):
     def apply(self, t: Tables) -> None:
         """Put the effect into the plant's tables."""
         t.joints["friction_pressure"][self.joint] += self.coefficient
-        _bristles(t, self.joint, self.coefficient * t.rig.supply.pressure, self.presliding)
-
-
-def _bristles(t: Tables, joint: int | None, force: float, presliding: float) -> None:
-    # Friction of several causes shares one set of bristles: their stiffnesses add.
-    row = t.joints[joint : joint + 1] if joint is not None else t.joints
-    row["friction_scale"] += force
-    row["bristle_stiffness"] += force / presliding
-    row["bristle_limit"] = BRISTLE_LIMIT
-    # Enough micro-damping that presliding does not ring, little against Fv G^-2.
-    row["bristle_damping"] += 2e-3 * force / presliding
+        self.seal(t, self.coefficient * t.rig.supply.pressure)

@@ -16,17 +16,22 @@ class ValveDeadband(PlantEffect):
     drawn_at = "joint"
     sizes: ClassVar = {"width": (4e-3, 20e-3)}
 
+    forms = ("round", "sharp", "notch")
     name: Literal["valve_deadband"]
     where: str
     width: Voltage = Field(gt=0, description="of the spool's LVDT [V]")
     astern: Voltage | None = Field(default=None, gt=0)
     rounding: Voltage | None = Field(default=None, gt=0, description="default: a fifth of width")
+    form: Literal["round", "sharp", "notch"] = "round"
 
     def apply(self, t: Tables) -> None:
         """Put the effect into the plant's tables."""
         t.joints["lap_ahead"][self.joint] += self.width
         t.joints["lap_astern"][self.joint] += self.astern or self.width
-        t.joints["rounding"][self.joint] += self.rounding or 0.2 * self.width
+        if self.form == "round":
+            t.joints["rounding"][self.joint] += self.rounding or 0.2 * self.width
+        elif self.form == "notch":
+            t.joints["notch"][self.joint] = 2.0 * self.width
 
 
 class UnderlapLeakage(PlantEffect):
@@ -35,16 +40,21 @@ class UnderlapLeakage(PlantEffect):
     drawn_at = "joint"
     sizes: ClassVar = {"width": (4e-3, 15e-3)}
 
+    forms = ("round", "sharp", "notch")
     name: Literal["underlap_leakage"]
     where: str
     width: Voltage = Field(gt=0)
     rounding: Voltage | None = Field(default=None, gt=0, description="default: half of width")
+    form: Literal["round", "sharp", "notch"] = "round"
 
     def apply(self, t: Tables) -> None:
         """Put the effect into the plant's tables."""
         t.joints["lap_ahead"][self.joint] -= self.width
         t.joints["lap_astern"][self.joint] -= self.width
-        t.joints["rounding"][self.joint] += self.rounding or 0.5 * self.width
+        if self.form == "round":
+            t.joints["rounding"][self.joint] += self.rounding or 0.5 * self.width
+        elif self.form == "notch":
+            t.joints["notch"][self.joint] = self.width
 
 
 class SpoolOffset(PlantEffect):

@@ -9,7 +9,7 @@ q, q rate, z cap, z rod, bristle (N each), z supply, z manifold, tank pressure. 
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import copysign, cos, exp, sin, sqrt
+from math import copysign, cos, exp, sin, sqrt, tanh
 from typing import Any, ParamSpec, TypeVar
 
 import numba
@@ -43,16 +43,17 @@ def pressure(z: float, bench: Any) -> float:
 def softening(z: float, warmth: float, bench: Any) -> float:
     """Return the ratio of the present bulk modulus to dp/dz of `pressure`.
 
-    `warmth` is b(T)/b; entrained air adds V_g = a (p0 / p_abs) exp(-p / p_d) per volume of oil: an
-    isothermal gas (Wylie) that dissolves as the pressure rises (Henry's law).
+    `warmth` is b(T)/b; entrained air adds V_g = a (p0 / p_abs)^(1/n) exp(-p / p_d) per volume of
+    oil: a polytropic gas of exponent n (Wylie) that dissolves as the pressure rises (Henry's law).
     """
     if bench.air <= 0.0:
         return warmth
     root = sqrt(z * z + bench.trapped)
     absolute = bench.half_bulk * (z + root) + 1e-3
     stiff = absolute / root
-    free = bench.air * ATMOSPHERE / absolute * exp(-absolute / bench.air_dissolution)
-    gas = free * (1.0 / absolute + 1.0 / bench.air_dissolution)
+    n = bench.air_exponent
+    free = bench.air * (ATMOSPHERE / absolute) ** (1.0 / n) * exp(-absolute / bench.air_dissolution)
+    gas = free * (1.0 / (n * absolute) + 1.0 / bench.air_dissolution)
     ratio: float = warmth / (1.0 + warmth * stiff * gas)
     return ratio
 
@@ -64,12 +65,17 @@ def orifice(drop: float, laminar: float) -> float:
 
 
 @jit
-def opening(travel: float, lap: float, rounding: float) -> float:
+def opening(travel: float, lap: float, rounding: float, notch: float) -> float:
     """Return one edge's opening [V]; sharp at zero rounding, lap > 0 overlaps, < 0 underlaps.
 
     A corner worn round over +- rounding of travel: a parabola there that meets both straight lines.
+    A triangular notch of depth `notch` [V] opens as the square of the travel, then as the edge.
     """
     past = travel - lap
+    if notch > 0.0:
+        if past <= 0.0:
+            return 0.0
+        return past * past / (2.0 * notch) if past < notch else past - 0.5 * notch
     if abs(past) >= rounding:
         return max(past, 0.0)
     return (past + rounding) * (past + rounding) / (4.0 * rounding)
@@ -88,18 +94,36 @@ def contact(s: float, v: float, joint: Any) -> float:
 
 
 @jit
+def level(s: float, v: float, p_cap: float, p_rod: float, joint: Any) -> float:
+    """Return the steady friction's level [N], above zero, in the direction of v."""
+    force = joint.friction_plus if v >= 0.0 else joint.friction_minus
+    ratio = v / joint.stribeck_speed
+    force += joint.stribeck * exp(-ratio * ratio)
+    force += joint.friction_pressure * max(p_cap + p_rod, 0.0)
+    force = max(force * (1.0 + joint.friction_taper * s), 1e-3 * joint.friction_scale)
+    return float(force)
+
+
+@jit
+def sliding(s: float, v: float, p_cap: float, p_rod: float, joint: Any) -> float:
+    """Return seal friction without memory [N], smooth over a speed `friction_width`.
+
+    level tanh(v / width), or level v / sqrt(v^2 + width^2) where `friction_corner` is set.
+    """
+    x = v / joint.friction_width
+    share = x / sqrt(1.0 + x * x) if joint.friction_corner > 0.0 else tanh(x)
+    force: float = level(s, v, p_cap, p_rod, joint) * share
+    return force
+
+
+@jit
 def bristle(deflection: float, s: float, v: float, p_cap: float, p_rod: float, joint: Any) -> Any:
     """Return (seal friction [N], bristle rate [m/s]) after LuGre (Canudas de Wit 1995).
 
     Its relaxation rate |v| sigma0 / g is bounded at `bristle_limit`, so that the fixed step holds
     at any speed; the steady force stays g(v) sign(v).
     """
-    level = joint.friction_plus if v >= 0.0 else joint.friction_minus
-    ratio = v / joint.stribeck_speed
-    level += joint.stribeck * exp(-ratio * ratio)
-    level += joint.friction_pressure * max(p_cap + p_rod, 0.0)
-    level = max(level * (1.0 + joint.friction_taper * s), 1e-3 * joint.friction_scale)
-    relax = abs(v) * joint.bristle_stiffness / level
+    relax = abs(v) * joint.bristle_stiffness / level(s, v, p_cap, p_rod, joint)
     rate = (v - relax * deflection) / (1.0 + relax / joint.bristle_limit)
     return joint.bristle_stiffness * deflection + joint.bristle_damping * rate, rate
 
@@ -127,12 +151,12 @@ def port_flows(
     q_rod = -q_cap - j.leak_rod * (p_rod - tank)
     q_cap -= j.leak_cap * (p_cap - tank)
     demand, returned = 0.0, 0.0
-    ahead = opening(x, j.lap_ahead, j.rounding)
+    ahead = opening(x, j.lap_ahead, j.rounding, j.notch)
     if ahead > 0.0:
         demand = j.c_pp * ahead * orifice(port - p_cap, lam)
         returned = j.c_mp * ahead * orifice(p_rod - tank, lam)
         q_cap, q_rod = q_cap + demand, q_rod - returned
-    astern = opening(-x, j.lap_astern, j.rounding)
+    astern = opening(-x, j.lap_astern, j.rounding, j.notch)
     if astern > 0.0:
         feed = j.c_mm * astern * orifice(port - p_rod, lam)
         drain = j.c_pm * astern * orifice(p_cap - tank, lam)
@@ -154,7 +178,10 @@ def supply_rates(
     p_supply, line = pressure(y[at], bench), demand
     dy[at + 1] = 0.0
     if bench.line_gain > 0.0:
-        line = bench.line_gain * orifice(p_supply - port, bench.laminar)
+        drop = p_supply - port
+        line = bench.line_gain * orifice(drop, bench.laminar)
+        if bench.line_laminar > 0.0:
+            line = bench.line_laminar * drop
         stiff = softening(y[at + 1], warmth, bench)
         dy[at + 1] = stiff * (line - demand) / bench.manifold_volume
     stiff = softening(y[at], warmth, bench)
@@ -233,7 +260,9 @@ def rates(
 
         force = j.cap_area * p_cap - j.rod_area * p_rod - contact(s, v, j)
         dy[4 * n + i] = 0.0
-        if j.bristle_stiffness > 0.0:
+        if j.friction_width > 0.0:
+            force -= sliding(s, v, p_cap, p_rod, j)
+        elif j.bristle_stiffness > 0.0:
             friction, dy[4 * n + i] = bristle(y[4 * n + i], s, v, p_cap, p_rod, j)
             force -= friction
         twist = y[i] - j.spring_rest

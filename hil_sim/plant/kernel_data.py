@@ -43,17 +43,20 @@ JOINT: Final = _records(
     "leak_internal leak_length leak_cap leak_rod "
     # spool and its edges
     "omega zeta spool_stroke spool_rate spool_gain null opening_rate lap_ahead lap_astern rounding "
+    "notch "
     # mechanics: weight is W g
     "viscous weight spring spring_rest spring_hardening torque_offset "
     "contact_stiffness contact_damping "
     "friction_plus friction_minus stribeck stribeck_speed friction_pressure friction_scale "
-    "friction_taper bristle_stiffness bristle_damping bristle_limit "
+    "friction_taper friction_width friction_corner bristle_stiffness bristle_damping "
+    "bristle_limit "
     "output_top output_range",
 )
 BENCH: Final = _records(
     "",
-    "half_bulk trapped air air_dissolution laminar sin_slope cos_slope "
-    "pump supply_volume relief_crack relief_slope relief_rounding line_gain manifold_volume "
+    "half_bulk trapped air air_dissolution air_exponent laminar sin_slope cos_slope "
+    "pump supply_volume relief_crack relief_slope relief_rounding "
+    "line_gain line_laminar manifold_volume "
     "tank_pressure tank_resistance tank_lag "
     "temperature band period_1 phase_1 period_2 phase_2 bulk_temperature viscosity_temperature",
 )

@@ -115,6 +115,7 @@ def _fill_bench(
         "half_bulk": bulk / 2.0,
         "trapped": 4.0 * constants.residual_air * ATMOSPHERE / bulk,
         "air_dissolution": 1.0,
+        "air_exponent": 1.0,
         "laminar": constants.laminar_transition,
         "cos_slope": 1.0,
         "pump": rig.supply.flow,
