@@ -8,10 +8,12 @@ from typing import Final
 
 import numpy as np
 
+from hil_sim.effects import CLASSES
 from rig.model.parse import InputError
 
 JUDGING_SEED: Final = 100
 NONE, SINGLE, PAIR, OUTSIDE = "none", "single", "pair", "outside"
+FORMS: Final = {kind.effect_name(): kind.forms for kind in CLASSES}
 LOUD = 3.0  # repeatable residual over the noise from which an effect must be found
 
 # name, where (the scenario's), key of the size, small, medium and large size, other keys
@@ -105,7 +107,9 @@ def place_of(where: str) -> str:
     return f"joint {joint}{side}"
 
 
-def effect_text(sizes: Sizes, joint: int, level: int) -> tuple[str, tuple[str, str], float]:
+def effect_text(
+    sizes: Sizes, joint: int, level: int, form: str = ""
+) -> tuple[str, tuple[str, str], float]:
     """Return the scenario's text of one effect, its name and place, and its size in SI."""
     name, where, key, levels, other = sizes
     place = where.format(j=joint)
@@ -114,7 +118,8 @@ def effect_text(sizes: Sizes, joint: int, level: int) -> tuple[str, tuple[str, s
         if place.startswith("channel ")
         else (f"where: {place}")
     )
-    text = f"{{name: {name}, {at}, {key}: {levels[level]}" + (f", {other}" if other else "") + "}"
+    more = (other, f"form: {form}" if form else "")
+    text = ", ".join(filter(None, (f"{{name: {name}, {at}, {key}: {levels[level]}", *more))) + "}"
     return text, (name, place_of(place)), si_size(levels[level])
 
 
@@ -137,13 +142,15 @@ NOISE: Final = (1.0, 0.5, 1.0, 2.0)  # times the rig's stated sensor noise, in t
 
 
 def cases(
-    counts: Mapping[str, int], seed: int, only: Sequence[str] = (), level: int | None = None
-) -> list[Case]:
+    counts: Mapping[str, int], seed: int, only: Sequence[str] = (), level: int | None = None,
+    forms: bool = False,
+) -> list[Case]:  # fmt: skip
     """Return `counts[kind]` cases of each kind (of single: of each effect).
 
     The seeds of each kind go on from `seed`, so that more of one kind leave the others as they are.
 
-    Places and partners are drawn by `seed`, sizes and noise go in turn. Raises InputError for a
+    Places and partners are drawn by `seed`, sizes and noise go in turn; with `forms` each effect
+    has one of its other forms (`PlantEffect.forms`), in turn. Raises InputError for a
     kind that does not exist.
     """
     unknown = sorted(set(counts) - {NONE, SINGLE, PAIR, OUTSIDE})
@@ -153,7 +160,7 @@ def cases(
     for kind, count in counts.items():
         rng = np.random.default_rng([seed, len(kind)])
         if kind == SINGLE:
-            drawn = _singles(count, rng, only, level)
+            drawn = _singles(count, rng, only, level, forms)
         else:
             drawn = {NONE: _clean, PAIR: _pairs, OUTSIDE: _strangers}[kind](count, rng)
         for k, (label, members, text, moves) in enumerate(drawn):
@@ -173,7 +180,7 @@ def _clean(count: int, rng: np.random.Generator) -> list[Drawn]:
 
 
 def _singles(
-    count: int, rng: np.random.Generator, only: Sequence[str], level: int | None
+    count: int, rng: np.random.Generator, only: Sequence[str], level: int | None, forms: bool
 ) -> list[Drawn]:
     out = []
     for sizes in SINGLES:
@@ -181,7 +188,9 @@ def _singles(
             continue
         for k in range(count):
             size = level if level is not None else 2 - k % 3
-            out.append(_drawn([(sizes, int(rng.integers(1, 3)), size)]))
+            others = FORMS.get(sizes[0], ())[1:] if forms else ()
+            form = others[k % len(others)] if others else ""
+            out.append(_drawn([(sizes, int(rng.integers(1, 3)), size, form)]))
     return out
 
 
@@ -190,7 +199,7 @@ def _pairs(count: int, rng: np.random.Generator) -> list[Drawn]:
     out = []
     for _ in range(count):
         one, two = rng.choice(len(loud), size=2, replace=False)
-        out.append(_drawn([(loud[int(i)], int(rng.integers(1, 3)), 2) for i in (one, two)]))
+        out.append(_drawn([(loud[int(i)], int(rng.integers(1, 3)), 2, "") for i in (one, two)]))
     return out
 
 
@@ -202,10 +211,10 @@ def _strangers(count: int, rng: np.random.Generator) -> list[Drawn]:
     return out
 
 
-def _drawn(members: Sequence[tuple[Sizes, int, int]]) -> Drawn:
+def _drawn(members: Sequence[tuple[Sizes, int, int, str]]) -> Drawn:
     built = [effect_text(*m) for m in members]
     label = " + ".join(
-        f"{m[0][3][m[2]]} {key[0]} at {key[1]}"
+        f"{m[0][3][m[2]]} {key[0]} at {key[1]}" + (f" ({m[3]})" if m[3] else "")
         for m, (_, key, _) in zip(members, built, strict=True)
     )
     return label, built, ", ".join(text for text, _, _ in built), ""

@@ -37,6 +37,9 @@ def trace(
     level: Annotated[
         int | None, typer.Option(min=0, max=2, help="Only this size: 0 small .. 2 large.")
     ] = None,
+    forms: Annotated[
+        bool, typer.Option("--forms", help="Single effects in the bench's other forms only.")
+    ] = False,
     workers: WorkersOption = 2,
     cluster: ClusterOption = None,
     json: JsonOption = None,
@@ -58,11 +61,11 @@ def trace(
         counts, machines = {NONE: 4, SINGLE: 1, PAIR: 1, OUTSIDE: 2}, 2
         names = names or ("coulomb_friction", "internal_leakage", "valve_deadband", "torque_offset")
     # Those that take long first: the last to end are then short ones.
-    work = [*cases_of(machines, seed), *cases(counts, seed, names, level)[::-1]]
+    work = [*cases_of(machines, seed), *cases(counts, seed, names, level, forms)[::-1]]
     outcomes = list(all_of(work, cluster or workers, progress, keep))
     asked = {"--clean": clean, "--single": single, "--pairs": pairs, "--outside": outside,
              "--machines": machines}  # fmt: skip
-    made = partial(command_of, asked, seed, quick=quick, only=only, level=level)
+    made = partial(command_of, asked, seed, quick=quick, only=only, level=level, forms=forms)
     write_json(json, as_json(outcomes))
     _show("study trace", text(outcomes), made, json, docs)
 
@@ -109,7 +112,7 @@ def _show(
 
 def command_of(
     counts: Mapping[str, int], seed: int, docs: Path, quick: bool = False, only: str = "",
-    level: int | None = None,
+    level: int | None = None, forms: bool = False,
 ) -> str:  # fmt: skip
     """Return the line that draws the same cases again: --quick has its own `counts`."""
     words = ["python", "-m", "tests.studies", "trace"]
@@ -117,6 +120,7 @@ def command_of(
     words += ["--seed", str(seed)]
     words += ["--only", only] if only else []
     words += [] if level is None else ["--level", str(level)]
+    words += ["--forms"] if forms else []
     return shlex.join([*words, "--docs", str(docs)])
 
 
