@@ -24,7 +24,7 @@ from analysis.design.sensor_noise import score_covariance
 from analysis.design.twin_records import PlannedStep, Played, ideal, play
 from analysis.identify.reduction import SEGMENTS
 from analysis.identify.stacked_rows import build_rows
-from analysis.regression.noise import noise_moments
+from analysis.regression.noise import record_moments
 from analysis.regression.rows import Filtering, Rows, default_filtering, parameters_of
 from analysis.regression.solve import RowCluster, half_width, solve, triangle
 from analysis.signals.conditioning import condition
@@ -143,15 +143,14 @@ def information(
     filters = filtering(record)
     signals = condition(exact, record, filters.channels, moving)
     run = Run(exact, (record,), source="twin")
-    rows = build_rows(exact, [run], terms, filtering)[0].rows
+    (built,) = build_rows(exact, [run], terms, filtering)
+    rows = built.rows
     scores = score_covariance(
         exact, terms, signals, moving, filters, rows, coefficients(rig, terms)
     )
-    share = (
-        noise_moments(exact, [run], terms, filtering, np.random.default_rng(SEED))
-        if moments
-        else {}
-    )
+    share = {}
+    if moments:
+        share = record_moments(exact, terms, built.conditioned, rows, np.random.default_rng(SEED))
     matrix, triangles, count = {}, {}, {}
     for family in FAMILIES:
         mine = [r for name, r in rows.items() if family_of(name) == family]

@@ -107,6 +107,13 @@ def refuse_dead_channels(
             )
 
 
+def refuse_dead_records(rig: Rig, runs: Iterable[Run]) -> None:
+    """Raise InputError for a record of the runs with a dead channel (`refuse_dead_channels`)."""
+    for run in runs:
+        for record in run.records:
+            refuse_dead_channels(rig, record)
+
+
 def clipped_counts(rig: Rig, record: Record) -> dict[str, int]:
     """Count, per channel that rows need, the samples at an end of their sensor's range."""
     return {

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,10 +14,9 @@ from analysis.identify.advice import base_statements
 from analysis.identify.checks import Check
 from analysis.identify.estimation import UNBIASED, EstimationJob, Refined, refine
 from analysis.identify.plausibility import consistency
-from analysis.identify.reduction import RecordReduction, reduce_runs, solve_reductions
-from analysis.identify.reduction import repeats_of as reduced_repeats
+from analysis.identify.reduction import RecordReduction, reduce_rows, solve_reductions
 from analysis.identify.result import PLAIN, Identification, estimates_of, with_ends
-from analysis.identify.stacked_rows import build_rows
+from analysis.identify.stacked_rows import build_rows, repeats_of
 from analysis.regression.rows import Filtering, default_filtering
 from analysis.regression.solve import Solution
 from analysis.simulation.model import Estimate, Model
@@ -58,17 +58,16 @@ def coupled(
 
             found, check = free_run_fit(rig, runs, used, solutions)
             return Refined(found, (check,), estimator)
-        job = EstimationJob(
-            rig, runs, used, lambda extra: build_rows(rig, runs, (*used, *extra), filtering),
-            estimator, bootstrap, rng or np.random.default_rng(0),
-        )  # fmt: skip
+        job = EstimationJob(rig, runs, used, built, estimator, bootstrap, rng)
         return refine(job, solutions)
 
-    reductions = reduce_runs(rig, runs, used, filtering)
+    built = build_rows(rig, runs, used, filtering)
+    reductions = reduce_rows(rig, used, built)
     sources = [run.source for run in runs]
-    return conclude(
+    result = conclude(
         rig, sources, used, reductions, reject_noise, None if estimator == PLAIN else refined
     )
+    return replace(result, built=tuple(built))
 
 
 def conclude(
@@ -116,7 +115,7 @@ def _statements(
     masked: int,
 ) -> tuple[Check, ...]:
     return (
-        ck.repeats(reduced_repeats(reductions)),
+        ck.repeats(repeats_of((one.run, one.head) for one in reductions)),
         ck.joints_excited(rig, [one.head for one in reductions]),
         *ck.clipping(rig, [(one.head, one.clipped) for one in reductions]),
         ck.lost_samples([(one.head, one.lost) for one in reductions]),

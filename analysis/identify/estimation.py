@@ -1,4 +1,4 @@
-"""From the rows of an identification to the estimator asked for, its intervals and its checks."""
+"""Solve the rows of an identification by the estimator asked for, with intervals and checks."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from analysis.identify.estimators.bootstrap import bootstrap
 from analysis.identify.estimators.covariance import CovarianceParts, spread
 from analysis.identify.estimators.equations import (
     EquationFit,
-    HasRows,
     Prepared,
     RepeatBlock,
     blocks_of,
@@ -32,11 +31,12 @@ from analysis.identify.estimators.statements import (
     outlier_statement,
 )
 from analysis.identify.estimators.weighted import weighted_least_squares
+from analysis.identify.stacked_rows import RecordRows, repeats_of, with_columns
 from analysis.regression.rows import parameters_of
 from analysis.regression.solve import Solution
 from analysis.terms.base import Used
 from rig.model.parse import InputError
-from rig.model.records import Record, Run
+from rig.model.records import Run
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
@@ -54,24 +54,19 @@ _FITS: Mapping[str, Callable[[Sequence[RepeatBlock]], EquationFit]] = {
     "iv": instrumental_variables,
     "robust": robust,
 }
-RowsWith = Callable[[Sequence[Used]], Sequence[HasRows]]
 
 
 @dataclass(frozen=True)
 class EstimationJob:
-    """What to estimate from: rig, runs, the model's terms, and how to build rows with more."""
+    """What to estimate from: rig, runs, the model's terms, and the rows built with them."""
 
     rig: Rig
     runs: Sequence[Run]
     terms: Sequence[Used]
-    rows_with: RowsWith
+    built: Sequence[RecordRows]
     estimator: str = "ls"
     bootstrap: int = 0
     rng: np.random.Generator | None = None
-
-    def records(self) -> dict[tuple[int, str], Record]:
-        """Return the records by (run, name)."""
-        return {(i, r.name): r for i, run in enumerate(self.runs) for r in run.records}
 
 
 @dataclass(frozen=True)
@@ -97,7 +92,8 @@ def refine(job: EstimationJob, solutions: Mapping[str, Solution]) -> Refined:
     InputError for an estimator that needs repeats where a step has one only.
     """
     refuse_unknown(job.estimator)
-    single = sorted(s for (_, s), n in _repeats(job).items() if n < 2)
+    counted = repeats_of((one.conditioned.run, one.record) for one in job.built)
+    single = sorted(step for (_, step), n in counted.items() if n < 2)
     if single and job.estimator in NEED_REPEATS:
         raise InputError(
             f"--estimator {job.estimator} needs two or more repeats of every step, with the same "
@@ -161,14 +157,6 @@ def _drawn(
     return {name: (float(a), float(b)) for name, a, b in ends}
 
 
-def _repeats(job: EstimationJob) -> dict[tuple[int, str], int]:
-    seen: dict[tuple[int, str], set[int]] = {}
-    for i, run in enumerate(job.runs):
-        for r in run.records:
-            seen.setdefault((i, r.step), set()).add(r.repeat)
-    return {k: len(v) for k, v in seen.items()}
-
-
 def _prepare(
     job: EstimationJob, solutions: Mapping[str, Solution]
 ) -> tuple[list[Prepared], list[Check]]:
@@ -178,7 +166,7 @@ def _prepare(
         for name, v in zip(s.names, s.value, strict=True):
             values[name] = float(1.0 / v) if name == "b" and v != 0 else float(v)
     extra = list(nu.nuisance_terms(job.terms, job.runs, values))
-    per_record = job.rows_with(extra)
+    built = with_columns(job.rig, job.terms, job.built, extra)
     checks: list[Check] = []
     out = []
     for family, solution in solutions.items():
@@ -187,7 +175,7 @@ def _prepare(
         if not mine:
             continue
         beside = [n for n in (nu.KAPPA, nu.TAU) if n in columns]
-        prepared = _family(job, per_record, family, columns, mine, beside)
+        prepared = _family(built, family, columns, mine, beside)
         for name in tuple(beside):
             fit = least_squares(prepared.blocks)
             # Anew each time: a nuisance that was left out has shifted the columns.
@@ -200,27 +188,22 @@ def _prepare(
             checks.append(nuisance_statement(belief, prepared.names, fit.beta, error, wrong))
             if wrong:
                 beside.remove(belief.name)
-                prepared = _family(job, per_record, family, columns, mine, beside)
+                prepared = _family(built, family, columns, mine, beside)
         out.append(prepared)
     return out, checks
 
 
 def _family(
-    job: EstimationJob,
-    per_record: Sequence[HasRows],
+    built: Sequence[RecordRows],
     family: str,
     columns: Sequence[str],
     mine: Sequence[str],
     beside: Sequence[str],
 ) -> Prepared:
-    records = job.records()
     names = (*mine, *beside)
-    periods = [
-        records[one.run, one.record].period / records[one.run, one.record].sample_rate
-        for one in per_record
-    ]
     kept = [list(columns).index(n) for n in names]
-    blocks = levelled(blocks_of(per_record, family, kept, periods), records)
+    records = {(one.conditioned.run, one.record.name): one.record for one in built}
+    blocks = levelled(blocks_of(built, family, kept), records)
     return Prepared(family, names, len(mine), tuple(blocks))
 
 

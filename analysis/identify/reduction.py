@@ -1,16 +1,14 @@
 """One record reduced to what an identification needs of it: triangles, counts, noise.
 
 A reduction is a few kilobytes whatever the record's length. It is made where the samples are (in
-this process, in another, on a worker of a cluster) and only it travels;
-`analysis.identify.identify` puts reductions together. Every record is kept in SEGMENTS parts of its
-duration, because only when all records are known is it known whether a step has repeats to compare
-or must compare its own parts.
+this process, in another, on a worker of a cluster) and only it is sent on;
+`analysis.identify.coupled` joins the reductions of all records. Every record is kept in SEGMENTS
+parts of its duration: a step of one record has no repeats to compare, and compares its parts.
 """
 
 from __future__ import annotations
 
-import zlib
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -18,17 +16,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.identify import checks as ck
+from analysis.identify.stacked_rows import RecordRows, repeats_of
 from analysis.regression.chunks import STRETCH, InMemory, Source, divisible, source_rows
+from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.noise import record_moments
 from analysis.regression.nonlinear import reduced
 from analysis.regression.qr import Accumulator
-from analysis.regression.rows import Filtering, Rows, parameters_of
+from analysis.regression.rows import Filtering, Rows, parameters_of, record_rows
 from analysis.regression.solve import RowCluster, Solution, merge, solve
-from analysis.signals.conditioning import Mask, lost_samples, moving_joints
-from analysis.signals.locks import moving_of
+from analysis.signals.conditioning import Mask, condition, lost_samples
+from analysis.signals.locks import DECIDING_SAMPLES, moving_joints
 from analysis.terms.base import FAMILIES, Used, family_of
 from rig.model import channels as ch
-from rig.model.records import Record, RecordHead, Run, head_of
+from rig.model.records import Record, RecordHead, head_of
 from rig.model.rig import Rig
 from rig.runs.stream import open_record
 
@@ -83,50 +83,33 @@ def reduce_task(task: RecordTask) -> RecordReduction:
 
 @dataclass(frozen=True)
 class StepTask:
-    """The repeats of one step of a run folder, of which is asked which joints move."""
+    """The repeats of one step of a run folder, to find which joints move in it."""
 
     rig: Rig
     path: str
     step: str
     records: tuple[str, ...]
-    stretch: int = STRETCH
 
 
 def steps_of(rig: Rig, path: str, heads: Sequence[RecordHead]) -> list[StepTask]:
-    """Return the steps; repeats of one decide together whether its locks give."""
+    """Return the steps with a locked joint; all repeats of one decide together what moves."""
     names: dict[str, list[str]] = {}
     for head in heads:
-        if head.locked:
-            names.setdefault(head.step, []).append(head.name)
-    return [StepTask(rig, path, step, tuple(n)) for step, n in names.items() if len(n) > 1]
+        names.setdefault(head.step, []).append(head.name)
+    locked = {head.step for head in heads if head.locked}
+    return [StepTask(rig, path, step, tuple(n)) for step, n in names.items() if step in locked]
 
 
 def moving_task(task: StepTask) -> tuple[bool, ...]:
-    """Return which joints (N,) move in a step; of a long record its first stretch tells."""
-    thin = []
+    """Return which joints (N,) move in a step; of its records only positions are kept."""
+    repeats = []
     for name in task.records:
         with open_record(task.path, name) as reader:
-            thin.append(_positions(task.rig, reader.read(0, task.stretch)))
-    return tuple(map(bool, moving_of(task.rig, thin)))
-
-
-def _positions(rig: Rig, record: Record) -> Record:
-    """Return the record with the positions of the locked joints alone."""
-    names = [ch.channel(rig.position_kind, i) for i in record.locked]
-    return replace(record, channels={n: x for n, x in record.channels.items() if n in names})
-
-
-def _moving_here(rig: Rig, run: Run) -> dict[str, Mask]:
-    """Return what `moving_task` does of all steps of a run at hand."""
-    steps = steps_of(rig, "", [head_of(record) for record in run.records])
-    return {
-        one.step: moving_of(
-            rig,
-            [_positions(rig, InMemory(r).read(0, one.stretch)) for r in run.records
-             if r.name in one.records],
-        )
-        for one in steps
-    }  # fmt: skip
+            record = reader.read(0, min(reader.head.samples, DECIDING_SAMPLES))
+            places = [ch.channel(task.rig.position_kind, i) for i in record.locked]
+            channels = {n: x for n, x in record.channels.items() if n in places}
+            repeats.append(replace(record, channels=channels))
+    return tuple(map(bool, moving_joints(task.rig, repeats)))
 
 
 def path_of(task: RecordTask | StepTask) -> str:
@@ -134,27 +117,24 @@ def path_of(task: RecordTask | StepTask) -> str:
     return task.path
 
 
-def reduce_runs(
-    rig: Rig,
-    runs: Sequence[Run],
-    terms: tuple[Used, ...],
-    filtering: Callable[[Record], Filtering],
+def reduce_rows(
+    rig: Rig, terms: Sequence[Used], built: Sequence[RecordRows]
 ) -> list[RecordReduction]:
-    """Reduce all records of runs at hand."""
-    return [
-        reduce_record(
-            rig,
-            number,
-            InMemory(record),
-            terms,
-            filtering,
-            record.name in first,
-            moving=moving.get(record.step),
-        )
-        for number, run in enumerate(runs)
-        for first, moving in ((first_of_steps(run.records), _moving_here(rig, run)),)
-        for record in run.records
-    ]
+    """Reduce the rows of all records of runs in memory."""
+    disturbed: set[tuple[int, str]] = set()
+    out = []
+    for one in built:
+        record, noise = one.record, None
+        if one.group not in disturbed:
+            disturbed.add(one.group)
+            noise = record_moments(rig, terms, one.conditioned, one.rows)
+        duration = record.samples / record.sample_rate
+        parts, masked = _folded(rig, terms, [one.rows], duration)
+        lost = int(lost_samples(rig, record).any(axis=1).sum())
+        clipped = ck.clipped_counts(rig, record)
+        run = one.conditioned.run
+        out.append(RecordReduction(run, head_of(record), parts, masked, lost, clipped, noise))
+    return out
 
 
 def first_of_steps(records: Sequence[Record | RecordHead]) -> set[str]:
@@ -175,30 +155,47 @@ def reduce_record(
     stretch: int = STRETCH,
     moving: Mask | None = None,
 ) -> RecordReduction:
-    """Reduce one record, a long one in stretches; raises InputError for one that cannot be used.
+    """Reduce one record, a long one chunk by chunk; raises InputError for one that is unusable.
 
-    `moving` (N,) as for `source_rows`.
+    `moving` (N,) is the decision for all repeats of its step (`analysis.signals.locks`), by default
+    of this record alone.
     """
     head = source.head
     filters = filtering(source.read(0, min(head.samples, stretch)))
     lost, clipped = _inspect(rig, source, stretch)
+    if moving is None:
+        moving = moving_joints(rig, [source.read(0, min(head.samples, DECIDING_SAMPLES))])
+    chunks = source_rows(rig, terms, source, filters, moving, stretch)
+    parts, masked = _folded(rig, terms, chunks, head.samples / head.sample_rate)
+    noise = None
+    if with_noise:
+        # Of a long record the first chunk stands for the whole.
+        count = min(head.samples, stretch) if divisible(filters) else head.samples
+        part = source.read(0, count)
+        signals = condition(rig, part, filters.channels, moving)
+        rows = record_rows(rig, terms, signals, filters)
+        found = record_moments(rig, terms, ConditionedRecord(run, part, signals, filters), rows)
+        noise = {family: moment * (head.samples / count) for family, moment in found.items()}
+    return RecordReduction(run, head, parts, masked, lost, clipped, noise)
+
+
+def _folded(
+    rig: Rig, terms: Sequence[Used], chunks: Iterable[Mapping[str, Rows]], duration: float
+) -> tuple[dict[str, tuple[Part, ...]], int]:
+    """Return one triangle per family and part of a record of `duration` [s], and rows masked."""
     sums = {
         family: [Accumulator(len(parameters_of(rig, terms, family))) for _ in range(SEGMENTS)]
         for family in FAMILIES
     }
     masked = 0
-    for found in source_rows(rig, terms, source, filters, stretch, moving=moving):
-        for name, rows in found.items():
+    for rows_by_equation in chunks:
+        for name, rows in rows_by_equation.items():
             masked += rows.masked
-            for part, inside in enumerate(parts_of(rows, head.samples / head.sample_rate)):
+            for part, inside in enumerate(parts_of(rows, duration)):
                 sums[family_of(name)][part].fold(rows.matrix[inside], rows.rhs[inside])
-    parts = {f: tuple((one.triangle, one.rows) for one in every) for f, every in sums.items()}
-    noise = None
-    if with_noise:
-        # Of a long record a stretch stands for the whole.
-        count = min(head.samples, stretch) if divisible(filters) else head.samples
-        noise = _noise(rig, source, count, terms, filtering, moving)
-    return RecordReduction(run, head, parts, masked, lost, clipped, noise)
+    return {
+        f: tuple((one.triangle, one.rows) for one in every) for f, every in sums.items()
+    }, masked
 
 
 def parts_of(rows: Rows, duration: float) -> list[slice]:
@@ -225,35 +222,9 @@ def _inspect(rig: Rig, source: Source, stretch: int) -> tuple[int, dict[str, int
     return lost, clipped
 
 
-def _noise(
-    rig: Rig,
-    source: Source,
-    count: int,
-    terms: Sequence[Used],
-    filtering: Callable[[Record], Filtering],
-    moving: Mask | None,
-) -> dict[str, Array]:
-    """Return the noise moments of a record, from its first `count` samples."""
-    head = source.head
-    # A stream of its own for every step: the prediction is the same in any order of records.
-    rng = np.random.default_rng([0, zlib.crc32(head.step.encode())])
-    part = source.read(0, count)
-    moves = moving_joints(rig, part) if moving is None else moving
-    found = record_moments(rig, part, terms, filtering, moves, rng)
-    return {family: moment * (head.samples / count) for family, moment in found.items()}
-
-
-def repeats_of(reductions: Sequence[RecordReduction]) -> dict[tuple[int, str], int]:
-    """Count the repeats of every (run, step)."""
-    seen: dict[tuple[int, str], set[int]] = {}
-    for one in reductions:
-        seen.setdefault((one.run, one.head.step), set()).add(one.head.repeat)
-    return {key: len(values) for key, values in seen.items()}
-
-
 def clusters_of(reductions: Sequence[RecordReduction], family: str) -> list[RowCluster]:
     """Return one cluster per record, or one per part where its step has this record only."""
-    repeats = repeats_of(reductions)
+    repeats = repeats_of((one.run, one.head) for one in reductions)
     out: list[RowCluster] = []
     for one in reductions:
         stratum = (one.run, one.head.step)

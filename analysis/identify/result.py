@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.identify.checks import Check
+from analysis.identify.stacked_rows import RecordRows
 from analysis.regression.solve import Solution, half_width
 from analysis.simulation.model import Estimate, Model, estimate_json, finite
 from analysis.terms.base import Coefficient, Used
@@ -22,7 +23,10 @@ PLAIN = "plain"  # least squares as in the paper: no nuisances, scatter between 
 
 @dataclass(frozen=True)
 class Identification:
-    """What an identification found: estimates, conditioning, rows used and left out, checks."""
+    """What an identification found: estimates, conditioning, rows used and left out, checks.
+
+    `built` are the rows it was solved from; none where they were not all in memory.
+    """
 
     method: str
     estimates: Mapping[str, Estimate]
@@ -33,6 +37,7 @@ class Identification:
     checks: tuple[Check, ...]
     model: Model
     extra: Mapping[str, Any] = field(default_factory=dict)  # a method's own figures, plain data
+    built: tuple[RecordRows, ...] = field(default=(), repr=False, compare=False)
 
 
 def to_json(result: Identification) -> dict[str, Any]:

@@ -1,22 +1,22 @@
-"""The rows of all records of a set of runs, stacked by step and repeat, and solved."""
+"""The regression rows of all records of a set of runs, built once and shared by all who need them.
+
+The solution, the estimators that refine it and the report all read the same `RecordRows`; columns
+that an estimator fits beside the model's are appended to them (`with_columns`).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analysis.identify import checks as ck
-from analysis.identify.reduction import SEGMENTS
-from analysis.regression.nonlinear import reduced
-from analysis.regression.rows import Filtering, Rows, default_filtering, parameters_of, record_rows
-from analysis.regression.solve import RowCluster, Solution, solve, triangle
-from analysis.signals.conditioning import condition
-from analysis.signals.locks import moving_by_step
-from analysis.terms.base import FAMILIES, Used, family_of
-from rig.model.records import Record, Run
+from analysis.regression.conditioned import ConditionedRecord, condition_runs
+from analysis.regression.rows import Filtering, Rows, default_filtering, prepared, record_rows
+from analysis.terms.base import Used, family_of
+from rig.model.records import Record, RecordHead, Run
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
@@ -24,13 +24,24 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class RecordRows:
-    """The rows of one record by equation, and which run, step and repeat it is."""
+    """The rows of one record by equation, and the conditioned record that they were built from."""
 
-    run: int
-    record: str
-    step: str
-    repeat: int
+    conditioned: ConditionedRecord
     rows: Mapping[str, Rows]
+
+    @property
+    def record(self) -> Record:
+        """The record itself."""
+        return self.conditioned.record
+
+    @property
+    def group(self) -> tuple[int, str]:
+        """Which repeats belong together: the run and the step."""
+        return self.conditioned.group
+
+    def family(self, family: str) -> list[Rows]:
+        """Return the rows of the equations of one family that have any."""
+        return [r for name, r in self.rows.items() if family_of(name) == family and len(r.rhs)]
 
 
 def build_rows(
@@ -40,67 +51,43 @@ def build_rows(
     filtering: Callable[[Record], Filtering] = default_filtering,
 ) -> list[RecordRows]:
     """Return the filtered, decimated rows of every record; raises InputError for a bad one."""
-    built = []
-    for index, run in enumerate(runs):
-        moving = moving_by_step(rig, run)
-        for record in run.records:
-            ck.refuse_dead_channels(rig, record)
-            filters = filtering(record)
-            signals = condition(rig, record, filters.channels, moving.get(record.step))
-            rows = record_rows(rig, terms, signals, filters)
-            built.append(RecordRows(index, record.name, record.step, record.repeat, rows))
-    return built
+    ck.refuse_dead_records(rig, runs)
+    return [
+        RecordRows(one, record_rows(rig, terms, one.signals, one.filtering))
+        for one in condition_runs(rig, runs, filtering)
+    ]
 
 
-def repeats_of(per_record: Sequence[RecordRows]) -> dict[tuple[int, str], int]:
-    """Count the repeats of every (run, step)."""
-    seen: dict[tuple[int, str], set[int]] = {}
-    for one in per_record:
-        seen.setdefault((one.run, one.step), set()).add(one.repeat)
-    return {key: len(values) for key, values in seen.items()}
+def with_columns(
+    rig: Rig, terms: Sequence[Used], built: Sequence[RecordRows], extra: Sequence[Used]
+) -> list[RecordRows]:
+    """Return the rows of `terms` with the columns of the terms `extra` appended, in their order.
 
-
-def solve_rows(
-    rig: Rig,
-    terms: Sequence[Used],
-    per_record: Sequence[RecordRows],
-    noise: Mapping[str, Array] | None = None,
-    reject_noise: bool = True,
-) -> dict[str, Solution]:
-    """Reduce the rows to one triangle per cluster and solve each family once."""
-    repeats = repeats_of(per_record)
-    out = {}
-    for family in FAMILIES:
-        names = parameters_of(rig, terms, family)
-        clusters: list[RowCluster] = []
-        for one in per_record:
-            clusters += clusters_of(one, family, repeats)
-        if names:
-            moments = noise[family] if noise else None
-            linear = solve(names, clusters, moments, reject_noise)
-            out[family] = reduced(rig, terms, linear, clusters, moments, reject_noise)
-    return out
-
-
-def clusters_of(
-    one: RecordRows, family: str, repeats: Mapping[tuple[int, str], int]
-) -> list[RowCluster]:
-    """Reduce a record's rows of one family to a triangle, or to several of an only repeat."""
-    pieces = 1 if repeats[one.run, one.step] > 1 else SEGMENTS
+    The extra terms may neither change the signals nor mask rows; equations without one of their
+    columns get none.
+    """
+    if not extra:
+        return list(built)
+    families = {c.family for used in extra for c in used.term.coefficients(rig)}
     out = []
-    rows = [r for name, r in one.rows.items() if family_of(name) == family]
-    for piece in range(pieces):
-        parts = [_piece(r, piece, pieces) for r in rows]
-        count = sum(len(rhs) for _, rhs in parts)
-        if count:
-            matrix = np.concatenate([m for m, _ in parts])
-            rhs = np.concatenate([y for _, y in parts])
-            key: Hashable = one.repeat if pieces == 1 else (one.repeat, piece)
-            out.append(RowCluster((one.run, one.step), key, triangle(matrix, rhs), count))
+    for one in built:
+        signals = prepared(rig, terms, one.conditioned.signals)
+        more = record_rows(rig, extra, signals, one.conditioned.filtering, families)
+        rows = {name: _joined(r, more[name]) if name in more else r for name, r in one.rows.items()}
+        out.append(replace(one, rows=rows))
     return out
 
 
-def _piece(rows: Rows, piece: int, pieces: int) -> tuple[Array, Array]:
-    edges = np.linspace(0, len(rows.rhs), pieces + 1).astype(int)
-    inside = slice(edges[piece], edges[piece + 1])
-    return rows.matrix[inside], rows.rhs[inside]
+def _joined(rows: Rows, more: Rows) -> Rows:
+    """Append columns to rows whose instants are among those of `more`."""
+    at = np.searchsorted(more.time, rows.time - 1e-9)
+    matrix = np.column_stack((rows.matrix, more.matrix[at]))
+    return replace(rows, names=(*rows.names, *more.names), matrix=matrix)
+
+
+def repeats_of(records: Iterable[tuple[int, Record | RecordHead]]) -> dict[tuple[int, str], int]:
+    """Count the repeats of every (run, step) among the records, each with its run's number."""
+    seen: dict[tuple[int, str], set[int]] = {}
+    for run, record in records:
+        seen.setdefault((run, record.step), set()).add(record.repeat)
+    return {key: len(repeats) for key, repeats in seen.items()}

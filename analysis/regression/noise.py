@@ -1,8 +1,8 @@
 """What sensor noise does to the regressor: attenuation predicted from the stated noise.
 
-Noise in the columns biases least squares (NOTES, "Measured traps"). A record is disturbed once more
-by the rig's stated noise; the difference D of its rows [X y] before and after is, to first order,
-the noise that is in the rows already. With N = D'D and A = X'X,
+Noise in the columns biases least squares (attenuation). A record is disturbed once more by the
+rig's stated noise; the difference D of its rows [X y] before and after is, to first order, the
+noise that is in the rows already. With N = D'D and A = X'X,
  bias = - A^-1 (N_xx beta - n_xy),
 and the diagonal of A^-1 N_xx is the share of a column's own information that is noise: a parameter
 that rests on noise (the inertia of a joint that only trembles in its lock) is no parameter.
@@ -11,52 +11,22 @@ Source: Fuller, Measurement Error Models, section 2.2.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import zlib
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.regression.rows import Filtering, Rows, parameters_of, record_rows
-from analysis.signals.conditioning import Mask, condition
-from analysis.signals.locks import moving_by_step
-from analysis.terms.base import FAMILIES, Used, family_of
+from analysis.regression.conditioned import ConditionedRecord
+from analysis.regression.rows import Rows, record_rows
+from analysis.signals.conditioning import condition
+from analysis.terms.base import Used, family_of
 from rig.model import channels as ch
-from rig.model.records import Record, Run
+from rig.model.records import Record
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
-
-
-def noise_moments(
-    rig: Rig,
-    runs: Sequence[Run],
-    terms: Sequence[Used],
-    filtering: Callable[[Record], Filtering],
-    rng: np.random.Generator,
-) -> dict[str, Array]:
-    """Return N (k+1, k+1) of [X y] for each family, all records together.
-
-    One record of every step is disturbed and stands for its repeats.
-    """
-    total = {
-        family: np.zeros((1 + len(names), 1 + len(names)))
-        for family in FAMILIES
-        for names in (parameters_of(rig, terms, family),)
-    }
-    for run in runs:
-        counts: dict[str, int] = {}
-        for record in run.records:
-            counts[record.step] = counts.get(record.step, 0) + 1
-        seen: set[str] = set()
-        moving = moving_by_step(rig, run)
-        for record in run.records:
-            if record.step not in seen:
-                seen.add(record.step)
-                moments = record_moments(rig, record, terms, filtering, moving[record.step], rng)
-                for family, moment in moments.items():
-                    total[family] += counts[record.step] * moment
-    return total
 
 
 def disturbed(rig: Rig, record: Record, rng: np.random.Generator) -> Record:
@@ -72,18 +42,22 @@ def disturbed(rig: Rig, record: Record, rng: np.random.Generator) -> Record:
 
 def record_moments(
     rig: Rig,
-    record: Record,
     terms: Sequence[Used],
-    filtering: Callable[[Record], Filtering],
-    moving: Mask,
-    rng: np.random.Generator,
+    conditioned: ConditionedRecord,
+    before: Mapping[str, Rows],
+    rng: np.random.Generator | None = None,
 ) -> dict[str, Array]:
-    """Return N (k+1, k+1) of [X y] for each family of one record whose joints `moving` (N,)."""
-    filters = filtering(record)
-    before, after = (
-        record_rows(rig, terms, condition(rig, r, filters.channels, moving), filters)
-        for r in (record, disturbed(rig, record, rng))
-    )
+    """Return N (k+1, k+1) of [X y] for each family of one record with the rows `before`.
+
+    `rng` draws the noise; by default each step has a stream of its own, so that the prediction
+    does not depend on the order of the records.
+    """
+    if rng is None:
+        rng = np.random.default_rng([0, zlib.crc32(conditioned.record.step.encode())])
+    filters, moving = conditioned.filtering, conditioned.signals.moving
+    record = disturbed(rig, conditioned.record, rng)
+    signals = condition(rig, record, filters.channels, moving)
+    after = record_rows(rig, terms, signals, filters)
     out: dict[str, Array] = {}
     for name, rows in before.items():
         D = _difference(rows, after[name])

@@ -132,6 +132,13 @@ def parameters_of(rig: Rig, terms: Sequence[Used], family: str) -> tuple[str, ..
     return tuple(names)
 
 
+def prepared(rig: Rig, terms: Sequence[Used], signals: Signals) -> Signals:
+    """Return the signals as the terms' columns see them, each term having prepared them in turn."""
+    for used in terms:
+        signals = used.term.prepare(rig, signals, used.shape)
+    return signals
+
+
 def record_rows(
     rig: Rig,
     terms: Sequence[Used],
@@ -142,11 +149,10 @@ def record_rows(
 ) -> dict[str, Rows]:
     """Return the filtered rows of every equation of the excited joints of one record.
 
-    Only those of `families`, and only rows whose time [s] lies `within` (from, before): a part of
-    a longer record yields the rows that are its own.
+    Only those of `families`, and only rows whose time [s] lies `within` (from, before), for a chunk
+    of a longer record.
     """
-    for used in terms:
-        signals = used.term.prepare(rig, signals, used.shape)
+    signals = prepared(rig, terms, signals)
     columns: Columns = {}
     valid: dict[str, Mask] = {}
     for used in terms:

@@ -63,7 +63,6 @@ def write_report(
     truth: Mapping[str, float] | None = None,
     title: str = "Identification report",
     provenance: Provenance | None = None,
-    rows: Sequence[RecordRows] | None = None,
 ) -> None:
     """Write the report as one HTML file, replacing an old one only when the new one is complete.
 
@@ -71,7 +70,7 @@ def write_report(
     """
     text = render_report(
         runs=runs, identification=identification, model=model, validation=validation,
-        validation_runs=validation_runs, truth=truth, title=title, provenance=provenance, rows=rows,
+        validation_runs=validation_runs, truth=truth, title=title, provenance=provenance,
     )  # fmt: skip
     write(path, text)
     log.info("wrote %s, %d kB", path, len(text) // 1000)
@@ -87,22 +86,19 @@ def render_report(
     truth: Mapping[str, float] | None = None,
     title: str = "Identification report",
     provenance: Provenance | None = None,
-    rows: Sequence[RecordRows] | None = None,
 ) -> str:
     """Return the report as HTML text.
 
     `runs` are those behind `identification`, `model` the one that was validated (default: the
-    identified one), `truth` the parameters of a simulated bench (SI, by name), `rows` the
-    regression rows where they were not built by the default filtering. Raises InputError for
-    records that cannot be used or a model of another rig.
+    identified one), `truth` the parameters of a simulated bench (SI, by name). Raises InputError
+    for records that cannot be used or a model of another rig.
     """
     model = model or identification.model
     rig = identification.model.rig
     difference = rig_difference(model.rig, rig)
     if difference:
         raise InputError(f"the model and the identification are of different rigs: {difference}")
-    if rows is None:
-        rows = build_rows(rig, runs, identification.model.terms)
+    rows = identification.built or build_rows(rig, runs, identification.model.terms)
     context = {
         "title": title,
         "rig": rig,

@@ -1,4 +1,4 @@
-"""What the regression leaves: residuals per step and equation, split into what repeats and not.
+"""Residuals of the regression per step and equation: systematic part, and scatter of repeats.
 
 Repeats of a step had the same excitation, started at the same sample. With n repeats r_k(t),
  scatter^2 = mean_t var_k(r_k)  (ddof 1),   repeatable^2 = mean_t(mean_k r)^2 - scatter^2 / n,
@@ -16,6 +16,7 @@ from scipy.signal import welch
 
 from analysis.identify.result import Identification
 from analysis.identify.stacked_rows import RecordRows
+from analysis.regression.least_squares import least_squares
 from analysis.regression.rows import Rows
 from analysis.regression.solve import RowCluster, solve, triangle
 from analysis.terms.base import FAMILIES, family_of
@@ -66,14 +67,11 @@ def coefficients(
     """
     out = {}
     for family, solution in identification.solutions.items():
-        beta = np.array(solution.value)
+        beta = solution.value
         if not np.isfinite(beta).all():
-            parts = [r for one in per_record for n, r in one.rows.items() if family_of(n) == family]
-            X = np.concatenate([r.matrix for r in parts])
-            y = np.concatenate([r.rhs for r in parts])
-            scale = np.linalg.norm(X, axis=0)
-            scale[scale == 0] = 1.0
-            beta = np.linalg.lstsq(X / scale, y, rcond=1e-6)[0] / scale
+            parts = [rows for one in per_record for rows in one.family(family)]
+            X, y = np.vstack([r.matrix for r in parts]), np.concatenate([r.rhs for r in parts])
+            beta = least_squares(X, y)
         out[family] = beta
     return out
 
@@ -83,7 +81,7 @@ def residuals(identification: Identification, per_record: Sequence[RecordRows]) 
     beta = coefficients(identification, per_record)
     groups: dict[tuple[int, str], list[RecordRows]] = {}
     for one in per_record:
-        groups.setdefault((one.run, one.step), []).append(one)
+        groups.setdefault(one.group, []).append(one)
     out = []
     for (run, step), members in groups.items():
         names = sorted(members[0].rows, key=_order)
@@ -165,9 +163,9 @@ def per_repeat(
     """Identify from every repeat alone, as the paper's Table III does; {} below two repeats."""
     rounds: dict[int, list[RecordRows]] = {}
     for one in per_record:
-        rounds.setdefault(one.repeat, []).append(one)
-    steps = {(one.run, one.step) for one in per_record}
-    whole = [m for m in rounds.values() if {(one.run, one.step) for one in m} == steps]
+        rounds.setdefault(one.record.repeat, []).append(one)
+    steps = {one.group for one in per_record}
+    whole = [m for m in rounds.values() if {one.group for one in m} == steps]
     if len(whole) < 2:
         return {}
     reciprocal = {
@@ -188,12 +186,12 @@ def _solve_once(
 ) -> Mapping[str, float]:
     clusters = []
     for one in members:
-        rows = [r for n, r in one.rows.items() if family_of(n) == family and len(r.rhs)]
+        rows = one.family(family)
         if rows:
             matrix = np.concatenate([r.matrix for r in rows])
             rhs = np.concatenate([r.rhs for r in rows])
             clusters.append(
-                RowCluster((one.run, one.step), one.repeat, triangle(matrix, rhs), len(rhs))
+                RowCluster(one.group, one.record.repeat, triangle(matrix, rhs), len(rhs))
             )
     if not clusters or family not in FAMILIES:
         return {}

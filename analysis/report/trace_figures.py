@@ -13,6 +13,7 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from analysis.effects.base import Effect
+from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.rows import Rows
 from analysis.report import format as fm
 from analysis.report.plots.style import (
@@ -32,7 +33,6 @@ from analysis.simulation.model import Model
 from analysis.terms.base import family_of
 from analysis.trace.clues.variables import variables
 from analysis.trace.data.conditioned_record import (
-    ConditionedRecord,
     conditioned_records,
     filtered,
     model_rows,

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.signals.filters import ALIGN_HALF_WIDTH, Smoother, align, channel_filter, row_filter
+from analysis.signals.filters import ALIGN_HALF_WIDTH, Smoother, align, bridged, channel_filter
+from analysis.signals.locks import held_positions, moving_joints
 from rig.model import channels as ch
 from rig.model.parse import InputError
 from rig.model.records import Record
@@ -21,14 +22,6 @@ from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-
-# A lock gives: measured on a finer plant, leaving out the motion of a joint held by a closed valve
-# made M2 47 % and Fv2 190 % too large, and that of an end-stop contact R12 1.5 %; with it the error
-# is below 0.05 %. Only a joint whose acceleration within GIVE_BAND stays below this many times what
-# sensor noise alone would show is held at its mean, because noise in the place of an absent motion
-# would make unidentifiable parameters look identified.
-GIVE_THRESHOLD = 1.2
-GIVE_BAND = 15.0  # [Hz]
 
 
 @dataclass(frozen=True)
@@ -38,7 +31,8 @@ class Signals:
     `excited` (N,) marks the joints whose rows may be used; `valid` (n, N) is false where a sensor
     of the joint was clipped within the filter's reach or the filter runs over the record's edge.
     `lost` (n, N) is true where a sample of the joint that never arrived is within that reach: what
-    stands there was made up by a straight line, and no row may see it.
+    stands there was made up by a straight line, and no row may see it. `moving` (N,) marks the
+    joints whose motion is the measured one; the others stand still.
     """
 
     rate: float
@@ -63,6 +57,7 @@ class Signals:
     excited: Mask
     valid: Mask
     lost: Mask | None = None
+    moving: Mask | None = None
 
     @property
     def joints(self) -> int:
@@ -98,19 +93,6 @@ def align_reach(rig: Rig, rate: float) -> int:
     return ALIGN_HALF_WIDTH + int(np.floor(max(shifts, default=0.0) + 0.5))
 
 
-def bridged(x: Array) -> Array:
-    """Return x (n,) with a straight line over every gap of NaN, zeros if nothing is left of it."""
-    missing = np.isnan(x)
-    if not missing.any():
-        return x
-    if missing.all():
-        return np.zeros_like(x)
-    index = np.arange(len(x))
-    filled = x.copy()
-    filled[missing] = np.interp(index[missing], index[~missing], x[~missing])
-    return filled
-
-
 def lost_samples(rig: Rig, record: Record) -> Mask:
     """Return where (n, N) a joint's sample, or one of the bench's, never arrived (NaN)."""
     lost = np.zeros((record.samples, len(rig.joints)), dtype=bool)
@@ -134,9 +116,10 @@ def condition(
 ) -> Signals:
     """Turn a record into signals through one zero-phase filter (default `channel_filter`).
 
-    `moving` (N,) overrides `moving_joints` and `held` (N,) [m] `held_pistons`, for a record that
-    is a part of a longer one. Lost samples (NaN) are marked in `Signals.lost`. Raises InputError
-    naming record and channel where one is missing or not finite.
+    `moving` (N,) is what `analysis.signals.locks.moving_joints` decided for all repeats of the
+    record's step; without it the record counts as the only repeat. `held` (N,) [m] overrides
+    `held_positions`, for a record that is a part of a longer one. Lost samples (NaN) are marked in
+    `Signals.lost`. Raises InputError naming record and channel where one is missing or not finite.
     """
     smoother = smoother or channel_filter(record.sample_rate)
     joints = range(1, len(rig.joints) + 1)
@@ -154,8 +137,8 @@ def condition(
 
     raw_s, raw_p = stacked(rig.position_kind), (stacked(ch.CAP), stacked(ch.ROD))
     supply, oil = (0.0, 0.0) if rig.electric else (rig.supply.pressure, rig.oil.temperature)
-    moving = moving_joints(rig, record) if moving is None else moving
-    held = held_pistons(rig, record) if held is None else held
+    moving = moving_joints(rig, [record]) if moving is None else moving
+    held = held_positions(rig, [record]) if held is None else held
     s, sd, sdd = _motion(raw_s, moving, held, smoother)
     q, qd, qdd, G = _angles(rig, s, sd, sdd)
     volumes = [rig.chamber_volumes(i - 1, s[:, i - 1]) for i in joints]
@@ -176,6 +159,7 @@ def condition(
         excited=excited,
         valid=_valid(rig, record, smoother.reach),
         lost=_lost(rig, record, smoother.reach + align_reach(rig, record.sample_rate)),
+        moving=moving,
     )  # fmt: skip
 
 
@@ -212,26 +196,6 @@ def _refuse_missing(rig: Rig, record: Record, excited: Mask) -> None:
                 )
 
 
-def moving_joints(rig: Rig, record: Record) -> Mask:
-    """Return which joints (N,) move: the excited, and the locked whose lock visibly gives."""
-    found = []
-    for i in range(1, len(rig.joints) + 1):
-        place = np.asarray(record.channels[ch.channel(rig.position_kind, i)])
-        locked, noise = i in record.locked, rig.sensors.of(rig.position_kind).noise
-        found.append(not locked or gives(place, record.sample_rate, noise))
-    return np.array(found)
-
-
-def held_pistons(rig: Rig, record: Record) -> Array:
-    """Return each piston's mean (N,) [m] (electric: q) over what arrived: where a lock holds it."""
-    means = []
-    for i in range(1, len(rig.joints) + 1):
-        place = np.asarray(record.channels[ch.channel(rig.position_kind, i)])
-        here = place[~np.isnan(place)]
-        means.append(float(here.mean()) if len(here) else 0.0)
-    return np.array(means)
-
-
 def _motion(
     raw: Array, moving: Mask, held: Array, smoother: Smoother
 ) -> tuple[Array, Array, Array]:
@@ -239,16 +203,6 @@ def _motion(
     s, sd, sdd = (smoother.apply(raw, k) for k in range(3))
     s[:, ~moving], sd[:, ~moving], sdd[:, ~moving] = held[~moving], 0.0, 0.0
     return s, sd, sdd
-
-
-def gives(piston: Array, rate: float, noise: float) -> bool:
-    """Tell whether a locked piston (n,) accelerates visibly above its sensor's noise [m]."""
-    band = row_filter(rate, GIVE_BAND)
-    if len(piston) <= 4 * band.reach:
-        return False
-    inner = band.apply(bridged(piston), 2)[band.reach : -band.reach]
-    floor = noise * float(np.linalg.norm(band.taps[2]))
-    return bool(np.std(inner) > GIVE_THRESHOLD * floor)
 
 
 def _angles(rig: Rig, s: Array, sd: Array, sdd: Array) -> tuple[Array, Array, Array, Array]:

@@ -251,3 +251,16 @@ def align(x: Array, shift: float) -> Array:
     taps = _kernel(distance, 0.425, ALIGN_HALF_WIDTH + 0.5, 8.0)
     # Convolution turns the taps round.
     return _convolve(_extended(x, reach, "alignment"), taps[::-1] / taps.sum())
+
+
+def bridged(x: Array) -> Array:
+    """Return x (n,) with a straight line over every gap of NaN, zeros if nothing is left of it."""
+    missing = np.isnan(x)
+    if not missing.any():
+        return x
+    if missing.all():
+        return np.zeros_like(x)
+    index = np.arange(len(x))
+    filled = x.copy()
+    filled[missing] = np.interp(index[missing], index[~missing], x[~missing])
+    return filled

@@ -18,6 +18,7 @@ from analysis.effects.measurement import corrected_channels
 from analysis.regression.rows import Filtering, default_filtering
 from analysis.signals.conditioning import Mask, Signals, aligned_channels, condition, lost_samples
 from analysis.signals.filters import Smoother
+from analysis.signals.locks import moving_by_step
 from analysis.simulation.model import Model, finite, refuse_other_rig
 from analysis.simulation.simulate import (
     Simulation,
@@ -80,7 +81,11 @@ def validate(model: Model, runs: Sequence[Run]) -> list[RecordValidation]:
     out = []
     for run in runs:
         refuse_other_rig(model, run.rig, run.source or "the run")
-        out += [validate_record(model, run.rig, record) for record in run.records]
+        moving = moving_by_step(run.rig, run.records)
+        out += [
+            validate_record(model, run.rig, record, moving=moving[record.step])
+            for record in run.records
+        ]
     if not out:
         raise InputError("no records to validate on: the run holds none")
     return out
@@ -89,11 +94,16 @@ def validate(model: Model, runs: Sequence[Run]) -> list[RecordValidation]:
 def validate_record(
     model: Model, rig: Rig, record: Record,
     filtering: Callable[[Record], Filtering] = default_filtering,
+    moving: Mask | None = None,
 ) -> RecordValidation:  # fmt: skip
-    """Validate on one record (see `validate`)."""
+    """Validate on one record (see `validate`).
+
+    `moving` (N,) is the decision for all repeats of its step (`analysis.signals.locks`), by default
+    of this record alone.
+    """
     smoother = filtering(record).channels
     here = arrived(rig, record)
-    signals = put_right(rig, model.terms, condition(rig, record, smoother))
+    signals = put_right(rig, model.terms, condition(rig, record, smoother, moving))
     # A sensor that the model says is wrong is put right before anything is compared with it.
     channels = aligned_channels(rig, record)
     channels = corrected_channels(rig, model.terms, channels, record.sample_rate)

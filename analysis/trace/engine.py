@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from analysis.effects.base import Effect, ordered
 from analysis.identify import checks as ck
 from analysis.identify.identify import identify
+from analysis.regression.conditioned import ConditionedRecord
 from analysis.simulation.model import Model
 from analysis.terms import baseline_of
 from analysis.terms.base import FAMILIES, Used
 from analysis.trace.data.candidates import catalogue, variants
-from analysis.trace.data.conditioned_record import ConditionedRecord, conditioned_records
+from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.noise_floor import STATED
 from analysis.trace.data.regression_data import RegressionData, regression_data
 from analysis.trace.data.spectral_lines import lines

@@ -15,13 +15,14 @@ from scipy.linalg import lstsq
 
 from analysis.identify.identify import identify
 from analysis.identify.out_of_core import identify_folders
-from analysis.identify.reduction import reduce_record, solve_reductions
+from analysis.identify.reduction import reduce_record, reduce_rows, solve_reductions
 from analysis.identify.result import PLAIN, Identification
-from analysis.identify.stacked_rows import build_rows, solve_rows
-from analysis.regression.chunks import InMemory, locks_of, source_rows
+from analysis.identify.stacked_rows import build_rows
+from analysis.regression.chunks import InMemory, source_rows
 from analysis.regression.qr import Accumulator, accumulate
 from analysis.regression.rows import default_filtering, paper_filtering
 from analysis.regression.solve import triangle
+from analysis.signals.locks import held_positions, moving_joints
 from analysis.terms import baseline
 from analysis.terms.base import Used
 from rig.model.records import Record, Run
@@ -98,7 +99,9 @@ def test_streamed_folders_give_what_all_rows_in_memory_give(
     assert_same(streamed, identify([multisine_run], estimator=PLAIN))
     # An independent route: every row of every record stacked, solved by LAPACK's gelsy.
     per_record = build_rows(rig, [multisine_run], TERMS)
-    for family, solution in solve_rows(rig, TERMS, per_record).items():
+    for family, solution in solve_reductions(
+        rig, TERMS, reduce_rows(rig, TERMS, per_record)
+    ).items():
         found = streamed.solutions[family]
         every = [r for one in per_record for r in one.rows.values() if r.names == found.names]
         X = np.vstack([r.matrix for r in every])
@@ -147,8 +150,9 @@ def test_a_long_record_in_stretches_has_the_rows_of_the_whole(
     record = replace(record, channels=lost)
     filters = filtering(record)  # type: ignore[operator]
     source = InMemory(record)
-    (whole,) = source_rows(rig, TERMS, source, filters)
-    parts = list(source_rows(rig, TERMS, source, filters, stretch))
+    moving = moving_joints(rig, [record])
+    (whole,) = source_rows(rig, TERMS, source, filters, moving)
+    parts = list(source_rows(rig, TERMS, source, filters, moving, stretch))
     assert len(parts) == -(-40_000 // stretch)
     for name, rows in whole.items():
         found = [part[name] for part in parts]
@@ -185,7 +189,8 @@ def test_what_a_lock_does_is_found_in_stretches_too(multisine_run: Run, rig: Rig
     t = np.arange(record.samples) / record.sample_rate
     shaken = record.channels["piston_1"] + 20e-6 * np.sin(2 * np.pi * 8 * t)
     for piston, gives in ((record.channels["piston_1"], False), (shaken, True)):
-        source = InMemory(replace(record, channels={**record.channels, "piston_1": piston}))
-        found = locks_of(rig, source, 6_000)
-        assert found.moving.tolist() == [gives, True]
-        assert found.held == pytest.approx(locks_of(rig, source).held, rel=1e-12)
+        whole = replace(record, channels={**record.channels, "piston_1": piston})
+        assert moving_joints(rig, [whole]).tolist() == [gives, True]
+        parts = [InMemory(whole).read(a, a + 6_000) for a in range(0, whole.samples, 6_000)]
+        expected = held_positions(rig, [whole])
+        assert held_positions(rig, parts) == pytest.approx(expected, rel=1e-12)

@@ -11,8 +11,9 @@ import pytest
 from analysis.identify.identify import identify
 from analysis.identify.result import Identification, to_json
 from analysis.regression.rows import FILTERINGS, Filtering
-from analysis.signals.conditioning import condition, gives
+from analysis.signals.conditioning import condition
 from analysis.signals.filters import channel_filter, row_filter, row_step
+from analysis.signals.locks import gives
 from rig.model.parameters import parameter_names, parameter_unit
 from rig.model.parse import InputError
 from rig.model.records import Record, Run

@@ -9,8 +9,9 @@ import pytest
 
 from analysis.identify.identify import identify
 from analysis.identify.online import FLOOR, RowFeed, Tracker, track
+from analysis.identify.reduction import reduce_rows, solve_reductions
 from analysis.identify.result import PLAIN
-from analysis.identify.stacked_rows import build_rows, solve_rows
+from analysis.identify.stacked_rows import build_rows
 from analysis.regression.chunks import Locks, stretch_rows
 from analysis.regression.rows import default_filtering
 from analysis.terms import baseline
@@ -182,7 +183,8 @@ def test_repeats_take_over_from_pieces_of_the_only_record(multisine_run: Run, ri
     track(tracker, first)
     assert tracker.estimates()["b"].std > 0
     track(tracker, second)
-    batch = solve_rows(rig, TERMS, build_rows(rig, [Run(rig, (first, second))], TERMS))
+    built = build_rows(rig, [Run(rig, (first, second))], TERMS)
+    batch = solve_reductions(rig, TERMS, reduce_rows(rig, TERMS, built))
     scale = tracker.estimates()["C_pp_2"].std ** 2
     k = batch["fluid"].names.index("C_pp_2")
     assert scale == pytest.approx(batch["fluid"].covariance[k, k], rel=1e-6)

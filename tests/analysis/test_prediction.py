@@ -10,7 +10,8 @@ import pytest
 from analysis.design.predict import Prediction, predict, to_json
 from analysis.design.sensor_noise import moved
 from analysis.design.twin_records import Played, ideal, play
-from analysis.identify.stacked_rows import build_rows, solve_rows
+from analysis.identify.reduction import reduce_rows, solve_reductions
+from analysis.identify.stacked_rows import build_rows
 from analysis.regression.rows import default_filtering
 from analysis.signals.conditioning import condition
 from analysis.terms import baseline
@@ -56,7 +57,7 @@ def test_the_scatter_of_simulated_experiments_is_the_one_predicted(
     for _ in range(DRAWS):
         records = tuple(measured(exact, one.record, rng) for one in played)
         rows = build_rows(exact, [Run(exact, records)], USED)
-        for solution in solve_rows(exact, USED, rows).values():
+        for solution in solve_reductions(exact, USED, reduce_rows(exact, USED, rows)).values():
             for name, value in zip(solution.names, solution.value, strict=True):
                 found.setdefault(name, []).append(float(value))
     ratios = {}

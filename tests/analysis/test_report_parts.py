@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from analysis.identify.identify import identify
 from analysis.identify.stacked_rows import RecordRows, build_rows
+from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.rows import Rows
 from analysis.report import facts, paper
 from analysis.report import format as fm
@@ -133,7 +134,7 @@ def test_noise_and_model_error_are_told_apart(multisine_run: Run) -> None:
             beta = found.solutions["mechanical" if "torque" in name else "fluid"].value
             error = 2.0 * np.sin(2 * np.pi * 3.0 * r.time) + 5.0 * rng.standard_normal(len(r.time))
             rows[name] = replace(r, rhs=r.matrix @ beta + error)
-        quiet.append(RecordRows(one.run, one.record, one.step, one.repeat, rows))
+        quiet.append(replace(one, rows=rows))
     for one_residual in residuals(found, quiet):
         assert one_residual.repeats == 4
         assert one_residual.scatter == pytest.approx(5.0, rel=0.1)
@@ -154,7 +155,9 @@ def test_masked_rows_leave_the_scatter_where_it_was() -> None:
         rows = Rows("torque_1", ("M1",), np.ones((int(kept.sum()), 1)),
                     7.0 + rng.standard_normal(int(kept.sum())), t[kept],
                     int((~kept).sum()))  # fmt: skip
-        return RecordRows(0, f"a_r{repeat}", "a", repeat, {"torque_1": rows})
+        record = Record(f"a_r{repeat}", "a", (), repeat, 1000.0, {})
+        conditioned = ConditionedRecord(0, record, None, None)  # type: ignore[arg-type]
+        return RecordRows(conditioned, {"torque_1": rows})
 
     class _Solution:
         value = np.array([7.0])
@@ -188,7 +191,7 @@ def test_each_repeat_alone_gives_what_identifying_it_alone_gives(multisine_run: 
         assert spread.repeats == 4
         assert (spread.low, spread.high) == pytest.approx((min(values), max(values)), rel=1e-9)
         assert spread.rsd == pytest.approx(100 * np.std(values, ddof=1) / np.mean(values), rel=1e-6)
-    assert per_repeat(found, [r for r in rows if r.repeat == 1]) == {}
+    assert per_repeat(found, [r for r in rows if r.record.repeat == 1]) == {}
 
 
 def test_a_bench_that_is_no_rigid_body_is_told_from_a_bad_identification() -> None:

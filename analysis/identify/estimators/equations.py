@@ -8,14 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.regression.rows import Rows
-from analysis.signals.conditioning import bridged
-from analysis.terms.base import family_of
+from analysis.identify.stacked_rows import RecordRows
+from analysis.signals.filters import bridged
 from rig.model import channels as ch
 from rig.model.records import Record
 
@@ -26,30 +24,6 @@ SEGMENTS = 10  # of one period of the excitation
 LEVELS = 8  # bins of an equation's state
 AVERAGED = 0.02  # [s] of a channel, for sorting
 SHORTEST_SEGMENT = 0.25  # [s]: longer than the row filter's memory of the noise
-
-
-class HasRows(Protocol):
-    """The rows of one record by equation (`analysis.identify.identify.RecordRows`)."""
-
-    @property
-    def run(self) -> int:
-        """Index of the run."""
-
-    @property
-    def record(self) -> str:
-        """Name of the record."""
-
-    @property
-    def step(self) -> str:
-        """Its step."""
-
-    @property
-    def repeat(self) -> int:
-        """Its repeat."""
-
-    @property
-    def rows(self) -> Mapping[str, Rows]:
-        """Rows by equation."""
 
 
 @dataclass(frozen=True)
@@ -114,21 +88,20 @@ def segments(time: Array, period: float, segments_wanted: int = SEGMENTS) -> Ind
     return np.asarray(np.floor((place % 1.0) * count), dtype=np.int64)
 
 
-def blocks_of(
-    per_record: Sequence[HasRows], family: str, kept: Sequence[int], periods: Sequence[float]
-) -> list[RepeatBlock]:
-    """Return the blocks of one family with the columns `kept`; `periods` [s] per record."""
+def blocks_of(built: Sequence[RecordRows], family: str, kept: Sequence[int]) -> list[RepeatBlock]:
+    """Return the blocks of one family with the columns `kept`."""
     found = []
-    for one, period in zip(per_record, periods, strict=True):
-        for name, rows in one.rows.items():
-            if family_of(name) == family and len(rows.rhs):
-                found.append(
-                    RepeatBlock(
-                        one.run, one.step, one.repeat, one.record, name,
-                        rows.matrix[:, list(kept)], rows.rhs, rows.time,
-                        segments(rows.time, period), np.zeros(len(rows.rhs), dtype=np.int64),
-                    )
-                )  # fmt: skip
+    for one in built:
+        record = one.record
+        for rows in one.family(family):
+            found.append(
+                RepeatBlock(
+                    *one.group, record.repeat, record.name, rows.equation,
+                    rows.matrix[:, list(kept)], rows.rhs, rows.time,
+                    segments(rows.time, record.period / record.sample_rate),
+                    np.zeros(len(rows.rhs), dtype=np.int64),
+                )
+            )  # fmt: skip
     return found
 
 

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -24,12 +23,10 @@ from analysis.identify import checks as ck
 from analysis.identify.checks import Check
 from analysis.identify.methods.stages import Outcome, StepRows, as_solution, solve_stages
 from analysis.identify.plausibility import consistency
+from analysis.identify.reduction import RecordReduction, clusters_of, noise_of, reduce_rows
 from analysis.identify.result import Identification, estimates_of
-from analysis.identify.stacked_rows import RecordRows, build_rows, clusters_of, repeats_of
-from analysis.regression.noise import noise_moments
+from analysis.identify.stacked_rows import build_rows, repeats_of
 from analysis.regression.rows import Filtering, parameters_of
-from analysis.regression.solve import RowCluster
-from analysis.signals.conditioning import lost_samples
 from analysis.simulation.model import Estimate, Model, estimate_json, finite
 from analysis.terms.base import FAMILIES, Used
 from rig.model.parse import InputError
@@ -50,7 +47,10 @@ def sequential(
     Raises InputError for runs of different rigs and records that cannot be used.
     """
     rig = ck.common_rig(runs)
-    stages, masked, names = _stages(rig, runs, terms, filtering)
+    built = build_rows(rig, runs, terms, filtering)
+    reductions = reduce_rows(rig, terms, built)
+    stages = _stages(rig, terms, reductions)
+    masked = sum(one.masked for one in reductions)
     started = time.perf_counter()
     outcomes = {
         family: solve_stages(parameters_of(rig, terms, family), stages[family], reject_noise)
@@ -61,20 +61,20 @@ def sequential(
     estimates, covariance = estimates_of(rig, terms, solutions)
     rows = {family: outcome.rows for family, outcome in outcomes.items()}
     shown = {name: _shown(rig, terms, outcomes, name) for name in estimates}
-    records = [record for run in runs for record in run.records]
+    heads = [one.head for one in reductions]
     statements = (
         _uniqueness(shown),
-        ck.repeats(_repeats(runs)),
-        ck.joints_excited(rig, records),
-        *ck.clipping(rig, [(r, ck.clipped_counts(rig, r)) for r in records]),
-        ck.lost_samples([(r, int(lost_samples(rig, r).any(axis=1).sum())) for r in records]),
+        ck.repeats(repeats_of((one.run, one.head) for one in reductions)),
+        ck.joints_excited(rig, heads),
+        *ck.clipping(rig, [(one.head, one.clipped) for one in reductions]),
+        ck.lost_samples([(one.head, one.lost) for one in reductions]),
         ck.masked(sum(rows.values()), masked),
         *consistency(rig, estimates),
     )
     provenance = {
         "method": "sequential",
         "runs": [run.source for run in runs],
-        "records": names,
+        "records": [head.name for head in heads],
         "rows": rows,
         "checks_failed": [c.name for c in statements if not c.ok],
     }
@@ -82,48 +82,37 @@ def sequential(
     extra = {"sequential": _json(outcomes, shown, estimates, estimates_of(rig, terms, second)[0])}
     model = Model(rig, tuple(terms), estimates, covariance, provenance)
     return Identification(
-        "sequential", estimates, solutions, rows, masked, seconds, statements, model, extra
+        "sequential",
+        estimates,
+        solutions,
+        rows,
+        masked,
+        seconds,
+        statements,
+        model,
+        extra,
+        tuple(built),
     )
 
 
-def _repeats(runs: Sequence[Run]) -> dict[tuple[int, str], int]:
-    counts: dict[tuple[int, str], set[int]] = {}
-    for index, run in enumerate(runs):
-        for record in run.records:
-            counts.setdefault((index, record.step), set()).add(record.repeat)
-    return {key: len(found) for key, found in counts.items()}
-
-
 def _stages(
-    rig: Rig,
-    runs: Sequence[Run],
-    terms: Sequence[Used],
-    filtering: Callable[[Record], Filtering],
-) -> tuple[dict[str, list[StepRows]], int, list[str]]:
-    """Return the stages of each family in the order of the steps, rows masked, records' names."""
-    out: dict[str, list[StepRows]] = {family: [] for family in FAMILIES}
-    masked, names = 0, []
-    for step in dict.fromkeys(record.step for run in runs for record in run.records):
-        part = [
-            replace(run, records=tuple(r for r in run.records if r.step == step)) for run in runs
-        ]
-        built = build_rows(rig, part, terms, filtering)
-        masked += sum(rows.masked for one in built for rows in one.rows.values())
-        names += [one.record for one in built]
-        noise = noise_moments(rig, part, terms, filtering, np.random.default_rng(0))
-        for family in FAMILIES:
-            clusters = _clusters(built, family)
+    rig: Rig, terms: Sequence[Used], reductions: Sequence[RecordReduction]
+) -> dict[str, list[StepRows]]:
+    """Return the stages of each family in the order of the steps."""
+    out: dict[str, list[StepRows]] = {}
+    for family in FAMILIES:
+        width = len(parameters_of(rig, terms, family)) + 1
+        out[family] = []
+        for step in dict.fromkeys(one.head.step for one in reductions):
+            part = [one for one in reductions if one.head.step == step]
+            noise = noise_of(part, family)
+            clusters = tuple(clusters_of(part, family))
             if clusters:
-                out[family].append(StepRows(step, clusters, noise[family]))
-    for family, found in out.items():
-        if not found:
+                noise = np.zeros((width, width)) if noise is None else noise
+                out[family].append(StepRows(step, clusters, noise))
+        if not out[family]:
             raise InputError(f"no {family} row of any record can be used; all of them are masked")
-    return out, masked, names
-
-
-def _clusters(built: Sequence[RecordRows], family: str) -> tuple[RowCluster, ...]:
-    repeats = repeats_of(built)
-    return tuple(c for one in built for c in clusters_of(one, family, repeats))
+    return out
 
 
 def _shown(

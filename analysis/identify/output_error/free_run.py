@@ -26,15 +26,15 @@ from analysis.identify.checks import Check
 from analysis.identify.estimators.covariance import spread
 from analysis.identify.estimators.equations import SEGMENTS, Pieces
 from analysis.identify.output_error.fit import refuse_undetermined
-from analysis.regression.rows import default_filtering
+from analysis.regression.conditioned import ConditionedRecord, condition_runs
 from analysis.regression.solve import Solution
-from analysis.signals.conditioning import Mask, aligned_channels, condition
+from analysis.signals.conditioning import Mask, aligned_channels
 from analysis.simulation.model import Estimate, Model
 from analysis.simulation.simulate import DrivingInput, State, compiled, drive_of, simulate
 from analysis.simulation.validate import arrived, first_state
 from analysis.terms.base import Used
 from rig.model import channels as ch
-from rig.model.records import Record, Run
+from rig.model.records import Run
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
@@ -48,10 +48,10 @@ FAILED = 1e3  # [m or rad] in place of a state that ceased to exist
 class _Record:
     """One record ready to run: drive, first state, measured positions (n, F) that arrived."""
 
-    def __init__(self, rig: Rig, run: int, record: Record) -> None:
-        signals = condition(rig, record, default_filtering(record).channels)
+    def __init__(self, rig: Rig, conditioned: ConditionedRecord) -> None:
+        record, signals = conditioned.record, conditioned.signals
         channels = aligned_channels(rig, record)
-        self.key, self.repeat = (run, record.step), record.repeat
+        self.key, self.repeat = conditioned.group, record.repeat
         self.drive: DrivingInput = drive_of(signals)
         self.start: State = first_state(rig, record, signals, channels)
         self.names = [
@@ -74,7 +74,7 @@ class FreeRuns:
 
     def __init__(self, rig: Rig, runs: Sequence[Run], terms: Sequence[Used]) -> None:
         self.rig, self.terms = rig, tuple(terms)
-        self.records = [_Record(rig, i, r) for i, run in enumerate(runs) for r in run.records]
+        self.records = [_Record(rig, one) for one in condition_runs(rig, runs)]
 
     def left(self, values: Mapping[str, float]) -> list[Array]:
         """Return every record's measured less simulated positions (n, F)."""

@@ -18,8 +18,8 @@ from analysis.identify.output_error.shooting import (
     shoot,
 )
 from analysis.identify.output_error.window_data import Nudged, Reduced, Stretch, WindowSource
-from analysis.regression.rows import default_filtering
-from analysis.signals.conditioning import Mask, condition
+from analysis.regression.conditioned import condition_runs
+from analysis.signals.conditioning import Mask
 from analysis.signals.filters import channel_filter
 from analysis.simulation.model import Estimate, Model
 from analysis.simulation.simulate import compiled, drive_of, hidden_paths, put_right
@@ -76,12 +76,11 @@ class Windows:
         self._cut(runs)
 
     def _cut(self, runs: Sequence[Run]) -> None:
-        records = [(i, r) for i, run in enumerate(runs) for r in run.records]
-        strata = {s: k for k, s in enumerate(sorted({(i, r.step) for i, r in records}))}
+        records = condition_runs(self.rig, runs)
+        strata = {s: k for k, s in enumerate(sorted({one.group for one in records}))}
         most = max(1, round(self.seconds / WINDOW) // len(records))
-        for i, record in records:
-            signals = condition(self.rig, record, default_filtering(record).channels)
-            signals = put_right(self.rig, self.terms, signals)
+        for one in records:
+            record, signals = one.record, put_right(self.rig, self.terms, one.signals)
             drive = drive_of(signals)
             inputs = np.column_stack(
                 (drive.p_s, drive.temperature, drive.u, drive.q, drive.qd, drive.qdd)
@@ -105,7 +104,7 @@ class Windows:
             for part, first in enumerate(chosen):
                 at = first + SAMPLES_PER_STEP * every * np.arange(points)
                 self.stretches.append(
-                    Stretch(len(self.sources) - 1, strata[i, record.step], record.repeat, part,
+                    Stretch(len(self.sources) - 1, strata[one.group], record.repeat, part,
                              ShootingWindow(first, points), measured[at])
                 )  # fmt: skip
         if not self.stretches:

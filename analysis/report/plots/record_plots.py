@@ -28,7 +28,7 @@ from analysis.report.plots.style import (
     thin,
 )
 from analysis.report.residuals import Residual
-from analysis.signals.conditioning import bridged
+from analysis.signals.filters import bridged
 from rig.model import channels as ch
 from rig.model.records import Record
 from rig.model.rig import Rig

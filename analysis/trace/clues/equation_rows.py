@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.rows import Rows
 from analysis.signals.conditioning import Signals
-from analysis.trace.data.conditioned_record import ConditionedRecord, filtered, prepared
+from analysis.trace.data.conditioned_record import filtered, prepared
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.search.linear_fit import orthonormal
 

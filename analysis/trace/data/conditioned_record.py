@@ -11,39 +11,21 @@ which to first order in the change is what the effect puts into the residual.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analysis.effects.base import SENSOR, ordered
 from analysis.identify import checks as ck
+from analysis.regression.conditioned import ConditionedRecord, condition_runs
 from analysis.regression.rows import Filtering, Rows, default_filtering, record_rows
-from analysis.signals.conditioning import Signals, condition
+from analysis.signals.conditioning import Signals
 from analysis.terms.base import FAMILIES, Columns, Term, Used
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class ConditionedRecord:
-    """One record made ready: its signals under the channel filter, its filters, its equations.
-
-    `families` are the families of rows that are looked at, by default all.
-    """
-
-    run: int
-    record: Record
-    signals: Signals
-    filtering: Filtering
-    families: tuple[str, ...] = tuple(FAMILIES)
-
-    @property
-    def group(self) -> tuple[int, str]:
-        """Which repeats belong together: the run and the step."""
-        return self.run, self.record.step
 
 
 def trace_filtering(record: Record) -> Filtering:
@@ -65,14 +47,8 @@ def conditioned_records(
     families: tuple[str, ...] = tuple(FAMILIES),
 ) -> list[ConditionedRecord]:
     """Condition every record of the runs; raises InputError for a record that cannot be used."""
-    out = []
-    for index, run in enumerate(runs):
-        for record in run.records:
-            ck.refuse_dead_channels(rig, record)
-            filters = filtering(record)
-            signals = condition(rig, record, filters.channels)
-            out.append(ConditionedRecord(index, record, signals, filters, families))
-    return out
+    ck.refuse_dead_records(rig, runs)
+    return condition_runs(rig, runs, filtering, families)
 
 
 def held(term: Term, conditioned: ConditionedRecord) -> bool:

@@ -19,11 +19,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.noise import disturbed
 from analysis.regression.rows import Rows
-from analysis.signals.conditioning import condition, moving_joints
+from analysis.signals.conditioning import condition
 from analysis.terms.base import Used
-from analysis.trace.data.conditioned_record import ConditionedRecord, model_rows, row_residual
+from analysis.trace.data.conditioned_record import model_rows, row_residual
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
@@ -148,8 +149,8 @@ def stated_noise(
     """Return the rms that the rig's stated sensor noise alone puts into each residual."""
     rng = np.random.default_rng(0)  # a prediction, the same every time
     record = disturbed(rig, conditioned.record, rng)
-    moving = moving_joints(rig, conditioned.record)
-    signals = condition(rig, record, conditioned.filtering.channels, moving)
+    filters, moving = conditioned.filtering, conditioned.signals.moving
+    signals = condition(rig, record, filters.channels, moving)
     again = model_rows(rig, terms, replace(conditioned, record=record, signals=signals))
     out = {}
     for name, before in rows.items():

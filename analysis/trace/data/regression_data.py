@@ -17,12 +17,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.rows import Rows
-from analysis.signals.conditioning import Signals, condition, moving_joints
+from analysis.signals.conditioning import Signals, condition
 from analysis.terms.base import Used
 from analysis.trace.data.candidates import Variant
 from analysis.trace.data.conditioned_record import (
-    ConditionedRecord,
     candidate_columns,
     held,
     model_rows,
@@ -99,8 +99,7 @@ def _average(rig: Rig, repeats: Sequence[ConditionedRecord]) -> ConditionedRecor
         for name in names
     }
     record = replace(first.record, channels=channels)
-    moving = np.any([moving_joints(rig, s.record) for s in repeats], axis=0)
-    signals = condition(rig, record, first.filtering.channels, moving)
+    signals = condition(rig, record, first.filtering.channels, first.signals.moving)
     valid = np.all([s.signals.valid[:n] for s in repeats], axis=0)
     return replace(first, record=record, signals=replace(signals, valid=signals.valid & valid))
 

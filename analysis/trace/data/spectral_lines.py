@@ -20,8 +20,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.rows import Rows, lines_cutoff
-from analysis.trace.data.conditioned_record import ConditionedRecord, filtered
+from analysis.trace.data.conditioned_record import filtered
 from analysis.trace.data.noise_floor import Group
 from analysis.trace.data.regression_data import RegressionData, Segment
 

@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.identify.estimators.nuisance import KAPPA
+from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.rows import Rows
 from analysis.simulation.model import Model
 from analysis.simulation.validate import validate
-from analysis.trace.data.conditioned_record import ConditionedRecord, model_rows, row_residual
+from analysis.trace.data.conditioned_record import model_rows, row_residual
 from analysis.trace.data.noise_floor import floors
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.temperature_nuisance import plausible

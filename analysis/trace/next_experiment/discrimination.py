@@ -24,12 +24,12 @@ from numpy.typing import NDArray
 
 from analysis.design.twin_records import ideal
 from analysis.effects.base import Effect, shapes_of
+from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.rows import Rows
 from analysis.signals.conditioning import Signals, condition
 from analysis.terms.base import Used
 from analysis.trace.data.candidates import Variant
 from analysis.trace.data.conditioned_record import (
-    ConditionedRecord,
     candidate_columns,
     held,
     model_rows,

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from analysis.design.limits import Spectrum, forecast_of, used
 from analysis.design.moves import Tone, with_tones
 from analysis.design.twin_records import PlannedStep, Played, play
-from analysis.trace.data.conditioned_record import ConditionedRecord
+from analysis.regression.conditioned import ConditionedRecord
 from rig.model import channels as ch
 from rig.model.parse import InputError
 from rig.model.rig import Rig

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares as search_shapes
 
 from analysis.effects.base import Effect, Shape, shapes_of
+from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.rows import Rows
 from analysis.terms.base import Used
-from analysis.trace.data.conditioned_record import ConditionedRecord, acts_on, held, model_rows
+from analysis.trace.data.conditioned_record import acts_on, held, model_rows
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.search.linear_fit import CHANCE, orthonormal
 from rig.model.rig import Rig

@@ -15,8 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from analysis.identify.methods.search import with_values
+from analysis.identify.reduction import clusters_of, reduce_rows
 from analysis.identify.result import Identification, estimates_of
-from analysis.identify.stacked_rows import build_rows, clusters_of, repeats_of
+from analysis.identify.stacked_rows import build_rows
 from analysis.regression.rows import Filtering, default_filtering, parameters_of
 from analysis.regression.solve import RowCluster, Solution, merge, solve
 from analysis.simulation.model import Model
@@ -139,12 +140,12 @@ class _Alone:
 def _alone(run: Run, filtering: Choice) -> _Alone:
     terms = tuple(Used(term) for term in baseline())
     rows = build_rows(run.rig, [run], terms, filtering)
-    repeats = repeats_of(rows)
+    reductions = reduce_rows(run.rig, terms, rows)
     started = time.perf_counter()
     solutions, plain = {}, {}
     for family in FAMILIES:
         names = parameters_of(run.rig, terms, family)
-        clusters = [c for one in rows for c in clusters_of(one, family, repeats)]
+        clusters = clusters_of(reductions, family)
         solutions[family] = solve(names, clusters)
         plain[family] = plain_condition(clusters)
     seconds = time.perf_counter() - started
