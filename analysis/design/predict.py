@@ -15,7 +15,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ from analysis.design.sensor_noise import score_covariance
 from analysis.design.twin_records import PlannedStep, Played, ideal, play
 from analysis.identify.reduction import SEGMENTS
 from analysis.identify.stacked_rows import build_rows
+from analysis.regression.least_squares import scaled_inverse
 from analysis.regression.noise import record_moments
 from analysis.regression.rows import Filtering, Rows, default_filtering, parameters_of
 from analysis.regression.solve import RowCluster, half_width, solve, triangle
@@ -224,7 +225,7 @@ def covariance(
     """
     A = np.sum([one.repeats * one.matrix[family] for one in found], axis=0)
     kept = np.diag(A) > 0 if kept is None else kept & (np.diag(A) > 0)
-    inverse = _inverse(A[np.ix_(kept, kept)])
+    inverse = scaled_inverse(A[np.ix_(kept, kept)])
     parts = [inverse @ one.scores[family][np.ix_(kept, kept)] @ inverse for one in found]
     total = np.full(A.shape, np.nan)
     inner = np.sum([one.repeats * part for one, part in zip(found, parts, strict=True)], axis=0)
@@ -239,26 +240,16 @@ def covariance(
     return total, dof
 
 
-def _inverse(A: Array) -> Array:
-    scale = 1.0 / np.sqrt(np.diag(A))
-    return np.asarray(np.linalg.pinv(A * np.outer(scale, scale), 1e-12)) * np.outer(scale, scale)
-
-
 def _oil_scatter(rig: Rig, found: Sequence[StepInformation], kept: NDArray[np.bool_]) -> Array:
     """Return the scatter (k,) of the coefficients if 1/b differs from step to step with the oil."""
     A = np.sum([one.repeats * one.matrix["fluid"] for one in found], axis=0)
     kept = kept & (np.diag(A) > 0)
-    inverse = _inverse(A[np.ix_(kept, kept)])
+    inverse = scaled_inverse(A[np.ix_(kept, kept)])
     spread = OIL_FALL * rig.oil.temperature_band / math.sqrt(2.0)
     shifts = np.array([inverse @ (one.repeats * one.oil[kept]) for one in found])
     out = np.full(len(A), np.nan)
     out[kept] = spread * np.sqrt(np.sum(shifts**2, axis=0))
     return out
-
-
-def with_repeats(found: Sequence[StepInformation], repeats: int) -> list[StepInformation]:
-    """Return the same steps with another number of repeats each."""
-    return [replace(one, repeats=repeats) for one in found]
 
 
 def to_json(prediction: Prediction) -> dict[str, object]:

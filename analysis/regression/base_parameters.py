@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr
 
-from analysis.regression.solve import RANK_TOLERANCE, SHARE_OF_NOISE, SHARE_OF_NULL
+from analysis.regression.least_squares import factored
+from analysis.regression.solve import SHARE_OF_NOISE, SHARE_OF_NULL
 
 Array = NDArray[np.float64]
 
@@ -75,21 +76,18 @@ def determined(names: Sequence[str], X: Array, noise: Array | None = None) -> De
     `noise` (k, k) is the part of X'X that sensor noise makes.
     """
     k = len(names)
-    size = np.linalg.norm(X, axis=0)
-    scale = np.where(size > 0.0, size, 1.0)
-    _, sigma, Vt = np.linalg.svd(X / scale, full_matrices=True)
-    sigma = np.concatenate((sigma, np.zeros(k - len(sigma))))
-    strong = sigma > RANK_TOLERANCE * sigma[0] if sigma[0] > 0 else np.zeros(k, dtype=bool)
-    null = np.vstack((Vt[~strong], _noisy(Vt[strong], sigma[strong], scale, noise)))
-    condition = float(sigma[0] / sigma[-1]) if sigma[-1] > 0 else float("inf")
+    factors = factored(X)
+    scale, strong = factors.scale, factors.strong
+    noisy = _noisy(factors.Vt[strong], factors.sigma[strong], scale, noise)
+    null = np.vstack((factors.null, noisy))
     if len(null):
         null = np.linalg.qr(null.T)[0].T
     members = np.linalg.norm(null, axis=0) > SHARE_OF_NULL
     lost = tuple(n for n, inside in zip(names, members, strict=True) if inside)
     known = tuple(n for n in names if n not in lost)
-    base = _combinations(names, null, scale, size) if len(null) else ()
+    base = _combinations(names, null, scale, np.any(X != 0.0, axis=0)) if len(null) else ()
     return Determined(
-        tuple(names), k - len(null), condition, null / scale, known, lost,
+        tuple(names), k - len(null), factors.condition, null / scale, known, lost,
         tuple(c for c in base if any(name in lost for name, _ in c.parts)),
     )  # fmt: skip
 
@@ -105,7 +103,7 @@ def _noisy(Vt: Array, sigma: Array, scale: Array, noise: Array | None) -> Array:
 
 
 def _combinations(
-    names: Sequence[str], null: Array, scale: Array, size: Array
+    names: Sequence[str], null: Array, scale: Array, shown: NDArray[np.bool_]
 ) -> list[Combination]:
     """Return the base parameters of a scaled null space (m, k), in the names' order."""
     m = len(null)
@@ -118,7 +116,7 @@ def _combinations(
         c = np.zeros(len(names))
         c[i], c[dependent] = 1.0, -(back @ null[:, i])
         # A column of zeros carries nothing: it is lost alone, and in no combination.
-        c[(np.abs(c) < NEGLIGIBLE * np.abs(c).max()) | (size == 0.0)] = 0.0
+        c[(np.abs(c) < NEGLIGIBLE * np.abs(c).max()) | ~shown] = 0.0
         parts = [int(p) for p in np.flatnonzero(c)]
         plain = c * scale
         if parts:

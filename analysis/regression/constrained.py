@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import null_space
 
+from analysis.regression.least_squares import least_squares
 from rig.model.parse import InputError
 
 Array = NDArray[np.float64]
@@ -76,7 +77,7 @@ def minimise(X: Array, y: Array, feasible: Feasible) -> Minimum:
     G = G / np.maximum(np.linalg.norm(G, axis=1, keepdims=True), 1e-300)
     F = np.tensordot(basis.T, feasible.forms / scale[:, None, None], axes=1)
     F = F / max(float(np.abs(F).max(initial=0.0)), 1e-300)
-    x = np.asarray(np.linalg.lstsq(A, y, rcond=None)[0])
+    x = least_squares(A, y)
     free = x
     if not _inside(x, G, F):
         x = _follow(A, y, G, F, _interior(x, G, F))

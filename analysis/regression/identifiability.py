@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from analysis.regression.base_parameters import Determined, determined
 from analysis.regression.rows import Filtering, parameters_of, record_rows
+from analysis.regression.solve import square
 from analysis.signals.conditioning import condition
 from analysis.signals.filters import channel_filter
 from analysis.terms import baseline
@@ -56,7 +57,7 @@ def predicted_rows(
     stacked: dict[str, list[Array]] = {}
     for name, one in rows.items():
         stacked.setdefault(family_of(name), []).append(one.matrix)
-    return {family: _triangle(np.vstack(parts)) for family, parts in stacked.items()}
+    return {family: square(np.vstack(parts)) for family, parts in stacked.items()}
 
 
 def judge(rig: Rig, steps: Sequence[Triangles]) -> dict[str, Determined]:
@@ -68,9 +69,3 @@ def judge(rig: Rig, steps: Sequence[Triangles]) -> dict[str, Determined]:
         X = np.vstack([step[family] for step in steps]) if steps else np.zeros((1, len(names)))
         out[family] = determined(names, X)
     return out
-
-
-def _triangle(matrix: Array) -> Array:
-    k = matrix.shape[1]
-    R = np.asarray(np.linalg.qr(matrix, mode="r"))
-    return np.vstack((R, np.zeros((k - len(R), k)))) if len(R) < k else R

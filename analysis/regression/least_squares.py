@@ -18,6 +18,7 @@ Array = NDArray[np.float64]
 # Smallest singular value of the scaled matrix over the largest. A direction below it is a thousand
 # times less visible than the best; measured records show such directions by their noise alone.
 RANK_TOLERANCE = 1e-3
+ROUNDING = 1e-12  # the same of normal equations X'X, where rounding alone sets the limit
 
 
 @dataclass(frozen=True)
@@ -74,13 +75,13 @@ def least_squares(X: Array, y: Array) -> Array:
 def scaled_inverse(A: Array) -> Array:
     """Invert a matrix A (k, k) of normal or estimating equations, its diagonal scaled to 1.
 
-    A = X'X squares the singular values, so the tolerance is RANK_TOLERANCE squared. Rows and
-    columns with nothing on the diagonal stay zero.
+    Weak directions stay in, for their large variance is what an interval must show; left out are
+    those beyond what double precision resolves (ROUNDING) and columns with a zero diagonal.
     """
     scale = np.sqrt(np.abs(np.diag(A)))
     kept = scale > 0.0
     size = np.outer(scale[kept], scale[kept])
     inverse = np.zeros_like(A)
-    inner = np.linalg.pinv(A[np.ix_(kept, kept)] / size, RANK_TOLERANCE**2)
+    inner = np.linalg.pinv(A[np.ix_(kept, kept)] / size, ROUNDING)
     inverse[np.ix_(kept, kept)] = inner / size
     return inverse

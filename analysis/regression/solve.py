@@ -1,13 +1,13 @@
 """Coupled least squares by QR, in a form that streams: factors merge, rows may be forgotten.
 
 The rows of all records are stacked and solved once, so that a parameter that appears in several
-steps has one value (NOTES, "Why coupled"; the paper's STEP4). Each cluster of rows is reduced to
+steps has one value (Sakai and Maeshima's STEP4). Each cluster of rows is reduced to
 the triangle R of [X y] = Q R, (k+1, k+1); triangles merge by another QR, and everything below
 (solution, condition number, residual, clustered errors) needs triangles only.
 
 Standard errors are clustered by repeat: within one record residuals are correlated, so only whole
 repeats are independent. Steps are strata: the scores g = X'(y - X beta) of the repeats of a step
-are taken about their mean, so what repeats identically (model error) is not mistaken for scatter.
+are taken about their mean: an error of the model, the same in every repeat, is no scatter.
  V = A^-1 [ sum_steps n/(n-1) sum_r (g_r - mean g)(g_r - mean g)' ] A^-1,  A = X'X,
 and a parameter's t quantile has Satterthwaite's degrees of freedom over the steps (n - 1 each).
 Source: Liang and Zeger (1986) in its stratified form (Cochran, Sampling Techniques, ch. 11).
@@ -22,9 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
+from analysis.regression.least_squares import factored
+
 Array = NDArray[np.float64]
 
-RANK_TOLERANCE = 1e-3  # smallest singular value of the scaled matrix over the largest
 SHARE_OF_NOISE = 0.1  # of a column's own information: beyond, the parameter rests on noise
 SHARE_OF_NULL = 0.05  # a parameter with more of a null direction than this is not identifiable
 
@@ -65,15 +66,16 @@ class Solution:
 
 def triangle(matrix: Array, rhs: Array) -> Array:
     """Return R (k+1, k+1) of [X y] = Q R for rows (m, k), (m,)."""
-    return _square(np.column_stack((matrix, rhs)))
+    return square(np.column_stack((matrix, rhs)))
 
 
 def merge(triangles: Iterable[Array]) -> Array:
     """Return the triangle of all rows behind the given triangles, (k+1, k+1)."""
-    return _square(np.vstack(list(triangles)))
+    return square(np.vstack(list(triangles)))
 
 
-def _square(stacked: Array) -> Array:
+def square(stacked: Array) -> Array:
+    """Return the triangle R (k, k) of stacked = Q R, (m, k), filled with zeros where m < k."""
     width = stacked.shape[1]
     R: Array = np.asarray(np.linalg.qr(stacked, mode="r"))
     return np.vstack((R, np.zeros((width - len(R), width)))) if len(R) < width else R
@@ -123,18 +125,16 @@ def _pseudo_inverse(names: Sequence[str], X: Array) -> tuple[Array, float, dict[
 
     Columns that are zero, and directions below the rank tolerance, are left out of the inverse.
     """
-    scale = np.linalg.norm(X, axis=0)
-    kept = np.flatnonzero(scale > 0.0)
-    lost = {n: "no row contains it" for n, size in zip(names, scale, strict=True) if size == 0.0}
+    shown = np.any(X != 0.0, axis=0)
+    lost = {n: "no row contains it" for n, filled in zip(names, shown, strict=True) if not filled}
     inverse = np.zeros_like(X)
+    kept = np.flatnonzero(shown)
     if not len(kept):
         return inverse, float("inf"), lost
-    U, sigma, Vt = np.linalg.svd(X[:, kept] / scale[kept], full_matrices=False)
-    strong = sigma > RANK_TOLERANCE * sigma[0]
-    lost |= _confounded([names[int(i)] for i in kept], Vt[~strong])
-    inverse[kept] = (Vt[strong].T / sigma[strong]) / scale[kept, None] @ U[:, strong].T
-    condition = float(sigma[0] / sigma[-1]) if sigma[-1] > 0 else float("inf")
-    return inverse, condition, lost
+    factors = factored(X[:, kept])
+    lost |= _confounded([names[int(i)] for i in kept], factors.null)
+    inverse[kept] = factors.inverse
+    return inverse, factors.condition, lost
 
 
 def _confounded(names: Sequence[str], null: Array) -> dict[str, str]:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.identify.stacked_rows import RecordRows
+from analysis.regression.least_squares import scaled_inverse
 from analysis.signals.filters import bridged
 from rig.model import channels as ch
 from rig.model.records import Record
@@ -113,9 +114,7 @@ def solve(blocks: Sequence[RepeatBlock], Z: Sequence[Array], w: Sequence[Array])
         weighted = z * weight[:, None]
         A += weighted.T @ b.X
         c += weighted.T @ b.y
-    scale = np.sqrt(np.abs(np.diag(A)))
-    scale[scale == 0.0] = 1.0
-    inverse = np.linalg.inv(A / np.outer(scale, scale)) / np.outer(scale, scale)
+    inverse = scaled_inverse(A)
     return EquationFit(tuple(blocks), tuple(Z), tuple(w), inverse @ c, inverse)
 
 

@@ -25,6 +25,7 @@ from analysis.identify.estimators.covariance import CovarianceParts, spread
 from analysis.identify.estimators.equations import Pieces
 from analysis.identify.output_error.window_data import Reduced
 from analysis.identify.output_error.windows import WINDOW, Windows
+from analysis.regression.least_squares import scaled_inverse
 from analysis.regression.solve import Solution
 from analysis.terms.base import Used
 from rig.model.parse import InputError
@@ -147,11 +148,7 @@ class Search:
         for belief in nu.beliefs(self.names, theta):
             A = A + np.outer(belief.h, belief.h) / belief.std**2
             g = g - belief.h * float(belief.h @ theta) / belief.std**2
-        scale = np.sqrt(np.diag(A))
-        told = np.flatnonzero(scale > 0)
-        inside, scale = A[np.ix_(told, told)], np.outer(scale[told], scale[told])
-        inverse = np.zeros_like(A)
-        inverse[np.ix_(told, told)] = np.linalg.inv(inside / scale) / scale
+        inverse = scaled_inverse(A)
         return inverse @ g, inverse
 
     def _refined(

@@ -27,6 +27,7 @@ from analysis.identify.estimators.covariance import spread
 from analysis.identify.estimators.equations import SEGMENTS, Pieces
 from analysis.identify.output_error.fit import refuse_undetermined
 from analysis.regression.conditioned import ConditionedRecord, condition_runs
+from analysis.regression.least_squares import scaled_inverse
 from analysis.regression.solve import Solution
 from analysis.signals.conditioning import Mask, aligned_channels
 from analysis.simulation.model import Estimate, Model
@@ -108,7 +109,7 @@ def free_run_fit(
     before = float(np.sqrt(np.mean(stacked(first) ** 2)))
     after = float(np.sqrt(np.mean(found.fun**2)))
     jacobian = found.jac / scale
-    inverse = np.linalg.inv(jacobian.T @ jacobian)
+    inverse = scaled_inverse(jacobian.T @ jacobian)
     error = spread([_pieces(ready.records, found, jacobian)], inverse)
     unit = rig.unit_of(ready.records[0].names[0])
     check = Check(
