@@ -145,7 +145,7 @@ def force_unit(rig: Rig, joint: int) -> str:
 class CoulombFriction(Friction):
     """F_f = Fc z: dry friction of one level (Coulomb 1785; the contact's state z, see the module).
 
-    Hides in the viscous friction: 80 N on the seed bench make Fv2 110 % too large (NOTES).
+    Hides in the viscous friction: 80 N on the seed bench make Fv2 110 % too large.
     """
 
     name: ClassVar[str] = "coulomb_friction"

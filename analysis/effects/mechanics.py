@@ -40,8 +40,8 @@ def torque_limit(rig: Rig, joint: int) -> float:
 class BaseInclination(Effect):
     """All absolute angles turned by one angle alpha: link k pulls W_k g sin(theta_k + alpha).
 
-    Inertia sees differences of absolute angles only, so turning them changes gravity alone (NOTES,
-    "N DOF planar chain"); W_k cos(alpha) and W_k sin(alpha) share one alpha, which is therefore a
+    Inertia sees differences of absolute angles only, so turning them changes gravity alone
+    (docs/n-joints.md); W_k cos(alpha) and W_k sin(alpha) share one alpha, which is therefore a
     shape and not N linear unknowns.
     """
 

@@ -32,11 +32,11 @@ HEAVIEST = 200.0  # [kg] beyond what the catalogue's benches carry
 
 @dataclass(frozen=True)
 class Payload(Effect):
-    """A point mass m at the tip: R_ij grows by m l_i l_j, W_i by m l_i (NOTES, "N DOF chain").
+    """A point mass m at the tip: R_ij grows by m l_i l_j, W_i by m l_i.
 
     Its columns are a sum of the baseline's own, so M, R and W of one run absorb it COMPLETELY: no
     excitation of that run shows it. It is seen only against a reference: parameters of a model
-    identified without it (`payload_of_shift`), M, R and W held there.
+    identified without it, M, R and W held there.
     """
 
     name: ClassVar[str] = "payload"
@@ -98,25 +98,6 @@ def growth(rig: Rig) -> dict[str, float]:
     shares = np.linalg.lstsq(patterns.T, np.outer(lengths, lengths).ravel(), rcond=None)[0]
     weights = {f"W{i}": float(length) for i, length in enumerate(lengths, start=1)}
     return dict(zip(names, map(float, shares), strict=True)) | weights
-
-
-def payload_of_shift(
-    rig: Rig, reference: Mapping[str, float], found: Mapping[str, float], covariance: Array
-) -> tuple[float, float, float]:
-    """Return (m, its standard error [kg], misfit per degree of freedom) of a shift of parameters.
-
-    `covariance` (k, k) is that of the difference found - reference over the names of `growth`, in
-    their order. A misfit far above 1 says that something else than a payload moved them.
-    """
-    weights = growth(rig)
-    direction = np.array(list(weights.values()))
-    shift = np.array([found[name] - reference[name] for name in weights])
-    inverse = np.linalg.pinv(covariance)
-    information = float(direction @ inverse @ direction)
-    mass = float(direction @ inverse @ shift) / information
-    left = shift - mass * direction
-    dof = max(len(weights) - 1, 1)
-    return mass, information**-0.5, float(left @ inverse @ left) / dof
 
 
 @kernel

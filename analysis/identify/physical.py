@@ -4,11 +4,11 @@ Level 1, *signs*: friction, flow gains and 1/b are not negative, and the chain's
 semidefinite. M_ij(q) sums R_kl cos(theta_k - theta_l) (`terms.inertia`), and the cosines form a
 Gram matrix, so by Schur's product theorem M(q) is then so in every posture; with all links in line
 M(q) is made of R alone, so over all postures nothing weaker would do.
-Level 2, *rigid bodies*: R_ij = l_i W_j for i < j besides, l_i being the rig's link lengths (NOTES,
-"N DOF planar chain"). Both levels together say exactly that there are links with masses m_k > 0,
-first moments h_k and pseudo-inertias [[I_k, h_k], [h_k, m_k]] >= 0 behind the parameters:
+Level 2, *rigid bodies*: R_ij = l_i W_j for i < j besides, l_i being the rig's link lengths
+(`terms.inertia`). Both levels together say exactly that there are links with masses m_k > 0, first
+moments h_k and pseudo-inertias [[I_k, h_k], [h_k, m_k]] >= 0 behind the parameters:
     R_kk = I_k + l_k^2 m_beyond(k),  W_k = h_k + l_k m_beyond(k),  m_beyond(k) = sum_{j>k} m_j;
-eliminating the links from the tip inwards takes the same Schur complements as R >= 0 (`links_of`).
+eliminating the links from the tip inwards takes the same Schur complements as R >= 0.
 
 Solved as constrained least squares on the triangle that the identification has made already: the
 consistent parameters are those nearest to the free ones in the metric X'X of all rows. A
@@ -257,24 +257,6 @@ def _verdict(price: Price) -> str:
         return "the repeats are too few to tell whether the data allow it"
     word = "REJECTED by the data" if price.rejected else "compatible with the data"
     return f"{word}, p = {price.p:.2g}"
-
-
-def links_of(rig: Rig, R: Array, W: Array) -> list[tuple[float, float, float]]:
-    """Return links (m, h, I) behind R (N, N) and W (N,), the least masses that do, tip last.
-
-    From the tip inwards: m_k is the least with [[I_k, h_k], [h_k, m_k]] >= 0, where I_k = R_kk -
-    l_k^2 m_beyond and h_k = W_k - l_k m_beyond. Raises InputError where no link can do it.
-    """
-    found, beyond = [], 0.0
-    for k in range(len(W) - 1, -1, -1):
-        length = rig.joints[k].link_length if k < len(W) - 1 else 0.0
-        inertia, moment = R[k, k] - length**2 * beyond, W[k] - length * beyond
-        if not inertia > 0:
-            raise InputError(f"no link {k + 1} of positive mass has these parameters")
-        mass = moment**2 / inertia
-        found.append((float(mass), float(moment), float(inertia)))
-        beyond += mass
-    return found[::-1]
 
 
 def to_json(found: Physical) -> dict[str, Any]:

@@ -45,17 +45,6 @@ class Feasible:
         """Return sum_i beta_i F_i (n, n)."""
         return np.asarray(np.tensordot(beta, self.forms, axes=1))
 
-    def violated(self, beta: Array) -> list[str]:
-        """Name the inequalities that beta breaks."""
-        out = [
-            label
-            for label, value in zip(self.positive_labels, self.positive @ beta, strict=True)
-            if value < 0
-        ]
-        if self.forms.shape[1] and np.linalg.eigvalsh(self.form(beta))[0] < 0:
-            out.append(self.form_label)
-        return out
-
 
 @dataclass(frozen=True)
 class Minimum:

@@ -106,7 +106,7 @@ def right_sides(rig: Rig, signals: Signals) -> dict[str, Array]:
 
     An electric joint has its drive's torque or force alone: gain times drive.
 
-    The torque is G F (NOTES; the paper's regressor lines print the inverse of G).
+    The torque is G F, by virtual work; Sakai and Maeshima's regressor prints the inverse of G.
     """
     if rig.electric:
         gains = drive_gains(rig)

@@ -1,7 +1,7 @@
 """The numbers the paper prints, as data in SI, to stand beside one's own.
 
 Source: Sakai and Maeshima, "A new method for parameter identification for N-DOF hydraulic robots",
-Table III (identified results) and Table IV (FIT ratio). Units follow NOTES of the method: the
+Table III (identified results) and Table IV (FIT ratio). Units follow docs/method.md: the
 paper prints Fv in N s/m, which is N m s/rad, and the gains in m^2/(s V sqrt(Pa)), which is m^3/...
 """
 

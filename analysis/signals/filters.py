@@ -2,7 +2,7 @@
 
 Every smoother here is linear and symmetric, so it shifts nothing in time, and the analysis passes
 every channel through the same one: only then do the flow and torque balances still hold between
-filtered signals (NOTES, "Measured traps"; the paper's causal 20-sample average delays by 9.5 ms).
+filtered signals (Sakai and Maeshima's causal 20-sample average delays by 9.5 ms).
 
 A smoother is a row of symmetric taps per derivative: y_k = (d/dt)^k (h * x). Filtering happens
 twice in the analysis, and for a reason. Products such as sqrt(p_s - p) u or cos(q2) q1'' do not
@@ -22,7 +22,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import butter, kaiserord, oaconvolve, savgol_coeffs, sosfiltfilt, upfirdn
+from scipy.signal import butter, kaiserord, oaconvolve, sosfiltfilt, upfirdn
 from scipy.special import i0
 
 from rig.model.parse import InputError
@@ -81,44 +81,6 @@ class FirSmoother:
         return np.asarray(filtered[first : (len(x) - 1) // step + 1])
 
 
-@dataclass(frozen=True)
-class FourierSmoother:
-    """Differentiation in the frequency domain of whole periods, exact where a record is periodic.
-
-    A record drifts and is trimmed between periods, so the line to the sample that would come
-    next is taken out first and put back; what a line cannot describe, and the noise of the ends,
-    leaks: that, and records that are not whole periods, are why this is not the default.
-    """
-
-    rate: float
-    cutoff: float
-
-    @property
-    def name(self) -> str:
-        """What it is, with its settings."""
-        return f"Fourier, {self.cutoff:g} Hz"
-
-    @property
-    def reach(self) -> int:
-        """A leak at the joint of the ends decays over about two periods of the cutoff."""
-        return round(2 * self.rate / self.cutoff)
-
-    def apply(self, x: Array, order: int = 0) -> Array:
-        """Return the low-passed (d/dt)^order of x (n, ...), x being whole periods plus a line."""
-        n = len(x)
-        slope = (2 * x[-1] - x[-2] - x[0]) / n
-        line = np.multiply.outer(np.arange(n, dtype=np.float64), slope)
-        frequency = np.fft.rfftfreq(n, 1 / self.rate)
-        gain = np.where(frequency <= self.cutoff, (2j * np.pi * frequency) ** order, 0.0)
-        shape = (-1,) + (1,) * (x.ndim - 1)
-        smooth = np.fft.irfft(np.fft.rfft(x - line, axis=0) * gain.reshape(shape), n, axis=0)
-        if order == 0:
-            smooth += line
-        elif order == 1:
-            smooth += slope * self.rate
-        return np.asarray(smooth)
-
-
 def _extended(x: Array, reach: int, name: str) -> Array:
     """Continue x by point reflection at both ends, which keeps value and slope there."""
     if len(x) <= reach:
@@ -157,10 +119,10 @@ def windowed_sinc(rate: float, cutoff: float, transition: float) -> FirSmoother:
     reach = count // 2 + 1
     t = np.arange(-reach, reach + 1) / rate
     h0 = _kernel(t, cutoff + 0.5 * transition, (reach + 1) / rate, beta)
-    return _differenced(f"windowed sinc, {cutoff:g} Hz", h0, rate)
+    return differenced(f"windowed sinc, {cutoff:g} Hz", h0, rate)
 
 
-def _differenced(name: str, h0: Array, rate: float, order: int = 8) -> FirSmoother:
+def differenced(name: str, h0: Array, rate: float, order: int = 8) -> FirSmoother:
     """Return taps of a symmetric value filter followed by central differences of `order`."""
     first, second = _DIFFERENCES[order]
     wide = np.pad(h0, len(first) // 2)
@@ -179,7 +141,7 @@ def moving_average(rate: float, samples: int = 20) -> FirSmoother:
     h0 = np.full(samples, 1.0 / samples)
     if samples % 2 == 0:
         h0 = np.convolve(h0, [0.5, 0.5])
-    return _differenced(f"moving average, {samples} samples", h0, rate, order=2)
+    return differenced(f"moving average, {samples} samples", h0, rate, order=2)
 
 
 def butterworth(rate: float, cutoff: float, order: int = 4) -> FirSmoother:
@@ -194,28 +156,7 @@ def butterworth(rate: float, cutoff: float, order: int = 4) -> FirSmoother:
     strong = np.flatnonzero(np.abs(h0) > 1e-6 * np.abs(h0).max())
     half_kept = half - int(strong[0])
     h0 = h0[half - half_kept : half + half_kept + 1]
-    return _differenced(f"Butterworth, {cutoff:g} Hz", h0 / h0.sum(), rate)
-
-
-def savitzky_golay(rate: float, samples: int = 31, degree: int = 4) -> FirSmoother:
-    """Return a local polynomial fit of `degree` over an odd number of samples."""
-    taps = [savgol_coeffs(samples, degree, deriv=k, delta=1 / rate) for k in range(3)]
-    return FirSmoother(f"Savitzky-Golay, {samples} samples", np.stack(taps))
-
-
-def smoothing_spline(rate: float, cutoff: float) -> FirSmoother:
-    """Return the quintic smoothing spline on equal spacing, -6 dB at `cutoff` [Hz].
-
-    It minimises sum (x - f)^2 + lambda int |f^(3)|^2; far from the ends that is convolution with
-    a fixed symmetric kernel of frequency response 1 / (1 + (f / f_c)^6), taken to 1e-6.
-    Source: Reinsch (1967); Silverman (1984), Spline smoothing: the equivalent variable kernel.
-    """
-    count = int(2 ** np.ceil(np.log2(64 * rate / cutoff)))
-    f = np.fft.rfftfreq(count, 1.0 / rate)
-    kernel = np.fft.irfft(1.0 / (1.0 + (f / cutoff) ** 6), count)
-    strong = np.flatnonzero(np.abs(kernel[: count // 2]) > 1e-6 * kernel[0])
-    around = np.arange(-int(strong[-1]), int(strong[-1]) + 1)
-    return _differenced(f"smoothing spline, {cutoff:g} Hz", kernel[around], rate)
+    return differenced(f"Butterworth, {cutoff:g} Hz", h0 / h0.sum(), rate)
 
 
 def channel_filter(rate: float) -> FirSmoother:

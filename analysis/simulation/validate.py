@@ -1,7 +1,7 @@
 """Validation: the model driven by the measured spool (electric: drive) against what was measured.
 
-FIT = 100 (1 - |y - yhat| / |y - mean y|) per channel (NOTES, Table IV), free run from the record's
-first sample; windowed RMSE restarts the model from the data every 0.25 s, which shows the model's
+FIT = 100 (1 - |y - yhat| / |y - mean y|) per channel (Sakai and Maeshima, Table IV), free run from
+the record's first sample; windowed RMSE restarts the model from the data every 0.25 s, which shows the model's
 rates without the drift that a free run collects.
 """
 

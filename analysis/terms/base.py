@@ -4,7 +4,7 @@ A model is a list of terms (DESIGN, "Identification is an algebra of rows"). Add
 file in this package (or one later listed in `analysis.terms.PACKAGES`) that holds a frozen
 dataclass derived from `Term` and names it in `TERMS`; nothing else changes.
 
-Sign convention of every row (NOTES): sum of columns times coefficients = right-hand side, with
+Sign convention of every row: sum of columns times coefficients = right-hand side, with
 right-hand sides G F (torque_i), + A_cap ds/dt (flow_cap_i), - A_rod ds/dt (flow_rod_i).
 
 Simulation. Each term has a kernel, a numba function of fixed signature, so that the integrator is

@@ -26,7 +26,10 @@ from rig.model.rig import Rig
 
 @dataclass(frozen=True)
 class Compressibility(Term):
-    """- (1/b) V dp/dt in the flow rows of each chamber (NOTES, "Fluid"): linear in 1/b."""
+    """- (1/b) V dp/dt in the flow rows of each chamber, linear in 1/b.
+
+    Source: Sakai and Maeshima, section II.
+    """
 
     name: ClassVar[str] = "compressibility"
 

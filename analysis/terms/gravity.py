@@ -27,7 +27,7 @@ from rig.model.rig import Rig
 
 @dataclass(frozen=True)
 class Gravity(Term):
-    """V = - sum_k W_k g cos(theta_k): joint i carries sum_{k>=i} W_k g sin(theta_k) (NOTES)."""
+    """V = - sum_k W_k g cos(theta_k): joint i carries sum_{k>=i} W_k g sin(theta_k)."""
 
     name: ClassVar[str] = "gravity"
 

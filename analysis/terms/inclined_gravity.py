@@ -34,7 +34,7 @@ class InclinedGravity(Term):
 
     Link k pulls W_k g sin(theta_k + alpha) = g [W_k cos(alpha) sin(theta_k) + W_k sin(alpha)
     cos(theta_k)]: linear in 2 N unknowns that share alpha. `reduction` gives the N + 1 parameters
-    (NOTES, "N DOF planar chain"; the common parameter of the paper's last claim).
+    (docs/n-joints.md; the common parameter of Sakai and Maeshima's last claim).
     """
 
     name: ClassVar[str] = "inclined_gravity"

@@ -29,11 +29,12 @@ from rig.model.rig import Rig
 
 @dataclass(frozen=True)
 class Inertia(Term):
-    """T = 1/2 sum_ij R_ij cos(theta_i - theta_j) theta_i' theta_j' (NOTES, "N DOF planar chain").
+    """T = 1/2 sum_ij R_ij cos(theta_i - theta_j) theta_i' theta_j' (docs/n-joints.md).
 
     In absolute angles the torque on link k is sum_j R_kj [cos(theta_k - theta_j) theta_j'' +
     sin(theta_k - theta_j) theta_j'^2]; joint i carries the links i..N, so tau_i sums k >= i.
-    For N = 2, R11 = M1 - M2, R22 = M2: this is NOTES' M(q) q'' + h with h already a torque.
+    For N = 2, R11 = M1 - M2, R22 = M2: this is Sakai and Maeshima's M(q) q'' + h with h
+    already a torque.
     """
 
     name: ClassVar[str] = "inertia"

@@ -34,12 +34,12 @@ from rig.model.rig import Rig
 
 @dataclass(frozen=True)
 class Orifice(Term):
-    """Turbulent flow through an opening proportional to the spool (NOTES, "Fluid").
+    """Turbulent flow through an opening proportional to the spool (docs/method.md).
 
     cap: C_pp sqrt(p_s - p_cap) u [u>0] + C_pm sqrt(p_cap - p_t) u [u<0];
     rod: - C_mp sqrt(p_rod - p_t) u [u>0] - C_mm sqrt(p_s - p_rod) u [u<0].
-    The paper prints the rod's root for u > 0 as zero and divides one rod term by V_cap; NOTES has
-    it from first principles. Outside [p_t, p_s] there is no real root: the rows mask the sample,
+    The paper prints the rod's root for u > 0 as zero and divides one rod term by V_cap; here
+    it is from first principles. Outside [p_t, p_s] there is no real root: the rows mask the sample,
     the simulation takes the signed root and counts it.
     """
 

@@ -23,7 +23,7 @@ from rig.model.rig import Rig
 
 @dataclass(frozen=True)
 class ViscousFriction(Term):
-    """Torque Fv_i q_i' against the motion of joint i (NOTES, "Mechanics")."""
+    """Torque Fv_i q_i' against the motion of joint i (Sakai and Maeshima, section II)."""
 
     name: ClassVar[str] = "viscous_friction"
 

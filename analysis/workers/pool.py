@@ -4,7 +4,7 @@ A pool maps a plain function (importable by name, picklable, no state of its own
 yields the results in the items' order; what the function raises, `map` raises. Use it as a context
 manager: processes and connections end with it, whatever happens inside.
 
-    with local_pool(workers) as pool:
+    with Processes(workers) as pool:
         for result in pool.map(one_study, seeds): ...
 
 Randomness comes with the items (a seed, a `SeedSequence` child), never from the process. Work is
@@ -117,12 +117,6 @@ class Processes:
             raise ChildProcessError(
                 "a worker process died (out of memory, or killed); its work is lost"
             ) from error
-
-
-def local_pool(workers: int | None = None) -> Pool:
-    """Return what Monte Carlo studies use: processes, or none for a single worker."""
-    count = workers or os.cpu_count() or 1
-    return Serial() if count == 1 else Processes(count)
 
 
 def in_order(submit: Callable[[T], Any], items: Iterable[T], workers: int) -> Iterator[Any]:

@@ -1,4 +1,4 @@
-"""Names and units of what a bench measures (CONTRACT: `spool_i piston_i cap_pressure_i …`).
+"""Names and units of what a bench measures (`spool_i piston_i cap_pressure_i …`).
 
 Electric joints have `position_i` and `drive_i` instead; their units are the joint's
 (`Rig.unit_of`).

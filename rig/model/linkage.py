@@ -1,6 +1,6 @@
 """Geometry of a cylinder between two pins: piston displacement against joint angle.
 
-Source: NOTES of the method, "Linkage": (lc + s)^2 = a^2 + c^2 - 2 a c cos(beta), beta = q + offset,
+Source: Sakai and Maeshima, section II: (lc + s)^2 = a^2 + c^2 - 2 a c cos(beta), beta = q + offset,
 with s = 0 at mid-stroke and lc the length there. The triangle's angle beta is taken in (0, pi), so
 that extending the cylinder opens it and G = ds/dq = a c sin(beta) / (lc + s) is positive.
 """

@@ -1,6 +1,6 @@
-"""Names and units of the parameters (CONTRACT, "Names").
+"""Names and units of the parameters of the model (docs/method.md, docs/n-joints.md).
 
-Source: NOTES, "N DOF planar chain": R_ii, R_ij (i<j), W_i, Fv_i; for two joints
+A planar chain has R_ii, R_ij (i<j), W_i, Fv_i; for two joints
 M1 = R11 + R22, M2 = R22, for one M1 = R11.
 """
 

@@ -1,6 +1,6 @@
 """What a bench is made of: frozen models that hold data in SI and refuse what cannot be built.
 
-Source of the geometry and constants: NOTES of the method, "Linkage" and "Bench constants".
+Source of the geometry and constants: Sakai and Maeshima, section II and Table II.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ from analysis.identify.identify import identify
 from analysis.identify.out_of_core import identify_folders
 from analysis.identify.result import PLAIN
 from analysis.workers.cluster import DaskCluster
-from analysis.workers.pool import Pool, Processes, Serial, local_pool
+from analysis.workers.pool import Pool, Processes, Serial
 from rig.model.parse import InputError
 from rig.model.records import Run
 from rig.runs.exchange.fixtures import write_run
@@ -94,11 +94,6 @@ def test_processes_are_others_have_one_thread_each_and_end_with_the_block() -> N
 def test_a_process_that_dies_ends_the_work_with_a_reason() -> None:
     with Processes(1) as pool, pytest.raises(ChildProcessError, match="a worker process died"):
         list(pool.map(gone, [1]))
-
-
-def test_one_worker_needs_no_process() -> None:
-    assert isinstance(local_pool(1), Serial)
-    assert isinstance(local_pool(3), Processes)
 
 
 @contextmanager

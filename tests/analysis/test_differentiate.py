@@ -8,14 +8,15 @@ import pytest
 from analysis.signals import filters as d
 from rig.model.parse import InputError
 from rig.model.rig import Rig
+from tests.studies.estimators import other_filters
 from tests.studies.estimators.differentiation import markdown, table
 
 RATE = 1000.0
 FIR = [
     d.moving_average(RATE),
     d.butterworth(RATE, 80.0),
-    d.savitzky_golay(RATE),
-    d.smoothing_spline(RATE, 80.0),
+    other_filters.savitzky_golay(RATE),
+    other_filters.smoothing_spline(RATE, 80.0),
     d.channel_filter(RATE),
     d.row_filter(RATE, 15.0),
 ]
@@ -63,7 +64,7 @@ def test_fourier_is_exact_on_whole_periods_that_drift() -> None:
     t = np.arange(2000) / RATE
     x = np.cos(2 * np.pi * 4 * t) + 0.3 * t
     wanted = -8 * np.pi * np.sin(2 * np.pi * 4 * t) + 0.3
-    smoother = d.FourierSmoother(RATE, 40.0)
+    smoother = other_filters.FourierSmoother(RATE, 40.0)
     inner = slice(smoother.reach, -smoother.reach)
     assert np.abs(smoother.apply(x, 1) - wanted)[inner].max() < 0.01
 

@@ -2,7 +2,7 @@
 
 Absolute angle theta_k = q_1 + ... + q_k, zero hanging straight down. The inner pin of cylinder k
 lies at distance a in direction theta_(k-1) - offset_k, the outer one at c in direction theta_k, so
-that the angle between them is beta_k = q_k + offset_k (NOTES, "Linkage").
+that the angle between them is beta_k = q_k + offset_k (`rig.model.linkage`).
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ import pytest
 from analysis.effects.base import Effect, ordered
 from analysis.effects.contact import contact_levels, contact_state, contact_under_load, worked
 from analysis.effects.measurement import Sensor
-from analysis.effects.payload import growth, payload_of_shift
+from analysis.effects.payload import growth
 from analysis.identify.identify import identify
 from analysis.regression.rows import right_sides
 from analysis.signals.conditioning import Signals
@@ -311,19 +311,11 @@ def test_a_payload_is_absorbed_and_says_so(rig: Rig, multisine_run: Run) -> None
     assert "m_payload" in solution.unidentifiable
 
 
-def test_a_payload_is_weighed_against_a_reference(rig: Rig) -> None:
-    """NOTES: 6.5 kg at the tip; M2 grows by about 1.6, M1 by twice that."""
+def test_a_payload_adds_to_the_inertia_what_a_point_mass_does(rig: Rig) -> None:
+    """6.5 kg at the tip; M2 grows by about 1.6, M1 by twice that."""
     grown = growth(rig)
     assert grown["M2"] * 6.5 == pytest.approx(1.6, rel=0.02)
     assert grown["M1"] == pytest.approx(2 * grown["M2"])
-    found = {name: TRUTH[name] + 6.5 * share for name, share in grown.items()}
-    spread = np.diag([(0.01 * abs(TRUTH[name])) ** 2 for name in grown])
-    mass, error, misfit = payload_of_shift(rig, TRUTH, found, spread)
-    assert mass == pytest.approx(6.5)
-    assert error < 0.2
-    assert misfit < 1e-6
-    found["W1"] += 2.0
-    assert payload_of_shift(rig, TRUTH, found, spread)[2] > 10
 
 
 def test_effects_that_no_data_can_tell_apart_name_each_other(rig: Rig) -> None:

@@ -16,19 +16,21 @@ from analysis.identify.identify import identify
 from analysis.identify.result import PLAIN
 from analysis.regression.rows import Filtering, default_filtering
 from analysis.signals.filters import (
-    FourierSmoother,
     Smoother,
     butterworth,
     channel_filter,
     moving_average,
     row_filter,
     row_step,
-    savitzky_golay,
-    smoothing_spline,
 )
 from analysis.simulation.synthetic import multisine, sine, synthetic_run
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
+from tests.studies.estimators.other_filters import (
+    FourierSmoother,
+    savitzky_golay,
+    smoothing_spline,
+)
 
 Choice = Callable[[Record], Filtering]
 
