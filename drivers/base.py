@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol, Self
+from typing import Any, ClassVar, Protocol, Self, runtime_checkable
 from urllib.parse import SplitResult
 
 import numpy as np
@@ -31,6 +31,10 @@ class DeviceError(Exception):
 
 class DeviceLost(DeviceError):
     """The device does not answer any more (or never did)."""
+
+
+class DeviceBusy(DeviceError):
+    """Another client has control of the device; this one may only zero its outputs."""
 
 
 @dataclass(frozen=True)
@@ -153,3 +157,11 @@ class Driver(Protocol):
 
     def reset(self) -> None:
         """Clear a latched trip of the device; only on a person's word."""
+
+
+@runtime_checkable
+class LatchesTrip(Protocol):
+    """A driver whose device can be left with a latched trip of its own, against any other host."""
+
+    def close_tripped(self) -> None:
+        """Zero the outputs, then close so that the device latches a trip; never raises."""

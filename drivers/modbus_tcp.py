@@ -16,6 +16,7 @@ from pydantic import Field
 
 from drivers.base import (
     Array,
+    DeviceBusy,
     DeviceError,
     DeviceInfo,
     DeviceLost,
@@ -27,7 +28,7 @@ from drivers.modbus_blocks import BlockDecoder, unwrap
 from drivers.modbus_transport import DeviceRefused, DeviceSilent, ModbusConnection, unpack
 from rig.model import registers as reg
 from rig.model.codes import encode_output
-from rig.model.parts import Wire
+from rig.model.parts import LOCALHOST, PORT, Wire
 from rig.model.registers import Refusal, Status, TripCause
 from rig.model.rig import Rig
 
@@ -43,8 +44,8 @@ class TcpSettings(WireSettings):
 
     example: ClassVar = "modbus-tcp://127.0.0.1:5020"
 
-    host: str = "127.0.0.1"
-    port: int = Field(default=5020, ge=0, le=65535)
+    host: str = LOCALHOST
+    port: int = Field(default=PORT, ge=0, le=65535)
 
     @classmethod
     def of_endpoint(cls, url: SplitResult) -> Mapping[str, Any]:
@@ -107,6 +108,17 @@ class ModbusTcpDriver:
             logger.debug("while closing: %s", error)
         finally:
             # A device that lost its controller zeroes its outputs by itself.
+            with suppress(OSError):
+                self._link.close()
+
+    def close_tripped(self) -> None:
+        """Zero the outputs, then close while it streams: the device latches a lost host."""
+        try:
+            if self._link.is_open:
+                self._command(reg.CONTROL_ZERO, reg.ZERO_NOW)
+        except DeviceError as error:
+            logger.debug("while closing after a trip: %s", error)
+        finally:
             with suppress(OSError):
                 self._link.close()
 
@@ -263,6 +275,8 @@ class ModbusTcpDriver:
         text = reg.REFUSAL_TEXT[Refusal(reason)]
         if reason == Refusal.TRIPPED:
             text = f"tripped: {self.trip_cause()}; find the cause, then reset it"
+        if reason == Refusal.NOT_IN_CONTROL:
+            return DeviceBusy(f"another client has control of the device at {self._link.where}")
         at = f" (joint {joint})" if joint else ""
         return DeviceRefused(f"device at {self._link.where} refused {about}{at}: {text}")
 

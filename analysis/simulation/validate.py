@@ -1,8 +1,8 @@
 """Validation: the model driven by the measured spool (electric: drive) against what was measured.
 
 FIT = 100 (1 - |y - yhat| / |y - mean y|) per channel (Sakai and Maeshima, Table IV), free run from
-the record's first sample; windowed RMSE restarts the model from the data every 0.25 s, which shows the model's
-rates without the drift that a free run collects.
+the record's first sample; windowed RMSE restarts the model from the data every 0.25 s, which shows
+the model's rates without the drift that a free run collects.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The local sockets through which a screen watches a run and stops it; only their owner may.
 
 Two ZeroMQ sockets per session in a folder of mode 0700: `<rig>-<pid>.pub` (PUB: snapshots) and
-`<rig>-<pid>.cmd` (REP: "stop", "reset"). The run never waits for a screen: snapshots that nobody
+`<rig>-<pid>.cmd` (REP: "stop"). The run never waits for a screen: snapshots that nobody
 takes are dropped, commands are polled.
 """
 
@@ -27,7 +27,7 @@ __all__ = ["AttachError", "Attachment", "ChannelView", "Endpoint", "Publisher", 
 
 log = logging.getLogger(__name__)
 
-COMMANDS = ("stop", "reset")
+COMMANDS = ("stop",)
 _MAX_PATH = 100  # a Unix socket's address holds 107 bytes
 _MAX_NAME = 32
 _FILE = re.compile(r"^(?P<rig>.+)-(?P<pid>\d+)\.(?:pub|cmd)$")

@@ -7,14 +7,15 @@ import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import TypeVar
+from typing import Final, TypeVar
 
-from drivers.base import DeviceError, DeviceInfo, DeviceLost, Driver, OutputLaw
+from drivers.base import DeviceError, DeviceInfo, DeviceLost, Driver, LatchesTrip, OutputLaw
 from rig.model.rig import Rig
 
 log = logging.getLogger(__name__)
 Result = TypeVar("Result")
 
+UNSURE: Final = "outputs not confirmed at zero"
 _ZERO_ATTEMPTS = 2
 
 
@@ -26,6 +27,12 @@ class Outputs:
         self._rig = rig
         self._connected = False
         self._silent = False
+        self._told = False  # that zero is not confirmed: once, until it is
+
+    @property
+    def connected(self) -> bool:
+        """Whether the device has answered, and so may have outputs that are not zero."""
+        return self._connected
 
     def connect(self) -> DeviceInfo:
         """Open the wire, check that device and rig fit, zero the outputs; DeviceError if not."""
@@ -55,15 +62,18 @@ class Outputs:
             except Exception as error:
                 problem = error
             else:
-                self._silent = False
+                self._silent = self._told = False
                 return True
-        if not self._silent:
+        if not self._told:
             log.error(
-                "outputs not confirmed at zero (%s); the device's watchdog zeroes them in %g s",
+                "%s (%s); the device's own watchdog should zero them in %g s: keep away from the "
+                "machine, use its emergency stop",
+                UNSURE,
                 problem,
                 self._rig.wire.watchdog,
+                extra={"alarm": True},
             )
-        self._silent = True
+        self._silent = self._told = True
         return False
 
     def safely(self, call: Callable[[], Result]) -> Result:
@@ -72,9 +82,10 @@ class Outputs:
             return call()
         except BaseException as error:
             if isinstance(error, DeviceLost):
-                log.error("%s", error)
                 self._silent = True
-            self.zero()
+            self.zero()  # says first what matters most: whether they are at zero
+            if isinstance(error, DeviceLost):
+                log.error("%s", error)
             raise
 
     def bounded(self, laws: Sequence[OutputLaw]) -> list[OutputLaw]:
@@ -86,13 +97,19 @@ class Outputs:
             _bounded(law, joint.limits.command) for law, joint in zip(laws, joints, strict=True)
         ]
 
-    def close(self) -> bool:
-        """Zero once more, stop the stream, close the wire; says whether zero is sure; no raise."""
+    def close(self, *, tripped: bool = False) -> bool:
+        """Zero once more, stop the stream, close the wire; says whether zero is sure; no raise.
+
+        After a trip the wire is closed so that the device latches it too, where its driver can.
+        """
         zeroed = self.zero() or not self._connected
-        if self._connected and not self._silent:
-            with suppress(DeviceError):
-                self.driver.stop()
-        self.driver.close()
+        if tripped and not self._silent and isinstance(self.driver, LatchesTrip):
+            self.driver.close_tripped()
+        else:
+            if self._connected and not self._silent:
+                with suppress(DeviceError):
+                    self.driver.stop()
+            self.driver.close()
         self._connected = False
         return zeroed
 

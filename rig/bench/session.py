@@ -1,7 +1,8 @@
 """The bench: one session with a device, in which every way out begins with outputs at zero.
 
 Order on any exit: outputs to zero, the wire closed, data flushed, then the report. Signals set a
-flag that the exchange loop honours; nothing interrupts the zeroing. Trips latch.
+flag that the exchange loop honours; nothing interrupts the zeroing. A trip latches: no session with
+this bench begins until a person has cleared it (`rig.bench.latch`).
 """
 
 from __future__ import annotations
@@ -18,22 +19,38 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import DeviceError, DeviceInfo, Driver, OutputLaw, SampleBlock
+from drivers.base import (
+    DeviceBusy,
+    DeviceError,
+    DeviceInfo,
+    DeviceLost,
+    Driver,
+    OutputLaw,
+    SampleBlock,
+)
+from rig.bench.after_zero import record_zero
 from rig.bench.attach import Publisher
 from rig.bench.display import Display
 from rig.bench.guard import Guard, GuardSettings, JointRole
 from rig.bench.handles import RecordHandle
+from rig.bench.latch import BenchState
 from rig.bench.lateness import ArrivalClock
 from rig.bench.observers import Observers
-from rig.bench.outputs import Outputs
+from rig.bench.outputs import UNSURE, Outputs
 from rig.bench.stops import StopFlag
 from rig.model.rig import Rig
-from rig.model.trips import Latched, OperatorStop, RecordingFailed, SafetyTrip, Violation
+from rig.model.trips import (
+    Latched,
+    OperatorStop,
+    RecordingFailed,
+    SafetyTrip,
+    Violation,
+    reset_command,
+)
 from rig.runs import runstate
 from rig.runs.recorder import Recorder, RecordMeta
 
 log = logging.getLogger(__name__)
-UNSURE = "outputs not confirmed at zero"
 Array = NDArray[np.float64]
 
 
@@ -41,8 +58,9 @@ class Bench:
     """A session with the device behind `driver`; a context manager that owns driver and publisher.
 
     Call `exchange` (or `run_for`) at least as often as the rig's watchdog: nothing may wait
-    elsewhere. Raises InputError, DeviceError, DeviceLost, RecordingFailed on entry; SafetyTrip,
-    OperatorStop and the same from then on, each with the outputs already at zero.
+    elsewhere. Raises InputError, Latched, DeviceBusy, DeviceError, DeviceLost, RecordingFailed on
+    entry; SafetyTrip, OperatorStop and the same from then on, each with the outputs already at
+    zero. `state` is what outlives the session, by default of the bench at the rig's wire.
     """
 
     info: DeviceInfo
@@ -57,8 +75,10 @@ class Bench:
         clock: Callable[[], float] = time.monotonic,
         settings: GuardSettings | None = None,
         signals: bool = True,
+        state: BenchState | None = None,
     ) -> None:
         self.rig = rig
+        self.state = state or BenchState(rig.wire)
         self.recorder = recorder
         self.observers = Observers()
         self.trip: SafetyTrip | None = None
@@ -80,10 +100,13 @@ class Bench:
         if self._signals:
             self._stop.install()
         try:
-            self.info = self._outputs.connect()
+            self.state.refuse_if_tripped(self.rig)
+            self.state.prepare()
+            self.info = self._connect()
+            self.state.take(None if self.recorder is None else self.recorder.folder)
             cause = self._outputs.safely(self._driver.trip_cause)
             if cause is not None:
-                raise Latched(cause, self.rig)
+                raise Latched(f"the device tripped earlier and stays so: {cause}", self.rig)
             if self.recorder is not None:
                 self.recorder.open(self.info)
             self.restart()
@@ -91,6 +114,18 @@ class Bench:
             self._leave(error)
             raise
         return self
+
+    def _connect(self) -> DeviceInfo:
+        try:
+            return self._outputs.connect()
+        except DeviceBusy as error:
+            holder = self.state.holder()
+            if holder is None:
+                raise DeviceBusy(f"{error}; no process of this computer is known to") from error
+            run = f", which writes {holder.run}" if holder.run else ""
+            raise DeviceBusy(
+                f"{error}: process {holder.pid}{run}; wait for its end or stop it"
+            ) from error
 
     def restart(self) -> None:
         """Start (again) the device's stream of blocks and its waveforms."""
@@ -107,24 +142,52 @@ class Bench:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._leave(error)
+        sure = self._leave(error)
         if error is None and self._stop.reason is not None:
             raise OperatorStop(f"{self._stop.reason}; the run itself was complete")
+        if error is None and not sure:
+            raise DeviceLost(f"{UNSURE}; the run itself was complete")
 
-    def _leave(self, error: BaseException | None) -> None:
-        """Zero, close the wire, flush, report; the signals come back last."""
+    def _leave(self, error: BaseException | None) -> bool:
+        """Zero, prove it, close the wire, flush, report; says whether the outputs are at zero.
+
+        The signals come back last.
+        """
         state, message = _outcome(error)
+        unsure = f"{message}; {UNSURE}".lstrip("; ")
+        sure = False
         try:
-            if not self._outputs.close():
-                message = f"{message}; {UNSURE}".lstrip("; ")
-            # A screen waits for this, and flushing can take seconds.
-            self._display.ended(state, message)
+            sure = not self._outputs.connected or self._outputs.zero()
+            # A screen waits for this, and what follows can take seconds.
+            self._display.ended(state, message if sure else unsure)
+            if sure and not self._ends_at_zero(error):
+                log.error("%s: it still reports a command", UNSURE, extra={"alarm": True})
+                sure = False
+            if not self._outputs.close(tripped=self.trip is not None) or not sure:
+                sure, message = False, unsure
+                self._display.ended(state, message)
+                if error is not None:
+                    error.add_note(UNSURE)
         finally:
+            self.state.release()
             try:
                 self._flush(state, message, error)
             finally:
                 self._display.close()
                 self._stop.restore()
+        return sure
+
+    def _ends_at_zero(self, error: BaseException | None) -> bool:
+        """Record that an early end leaves the outputs at zero; False if the device says not."""
+        early = error is not None or self._stop.reason is not None
+        recording = self.recorder is not None and self.recorder.is_open
+        if not early or not recording or self._expected is None:
+            return True
+
+        def keep(block: SampleBlock) -> None:
+            self._keep(block, None, self._continue(block))
+
+        return record_zero(self.rig, self._driver.read_block, keep, self._clock) is not False
 
     def _flush(self, state: str, message: str, error: BaseException | None) -> None:
         if self.recorder is None:
@@ -176,7 +239,7 @@ class Bench:
         trip = None
         if violation is not None:
             self.zero_outputs()
-            trip = self._latch(SafetyTrip(violation, self.rig))
+            trip = self._latch(violation)
         self._keep(block, late, lost)
         self.observers.block(block)
         self._display.show(block, late or 0.0, self.lost_samples, self._guard.roles)
@@ -222,10 +285,13 @@ class Bench:
 
         self._outputs.safely(keep)
 
-    def _latch(self, trip: SafetyTrip | None) -> SafetyTrip | None:
-        self.trip = trip
-        self._display.trip = None if trip is None else str(trip)
-        return trip
+    def _latch(self, violation: Violation) -> SafetyTrip:
+        self.trip = SafetyTrip(violation, self.rig)
+        self._display.trip = str(self.trip)
+        folder = None if self.recorder is None else self.recorder.folder
+        if self.state.latch(str(self.trip), self.rig, folder):
+            self.trip.add_note(f"look at the bench, then clear it with `{reset_command(self.rig)}`")
+        return self.trip
 
     def _report(self, trip: SafetyTrip) -> None:
         log.info("%s", trip)
@@ -235,11 +301,8 @@ class Bench:
 
     def _heed(self) -> None:
         """Honour a wish to stop and a latched trip before anything else is done."""
-        for command in self._display.commands():
-            if command == "stop":
-                self._stop.request("stopped by operator (from the screen)")
-            elif self.trip is not None:
-                self.reset()
+        if self._display.commands():
+            self._stop.request("stopped by operator (from the screen)")
         if self._stop.reason is not None:
             self.zero_outputs()
             with suppress(RecordingFailed):
@@ -248,13 +311,6 @@ class Bench:
         if self.trip is not None:
             self.zero_outputs()
             raise self.trip
-
-    def reset(self) -> None:
-        """Clear a latched trip, here and in the device; only on a person's word."""
-        self._outputs.safely(self._driver.reset)
-        self._latch(None)
-        self._guard.forget()
-        self.event("reset", self.tick)
 
     def run_for(self, seconds: float, watch: Callable[[SampleBlock], None] | None = None) -> Array:
         """Exchange until `seconds` of device time have passed; returns their samples.

@@ -125,14 +125,17 @@ def run(
 def reset(
     rig: RigOption,
     endpoint: EndpointOption = None,
+    reason: Annotated[
+        str, typer.Option(help="What was found and done; kept with the trip.  [required]")
+    ] = "",
 ) -> None:
-    """Clear a trip that the device has latched, after a person has looked at the bench.
+    """Clear a latched trip, in the device and on this computer, after a look at the bench.
 
-    Example: bramah reset --rig shinshu-2dof
+    Example: bramah reset --rig shinshu-2dof --reason "pressure sensor 2 replaced"
     """
     from rig.cli.running import reset_device
 
-    typer.echo(f"cleared: {reset_device(rig, endpoint)}")
+    typer.echo(f"cleared: {reset_device(rig, endpoint, reason)}")
 
 
 def monitor(

@@ -11,8 +11,9 @@ from collections.abc import Callable
 import typer
 from typer.exceptions import TyperException
 
-from drivers.base import DeviceError
+from drivers.base import DeviceBusy, DeviceError
 from protocols.engine.errors import ProtocolAborted
+from rig.bench.outputs import UNSURE
 from rig.model.parse import InputError
 from rig.model.trips import Latched, OperatorStop, RecordingFailed, SafetyTrip
 
@@ -30,8 +31,28 @@ class WorkError(Exception):
     """The work could not be done; the message says why in one line (exit code 1)."""
 
 
+def coloured() -> bool:
+    """Return whether standard error is a terminal on which the person wants colour."""
+    return sys.stderr.isatty() and not os.environ.get("NO_COLOR")
+
+
+def alarm(text: str) -> str:
+    """Return a text in white on red where standard error has colour."""
+    return f"\033[1;37;41m{text}\033[0m" if coloured() else text
+
+
+class LogFormatter(logging.Formatter):
+    """Writes a log line; one that carries `alarm` is shown as `alarm` shows a text."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line."""
+        line = super().format(record)
+        return alarm(line) if getattr(record, "alarm", False) else line
+
+
 def _say(message: str) -> None:
-    print("bramah: " + " ".join(message.split()), file=sys.stderr)
+    line = "bramah: " + " ".join(message.split())
+    print(alarm(line) if UNSURE in line else line, file=sys.stderr)
 
 
 def _os_error(error: OSError) -> str:
@@ -43,6 +64,7 @@ def _os_error(error: OSError) -> str:
 _CODES: tuple[tuple[tuple[type[BaseException], ...], int, Callable[..., str]], ...] = (
     ((InputError,), BAD_INPUT, str),
     ((SafetyTrip, Latched), TRIPPED, str),
+    ((DeviceBusy,), DEVICE_LOST, lambda error: f"device in use: {error}"),
     ((DeviceError,), DEVICE_LOST, lambda error: f"device: {error}"),
     ((OperatorStop, KeyboardInterrupt), INTERRUPTED, lambda error: str(error) or "stopped"),
     ((WorkError, RecordingFailed, ProtocolAborted), FAILED, str),
@@ -53,8 +75,15 @@ _CODES: tuple[tuple[tuple[type[BaseException], ...], int, Callable[..., str]], .
 def _code_and_message(error: BaseException) -> tuple[int, str]:
     for kinds, code, text in _CODES:
         if isinstance(error, kinds):
-            return code, text(error)
+            return code, _with_notes(error, text(error))
     return FAILED, f"{type(error).__name__}: {error}; --debug shows where"
+
+
+def _with_notes(error: BaseException, message: str) -> str:
+    """Return the message with what the bench added; outputs that may not be zero come first."""
+    notes = list(getattr(error, "__notes__", ()))
+    first = [note for note in notes if note == UNSURE]
+    return "; ".join([*first[:1], message, *(note for note in notes if note != UNSURE)])
 
 
 def guarded(work: Callable[[], int | None], *, debug: bool) -> int:

@@ -12,7 +12,7 @@ from typing import Final
 import typer
 
 import rig.cli
-from rig.cli.errors import guarded
+from rig.cli.errors import LogFormatter, guarded
 
 # Matrices here are tall and narrow, and there are many: BLAS threads get in each other's way.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -38,9 +38,7 @@ def run(arguments: list[str] | None = None) -> None:
     words = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in words
     words = [word for word in words if word != "--debug"]
-    logging.basicConfig(
-        level=logging.DEBUG if debug else logging.WARNING,
-        format="%(levelname)s %(name)s: %(message)s",
-        stream=sys.stderr,
-    )
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(LogFormatter("%(levelname)s %(name)s: %(message)s"))
+    logging.basicConfig(level=logging.DEBUG if debug else logging.WARNING, handlers=[handler])
     sys.exit(guarded(lambda: app(words, standalone_mode=False), debug=debug))

@@ -16,6 +16,7 @@ from protocols.engine import engine
 from protocols.files import library
 from protocols.files.plan import Overrides, Plan, resolve
 from rig.bench.attach import AttachError, Publisher
+from rig.bench.latch import reset_bench
 from rig.bench.session import Bench
 from rig.model.rig import Rig
 from rig.runs.recorder import Recorder
@@ -126,18 +127,12 @@ def run_protocol(job: ProtocolJob, say: Say) -> Path:
     return job.out
 
 
-def reset_device(rig: str, endpoint: str | None) -> str:
-    """Clear a device's latched trip on a person's word; returns what had tripped it."""
+def reset_device(rig: str, endpoint: str | None, reason: str) -> str:
+    """Clear a bench's latched trip on a person's word; returns what had tripped it."""
     described = load_bench(rig)
     wire = described.wire if endpoint is None else wire_at(endpoint, described.wire)
-    driver = make_driver(wire, described)
-    try:
-        driver.connect()
-        cause = driver.trip_cause()
-        driver.reset()
-    finally:
-        driver.close()
-    return cause or "nothing"
+    described = described.model_copy(update={"wire": wire})
+    return reset_bench(described, make_driver(wire, described), reason)
 
 
 def overridden(

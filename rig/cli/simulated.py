@@ -8,11 +8,30 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
+from rig.bench.latch import STATE_VARIABLE
 from rig.cli.errors import WorkError
 
 _START = "from rig.cli.main import run; run()"
 _END_SECONDS = 10.0
+
+
+@contextmanager
+def _state_of_its_own() -> Iterator[None]:
+    """Keep what a bench leaves behind (`rig.bench.latch`) in a folder that goes with it.
+
+    A simulated bench on a free port is a new one: no trip of another that had this port is its.
+    """
+    before = os.environ.get(STATE_VARIABLE)
+    with TemporaryDirectory(prefix="bramah-") as folder:
+        os.environ[STATE_VARIABLE] = folder
+        try:
+            yield
+        finally:
+            os.environ.pop(STATE_VARIABLE)
+            if before is not None:
+                os.environ[STATE_VARIABLE] = before
 
 
 @contextmanager
@@ -32,14 +51,17 @@ def simulated_bench(
     words += [] if truth is None else ["--truth", str(truth)]
     words += ["--real-time"] if real_time else []
     words += [] if scenario is None else ["--scenario", str(scenario)]
-    with subprocess.Popen(
-        [sys.executable, "-c", _START, *words],
-        stdout=subprocess.PIPE,
-        stdin=subprocess.DEVNULL,
-        text=True,
-        # A Ctrl-C at the terminal is for us; the bench must live until its outputs are zeroed.
-        start_new_session=True,
-    ) as child:
+    with (
+        _state_of_its_own(),
+        subprocess.Popen(
+            [sys.executable, "-c", _START, *words],
+            stdout=subprocess.PIPE,
+            stdin=subprocess.DEVNULL,
+            text=True,
+            # A Ctrl-C at the terminal is for us; the bench must live until its outputs are zeroed.
+            start_new_session=True,
+        ) as child,
+    ):
         assert child.stdout is not None
         try:
             endpoint = child.stdout.readline().strip()

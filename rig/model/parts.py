@@ -6,7 +6,7 @@ Source of the geometry and constants: Sakai and Maeshima, section II and Table I
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal, Self
+from typing import Any, Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -242,6 +242,10 @@ class Oil(Part):
     temperature_band: TemperatureDifference = Field(default=2.0, ge=0)
 
 
+LOCALHOST: Final = "127.0.0.1"
+PORT: Final = 5020  # of a bench that listens on TCP, where its rig file names none
+
+
 class Wire(Part):
     """How the bench is reached: the kind of wire, times, and the settings of that kind's driver.
 
@@ -262,3 +266,13 @@ class Wire(Part):
     def reached_by(self, kind: str, settings: Mapping[str, Any]) -> Wire:
         """Return a wire with the same times, of this kind and with these settings."""
         return Wire(kind=kind, timeout=self.timeout, watchdog=self.watchdog, **settings)
+
+    @property
+    def endpoint(self) -> str:
+        """Where the bench answers, as `--endpoint` takes it: a device file, or host and port."""
+        at = self.settings
+        if "device" in at:
+            return f"{self.kind}://{at['device']}"
+        host = str(at.get("host", LOCALHOST))
+        host = f"[{host}]" if ":" in host else host
+        return f"{self.kind}://{host}:{at.get('port', PORT)}"

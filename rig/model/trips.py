@@ -80,14 +80,16 @@ class SafetyTrip(Exception):
         )
 
 
-class Latched(Exception):
-    """The device keeps its outputs at zero since an earlier trip (exit 3)."""
+def reset_command(rig: Rig) -> str:
+    """Return the command that clears a trip of this rig's bench."""
+    return f"bramah reset --rig {rig.name} --endpoint {rig.wire.endpoint} --reason TEXT"
 
-    def __init__(self, cause: str, rig: Rig) -> None:
-        super().__init__(
-            f"the device tripped earlier and stays so: {cause}; look at the bench, "
-            f"then clear it with `bramah reset --rig {rig.name}`"
-        )
+
+class Latched(Exception):
+    """The bench tripped earlier and nobody has cleared that; nothing was moved (exit 3)."""
+
+    def __init__(self, what: str, rig: Rig) -> None:
+        super().__init__(f"{what}; look at the bench, then clear it with `{reset_command(rig)}`")
 
 
 class OperatorStop(Exception):

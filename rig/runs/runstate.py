@@ -55,7 +55,7 @@ class Owner:
     host: str
 
 
-def _started(pid: int) -> str | None:
+def process_started(pid: int) -> str | None:
     """Return when a process started, in its kernel's words; None if there is no such process."""
     try:
         stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
@@ -78,7 +78,7 @@ def _started(pid: int) -> str | None:
 
 def process_alive(pid: int, started: str = "") -> bool:
     """Whether process `pid` lives; with `started`, whether it is still the same one."""
-    found = _started(pid)
+    found = process_started(pid)
     if found is None:
         return False
     return not (found and started) or found == started
@@ -86,7 +86,7 @@ def process_alive(pid: int, started: str = "") -> bool:
 
 def take_ownership(folder: Path) -> None:
     """Note this process as the one that writes the run."""
-    owner = Owner(os.getpid(), _started(os.getpid()) or "", here())
+    owner = Owner(os.getpid(), process_started(os.getpid()) or "", here())
     replace_text(folder / _OWNER, json.dumps(asdict(owner)) + "\n")
 
 

@@ -107,7 +107,9 @@ def test_a_killed_run_leaves_valves_closed_and_is_recovered(endless: Path, tmp_p
         )
         assert refused.returncode == 3, refused.stderr
         assert "bramah reset" in refused.stderr
-        cleared = bramah("reset", "--rig", RIG, "--endpoint", endpoint)
+        cleared = bramah(
+            "reset", "--rig", RIG, "--endpoint", endpoint, "--reason", "the run was killed"
+        )
         assert cleared.returncode == 0, cleared.stderr
         assert not (tmp_path / "next").exists()
     assert "interrupted" in bramah("runs", tmp_path).stdout

@@ -13,6 +13,7 @@ import pytest
 
 from drivers.base import DeviceError, DeviceInfo, DeviceLost, OutputLaw, SampleBlock
 from rig.bench.guard import EXCITED, FREE, JointRole
+from rig.bench.latch import reset_bench
 from rig.bench.session import Bench
 from rig.model.trips import Latched, OperatorStop, SafetyTrip
 from rig.runs.recorder import Recorder
@@ -114,8 +115,11 @@ def test_a_trip_latches_until_it_is_reset(caplog: pytest.LogCaptureFixture) -> N
                 attempt()
             assert again.value is first.value
         assert set(driver.calls) == {"zero"}
-        bench.reset()
-        assert driver.calls[-1] == "reset"
+    with pytest.raises(Latched, match=r"9.5 MPa.*bramah reset .*--reason"), Bench(RIG, driver):
+        pytest.fail("a run began on a bench that had tripped")
+    assert reset_bench(RIG, driver, "sensor replaced").startswith("safety trip: limit 'pressure'")
+    assert driver.calls[-3:] == ["connect", "reset", "close"]
+    with Bench(RIG, driver) as bench:
         bench.apply(MOVE)
         assert len(bench.run_for(0.1)) == 100
 
@@ -183,7 +187,7 @@ def test_a_device_of_another_rig_is_refused_at_zero(tmp_path: Path) -> None:
     driver.info = DeviceInfo("other", 3, 14, 1000.0, 10, True)
     with pytest.raises(DeviceError, match="has 3 joints, rig 'shinshu-2dof' has 2"):
         Bench(RIG, driver, Recorder(tmp_path / "run", RIG)).__enter__()
-    assert driver.calls == ["connect", "zero", "zero", "stop", "close"]
+    assert driver.calls == ["connect", "zero", "zero", "zero", "stop", "close"]
     assert not (tmp_path / "run").exists()
 
 
@@ -283,8 +287,8 @@ def test_a_signal_stops_at_the_next_exchange_and_the_handlers_come_back(
         bench.apply(MOVE)
         with bench.record(step="s", start_tick=0):
             bench.run_for(1.0)
-    assert driver.calls[3:] == ["apply", "zero", "zero", "zero", "stop", "close"]
-    assert driver.tick == 80
+    assert driver.calls[3:] == ["apply", "zero", "zero", "zero", "zero", "stop", "close"]
+    assert driver.tick == 80 + 2000
     assert signal.getsignal(number) is before
     run = load_run(tmp_path / "r", partial=True)
     assert (run.state, run.records[0].samples) == ("aborted", 80)

@@ -1,0 +1,96 @@
+"""A trip that the host saw keeps the bench from running until a person clears it with a reason."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from rig.runs.store import load_run
+from tests.cli.bench import LONG, SHORT, bramah, simulated, started, wait_for
+from tests.services.test_after_zero import commands
+
+RIG = "shinshu-2dof"
+
+
+@pytest.fixture
+def short(tmp_path: Path) -> Path:
+    path = tmp_path / "short.yaml"
+    path.write_text(SHORT)
+    return path
+
+
+@pytest.fixture
+def faulty(tmp_path: Path) -> Iterator[str]:
+    """The endpoint of a bench whose sensor reads 6 MPa too high: every run of it trips."""
+    scenario = tmp_path / "scenario.yaml"
+    scenario.write_text(
+        "effects: [{name: sensor_offset, channel: cap_pressure_2, offset: 6 MPa}]\n"
+    )
+    with simulated("--scenario", scenario) as (endpoint, _):
+        yield endpoint
+
+
+def test_after_a_trip_nothing_moves_until_a_reset_with_a_reason(
+    short: Path, faulty: str, tmp_path: Path, state: Path
+) -> None:
+    def run(name: str):
+        return bramah("run", short, "--rig", RIG, "--out", tmp_path / name, "--endpoint", faulty)
+
+    first = run("first")
+    assert first.returncode == 3, first.stderr
+    assert f"bramah reset --rig {RIG} --endpoint {faulty} --reason" in first.stderr
+    put_out = commands(tmp_path / "first")
+    assert len(put_out) > 2000
+    assert not put_out[-2000:].any()
+
+    refused = run("second")
+    assert refused.returncode == 3, refused.stderr
+    for word in ("cap_pressure_2", str(tmp_path / "first"), f"--endpoint {faulty} --reason"):
+        assert word in refused.stderr
+    assert not (tmp_path / "second").exists()
+
+    # A host that knows nothing of the trip, such as another computer: the device itself refuses.
+    (note,) = state.rglob("trip.json")
+    kept = note.read_text()
+    note.unlink()
+    elsewhere = run("third")
+    assert elsewhere.returncode == 3, elsewhere.stderr
+    assert "the device tripped earlier" in elsewhere.stderr
+    note.write_text(kept)
+
+    unsaid = bramah("reset", "--rig", RIG, "--endpoint", faulty)
+    assert unsaid.returncode == 2
+    assert "--reason TEXT is missing" in unsaid.stderr
+    assert run("fourth").returncode == 3
+
+    line = ("reset", "--rig", RIG, "--endpoint", faulty, "--reason", "sensor looked at")
+    cleared = bramah(*line)
+    assert cleared.returncode == 0, cleared.stderr
+    assert "cap_pressure_2" in cleared.stdout
+    again = run("fifth")  # it drives the machine, and trips anew
+    assert again.returncode == 3, again.stderr
+    assert "still" not in again.stderr
+    assert (tmp_path / "fifth" / "state").read_text() == "tripped\n"
+
+
+def test_a_second_run_on_a_bench_in_use_names_the_run_that_has_it(tmp_path: Path) -> None:
+    endless = tmp_path / "endless.yaml"
+    endless.write_text(SHORT.replace("repeats: 2", "repeats: 400"))
+    run = tmp_path / "monday"
+    with simulated() as (endpoint, _):
+        line = ("run", endless, "--rig", RIG, "--endpoint", endpoint, "--out")
+        with started(*line, run) as process:
+            wait_for("record 1 of", process)
+            second = bramah(*line, tmp_path / "second")
+            assert second.returncode == 4, second.stderr
+            assert f"in use: another client has control of the device at {endpoint[13:]}" in (
+                second.stderr
+            )
+            assert f"process {process.pid}, which writes {run}" in second.stderr
+            assert process.poll() is None
+            process.terminate()
+            process.communicate(timeout=LONG)
+            assert process.returncode == 130
+    assert load_run(run, partial=True).records

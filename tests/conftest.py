@@ -1,0 +1,25 @@
+"""No test reads or writes what the person's own benches left behind."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from rig.bench.latch import STATE_VARIABLE
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _state_folder(tmp_path_factory: pytest.TempPathFactory):
+    """A state folder for what runs in fixtures that several tests share."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(STATE_VARIABLE, str(tmp_path_factory.mktemp("state")))
+        yield
+
+
+@pytest.fixture(autouse=True)
+def state(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A state folder of the test's own: its processes inherit it."""
+    folder = tmp_path_factory.mktemp("state")
+    monkeypatch.setenv(STATE_VARIABLE, str(folder))
+    return folder
