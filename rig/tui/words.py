@@ -9,6 +9,7 @@ from typing import Final
 from rich.text import Text
 
 from rig.bench.attach import ChannelView, Endpoint, Snapshot
+from rig.bench.outputs import UNSURE
 from rig.model import channels as ch
 from rig.tui.link import ENDED_STATES, QUIET, Frame, LinkStage
 from rig.tui.story import trip_text
@@ -73,6 +74,8 @@ def notices(frame: Frame, stop: Stop | None, now: float, *, paused: bool) -> lis
     if frame.trouble:
         found.append(Notice("alarm", f"CANNOT REACH RUNS: {frame.trouble}"))
     snapshot = frame.snapshot
+    if snapshot is not None and UNSURE in snapshot.message:
+        found.append(Notice("alarm", f"{UNSURE.upper()}: keep away from the machine. {EMERGENCY}"))
     if snapshot is not None and snapshot.trip is not None:
         found.append(Notice("alarm", f"TRIP  {trip_text(snapshot.trip)}"))
     if stop is not None and (stop.endpoint == frame.endpoint or now - stop.at < LINGER):
@@ -125,7 +128,7 @@ def _zeroed(snapshot: Snapshot) -> bool:
     """
     said = snapshot.message.lower()
     stopped = snapshot.state == "aborted" and "stopped" in said
-    return (stopped or snapshot.state == "tripped") and "not confirmed" not in said
+    return (stopped or snapshot.state == "tripped") and UNSURE not in said
 
 
 def _ended(frame: Frame) -> Notice:

@@ -133,6 +133,10 @@ def test_a_bench_that_dies_mid_run_is_reported_and_its_data_kept(
             _, errors = process.communicate(timeout=LONG)
         assert process.returncode == 4, errors
         assert "does not answer" in errors or "not answered" in errors or "closed" in errors
+        alarm, lost, last = errors.strip().splitlines()[-3:]
+        assert "outputs not confirmed at zero" in alarm
+        assert "not confirmed" not in lost
+        assert last.startswith("bramah: outputs not confirmed at zero; device: ")
         assert "Traceback" not in errors
     assert len(load_run(run).records) >= 2
 

@@ -79,6 +79,16 @@ def test_only_a_run_that_says_it_stopped_confirms_a_stop(message: str, level: st
     assert notice[0] == level
 
 
+@pytest.mark.parametrize("state", ["aborted", "tripped", "done"])
+def test_outputs_that_may_not_be_zero_stand_above_all_else(state: str) -> None:
+    message = "the device does not answer; outputs not confirmed at zero"
+    frame = replace(LIVE, snapshot=replace(tripped(VIEW), state=state, message=message))
+    level, text = said(frame, Stop(100.0, HERE, KeyAnswer.TAKEN))[0]
+    assert level == "alarm"
+    assert text.startswith("OUTPUTS NOT CONFIRMED AT ZERO: ")
+    assert "emergency stop" in text
+
+
 def test_a_stop_of_another_run_is_never_confirmed_by_the_one_shown() -> None:
     elsewhere = Stop(100.0, endpoint("press", 7), KeyAnswer.TAKEN)
     frame = replace(LIVE, snapshot=stopped(VIEW))
