@@ -14,6 +14,8 @@ from rig.model.rig import Rig
 
 logger = logging.getLogger(__name__)
 
+LATE = 16  # blocks back that a late answer may be of
+
 
 def unwrap(raw: int, near: int, bits: int) -> int:
     """Return the number congruent to `raw` modulo 2^bits that is nearest to `near`."""
@@ -47,6 +49,11 @@ class BlockDecoder:
         self._sequence = None
         if tick is not None:
             self.tick = tick
+
+    def seen(self, header: BlockHeader) -> bool:
+        """Tell whether a block is one of the last few decoded: a late copy of an answer."""
+        behind = (self.acknowledge - header.sequence) & 0xFFFF
+        return self._sequence is not None and behind <= min(self._sequence, LATE)
 
     def decode(self, header: BlockHeader, answer: bytes) -> SampleBlock:
         """Return the block in SI; raises DeviceError if it is impossible after the last one."""

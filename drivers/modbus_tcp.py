@@ -202,7 +202,7 @@ class ModbusTcpDriver:
         while True:
             answer = self._exchange()
             header = reg.unpack_header(answer)
-            if header.status & Status.BLOCK and header.sequence == self._decoder.acknowledge:
+            if header.status & Status.BLOCK and self._decoder.seen(header):
                 # The device offers no block again that it knows to have arrived: a late answer.
                 logger.warning("block %d came a second time; asking again", header.sequence)
                 self._link.settle()

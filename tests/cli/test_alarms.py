@@ -55,7 +55,5 @@ def test_without_colour_the_words_come_first(
     monkeypatch: pytest.MonkeyPatch, stream: type[io.StringIO], no_colour: str | None
 ) -> None:
     end, alarm, _ = said(monkeypatch, stream(), no_colour)
-    assert end == (
-        f"bramah: {UNSURE}; device: the device does not answer; look at the bench"
-    )
+    assert end == (f"bramah: {UNSURE}; device: the device does not answer; look at the bench")
     assert alarm == UNSURE
