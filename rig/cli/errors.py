@@ -11,12 +11,6 @@ from collections.abc import Callable
 import typer
 from typer.exceptions import TyperException
 
-from drivers.base import DeviceBusy, DeviceError
-from protocols.engine.errors import ProtocolAborted
-from rig.bench.outputs import UNSURE
-from rig.model.parse import InputError
-from rig.model.trips import Latched, OperatorStop, RecordingFailed, SafetyTrip
-
 OK = 0
 FAILED = 1
 BAD_INPUT = 2
@@ -51,6 +45,8 @@ class LogFormatter(logging.Formatter):
 
 
 def _say(message: str) -> None:
+    from rig.bench.outputs import UNSURE
+
     line = "bramah: " + " ".join(message.split())
     print(alarm(line) if UNSURE in line else line, file=sys.stderr)
 
@@ -60,20 +56,30 @@ def _os_error(error: OSError) -> str:
     return f"{error.strerror or error}{name}"
 
 
-# First match wins. An error not listed is a fault of ours, and says so.
-_CODES: tuple[tuple[tuple[type[BaseException], ...], int, Callable[..., str]], ...] = (
-    ((InputError,), BAD_INPUT, str),
-    ((SafetyTrip, Latched), TRIPPED, str),
-    ((DeviceBusy,), DEVICE_LOST, lambda error: f"device in use: {error}"),
-    ((DeviceError,), DEVICE_LOST, lambda error: f"device: {error}"),
-    ((OperatorStop, KeyboardInterrupt), INTERRUPTED, lambda error: str(error) or "stopped"),
-    ((WorkError, RecordingFailed, ProtocolAborted), FAILED, str),
-    ((OSError,), FAILED, _os_error),
-)
+def _codes() -> tuple[tuple[tuple[type[BaseException], ...], int, Callable[..., str]], ...]:
+    """Return error types with their exit code and message; the first match wins.
+
+    Imported when something went wrong: a `--help` needs none of these packages.
+    """
+    from drivers.base import DeviceBusy, DeviceError
+    from protocols.engine.errors import ProtocolAborted
+    from rig.model.parse import InputError
+    from rig.model.trips import Latched, OperatorStop, RecordingFailed, SafetyTrip
+
+    return (
+        ((InputError,), BAD_INPUT, str),
+        ((SafetyTrip, Latched), TRIPPED, str),
+        ((DeviceBusy,), DEVICE_LOST, lambda error: f"device in use: {error}"),
+        ((DeviceError,), DEVICE_LOST, lambda error: f"device: {error}"),
+        ((OperatorStop, KeyboardInterrupt), INTERRUPTED, lambda error: str(error) or "stopped"),
+        ((WorkError, RecordingFailed, ProtocolAborted), FAILED, str),
+        ((OSError,), FAILED, _os_error),
+    )
 
 
 def _code_and_message(error: BaseException) -> tuple[int, str]:
-    for kinds, code, text in _CODES:
+    # An error not listed is a fault of ours, and says so.
+    for kinds, code, text in _codes():
         if isinstance(error, kinds):
             return code, _with_notes(error, text(error))
     return FAILED, f"{type(error).__name__}: {error}; --debug shows where"
@@ -81,6 +87,8 @@ def _code_and_message(error: BaseException) -> tuple[int, str]:
 
 def _with_notes(error: BaseException, message: str) -> str:
     """Return the message with what the bench added; outputs that may not be zero come first."""
+    from rig.bench.outputs import UNSURE
+
     notes = list(getattr(error, "__notes__", ()))
     first = [note for note in notes if note == UNSURE]
     return "; ".join([*first[:1], message, *(note for note in notes if note != UNSURE)])

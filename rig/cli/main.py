@@ -1,44 +1,130 @@
-"""The `bramah` command: verbs, and nothing that a verb does."""
+"""The `bramah` command: which verbs there are; a verb's module is imported when it is called."""
 
 from __future__ import annotations
 
+import ast
 import importlib
 import logging
 import os
-import pkgutil
 import sys
-from typing import Final
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Any, Final
 
 import typer
 
-import rig.cli
 from rig.cli.errors import LogFormatter, guarded
 
 # Matrices here are tall and narrow, and there are many: BLAS threads get in each other's way.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-# Shown first, in this order; every other module named *_command registers its verbs after them.
-FIRST: Final = ("demo_command", "bench_commands", "plan_command", "analysis_commands")
+# In the order of `bramah --help`: a verb, and the module whose `register` adds it.
+VERBS: Final = {
+    "demo": "rig.cli.demo",
+    "sim": "rig.cli.sim",
+    "check": "rig.cli.check",
+    "run": "rig.cli.run",
+    "monitor": "rig.cli.monitor",
+    "runs": "rig.cli.runs",
+    "recover": "rig.cli.recover",
+    "probe": "rig.cli.probe",
+    "stop": "rig.cli.stop",
+    "depressurise": "rig.cli.depressurise",
+    "reset": "rig.cli.reset",
+    "plan": "rig.cli.plan",
+    "design": "rig.cli.design",
+    "import": "rig.cli.import_",
+    "export": "rig.cli.export",
+    "identify": "rig.cli.identify",
+    "validate": "rig.cli.validate",
+    "simulate": "rig.cli.simulate",
+    "trace": "rig.cli.trace",
+    "loop": "rig.cli.loop",
+    "bench": "rig.cli.bench.command",
+}
+GUIDE: Final = """Run a hydraulic robot's test bench, identify it, say what the model lacks.
 
-app = typer.Typer(
-    name="bramah",
-    help="Run a hydraulic robot's test bench, identify its parameters, say what the model lacks.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    add_completion=False,
-    rich_markup_mode=None,
-)
-_found = [m.name for m in pkgutil.iter_modules(rig.cli.__path__) if "_command" in m.name]
-for name in (*FIRST, *sorted(set(_found) - set(FIRST))):
-    importlib.import_module(f"rig.cli.{name}").register(app)
+Begin with `bramah demo`, which needs no hardware. At a bench: `bramah probe` reads it and moves
+nothing, `bramah check` proves a protocol, `bramah run` runs it; then come `bramah identify`,
+`bramah validate` and `bramah trace`.
+"""
+
+
+def command_line(verbs: Sequence[str]) -> typer.Typer:
+    """Return the command line with these verbs in full, the others by name and summary only."""
+    app = typer.Typer(
+        name="bramah",
+        help=GUIDE,
+        pretty_exceptions_enable=False,
+        add_completion=False,
+        rich_markup_mode=None,
+    )
+    app.callback()(_bramah)
+    for verb, module in VERBS.items():
+        if verb in verbs:
+            importlib.import_module(module).register(app)
+        else:
+            app.command(verb, help=_summary(module))(_not_imported)
+    return app
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        from importlib.metadata import version
+
+        typer.echo(f"bramah {version('bramah')}")
+        raise typer.Exit
+
+
+def _bramah(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", is_eager=True, callback=_print_version, help="Print the version and exit."
+        ),
+    ] = False,
+) -> None:
+    """Take the options that stand before a verb."""
+
+
+def _not_imported() -> None:
+    raise AssertionError("a verb was called that the command line was not made for")
+
+
+def _summary(module: str) -> str:
+    """Return the first line of a verb's docstring, read from its source and not imported."""
+    parent, _, leaf = module.rpartition(".")
+    spec = find_spec(parent)
+    assert spec is not None
+    assert spec.submodule_search_locations
+    source = Path(spec.submodule_search_locations[0], f"{leaf}.py").read_text(encoding="utf-8")
+    for node in ast.parse(source).body:
+        doc = ast.get_docstring(node) if isinstance(node, ast.FunctionDef) else None
+        if doc and "Example: bramah" in doc:
+            return doc.splitlines()[0]
+    raise AssertionError(f"{module} has no verb")
+
+
+def __getattr__(name: str) -> Any:
+    # The whole command line, for whoever asks for it; a call imports its own verb alone.
+    if name == "app":
+        return command_line(list(VERBS))
+    raise AttributeError(name)
 
 
 def run(arguments: list[str] | None = None) -> None:
     """Run the command line and exit with the contract's code; `--debug` may stand anywhere."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in words
-    words = [word for word in words if word != "--debug"]
-    handler = logging.StreamHandler(sys.stderr)
+    words = [word for word in words if word != "--debug"] or ["--help"]
+    handler = logging.StreamHandler()
     handler.setFormatter(LogFormatter("%(levelname)s %(name)s: %(message)s"))
     logging.basicConfig(level=logging.DEBUG if debug else logging.WARNING, handlers=[handler])
-    sys.exit(guarded(lambda: app(words, standalone_mode=False), debug=debug))
+    verb = next((word for word in words if not word.startswith("-")), "")
+
+    def work() -> int | None:
+        result: int | None = command_line([verb])(words, standalone_mode=False)
+        return result
+
+    sys.exit(guarded(work, debug=debug))

@@ -18,7 +18,7 @@ from protocols.design.check import check
 from protocols.files import library
 from protocols.files.plan import resolve
 from rig.cli import looping
-from rig.cli.looping import DECLINED, FLOOR, NOTHING, REFUSED, ROUNDS, Loop, Wanted
+from rig.cli.experiment_loop import DECLINED, FLOOR, NOTHING, REFUSED, ROUNDS, Loop, Wanted
 from rig.cli.trace_text import story_text
 from rig.runs.rigs import load_rig
 from tests.analysis.page import Page

@@ -21,7 +21,7 @@ from protocols.files import library
 from protocols.files.plan import Plan, StepPlan, resolve
 from protocols.files.schema import Protocol
 from protocols.files.writer import protocol_text
-from rig.cli.planning import predictor
+from rig.cli.step_planning import predictor
 from rig.model.codes import decode_input
 from rig.model.parameters import parameter_names
 from rig.model.records import Record, Run

@@ -13,7 +13,7 @@ import pytest
 
 from analysis.report.paper import TABLE_III, TABLE_IV
 from rig.cli.output import write_json
-from rig.cli.simulated import simulated_bench
+from rig.cli.simulated_bench import simulated_bench
 from rig.model.records import Run
 from rig.model.rig import Rig
 from rig.runs.exchange.importer import import_records

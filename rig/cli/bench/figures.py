@@ -19,9 +19,9 @@ from rig.cli.bench.acquisition import measure_acquisition
 from rig.cli.bench.analysis import identify_figures, simulation_figures
 from rig.cli.bench.figure import Figure
 from rig.cli.bench.stream_figures import stream_figures
+from rig.cli.experiment import RIG, Experiment, experiment
 from rig.cli.output import table
-from rig.cli.simulated import simulated_bench
-from rig.cli.story import RIG, Experiment, experiment
+from rig.cli.simulated_bench import simulated_bench
 from rig.model import channels as ch
 from rig.model.parse import InputError
 from rig.runs.rigs import load_rig

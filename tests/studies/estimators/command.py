@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from rig.cli.bench_commands import JsonOption
+from rig.cli.options import JsonOption
 from rig.cli.output import progress, write_json
 
 WorkersOption = Annotated[int, typer.Option(min=1, help="Processes at once.")]

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.bench_commands import JsonOption, RigOption
+from rig.cli.options import JsonOption, RigOption
 
 
 def design(

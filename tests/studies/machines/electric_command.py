@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.bench_commands import JsonOption
+from rig.cli.options import JsonOption
 from rig.cli.output import progress, write_json
 
 
@@ -34,7 +34,7 @@ def electric(
     import math
 
     from analysis.identify.result import to_json
-    from rig.cli.tables import identification_text, validation_text
+    from rig.cli.render import identification_text, validation_text
     from tests.studies.machines import electric as study
 
     if seeds > 1:

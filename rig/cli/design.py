@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.bench_commands import JsonOption, RigOption
+from rig.cli.options import JsonOption, RigOption
 
 
 def design(
@@ -27,8 +27,8 @@ def design(
 
     Example: bramah design lock-and-excite-multisine --rig shinshu-2dof --criterion b --out b.yaml
     """
-    from rig.cli.foresight import design_json, design_protocol, design_text
     from rig.cli.output import write_json
+    from rig.cli.predicted_errors import design_json, design_protocol, design_text
 
     found = design_protocol(protocol, rig, criterion, budget, seed)
     out.parent.mkdir(parents=True, exist_ok=True)

@@ -23,7 +23,7 @@ from protocols.design.check import check
 from protocols.engine.errors import ProtocolAborted
 from protocols.files import library
 from protocols.files.plan import Overrides, resolve
-from rig.cli.running import ProtocolJob, run_protocol
+from rig.cli.protocol_run import ProtocolJob, run_protocol
 from rig.model.parse import InputError
 from rig.model.records import Run
 from rig.model.rig import Rig

@@ -7,7 +7,7 @@ from typing import Annotated, Final
 
 import typer
 
-from rig.cli.bench_commands import JsonOption
+from rig.cli.options import JsonOption
 from rig.cli.output import progress, write_json
 
 FAMILIES_OF: Final = {
@@ -64,7 +64,7 @@ def trace(
     if model is not None:
         save_model(result.model_after, model)
     if report is not None:
-        from rig.cli.trace_reporting import write_trace
+        from rig.cli.reports import write_trace
 
         write_trace(report, judged, result)
     if json != Path("-"):

@@ -1,40 +1,27 @@
-"""Verbs of the analysis: import, identify, validate."""
+"""The `identify` verb: every parameter from all records of the runs."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.bench_commands import JsonOption
-from rig.cli.output import progress, write_json
-from rig.model.parse import InputError
-from rig.model.records import Record, Run
+from rig.cli.options import (
+    JsonOption,
+    RunsArgument,
+)
+from rig.cli.output import write_json
+
+log = logging.getLogger(__name__)
 
 if TYPE_CHECKING:
     from analysis.identify.result import Identification
     from analysis.regression.rows import Filtering
     from analysis.terms.base import Used
-
-RunsArgument = Annotated[list[Path], typer.Argument(help="Run folders.")]
-
-
-def import_foreign(
-    manifest: Annotated[Path, typer.Argument(help="A YAML file that lists CSV or MAT files.")],
-    out: Annotated[Path, typer.Option(help="The run folder to make.")],
-) -> None:
-    """Bring records of another system into a run folder.
-
-    Example: bramah import manifest.yaml --out runs/foreign
-    """
-    from rig.runs.exchange.importer import import_records
-
-    report = import_records(manifest, out)
-    for warning in report.warnings:
-        progress(f"note: {warning}")
-    typer.echo(str(report.path))
+    from rig.model.records import Record, Run
 
 
 def _load(folders: Sequence[Path]) -> list[Run]:
@@ -45,6 +32,8 @@ def _load(folders: Sequence[Path]) -> list[Run]:
 
 def _refuse_unstreamed(option: str, method: str, estimator: str | None, bootstrap: int) -> None:
     """Raise InputError for what needs the rows of all records in memory."""
+    from rig.model.parse import InputError
+
     for name, asked, wanted in (
         ("--method", method, "coupled"),
         ("--estimator", estimator or "plain", "plain"),
@@ -160,9 +149,9 @@ def identify(
     from analysis.regression.rows import FILTERINGS
     from analysis.simulation.model import save_model
     from analysis.trace.search.shapes import shapes_in
-    from rig.cli.method_text import method_text
-    from rig.cli.tables import identification_text, shapes_text
+    from rig.cli.render import identification_text, method_text, shapes_text
     from rig.cli.truth_file import read_truth
+    from rig.model.parse import InputError
 
     if filtering not in FILTERINGS:
         raise InputError(f"--filtering {filtering}: expected one of: {' '.join(FILTERINGS)}")
@@ -198,7 +187,7 @@ def identify(
         save_model(result.model, model)
     write_json(json, told)
     if report is not None:
-        from rig.cli.reporting import write_identification
+        from rig.cli.reports import write_identification
 
         write_identification(report, _load(runs), result)
     if json != Path("-"):
@@ -206,28 +195,6 @@ def identify(
         typer.echo(identification_text(result, known) + more)
 
 
-def validate(
-    model: Annotated[Path, typer.Argument(help="A model file of `bramah identify --model`.")],
-    runs: RunsArgument,
-    json: JsonOption = None,
-) -> None:
-    """Simulate the model with the measured spool and compare it with records.
-
-    Example: bramah validate model.json runs/tuesday
-    """
-    from analysis.simulation.model import load_model
-    from analysis.simulation.validate import to_json
-    from analysis.simulation.validate import validate as validate_model
-    from rig.cli.tables import validation_text
-
-    results = validate_model(load_model(model), _load(runs))
-    write_json(json, to_json(results))
-    if json != Path("-"):
-        typer.echo(validation_text(results))
-
-
 def register(app: typer.Typer) -> None:
-    """Add these verbs to the command line."""
-    app.command("import")(import_foreign)
+    """Add this verb to the command line."""
     app.command()(identify)
-    app.command()(validate)

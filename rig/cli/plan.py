@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.bench_commands import JsonOption, RigOption
+from rig.cli.options import JsonOption, RigOption
 from rig.cli.output import progress, write_json
 
 
@@ -26,8 +26,8 @@ def plan(
 
     Example: bramah plan --rig digger-3dof --out digger.yaml --validation digger-validate.yaml
     """
-    from rig.cli.planning import Wish, planned
     from rig.cli.sheets import proof_text
+    from rig.cli.step_planning import Wish, planned
 
     wish = Wish(rig, out, validation, prove)
     proof = planned(wish, progress)

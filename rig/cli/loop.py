@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from rig.cli.bench_commands import EndpointOption, JsonOption, RepeatsOption, RigOption, ScaleOption
+from rig.cli.options import EndpointOption, JsonOption, RepeatsOption, RigOption, ScaleOption
 from rig.cli.output import progress, write_json
 
 
@@ -65,8 +65,8 @@ def loop(
         )
     # What loads the analysis comes after what can be refused without it.
     from protocols.files.plan import Overrides
-    from rig.cli.looping import Loop, Wanted, refuse_taken
-    from rig.cli.simulated import simulated_bench
+    from rig.cli.experiment_loop import Loop, Wanted, refuse_taken
+    from rig.cli.simulated_bench import simulated_bench
 
     refuse_taken(out)
     with ExitStack() as stack:
@@ -95,7 +95,7 @@ def _asked(experiment: Mapping[str, Any]) -> bool:
 def _tell(going: Any, json: Path | None, report: Path) -> None:
     from analysis.simulation.model import save_model
     from analysis.trace.loop_rounds import rounds_json
-    from rig.cli.trace_reporting import write_story
+    from rig.cli.reports import write_loop
     from rig.cli.trace_text import story_text
 
     if not going.rounds and not going.wanted.out.is_dir():
@@ -105,7 +105,7 @@ def _tell(going: Any, json: Path | None, report: Path) -> None:
     write_json(json, told)
     if going.rounds:
         report.parent.mkdir(parents=True, exist_ok=True)
-        write_story(report, going.train, going.judge, going.rounds, going.stopped)
+        write_loop(report, going.train, going.judge, going.rounds, going.stopped)
         save_model(going.rounds[-1].result.model_after, going.wanted.out / "model.json")
         if json != Path("-"):
             typer.echo(story_text(going.rounds, going.stopped))

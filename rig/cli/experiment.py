@@ -21,10 +21,10 @@ from analysis.trace.engine import trace
 from analysis.trace.result import to_json as trace_json
 from protocols.files.plan import Overrides
 from rig.cli.output import progress, write_json
-from rig.cli.reporting import provenance
-from rig.cli.running import ProtocolJob, run_protocol
-from rig.cli.simulated import simulated_bench
-from rig.cli.tables import identification_text, parameter_table, validation_text
+from rig.cli.protocol_run import ProtocolJob, run_protocol
+from rig.cli.render import identification_text, parameter_table, validation_text
+from rig.cli.reports import provenance
+from rig.cli.simulated_bench import simulated_bench
 from rig.cli.truth_file import read_truth
 from rig.model.records import Run
 from rig.runs.store import load_run
@@ -83,7 +83,7 @@ def experiment(
 
 def tell(out: Path, seed: int, repeats: int | None) -> None:
     """Run the demo into a new folder of `out`, print its results and write its reports."""
-    from rig.cli.trace_reporting import write_trace
+    from rig.cli.reports import write_trace
 
     started = time.monotonic()
     folder = out / datetime.now().strftime("%Y-%m-%dT%H-%M-%S")
@@ -125,5 +125,5 @@ def write_experiment(path: Path, done: Experiment, command: str, seed: int) -> N
         validation_runs=done.judged,
         truth=done.truth,
         title="A simulated bench, identified and validated",
-        provenance=provenance((command,), {"simulated bench": seed}),
+        provenance=provenance(command, {"simulated bench": seed}),
     )

@@ -1,4 +1,4 @@
-"""Verbs that hand records on: `export` to other programs, `simulate` as a model has them."""
+"""The `simulate` verb: the run that a model would have given."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rig.cli.errors import WorkError
-from rig.cli.output import progress
 
 if TYPE_CHECKING:
     from analysis.simulation.model import Model
@@ -22,35 +21,6 @@ ModelOption = Annotated[
     Path | None,
     typer.Option(help="A model file: what it simulates stands beside the measured channels."),
 ]
-
-
-def export(
-    run: RunArgument,
-    kind: Annotated[str, typer.Option("--format", help="csv, mat, parquet or mf4.")] = "csv",
-    out: Annotated[
-        Path | None, typer.Option(help="The folder to make.  [default: RUN-FORMAT beside the run]")
-    ] = None,
-    model: ModelOption = None,
-) -> None:
-    """Write a run for other programs, a file per record; csv and mat can be imported again.
-
-    Example: bramah export runs/monday --format mat
-    """
-    from rig.runs.exchange.export import export_run, library_missing
-    from rig.runs.stream import read_run_head
-
-    missing = library_missing(kind)
-    if missing:
-        raise WorkError(
-            f"--format {kind} needs the package {missing}, which is not installed: "
-            "pip install 'bramah[export]'"
-        )
-    more = None if model is None else _simulator(model, read_run_head(run).rig, str(run))
-    folder = run if run.name not in ("", "..") else run.resolve()
-    wanted = folder.with_name(f"{folder.name}-{kind}") if out is None else out
-    files = export_run(run, wanted, kind, more)
-    progress(f"{len(files)} files")
-    typer.echo(str(wanted))
 
 
 def simulate(
@@ -70,13 +40,13 @@ def simulate(
 
     refuse_occupied(out)
     loaded = load_run(run)
-    simulated = _simulator(model, loaded.rig, str(run))
+    simulated = channel_simulator(model, loaded.rig, str(run))
     records = tuple(replace(r, channels={**r.channels, **simulated(r)}) for r in loaded.records)
     source = f"{run.name} simulated by {model.name}"
     typer.echo(str(write_run(out, replace(loaded, records=records, source=source))))
 
 
-def _simulator(path: Path, rig: Rig, source: str) -> Callable[[Record], Mapping[str, Any]]:
+def channel_simulator(path: Path, rig: Rig, source: str) -> Callable[[Record], Mapping[str, Any]]:
     """Return what simulates a record's excited joints: channels (n,) by name.
 
     Raises InputError for a model of another rig, WorkError where a simulation fails.
@@ -98,6 +68,5 @@ def _simulator(path: Path, rig: Rig, source: str) -> Callable[[Record], Mapping[
 
 
 def register(app: typer.Typer) -> None:
-    """Add these verbs to the command line."""
-    app.command()(export)
+    """Add this verb to the command line."""
     app.command()(simulate)

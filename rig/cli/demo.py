@@ -19,7 +19,7 @@ def demo(
 
     Example: bramah demo --out demo-out
     """
-    from rig.cli.story import tell
+    from rig.cli.experiment import tell
 
     tell(out, seed, repeats)
 

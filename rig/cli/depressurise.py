@@ -1,0 +1,38 @@
+"""The `depressurise` verb: the pressure let out where the rig can."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import typer
+
+from rig.cli.device import device_of
+from rig.cli.options import EndpointOption, RigOption
+
+if TYPE_CHECKING:
+    pass
+
+from rig.cli.stop import stop
+
+
+def depressurise(rig: RigOption, endpoint: EndpointOption = None) -> None:
+    """Let the pressure out where the rig can; zeroes the outputs first.
+
+    Example: bramah depressurise --rig shinshu-2dof
+    """
+    from rig.bench import probe as bench
+    from rig.cli.errors import WorkError
+
+    stop(rig, endpoint)
+    described, driver = device_of(rig, endpoint)
+    left = bench.pressurised(bench.probe(driver, described))
+    if left:
+        raise WorkError(
+            f"rig {described.name!r} describes no way to let the pressure out: stop the pump and "
+            f"open the relief by hand; still under pressure: {', '.join(left)}"
+        )
+
+
+def register(app: typer.Typer) -> None:
+    """Add this verb to the command line."""
+    app.command()(depressurise)

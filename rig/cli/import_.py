@@ -1,0 +1,34 @@
+"""The `import` verb: records of another system as a run folder."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rig.cli.output import progress
+
+log = logging.getLogger(__name__)
+
+
+def import_foreign(
+    manifest: Annotated[Path, typer.Argument(help="A YAML file that lists CSV or MAT files.")],
+    out: Annotated[Path, typer.Option(help="The run folder to make.")],
+) -> None:
+    """Bring records of another system into a run folder.
+
+    Example: bramah import manifest.yaml --out runs/foreign
+    """
+    from rig.runs.exchange.importer import import_records
+
+    report = import_records(manifest, out)
+    for warning in report.warnings:
+        progress(f"note: {warning}")
+    typer.echo(str(report.path))
+
+
+def register(app: typer.Typer) -> None:
+    """Add this verb to the command line."""
+    app.command("import")(import_foreign)

@@ -1,0 +1,46 @@
+"""The `probe` verb: one block of every channel, and nothing moved."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from rig.cli.device import device_of, print_pressure
+from rig.cli.options import EndpointOption, JsonOption, RigOption
+from rig.cli.output import table, write_json
+
+if TYPE_CHECKING:
+    from rig.bench.probe import Reading
+
+
+def probe(rig: RigOption, endpoint: EndpointOption = None, json: JsonOption = None) -> None:
+    """Read one block of every channel and move nothing; exit 1 where a channel is not plausible.
+
+    Example: bramah probe --rig shinshu-2dof
+    """
+    from rig.bench import probe as bench
+    from rig.cli.errors import WorkError
+
+    described, driver = device_of(rig, endpoint)
+    found = bench.probe(driver, described)
+    write_json(json, [asdict(one) for one in found])
+    if json != Path("-"):
+        header = ("channel", "mean", "least", "most", "unit", "codes", "")
+        typer.echo(table(header, [_row(one) for one in found]))
+    print_pressure(bench.pressurised(found))
+    odd = [one.channel for one in found if one.mark != bench.GOOD]
+    if odd:
+        raise WorkError(f"not plausible: {', '.join(odd)}; look at the last column")
+
+
+def _row(one: Reading) -> tuple[str, ...]:
+    numbers = (f"{value:.5g}" for value in (one.mean, one.low, one.high))
+    return (one.channel, *numbers, one.unit, f"{one.codes[0]}..{one.codes[1]}", one.mark)
+
+
+def register(app: typer.Typer) -> None:
+    """Add this verb to the command line."""
+    app.command()(probe)

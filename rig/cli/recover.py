@@ -1,0 +1,31 @@
+"""The `recover` verb: an interrupted run finalised from its journal."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+log = logging.getLogger(__name__)
+
+
+def recover(
+    run: Annotated[Path, typer.Argument(help="The run folder of an interrupted run.")],
+    force: Annotated[
+        bool, typer.Option("--force", help="Also a run of another computer that looks alive.")
+    ] = False,
+) -> None:
+    """Finalise an interrupted run from its journal; what was recorded becomes readable.
+
+    Example: bramah recover runs/monday
+    """
+    from rig.runs.recover import recover as recover_run
+
+    typer.echo(recover_run(run, force=force).message)
+
+
+def register(app: typer.Typer) -> None:
+    """Add this verb to the command line."""
+    app.command()(recover)

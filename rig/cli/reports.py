@@ -1,0 +1,50 @@
+"""Reports with what only the command line knows: the date, the command, the versions."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from datetime import datetime
+from pathlib import Path
+
+from analysis.identify.result import Identification
+from analysis.report.identification import Provenance, write_report
+from analysis.report.loop import write_loop_report
+from analysis.report.trace import write_trace_report
+from analysis.trace.loop_rounds import Round
+from analysis.trace.result import Trace
+from rig.model.records import Run
+from rig.runs.versions import versions
+
+
+def provenance(
+    command: str | None = None, seeds: Mapping[str, str | int] | None = None
+) -> Provenance:
+    """Return date, command (default: this process's own), software versions and seeds."""
+    line = shlex.join(["bramah", *sys.argv[1:]]) if command is None else command
+    date = datetime.now().astimezone().strftime("%Y-%m-%d %H:%M")
+    return Provenance(date=date, commands=(line,), versions=versions(), seeds=dict(seeds or {}))
+
+
+def write_identification(path: Path, runs: Sequence[Run], result: Identification) -> None:
+    """Write the report of an identification alone."""
+    write_report(
+        path,
+        runs=runs,
+        identification=result,
+        title=f"Identification of {result.model.rig.name}",
+        provenance=provenance(),
+    )
+
+
+def write_trace(path: Path, holdout: Sequence[Run], result: Trace) -> None:
+    """Write the trace's report."""
+    write_trace_report(path, holdout, result, provenance())
+
+
+def write_loop(
+    path: Path, train: Sequence[Run], holdout: Sequence[Run], rounds: Sequence[Round], stopped: str
+) -> None:
+    """Write the report of a whole loop."""
+    write_loop_report(path, train, holdout, rounds, stopped, provenance())

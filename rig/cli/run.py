@@ -1,0 +1,59 @@
+"""The `run` verb: a protocol run unattended into a run folder."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rig.cli.options import (
+    DurationOption,
+    EndpointOption,
+    RepeatsOption,
+    RigOption,
+    ScaleOption,
+    StepOption,
+    WaveSeedOption,
+)
+from rig.cli.output import progress
+
+log = logging.getLogger(__name__)
+
+
+def run(
+    protocol: Annotated[str, typer.Argument(help="A shipped protocol's name, or a file.")],
+    rig: RigOption,
+    out: Annotated[Path, typer.Option(help="The run folder to make.")],
+    endpoint: EndpointOption = None,
+    repeats: RepeatsOption = None,
+    duration: DurationOption = None,
+    amplitude_scale: ScaleOption = 1.0,
+    wave_seed: WaveSeedOption = None,
+    step: StepOption = None,
+    operator: Annotated[
+        str | None, typer.Option(help="Written into the run.  [default: you]")
+    ] = None,
+    track: Annotated[
+        bool, typer.Option("--track", help="Follow b and the flow gains while it runs.")
+    ] = False,
+    memory: Annotated[
+        float, typer.Option(help="Of --track: forget with this time constant [s].")
+    ] = float("inf"),
+) -> None:
+    """Run a protocol unattended into a run folder; Ctrl-C zeroes the outputs and keeps the data.
+
+    Example: bramah run lock-and-excite-multisine --rig shinshu-2dof --out runs/monday
+    """
+    from rig.cli.protocol_run import ProtocolJob, overridden, run_protocol
+
+    changes = overridden(repeats, duration, amplitude_scale, wave_seed, step)
+    job = ProtocolJob(protocol, rig, out, endpoint, changes, operator, track, memory)
+    folder = run_protocol(job, progress)
+    typer.echo(str(folder))
+
+
+def register(app: typer.Typer) -> None:
+    """Add this verb to the command line."""
+    app.command()(run)

@@ -1,0 +1,51 @@
+"""The `sim` verb: the simulated bench as a process of its own."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rig.cli.options import (
+    RigOption,
+)
+
+log = logging.getLogger(__name__)
+
+
+def sim(
+    rig: RigOption,
+    wire: Annotated[
+        str, typer.Option(help="modbus-tcp or modbus-rtu (on a pseudo-terminal).")
+    ] = "modbus-tcp",
+    scenario: Annotated[
+        str | None,
+        typer.Option(help="A file of hidden effects, worn-seal, or random: drawn by the seed."),
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Of noise, temperature, and what is drawn.", min=0)] = 0,
+    port: Annotated[
+        int | None, typer.Option(help="0 takes a free one.  [default: the rig's]", min=0, max=65535)
+    ] = None,
+    real_time: Annotated[
+        bool, typer.Option("--real-time", help="Keep pace with the clock on the wall.")
+    ] = False,
+    truth: Annotated[
+        Path | None,
+        typer.Option(help="Write true parameters and what is hidden to this JSON file."),
+    ] = None,
+    parent: Annotated[int | None, typer.Option(hidden=True)] = None,
+) -> None:
+    """Run the simulated bench as a process of its own; its endpoint is the first line printed.
+
+    Example: bramah sim --rig shinshu-2dof --wire modbus-tcp --seed 1
+    """
+    from rig.cli.simulator import Served, serve_bench
+
+    serve_bench(Served(rig, seed, scenario, port, real_time, truth, parent, wire))
+
+
+def register(app: typer.Typer) -> None:
+    """Add this verb to the command line."""
+    app.command()(sim)

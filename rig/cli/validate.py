@@ -1,0 +1,43 @@
+"""The `validate` verb: the model's simulation beside records."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rig.cli.options import (
+    JsonOption,
+    RunsArgument,
+)
+from rig.cli.output import write_json
+
+log = logging.getLogger(__name__)
+
+
+def validate(
+    model: Annotated[Path, typer.Argument(help="A model file of `bramah identify --model`.")],
+    runs: RunsArgument,
+    json: JsonOption = None,
+) -> None:
+    """Simulate the model with the measured spool and compare it with records.
+
+    Example: bramah validate model.json runs/tuesday
+    """
+    from analysis.simulation.model import load_model
+    from analysis.simulation.validate import to_json
+    from analysis.simulation.validate import validate as validate_model
+    from rig.cli.render import validation_text
+    from rig.runs.store import load_run
+
+    results = validate_model(load_model(model), [load_run(folder) for folder in runs])
+    write_json(json, to_json(results))
+    if json != Path("-"):
+        typer.echo(validation_text(results))
+
+
+def register(app: typer.Typer) -> None:
+    """Add this verb to the command line."""
+    app.command()(validate)
