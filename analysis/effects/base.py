@@ -59,7 +59,8 @@ class Effect(Term):
     them apart; `includes` names effects that it becomes at a limit of its own numbers. `stage`
     orders the terms' `prepare` (see `ordered`): what a sensor distorts is undone first, then comes
     what acts on the spool, in the oil's own order. `alters` names the families of rows that
-    `prepare` changes: rows of others need not be built again for another shape.
+    `prepare` changes: rows of others need not be built again for another shape. `hydraulic` marks
+    what acts on oil, valve or cylinder, and is not for electric joints.
     """
 
     family: ClassVar[str] = ""
@@ -69,6 +70,7 @@ class Effect(Term):
     includes: ClassVar[tuple[str, ...]] = ()
     stage: ClassVar[int] = PLANT
     alters: ClassVar[tuple[str, ...]] = tuple(FAMILIES)
+    hydraulic: ClassVar[bool] = False
 
     @property
     def place(self) -> str:
@@ -99,7 +101,12 @@ class Effect(Term):
 
     @classmethod
     def places(cls, rig: Rig) -> tuple[str, ...]:
-        """Return every `where` this effect can be at on a rig."""
+        """Return every `where` this effect can be at on a rig, none without the oil it acts on."""
+        return () if cls.hydraulic and "fluid" not in rig.families else cls.all_places(rig)
+
+    @classmethod
+    def all_places(cls, rig: Rig) -> tuple[str, ...]:
+        """Return the places on a rig that has what the effect acts on, by default every joint."""
         return tuple(f"joint {i}" for i in range(1, len(rig.joints) + 1))
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:

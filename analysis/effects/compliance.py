@@ -43,6 +43,7 @@ class EntrainedAir(Effect):
     """
 
     name: ClassVar[str] = "entrained_air"
+    hydraulic: ClassVar[bool] = True
     family: ClassVar[str] = "fluid"
     variable: ClassVar[str] = "the pressure rate at low chamber pressure"
     confounders: ClassVar[tuple[str, ...]] = ("dead_volume", "spool_lag", "channel_delay")
@@ -56,9 +57,9 @@ class EntrainedAir(Effect):
         return _air
 
     @classmethod
-    def places(cls, rig: Rig) -> tuple[str, ...]:
-        """Return the bench, where it is hydraulic."""
-        return () if getattr(rig, "electric", False) else ("bench",)
+    def all_places(cls, rig: Rig) -> tuple[str, ...]:
+        """Return the bench."""
+        return ("bench",)
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return alpha [-]."""
@@ -101,6 +102,7 @@ class DeadVolume(Effect):
 
     name: ClassVar[str] = "dead_volume"
     prepares: ClassVar[bool] = True
+    hydraulic: ClassVar[bool] = True
     family: ClassVar[str] = "fluid"
     alters: ClassVar[tuple[str, ...]] = ("fluid",)
     variable: ClassVar[str] = "the chamber's pressure rate"
@@ -116,10 +118,11 @@ class DeadVolume(Effect):
         return _dead
 
     @classmethod
-    def places(cls, rig: Rig) -> tuple[str, ...]:
+    def all_places(cls, rig: Rig) -> tuple[str, ...]:
         """Return each chamber of each hydraulic joint."""
-        joints = () if getattr(rig, "electric", False) else super().places(rig)
-        return tuple(f"{joint} {side}" for joint in joints for side in ("cap", "rod"))
+        return tuple(
+            f"{joint} {side}" for joint in super().all_places(rig) for side in ("cap", "rod")
+        )
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return nothing: the volume is a shape."""

@@ -129,11 +129,8 @@ class Friction(Effect):
 
 
 def force_limit(rig: Rig, joint: int) -> float:
-    """Return half of what the cylinder can push [N]: dry friction above it would stop the joint."""
-    if getattr(rig, "electric", False):
-        j = rig.joints[joint]
-        return 0.5 * abs(float(j.drive.gain)) * float(j.limits.drive)  # type: ignore[attr-defined]
-    return 0.5 * rig.joints[joint].cylinder.cap_area * rig.supply.pressure
+    """Return half of what cylinder or drive exerts [N]: more dry friction would stop the joint."""
+    return 0.5 * rig.largest_force(joint)
 
 
 def force_unit(rig: Rig, joint: int) -> str:

@@ -51,6 +51,7 @@ class AsymmetricFriction(Friction):
     `torque_offset` of (F_ext - F_ret)/2: wherever it slides they are the same, and named are those.
     """
 
+    hydraulic: ClassVar[bool] = True
     name: ClassVar[str] = "asymmetric_friction"
     variable: ClassVar[str] = "the direction of the piston's motion"
     confounders: ClassVar[tuple[str, ...]] = ("coulomb_friction", "torque_offset")
@@ -66,11 +67,6 @@ class AsymmetricFriction(Friction):
 
     def _names(self) -> tuple[str, str]:
         return f"F_ext_{self.joint + 1}", f"F_ret_{self.joint + 1}"
-
-    @classmethod
-    def places(cls, rig: Rig) -> tuple[str, ...]:
-        """Return the hydraulic joints: on an electric one it is two simpler effects."""
-        return () if getattr(rig, "electric", False) else super().places(rig)
 
     def shape_names(self) -> tuple[str, ...]:
         """Name the presliding distances of the two directions."""
@@ -137,6 +133,7 @@ class PressureDependentFriction(Friction):
     distance at supply pressure, k_s the stiffening.
     """
 
+    hydraulic: ClassVar[bool] = True
     name: ClassVar[str] = "pressure_dependent_friction"
     stiffens: ClassVar[bool] = True
     variable: ClassVar[str] = "the sum of the chamber pressures, with the velocity's sign"
@@ -153,11 +150,6 @@ class PressureDependentFriction(Friction):
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return k [m^2]."""
         return (Coefficient(f"k_friction_{self.joint + 1}", "m^2", "mechanical"),)
-
-    @classmethod
-    def places(cls, rig: Rig) -> tuple[str, ...]:
-        """Return the hydraulic joints."""
-        return () if getattr(rig, "electric", False) else super().places(rig)
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return G w."""

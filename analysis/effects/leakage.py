@@ -35,13 +35,9 @@ UNIT = "m^3/(s*Pa)"
 @dataclass(frozen=True)
 class _Leakage(Effect):
     family: ClassVar[str] = "fluid"
+    hydraulic: ClassVar[bool] = True
     per_joint: ClassVar[bool] = True
     where: str = "joint 1"
-
-    @classmethod
-    def places(cls, rig: Rig) -> tuple[str, ...]:
-        """Return the hydraulic joints."""
-        return () if getattr(rig, "electric", False) else super().places(rig)
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Refuse a leak that pumps, and one of more than half the pump at full pressure."""
@@ -115,10 +111,10 @@ class ExternalLeakage(_Leakage):
         return _external
 
     @classmethod
-    def places(cls, rig: Rig) -> tuple[str, ...]:
+    def all_places(cls, rig: Rig) -> tuple[str, ...]:
         """Return each hydraulic joint, then each of its chambers."""
         return tuple(
-            f"{joint}{side}" for joint in super().places(rig) for side in ("", " cap", " rod")
+            f"{joint}{side}" for joint in super().all_places(rig) for side in ("", " cap", " rod")
         )
 
     @property

@@ -33,6 +33,7 @@ MARGIN: Final = 16  # [samples] that the interpolation of a shift reaches
 class Sensor(Effect):
     """What the three share: the channel, and the way from one channel to all that follows."""
 
+    hydraulic: ClassVar[bool] = True
     family: ClassVar[str] = "measurement"
     stage: ClassVar[int] = SENSOR
     where: str = "joint 1 piston"
@@ -50,10 +51,8 @@ class Sensor(Effect):
         return ch.channel(KINDS[self.side], self.joint + 1)
 
     @classmethod
-    def places(cls, rig: Rig) -> tuple[str, ...]:
+    def all_places(cls, rig: Rig) -> tuple[str, ...]:
         """Return every channel that the model uses."""
-        if getattr(rig, "electric", False):
-            return ()
         joints = range(1, len(rig.joints) + 1)
         supply = ("bench",) if rig.sensors.supply_pressure is not None else ()
         return (*(f"joint {i} {side}" for i in joints for side in KINDS), *supply)
@@ -244,9 +243,9 @@ class SensorOffset(Sensor):
         return (("spool_offset", self.place),) if self.side == "spool" else ()
 
     @classmethod
-    def places(cls, rig: Rig) -> tuple[str, ...]:
+    def all_places(cls, rig: Rig) -> tuple[str, ...]:
         """Return every channel that the model uses but the spools."""
-        return tuple(place for place in super().places(rig) if not place.endswith("spool"))
+        return tuple(place for place in super().all_places(rig) if not place.endswith("spool"))
 
     def shape_names(self) -> tuple[str, ...]:
         """Name the offset."""

@@ -27,13 +27,9 @@ from rig.model.rig import Rig
 
 
 def torque_limit(rig: Rig, joint: int) -> float:
-    """Return half of the largest torque of the joint's cylinder [N m] at mid-stroke."""
-    if getattr(rig, "electric", False):
-        j = rig.joints[joint]
-        return 0.5 * abs(float(j.drive.gain)) * float(j.limits.drive)  # type: ignore[attr-defined]
-    linkage, cylinder = rig.joints[joint].linkage, rig.joints[joint].cylinder
-    lever = abs(float(linkage.jacobian(linkage.angle(0.0))))
-    return 0.5 * lever * cylinder.cap_area * rig.supply.pressure
+    """Return half of the largest torque of the joint's cylinder (at mid-stroke) or drive [N m]."""
+    _, lever, _ = rig.joints[joint].geometry(0.0)
+    return 0.5 * abs(float(lever)) * rig.largest_force(joint)
 
 
 @dataclass(frozen=True)
@@ -61,7 +57,7 @@ class BaseInclination(Effect):
         return _inclination
 
     @classmethod
-    def places(cls, rig: Rig) -> tuple[str, ...]:
+    def all_places(cls, rig: Rig) -> tuple[str, ...]:
         """Return the bench, where gravity pulls at links whose base is not free already."""
         free = getattr(rig, "inclination", 0.0) == UNKNOWN
         return () if getattr(rig, "prismatic", False) or free or rig.gravity == 0 else ("bench",)
@@ -136,9 +132,8 @@ class JointSpring(Effect):
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
         """Return the rest angle [rad], anywhere in the joint's reach."""
         low, high = _reach(rig, self.joint)
-        middle = 0.5 * (low + high)
-        if not getattr(rig, "electric", False):
-            middle = float(rig.joints[self.joint].linkage.angle(0.0))
+        part = rig.joints[self.joint]
+        middle = float(part.geometry(0.5 * sum(part.position_range))[0])
         return (Shape(f"rest_{self.joint + 1}", "rad", low, high, (middle,)),)
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
@@ -166,11 +161,8 @@ class JointSpring(Effect):
 
 def _reach(rig: Rig, joint: int) -> tuple[float, float]:
     """Return the joint's smallest and largest angle."""
-    if getattr(rig, "electric", False):
-        low, high = rig.joints[joint].limits.position  # type: ignore[attr-defined]
-        return float(low), float(high)
     part = rig.joints[joint]
-    ends = [float(part.linkage.angle(side * 0.5 * part.cylinder.stroke)) for side in (-1, 1)]
+    ends = [float(part.geometry(end)[0]) for end in part.position_range]
     return min(ends), max(ends)
 
 
@@ -209,7 +201,7 @@ class TorqueOffset(Effect):
         return _torque
 
     def _name(self, rig: Rig) -> tuple[str, float]:
-        if getattr(rig, "electric", False):
+        if rig.electric:
             return f"offset{self.joint + 1}", 1.0
         return f"T_offset_{self.joint + 1}", -1.0
 

@@ -53,7 +53,7 @@ class Payload(Effect):
         return _payload
 
     @classmethod
-    def places(cls, rig: Rig) -> tuple[str, ...]:
+    def all_places(cls, rig: Rig) -> tuple[str, ...]:
         """Return the bench, where it has links."""
         return () if getattr(rig, "prismatic", False) else ("bench",)
 

@@ -39,15 +39,16 @@ LONGEST: Final = 5.0  # [s] of the pump's flow: the most oil between supply sens
 
 @dataclass(frozen=True)
 class _PortEffect(Effect):
+    hydraulic: ClassVar[bool] = True
     family: ClassVar[str] = "fluid"
     alters: ClassVar[tuple[str, ...]] = ("fluid",)
     prepares: ClassVar[bool] = True
     stage: ClassVar[int] = SUPPLY
 
     @classmethod
-    def places(cls, rig: Rig) -> tuple[str, ...]:
-        """Return the bench, where it is hydraulic."""
-        return () if getattr(rig, "electric", False) else ("bench",)
+    def all_places(cls, rig: Rig) -> tuple[str, ...]:
+        """Return the bench."""
+        return ("bench",)
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return nothing: pressures stand under the orifices' roots."""

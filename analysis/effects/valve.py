@@ -33,16 +33,12 @@ from rig.model.rig import Rig
 class ValveEffect(Effect):
     """What the valve's effects share: one hydraulic joint, no linear unknown, spool as abscissa."""
 
+    hydraulic: ClassVar[bool] = True
     family: ClassVar[str] = "valve"
     alters: ClassVar[tuple[str, ...]] = ("fluid",)
     prepares: ClassVar[bool] = True
     per_joint: ClassVar[bool] = True
     where: str = "joint 1"
-
-    @classmethod
-    def places(cls, rig: Rig) -> tuple[str, ...]:
-        """Return the hydraulic joints."""
-        return () if getattr(rig, "electric", False) else super().places(rig)
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return nothing: the gains stay the orifices'."""

@@ -223,7 +223,7 @@ class Tracker:
             raise InputError(f"a memory of {memory:g} s; expected more than 0")
         used = tuple(terms) if terms is not None else tuple(map(Used, baseline_of(rig)))
         if families is None:  # what needs nothing of the locked joints, where there is such
-            families = ("mechanical",) if rig.electric else ("fluid",)
+            families = rig.families[-1:]
         self._rig, self._filtering, self._families = rig, filtering, tuple(families)
         self._terms = tuple(one for one in used if self._concerns(one))
         names = {family: parameters_of(rig, self._terms, family) for family in families}

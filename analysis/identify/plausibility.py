@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from analysis.identify.checks import Check
 from analysis.simulation.model import Estimate
 from analysis.terms.inertia import chain_matrix, mass_matrix
-from rig.model.electric import position_limits
 from rig.model.parameters import gain_names, inertia_names
 from rig.model.rig import Rig
 
@@ -34,7 +33,9 @@ def _signs(rig: Rig, estimates: Mapping[str, Estimate]) -> Check:
         for name in positive
         if name in estimates and estimates[name].value <= 0
     ]
-    judged = "friction is" if rig.electric else "friction, bulk modulus and flow gains are"
+    judged = (
+        "friction, bulk modulus and flow gains are" if "fluid" in rig.families else "friction is"
+    )
     return Check("signs", not bad, "; ".join(bad) or f"{judged} positive")
 
 
@@ -99,10 +100,6 @@ def workspace(rig: Rig, points: int = 9) -> list[Array]:
         unit = np.outer(np.arange(4096), steps) % 1.0
     angles = np.empty_like(unit)
     for i, joint in enumerate(rig.joints):
-        if rig.electric:
-            low, high = position_limits(rig, i)
-            angles[:, i] = low + unit[:, i] * (high - low)
-            continue
-        half = joint.cylinder.stroke / 2
-        angles[:, i] = joint.linkage.angle((2 * unit[:, i] - 1) * half)
+        low, high = joint.position_range
+        angles[:, i] = joint.geometry(low + unit[:, i] * (high - low))[0]
     return list(angles)

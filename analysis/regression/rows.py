@@ -27,7 +27,6 @@ from analysis.signals.filters import (
 )
 from analysis.terms.base import FAMILIES, Columns, Used, equation
 from rig.model import channels as ch
-from rig.model.electric import drive_gains
 from rig.model.records import Record
 from rig.model.rig import Rig
 
@@ -108,10 +107,10 @@ def right_sides(rig: Rig, signals: Signals) -> dict[str, Array]:
 
     The torque is G F, by virtual work; Sakai and Maeshima's regressor prints the inverse of G.
     """
-    if rig.electric:
-        gains = drive_gains(rig)
-        return {equation("torque", i): gain * signals.u[:, i] for i, gain in enumerate(gains)}
-    sides = {}
+    gains = rig.drive_gains
+    sides = {equation("torque", i): gain * signals.u[:, i] for i, gain in enumerate(gains)}
+    if "fluid" not in rig.families:
+        return sides
     for i, joint in enumerate(rig.joints):
         cap, rod = joint.cylinder.cap_area, joint.cylinder.rod_area
         force = cap * signals.p_cap[:, i] - rod * signals.p_rod[:, i]

@@ -73,10 +73,6 @@ def arm(rig: Rig) -> ReportFigure | None:
     )  # fmt: skip
 
 
-def _input(rig: Rig) -> str:
-    return ch.DRIVE if rig.electric else ch.SPOOL
-
-
 def _excitation(rig: Rig) -> Callable[[Rig, Record, int, str], Markup]:
     return record_plots.electric_excitation if rig.electric else record_plots.excitation
 
@@ -85,7 +81,7 @@ def excitations(rig: Rig, runs: Sequence[Run]) -> Gallery:
     """Return one figure per step and excited joint, of the step's first repeat."""
     wanted = [
         (step, joint) for step in steps(rig, runs) for joint in step.excited
-        if ch.channel(_input(rig), joint) in step.records[0].channels
+        if ch.channel(rig.drive_kind, joint) in step.records[0].channels
     ]  # fmt: skip
     return Gallery(
         tuple(

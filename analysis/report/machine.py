@@ -10,10 +10,9 @@ import numpy as np
 from analysis.report import format as fm
 from analysis.report.plots.arm_plot import angle_range
 from rig.model import channels as ch
-from rig.model.electric import ElectricRig
 from rig.model.parts import Joint
 from rig.model.records import Record, Run
-from rig.model.rig import Rig
+from rig.model.rig import ElectricRig, Rig
 
 LOCKS = {
     "closed": "valve closed",

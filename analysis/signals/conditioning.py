@@ -145,7 +145,7 @@ def condition(
     return Signals(
         rate=record.sample_rate,
         t=record.time,
-        u=smoother.apply(stacked(ch.DRIVE if rig.electric else ch.SPOOL)),
+        u=smoother.apply(stacked(rig.drive_kind)),
         s=s, sd=sd, q=q, qd=qd, qdd=qdd, theta=rig.base_angle + np.cumsum(q, axis=1), G=G,
         p_cap=smoother.apply(raw_p[0]),
         p_rod=smoother.apply(raw_p[1]),
@@ -207,14 +207,9 @@ def _motion(
 
 def _angles(rig: Rig, s: Array, sd: Array, sdd: Array) -> tuple[Array, Array, Array, Array]:
     """Return q, dq/dt, d2q/dt2 and G (n, N): q' = s'/G, q'' = (s'' - (dG/dq) q'^2)/G."""
-    if rig.electric:
-        return s, sd, sdd, np.ones_like(s)
     q, G, slope = np.empty_like(s), np.empty_like(s), np.empty_like(s)
     for i, joint in enumerate(rig.joints):
-        half = 0.55 * joint.cylinder.stroke  # a sensor may read a little past the stroke's end
-        q[:, i] = joint.linkage.angle(np.clip(s[:, i], -half, half))
-        G[:, i] = joint.linkage.jacobian(q[:, i])
-        slope[:, i] = joint.linkage.jacobian_rate(q[:, i])
+        q[:, i], G[:, i], slope[:, i] = joint.geometry(s[:, i])
     qd = sd / G
     return q, qd, (sdd - slope * qd**2) / G, G
 

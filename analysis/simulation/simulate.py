@@ -14,7 +14,6 @@ from analysis.simulation import integrator
 from analysis.simulation.model import Model
 from analysis.terms.base import OUT_ROWS, X_ROWS, Used
 from rig.model import channels as ch
-from rig.model.electric import drive_gains
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 
@@ -147,7 +146,7 @@ def _geometry_cached(rows: tuple[tuple[float, ...], ...]) -> Array:
 def _geometry(rig: Rig) -> Array:
     if rig.electric:
         rows = [[0.0] * 10 for _ in rig.joints]
-        for row, gain in zip(rows, drive_gains(rig), strict=True):
+        for row, gain in zip(rows, rig.drive_gains, strict=True):
             row[integrator.GAIN] = gain
         rows[0][integrator.OFFSET] = rig.base_angle
         return _geometry_cached(tuple(map(tuple, rows)))

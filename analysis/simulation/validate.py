@@ -1,7 +1,7 @@
 """Validation: the model driven by the measured spool (electric: drive) against what was measured.
 
-FIT = 100 (1 - |y - yhat| / |y - mean y|) per channel (Sakai and Maeshima, Table IV), free run from
-the record's first sample; windowed RMSE restarts the model from the data every 0.25 s, which shows
+FIT = 100 (1 - |y - yhat| / |y - mean y|) per channel (Sakai and Maeshima, Table IV), from a free
+run of the whole record; windowed RMSE restarts the model from the data every 0.25 s, which shows
 the model's rates without the drift that a free run collects.
 """
 
@@ -161,11 +161,10 @@ def arrived(rig: Rig, record: Record) -> Mask:
 
 def _compared(rig: Rig, channels: Mapping[str, Array], signals: Signals) -> dict[str, Array]:
     """Return the measured piston and pressures (electric: position) of the excited joints."""
-    kinds = (rig.position_kind,) if rig.electric else (ch.PISTON, ch.CAP, ch.ROD)
     return {
         ch.channel(kind, i + 1): channels[ch.channel(kind, i + 1)]
         for i in map(int, np.flatnonzero(signals.excited))
-        for kind in kinds
+        for kind in rig.simulated_kinds
     }
 
 
@@ -195,13 +194,10 @@ def first_state(
             return np.asarray(np.polynomial.polynomial.polyfit(t, samples, START_DEGREE))
 
         s = fitted(rig.position_kind)
-        if rig.electric:
-            q[i], qd[i] = s[0], s[1]
-            continue
-        linkage = rig.joints[i].linkage
-        q[i] = linkage.angle(s[0])
-        qd[i] = s[1] / linkage.jacobian(q[i])
-        cap[i], rod[i] = fitted(ch.CAP)[0], fitted(ch.ROD)[0]
+        q[i], G, _ = rig.joints[i].geometry(s[0])
+        qd[i] = s[1] / G
+        if ch.CAP in rig.simulated_kinds:
+            cap[i], rod[i] = fitted(ch.CAP)[0], fitted(ch.ROD)[0]
     return replace(state, q=q, qd=qd, p_cap=cap, p_rod=rod)
 
 

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from typing import Final
 
 from analysis.terms.base import Term
-from rig.model.electric import UNKNOWN, ElectricRig
+from rig.model.electric import UNKNOWN
 from rig.model.parse import InputError
-from rig.model.rig import Rig
+from rig.model.rig import ElectricRig, Rig
 
 PACKAGES: Final = ("analysis.terms", "analysis.effects")
 ELECTRIC: Final = ("inertia", "viscous_friction")

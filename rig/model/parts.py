@@ -6,8 +6,9 @@ Source of the geometry and constants: Sakai and Maeshima, section II and Table I
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Final, Literal, Self
+from typing import Any, ClassVar, Final, Literal, Self
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from rig.model import channels as ch
@@ -116,7 +117,18 @@ class Limits(Part):
 
 
 class Joint(Part):
-    """One hydraulic joint: link, linkage, cylinder, valve and its limits."""
+    """One hydraulic joint: link, linkage, cylinder, valve and its limits.
+
+    What the kinds of joint answer alike, each its own way, is the block of class variables and the
+    properties below; `rig.model.electric.ElectricJoint` has the same.
+    """
+
+    kinds: ClassVar[tuple[str, ...]] = ch.JOINT_KINDS
+    position_kind: ClassVar[str] = ch.PISTON
+    drive_kind: ClassVar[str] = ch.SPOOL
+    simulated_kinds: ClassVar[tuple[str, ...]] = (ch.PISTON, ch.CAP, ch.ROD)
+    families: ClassVar[tuple[str, ...]] = ("mechanical", "fluid")
+    drive_gain: ClassVar[float] = 0.0
 
     type: Literal["hydraulic"] = "hydraulic"
     name: str = Field(min_length=1)
@@ -153,6 +165,20 @@ class Joint(Part):
                 f"valve's command_range {self.valve.command_range:g} V"
             )
         return self
+
+    @property
+    def position_range(self) -> tuple[float, float]:
+        """The piston's ends [m]."""
+        return -self.cylinder.stroke / 2, self.cylinder.stroke / 2
+
+    def geometry(self, position: Array | float) -> tuple[Array, Array, Array]:
+        """Return angle q [rad], G = ds/dq [m] and dG/dq [m/rad] at piston displacement s [m].
+
+        A sensor may read a little past the stroke's end: beyond 0.55 strokes s is held.
+        """
+        half = 0.55 * self.cylinder.stroke
+        q = self.linkage.angle(np.clip(position, -half, half))
+        return q, self.linkage.jacobian(q), self.linkage.jacobian_rate(q)
 
 
 class _Sensor(Part):

@@ -1,11 +1,13 @@
 """The rig description: a whole bench, its channels and what it is designed to be.
 
-The bench's pieces stand in `rig.model.parts`.
+The pieces of a bench stand in `rig.model.parts`, those of electric joints in `rig.model.electric`.
+An `ElectricRig` is a `Rig` for everything that asks for joints, channels, sensors or mechanics; a
+rig file chooses by `type: electric` at its joints, and `Rig.model_validate` returns that class.
 """
 
 from __future__ import annotations
 
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from pydantic import (
@@ -17,9 +19,18 @@ from pydantic import (
 )
 
 from rig.model import channels as ch
+from rig.model.electric import (
+    UNKNOWN,
+    ElectricJoint,
+    ElectricSensors,
+    electric_names,
+    electric_unit,
+    si_pair,
+    si_value,
+)
 from rig.model.parameters import MAX_JOINTS, parameter_names, parameter_unit
 from rig.model.parts import Array, Joint, Oil, Part, Sensors, Supply, Wire
-from rig.model.quantity import Acceleration, Frequency, parse_quantity
+from rig.model.quantity import Acceleration, Angle, Frequency, parse_quantity
 
 
 class Rig(Part):
@@ -44,15 +55,12 @@ class Rig(Part):
     def _by_type(
         cls, data: Any, handler: ModelWrapValidatorHandler[Self], info: ValidationInfo
     ) -> Any:
-        """Hand a description of electric joints to `rig.model.electric.ElectricRig`."""
-        types = _types(data) if cls is Rig else set()
-        if "electric" not in types:
-            return handler(data)
-        if types != {"electric"}:
+        """Read a description by the class of rig that its joints' `type` names."""
+        types = _types(data) & set(_CLASSES) if cls is Rig else set()
+        if len(types) > 1:
             raise ValueError("joints of both types, hydraulic and electric, in one rig: not yet")
-        from rig.model.electric import ElectricRig  # noqa: PLC0415 - it is a Rig itself
-
-        return ElectricRig.model_validate(data, context=info.context)
+        chosen = _CLASSES[types.pop()] if types else cls
+        return handler(data) if chosen is cls else chosen.model_validate(data, context=info.context)
 
     @field_validator("nominal", mode="before")
     @classmethod
@@ -74,17 +82,41 @@ class Rig(Part):
     @property
     def electric(self) -> bool:
         """Whether the joints are electric (`rig.model.electric`)."""
-        return False
+        return "fluid" not in self.families
 
     @property
     def position_kind(self) -> str:
         """Channel kind of a joint's position."""
-        return ch.PISTON
+        return self.joints[0].position_kind
+
+    @property
+    def drive_kind(self) -> str:
+        """Channel kind of what drives a joint: spool or drive."""
+        return self.joints[0].drive_kind
 
     @property
     def joint_kinds(self) -> tuple[str, ...]:
         """Channel kinds that an excited joint needs."""
-        return ch.JOINT_KINDS
+        return self.joints[0].kinds
+
+    @property
+    def simulated_kinds(self) -> tuple[str, ...]:
+        """Channel kinds of a joint that a simulation predicts."""
+        return self.joints[0].simulated_kinds
+
+    @property
+    def families(self) -> tuple[str, ...]:
+        """Families of equations that the joints have: mechanical, and fluid where there is oil."""
+        return self.joints[0].families
+
+    @property
+    def drive_gains(self) -> tuple[float, ...]:
+        """Each joint's force or torque per unit of drive; zeros for a hydraulic rig."""
+        return tuple(joint.drive_gain for joint in self.joints)
+
+    def largest_force(self, joint: int) -> float:
+        """Return the largest force [N] of the cylinder of joint `joint` (0-based)."""
+        return self.joints[joint].cylinder.cap_area * self.supply.pressure
 
     @property
     def base_angle(self) -> float:
@@ -122,6 +154,121 @@ class Rig(Part):
             c.cap_pipe_volume + (half + s) * c.cap_area,
             c.rod_pipe_volume + (half - s) * c.rod_area,
         )
+
+
+class ElectricRig(Rig):
+    """A robot of electric joints: a planar chain of revolute ones, or one prismatic joint.
+
+    `gravity` 0 means motion in a horizontal plane. `inclination` turns the base about the joints'
+    axis [rad], or is `unknown`: then it is identified, common to all joints (the paper's last
+    claim).
+    """
+
+    # A Rig to whoever asks for mechanics; the narrower types are this module's whole purpose.
+    gravity: Acceleration = Field(default=9.8, ge=0)
+    inclination: Angle | Literal["unknown"] = 0.0
+    supply: Supply | None = Field(default=None, exclude=True)  # type: ignore[assignment]
+    oil: Oil | None = Field(default=None, exclude=True)  # type: ignore[assignment]
+    joints: tuple[ElectricJoint, ...] = Field(min_length=1, max_length=9)  # type: ignore[assignment]
+    sensors: ElectricSensors  # type: ignore[assignment]
+
+    @field_validator("supply", "oil", mode="before")
+    @classmethod
+    def _no_fluid(cls, value: Any) -> Any:
+        if value is not None:
+            raise ValueError("an electric rig has neither supply nor oil; remove this key")
+        return value
+
+    @field_validator("sensors", mode="before")
+    @classmethod
+    def _sensor_units(cls, value: Any, info: ValidationInfo) -> Any:
+        joints = info.data.get("joints")
+        if not isinstance(value, dict) or not joints:
+            return value
+        units = {"position": joints[0].position_unit, "drive": joints[0].drive.unit}
+        out = dict(value)
+        for key, si in units.items():
+            if isinstance(out.get(key), dict):
+                sensor = dict(out[key])
+                if "range" in sensor:
+                    sensor["range"] = si_pair(sensor["range"], si, info)
+                if "noise" in sensor:
+                    sensor["noise"] = si_value(sensor["noise"], si, info)
+                out[key] = sensor
+        return out
+
+    @field_validator("nominal", mode="before")
+    @classmethod
+    def _nominal_units(cls, value: object, info: ValidationInfo) -> object:
+        joints = info.data.get("joints")
+        if not isinstance(value, dict) or not joints:
+            return value
+        known = {name: electric_unit(name, joints) for name in electric_names(joints)}
+        for name in value:
+            if name not in known:
+                raise ValueError(
+                    f"{name!r} is no parameter of an electric rig with {len(joints)} joint(s); "
+                    f"expected one of: {' '.join(known)}"
+                )
+        return {k: si_value(v, known[k], info) for k, v in value.items()}
+
+    @model_validator(mode="after")
+    def _one_machine(self) -> Self:
+        kinds = {joint.kind for joint in self.joints}
+        if "prismatic" in kinds and len(self.joints) > 1:
+            raise ValueError(
+                "a prismatic joint is supported alone; joints of a chain are all revolute"
+            )
+        if len({joint.drive.unit for joint in self.joints}) > 1:
+            raise ValueError("all joints of a rig share one drive unit, as they share one sensor")
+        if self.inclination == UNKNOWN and (self.prismatic or self.gravity == 0.0):
+            raise ValueError(
+                "inclination: unknown needs revolute joints and gravity; for a prismatic joint the "
+                "slope's pull is a torque_offset"
+            )
+        return self
+
+    @property
+    def prismatic(self) -> bool:
+        """Whether the rig is one prismatic joint."""
+        return self.joints[0].kind == "prismatic"
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """The measured channels, in the order every block and file keeps."""
+        each = range(1, len(self.joints) + 1)
+        return tuple(ch.channel(kind, i) for i in each for kind in ch.ELECTRIC_KINDS)
+
+    @property
+    def recorded(self) -> tuple[str, ...]:
+        """The channels of a record: the drive is measured, there is no command beside it."""
+        return self.channels
+
+    @property
+    def base_angle(self) -> float:
+        """Known inclination of the base [rad]; 0 where it is unknown."""
+        return 0.0 if self.inclination == UNKNOWN else float(self.inclination)
+
+    def unit_of(self, channel: str) -> str:
+        """Return the unit of a channel's samples."""
+        kind, joint = ch.kind_of(channel)
+        place = self.joints[(joint or 1) - 1]
+        return {ch.POSITION: place.position_unit, ch.DRIVE: place.drive.unit}[kind]
+
+    def unit_of_parameter(self, name: str) -> str:
+        """Return the SI unit of a parameter; a prismatic joint has kg and N s/m."""
+        return electric_unit(name, self.joints)
+
+    def chamber_volumes(self, joint: int, piston: Array) -> tuple[Array, Array]:
+        """Return zeros: there are no chambers."""
+        return np.zeros_like(piston), np.zeros_like(piston)
+
+    def largest_force(self, joint: int) -> float:
+        """Return the largest force or torque [N or N m] of the drive of joint `joint` (0-based)."""
+        return abs(self.joints[joint].drive.gain) * self.joints[joint].limits.drive
+
+
+_CLASSES: dict[str, type[Rig]] = {"hydraulic": Rig, "electric": ElectricRig}
 
 
 def _types(data: Any) -> set[str]:

@@ -11,7 +11,6 @@ from dataclasses import astuple, dataclass
 import numpy as np
 from numba import njit
 
-from rig.model.electric import drive_gains
 from rig.model.records import Record
 from rig.model.rig import Rig
 
@@ -65,7 +64,7 @@ def record(
     repeat: int = 1,
 ) -> Record:  # fmt: skip
     """Run it and measure with the rig's stated noise."""
-    n, rate, gain = len(reference), rig.sample_rate, drive_gains(rig)[0]
+    n, rate, gain = len(reference), rig.sample_rate, rig.drive_gains[0]
     par = np.array(astuple(carriage))
     position, drive = _run(reference, 1.0 / (rate * FINE), gain, par, float(reference[0]), 0.0)
     noise = rig.sensors.position.noise, rig.sensors.drive.noise

@@ -17,10 +17,9 @@ from analysis.simulation.simulate import DrivingInput, State, compiled, rates_of
 from analysis.simulation.validate import validate
 from analysis.terms import with_effects
 from analysis.terms.base import Used
-from rig.model.electric import ElectricRig
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
-from rig.model.rig import Rig
+from rig.model.rig import ElectricRig, Rig
 from rig.runs.rigs import load_rig
 from tests.studies.machines import electric_plant as plant
 

@@ -12,8 +12,8 @@ from analysis.identify.out_of_core import identify_folders
 from analysis.identify.result import PLAIN
 from analysis.terms import with_effects
 from analysis.terms.base import Used
-from rig.model.electric import ElectricRig
 from rig.model.records import Run
+from rig.model.rig import ElectricRig
 from rig.runs.exchange.fixtures import write_run
 from rig.runs.rigs import load_rig
 from tests.analysis.test_accumulate import assert_same

@@ -6,9 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from rig.model.electric import ElectricRig
 from rig.model.parse import InputError, parse_model
-from rig.model.rig import Rig
+from rig.model.rig import ElectricRig, Rig
 from rig.runs.rigs import load_bench, load_rig, rig_text
 
 TEXT, _ = rig_text("emps")

@@ -17,8 +17,9 @@ from analysis.simulation.validate import RecordValidation, validate
 from analysis.terms import with_effects
 from analysis.terms.base import Used
 from rig.cli.output import table
-from rig.model.electric import INCLINATION, ElectricRig
+from rig.model.electric import INCLINATION
 from rig.model.records import Run
+from rig.model.rig import ElectricRig
 from rig.runs.exchange.importer import import_records
 from rig.runs.rigs import load_rig
 from tests.studies.machines.electric_plant import Arm, draw_arm, records

@@ -22,8 +22,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rig.model.electric import ElectricRig
 from rig.model.records import Record, Run
+from rig.model.rig import ElectricRig
 
 Array = NDArray[np.float64]
 

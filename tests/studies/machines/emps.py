@@ -26,7 +26,6 @@ from analysis.simulation.validate import validate
 from analysis.terms import with_effects
 from analysis.terms.base import Used
 from rig.cli.output import table
-from rig.model.electric import drive_gains
 from rig.model.records import Record, Run
 from rig.runs.exchange.columns import read_table
 from rig.runs.exchange.importer import import_records
@@ -203,7 +202,7 @@ def closed_loop(values: Mapping[str, float], gain: float, data: Emps) -> tuple[A
 
 def closed_loop_table(data: Emps) -> str:
     """Return what position and drive do under the machine's own controller."""
-    record, gain = data.whole.records[0], drive_gains(data.whole.rig)[0]
+    record, gain = data.whole.records[0], data.whole.rig.drive_gains[0]
     measured, drive = (np.asarray(record.channels[n]) for n in ("position_1", "drive_1"))
     rows = []
     for name, effects in MODELS.items():
