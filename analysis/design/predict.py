@@ -29,10 +29,9 @@ from analysis.regression.noise import record_moments
 from analysis.regression.rows import Filtering, Rows, default_filtering, parameters_of
 from analysis.regression.solve import RowCluster, half_width, solve, triangle
 from analysis.signals.conditioning import condition
-from analysis.simulation.model import finite
+from analysis.simulation.model import finite, nominal_model
 from analysis.terms import baseline
-from analysis.terms.base import FAMILIES, Used, family_of
-from rig.model.parse import InputError
+from analysis.terms.base import FAMILIES, Used, family_of, inverted
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
 
@@ -115,17 +114,7 @@ def predict(
 
 def coefficients(rig: Rig, terms: Sequence[Used]) -> dict[str, float]:
     """Return the rows' nominal coefficients (1/b for b); raises InputError where one is missing."""
-    out = {}
-    for used in terms:
-        for c in used.term.coefficients(rig):
-            if c.parameter not in rig.nominal:
-                raise InputError(
-                    f"rig {rig.name!r} has no nominal {c.parameter!r} [{c.unit}]; nothing can be "
-                    "predicted without: add it under 'nominal' in the rig file"
-                )
-            value = rig.nominal[c.parameter]
-            out[c.parameter] = 1.0 / value if c.reciprocal else value
-    return out
+    return inverted(rig, terms, nominal_model(rig, terms).values)
 
 
 def information(

@@ -238,6 +238,7 @@ def _parameter_row(
     value = unit.scale * estimate.value
     low, high = (unit.scale * end for end in estimate.ci95)
     places = fm.decimals(value, 0.5 * (high - low))
+    digits = 4 if unit.scale == 1e6 else 3
     true = truth.get(name)
     mean = paper.TABLE_III[name].mean if rig.name == paper.RIG and name in paper.TABLE_III else None
     shown = estimate.identified
@@ -247,26 +248,15 @@ def _parameter_row(
         name,
         fm.meaning(name, len(rig.joints)),
         fm.fixed(value, places) if shown else fm.DASH,
-        f"± {_half(0.5 * (high - low), places)}" if has_interval else "",
+        f"± {fm.half_width(0.5 * (high - low), places)}" if has_interval else "",
         unit.text,
         f"{fm.fixed(low, places)} … {fm.fixed(high, places)}" if has_interval else fm.DASH,
         fm.column_percent(100 * estimate.std / abs(estimate.value)) if shown else fm.DASH,
-        _scaled(rig.nominal.get(name), unit.scale),
-        _scaled(true, unit.scale),
+        fm.significant(rig.nominal.get(name), digits, unit.scale),
+        fm.significant(true, digits, unit.scale),
         fm.column_percent(error, signed=True),
         ("yes" if covers(estimate, true) else "no") if true and has_interval else fm.DASH,
-        _scaled(mean, unit.scale),
+        fm.significant(mean, digits, unit.scale),
         "" if shown and not estimate.note else f"not identifiable: {estimate.note or 'no value'}"
         if not shown else estimate.note,
     )  # fmt: skip
-
-
-def _half(half: float, places: int) -> str:
-    """Write half an interval to the value's decimals, in powers of ten where those show nothing."""
-    if not math.isfinite(half) or round(half, places) == 0:
-        return fm.significant(half, 1)
-    return fm.fixed(half, places)
-
-
-def _scaled(value: float | None, scale: float) -> str:
-    return fm.DASH if value is None else fm.significant(scale * value, 4 if scale == 1e6 else 3)

@@ -52,10 +52,11 @@ def _tidy(text: str) -> str:
     return text.replace("-", MINUS)
 
 
-def significant(value: float | None, digits: int = 3) -> str:
-    """Write with `digits` significant digits, in powers of ten where very large or small."""
+def significant(value: float | None, digits: int = 3, scale: float = 1.0) -> str:
+    """Write scale * value with `digits` significant digits; in powers of ten if large or small."""
     if value is None or math.isnan(value):
         return DASH
+    value *= scale
     if math.isinf(value):
         return "∞" if value > 0 else f"{MINUS}∞"
     if value == 0:
@@ -102,11 +103,23 @@ def decimals(value: float, half_width: float) -> int:
     return max(min(max(wanted, least), most), 0)
 
 
-def fixed(value: float | None, places: int) -> str:
-    """Write a number with so many decimals; dash and infinity as `significant`."""
+def fixed(value: float | None, places: int, scale: float = 1.0) -> str:
+    """Write scale * value with so many decimals; dash and infinity as `significant`."""
     if value is None or not math.isfinite(value):
         return significant(value)
-    return _tidy(f"{value:.{places}f}")
+    return _tidy(f"{scale * value:.{places}f}")
+
+
+def constant(value: float) -> str:
+    """Write a constant as it was given, without trailing zeros."""
+    return f"{value:.6g}".replace("-", MINUS)
+
+
+def half_width(half: float, places: int) -> str:
+    """Write half an interval to the value's decimals, in powers of ten where those show nothing."""
+    if not math.isfinite(half) or round(half, places) == 0:
+        return significant(half, 1)
+    return fixed(half, places)
 
 
 def count(number: int, noun: str, plural: str = "") -> str:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from analysis.report import format as fm
+from analysis.report.format import constant as _n
 from analysis.report.plots.arm_plot import angle_range
 from rig.model import channels as ch
 from rig.model.parts import Joint
@@ -50,11 +51,6 @@ def bench_constants(rig: Rig) -> list[tuple[str, str]]:
     if s.skew:
         out.append(("multiplexer skew", f"{_n(s.skew * 1e6)} µs from channel to channel"))
     return out
-
-
-def _n(value: float) -> str:
-    """Write a constant as it was given, without trailing zeros."""
-    return f"{value:.6g}".replace("-", fm.MINUS)
 
 
 def joint_constants(rig: Rig) -> list[tuple[str, list[str]]]:

@@ -19,7 +19,7 @@ from analysis.identify.stacked_rows import RecordRows
 from analysis.regression.least_squares import least_squares
 from analysis.regression.rows import Rows
 from analysis.regression.solve import RowCluster, solve, triangle
-from analysis.terms.base import FAMILIES, family_of
+from analysis.terms.base import FAMILIES, family_of, inverted
 
 Array = NDArray[np.float64]
 
@@ -168,16 +168,13 @@ def per_repeat(
     whole = [m for m in rounds.values() if {one.group for one in m} == steps]
     if len(whole) < 2:
         return {}
-    reciprocal = {
-        c.parameter for used in identification.model.terms
-        for c in used.term.coefficients(identification.model.rig) if c.reciprocal
-    }  # fmt: skip
+    model = identification.model
     found: dict[str, list[float]] = {}
     for members in whole:
         for family, solution in identification.solutions.items():
             alone = _solve_once(members, family, solution.names)
-            for name, value in alone.items():
-                found.setdefault(name, []).append(1.0 / value if name in reciprocal else value)
+            for name, value in inverted(model.rig, model.terms, alone).items():
+                found.setdefault(name, []).append(value)
     return {name: _scatter(np.array(values)) for name, values in found.items()}
 
 

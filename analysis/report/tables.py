@@ -62,7 +62,7 @@ def fit_rows(validation: Sequence[RecordValidation]) -> list[FitRow]:
     for result in validation:
         for joint in joints_of(result):
             names = [ch.channel(kind, joint) for kind in KINDS]
-            scales = (1e3, 1e-3, 1e-3)
+            scaled = tuple(zip(names, (1e3, 1e-3, 1e-3), strict=True))
             remark = f"failed: {result.failure}" if result.failure else ""
             if result.outside:
                 remark += ("; " if remark else "") + (
@@ -72,21 +72,12 @@ def fit_rows(validation: Sequence[RecordValidation]) -> list[FitRow]:
                 FitRow(
                     result.record, joint,
                     tuple(fm.fit(result.fit.get(n)) for n in names),
-                    _scaled(result.rmse, names, scales),
-                    _scaled(result.window_rmse, names, scales),
+                    tuple(fm.significant(result.rmse.get(n), scale=s) for n, s in scaled),
+                    tuple(fm.significant(result.window_rmse.get(n), scale=s) for n, s in scaled),
                     remark,
                 )
             )  # fmt: skip
     return out
-
-
-def _scaled(
-    figures: Mapping[str, float], names: Sequence[str], scales: Sequence[float]
-) -> tuple[str, ...]:
-    return tuple(
-        fm.significant(figures[n] * s) if n in figures else fm.DASH
-        for n, s in zip(names, scales, strict=True)
-    )
 
 
 @dataclass(frozen=True)
@@ -176,18 +167,14 @@ def table_iii(
         if theirs is None:
             continue
         unit = fm.display_unit(estimate.unit)
-
-        def shown(value: float | None, digits: int = 4, scale: float = unit.scale) -> str:
-            return fm.DASH if value is None else fm.significant(value * scale, digits)
-
         ours = scatter.get(name)
         spread = (ours.low, ours.mean, ours.high) if ours else (None, None, None)
         deviation = 100 * (estimate.value / theirs.mean - 1)
         mark = mark_of(ours.rsd, theirs.rsd) if ours and math.isfinite(ours.rsd) else ""
         out.append(
             Table3Row(
-                name, unit.text, shown(estimate.value),
-                tuple(shown(v) for v in spread),
+                name, unit.text, fm.significant(estimate.value, 4, unit.scale),
+                tuple(fm.significant(v, 4, unit.scale) for v in spread),
                 fm.column_percent(ours.rsd if ours else None),
                 mark,
                 _printed(theirs, unit.scale, 0 if name == "b" else 2),
@@ -200,11 +187,9 @@ def table_iii(
 def _printed(theirs: paper.PaperParameter, scale: float, places: int) -> tuple[str, ...]:
     """Write the paper's min, mean, max, RSD, PSO, GA, nominal with the decimals it prints."""
 
-    def shown(value: float | None) -> str:
-        return fm.DASH if value is None else fm.fixed(scale * value, places)
-
     return (
-        *(shown(v) for v in (theirs.low, theirs.mean, theirs.high)),
-        f"{theirs.rsd:.2f}", shown(theirs.pso), shown(theirs.ga),
-        " to ".join(shown(v) for v in theirs.nominal) or fm.DASH,
+        *(fm.fixed(v, places, scale) for v in (theirs.low, theirs.mean, theirs.high)),
+        f"{theirs.rsd:.2f}",
+        *(fm.fixed(v, places, scale) for v in (theirs.pso, theirs.ga)),
+        " to ".join(fm.fixed(v, places, scale) for v in theirs.nominal) or fm.DASH,
     )  # fmt: skip

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -64,18 +64,26 @@ class Model:
 
 def nominal_model(rig: Rig, terms: Sequence[Used]) -> Model:
     """Return the model of the rig's nominal values; raises InputError where one is missing."""
-    parameters = {}
     for used in terms:
         for c in used.term.parameters(rig):
             if c.parameter not in rig.nominal:
                 raise InputError(
-                    f"rig {rig.name!r} has no nominal {c.parameter!r} [{c.unit}]; the twin needs "
-                    "one: add it under 'nominal' in the rig file"
+                    f"rig {rig.name!r} has no nominal {c.parameter!r} [{c.unit}]; without it "
+                    "nothing can be simulated or predicted: add it under 'nominal' in the rig file"
                 )
-            value = rig.nominal[c.parameter]
-            parameters[c.parameter] = Estimate(value, c.unit, math.nan, (math.nan, math.nan))
+    return replace(model_of(rig, terms, rig.nominal), provenance={"source": "nominal"})
+
+
+def model_of(rig: Rig, terms: Sequence[Used], values: Mapping[str, float]) -> Model:
+    """Return the model of parameter values alone, without intervals; others are left out."""
+    parameters = {
+        c.parameter: Estimate(values[c.parameter], c.unit, math.nan, (math.nan, math.nan))
+        for used in terms
+        for c in used.term.parameters(rig)
+        if c.parameter in values
+    }
     k = len(parameters)
-    return Model(rig, tuple(terms), parameters, np.full((k, k), np.nan), {"source": "nominal"})
+    return Model(rig, tuple(terms), parameters, np.full((k, k), np.nan))
 
 
 def finite(value: float) -> float | None:

@@ -204,3 +204,9 @@ class Used:
 
     term: Term
     shape: tuple[float, ...] = ()
+
+
+def inverted(rig: Rig, terms: Sequence[Used], values: Mapping[str, float]) -> dict[str, float]:
+    """Turn parameters into the rows' coefficients, or those into parameters: b and 1/b."""
+    reciprocal = {c.parameter for u in terms for c in u.term.coefficients(rig) if c.reciprocal}
+    return {name: 1.0 / v if name in reciprocal and v else v for name, v in values.items()}

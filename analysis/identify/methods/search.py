@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from analysis.regression.rows import Filtering
 from analysis.signals.conditioning import Mask, aligned_channels, condition
-from analysis.simulation.model import Estimate, Model
+from analysis.simulation.model import Model, model_of
 from analysis.simulation.simulate import DrivingInput, State, compiled, drive_of, simulate, state_at
 from analysis.simulation.validate import arrived
 from analysis.terms.base import Used
@@ -167,16 +167,10 @@ def _template(rig: Rig, terms: Sequence[Used], names: Sequence[str]) -> Model:
             f"rig {rig.name!r} has no positive nominal {' '.join(missing)}: a search has to know "
             "where to look; add them under 'nominal' in the rig file"
         )
-    none = (np.nan, np.nan)
-    parameters = {
-        c.parameter: Estimate(rig.nominal.get(c.parameter, PLAIN), c.unit, np.nan, none)
-        for used in terms
-        for c in used.term.coefficients(rig)
-    }
-    if set(names) - set(parameters):
+    known = [c.parameter for used in terms for c in used.term.coefficients(rig)]
+    if set(names) - set(known):
         raise InputError("a search needs the paper's terms: inertia, friction, gravity, oil, gains")
-    k = len(parameters)
-    return Model(rig, tuple(terms), parameters, np.full((k, k), np.nan))
+    return model_of(rig, terms, {name: rig.nominal.get(name, PLAIN) for name in known})
 
 
 def _stilled(drive: DrivingInput) -> DrivingInput:

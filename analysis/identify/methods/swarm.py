@@ -36,7 +36,7 @@ from analysis.identify.result import Identification, estimates_of
 from analysis.regression.rows import Filtering, parameters_of
 from analysis.regression.solve import Solution
 from analysis.simulation.model import Model
-from analysis.terms.base import FAMILIES, Used
+from analysis.terms.base import FAMILIES, Used, inverted
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
 
@@ -194,16 +194,10 @@ def _identification(
 
 def _as_solution(method: str, task: SearchTask, trail: Trail, family: str) -> Solution:
     """Return a family's values as a solution of no rows: no interval, no condition number."""
-    coefficients = {
-        c.parameter: c for u in task.model.terms for c in u.term.coefficients(task.model.rig)
-    }
+    found = inverted(task.model.rig, task.model.terms, trail.values)
     names = parameters_of(task.model.rig, task.model.terms, family)
     nan = np.full(len(names), np.nan)
-    value = nan.copy()
-    for i, name in enumerate(names):
-        if name in trail.values:
-            found = trail.values[name]
-            value[i] = 1.0 / found if coefficients[name].reciprocal else found
+    value = np.array([found.get(name, np.nan) for name in names])
     lost = {n: f"{method} searches STEP1's parameters only" for n in names if n not in trail.values}
     return Solution(names, value, np.diag(nan), nan, np.nan, 0, np.nan, nan, lost)
 

@@ -30,7 +30,7 @@ from analysis.regression.conditioned import ConditionedRecord, condition_runs
 from analysis.regression.least_squares import scaled_inverse
 from analysis.regression.solve import Solution
 from analysis.signals.conditioning import Mask, aligned_channels
-from analysis.simulation.model import Estimate, Model
+from analysis.simulation.model import Model, model_of
 from analysis.simulation.simulate import DrivingInput, State, compiled, drive_of, simulate
 from analysis.simulation.validate import arrived, first_state
 from analysis.terms.base import Used
@@ -79,10 +79,7 @@ class FreeRuns:
 
     def left(self, values: Mapping[str, float]) -> list[Array]:
         """Return every record's measured less simulated positions (n, F)."""
-        nan = (np.nan, np.nan)
-        estimates = {n: Estimate(v, "", np.nan, nan) for n, v in values.items()}
-        k = len(estimates)
-        model = Model(self.rig, self.terms, estimates, np.full((k, k), np.nan))
+        model = model_of(self.rig, self.terms, values)
         return [record.left(model) for record in self.records]
 
 

@@ -23,6 +23,7 @@ from analysis.identify.output_error.fit import Search
 from analysis.identify.output_error.windows import Windows
 from analysis.regression.solve import half_width
 from analysis.simulation.model import Estimate, Model
+from analysis.terms.base import inverted
 from rig.model.parse import InputError
 from rig.model.records import Run
 
@@ -145,12 +146,10 @@ def _shapes(model: Model, effect: Effect) -> tuple[Shape, ...]:
 
 def _theta(windows: Windows, model: Model) -> Array:
     """Return the windows' parameters (k,) as the model has them, 1/b for b."""
-    values = dict(model.values)
+    values = inverted(model.rig, model.terms, model.values)
     for used in model.terms:
         values |= shape_values(model.rig, used)
-    return np.array(
-        [1.0 / values[n] if n in windows.reciprocal else values[n] for n in windows.names]
-    )
+    return np.array([values[n] for n in windows.names])
 
 
 def _free(model: Model, effect: Effect) -> frozenset[str]:

@@ -21,9 +21,9 @@ from analysis.identify.output_error.window_data import Nudged, Reduced, Stretch,
 from analysis.regression.conditioned import condition_runs
 from analysis.signals.conditioning import Mask
 from analysis.signals.filters import channel_filter
-from analysis.simulation.model import Estimate, Model
+from analysis.simulation.model import Model, model_of
 from analysis.simulation.simulate import compiled, drive_of, hidden_paths, put_right
-from analysis.terms.base import Used
+from analysis.terms.base import Used, inverted
 from rig.model import channels as ch
 from rig.model.parse import InputError
 from rig.model.records import Run
@@ -61,9 +61,6 @@ class Windows:
             if name in shapes
         }
         names = (*names, *shapes)
-        self.reciprocal = {
-            c.parameter for used in terms for c in used.term.coefficients(rig) if c.reciprocal
-        }
         self.warm = (
             free is None
             and "b" in names
@@ -193,13 +190,7 @@ class Windows:
             terms[k] = replace(terms[k], shape=tuple(shape))
         if self.warm:
             values["b"] += kelvin * values.pop(nu.KAPPA)
-        nan = (np.nan, np.nan)
-        estimates = {
-            n: Estimate(1.0 / v if n in self.reciprocal else v, "", np.nan, nan)
-            for n, v in values.items()
-        }
-        k = len(estimates)
-        return Model(self.rig, tuple(terms), estimates, np.full((k, k), np.nan))
+        return model_of(self.rig, terms, inverted(self.rig, terms, values))
 
     def linearised(
         self, theta: Array, starts: Sequence[Array], sigma: Mapping[int, Array]
