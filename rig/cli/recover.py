@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-log = logging.getLogger(__name__)
-
+from rig.cli.errors import WorkError
 
 def recover(
     run: Annotated[Path, typer.Argument(help="The run folder of an interrupted run.")],
@@ -23,7 +21,12 @@ def recover(
     """
     from rig.runs.recover import recover as recover_run
 
-    typer.echo(recover_run(run, force=force).message)
+    report = recover_run(run, force=force)
+    typer.echo(report.message)
+    if report.damaged is not None:
+        raise WorkError(
+            f"{run}: {report.missing} samples are known to be lost; {report.damaged.name} is kept"
+        )
 
 
 def register(app: typer.Typer) -> None:

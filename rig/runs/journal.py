@@ -32,12 +32,15 @@ Ticks = NDArray[np.int64]
 
 _FORMAT = 1
 _LAST = (1 << 63) - 1  # the largest number SQLite gives a row
-_SCHEMA = """
-CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
+_BLOCKS = """
 CREATE TABLE block (
     id INTEGER PRIMARY KEY, stream INTEGER NOT NULL, sequence INTEGER NOT NULL,
     tick INTEGER NOT NULL, samples INTEGER NOT NULL, late REAL, crc INTEGER NOT NULL,
-    data BLOB NOT NULL, saturated BLOB NOT NULL);
+    data BLOB NOT NULL, saturated BLOB NOT NULL)
+"""
+_SCHEMA = f"""
+CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
+{_BLOCKS};
 CREATE TABLE mark (
     id INTEGER PRIMARY KEY, stream INTEGER NOT NULL, start INTEGER NOT NULL, ticks INTEGER,
     state TEXT NOT NULL, meta TEXT NOT NULL);
@@ -214,7 +217,18 @@ class Journal:
         )
         with suppress(sqlite3.DatabaseError):  # reported by `spans`
             for row in rows:
-                yield int(row[0]), _decode(row[1:], columns, measured)
+                yield int(row[0]), decode_row(row[1:], columns, measured)
+
+    def in_order(self) -> None:
+        """Number the blocks anew in the order of stream and tick; raises RecordingFailed."""
+        rows = (
+            "INSERT INTO block SELECT NULL, stream, sequence, tick, samples, late, crc, data, "
+            "saturated FROM unordered ORDER BY stream, tick"
+        )
+        self._write("ALTER TABLE block RENAME TO unordered", ())
+        self._write(_BLOCKS, ())
+        self._write(rows, ())
+        self._write("DROP TABLE unordered", ())
 
     def close(self) -> None:
         """Close the files; never raises."""
@@ -228,7 +242,8 @@ class Journal:
             self.path.with_name(self.path.name + suffix).unlink(missing_ok=True)
 
 
-def _decode(row: tuple[Any, ...], columns: int, measured: int) -> Block | None:
+def decode_row(row: tuple[Any, ...], columns: int, measured: int) -> Block | None:
+    """Return the block of a row (its columns behind the id), None if the checksum fails."""
     stream, sequence, tick, samples, late, crc, data, marks = row
     if not isinstance(data, bytes) or len(data) != samples * columns * 8:
         return None

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import logging
-from contextlib import suppress
-from dataclasses import dataclass
+import sqlite3
+from contextlib import closing, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rig.model.parse import InputError
+from rig.model.rig import Rig
 from rig.model.trips import RecordingFailed
 from rig.runs import runstate, store
 from rig.runs.journal import Journal
 from rig.runs.recorder import finalise
+from rig.runs.salvage.rebuild import find_damage, rebuild, set_aside
 from rig.runs.sections import Written
 
 log = logging.getLogger(__name__)
@@ -19,7 +22,10 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class RecoverReport:
-    """What `recover` found and did; `records` counts complete and partial ones."""
+    """What `recover` found and did; `records` counts complete and partial ones.
+
+    `damaged` is where a damaged journal is kept, of which `missing` samples are known to be lost.
+    """
 
     path: Path
     state: str
@@ -29,6 +35,8 @@ class RecoverReport:
     lost_samples: int
     damaged_blocks: int
     message: str
+    damaged: Path | None = None
+    missing: int = 0
 
 
 def recover(path: str | Path, *, force: bool = False) -> RecoverReport:
@@ -36,7 +44,8 @@ def recover(path: str | Path, *, force: bool = False) -> RecoverReport:
 
     The state becomes the one the run was about to end in, or `interrupted`. `force` recovers a
     run of another computer, where this one cannot ask whether its process lives. Raises
-    InputError (no run, still running) and RecordingFailed (the disk).
+    InputError (no run, still running) and RecordingFailed (the disk; nothing of the journal can be
+    read). A damaged journal is never deleted: see `RecoverReport.damaged`.
     """
     folder = Path(path)
     header = store.read_header(folder)
@@ -47,7 +56,7 @@ def recover(path: str | Path, *, force: bool = False) -> RecoverReport:
         stood = runstate.read_state(folder)
         runstate.take_ownership(folder)
         try:
-            return _from_journal(folder, header.rig.name, stood)
+            return _from_journal(folder, header.rig, stood)
         finally:
             runstate.give_up_ownership(folder)
     except OSError as error:
@@ -70,23 +79,72 @@ def _refuse_if_alive(folder: Path, force: bool) -> None:
         )
 
 
-def _from_journal(folder: Path, rig_name: str, stood: str) -> RecoverReport:
+def _from_journal(folder: Path, rig: Rig, stood: str) -> RecoverReport:
     for stray in folder.glob("*.tmp"):
         stray.unlink(missing_ok=True)
-    journal = Journal.open(folder / runstate.JOURNAL)
+    path = folder / runstate.JOURNAL
+    damage = find_damage(path, rig)
+    if damage is not None:
+        return _from_damaged(folder, rig, stood, damage)
+    journal = Journal.open(path)
     try:
         state = str(journal.meta("outcome") or stood)
-        written = finalise(journal, folder, rig_name, state)
+        written = finalise(journal, folder, rig.name, state)
     finally:
         journal.close()
+    message = _counts(written)
+    _note(folder, state, message)
+    return _report(folder, state, written, message)
+
+
+def _from_damaged(folder: Path, rig: Rig, stood: str, damage: str) -> RecoverReport:
+    """Finalise what a damaged journal still holds; the journal itself is kept beside."""
+    path = folder / runstate.JOURNAL
+    state = _outcome(path) or stood
+    journal, found = rebuild(path, rig, damage)
+    try:
+        if not found.blocks:
+            journal.delete()
+            raise RecordingFailed(
+                f"{path}: not a readable journal: {damage}; no block of samples in it can be read. "
+                "It stays as it is: copy it from a backup, or start the run anew"
+            )
+        written = finalise(journal, folder, rig.name, state)
+    finally:
+        journal.close()
+    kept = set_aside(path)
+    seconds = found.lost / rig.sample_rate
+    loss = f"lost: {found.lost} samples ({seconds:.3f} s)" if found.lost else "no loss is known"
     message = (
+        f"the journal is damaged: {damage}; read from it: {found.samples} samples; {loss}; what "
+        f"came after its last readable sample cannot be counted; {_counts(written)}; the damaged "
+        f"journal is kept as {kept.name}"
+    )
+    if found.nameless:
+        message += (
+            f"; what these records were cannot be read, their samples stand under "
+            f"{runstate.BETWEEN}: {', '.join(found.nameless)}"
+        )
+    _note(folder, state, message)
+    report = _report(folder, state, written, message)
+    return replace(report, damaged_blocks=found.lost_blocks, damaged=kept, missing=found.lost)
+
+
+def _outcome(path: Path) -> str | None:
+    """Return the state that a damaged journal's run was about to end in, if that can be read."""
+    try:
+        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as db:
+            outcome = Journal(db, path).meta("outcome")
+    except (sqlite3.Error, ValueError, TypeError):
+        return None
+    return outcome if outcome in runstate.STATES else None
+
+
+def _counts(written: Written) -> str:
+    return (
         f"{written.records} record(s), {written.partial} of them unfinished, "
         f"{written.samples} samples, {written.lost_samples} lost"
     )
-    if written.damaged_blocks:
-        message += f"; {written.damaged_blocks} damaged block(s), see journal.damaged.sqlite"
-    _note(folder, state, message)
-    return _report(folder, state, written, message)
 
 
 def _without_journal(folder: Path) -> RecoverReport:

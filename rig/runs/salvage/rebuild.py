@@ -1,0 +1,235 @@
+"""Tell a damaged journal from a whole one, and make a whole one of what a damaged one still holds.
+
+A damaged journal's files are read only. What counts as lost: the gaps that the readable blocks
+leave between them (less what was lost on the wire, which the events say), the blocks before the
+first by its number, and what the events and marks say was measured after the last.
+"""
+
+from __future__ import annotations
+
+import logging
+import sqlite3
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from drivers.base import SampleBlock
+from rig.model.rig import Rig
+from rig.runs.files import sync_folder
+from rig.runs.journal import Block, Journal, Mark, decode_row
+from rig.runs.runstate import read_events
+from rig.runs.salvage.scan import best_marks, block_rows, marks, raw_bytes
+
+log = logging.getLogger(__name__)
+
+REBUILT: Final = "journal.rebuilt.sqlite"
+DAMAGED: Final = "journal.damaged"
+_FILES: Final = ("", "-wal", "-shm")
+_WAL_HEADER, _FRAME_HEADER = 32, 24
+_AT_ONCE = 256  # rows asked for together; where one is unreadable each is tried alone
+_UNREADABLE = (sqlite3.Error, ValueError, TypeError, KeyError, AttributeError, OverflowError)
+
+
+@dataclass(frozen=True)
+class Salvage:
+    """What a damaged journal still holds; `lost` samples are known to be missing."""
+
+    what: str
+    blocks: int
+    samples: int
+    lost: int
+    lost_blocks: int
+    nameless: tuple[str, ...]
+
+
+def find_damage(path: Path, rig: Rig) -> str | None:
+    """Return what is wrong with a journal in a few words, None if all of it can be read."""
+    log_file = path.with_name(path.name + "-wal")
+    try:
+        with closing(_open(path)) as db:
+            (said,) = db.execute("PRAGMA integrity_check(1)").fetchone()
+            if said != "ok":
+                return f"its pages are damaged ({' '.join(str(said).split())})"
+            newest = _check_rows(Journal(db, path), db, rig)
+    except _UNREADABLE as error:
+        return f"SQLite cannot read it ({error})"
+    if isinstance(newest, str):
+        return newest
+    raw = raw_bytes(log_file)
+    rows = (_as_block(row.values, rig) for row in block_rows(raw))
+    if any(block is not None and (block.stream, block.tick) > newest for block in rows):
+        return "its write-ahead log is damaged before its end"
+    return "the end of its write-ahead log is cut off" if _torn(raw) else None
+
+
+def _open(path: Path) -> sqlite3.Connection:
+    """Open a journal so that its files stay as they are: no log is written back."""
+    return sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True, isolation_level=None)
+
+
+def _check_rows(journal: Journal, db: sqlite3.Connection, rig: Rig) -> str | tuple[int, int]:
+    """Return what is wrong with the rows, or the newest block as (stream, tick)."""
+    if journal.meta("columns") != list(rig.recorded):
+        return "its columns are not those of the run's rig"
+    if journal.meta("measured") != len(rig.channels):
+        return "its count of sensors is not that of the run's rig"
+    if journal.meta("sample_rate") != rig.sample_rate:
+        return "its sample rate is not that of the run's rig"
+    journal.marks()
+    newest, count = (-1, -1), 0
+    for _, block in journal.blocks():
+        if block is None:
+            return "the checksum of a block does not match"
+        if (block.stream, block.tick) <= newest:
+            return "its blocks are out of order"
+        newest, count = (block.stream, block.tick), count + 1
+    (held, last) = db.execute("SELECT count(*), max(id) FROM block").fetchone()
+    return newest if held == count == (last or 0) else "blocks are missing"
+
+
+def _torn(raw: Any) -> bool:
+    if len(raw) < _WAL_HEADER:
+        return len(raw) > 0
+    page = int.from_bytes(raw[8:12].tobytes(), "big")
+    return page > 0 and (len(raw) - _WAL_HEADER) % (page + _FRAME_HEADER) != 0
+
+
+def _as_block(row: tuple[Any, ...], rig: Rig) -> Block | None:
+    """Return the block of a row without its number, None if the checksum does not match."""
+    values = row[1:]
+    if not all(isinstance(value, int) for value in (*values[:4], values[5])):
+        return None
+    try:
+        return decode_row(values, len(rig.recorded), len(rig.channels))
+    except _UNREADABLE:
+        return None
+
+
+def rebuild(path: Path, rig: Rig, what: str) -> tuple[Journal, Salvage]:
+    """Write what a damaged journal still holds into a new one beside it, open to be finished.
+
+    Raises RecordingFailed if the disk fails.
+    """
+    fresh = path.with_name(REBUILT)
+    for suffix in _FILES:
+        fresh.with_name(fresh.name + suffix).unlink(missing_ok=True)
+    made = Journal.create(fresh, rig.recorded, len(rig.channels), rig.sample_rate)
+    places: dict[tuple[int, int], tuple[int, int]] = {}  # block -> its length, its number
+    kept_marks: list[Mark] = []
+    for suffix in _FILES[:2]:
+        raw = raw_bytes(path.with_name(path.name + suffix))
+        kept_marks += marks(raw)
+        for row in block_rows(raw):
+            _keep(made, _as_block(row.values, rig), row.number, places)
+    for number, values in _rows_by_number(path):
+        _keep(made, _as_block(values, rig), number, places)
+    chosen = best_marks(kept_marks)
+    for mark in chosen:
+        number = made.begin_mark(mark.stream, mark.start, mark.meta)
+        if mark.state != "open" and mark.ticks is not None:
+            made.end_mark(number, mark.ticks, mark.state, mark.meta)
+    made.in_order()
+    return made, _account(path.parent, what, places, chosen)
+
+
+def _keep(
+    made: Journal,
+    block: Block | None,
+    number: int | None,
+    places: dict[tuple[int, int], tuple[int, int]],
+) -> None:
+    if block is None:
+        return
+    key = (block.stream, block.tick)
+    if key not in places:
+        sample_block = SampleBlock(
+            block.sequence, block.tick, block.data, block.saturated, 0, False
+        )
+        made.append(block.stream, sample_block, block.late)
+        places[key] = (len(block.data), number or 0)
+
+
+def _rows_by_number(path: Path) -> Iterator[tuple[int, tuple[Any, ...]]]:
+    """Yield the rows that SQLite can still read, many at once, then those around a fault alone."""
+    sql = (
+        "SELECT id, stream, sequence, tick, samples, late, crc, data, saturated FROM block "
+        "WHERE id BETWEEN ? AND ?"
+    )
+    try:
+        with closing(_open(path)) as db:
+            (last,) = db.execute("SELECT max(id) FROM block").fetchone()
+            for first in range(1, int(last or 0) + 1, _AT_ONCE):
+                for row in _readable(db, sql, first, first + _AT_ONCE - 1):
+                    yield int(row[0]), tuple(row)
+    except _UNREADABLE as error:
+        log.info("%s: %s", path, error)
+
+
+def _readable(db: sqlite3.Connection, sql: str, first: int, last: int) -> list[tuple[Any, ...]]:
+    try:
+        return db.execute(sql, (first, last)).fetchall()
+    except _UNREADABLE:
+        if first == last:
+            return []
+        middle = (first + last) // 2
+        return [*_readable(db, sql, first, middle), *_readable(db, sql, middle + 1, last)]
+
+
+def _account(
+    folder: Path,
+    what: str,
+    places: dict[tuple[int, int], tuple[int, int]],
+    chosen: Sequence[Mark],
+) -> Salvage:
+    """Count what is there and what is known to be missing."""
+    events = read_events(folder)
+    names = {str(mark.meta["name"]) for mark in chosen}
+    begun = {str(e["record"]) for e in events if e.get("event") == "record begins"}
+    if not places:
+        return Salvage(what, 0, 0, 0, 0, tuple(sorted(begun - names)))
+    keys = sorted(places)
+    ticks = np.array([key[1] for key in keys], dtype=np.int64)
+    streams = np.array([key[0] for key in keys], dtype=np.int64)
+    ends = ticks + np.array([places[key][0] for key in keys], dtype=np.int64)
+    gaps = np.where(streams[1:] == streams[:-1], ticks[1:] - ends[:-1], 0)
+    wire = sum(int(e["lost"]) for e in events if isinstance(e.get("lost"), int))
+    lost = max(0, int(gaps[gaps > 0].sum()) - wire)
+    usual = int(np.median(ends - ticks))
+    numbers = sorted(number for _, number in places.values() if number)
+    lost_blocks = 0 if not numbers else max(0, numbers[-1] - len(places))
+    if numbers and places[keys[0]][1] > 1:
+        lost += (places[keys[0]][1] - 1) * usual
+    # A record may be announced before its first sample is taken.
+    told = [e for e in events if e.get("event") != "record begins"]
+    known = [int(e["tick"]) for e in told if isinstance(e.get("tick"), int)]
+    known += [m.start + m.ticks for m in chosen if m.state == "complete" and m.ticks is not None]
+    lost += max(0, max(known, default=0) - int(ends[-1]))
+    return Salvage(
+        what,
+        len(places),
+        int((ends - ticks).sum()),
+        lost,
+        lost_blocks,
+        tuple(sorted(begun - names)),
+    )
+
+
+def set_aside(path: Path) -> Path:
+    """Give a damaged journal and its log another name, which no other has; returns it."""
+    number, target = 1, path.with_name(f"{DAMAGED}.sqlite")
+    while target.exists() or target.with_name(target.name + "-wal").exists():
+        number += 1
+        target = path.with_name(f"{DAMAGED}-{number}.sqlite")
+    # The database first: without it the run counts as finalised.
+    for suffix in _FILES:
+        source = path.with_name(path.name + suffix)
+        if suffix == "-shm":
+            source.unlink(missing_ok=True)
+        elif source.exists():
+            source.replace(target.with_name(target.name + suffix))
+    sync_folder(path.parent)
+    return target

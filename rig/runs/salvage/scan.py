@@ -1,0 +1,179 @@
+"""Find rows of a journal in the raw bytes of its files, whatever SQLite still makes of them.
+
+A row of a table is stored as (lengths of) payload and rowid, a header that gives one type per
+column, then the columns ("Database File Format", sqlite.org, section 2.1). A header of the block
+table is easily told from samples, and the block's checksum proves what follows it; so no page
+structure is needed, and the write-ahead log is read like the database. A row longer than a page is
+stored in pieces and not found here.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.runs.journal import Mark
+
+Bytes = NDArray[np.uint8]
+Like = Callable[[list[Bytes]], Any]  # to a mask, one flag per place
+
+_CHUNK = 1 << 24
+_OVERLAP = 1 << 16  # the largest page: no row that is whole reaches further
+_INTEGER = (0, 1, 2, 3, 4, 6, 8)  # bytes of the integer types 0 (NULL) to 6
+_NULL, _REAL, _ZERO, _ONE = 0, 7, 8, 9
+_STATES = {"open": 21, "complete": 29, "partial": 27, "discarded": 31}  # type of each text
+
+
+@dataclass(frozen=True)
+class FoundRow:
+    """A row's columns, where it begins in its file, and its number (None if that is damaged)."""
+
+    offset: int
+    number: int | None
+    values: tuple[Any, ...]
+
+
+def raw_bytes(path: Path) -> Bytes:
+    """Map a file for reading; an absent or empty one has no bytes."""
+    if not path.is_file() or path.stat().st_size == 0:
+        return np.empty(0, dtype=np.uint8)
+    return np.memmap(path, dtype=np.uint8, mode="r")
+
+
+def block_rows(raw: Bytes) -> Iterator[FoundRow]:
+    """Yield what looks like a row of the block table; only its checksum tells whether it is."""
+
+    def like(types: list[Bytes]) -> Any:
+        return np.logical_and.reduce([kind <= _ONE for kind in types[1:]])
+
+    yield from _rows(raw, 9, 7, like)
+
+
+def marks(raw: Bytes) -> Iterator[Mark]:
+    """Yield the marks found, in every version that is left of each."""
+
+    def like(types: list[Bytes]) -> Any:
+        number = [t <= _ONE for t in types[1:4]]
+        return np.logical_and.reduce([*number, np.isin(types[4], list(_STATES.values()))])
+
+    for row in _rows(raw, 6, 5, like):
+        _, stream, start, ticks, state, text = row.values
+        try:
+            meta = json.loads(text)
+            known = isinstance(meta, dict) and {"name", "step", "repeat"} <= meta.keys()
+        except (ValueError, TypeError):
+            continue
+        if known and state in _STATES and isinstance(stream, int) and isinstance(start, int):
+            yield Mark(row.number or 0, stream, start, ticks, state, meta)
+
+
+def _rows(raw: Bytes, columns: int, short: int, like: Like) -> Iterator[FoundRow]:
+    """Yield rows of so many columns, of which the first is NULL (it is the rowid).
+
+    `like` judges the types of the first `short` columns, each one byte in the header.
+    """
+    for begin in range(0, len(raw), _CHUNK):
+        part = np.asarray(raw[begin : begin + _CHUNK + _OVERLAP])
+        most = min(_CHUNK, len(part) - columns - 1)
+        if most <= 0:
+            continue
+        head = part[:most]
+        fits = (head > columns) & (head <= columns + 9) & (part[1 : most + 1] == _NULL)
+        places = np.flatnonzero(fits)
+        if not len(places):
+            continue
+        types = [part[places + 1 + k] for k in range(short)]
+        for place in places[like(types)].tolist():
+            found = _row(part, place, columns)
+            if found is not None:
+                yield FoundRow(begin + place, *found)
+
+
+def _row(part: Bytes, place: int, columns: int) -> tuple[int | None, tuple[Any, ...]] | None:
+    end = place + int(part[place])
+    at = place + 1
+    types: list[int] = []
+    while at < end and len(types) < columns:
+        value, at = _varint(part, at)
+        types.append(value)
+    if at != end or len(types) != columns:
+        return None
+    sizes = [_size(kind) for kind in types]
+    if any(size is None for size in sizes):
+        return None
+    whole = end + sum(size or 0 for size in sizes)
+    if whole > len(part):
+        return None
+    values = []
+    for kind, size in zip(types, sizes, strict=True):
+        values.append(_value(kind, part[end : end + (size or 0)].tobytes()))
+        end += size or 0
+    return _number(part, place, whole - place), tuple(values)
+
+
+def _varint(part: Bytes, at: int) -> tuple[int, int]:
+    """Return a number of seven bits a byte, high ones first, and where it ends."""
+    value = 0
+    for k in range(at, min(at + 9, len(part))):
+        byte = int(part[k])
+        value = (value << 7) | (byte & 0x7F)
+        if byte < 0x80:
+            return value, k + 1
+    return value, len(part) + 1
+
+
+def _as_varint(value: int) -> bytes:
+    digits = [value & 0x7F]
+    while value := value >> 7:
+        digits.append(0x80 | (value & 0x7F))
+    return bytes(reversed(digits))
+
+
+def _size(kind: int) -> int | None:
+    """Return the bytes of a column of this type, None for a type that does not exist."""
+    if kind < len(_INTEGER):
+        return _INTEGER[kind]
+    if kind in (_REAL, _ZERO, _ONE):
+        return 8 if kind == _REAL else 0
+    return (kind - 12) // 2 if kind >= 12 else None
+
+
+def _value(kind: int, raw: bytes) -> Any:
+    if kind == _NULL:
+        return None
+    if kind < len(_INTEGER):
+        return int.from_bytes(raw, "big", signed=True)
+    if kind == _REAL:
+        return float(np.frombuffer(raw, dtype=">f8")[0])
+    if kind in (_ZERO, _ONE):
+        return kind - _ZERO
+    return raw if kind % 2 == 0 else raw.decode("utf-8", errors="replace")
+
+
+def _number(part: Bytes, place: int, payload: int) -> int | None:
+    """Return the rowid that stands before a payload, behind the payload's own length."""
+    length = _as_varint(payload)
+    for size in range(1, 6):
+        begin = place - size - len(length)
+        if begin < 0 or part[begin : begin + len(length)].tobytes() != length:
+            continue
+        value, end = _varint(part, place - size)
+        if end == place:
+            return value
+    return None
+
+
+def best_marks(found: Sequence[Mark]) -> list[Mark]:
+    """Return one version of each mark, the closed one where it is left, in the order of start."""
+    best: dict[tuple[int, int, str], Mark] = {}
+    for mark in found:
+        key = (mark.stream, mark.start, str(mark.meta["name"]))
+        if key not in best or best[key].state == "open":
+            best[key] = mark
+    return [best[key] for key in sorted(best)]
