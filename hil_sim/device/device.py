@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from hil_sim.device.laws import DeviceLaw, LawTable, Refused
 from hil_sim.device.queue import BlockQueue
 from rig.model import registers as reg
+from rig.model.parts import WATCHDOG_RANGE
 from rig.model.registers import BlockHeader, Refusal, Status, TripCause
 from rig.model.rig import Rig
 
@@ -32,7 +33,7 @@ QUEUE_SECONDS = 4.0
 SETTLE_SECONDS = 0.2  # virtual time that passes with zero outputs after the host is gone
 VIRTUAL_SILENCE = 10.0  # nothing moves while a virtual host thinks, so it may think for long
 POLL_SECONDS = 0.05
-WATCHDOG_RANGE_MS = (20, 10_000)
+WATCHDOG_RANGE_MS = (round(1e3 * WATCHDOG_RANGE[0]), round(1e3 * WATCHDOG_RANGE[1]))
 _U32 = 0xFFFF_FFFF
 
 

@@ -88,6 +88,9 @@ class Display:
             kind, joint = ch.kind_of(name)
             found[name] = (None, None)
             if joint is None:
+                shared = self._rig.limits
+                limit = shared.supply_pressure if kind == ch.SUPPLY else shared.oil_temperature
+                found[name] = limit or (None, None)
                 continue
             limits = self._rig.joints[joint - 1].limits
             if kind in (ch.CAP, ch.ROD):

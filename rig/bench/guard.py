@@ -7,6 +7,14 @@ sample, in device time, that a limit does not allow.
 Rates are differences over the shortest window in which the sensor's own noise stays below a
 tenth of the limit: |x[k] - x[k-w]| fs / w, 6 sqrt(2) sigma fs / w <= 0.1 limit. A block is
 checked together with the tail of the one before it, so nothing falls between blocks.
+
+A sensor is *frozen* when an excited joint's channel keeps one value over `frozen_after` while that
+joint's command and another of its channels move. This cannot be a slow signal on a coarse
+converter: only sensors whose stated noise is a code or more are judged. Even at rest, two samples
+in a row of such a sensor read the same code with a probability of at most q / (2 sigma sqrt(pi)) <
+0.29 (q: one code), 250 of them with 0.29^249. Noise four times smaller than stated would still need
+a pressure or position constant to a code while the joint moves. What rests at an end of its range
+is left to the check for saturation.
 """
 
 from __future__ import annotations
@@ -21,13 +29,15 @@ from numpy.typing import NDArray
 from drivers.base import SampleBlock
 from rig.model import channels as ch
 from rig.model.rig import Rig
-from rig.model.trips import DEVICE, FINITE, Violation
+from rig.model.trips import DEVICE, FINITE, FROZEN, Violation
 
 Array = NDArray[np.float64]
 Counts = NDArray[np.int64]
 
 _HUGE = float(np.finfo(np.float64).max)  # finite, so that an infinite sample still violates it
 _VACUUM = -90e3  # no gauge pressure far below this exists, so none hides under such a range
+_SWING = 0.05  # of the command's limit, peak to peak: such a command moves the joint
+_MOVED = 12.0  # standard deviations, peak to peak: noise alone reaches some 7 in 250 samples
 _STROKE_MARGIN = 0.02  # of the stroke: give of the end stop and offset of the sensor
 
 
@@ -55,6 +65,7 @@ class GuardSettings:
     saturated_samples: int = 5  # so many in a row blind a channel
     saturated_samples_vacuum: int = 50  # cavitating oil rests at the low end, but with noise
     max_gap: float = 0.1  # [s] of device time without samples
+    frozen_after: float = 0.25  # [s] of device time that a moving joint's sensor keeps one value
     stale_after: float | None = None  # [s] of wall time; default: the rig's watchdog
 
 
@@ -95,6 +106,34 @@ def _rates(rig: Rig) -> tuple[_Rate, ...]:
     )
 
 
+class _Frozen:
+    """Finds a channel of one joint (0-based) that stands still while the joint moves."""
+
+    def __init__(self, rig: Rig, joint: int) -> None:
+        own = [(c, *ch.kind_of(name)) for c, name in enumerate(rig.channels)]
+        parts = [(c, rig.sensors.of(kind)) for c, kind, which in own if which == joint + 1]
+        self._columns = np.array([column for column, _ in parts])
+        codes = np.array([np.ptp(s.range) / ((1 << s.bits) - 1) for _, s in parts])
+        noise = np.array([s.noise for _, s in parts])
+        self._judged = noise >= codes
+        self._moved = _MOVED * np.maximum(noise, codes)
+        self._low = np.array([s.range[0] for _, s in parts]) + codes
+        self._high = np.array([s.range[1] for _, s in parts]) - codes
+        self._command = rig.recorded.index(ch.channel(ch.COMMAND, joint + 1))
+        self._swing = _SWING * rig.joints[joint].limits.command
+
+    def find(self, window: Array) -> int | None:
+        """Return the column that kept one value over a window of samples, None if none did."""
+        values = window[:, self._columns]
+        still = (values == values[0]).all(axis=0) & self._judged
+        still &= (values[0] > self._low) & (values[0] < self._high)
+        if not still.any() or np.ptp(window[:, self._command]) < self._swing:
+            return None
+        if not (np.ptp(values, axis=0) > self._moved).any():
+            return None
+        return int(self._columns[np.argmax(still)])
+
+
 class Guard:
     """Checks blocks in the order of `Rig.recorded`; the first violation is what it returns."""
 
@@ -103,7 +142,10 @@ class Guard:
         self.settings = settings or GuardSettings()
         self.stale_after = self.settings.stale_after or rig.wire.watchdog
         self._rates = _rates(rig)
+        self._frozen = tuple(_Frozen(rig, j) for j in range(len(rig.joints)))
+        self._window = max(2, round(self.settings.frozen_after * rig.sample_rate))
         self._keep = max((rate.window for rate in self._rates), default=0)
+        self._keep = max(self._keep, self._window)
         self._allowed_run = self._saturation_patience()
         self.roles: tuple[JointRole, ...] = (FREE,) * len(rig.joints)
         self.set_roles(self.roles)
@@ -141,7 +183,11 @@ class Guard:
 
     def _bounds(self, name: str) -> tuple[float, float]:
         kind, joint = ch.kind_of(name)
-        if joint is None or kind == ch.SPOOL:
+        if joint is None:
+            limits = self.rig.limits
+            shared = limits.supply_pressure if kind == ch.SUPPLY else limits.oil_temperature
+            return shared or (-_HUGE, _HUGE)
+        if kind == ch.SPOOL:
             return -_HUGE, _HUGE
         part = self.rig.joints[joint - 1]
         if kind == ch.COMMAND:  # the output converter may round up by a step
@@ -183,7 +229,8 @@ class Guard:
         for rate in self._rates:
             found += self._rate_violation(rate, joined, block.tick - len(self._tail))
         found += self._saturation(block)
-        self._tail = joined[-self._keep :] if self._keep else joined[:0]
+        found += self._frozen_sensor(joined[-self._window :], block)
+        self._tail = joined[-self._keep :]
         return min(found, key=lambda violation: violation.tick, default=None)
 
     def _range_violation(self, block: SampleBlock, row: int, column: int) -> Violation:
@@ -195,9 +242,25 @@ class Guard:
             limit = FINITE
         elif kind == ch.PISTON and joint is not None:
             limit = piston_bounds(self.roles[joint - 1], self.rig, joint - 1)[0]
+        elif joint is None:
+            limit = "supply pressure" if kind == ch.SUPPLY else "oil temperature"
         else:
             limit = "command" if kind == ch.COMMAND else "pressure"
         return Violation(limit, value, allowed, ch.unit_of(name), joint, name, block.tick + row)
+
+    def _frozen_sensor(self, window: Array, block: SampleBlock) -> list[Violation]:
+        """Return the violation of an excited joint's channel that kept one value all the window."""
+        if len(window) < self._window:
+            return []
+        for joint, (role, frozen) in enumerate(zip(self.roles, self._frozen, strict=True), 1):
+            column = frozen.find(window) if role.excited else None
+            if column is None:
+                continue
+            name = self.rig.recorded[column]
+            value, tick = float(window[-1, column]), block.tick + len(block.data) - 1
+            allowed = (-math.inf, self.settings.frozen_after)
+            return [Violation(FROZEN, value, allowed, ch.unit_of(name), joint, name, tick)]
+        return []
 
     def _rate_violation(self, rate: _Rate, joined: Array, first: int) -> list[Violation]:
         values = joined[:, rate.columns]

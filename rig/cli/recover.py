@@ -9,6 +9,7 @@ import typer
 
 from rig.cli.errors import WorkError
 
+
 def recover(
     run: Annotated[Path, typer.Argument(help="The run folder of an interrupted run.")],
     force: Annotated[

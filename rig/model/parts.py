@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, Final, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from rig.model import channels as ch
 from rig.model import linkage
@@ -31,6 +31,8 @@ from rig.model.quantity import (
 )
 
 Array = linkage.Array
+
+WATCHDOG_RANGE: Final = (0.02, 10.0)  # [s] that a device can be set to (docs/wire-modbus-tcp.md)
 
 
 class Part(BaseModel):
@@ -272,6 +274,21 @@ LOCALHOST: Final = "127.0.0.1"
 PORT: Final = 5020  # of a bench that listens on TCP, where its rig file names none
 
 
+class BenchLimits(Part):
+    """What may not be passed of what the whole bench shares; a limit that is not given is none."""
+
+    supply_pressure: tuple[Pressure, Pressure] | None = None
+    oil_temperature: tuple[Temperature, Temperature] | None = None
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        for name in type(self).model_fields:
+            low, high = getattr(self, name) or (0.0, 1.0)
+            if not low < high:
+                raise ValueError(f"limits {name}: lower {low:g} is not below upper {high:g}")
+        return self
+
+
 class Wire(Part):
     """How the bench is reached: the kind of wire, times, and the settings of that kind's driver.
 
@@ -283,6 +300,14 @@ class Wire(Part):
     kind: str = Field(default="modbus-tcp", pattern=r"^[a-z][a-z0-9-]*$")
     timeout: Time = Field(default=1.0, gt=0, description="answer expected within [s]")
     watchdog: Time = Field(default=0.5, gt=0, description="host silence after which outputs zero")
+
+    @field_validator("watchdog")
+    @classmethod
+    def _within_the_registers_range(cls, value: float) -> float:
+        low, high = WATCHDOG_RANGE
+        if not low <= value <= high:
+            raise ValueError(f"watchdog {value:g} s: a device takes {low:g} s to {high:g} s")
+        return value
 
     @property
     def settings(self) -> dict[str, Any]:

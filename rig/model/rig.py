@@ -29,7 +29,7 @@ from rig.model.electric import (
     si_value,
 )
 from rig.model.parameters import MAX_JOINTS, parameter_names, parameter_unit
-from rig.model.parts import Array, Joint, Oil, Part, Sensors, Supply, Wire
+from rig.model.parts import Array, BenchLimits, Joint, Oil, Part, Sensors, Supply, Wire
 from rig.model.quantity import Acceleration, Angle, Frequency, parse_quantity
 
 
@@ -44,6 +44,7 @@ class Rig(Part):
     oil: Oil
     joints: tuple[Joint, ...] = Field(min_length=1, max_length=MAX_JOINTS)
     sensors: Sensors
+    limits: BenchLimits = BenchLimits()
     wire: Wire = Wire()
     nominal: dict[str, float] = Field(
         default_factory=dict,
@@ -78,6 +79,35 @@ class Rig(Part):
         if not info.context:
             return value
         return {k: parse_quantity(str(v), parameter_unit(k)) for k, v in value.items()}
+
+    @model_validator(mode="after")
+    def _limits_can_be_seen(self) -> Self:
+        """Refuse a limit that no sample could pass: the sensor ends before it."""
+        if self.electric:
+            if self.limits != BenchLimits():
+                raise ValueError("an electric rig has neither supply nor oil; remove limits")
+            return self
+        top = self.sensors.chamber_pressure.range[1]
+        for joint in self.joints:
+            limit = joint.limits.pressure[1]
+            if limit >= top:
+                raise ValueError(
+                    f"joint {joint.name!r}: limits pressure up to {limit / 1e6:g} MPa can never be "
+                    f"seen to be passed: the range of sensors chamber_pressure ends at "
+                    f"{top / 1e6:g} MPa; lower the limit or state the sensor's true range"
+                )
+        for name in BenchLimits.model_fields:
+            limits, sensor = getattr(self.limits, name), getattr(self.sensors, name)
+            if limits is None:
+                continue
+            if sensor is None:
+                raise ValueError(f"limits {name}: this rig has no sensor {name}")
+            if limits[1] >= sensor.range[1]:
+                raise ValueError(
+                    f"limits {name}: the upper one, {limits[1]:g}, can never be seen to be passed: "
+                    f"the sensor's range ends at {sensor.range[1]:g}"
+                )
+        return self
 
     @property
     def electric(self) -> bool:

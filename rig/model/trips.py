@@ -9,6 +9,7 @@ from typing import Final
 from rig.model.rig import Rig
 
 FINITE: Final = "finite samples"
+FROZEN: Final = "frozen sensor"
 DEVICE: Final = "device watchdog or fault"
 
 # People read bar-sized and millimetre-sized numbers better than exponents.
@@ -42,6 +43,8 @@ def _allowed(violation: Violation) -> str:
     low, high = violation.allowed
     if violation.limit == DEVICE:
         return "nothing but running"
+    if violation.limit == FROZEN:
+        return f"only values that change within {high:g} s while the joint moves"
     if violation.limit == FINITE:
         return "finite numbers only"
     if math.isinf(low):

@@ -52,6 +52,35 @@ def test_a_bench_survives_being_stored_with_a_run() -> None:
 
 
 @pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("watchdog: 0.5 s", "watchdog: 100 s", "watchdog 100 s: a device takes 0.02 s to 10 s"),
+        ("watchdog: 0.5 s", "watchdog: 10 ms", "watchdog 0.01 s: a device takes 0.02 s to 10 s"),
+        (
+            "pressure: [-0.2 MPa, 9 MPa]",
+            "pressure: [-0.2 MPa, 12 MPa]",
+            "joint 'boom': limits pressure up to 12 MPa can never be seen to be passed: the range "
+            "of sensors chamber_pressure ends at 10 MPa",
+        ),
+        ("wire:", "limits: {supply_pressure: [1 MPa, 15 MPa]}\nwire:", "range ends at 1e+07"),
+        ("wire:", "limits: {supply_pressure: [1 MPa, 8]}\nwire:", "write one beside the number"),
+        ("wire:", "limits: {oil_temperature: [60 degC, 10 degC]}\nwire:", "is not below upper"),
+        ("wire:", "limits: {oil_pressure: [1 MPa, 8 MPa]}\nwire:", "oil_pressure"),
+    ],
+)
+def test_a_limit_that_could_not_protect_is_refused(old: str, new: str, expected: str) -> None:
+    assert expected in refused(old, new)
+
+
+def test_limits_of_the_whole_bench_are_optional_and_have_units() -> None:
+    text = TEXT.replace("wire:", "limits: {oil_temperature: [283.15 K, 60 degC]}\nwire:", 1)
+    bench = parse_model(Rig, text, "bench.yaml")
+    assert bench.limits.oil_temperature == pytest.approx((10.0, 60.0))
+    assert bench.limits.supply_pressure is None
+    assert Rig.model_validate_json(bench.model_dump_json()) == bench
+
+
+@pytest.mark.parametrize(
     ("old", "new", "fragment", "expected"),
     [
         ("stroke: 75 mm", "stroke: 75 kg", "stroke: 75", "expected one like 'm'"),

@@ -135,7 +135,7 @@ class LittleBench:
         if self.tick in self.happenings:
             self.happenings.pop(self.tick)()
         dt = 1.0 / self.rig.sample_rate
-        row = dict.fromkeys(self.rig.recorded, 3e6)
+        row = dict.fromkeys(self.rig.recorded, 3e6 + 500.0 * (self.tick % 7))  # a live sensor
         speeds = [c.speed for c in self.cylinders]
         for j, (c, law) in enumerate(zip(self.cylinders, self.laws, strict=True)):
             wave = self.waves[j][(self.tick - self.start) % len(self.waves[j])]

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from drivers.base import SampleBlock
 from rig.bench.guard import EXCITED, FREE, Guard, GuardSettings, JointRole, rate_window
+from rig.model.channels import kind_of
+from rig.model.parts import BenchLimits
 from rig.model.trips import SafetyTrip, Violation
 from rig.runs.rigs import load_rig
 
@@ -166,6 +168,82 @@ def test_ten_times_the_stated_noise_budget_is_needed_before_noise_alone_could_tr
     assert found is not None
     assert (found.limit, found.channel) == ("pressure rate", "cap_pressure_1")
     assert 10_000 < found.tick - 1000 <= 10_009
+
+
+def moving(n: int = 600) -> NDArray[np.float64]:
+    """Both joints driven at 1 Hz, every sensor read through its converter."""
+    data = quiet_stream(n=n)
+    rng = np.random.default_rng(5)
+    t = np.arange(n) / RIG.sample_rate
+    for joint in (1, 2):
+        data[:, NAMES.index(f"command_{joint}")] = np.sin(2 * np.pi * t)
+        spool = 0.1 * np.sin(2 * np.pi * t) + rng.normal(0, 0.2e-3, n)
+        data[:, NAMES.index(f"spool_{joint}")] = spool
+    for column, name in enumerate(RIG.channels):
+        low, high = RIG.sensors.of(kind_of(name)[0]).range
+        code = (high - low) / 65535
+        data[:, column] = low + np.round((data[:, column] - low) / code) * code
+    return data
+
+
+@pytest.mark.parametrize("channel", ["piston_2", "cap_pressure_2", "rod_pressure_2", "spool_2"])
+@given(cuts=CUTS)
+@settings(max_examples=15, deadline=None)
+def test_a_sensor_that_freezes_while_its_joint_moves_trips(channel: str, cuts: list[int]) -> None:
+    data = moving()
+    guard = Guard(RIG)
+    guard.set_roles([EXCITED, EXCITED])
+    assert first_violation(guard, blocks(data, [*cuts, *range(0, 600, 10)])) is None
+    guard.forget()
+    data[200:, NAMES.index(channel)] = data[200, NAMES.index(channel)]
+    found = first_violation(guard, blocks(data, [*cuts, *range(0, 600, 10)]))
+    assert found is not None
+    assert (found.limit, found.channel, found.joint) == ("frozen sensor", channel, 2)
+    assert 1000 + 200 + 249 <= found.tick <= 1000 + 200 + 260
+    said = str(SafetyTrip(found, RIG))
+    assert f"limit 'frozen sensor', {channel} of joint 2 (arm)" in said
+    assert "0.25 s" in said
+
+
+def test_what_may_stand_still_is_not_called_frozen() -> None:
+    every_ten = list(range(10, 600, 10))
+    frozen = moving()
+    frozen[:, NAMES.index("piston_2")] = 0.01
+    guard = Guard(RIG)
+    guard.set_roles([EXCITED, JointRole(locked_at=0.01, tolerance=1e-3)])
+    assert first_violation(guard, blocks(frozen, every_ten)) is None  # a locked joint
+    guard = Guard(RIG)
+    guard.set_roles([EXCITED, EXCITED])
+    at_rest = frozen.copy()
+    at_rest[:, NAMES.index("command_2")] = 0.0
+    assert first_violation(guard, blocks(at_rest, every_ten)) is None  # nothing drives it
+    guard.forget()
+    cavitating = moving()
+    cavitating[:, NAMES.index("cap_pressure_2")] = -0.1e6
+    assert first_violation(guard, blocks(cavitating, every_ten)) is None  # the end of the range
+    coarse = RIG.sensors.piston.model_copy(update={"bits": 8})  # a code is 31 noises
+    rough = RIG.model_copy(update={"sensors": RIG.sensors.model_copy(update={"piston": coarse})})
+    guard = Guard(rough)
+    guard.set_roles([EXCITED, EXCITED])
+    assert first_violation(guard, blocks(frozen, every_ten)) is None  # it may rest on a code
+
+
+@pytest.mark.parametrize(
+    ("channel", "value", "limit"),
+    [("supply_pressure", 5.4e6, "supply pressure"), ("oil_temperature", 61.0, "oil temperature")],
+)
+def test_supply_and_oil_have_limits_where_the_rig_file_gives_them(
+    channel: str, value: float, limit: str
+) -> None:
+    given_limits = BenchLimits(supply_pressure=(1e6, 5e6), oil_temperature=(20.0, 60.0))
+    data = quiet_stream()
+    data[100:, NAMES.index(channel)] = value
+    assert first_violation(Guard(RIG), blocks(data, [50])) is None
+    limited = RIG.model_copy(update={"limits": given_limits})
+    found = first_violation(Guard(limited), blocks(data, [50]))
+    assert found is not None
+    assert (found.limit, found.channel, found.tick) == (limit, channel, 1100)
+    assert f"limit '{limit}', {channel} of the bench: " in str(SafetyTrip(found, limited))
 
 
 def test_a_free_joint_may_touch_its_end_and_an_excited_one_may_not() -> None:
