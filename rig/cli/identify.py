@@ -25,8 +25,9 @@ if TYPE_CHECKING:
 
 
 def _load(folders: Sequence[Path]) -> list[Run]:
-    from rig.runs.store import load_run
+    from rig.runs.store import load_run, refuse_repeated
 
+    refuse_repeated(folders)
     return [load_run(folder) for folder in folders]
 
 
@@ -57,7 +58,9 @@ def _streamed(
     from analysis.simulation.model import load_model
     from analysis.workers.cluster import DaskCluster
     from analysis.workers.pool import Serial
+    from rig.runs.store import refuse_repeated
 
+    refuse_repeated(runs)
     model = None if like is None else load_model(like)
     # What the folders hold is read by who works on them: they need not exist here.
     with Serial() if cluster is None else DaskCluster(cluster) as pool:

@@ -46,7 +46,7 @@ def trace(
     from analysis.trace.result import to_json
     from rig.cli.trace_text import trace_text
     from rig.model.parse import InputError
-    from rig.runs.store import load_run
+    from rig.runs.store import load_run, refuse_repeated
 
     if not holdout:
         raise InputError(
@@ -55,6 +55,7 @@ def trace(
         )
     if equations not in FAMILIES_OF:
         raise InputError(f"--equations {equations}: expected one of: {' '.join(FAMILIES_OF)}")
+    refuse_repeated([*runs, *holdout])
     loaded, judged = [load_run(f) for f in runs], [load_run(f) for f in holdout]
     progress(f"tracing {sum(len(r.records) for r in loaded)} records")
     rigs = {run.source: run.rig for run in (*loaded, *judged)}

@@ -1,7 +1,8 @@
 """records.h5: plain HDF5 that h5py and MATLAB open; one group per record, units as attributes.
 
-Layout: `/NAME` is a record with one float64 dataset per channel (attribute `units`); attributes of
-the group are its step, repeat, locked joints, period and lines, what was lost, and whatever the
+Layout: `/NAME` is a record with one float64 dataset per channel (attribute `units`), its chunks
+with HDF5's own checksum (fletcher32), so that any reader refuses a sample changed later; attributes
+of the group are its step, repeat, locked joints, period and lines, what was lost, and whatever the
 protocol noted. `/between/0001 ...` are the samples outside of every record, so that the journal
 may go. Lists are one-dimensional integer arrays, flags are 0 or 1, text is UTF-8.
 `rig.runs.archive_reader` reads it.
@@ -32,6 +33,7 @@ log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 NAME = "records.h5"
+_CHUNK = 1 << 14  # samples that are read, and checked, together
 
 
 def write_group(
@@ -46,7 +48,11 @@ def write_group(
     for key, value in attributes.items():
         target.attrs[key] = _plain(value)
     for name, values in columns.items():
-        dataset = target.create_dataset(name, data=np.ascontiguousarray(values, dtype="<f8"))
+        data = np.ascontiguousarray(values, dtype="<f8")
+        whole = data.ndim == 1 and len(data) > 0  # a checksum needs chunks, and they a length
+        dataset = target.create_dataset(
+            name, data=data, fletcher32=whole, chunks=(min(len(data), _CHUNK),) if whole else None
+        )
         dataset.attrs["units"] = unit_of(name)
 
 

@@ -45,9 +45,19 @@ def head_of(name: str, group: h5py.Group, path: Path) -> RecordHead:
 def samples_of(
     group: h5py.Group, head: RecordHead, first: int = 0, last: int | None = None
 ) -> Record:
-    """Read the samples [first, last) of a record's group."""
+    """Read the samples [first, last) of a record's group; InputError where they were changed."""
     part = slice(first, last)
-    return head.record({n: np.asarray(group[n][part], dtype=np.float64) for n in head.channels})
+    found = {}
+    for name in head.channels:
+        try:
+            found[name] = np.asarray(group[name][part], dtype=np.float64)
+        except OSError as error:
+            raise InputError(
+                f"{group.file.filename}: record {head.name}, channel {name}: samples were changed "
+                "or damaged since they were written (their checksum does not match); take the "
+                f"file from a backup, or do without this run ({error})"
+            ) from error
+    return head.record(found)
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import getpass
+import hashlib
 import json
 import logging
 import os
@@ -198,6 +199,39 @@ def load_run(path: str | Path, *, partial: bool = False) -> Run:
 
     chosen = chosen_of(folder, state, read_records(folder / ARCHIVE), partial)
     return Run(header.rig, chosen, source=str(folder), state=state)
+
+
+def refuse_repeated(folders: Sequence[str | Path]) -> None:
+    """Raise InputError where two folders are one run: by path, or by equal content of records.h5.
+
+    Folders that are not here (a cluster may read them elsewhere) are told apart by name only.
+    """
+    seen: dict[object, Path] = {}
+    sized: dict[int, list[Path]] = {}
+    for folder in map(Path, folders):
+        keys: list[object] = [folder.resolve()]
+        archive = folder / ARCHIVE
+        if archive.is_file():
+            like = sized.setdefault(archive.stat().st_size, [])
+            for other in like:  # equal in size: then the content tells
+                seen.setdefault(_digest(other / ARCHIVE), other)
+            keys += [_digest(archive)] if like else []
+            like.append(folder)
+        for key in keys:
+            if key in seen:
+                raise InputError(
+                    f"{folder}: is the same run as {seen[key]}; the same samples twice are no "
+                    "further evidence: name each run once"
+                )
+            seen[key] = folder
+
+
+def _digest(path: Path) -> str:
+    try:
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
 
 
 def summarise(folder: Path) -> RunSummary:

@@ -162,7 +162,7 @@ def test_a_journal_that_is_none_is_refused(interrupted: Path) -> None:
     assert (interrupted / "journal.sqlite").read_bytes() == b"rubbish" * 1000
 
 
-@pytest.mark.parametrize("limit", [60_000, 130_000])
+@pytest.mark.parametrize("limit", [100_000, 130_000])
 def test_a_journal_that_cannot_grow_zeroes_the_outputs_and_what_it_took_is_readable(
     tmp_path: Path, limit: int
 ) -> None:
