@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,8 +13,6 @@ from rig.cli.options import (
     RunsArgument,
 )
 from rig.cli.output import write_json
-
-log = logging.getLogger(__name__)
 
 if TYPE_CHECKING:
     from analysis.identify.result import Identification

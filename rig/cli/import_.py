@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from rig.cli.output import progress
-
-log = logging.getLogger(__name__)
 
 
 def import_foreign(

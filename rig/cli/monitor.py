@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import logging
 from typing import Annotated
 
 import typer
-
-log = logging.getLogger(__name__)
 
 
 def monitor(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -25,7 +24,6 @@ from rig.runs.rigs import load_bench
 if TYPE_CHECKING:
     from rig.cli.tracking import Tracking
 
-log = logging.getLogger(__name__)
 Say = Callable[[str], None]
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from typing import Annotated
 
 import typer
@@ -11,8 +10,6 @@ from rig.cli.options import (
     EndpointOption,
     RigOption,
 )
-
-log = logging.getLogger(__name__)
 
 
 def reset(

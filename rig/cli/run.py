@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 from typing import Annotated
 
@@ -18,8 +17,6 @@ from rig.cli.options import (
     WaveSeedOption,
 )
 from rig.cli.output import progress
-
-log = logging.getLogger(__name__)
 
 
 def run(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 from typing import Annotated
 
@@ -13,8 +12,6 @@ from rig.cli.options import (
     RunsArgument,
 )
 from rig.cli.output import write_json
-
-log = logging.getLogger(__name__)
 
 
 def validate(
