@@ -32,7 +32,7 @@ class Shape:
     At `neutral` the effect is not there; None where its size is a linear coefficient. With
     `resolution` the low bound is only what data resolve: to lie there contradicts nothing. A
     `detail` of the form stands last, and a shape may do without it: it is searched only where the
-    records ask for it, and makes no explanation less simple than another.
+    records ask for it, makes no explanation less simple than another, and at a bound refuses none.
     """
 
     parameter: str
@@ -43,6 +43,10 @@ class Shape:
     neutral: float | None = None
     resolution: bool = False
     detail: bool = False
+
+    def given(self, value: float) -> bool:
+        """Whether a form has this parameter; at 0 below its bounds it does without."""
+        return value != 0.0 or self.low <= 0.0
 
     @property
     def middle(self) -> float:
@@ -139,9 +143,33 @@ class Effect(Term):
         given = self.shape_of(rig, shape)
         return (*given, *(0.0 for _ in self.shape_names()[len(given) :]))
 
+    def remembers(self, shape: Sequence[float]) -> bool:
+        """Whether the effect, if it has a hidden state, uses it in the form of a shape."""
+        return len(shape) > 0
+
+    def in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[float, ...]:
+        """Return the shape with the details that it does without, at their first look."""
+        return (*shape, *(s.middle for s in self.shapes(rig)[len(shape) :]))
+
+    def other_forms(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+        """Return shapes from which a search finds other forms of the same effect."""
+        return ()
+
+    def simpler(self, rig: Rig, values: Mapping[str, float]) -> str:
+        """Name the effect of `includes` that this one has become at its own numbers ('' if none).
+
+        `values` holds the effect's linear coefficients.
+        """
+        return ""
+
     def outside(self, rig: Rig, shape: Sequence[float]) -> str:
-        """Say which shape parameter lies on or beyond its physical bounds ('' if none)."""
+        """Say which shape parameter lies on or beyond its physical bounds ('' if none).
+
+        A detail of the form is not asked: it says nothing of whether the effect is there.
+        """
         for s, value in zip(self.shapes(rig)[: len(shape)], shape, strict=True):
+            if s.detail or not s.given(value):
+                continue
             margin = 1e-3 * (s.high - s.low)
             allowed = s.resolution or s.neutral == s.low
             low = s.low if allowed else s.low + margin

@@ -1,4 +1,4 @@
-"""The contact of a seal: a state z, -1 <= z <= 1, that turns over along a distance of travel.
+"""The contact of a seal: a state z, -1 <= z <= 1, that turns over with the direction of motion.
 
 After each reversal z goes over to the new direction within the presliding distance d (Dahl 1968;
 Armstrong-Helouvry, Dupont and Canudas de Wit 1994; Jelali and Kroll 2003), and rubber is the
@@ -6,8 +6,13 @@ stiffer the faster it is deformed (Ferry 1980), here in proportion, with the sti
 
     dz/ds = (1 + k |s'|) (sign(s') - z) / d
 
-With d -> 0, z = sign(s'). It is the contact without stiffening along the path that is `worked`,
-ds_w = (1 + k |s'|) ds.
+It is the contact without stiffening along the path that is `worked`, ds_w = (1 + k |s'|) ds.
+
+Where the reversal is finished within less travel than the records resolve, z is a function of the
+velocity alone (`memoryless`), over a transition speed w: the mean sign of a velocity about s' that
+is spread normally with the standard deviation w / sqrt 2,
+
+    z = erf(s' / w).
 """
 
 from __future__ import annotations
@@ -17,6 +22,7 @@ from typing import Final
 
 import numpy as np
 from numba import njit
+from scipy.special import erf
 
 from analysis.effects.base import Array, Shape
 
@@ -25,11 +31,13 @@ PRESLIDING_BOUNDS: Final = (2e-6, 5e-4)
 STIFFENING: Final = 30.0  # [s/m] where a search begins
 STIFFENING_BOUNDS: Final = (1.0, 3e3)  # [s/m] less is a tenth at 0.1 m/s: nothing
 FASTEST: Final = 3e3  # [1/s] relaxation in simulation; faster changes nothing that is seen
-# Speed of the transition through rest [m/s, or rad/s] where no presliding distance is given. A jump
+# Speed of the transition through rest [m/s, or rad/s] where no shape is given. A jump
 # would make the integrator chatter where a joint sticks; this creeps by less than 0.1 mm/s there.
 # On the measured positioning system 0.01 mm/s and 0.1 mm/s give the same parameters to 0.4 %,
 # 1 mm/s does not (2 %).
 TRANSITION: Final = 1e-4
+TRANSITION_BOUNDS: Final = (TRANSITION, 2e-2)  # [m/s] wider is viscous friction
+TRANSITION_START: Final = 1e-3  # [m/s] where a search begins
 
 
 def presliding(name: str) -> Shape:
@@ -40,6 +48,17 @@ def presliding(name: str) -> Shape:
 def stiffening(name: str) -> Shape:
     """Return a stiffening's shape [s/m]; a contact may stiffen less than can be seen."""
     return Shape(name, "s/m", *STIFFENING_BOUNDS, (STIFFENING,), resolution=True, detail=True)
+
+
+def transition(name: str) -> Shape:
+    """Return a transition speed's shape [m/s] of a contact without memory."""
+    bounds = TRANSITION_BOUNDS
+    return Shape(name, "m/s", *bounds, (TRANSITION_START,), resolution=True, detail=True)
+
+
+def memoryless(v: Array, speed: float) -> Array:
+    """Return z = erf(v / w) (n,) of a velocity v (n,) [m/s] and a transition speed w [m/s]."""
+    return np.asarray(erf(v / speed))
 
 
 def worked(s: Array, v: Array, stiffening: float) -> Array:
@@ -99,10 +118,13 @@ def contact_levels(s, extending, retracting):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def slide(v, y, distance, stiffening):  # type: ignore[no-untyped-def]
-    """Return (z, dy/dt) of the deflection y = d z, its relaxation bounded at `FASTEST`."""
+def slide(v, y, distance, stiffening, speed):  # type: ignore[no-untyped-def]
+    """Return (z, dy/dt) of the deflection y = d z, its relaxation bounded at `FASTEST`.
+
+    Without a distance the contact has no memory, and `speed` is its transition speed.
+    """
     if distance <= 0.0:
-        return math.tanh(v / TRANSITION), 0.0
+        return math.erf(v / speed), 0.0
     pace = 1.0 + stiffening * abs(v)
     relax = abs(v) / distance
     return y / distance, pace * (v - relax * y) / (1.0 + pace * relax / FASTEST)

@@ -7,10 +7,11 @@ the faster it is (stiffening k; of rubber: Ferry 1980):
 
     dz/ds = (1 + k |s'|) (sign(s') - z) / d
 
-Both are shape parameters. The piston's path alone decides z, so that the rows have it from the
-measured piston; the simulation carries the deflection y = d z [m] as a hidden state. A model that
-gives no presliding distance means the contact without memory, z = tanh(s'/v) with v = `TRANSITION`.
-Stribeck's and asymmetric friction have k = 0.
+The piston's path alone decides z, so that the rows have it from the measured piston; the
+simulation carries the deflection y = d z [m] as a hidden state. A presliding distance of 0 means
+the contact without memory, z = erf(s'/w) with the transition speed w (`TRANSITION` in a model
+without a shape). d, k and w are shape parameters; the rows decide between a distance and a
+transition speed. Stribeck's and asymmetric friction have k = 0.
 """
 
 from __future__ import annotations
@@ -25,12 +26,16 @@ import numpy as np
 from analysis.effects.base import Array, Effect, Shape, beyond
 from analysis.effects.contact import (
     FASTEST,
+    STIFFENING,
     TRANSITION,
+    TRANSITION_START,
     contact_state,
     contact_under_load,
+    memoryless,
     presliding,
     slide,
     stiffening,
+    transition,
     worked,
 )
 from analysis.signals.conditioning import Signals
@@ -52,30 +57,66 @@ LEAST_LEVEL: Final = 1e-6  # of the breakaway, where it has long vanished: no di
 
 @dataclass(frozen=True)
 class Friction(Effect):
-    """What the four forms share: joint, presliding distance, the state z of the contact.
+    """What the four forms share: joint, the state z of the contact, with memory or without.
 
     Where the contact `stiffens` the stiffening is a detail: a shape without it does not stiffen.
+    A shape with a transition speed, its last detail, has no memory, and 0 for distance and
+    stiffening. `before` counts the shape parameters that stand before the contact's own.
     """
 
     family: ClassVar[str] = "friction"
     per_joint: ClassVar[bool] = True
     stiffens: ClassVar[bool] = False
+    before: ClassVar[int] = 0
     where: str = "joint 1"
 
+    def distance_names(self) -> tuple[str, ...]:
+        """Name the presliding distances."""
+        return (f"presliding_{self.joint + 1}",)
+
     def shape_names(self) -> tuple[str, ...]:
-        """Name the presliding distance and, where the contact stiffens, the stiffening."""
-        own = (f"presliding_{self.joint + 1}",)
-        return (*own, f"stiffening_{self.joint + 1}") if self.stiffens else own
+        """Name distances, stiffening where the contact stiffens, and transition speed."""
+        joint = self.joint + 1
+        rate = (f"stiffening_{joint}",) if self.stiffens else ()
+        return (*self.distance_names(), *rate, f"transition_{joint}")
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return presliding distance [m], stiffening [s/m] (electric: in the joint's own unit)."""
-        own = (presliding(f"presliding_{self.joint + 1}"),)
-        return (*own, stiffening(f"stiffening_{self.joint + 1}")) if self.stiffens else own
+        """Return presliding distances [m], stiffening [s/m] and transition speed [m/s].
 
-    def contact_of(self, shape: Sequence[float]) -> tuple[float, float]:
-        """Return presliding distance [m] and stiffening [s/m] of a shape, 0 where not given."""
-        distance, rate, *_ = (*shape, 0.0, 0.0)
-        return distance, rate
+        On an electric joint they are in its own unit.
+        """
+        joint = self.joint + 1
+        rate = (stiffening(f"stiffening_{joint}"),) if self.stiffens else ()
+        distances = map(presliding, self.distance_names())
+        return (*distances, *rate, transition(f"transition_{joint}"))
+
+    def in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[float, ...]:
+        """Return the shape with a stiffening where the contact has a memory and can stiffen."""
+        if self.stiffens and self.remembers(shape) and len(shape) == self.before + 1:
+            return (*shape, STIFFENING)
+        return tuple(shape)
+
+    def other_forms(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+        """Return the contact without memory, of a shape that has one."""
+        if not len(shape) or not self.remembers(shape):
+            return ()
+        none = len(self.shape_names()) - self.before - 1
+        return ((*shape[: self.before], *(0.0,) * none, TRANSITION_START),)
+
+    def remembers(self, shape: Sequence[float]) -> bool:
+        """Whether the contact has a memory: a presliding distance above 0."""
+        return len(shape) > self.before and shape[self.before] > 0.0
+
+    def contact_of(self, shape: Sequence[float]) -> tuple[float, float, float]:
+        """Return presliding distance [m], stiffening [s/m] and transition speed [m/s] of a shape.
+
+        0, 0 and `TRANSITION` where they are not given.
+        """
+        own = shape[self.before :]
+        rate = own[1] if self.stiffens and len(own) > 1 else 0.0
+        last = len(self.shape_names()) - self.before - 1
+        speed = own[last] if len(own) > last else TRANSITION
+        return (own[0] if len(own) else 0.0), rate, speed
 
     def path(self, signals: Signals, shape: Sequence[float]) -> Array:
         """Return the path (n,) [m] that the contact is worked along."""
@@ -84,7 +125,9 @@ class Friction(Effect):
 
     def tolerance(self, shape: Sequence[float]) -> float:
         """Return a fine one for the contact without memory: coarser, creep at rest is noise."""
-        return self.rate_tolerance if len(shape) else 1e-3 * TRANSITION
+        if self.remembers(shape):
+            return self.rate_tolerance
+        return 1e-3 * self.contact_of(shape)[2]
 
     def hidden(self, rig: Rig) -> int:
         """Return 1: the deflection y = d z."""
@@ -98,7 +141,7 @@ class Friction(Effect):
         self, rig: Rig, signals: Signals, values: Mapping[str, float], shape: Sequence[float]
     ) -> Array:
         """Return the deflection (n, 1) [m]; a contact without memory has none."""
-        if not len(shape):
+        if not self.remembers(shape):
             return super().hidden_path(rig, signals, values, shape)
         return self.deflection(rig, signals, values, shape)[:, None]
 
@@ -110,16 +153,17 @@ class Friction(Effect):
 
     def contact(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Array:
         """Return z (n,) along the measured path."""
-        if not len(shape):
-            return np.asarray(np.tanh(signals.sd[:, self.joint] / TRANSITION))
-        return np.asarray(contact_state(self.path(signals, shape), shape[0]))
+        distance, _, speed = self.contact_of(shape)
+        if not self.remembers(shape):
+            return memoryless(signals.sd[:, self.joint], speed)
+        return np.asarray(contact_state(self.path(signals, shape), distance))
 
     def row(self, columns: Mapping[str, Array]) -> Columns:
         """Return columns of the joint's torque row."""
         return {equation("torque", self.joint): dict(columns)}
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
-        """Return joint (0-based), coefficients, shape; a contact that is not given is 0, 0."""
+        """Return joint (0-based), coefficients, distance, stiffening, transition speed."""
         linear = [values[c.parameter] for c in self.coefficients(rig)]
         return np.array([self.joint, *linear, *self.contact_of(shape)], dtype=np.float64)
 
@@ -191,6 +235,7 @@ class StribeckFriction(Friction):
     variable: ClassVar[str] = "the piston's velocity near zero"
     confounders: ClassVar[tuple[str, ...]] = ("coulomb_friction", "asymmetric_friction")
     includes: ClassVar[tuple[str, ...]] = ("coulomb_friction",)  # at a high Stribeck speed
+    before: ClassVar[int] = 1
     separated_by: ClassVar[str] = (
         "slow sweeps through zero velocity beside fast ones: it is gone above the Stribeck speed"
     )
@@ -205,11 +250,11 @@ class StribeckFriction(Friction):
         return (Coefficient(f"Fs{self.joint + 1}", force_unit(rig, self.joint), "mechanical"),)
 
     def shape_names(self) -> tuple[str, ...]:
-        """Name the Stribeck speed and the presliding distance."""
+        """Name the Stribeck speed, the presliding distance and the transition speed."""
         return (f"v_stribeck_{self.joint + 1}", *super().shape_names())
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return the Stribeck speed [m/s] and the presliding distance [m]."""
+        """Return the Stribeck speed [m/s], presliding distance [m] and transition speed [m/s]."""
         speed = rig.joints[self.joint].limits.speed
         grid = (0.01 * speed, 0.03 * speed, 0.1 * speed)
         own = Shape(self.shape_names()[0], "m/s", 2e-3 * speed, 0.4 * speed, grid)
@@ -217,10 +262,10 @@ class StribeckFriction(Friction):
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return G w."""
-        if len(shape):
+        if self.remembers(shape):
             w = self.deflection(rig, signals, {}, shape) / shape[1]
         else:
-            w = self._level(rig, signals, shape) * self.contact(rig, signals, ())
+            w = self._level(rig, signals, shape) * self.contact(rig, signals, shape)
         return self.row({f"Fs{self.joint + 1}": signals.G[:, self.joint] * w})
 
     def _level(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Array:
@@ -236,23 +281,23 @@ class StribeckFriction(Friction):
         return np.asarray(shape[1] * contact_under_load(s, level, 1.0 / shape[1]))
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
-        """Return joint (0-based), Fs, Stribeck speed, presliding distance (0 where none)."""
-        speed = self.shape_of(rig, shape)[0]
-        distance = shape[1] if len(shape) else 0.0
-        return np.array([self.joint, values[f"Fs{self.joint + 1}"], speed, distance])
+        """Return joint (0-based), Fs, Stribeck speed, presliding distance, transition speed."""
+        falling = self.shape_of(rig, shape)[0]
+        distance, _, speed = self.contact_of(shape)
+        return np.array([self.joint, values[f"Fs{self.joint + 1}"], falling, distance, speed])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Refuse a breakaway below Coulomb's level, too much of it, and a speed at its bounds."""
         name = f"Fs{self.joint + 1}"
         found = beyond(name, values[name], "N", force_limit(rig, self.joint))
-        return found or Effect.outside(self, rig, (shape[0], self.shapes(rig)[1].grid[1]))
+        return found or Effect.outside(self, rig, shape[:1])
 
 
 @kernel
 def _coulomb(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
     if phase == CONTRIBUTE:
         i = int(par[0])
-        state, dz[0] = slide(x[SD, i], z[0], par[2], par[3])
+        state, dz[0] = slide(x[SD, i], z[0], par[2], par[3], par[4])
         out[TORQUE, i] -= par[1] * x[G, i] * state
 
 
@@ -263,7 +308,7 @@ def _stribeck(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-d
         i = int(par[0])
         level = max(math.exp(-((x[SD, i] / par[2]) ** 2)), LEAST_LEVEL)
         # At a constant stiffness the distance goes with the level.
-        state, dz[0] = slide(x[SD, i], z[0], par[3] * level, 0.0)
+        state, dz[0] = slide(x[SD, i], z[0], par[3] * level, 0.0, par[4])
         out[TORQUE, i] -= par[1] * level * x[G, i] * state
 
 

@@ -12,13 +12,11 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from analysis.effects.base import Array, Shape, beyond
+from analysis.effects.base import Array, beyond
 from analysis.effects.contact import (
     FASTEST,
-    TRANSITION,
     contact_levels,
     contact_under_load,
-    presliding,
 )
 from analysis.effects.friction import Friction, force_limit, force_unit
 from analysis.signals.conditioning import Signals
@@ -68,13 +66,9 @@ class AsymmetricFriction(Friction):
     def _names(self) -> tuple[str, str]:
         return f"F_ext_{self.joint + 1}", f"F_ret_{self.joint + 1}"
 
-    def shape_names(self) -> tuple[str, ...]:
+    def distance_names(self) -> tuple[str, ...]:
         """Name the presliding distances of the two directions."""
         return f"presliding_ext_{self.joint + 1}", f"presliding_ret_{self.joint + 1}"
-
-    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return the presliding distances [m]."""
-        return tuple(map(presliding, self.shape_names()))
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return F_ext, F_ret [N]."""
@@ -89,10 +83,10 @@ class AsymmetricFriction(Friction):
 
     def _shares(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> tuple[Array, Array]:
         """Return the shares (n,) of the two levels along the measured path."""
-        if len(shape):
+        if self.remembers(shape):
             ahead, back = contact_levels(self.path(signals, ()), shape[0], shape[1])
             return ahead, back
-        z = self.contact(rig, signals, ())
+        z = self.contact(rig, signals, shape)
         return np.maximum(z, 0.0), np.maximum(-z, 0.0)
 
     def deflection(
@@ -105,9 +99,10 @@ class AsymmetricFriction(Friction):
         return np.asarray(shape[0] * force / (extending + retracting))
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
-        """Return joint (0-based), levels, presliding distances, 0 where none are given."""
+        """Return joint (0-based), levels, presliding distances (0 for none), transition speed."""
         linear = [values[name] for name in self._names()]
-        return np.array([self.joint, *linear, *(shape if len(shape) else (0.0, 0.0))])
+        distances = shape[:2] if len(shape) else (0.0, 0.0)
+        return np.array([self.joint, *linear, *distances, self.contact_of(shape)[2]])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Refuse a driving direction, too much, and directions that do not differ."""
@@ -118,9 +113,15 @@ class AsymmetricFriction(Friction):
             found = beyond(name, level, "N", limit, -DIFFERENCE * abs(mean))
             if found:
                 return found
-        if abs(levels[0] - levels[1]) < DIFFERENCE * mean:
+        if self.simpler(rig, values):
             return "the two directions differ by less than a tenth: this is coulomb_friction"
         return ""
+
+    def simpler(self, rig: Rig, values: Mapping[str, float]) -> str:
+        """Return Coulomb friction where the levels differ by less than `DIFFERENCE` of the mean."""
+        ahead, back = (values[name] for name in self._names())
+        equal = abs(ahead - back) < DIFFERENCE * 0.5 * (ahead + back)
+        return "coulomb_friction" if equal else ""
 
 
 @dataclass(frozen=True)
@@ -154,11 +155,11 @@ class PressureDependentFriction(Friction):
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return G w."""
         i = self.joint
-        if len(shape):
+        if self.remembers(shape):
             path = self.deflection(rig, signals, {}, shape)
             level = path * rig.supply.pressure / shape[0]
         else:
-            level = self._load(signals) * self.contact(rig, signals, ())
+            level = self._load(signals) * self.contact(rig, signals, shape)
         return self.row({f"k_friction_{i + 1}": signals.G[:, i] * level})
 
     def _load(self, signals: Signals) -> Array:
@@ -175,7 +176,7 @@ class PressureDependentFriction(Friction):
         return np.asarray(contact_under_load(path, self._load(signals), stiffness) / stiffness)
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
-        """Return joint (0-based), k, presliding distance (0 where none), stiffening, p_S."""
+        """Return joint (0-based), k, distance (0 where none), stiffening, transition speed, p_S."""
         k = values[f"k_friction_{self.joint + 1}"]
         return np.array([self.joint, k, *self.contact_of(shape), rig.supply.pressure])
 
@@ -192,7 +193,7 @@ def _asymmetric(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped
         i = int(par[0])
         v = x[SD, i]
         if par[3] <= 0.0:
-            state = math.tanh(v / TRANSITION)
+            state = math.erf(v / par[5])
             out[TORQUE, i] -= (par[1] if state > 0.0 else par[2]) * x[G, i] * state
             return
         scale = (par[1] + par[2]) / par[3]
@@ -209,9 +210,9 @@ def _by_pressure(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untype
         i = int(par[0])
         v, load = x[SD, i], max(x[P_CAP, i] + x[P_ROD, i], 0.0)
         if par[2] <= 0.0:
-            out[TORQUE, i] -= par[1] * load * x[G, i] * math.tanh(v / TRANSITION)
+            out[TORQUE, i] -= par[1] * load * x[G, i] * math.erf(v / par[4])
             return
-        stiffness = par[4] / par[2]
+        stiffness = par[5] / par[2]
         pace = 1.0 + par[3] * abs(v)
         relax = abs(v) * stiffness / max(load, 1.0)
         dz[0] = pace * (v - relax * z[0]) / (1.0 + pace * relax / FASTEST)

@@ -52,11 +52,11 @@ class Shot:
 
 
 def hidden_effects(model: Model) -> list[Effect]:
-    """Return the effects of a model that carry a state of their own and have a shape."""
+    """Return the effects of a model that carry a state of their own in the form they have."""
     return [
         u.term
         for u in model.terms
-        if isinstance(u.term, Effect) and u.term.hidden(model.rig) and len(u.shape)
+        if isinstance(u.term, Effect) and u.term.hidden(model.rig) and u.term.remembers(u.shape)
     ]
 
 

@@ -201,6 +201,8 @@ class Ground:
             found += [c[:, None] for c in self.columns(used).values()]
             for j, shape in enumerate(shapes_of(self.stage.rig, used)):
                 value = used.shape[j]
+                if not shape.given(value):
+                    continue
                 step = SHAPE_STEP * (abs(value) or shape.high - shape.low)
                 near = value + step if value + step <= shape.high else value - step
                 moved = Used(used.term, (*used.shape[:j], near, *used.shape[j + 1 :]))

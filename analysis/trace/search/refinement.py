@@ -114,13 +114,19 @@ def fit(data: RegressionData, terms: Sequence[Used]) -> ExactFit:
 def refine(data: RegressionData, terms: Sequence[Used], steps: int = MOST_STEPS) -> ExactFit:
     """Search the shape parameters that the board's own terms do not have, from where they are.
 
-    Then details of forms join, one after another, that take more away than chance, and a share of
-    what is left.
+    Where an effect has another form, the one that leaves less stays. Then details of forms join,
+    one after another, that take more away than chance, and a share of what is left.
     """
     found = _searched(data, terms, steps)
     for k in range(len(terms)):
         used = found.terms[k]
-        opened = used if used in data.terms else _in_detail(data.rig, used)
+        if used in data.terms or not isinstance(used.term, Effect):
+            continue
+        for shape in used.term.other_forms(data.rig, used.shape):
+            other = _searched(data, _with(found.terms, used, Used(used.term, shape)), steps)
+            found = other if other.energy < found.energy else found
+        used = found.terms[k]
+        opened = _in_detail(data.rig, used)
         asked = max(CHANCE, DETAIL * (found.energy - len(found.residual)))
         # Half, since in a straight line a detail promises less than it takes.
         if opened == used or _promise(data, found, used, opened) < 0.5 * asked:
@@ -149,8 +155,7 @@ def _in_detail(rig: Rig, used: Used) -> Used:
     """Return a term with the details that its shape does without, at their first look."""
     if not isinstance(used.term, Effect) or not len(used.shape):
         return used
-    more = [s.middle for s in used.term.shapes(rig)[len(used.shape) :]]
-    return Used(used.term, (*used.shape, *more))
+    return Used(used.term, used.term.in_detail(rig, used.shape))
 
 
 def _searched(data: RegressionData, terms: Sequence[Used], steps: int) -> ExactFit:
@@ -181,6 +186,7 @@ def _free(data: RegressionData, terms: Sequence[Used]) -> list[tuple[int, int, S
         for k, u in enumerate(terms)
         if u not in data.terms
         for j, s in enumerate(shapes_of(data.rig, u))
+        if s.given(u.shape[j])
     ]
 
 
@@ -234,6 +240,8 @@ def jacobian(data: RegressionData, model: ExactFit, used: Used) -> tuple[tuple[s
     own = [c.parameter for c in used.term.coefficients(data.rig)]
     names, columns = list(own), [rows.matrix[:, rows.names.index(n)] for n in own]
     for j, shape in enumerate(shapes_of(data.rig, used)):
+        if not shape.given(used.shape[j]):
+            continue
         step = 1e-3 * (shape.high - shape.low)
         if _logarithmic(shape):
             step = 1e-2 * used.shape[j]

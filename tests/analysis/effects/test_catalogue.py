@@ -34,7 +34,8 @@ CONTRACT = {
 }  # fmt: skip
 
 
-DETAILS = ("rounding", "corner", "V_supply", "stiffening")  # forms of edge, line, seal, no sizes
+# Forms of edge, line and seal, no sizes.
+DETAILS = ("rounding", "corner", "V_supply", "stiffening", "transition")
 
 
 def effects(rig: Rig) -> list[Effect]:
@@ -155,19 +156,23 @@ def hidden_state(e: Effect, rig: Rig, signals: Signals, shape: tuple[float, ...]
 
 
 def test_kernels_and_rows_are_the_same_equations(rig: Rig, state: Signals) -> None:
-    """What the simulation would integrate is, at any state, what the rows say."""
+    """What the simulation would integrate is, at any state and in any form, what the rows say."""
+    forms = []
     for e in effects(rig):
         if isinstance(e, Sensor):
             continue
-        shape = e.shape_of(rig, ())
-        shape = (*shape, *(s.grid[0] for s in e.shapes(rig)[len(shape) :]))  # details too
+        shape = e.in_detail(rig, e.shape_of(rig, ()))
         if e.name == "supply_sag":
             shape = (*shape[:2], 0.0)  # the simulation's line follows at once
+        forms += [(e, one) for one in (shape, *e.other_forms(rig, shape))]
+    for e, shape in forms:
         signals = consistent(rig, state, e, shape) if e.stage == 4 else state
         values, par = packed(e, rig, shape)
         seen = e.prepare(rig, signals, shape)
         columns = e.columns(rig, seen, shape)
-        memory = hidden_state(e, rig, signals, shape)
+        memory = np.zeros(len(signals.t))
+        if e.remembers(shape):
+            memory = hidden_state(e, rig, signals, shape)
         for k in range(40, 400, 17):
             x, bench = observed(signals, k)
             z, dz = np.full(e.hidden(rig), memory[k]), np.zeros(e.hidden(rig))
