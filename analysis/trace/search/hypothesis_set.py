@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.effects.base import Effect
+from analysis.terms import make
 from analysis.terms.base import Used
 from analysis.trace.data.candidates import Variant, complexity
 from analysis.trace.data.regression_data import RegressionData, VariantColumns, variant_columns
@@ -76,6 +77,26 @@ class HypothesisSet:
             self.listed[key] = self._listed(found.terms[len(self.base) :], found)
         return self.listed[key]
 
+    def tried(self, sets: Sequence[tuple[Used, ...]]) -> list[Hypothesis]:
+        """Return the sets refined exactly; one whose effect has become a simpler one, also so."""
+        out = [self.exact(effects) for effects in sets]
+        return out + [simpler for one in out if (simpler := self._simplified(one)) is not None]
+
+    def _simplified(self, one: Hypothesis) -> Hypothesis | None:
+        """Return the set with the simpler effects that its own have become, None where none has."""
+        rig = self.stage.rig
+        values = parameter_values(rig, one.fit.terms, dict(one.fit.beta))
+        effects: dict[Key, Used] = {}
+        for used in one.effects:
+            assert isinstance(used.term, Effect)
+            term, shape = used.term, used.shape
+            if term.simpler(rig, values):
+                term = _effect(term.simpler(rig, values), term.where)
+                shape = term.shape_of(rig, ())
+            effects.setdefault((term.name, term.where), Used(term, shape))
+        changed = frozenset(effects) != one.keys
+        return self.exact(tuple(effects.values())) if changed else None
+
     def better(self, one: Hypothesis, other: Hypothesis) -> bool:
         """Tell whether `one` is to be preferred: much less left, or as little and simpler."""
         slack = linear_fit.CHANCE * max(1, abs(one.size[1] - other.size[1]))
@@ -101,13 +122,13 @@ class HypothesisSet:
         r = self.stage.mean
         r = r - field.basis @ (field.basis.T @ r)
         self.field, self.projected = field, r
-        singles = [self.exact(e) for e in self._singles(field, r)]
+        singles = self.tried(self._singles(field, r))
         now = self.prune(self.best([self.empty, *singles]))
         if within(now.excess_energy, self.limits):
             return now
         if self.formed(now):
             return self.completed(now)
-        pairs = [self.exact(e) for e in self._pairs(field, r, singles)]
+        pairs = self.tried(self._pairs(field, r, singles))
         now = self.prune(self.best([self.empty, *singles, *pairs]))
         while not within(now.excess_energy, self.limits) and len(now.effects) < DEEPEST:
             grown = self.prune(self.best([now, *self.extensions(now)]))
@@ -195,14 +216,14 @@ class HypothesisSet:
         r = now.fit.residual * mask
         r = r - field.basis @ (field.basis.T @ r)
         more = linear_fit.options(field, (), r, 1.0)
-        out: list[Hypothesis] = []
+        out: list[tuple[Used, ...]] = []
         seen: set[Key] = set()
         for trial in more:
             variant = field.entries[trial.members[0]].variant
             if variant.key not in seen and len(seen) < NEXT:
                 seen.add(variant.key)
-                out.append(self.exact((*now.effects, variant.used)))
-        return out
+                out.append((*now.effects, variant.used))
+        return self.tried(out)
 
     def closer(self, now: Hypothesis, equations: Collection[str]) -> Hypothesis | None:
         """Return the set with the effect added that some equations ask for, None where none is.
@@ -246,3 +267,10 @@ class HypothesisSet:
         """Tell whether the effect that `without` lacks takes too small a share away."""
         drop = without.total - one.total
         return drop < linear_fit.ADD_SHARE * without.total
+
+
+def _effect(name: str, where: str) -> Effect:
+    """Return an effect of the catalogue at a place."""
+    found = make(name, where)
+    assert isinstance(found, Effect)
+    return found
