@@ -27,7 +27,7 @@ from analysis.trace.data.temperature_nuisance import stripped, temperature_terms
 from analysis.trace.judge import gates, held_out
 from analysis.trace.judge.shooting import reshaped, told
 from analysis.trace.next_experiment.proposal import propose
-from analysis.trace.remaining import clues_to, left_over
+from analysis.trace.remaining import Rest, clues_to, left_over
 from analysis.trace.result import (
     CLEAN,
     CONFOUNDED,
@@ -102,7 +102,10 @@ def trace(
         if quiet and verdict == UNEXPLAINED:
             notes.append(ELSEWHERE)
         if verdict == UNEXPLAINED and (found or quiet):
-            notes += [f"{e}: {words}" for e, words in rest]
+            notes += [f"{r.equation}: {r.words}" for r in rest if r.veto]
+        notes += [
+            f"{r.equation}: {r.words}; too little to speak against" for r in rest if not r.veto
+        ]
     split = lines(train_data, winner.fit.residual)
     moves: tuple[Dependence, ...] = ()
     formulas: tuple[Formula, ...] = ()
@@ -202,7 +205,7 @@ def _named(
     winner: Hypothesis,
     holdout_data: RegressionData,
     rng: np.random.Generator,
-) -> tuple[tuple[Found, ...], Hypothesis, str, list[tuple[str, str]]]:
+) -> tuple[tuple[Found, ...], Hypothesis, str, list[Rest]]:
     """Put the winner through the gates.
 
     Returns what was judged, the set that stands, the verdict, and the equations that keep more than
@@ -228,14 +231,23 @@ def _named(
         winner = hypotheses.exact(smaller)
     rest = left_over(hypotheses, winner, holdout_data)
     while rest:
-        more = hypotheses.closer(winner, {equation for equation, _ in rest})
+        more = hypotheses.closer(winner, {r.equation for r in rest})
         wider = gates.judge(hypotheses, more, holdout_data, rng) if more else ()
         later = left_over(hypotheses, more, holdout_data) if more else rest
-        if more is None or len(later) >= len(rest) or not all(map(gates.stands, wider)):
-            return (*found, *refused), winner, UNEXPLAINED, rest
+        # What speaks against nothing is named if nothing else fits as well: else it is left alone.
+        needed = any(r.veto for r in rest) or _tied(wider) == _tied(found)
+        stand = needed and all(map(gates.stands, wider))
+        if more is None or len(later) >= len(rest) or not stand:
+            break
         found, winner, rest = wider, more, later
-    tied = any(r.tied for f in found for r in f.rivals)
-    return found, winner, CONFOUNDED if tied else EXPLAINED, rest
+    if any(r.veto for r in rest):
+        return (*found, *refused), winner, UNEXPLAINED, rest
+    return found, winner, CONFOUNDED if _tied(found) else EXPLAINED, rest
+
+
+def _tied(found: Sequence[Found]) -> bool:
+    """Whether another effect fits as well as one of those found."""
+    return any(r.tied for f in found for r in f.rivals)
 
 
 def _fraction(hypotheses: HypothesisSet, winner: Hypothesis) -> float:

@@ -6,6 +6,7 @@ Clues tell it: variables, a frequency, a formula.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,19 +27,32 @@ LOUD = 0.1  # of all that is left: an equation with less asks for no clue
 SEEN = 8.0
 SHARE = 0.005
 HELD = 0.7  # share of the rest from which a formula holds it
+ACTED = 0.5  # of what was left before: an equation that keeps more the effects do not act in
+
+
+class Rest(NamedTuple):
+    """What an equation keeps, in words; whether it speaks against what was named (`veto`).
+
+    What does not may still be another effect's.
+    """
+
+    equation: str
+    words: str
+    veto: bool
 
 
 def left_over(
     hypotheses: HypothesisSet, winner: Hypothesis, holdout_data: RegressionData
-) -> list[tuple[str, str]]:
+) -> list[Rest]:
     """Return the equations that keep more than is nothing, and say what.
 
     Beside those that keep more than the noise floor's band (`gates.remaining`), those whose rest
-    one formula holds: it is no noise, and no form that is only a little simpler.
+    one formula holds: it is no noise, and no form that is only a little simpler. It speaks against
+    an effect that acts in this equation, where a bench with as much left would not be clean.
     """
-    out = gates.remaining(hypotheses, winner, holdout_data)
+    out = [Rest(*r, True) for r in gates.remaining(hypotheses, winner, holdout_data)]
     seen = _seen(hypotheses, winner) if winner.effects else {}
-    known = {equation for equation, _ in out}
+    known = {r.equation for r in out}
     asked = [equation for equation in seen if equation not in known]
     if not asked:
         return out
@@ -48,7 +62,9 @@ def left_over(
         found = formula(now, winner.fit.residual, later, held, equation)
         if found is not None and found.share >= HELD:
             words = f"{100 * seen[equation]:.2g} % of what repeated stays, and a formula holds it"
-            out.append((equation, f"{words}: {found.text}"))
+            loud = winner.excess_energy[equation] > hypotheses.limits.band[equation]
+            veto = loud and seen[equation] < ACTED
+            out.append(Rest(equation, f"{words}: {found.text}", veto))
     return out
 
 
