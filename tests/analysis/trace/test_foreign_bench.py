@@ -1,0 +1,96 @@
+"""One cause, many plants: the name and the size hang neither on its form nor on how it is measured.
+
+The bench is `foreign_bench`, none of whose forms is the catalogue's.
+"""
+
+from __future__ import annotations
+
+import pytest
+
+from analysis.trace.engine import trace
+from analysis.trace.result import Trace
+from rig.model.rig import Rig
+from tests.analysis.trace.foreign_bench import (
+    KARNOPP,
+    SIGMOID,
+    TANH,
+    Hidden,
+    pair_of_runs,
+)
+
+LEAK = 2e-12  # [m^3/(s Pa)]
+
+
+def traced(rig: Rig, hidden: Hidden, **measured: float) -> Trace:
+    train, held_out = pair_of_runs(rig, hidden, **measured)  # type: ignore[arg-type]
+    return trace([train], [held_out], look_ahead=False)
+
+
+@pytest.mark.parametrize(
+    ("form", "width"),
+    [(TANH, 1e-4), (TANH, 1e-3), (TANH, 5e-3), (TANH, 1e-2), (SIGMOID, 1e-3), (SIGMOID, 5e-3)],
+)
+def test_dry_friction_of_one_level_is_coulomb_friction_whatever_its_transition(
+    rig: Rig, form: int, width: float
+) -> None:
+    result = traced(rig, Hidden(80.0, 80.0, width, form))
+    assert result.verdict == "explained"
+    assert [(e.name, e.where) for e in result.effects] == [("coulomb_friction", "joint 2")]
+    assert result.effects[0].parameters["Fc2"].value == pytest.approx(80.0, rel=0.04)
+    assert result.model_after.values["Fv2"] == pytest.approx(4.43, rel=0.06)
+
+
+@pytest.mark.parametrize("width", [1e-3, 5e-3])
+def test_dry_friction_of_two_levels_is_asymmetric_friction(rig: Rig, width: float) -> None:
+    result = traced(rig, Hidden(100.0, 60.0, width))
+    assert result.verdict == "explained"
+    assert [(e.name, e.where) for e in result.effects] == [("asymmetric_friction", "joint 2")]
+    found = result.effects[0].parameters
+    assert found["F_ext_2"].value == pytest.approx(100.0, rel=0.03)
+    assert found["F_ret_2"].value == pytest.approx(60.0, rel=0.03)
+
+
+def test_a_joint_that_sticks_has_dry_friction_of_one_level_and_no_breakaway(rig: Rig) -> None:
+    """Karnopp's band of standstill: the filtered velocity does not show it, the level is right."""
+    result = traced(rig, Hidden(80.0, 80.0, 5e-4, KARNOPP))
+    assert [e.name for e in result.effects] == ["coulomb_friction"]
+    assert result.effects[0].parameters["Fc2"].value == pytest.approx(80.0, rel=0.03)
+
+
+def test_breakaway_above_the_sliding_level_is_still_stribeck_friction(rig: Rig) -> None:
+    result = traced(rig, Hidden(30.0, 30.0, breakaway=60.0))
+    assert result.verdict == "explained"
+    assert {e.name for e in result.effects} == {"coulomb_friction", "stribeck_friction"}
+
+
+@pytest.mark.parametrize(
+    ("rubbing", "measured"),
+    [
+        (2.0, {"repeats": 4}),
+        (2.0, {"repeats": 1}),
+        (0.7, {"noise": 1 / 3}),
+        (0.7, {"noise": 1.0}),
+        (0.7, {"noise": 3.0}),
+        (0.7, {"seconds": 5.0}),
+    ],
+)
+def test_a_leak_is_explained_however_well_it_is_measured(
+    rig: Rig, rubbing: float, measured: dict[str, float]
+) -> None:
+    """The seals rub with a force [N] that is nothing on a clean bench: it vetoes nothing here."""
+    result = traced(rig, Hidden(rubbing, rubbing, leak=LEAK), **measured)
+    assert result.verdict == "explained"
+    assert [(e.name, e.where) for e in result.effects] == [("internal_leakage", "joint 2")]
+    assert result.effects[0].parameters["c_internal_2"].value == pytest.approx(LEAK, rel=0.01)
+
+
+def test_what_vetoes_no_leak_is_clean_without_one(rig: Rig) -> None:
+    assert traced(rig, Hidden(2.0, 2.0)).verdict == "clean"
+
+
+@pytest.mark.parametrize("drop", [1e6, 2e6])
+def test_a_supply_that_sags_in_proportion_to_the_flow_is_named(rig: Rig, drop: float) -> None:
+    """Laminar share and drop lie on a ridge: what counts is the drop at the flows that were."""
+    result = traced(rig, Hidden(sag=drop))
+    assert result.verdict == "explained"
+    assert [(e.name, e.where) for e in result.effects] == [("supply_sag", "bench")]
