@@ -306,7 +306,9 @@ def _stribeck(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-d
     # The hidden state is w times d [m].
     if phase == CONTRIBUTE:
         i = int(par[0])
-        level = max(math.exp(-((x[SD, i] / par[2]) ** 2)), LEAST_LEVEL)
+        level = math.exp(-((x[SD, i] / par[2]) ** 2))
+        if par[3] > 0.0:
+            level = max(level, LEAST_LEVEL)
         # At a constant stiffness the distance goes with the level.
         state, dz[0] = slide(x[SD, i], z[0], par[3] * level, 0.0, par[4])
         out[TORQUE, i] -= par[1] * level * x[G, i] * state
