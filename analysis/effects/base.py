@@ -64,10 +64,14 @@ class Effect(Term):
     orders the terms' `prepare` (see `ordered`): what a sensor distorts is undone first, then comes
     what acts on the spool, in the oil's own order. `alters` names the families of rows that
     `prepare` changes: rows of others need not be built again for another shape. `hydraulic` marks
-    what acts on oil, valve or cylinder, and is not for electric joints.
+    what acts on oil, valve or cylinder, and is not for electric joints. `least` and `least_shape`
+    are the coefficients and shapes [SI] of the smallest size that a person would want to know of on
+    a bench of some kW at some MPa.
     """
 
     family: ClassVar[str] = ""
+    least: ClassVar[tuple[float, ...]] = ()
+    least_shape: ClassVar[tuple[float, ...]] = ()
     variable: ClassVar[str] = ""
     confounders: ClassVar[tuple[str, ...]] = ()
     separated_by: ClassVar[str] = ""
@@ -94,6 +98,10 @@ class Effect(Term):
     def side(self) -> str:
         """What `where` says after the joint: `cap`, `rod`, a sensor, or nothing."""
         return self.where.split()[2] if len(self.where.split()) > 2 else ""
+
+    def least_shapes(self) -> tuple[float, ...]:
+        """Return the first shapes of its smallest size of interest."""
+        return self.least_shape
 
     def absorbed(self, rig: Rig) -> str:
         """Say why the baseline's free parameters hide it completely ('' if they do not)."""

@@ -43,6 +43,7 @@ class EntrainedAir(Effect):
     """
 
     name: ClassVar[str] = "entrained_air"
+    least: ClassVar[tuple[float, ...]] = (3e-3,)  # of the volume, at one atmosphere
     hydraulic: ClassVar[bool] = True
     family: ClassVar[str] = "fluid"
     variable: ClassVar[str] = "the pressure rate at low chamber pressure"
@@ -101,6 +102,7 @@ class DeadVolume(Effect):
     """
 
     name: ClassVar[str] = "dead_volume"
+    least_shape: ClassVar[tuple[float, ...]] = (20e-6,)  # [m^3]
     prepares: ClassVar[bool] = True
     hydraulic: ClassVar[bool] = True
     family: ClassVar[str] = "fluid"

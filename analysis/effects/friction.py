@@ -190,6 +190,7 @@ class CoulombFriction(Friction):
     """
 
     name: ClassVar[str] = "coulomb_friction"
+    least: ClassVar[tuple[float, ...]] = (15.0,)  # [N]
     stiffens: ClassVar[bool] = True
     variable: ClassVar[str] = "the sign of the piston's velocity"
     confounders: ClassVar[tuple[str, ...]] = (
@@ -232,6 +233,7 @@ class StribeckFriction(Friction):
     """
 
     name: ClassVar[str] = "stribeck_friction"
+    least: ClassVar[tuple[float, ...]] = (30.0,)  # [N]
     variable: ClassVar[str] = "the piston's velocity near zero"
     confounders: ClassVar[tuple[str, ...]] = ("coulomb_friction", "asymmetric_friction")
     includes: ClassVar[tuple[str, ...]] = ("coulomb_friction",)  # at a high Stribeck speed

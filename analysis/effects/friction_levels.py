@@ -51,6 +51,7 @@ class AsymmetricFriction(Friction):
 
     hydraulic: ClassVar[bool] = True
     name: ClassVar[str] = "asymmetric_friction"
+    least: ClassVar[tuple[float, ...]] = (30.0, 10.0)  # [N] either way
     variable: ClassVar[str] = "the direction of the piston's motion"
     confounders: ClassVar[tuple[str, ...]] = ("coulomb_friction", "torque_offset")
     includes: ClassVar[tuple[str, ...]] = ("coulomb_friction",)  # where both levels are equal
@@ -136,6 +137,7 @@ class PressureDependentFriction(Friction):
 
     hydraulic: ClassVar[bool] = True
     name: ClassVar[str] = "pressure_dependent_friction"
+    least: ClassVar[tuple[float, ...]] = (5e-6,)  # [m^2]
     stiffens: ClassVar[bool] = True
     variable: ClassVar[str] = "the sum of the chamber pressures, with the velocity's sign"
     confounders: ClassVar[tuple[str, ...]] = ("coulomb_friction", "asymmetric_friction")

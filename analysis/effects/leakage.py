@@ -54,6 +54,7 @@ class InternalLeakage(_Leakage):
     """
 
     name: ClassVar[str] = "internal_leakage"
+    least: ClassVar[tuple[float, ...]] = (3e-13,)  # [m^3/(s Pa)]
     variable: ClassVar[str] = "the pressure difference across the piston"
     confounders: ClassVar[tuple[str, ...]] = (
         "external_leakage",
@@ -95,6 +96,7 @@ class ExternalLeakage(_Leakage):
     """Q = c (p - p_tank) out of one chamber, or of both with one c where `where` names none."""
 
     name: ClassVar[str] = "external_leakage"
+    least: ClassVar[tuple[float, ...]] = (3e-13,)  # [m^3/(s Pa)]
     variable: ClassVar[str] = "the chamber's pressure"
     confounders: ClassVar[tuple[str, ...]] = (
         "internal_leakage",

@@ -155,6 +155,7 @@ class ChannelDelay(Sensor):
     """reading(t) = x(t - delay), beyond the delay and skew that the rig file states."""
 
     name: ClassVar[str] = "channel_delay"
+    least_shape: ClassVar[tuple[float, ...]] = (1e-3,)  # [s]
     variable: ClassVar[str] = "the channel's rate"
     confounders: ClassVar[tuple[str, ...]] = ("spool_lag", "entrained_air", "dead_volume")
     separated_by: ClassVar[str] = (
@@ -189,6 +190,7 @@ class SensorGain(Sensor):
     """reading = gain x."""
 
     name: ClassVar[str] = "sensor_gain"
+    least_shape: ClassVar[tuple[float, ...]] = (1.01,)
     variable: ClassVar[str] = "the channel itself"
     confounders: ClassVar[tuple[str, ...]] = (
         "sensor_offset",
@@ -237,6 +239,11 @@ class SensorOffset(Sensor):
     separated_by: ClassVar[str] = (
         "working points far apart: low and high pressure, both ends of the stroke"
     )
+
+    def least_shapes(self) -> tuple[float, ...]:
+        """Return the offset that matters of a pressure or a piston, none of other channels."""
+        kind = ch.kind_of(self.channel)[0]
+        return {ch.PISTON: (0.3e-3,), ch.SPOOL: (), ch.TEMPERATURE: ()}.get(kind, (0.03e6,))
 
     def twins(self) -> tuple[tuple[str, str], ...]:
         """Return the null's offset for a spool: valve and sensor are one to the data."""

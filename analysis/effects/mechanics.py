@@ -42,6 +42,7 @@ class BaseInclination(Effect):
     """
 
     name: ClassVar[str] = "base_inclination"
+    least_shape: ClassVar[tuple[float, ...]] = (0.017,)  # [rad]
     prepares: ClassVar[bool] = True
     family: ClassVar[str] = "mechanics"
     alters: ClassVar[tuple[str, ...]] = ("mechanical",)
@@ -106,6 +107,7 @@ class JointSpring(Effect):
     """
 
     name: ClassVar[str] = "joint_spring"
+    least: ClassVar[tuple[float, ...]] = (20.0,)  # [N m/rad]
     family: ClassVar[str] = "mechanics"
     variable: ClassVar[str] = "the joint's angle"
     confounders: ClassVar[tuple[str, ...]] = ("torque_offset", "base_inclination")
@@ -181,6 +183,7 @@ class TorqueOffset(Effect):
     """
 
     name: ClassVar[str] = "torque_offset"
+    least: ClassVar[tuple[float, ...]] = (2.0,)  # [N m]
     family: ClassVar[str] = "mechanics"
     variable: ClassVar[str] = "nothing: it is constant"
     confounders: ClassVar[tuple[str, ...]] = (

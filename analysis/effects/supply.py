@@ -93,6 +93,7 @@ class SupplySag(_PortEffect):
     """
 
     name: ClassVar[str] = "supply_sag"
+    least_shape: ClassVar[tuple[float, ...]] = (0.2e6, 0.0, 0.0)  # [Pa] at the rated flow
     variable: ClassVar[str] = "the flow drawn from the supply"
     confounders: ClassVar[tuple[str, ...]] = ("tank_pressure", "sensor_gain", "sensor_offset")
     separated_by: ClassVar[str] = (
@@ -144,6 +145,7 @@ class TankPressure(_PortEffect):
     """
 
     name: ClassVar[str] = "tank_pressure"
+    least_shape: ClassVar[tuple[float, ...]] = (0.1e6, 0.0)  # [Pa]
     variable: ClassVar[str] = "the pressure left across the edge to the tank"
     confounders: ClassVar[tuple[str, ...]] = ("supply_sag", "sensor_offset", "external_leakage")
     separated_by: ClassVar[str] = (

@@ -44,6 +44,7 @@ class UnderlapLeakage(ValveEffect):
     """
 
     name: ClassVar[str] = "underlap_leakage"
+    least_shape: ClassVar[tuple[float, ...]] = (4e-3,)  # [V]
     prepares: ClassVar[bool] = False
     variable: ClassVar[str] = "the spool near its null and the chamber pressures"
     confounders: ClassVar[tuple[str, ...]] = (

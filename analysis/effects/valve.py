@@ -79,6 +79,7 @@ class ValveDeadband(ValveEffect):
     """
 
     name: ClassVar[str] = "valve_deadband"
+    least_shape: ClassVar[tuple[float, ...]] = (2e-3, 2e-3)  # [V]
     stage: ClassVar[int] = EDGES
     variable: ClassVar[str] = "the spool near its null"
     confounders: ClassVar[tuple[str, ...]] = ("spool_offset", "underlap_leakage", "spool_lag")
@@ -126,6 +127,7 @@ class SpoolOffset(ValveEffect):
     """
 
     name: ClassVar[str] = "spool_offset"
+    least_shape: ClassVar[tuple[float, ...]] = (1e-3,)  # [V]
     stage: ClassVar[int] = NULL
     variable: ClassVar[str] = "the spool's sign"
     confounders: ClassVar[tuple[str, ...]] = ("valve_deadband", "internal_leakage")
@@ -170,6 +172,7 @@ class SpoolLag(ValveEffect):
     """
 
     name: ClassVar[str] = "spool_lag"
+    least_shape: ClassVar[tuple[float, ...]] = (1e-3,)  # [s]
     stage: ClassVar[int] = LAG
     variable: ClassVar[str] = "the spool's velocity"
     confounders: ClassVar[tuple[str, ...]] = ("channel_delay", "valve_deadband", "entrained_air")

@@ -19,8 +19,13 @@ from analysis.terms.base import Used
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import RegressionData, regression_data
 from analysis.trace.data.temperature_nuisance import base_terms
-from analysis.trace.next_experiment.detectable_size import smallest
-from analysis.trace.next_experiment.discrimination import Explanation, Ground, Question, present
+from analysis.trace.next_experiment.discrimination import (
+    Explanation,
+    Ground,
+    Question,
+    present,
+    smallest,
+)
 from analysis.trace.next_experiment.proposal import SHOW
 from analysis.trace.result import Trace, to_json
 from analysis.trace.search.hypothesis import excess_of

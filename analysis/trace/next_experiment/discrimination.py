@@ -67,6 +67,21 @@ class Explanation:
         )
 
 
+def smallest(effect: Effect, rig: Rig) -> Explanation | None:
+    """Return an effect at its smallest size of interest, None where it has none or cannot show.
+
+    On poor excitation an effect of this size may leave nothing in the residual; then `clean` says
+    little about it.
+    """
+    own = effect.least_shapes()
+    if effect.absorbed(rig) or not (own or effect.least):
+        return None
+    usual = effect.shape_of(rig, ())
+    names = [c.parameter for c in effect.coefficients(rig)]
+    used = Used(effect, (*own, *usual[len(own) :]))
+    return Explanation((used,), dict(zip(names, effect.least, strict=False)))
+
+
 @dataclass(frozen=True)
 class Question:
     """What an experiment is to tell: `one` or `other`; `both_ways` unless `one` is only wanted

@@ -21,7 +21,6 @@ from analysis.terms import baseline_of, known
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.next_experiment import excitations as ex
-from analysis.trace.next_experiment.detectable_size import smallest
 from analysis.trace.next_experiment.discrimination import (
     Explanation,
     Ground,
@@ -31,6 +30,7 @@ from analysis.trace.next_experiment.discrimination import (
     loudest,
     present,
     separation,
+    smallest,
     view,
 )
 from analysis.trace.next_experiment.range_extension import LINES, farther, richer

@@ -12,7 +12,6 @@ from analysis.terms.base import Used
 from analysis.trace.data.candidates import catalogue
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import RegressionData, regression_data
-from analysis.trace.next_experiment.detectable_size import smallest
 from analysis.trace.next_experiment.discrimination import (
     Explanation,
     Ground,
@@ -21,6 +20,7 @@ from analysis.trace.next_experiment.discrimination import (
     loudest,
     present,
     separation,
+    smallest,
     view,
 )
 from analysis.trace.next_experiment.excitations import (

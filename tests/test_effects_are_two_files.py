@@ -1,0 +1,41 @@
+"""An effect is its class in the catalogue and its plant form; nobody else knows its name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from analysis.effects.base import Effect
+from analysis.terms import known
+from hil_sim.effects import CLASSES
+
+ROOT = Path(__file__).parents[1]
+CATALOGUE = {name: kind for name, kind in known().items() if issubclass(kind, Effect)}
+PLANT = {kind.effect_name() for kind in CLASSES}
+# What an electric rig file and the model's gravity know of by themselves.
+ELSEWHERE = {"base_inclination", "torque_offset"}
+
+
+def test_the_catalogue_and_the_plant_have_the_same_effects() -> None:
+    assert set(CATALOGUE) == PLANT
+
+
+@pytest.mark.parametrize("name", sorted(set(CATALOGUE) - ELSEWHERE))
+def test_no_other_file_of_the_product_knows_an_effect_by_name(name: str) -> None:
+    homes = (ROOT / "analysis" / "effects", ROOT / "hil_sim" / "effects")
+    users = [
+        str(path.relative_to(ROOT))
+        for package in ("rig", "protocols", "drivers", "analysis", "hil_sim")
+        for path in (ROOT / package).rglob("*.py")
+        if not any(home in path.parents for home in homes)
+        and f'"{name}"' in path.read_text(encoding="utf-8")
+    ]
+    assert users == []
+
+
+@pytest.mark.parametrize("kind", CATALOGUE.values(), ids=lambda kind: kind.name)
+def test_an_effect_carries_the_smallest_size_of_interest(kind: type[Effect]) -> None:
+    if kind.name in ("payload", "sensor_offset"):  # cannot show alone; differs by channel
+        return
+    assert kind.least or kind.least_shape
