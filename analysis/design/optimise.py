@@ -52,7 +52,7 @@ EARLY_SHARE = 0.6  # of the budget
 
 @dataclass(frozen=True)
 class Candidate:
-    """One step as designed so far: its tones by joint, what the twin did, what it tells."""
+    """One step as designed so far: its tones by joint, the twin's motion, the information."""
 
     tones: Mapping[int, Tone]
     played: Played
@@ -158,7 +158,7 @@ class _Search:
         self.allowed = {n: max(KEEP * e, about) for n, e in known.items()}
 
     def loosen(self, found: Sequence[StepInformation]) -> None:
-        """Let a start that had to be made smaller to keep the limits be as poor as it then is."""
+        """Rate a start that had to be made smaller to keep the limits by that smaller motion."""
         for name, error in self.errors(found).items():
             if name in self.allowed:
                 self.allowed[name] = max(self.allowed[name], 1.001 * error)

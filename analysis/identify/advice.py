@@ -44,7 +44,7 @@ def base_statements(rig: Rig, solutions: Mapping[str, Solution]) -> list[Check]:
             Check(
                 f"base parameters {family}", False,
                 f"rank {found.rank} of {k}; of {' '.join(solution.unidentifiable)} these records "
-                f"determine: {combined}. {_told(helps)}",
+                f"determine: {combined}. {_joined(helps)}",
             )
         )  # fmt: skip
     return out
@@ -59,7 +59,7 @@ def _help(rig: Rig, family: str, found: Determined) -> list[str]:
     return mechanical_help(rig, found) if family == "mechanical" else fluid_help(rig, found)
 
 
-def _told(helps: Sequence[str]) -> str:
+def _joined(helps: Sequence[str]) -> str:
     if not helps:
         return "Add a richer excitation: other poses, other speeds"
     return "Add: " + ", and: ".join(helps)

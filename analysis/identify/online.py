@@ -12,9 +12,9 @@ Forgetting goes by the device's clock, so a parameter that changes is followed w
 What is not excited fades, but never below FLOOR of its column's best: there its value is held, and
 it is said to be held, in the place of numbers that come from rounding.
 
-Followed by default are the flow rows (b and the gains), which need nothing of the locked joints.
+By default the flow rows are followed (b and the gains), which do not depend on the locked joints.
 Torque rows can be followed as well; locked joints then count as moving as measured, whereas
-`identify` decides from the whole record whether a lock gives.
+`identify` decides from all repeats of a step (`analysis.signals.locks`).
 """
 
 from __future__ import annotations
@@ -255,7 +255,7 @@ class Tracker:
         return self._feed is not None and self._fold(self._feed.feed(channels))
 
     def end(self) -> None:
-        """End the record; what it told is kept."""
+        """End the record and keep its rows."""
         if self._feed is not None:
             self._fold(self._feed.finish())
             for one in self._running.values():
@@ -263,7 +263,7 @@ class Tracker:
         self._kept, self._feed = self._running, None
 
     def discard(self) -> None:
-        """End the record as if it had not been."""
+        """End the record and drop its rows."""
         self._running, self._feed = self._kept, None
 
     def _fold(self, found: Mapping[str, Rows]) -> bool:

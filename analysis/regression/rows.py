@@ -32,11 +32,11 @@ from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
-ROW_CUTOFF = 15.0  # [Hz] where a record does not tell its excited lines
+ROW_CUTOFF = 15.0  # [Hz] where a record names no excited lines
 ROW_CUTOFF_RANGE = (8.0, 30.0)  # [Hz]
 # An electric joint's rows need one derivative less of anything noisy, and its friction flips in
 # milliseconds: narrower loses of the flips (`python -m tests.studies emps` prints the figures).
-ROW_CUTOFF_ELECTRIC = 30.0  # [Hz] where a record does not tell its excited lines
+ROW_CUTOFF_ELECTRIC = 30.0  # [Hz] where a record names no excited lines
 LINES_FACTOR = 1.5  # row filter over the highest excited line; the noise goes with its 5th power
 MASKED_SHARE = 1e-3  # of a filter's weight on masked samples: a row with more is dropped
 
@@ -76,7 +76,7 @@ def default_filtering(record: Record) -> Filtering:
 
 
 def lines_cutoff(record: Record) -> float:
-    """Return the row filter's cutoff [Hz] for a record that tells its excited lines."""
+    """Return the row filter's cutoff [Hz] for a record whose excited lines are known."""
     highest = max(record.lines) * record.sample_rate / record.period
     return float(np.clip(LINES_FACTOR * highest, *ROW_CUTOFF_RANGE))
 

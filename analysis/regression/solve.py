@@ -158,23 +158,45 @@ def scores(beta: Array, cluster: RowCluster) -> Array:
 def _clustered(beta: Array, bread: Array, clusters: Sequence[RowCluster]) -> tuple[Array, Array]:
     """Return the stratified cluster covariance (k, k) and Satterthwaite's dof (k,)."""
     k = len(beta)
-    strata: dict[Hashable, dict[Hashable, Array]] = {}
+    found: dict[tuple[Hashable, Hashable], Array] = {}
     for cluster in clusters:
-        keys = strata.setdefault(cluster.stratum, {})
-        keys[cluster.key] = keys.get(cluster.key, np.zeros(k)) + scores(beta, cluster)
+        key = (cluster.stratum, cluster.key)
+        found[key] = found.get(key, np.zeros(k)) + scores(beta, cluster)
+    number = {s: n for n, s in enumerate(dict.fromkeys(stratum for stratum, _ in found))}
+    labels = np.array([number[stratum] for stratum, _ in found], dtype=np.int64)
+    influence = np.array(list(found.values())).reshape(-1, k) @ bread
+    scatter = stratified(labels, influence)
+    return (np.full((k, k), np.nan), np.full(k, np.nan)) if scatter is None else scatter
+
+
+def stratified(stratum: NDArray[np.int64], influence: Array) -> tuple[Array, Array] | None:
+    """Return sum over strata of n/(n-1) sum (u - mean)(u - mean)' (k, k) of influences u (c, k).
+
+    `stratum` (c,) or (c, l) labels them. Also Satterthwaite's degrees of freedom (k,); None where
+    a stratum has one member only.
+    """
+    k = influence.shape[1]
     total, squares = np.zeros((k, k)), np.zeros(k)
-    for keys in strata.values():
-        n = len(keys)
+    labels = np.unique(stratum, axis=0, return_inverse=True)[1].ravel()
+    for label in range(labels.max(initial=-1) + 1):
+        u = influence[labels == label]
+        n = len(u)
         if n < 2:
-            return np.full((k, k), np.nan), np.full(k, np.nan)
-        influence = np.array(list(keys.values())) @ bread
-        influence -= influence.mean(axis=0)
-        part = influence.T @ influence * (n / (n - 1))
+            return None
+        u = u - u.mean(axis=0)
+        part = u.T @ u * (n / (n - 1))
         total += part
         squares += np.diag(part) ** 2 / (n - 1)
+    return total, satterthwaite(np.diag(total), squares)
+
+
+def satterthwaite(variance: Array, squares: Array) -> Array:
+    """Return the degrees of freedom (k,) of a sum of variances, 1 where nothing scatters.
+
+    `squares` (k,) sums each part's square over its own degrees of freedom.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
-        dof = np.where(squares > 0, np.diag(total) ** 2 / squares, 1.0)
-    return total, dof
+        return np.asarray(np.where(squares > 0, variance**2 / squares, 1.0))
 
 
 def half_width(std: Array, dof: Array, level: float = 0.95) -> Array:

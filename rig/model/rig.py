@@ -271,7 +271,7 @@ class ElectricRig(Rig):
 
     @property
     def recorded(self) -> tuple[str, ...]:
-        """The channels of a record: the drive is measured, there is no command beside it."""
+        """The channels of a record: the measured ones, for the drive is its own command."""
         return self.channels
 
     @property

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 from scipy.stats import t as student
 
-from analysis.identify.estimators.equations import RepeatBlock
+from analysis.identify.estimators.equations import RepeatBlock, rows_of
 
 Array = NDArray[np.float64]
 
@@ -80,10 +80,4 @@ def _resampled(blocks: Sequence[RepeatBlock], rng: np.random.Generator) -> list[
 def _piece(b: RepeatBlock, part: int, copy: int) -> RepeatBlock:
     # A repeat drawn twice counts as two.
     named = replace(b, repeat=copy, record=f"{b.record}#{copy}")
-    if part < 0:
-        return named
-    here = b.segment == part
-    return replace(
-        named, X=b.X[here], y=b.y[here], time=b.time[here], segment=b.segment[here],
-        level=b.level[here],
-    )  # fmt: skip
+    return named if part < 0 else rows_of(named, b.segment == part)

@@ -23,7 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import f as fisher
 
-from analysis.identify.estimators.equations import Indices, Pieces
+from analysis.identify.estimators.equations import Pieces
+from analysis.regression.solve import satterthwaite, stratified
 
 Array = NDArray[np.float64]
 
@@ -62,26 +63,8 @@ def spread(groupings: Sequence[Pieces], inverse: Array) -> CovarianceParts:
 def by_repeats(pieces: Pieces, inverse: Array) -> CovarianceParts | None:
     """Return the scatter between repeats within their steps; None where a step has only one."""
     stratum, score, _ = pieces.grouped(pieces.repeat)
-    return stratified(stratum, score @ inverse.T)
-
-
-def stratified(stratum: Indices, influence: Array) -> CovarianceParts | None:
-    """Return sum over strata of n/(n-1) sum (u - mean)(u - mean)' of influences u (c, k).
-
-    Degrees of freedom are Satterthwaite's; None where a stratum has one member only.
-    """
-    k = influence.shape[1]
-    total, squares = np.zeros((k, k)), np.zeros(k)
-    for s in np.unique(stratum, axis=0):
-        u = influence[(stratum == s) if stratum.ndim == 1 else (stratum == s).all(axis=1)]
-        n = len(u)
-        if n < 2:
-            return None
-        u = u - u.mean(axis=0)
-        part = u.T @ u * (n / (n - 1))
-        total += part
-        squares += np.diag(part) ** 2 / (n - 1)
-    return CovarianceParts(total, _satterthwaite(np.diag(total), squares), np.zeros(k))
+    found = stratified(stratum, score @ inverse.T)
+    return None if found is None else CovarianceParts(*found, np.zeros(len(inverse)))
 
 
 def lack_of_fit(pieces: Pieces, inverse: Array) -> Array:
@@ -93,10 +76,10 @@ def lack_of_fit(pieces: Pieces, inverse: Array) -> Array:
     if noise is None:
         return np.zeros((k, k))
     found = u.T @ u
-    size, floor = np.diag(found), np.diag(noise.covariance)
+    size, floor = np.diag(found), np.diag(noise[0])
     with np.errstate(divide="ignore", invalid="ignore"):
         dof = np.where(size > 0, size**2 / np.sum(u**4, axis=0), 1.0)
-        p = fisher.sf(size / floor, np.maximum(dof, 1.0), np.maximum(noise.dof, 1.0))
+        p = fisher.sf(size / floor, np.maximum(dof, 1.0), np.maximum(noise[1], 1.0))
     excess = np.where(p < VISIBLE, np.maximum(size - floor, 0.0), 0.0)
     scale = np.sqrt(excess / np.where(size > 0, size, 1.0))
     return np.asarray(found * np.outer(scale, scale))
@@ -115,7 +98,7 @@ def by_parts(pieces: Pieces, inverse: Array) -> CovarianceParts:
         part = u.T @ u * ((n - 1) / n if n > 1 else 1.0)
         total += part
         squares += np.diag(part) ** 2 / max(n - 1, 1)
-    return CovarianceParts(total, _satterthwaite(np.diag(total), squares), np.zeros(k))
+    return CovarianceParts(total, satterthwaite(np.diag(total), squares), np.zeros(k))
 
 
 def _without(A: Array, part: Array, score: Array) -> Array:
@@ -126,8 +109,3 @@ def _without(A: Array, part: Array, score: Array) -> Array:
         # That part alone determines some direction: its influence to first order.
         reduced = A / np.outer(scale, scale)
     return np.asarray(np.linalg.solve(reduced, score / scale) / scale)
-
-
-def _satterthwaite(variance: Array, squares: Array) -> Array:
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(np.where(squares > 0, variance**2 / squares, 1.0))

@@ -180,14 +180,12 @@ def common(blocks: Sequence[RepeatBlock]) -> list[RepeatBlock]:
     out = []
     for b in blocks:
         here = np.isin(np.round(b.time, 9), shared[*b.stratum, b.equation])
-        out.append(
-            b if here.all() else
-            _rows_of(b, here)
-        )  # fmt: skip
+        out.append(b if here.all() else rows_of(b, here))
     return out
 
 
-def _rows_of(b: RepeatBlock, here: NDArray[np.bool_]) -> RepeatBlock:
+def rows_of(b: RepeatBlock, here: NDArray[np.bool_]) -> RepeatBlock:
+    """Return a block with the rows `here` (m,) alone."""
     return replace(
         b, X=b.X[here], y=b.y[here], time=b.time[here], segment=b.segment[here],
         level=b.level[here],
@@ -242,14 +240,21 @@ def residual_scatter(blocks: Sequence[RepeatBlock], residuals: Sequence[Array]) 
     The blocks must share their rows (`common`). With n repeats the deviations are sqrt((n-1)/n)
     of the noise, which is undone.
     """
+    return [
+        (e - total / n) * np.sqrt(n / max(n - 1, 1))
+        for e, (total, n) in zip(residuals, over_repeats(blocks, residuals), strict=True)
+    ]
+
+
+def over_repeats(blocks: Sequence[RepeatBlock], arrays: Sequence[Array]) -> list[tuple[Array, int]]:
+    """Return, for each block, the sum of its repeats' arrays and how many repeats there are.
+
+    `arrays` holds one array a block, alike in shape among the repeats of a step's equation.
+    """
     total: dict[tuple[int, str, str], Array] = {}
     count: dict[tuple[int, str, str], int] = {}
-    for b, e in zip(blocks, residuals, strict=True):
+    for b, array in zip(blocks, arrays, strict=True):
         key = (*b.stratum, b.equation)
-        total[key] = total[key] + e if key in total else e.copy()
+        total[key] = total[key] + array if key in total else array.copy()
         count[key] = count.get(key, 0) + 1
-    out = []
-    for b, e in zip(blocks, residuals, strict=True):
-        n = count[*b.stratum, b.equation]
-        out.append((e - total[*b.stratum, b.equation] / n) * np.sqrt(n / max(n - 1, 1)))
-    return out
+    return [(total[*b.stratum, b.equation], count[*b.stratum, b.equation]) for b in blocks]

@@ -17,16 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from analysis.identify.estimators.covariance import stratified
 from analysis.identify.estimators.equations import (
     EquationFit,
-    Indices,
     RepeatBlock,
     common,
     least_squares,
+    over_repeats,
     pieces,
     solve,
 )
+from analysis.regression.solve import stratified
 
 Array = NDArray[np.float64]
 
@@ -51,15 +51,8 @@ class Hausman:
 def instrumental_variables(blocks: Sequence[RepeatBlock]) -> EquationFit:
     """Solve with the other repeats' mean rows as instruments; every step needs two repeats."""
     blocks = common(blocks)
-    total: dict[tuple[int, str, str], Array] = {}
-    count: dict[tuple[int, str, str], int] = {}
-    for b in blocks:
-        key = (*b.stratum, b.equation)
-        total[key] = total[key] + b.X if key in total else b.X.copy()
-        count[key] = count.get(key, 0) + 1
-    Z = [
-        (total[*b.stratum, b.equation] - b.X) / (count[*b.stratum, b.equation] - 1) for b in blocks
-    ]
+    sums = over_repeats(blocks, [b.X for b in blocks])
+    Z = [(total - b.X) / (n - 1) for b, (total, n) in zip(blocks, sums, strict=True)]
     return solve(blocks, Z, [np.ones(len(b.y)) for b in blocks])
 
 
@@ -74,14 +67,11 @@ def hausman(blocks: Sequence[RepeatBlock]) -> Hausman:
     difference = ls.beta - iv.beta
     one, other = pieces(ls), pieces(iv)
     influence = one.score @ ls.inverse.T - other.score @ iv.inverse.T
-    spread = stratified(_part_of(one.stratum, one.part), influence)
-    assert spread is not None, "instruments exist only where steps have repeats"
-    error = np.sqrt(np.diag(spread.covariance))
+    scatter = stratified(np.column_stack((one.stratum, one.part)), influence)
+    assert scatter is not None, "instruments exist only where steps have repeats"
+    covariance, dof = scatter
+    error = np.sqrt(np.diag(covariance))
     with np.errstate(divide="ignore", invalid="ignore"):
         statistic = np.where(error > 0, np.abs(difference) / error, 0.0)
         relative = difference / iv.beta
-    return Hausman(difference, error, 2 * student.sf(statistic, spread.dof), relative)
-
-
-def _part_of(stratum: Indices, part: Indices) -> Indices:
-    return np.column_stack((stratum, part))
+    return Hausman(difference, error, 2 * student.sf(statistic, dof), relative)

@@ -1,4 +1,4 @@
-"""What the model leaves out though it is known to be there, fitted beside it in small columns.
+"""Two small effects that the model leaves out, fitted as additional columns of the fluid rows.
 
 Both shift parameters by more than their scatter, so that without them no interval could be right;
 both are one column of the fluid rows, estimated with the rest, and neither is a parameter.

@@ -142,7 +142,7 @@ def run_search(
 def _pymoo(
     method: str, task: SearchTask, options: SearchOptions, rng: np.random.Generator
 ) -> tuple[Any, Any, Callable[[Array], Any]]:
-    """Return pymoo's algorithm, its evaluator, and how it wants to be told errors (n,)."""
+    """Return pymoo's algorithm, its evaluator, and the wrapper of errors (n,) that it takes."""
     # An extra: who never searches need not install it.
     try:
         core = {name: import_module(f"pymoo.{place}") for name, place in _PYMOO.items()}

@@ -92,7 +92,7 @@ class Search:
         self.names, self.stretches = windows.names, windows.stretches
 
     def run(self, theta: Array) -> OutputErrorFit:
-        """Search from theta (k,) on; what nothing in the windows tells of stays as it is."""
+        """Search from theta (k,); parameters that no window depends on keep their values."""
         theta = theta[: len(self.names)]
         starts = [self.windows.measured_start(s) for s in self.stretches]
         sigma = self.windows.sigma()

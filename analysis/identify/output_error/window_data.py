@@ -1,4 +1,4 @@
-"""What output error handles: windows of records, models with nudges, what a window tells."""
+"""Data of output error: windows of records, disturbed models, a window's normal equations."""
 
 from __future__ import annotations
 

@@ -202,7 +202,7 @@ class Windows:
             stretch = self.stretches[k]
             return self._window(stretch, starts[k], sigma[stretch.stratum], ready[stretch.record])
 
-        # A record's first window tells which parameters move nothing in it; once that is known,
+        # A record's first window shows which parameters move nothing in it; once that is known,
         # windows need not wait for one another.
         found = {}
         for k, stretch in enumerate(self.stretches):
