@@ -13,8 +13,8 @@ from hil_sim.effects import CLASSES
 ROOT = Path(__file__).parents[1]
 CATALOGUE = {name: kind for name, kind in known().items() if issubclass(kind, Effect)}
 PLANT = {kind.effect_name() for kind in CLASSES}
-# What an electric rig file and the model's gravity know of by themselves.
-ELSEWHERE = {"base_inclination", "torque_offset"}
+# Words that also name a quantity: of an electric rig file, of gravity, a state of the plant.
+ELSEWHERE = {"base_inclination", "torque_offset", "tank_pressure"}
 
 
 def test_the_catalogue_and_the_plant_have_the_same_effects() -> None:
