@@ -29,14 +29,14 @@ from drivers.base import (
     SampleBlock,
 )
 from rig.bench.after_zero import record_zero
-from rig.bench.attach import Publisher
-from rig.bench.display import Display
 from rig.bench.guard import Guard, GuardSettings, JointRole
 from rig.bench.handles import RecordHandle
 from rig.bench.latch import BenchState
 from rig.bench.lateness import ArrivalClock
 from rig.bench.observers import Observers
 from rig.bench.outputs import UNSURE, Outputs
+from rig.bench.screens.display import Display
+from rig.bench.screens.sockets import Publisher
 from rig.bench.stops import StopFlag
 from rig.model.rig import Rig
 from rig.model.trips import (

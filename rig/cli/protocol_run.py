@@ -14,8 +14,8 @@ from protocols.design.check import check
 from protocols.engine import engine
 from protocols.files import library
 from protocols.files.plan import Overrides, Plan, resolve
-from rig.bench.attach import AttachError, Publisher
 from rig.bench.latch import reset_bench
+from rig.bench.screens.sockets import AttachError, Publisher
 from rig.bench.session import Bench
 from rig.model.rig import Rig
 from rig.runs.recorder import Recorder

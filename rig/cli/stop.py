@@ -21,6 +21,7 @@ def stop(rig: RigOption, endpoint: EndpointOption = None) -> None:
     """
     from drivers.base import DeviceError
     from rig.bench import probe as bench
+    from rig.bench.outputs import UNSURE
 
     described, driver = device_of(rig, endpoint)
     try:
@@ -28,7 +29,7 @@ def stop(rig: RigOption, endpoint: EndpointOption = None) -> None:
     except DeviceError as error:
         watchdog = described.wire.watchdog
         raise type(error)(
-            f"OUTPUTS NOT CONFIRMED AT ZERO: {error}; use the emergency stop (the device's "
+            f"{UNSURE}: {error}; use the emergency stop (the device's "
             f"watchdog zeroes them {watchdog:g} s after its host has fallen silent)"
         ) from error
     finally:

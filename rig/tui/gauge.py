@@ -7,7 +7,7 @@ from typing import Final
 
 from rich.text import Text
 
-from rig.bench.attach import ChannelView
+from rig.bench.screens.sockets import ChannelView
 from rig.tui.braille import scale_around
 from rig.tui.units import limit, shown
 from rig.tui.words import OLD, value

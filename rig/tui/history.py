@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.bench.attach import ChannelView, Snapshot
+from rig.bench.screens.sockets import ChannelView, Snapshot
 from rig.tui.units import limit
 
 Array = NDArray[np.float64]

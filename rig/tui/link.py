@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Final, Protocol
 
-from rig.bench.attach import Attachment, Endpoint, Snapshot
+from rig.bench.screens.sockets import Attachment, Endpoint, Snapshot
 from rig.tui.history import EMPTY, History, HistoryWindow
 from rig.tui.story import Line, tell
 
@@ -28,7 +28,7 @@ ENDED_STATES: Final = frozenset({"done", "aborted", "tripped", "interrupted"})
 
 
 class SnapshotSource(Protocol):
-    """One connection to a run; what `rig.bench.attach.Attachment` offers."""
+    """One connection to a run; what `rig.bench.screens.sockets.Attachment` offers."""
 
     def receive(self, timeout: float) -> Snapshot | None:
         """Return the next snapshot, or None when none came within `timeout` seconds."""

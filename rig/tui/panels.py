@@ -13,7 +13,7 @@ from textual.app import ComposeResult
 from textual.containers import ItemGrid, Vertical
 from textual.widgets import Static
 
-from rig.bench.attach import ChannelView
+from rig.bench.screens.sockets import ChannelView
 from rig.model import channels as ch
 from rig.tui.gauge import LABEL, gauge
 from rig.tui.link import Frame

@@ -11,7 +11,7 @@ from textual.screen import ModalScreen
 from textual.widgets import OptionList, Static
 from textual.widgets.option_list import Option
 
-from rig.bench.attach import Endpoint
+from rig.bench.screens.sockets import Endpoint
 
 HELP: Final = """\
 [b]s[/b] or [b]space[/b]   STOP: zero all outputs, at once, without asking;

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from rig.bench.attach import Snapshot
+from rig.bench.screens.sockets import Snapshot
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from typing import Final
 
 from rich.text import Text
 
-from rig.bench.attach import ChannelView, Endpoint, Snapshot
 from rig.bench.outputs import UNSURE
+from rig.bench.screens.sockets import ChannelView, Endpoint, Snapshot
 from rig.model import channels as ch
 from rig.tui.link import ENDED_STATES, QUIET, Frame, LinkStage
 from rig.tui.story import trip_text

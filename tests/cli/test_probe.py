@@ -59,7 +59,7 @@ def test_stop_zeroes_what_another_host_has_put_out(endpoint: str) -> None:
 def test_what_could_not_be_confirmed_is_said_first() -> None:
     gone = bramah("stop", "--rig", RIG, "--endpoint", "modbus-tcp://127.0.0.1:9")
     assert gone.returncode == 4
-    assert "OUTPUTS NOT CONFIRMED AT ZERO" in gone.stderr
+    assert "outputs not confirmed at zero" in gone.stderr
     assert "emergency stop" in gone.stderr
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from drivers.base import OutputLaw
-from rig.bench.attach import Publisher
+from rig.bench.screens.sockets import Publisher
 from rig.bench.session import Bench
 from rig.model.trips import OperatorStop, RecordingFailed
 from rig.runs import archive, journal, recorder, store

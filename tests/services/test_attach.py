@@ -21,10 +21,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.base import SampleBlock
-from rig.bench.attach import AttachError, Attachment, Endpoint, Publisher
 from rig.bench.guard import EXCITED, JointRole
+from rig.bench.screens.snapshot import Snapshot, decimate, from_json, to_json
+from rig.bench.screens.sockets import AttachError, Attachment, Endpoint, Publisher
 from rig.bench.session import Bench
-from rig.bench.snapshot import Snapshot, decimate, from_json, to_json
 from rig.model.trips import OperatorStop, SafetyTrip
 from rig.runs.recorder import Recorder
 from rig.runs.store import load_run
@@ -101,7 +101,7 @@ def test_screens_that_come_go_hang_or_die_leave_the_run_untouched(
     run = tmp_path / "run"
     child = start(run, "serve", 100_000)
     script = (
-        "import sys, time\nfrom rig.bench.attach import Attachment\n"
+        "import sys, time\nfrom rig.bench.screens.sockets import Attachment\n"
         "a = Attachment(Attachment.find()[0])\n"
         "assert a.receive(20) is not None\nprint('seen', flush=True)\ntime.sleep(600)\n"
     )
@@ -241,7 +241,7 @@ def test_decimation_keeps_every_peak(case: tuple[int, int, int]) -> None:
 
 
 def test_a_snapshot_survives_its_wire_and_rubbish_is_refused() -> None:
-    from rig.bench.snapshot import BenchView, Progress, take_snapshot
+    from rig.bench.screens.snapshot import BenchView, Progress, take_snapshot
 
     view = BenchView("run", "rig", "running", 10, 0.01, 1.0, 0.0, 0, None)
     units = {"spool_1": "V"}

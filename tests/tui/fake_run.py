@@ -12,7 +12,7 @@ import sys
 import time
 from dataclasses import replace
 
-from rig.bench.attach import Publisher
+from rig.bench.screens.sockets import Publisher
 from tests.tui.recorded import Bench, of_this_process, snapshot, stopped, tripped
 
 PERIOD = 0.05  # wall seconds between snapshots

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from textual.pilot import Pilot
 
-from rig.bench.attach import Endpoint, Snapshot
+from rig.bench.screens.sockets import Endpoint, Snapshot
 from rig.tui.app import Monitor
 from rig.tui.link import SnapshotSource
 from rig.tui.words import KeyAnswer

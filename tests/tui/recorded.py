@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rig.bench.attach import ChannelView, Snapshot
+from rig.bench.screens.sockets import ChannelView, Snapshot
 
 RATE = 1000.0  # samples a second
 LIMITS = {

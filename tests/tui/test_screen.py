@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 
-from rig.bench.attach import Snapshot
+from rig.bench.screens.sockets import Snapshot
 from rig.tui.app import Monitor, automatic_span, farewell
 from tests.tui.glass import Machine, Recorded, endpoint, glass
 from tests.tui.recorded import Bench, run, snapshot, stopped, tripped

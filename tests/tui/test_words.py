@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.bench.attach import ChannelView
+from rig.bench.screens.sockets import ChannelView
 from rig.tui.app import farewell
 from rig.tui.gauge import bar, gauge
 from rig.tui.link import Frame, LinkStage

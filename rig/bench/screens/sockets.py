@@ -20,7 +20,7 @@ from pathlib import Path
 
 import zmq
 
-from rig.bench.snapshot import ChannelView, Snapshot, from_json, to_json
+from rig.bench.screens.snapshot import ChannelView, Snapshot, from_json, to_json
 from rig.runs.runstate import process_alive
 
 __all__ = ["AttachError", "Attachment", "ChannelView", "Endpoint", "Publisher", "Snapshot"]

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.base import SampleBlock
-from rig.bench.attach import Publisher
 from rig.bench.guard import JointRole, piston_bounds
-from rig.bench.snapshot import BenchView, Progress, take_snapshot
+from rig.bench.screens.snapshot import BenchView, Progress, take_snapshot
+from rig.bench.screens.sockets import Publisher
 from rig.model import channels as ch
 from rig.model.rig import Rig
 from rig.runs import runstate
