@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import typer
 
 from rig.cli.device import device_of
 from rig.cli.options import EndpointOption, RigOption
-
-if TYPE_CHECKING:
-    pass
-
 from rig.cli.stop import stop
 
 

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from rig.cli.errors import WorkError
 from rig.cli.output import progress
 from rig.cli.simulate import channel_simulator
-
-if TYPE_CHECKING:
-    pass
 
 RunArgument = Annotated[Path, typer.Argument(help="A run folder.")]
 ModelOption = Annotated[

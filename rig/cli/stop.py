@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import typer
 
 from rig.cli.device import device_of, print_pressure
 from rig.cli.options import EndpointOption, RigOption
 from rig.cli.output import progress
-
-if TYPE_CHECKING:
-    pass
 
 
 def stop(rig: RigOption, endpoint: EndpointOption = None) -> None:
