@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import struct
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -24,19 +23,23 @@ from drivers.base import (
     SampleBlock,
     WireSettings,
 )
+from drivers.bench_protocol import (
+    VIRTUAL_PATIENCE,
+    DeviceRefused,
+    DeviceSilent,
+    check_identity,
+    refusal_text,
+    trip_text,
+    wave_codes,
+)
 from drivers.modbus_blocks import BlockDecoder, unwrap
-from drivers.modbus_transport import DeviceRefused, DeviceSilent, ModbusConnection, unpack
+from drivers.modbus_transport import ModbusConnection, unpack
 from rig.model import registers as reg
-from rig.model.codes import encode_output
 from rig.model.parts import LOCALHOST, PORT, Wire
-from rig.model.registers import Refusal, Status, TripCause
+from rig.model.registers import Refusal, Status
 from rig.model.rig import Rig
 
 logger = logging.getLogger(__name__)
-
-# Nothing moves in a virtual device while it thinks: a busy computer is no danger to it.
-VIRTUAL_PATIENCE = 10.0
-_TOLERANCE = 1e-6  # registers hold single precision
 
 
 class TcpSettings(WireSettings):
@@ -146,18 +149,13 @@ class ModbusTcpDriver:
         """Say why the device has zeroed its outputs, or None if it has not."""
         status = self._status()
         cause = unpack(">H", status, _offset(reg.STATUS_CAUSE))
-        if cause == TripCause.NONE:
-            return None
-        tick = unpack(">I", status, _offset(reg.STATUS_TRIP_TICK))
-        known = cause in TripCause.__members__.values()
-        text = reg.TRIP_TEXT[TripCause(cause)] if known else f"cause {cause}"
-        return f"{text} (at sample {tick})"
+        return trip_text(cause, unpack(">I", status, _offset(reg.STATUS_TRIP_TICK)))
 
     # -- outputs ----------------------------------------------------------------------------
 
     def upload(self, joint: int, wave: Array) -> None:
         """Store one period of joint `joint`'s (0-based) waveform [V]; it acts from `apply` on."""
-        codes = self._wave_codes(joint, wave)
+        codes = wave_codes(self._rig, joint, wave)
         about = f"waveform of joint {joint + 1}"
         words = codes.view(np.uint16).tolist()
         self._control(reg.UPLOAD_JOINT.address, [joint + 1, *_u32(len(words))], about)
@@ -272,70 +270,20 @@ class ModbusTcpDriver:
         joint = unpack(">H", status, _offset(reg.STATUS_REFUSAL_JOINT))
         if reason not in Refusal.__members__.values():
             return DeviceRefused(f"{refused} (reason {reason}): {about}")
-        text = reg.REFUSAL_TEXT[Refusal(reason)]
-        if reason == Refusal.TRIPPED:
-            text = f"tripped: {self.trip_cause()}; find the cause, then reset it"
         if reason == Refusal.NOT_IN_CONTROL:
             return DeviceBusy(f"another client has control of the device at {self._link.where}")
+        trip = self.trip_cause() if reason == Refusal.TRIPPED else None
+        text = refusal_text(Refusal(reason), trip)
         at = f" (joint {joint})" if joint else ""
         return DeviceRefused(f"device at {self._link.where} refused {about}{at}: {text}")
 
-    def _wave_codes(self, joint: int, wave: Array) -> np.ndarray[tuple[int], np.dtype[np.int16]]:
-        if not 0 <= joint < len(self._rig.joints):
-            raise DeviceError(f"no joint {joint + 1} on a rig of {len(self._rig.joints)}")
-        volts = np.asarray(wave, dtype=np.float64).ravel()
-        if not 1 <= len(volts) <= reg.WAVE_CAPACITY:
-            raise DeviceError(
-                f"waveform of joint {joint + 1} has {len(volts)} samples; "
-                f"the device takes 1 to {reg.WAVE_CAPACITY}"
-            )
-        limit = self._rig.joints[joint].valve.command_range
-        wrong = np.flatnonzero(~(np.abs(volts) <= limit))
-        if len(wrong):
-            raise DeviceError(
-                f"waveform of joint {joint + 1}: sample {wrong[0]} is {volts[wrong[0]]:g} V, "
-                f"outside the converter's range of +-{limit:g} V"
-            )
-        return encode_output(volts, limit, reg.WAVE_BITS).astype(np.int16)
-
     def _identify(self) -> DeviceInfo:
-        rig, (first, end) = self._rig, reg.IDENTITY_SPAN
+        first, end = reg.IDENTITY_SPAN
         try:
             data = self._link.read(first, end - first)
         except DeviceRefused as refused:
             raise DeviceError(f"{refused}: it is no bench of this protocol") from refused
-        magic, version, joints, channels, rate, samples, virtual, _, converters = (
-            struct.unpack_from(">IHHHfHHII", data)
-        )
-        name = data[_offset(reg.IDENTITY_NAME, first) :].rstrip(b"\0").decode("ascii", "replace")
-        expected_name = rig.name[: 2 * reg.IDENTITY_NAME.words]
-        where = self._link.where
-        checks: tuple[tuple[str, object, object, bool], ...] = (
-            ("magic number", hex(magic), hex(reg.MAGIC), magic == reg.MAGIC),
-            ("protocol version", version, reg.PROTOCOL_VERSION, version == reg.PROTOCOL_VERSION),
-            ("rig", repr(name), repr(expected_name), name == expected_name),
-            ("joints", joints, len(rig.joints), joints == len(rig.joints)),
-            ("channels", channels, len(rig.channels), channels == len(rig.channels)),
-            (
-                "sample rate [Hz]",
-                f"{rate:g}",
-                f"{rig.sample_rate:g}",
-                abs(rate - rig.sample_rate) <= _TOLERANCE * rig.sample_rate,
-            ),
-            ("samples per block", samples, self._layout.samples, samples == self._layout.samples),
-        )
-        for what, found, expected, fits in checks:
-            if not fits:
-                raise DeviceError(
-                    f"the device at {where} is not the rig described: {what} {found}, "
-                    f"expected {expected}"
-                )
-        if converters != reg.converter_checksum(rig):
-            raise DeviceError(
-                f"the device at {where} converts with other ranges or bits than the sensors and "
-                f"valves of rig {rig.name!r}; start it with the same rig file"
-            )
-        return DeviceInfo(name, joints, channels, rig.sample_rate, samples, bool(virtual))
+        return check_identity(data, self._rig, self._link.where)
 
 
 def _offset(register: reg.Register, first: int = reg.STATUS_SPAN[0]) -> int:

@@ -18,16 +18,9 @@ from pymodbus.pdu.register_message import (
 )
 
 from drivers.base import DeviceError, DeviceLost
+from drivers.bench_protocol import DeviceRefused, DeviceSilent
 
 logger = logging.getLogger(__name__)
-
-
-class DeviceRefused(DeviceError):
-    """The device understood a request and did not carry it out."""
-
-
-class DeviceSilent(DeviceLost):
-    """No answer came in time; the same request may be worth another try."""
 
 
 class _RawAnswer:

@@ -1,0 +1,112 @@
+"""What every wire of this project's own protocol shares: identity, waveforms, reasons.
+
+Modbus TCP and the serial line carry the same values (`rig.model.registers`) in other envelopes.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.base import Array, DeviceError, DeviceInfo, DeviceLost
+from rig.model import registers as reg
+from rig.model.codes import encode_output
+from rig.model.registers import Refusal, TripCause
+from rig.model.rig import Rig
+
+# Nothing moves in a virtual device while it thinks: a busy computer is no danger to it.
+VIRTUAL_PATIENCE: Final = 10.0
+_TOLERANCE = 1e-6  # registers hold single precision
+_IDENTITY = struct.Struct(">IHHHfHHII")
+
+
+class DeviceRefused(DeviceError):
+    """The device understood a request and did not carry it out."""
+
+
+class DeviceSilent(DeviceLost):
+    """No answer came in time; the same request may be worth another try."""
+
+
+def check_identity(data: bytes, rig: Rig, where: str) -> DeviceInfo:
+    """Return who answered with the bytes of the identity group (`reg.IDENTITY_SPAN`).
+
+    Raises DeviceError with the first thing in which the device at `where` is not the rig's.
+    """
+    magic, version, joints, channels, rate, samples, virtual, _, converters = _IDENTITY.unpack_from(
+        data
+    )
+    layout = reg.block_layout(len(rig.channels), len(rig.joints))
+    name = data[2 * reg.IDENTITY_NAME.address :].rstrip(b"\0").decode("ascii", "replace")
+    expected_name = rig.name[: 2 * reg.IDENTITY_NAME.words]
+    checks: tuple[tuple[str, object, object, bool], ...] = (
+        ("magic number", hex(magic), hex(reg.MAGIC), magic == reg.MAGIC),
+        ("protocol version", version, reg.PROTOCOL_VERSION, version == reg.PROTOCOL_VERSION),
+        ("rig", repr(name), repr(expected_name), name == expected_name),
+        ("joints", joints, len(rig.joints), joints == len(rig.joints)),
+        ("channels", channels, len(rig.channels), channels == len(rig.channels)),
+        (
+            "sample rate [Hz]",
+            f"{rate:g}",
+            f"{rig.sample_rate:g}",
+            abs(rate - rig.sample_rate) <= _TOLERANCE * rig.sample_rate,
+        ),
+        ("samples per block", samples, layout.samples, samples == layout.samples),
+    )
+    for what, found, expected, fits in checks:
+        if not fits:
+            raise DeviceError(
+                f"the device at {where} is not the rig described: {what} {found}, "
+                f"expected {expected}"
+            )
+    if converters != reg.converter_checksum(rig):
+        raise DeviceError(
+            f"the device at {where} converts with other ranges or bits than the sensors and "
+            f"valves of rig {rig.name!r}; start it with the same rig file"
+        )
+    return DeviceInfo(name, joints, channels, rig.sample_rate, samples, bool(virtual))
+
+
+def wave_codes(
+    rig: Rig, joint: int, wave: Array, capacity: int = reg.WAVE_CAPACITY
+) -> NDArray[np.int16]:
+    """Return the 16-bit codes of a waveform [V] of joint `joint` (0-based).
+
+    Raises DeviceError for a joint that is none, more samples than `capacity`, or a voltage
+    outside the converter's range.
+    """
+    if not 0 <= joint < len(rig.joints):
+        raise DeviceError(f"no joint {joint + 1} on a rig of {len(rig.joints)}")
+    volts = np.asarray(wave, dtype=np.float64).ravel()
+    if not 1 <= len(volts) <= capacity:
+        raise DeviceError(
+            f"waveform of joint {joint + 1} has {len(volts)} samples; "
+            f"the device takes 1 to {capacity}"
+        )
+    limit = rig.joints[joint].valve.command_range
+    wrong = np.flatnonzero(~(np.abs(volts) <= limit))
+    if len(wrong):
+        raise DeviceError(
+            f"waveform of joint {joint + 1}: sample {wrong[0]} is {volts[wrong[0]]:g} V, "
+            f"outside the converter's range of +-{limit:g} V"
+        )
+    return encode_output(volts, limit, reg.WAVE_BITS).astype(np.int16)
+
+
+def trip_text(cause: int, tick: int) -> str | None:
+    """Say why a device has zeroed its outputs by itself and when, or None if it has not."""
+    if cause == TripCause.NONE:
+        return None
+    known = cause in TripCause.__members__.values()
+    text = reg.TRIP_TEXT[TripCause(cause)] if known else f"cause {cause}"
+    return f"{text} (at sample {tick})"
+
+
+def refusal_text(reason: Refusal, trip: str | None) -> str:
+    """Say why a device refused; `trip` is why it has tripped, if it has."""
+    if reason == Refusal.TRIPPED:
+        return f"tripped: {trip}; find the cause, then reset it"
+    return reg.REFUSAL_TEXT[reason]
