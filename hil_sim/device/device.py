@@ -171,9 +171,7 @@ class Device:
         """Return the oldest block with its header, all zeros but the header if there is none."""
         if client is not self._controller:
             raise Refused(Refusal.NOT_IN_CONTROL)
-        self.catch_up()
-        if not self.realtime and self.streaming and not len(self.queue):
-            self._run(self.layout.samples)
+        self.measure_ahead()
         block = self.queue.offer()
         if block is None:
             header = BlockHeader(0, self.tick & _U32, self.status, 0)
@@ -182,6 +180,12 @@ class Device:
             block.sequence, block.tick & _U32, self.status | Status.BLOCK, len(self.queue) - 1
         )
         return reg.pack_header(header) + block.samples
+
+    def measure_ahead(self) -> None:
+        """Measure what the host may read now: up to the present, or one block in virtual time."""
+        self.catch_up()
+        if not self.realtime and self.streaming and not len(self.queue):
+            self._run(self.layout.samples)
 
     # -- what happens by itself -------------------------------------------------------------
 

@@ -76,6 +76,17 @@ class BlockQueue:
             self._blocks.popleft()
             self._offered = None
 
+    def release(self, sequence: int) -> None:
+        """Drop all blocks up to number `sequence`, if that one is waiting."""
+        if self._blocks:
+            count = ((sequence - self._blocks[0].sequence) & 0xFFFF) + 1
+            for _ in range(count if count <= len(self._blocks) else 0):
+                self._blocks.popleft()
+
+    def waiting(self, index: int) -> QueuedBlock | None:
+        """Return the block at place `index` of those waiting, the oldest at 0, if there is one."""
+        return self._blocks[index] if index < len(self._blocks) else None
+
     def offer(self) -> QueuedBlock | None:
         """Return the oldest block, which stays until acknowledged."""
         if not self._blocks:

@@ -18,22 +18,32 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 
 from hil_sim.device.device import Device, Plant
 from hil_sim.device.laws import LawTable
+from hil_sim.device.lifetime import PARENT_SECONDS, EndpointError, Owner
 from hil_sim.device.pdu import REQUESTS, Request
 from hil_sim.device.register_map import RegisterMap
 from hil_sim.device.rtu_server import serve_line
+from hil_sim.device.serial_server import serve_serial
 from rig.model import registers as reg
 from rig.model.rig import Rig
+
+__all__ = [
+    "RTU",
+    "SERIAL",
+    "TCP",
+    "WIRES",
+    "BenchServer",
+    "EndpointError",
+    "serve",
+    "serve_until",
+    "warm_up",
+]
 
 logger = logging.getLogger(__name__)
 
 TCP: Final = "modbus-tcp"
 RTU: Final = "modbus-rtu"
-WIRES: Final = (TCP, RTU)
-_PARENT_SECONDS = 0.25
-
-
-class EndpointError(Exception):
-    """The address cannot be listened on; the message names host, port and what to do."""
+SERIAL: Final = "serial"
+WIRES: Final = (TCP, RTU, SERIAL)
 
 
 class _Session:
@@ -138,6 +148,9 @@ def serve(
     ticks compile, `warm_up` a spare one before.
     Raises EndpointError when the address cannot be listened on.
     """
+    if wire == SERIAL:
+        serve_serial(rig, plant, realtime=realtime, on_ready=on_ready, parent=parent)
+        return
     # The library's messages are about frames; what matters to people is raised or logged here.
     logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 
@@ -179,23 +192,12 @@ async def _serve(
 
 async def _end_with(parent: int, stop: asyncio.Event) -> None:
     """Set `stop` when process `parent` is gone."""
-    child = os.getppid() == parent
+    owner = Owner(parent)
     while not stop.is_set():
-        # A child's view of its parent is safe from a process number used again.
-        if os.getppid() != parent if child else not _exists(parent):
+        if owner.has_ended():
             logger.info("process %d, which this server served, has ended", parent)
             stop.set()
-        await asyncio.sleep(_PARENT_SECONDS)
-
-
-def _exists(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
+        await asyncio.sleep(PARENT_SECONDS)
 
 
 async def _no_such_function(*_args: object) -> ExcCodes:

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
 
+import numpy as np
+
 from rig.model import registers as reg
 from rig.model.registers import BlockHeader, BlockLayout
 from rig.model.wire.frames import MAX_ENCODED, MAX_PAYLOAD
@@ -113,7 +115,9 @@ def pack_apply(flag: int, laws: Sequence[Sequence[float]]) -> bytes:
 
     What single precision cannot hold becomes infinite, which the device refuses.
     """
-    words = reg.float_words(laws)
+    values = np.array(laws)
+    with np.errstate(over="ignore"):
+        words = reg.float_words(values)
     return struct.pack(f">H{len(words)}H", flag, *words)
 
 

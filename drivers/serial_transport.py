@@ -1,0 +1,160 @@
+"""Bytes of a serial port: the one thing the serial driver needs of an operating system.
+
+Another library takes pyserial's place by another class with the four methods of `Transport`.
+"""
+
+from __future__ import annotations
+
+import time
+from contextlib import suppress
+from typing import Protocol
+
+import serial
+
+from drivers.base import DeviceError, DeviceLost
+
+_SLICE_SECONDS = 0.02  # how long pyserial waits at a time: reading ends that much late, at most
+_ERRORS: tuple[type[Exception], ...] = (OSError,)  # pyserial's own are OSErrors
+with suppress(ImportError):  # none on Windows
+    import termios
+
+    _ERRORS = (OSError, termios.error)
+_OPENING_ERRORS: tuple[type[Exception], ...] = (*_ERRORS, ValueError)
+
+
+class Transport(Protocol):
+    """A port that can be opened and closed any number of times."""
+
+    @property
+    def where(self) -> str:
+        """The port's name, for people."""
+
+    @property
+    def is_open(self) -> bool:
+        """Whether bytes can be written and read."""
+
+    def open(self, *, shared: bool = False) -> None:
+        """Open the port and forget what it had received.
+
+        Raises DeviceLost when there is no such port, DeviceError when it may not be opened or,
+        unless `shared`, another program has it.
+        """
+
+    def write(self, data: bytes) -> None:
+        """Send bytes; raises DeviceLost when the port has gone."""
+
+    def read(self, patience: float) -> bytes:
+        """Return what is waiting, at once if there is any; nothing after `patience` [s] or so.
+
+        Raises DeviceLost when the port has gone.
+        """
+
+    def close(self) -> None:
+        """Close the port; never raises."""
+
+
+class PortInUse(DeviceError):
+    """Another program has the port."""
+
+
+class PySerialTransport:
+    """`Transport` over pyserial: 8 data bits, no parity, 1 stop bit, no flow control."""
+
+    def __init__(self, device: str, baud: int, write_timeout: float = 1.0) -> None:
+        self._device, self._baud, self._write_timeout = device, baud, write_timeout
+        self._port: serial.Serial | None = None
+
+    @property
+    def where(self) -> str:
+        """The port's name."""
+        return self._device
+
+    @property
+    def is_open(self) -> bool:
+        """Whether bytes can be written and read."""
+        return self._port is not None
+
+    def open(self, *, shared: bool = False) -> None:
+        """Open the port; see `Transport`."""
+        self.close()
+        try:
+            self._port = serial.Serial(
+                self._device,
+                self._baud,
+                timeout=_SLICE_SECONDS,
+                write_timeout=self._write_timeout,
+                exclusive=None if shared else True,
+            )
+        except _OPENING_ERRORS as error:
+            raise self._why_not(error) from error
+
+    def write(self, data: bytes) -> None:
+        """Send bytes; see `Transport`."""
+        port = self._usable()
+        try:
+            port.write(data)
+        except serial.SerialTimeoutException as error:
+            raise DeviceLost(f"the device at {self._device} takes no more bytes") from error
+        except _ERRORS as error:
+            raise self._gone() from error
+
+    def read(self, patience: float) -> bytes:
+        """Return what is waiting; see `Transport`."""
+        port = self._usable()
+        end = time.monotonic() + patience
+        try:
+            while True:
+                if waiting := port.in_waiting:
+                    return self._some(port, waiting)
+                if time.monotonic() >= end:
+                    return b""
+                # pyserial waits in the system for the first byte; the rest came with it.
+                if first := self._some(port, 1):
+                    return first + self._some(port, port.in_waiting)
+        except _ERRORS as error:
+            raise self._gone() from error
+
+    def close(self) -> None:
+        """Close the port; never raises."""
+        port, self._port = self._port, None
+        if port is not None:
+            with suppress(*_ERRORS):
+                port.close()
+
+    def _some(self, port: serial.Serial, size: int) -> bytes:
+        try:
+            return port.read(size) if size else b""
+        except serial.SerialException:
+            # Another program took the bytes (one that zeroes the outputs, say), or the port has
+            # gone: then this raises OSError.
+            _ = port.in_waiting
+            return b""
+
+    def _usable(self) -> serial.Serial:
+        if self._port is None:
+            raise DeviceLost(f"the port {self._device} is closed")
+        return self._port
+
+    def _gone(self) -> DeviceLost:
+        self.close()
+        return DeviceLost(f"the port {self._device} has gone: device unplugged or ended")
+
+    def _why_not(self, error: Exception) -> DeviceError:
+        text = str(error)
+        if "exclusively lock" in text:
+            return PortInUse(
+                f"the port {self._device} is in use by another program, which has control; "
+                "end it, or wait for its end"
+            )
+        number = error.errno if isinstance(error, OSError) else None
+        if number in (1, 13):
+            return DeviceError(
+                f"no permission to open {self._device}; on Linux join the group that owns it "
+                "(often `dialout`) and log in again"
+            )
+        if number == 2:
+            return DeviceLost(
+                f"there is no port {self._device}; is the device plugged in (or `bramah sim` "
+                "running there)?"
+            )
+        return DeviceLost(f"cannot open {self._device} at {self._baud} baud: {text}")

@@ -1,0 +1,94 @@
+"""The device's end of a pseudo terminal.
+
+The other end, ``/dev/pts/N``, is opened by any program like a serial port; its baud rate means
+nothing.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import select
+import time
+import tty
+from contextlib import suppress
+
+from hil_sim.device.lifetime import EndpointError
+
+_CHUNK = 65_536
+_UNPLUGGED_SECONDS = 0.01  # between two looks for a host while there is none
+_MOST_UNSENT = 1 << 16  # answers that wait for a host that does not read; no more is taken then
+
+
+class PtyLine:
+    """The device's end of a new pty; raises EndpointError where there are none."""
+
+    def __init__(self) -> None:
+        try:
+            self.fd, slave = os.openpty()
+            self.name = os.ttyname(slave)
+            tty.setraw(slave)
+            os.close(slave)
+        except (AttributeError, OSError) as error:
+            raise EndpointError(f"cannot make a pseudo terminal: {error}") from error
+        os.set_blocking(self.fd, False)
+        self._poll = select.poll()
+        self.connected = False
+        self._unsent = b""
+
+    @property
+    def free(self) -> bool:
+        """Whether a host listens and everything sent so far is on its way."""
+        return self.connected and not self._unsent
+
+    def receive(self, patience: float) -> bytes | None:
+        """Return what has arrived within `patience` [s]; None when the host has gone."""
+        events = select.POLLOUT if self._unsent else 0
+        if len(self._unsent) < _MOST_UNSENT:
+            events |= select.POLLIN
+        self._poll.register(self.fd, events)
+        if not self.connected:
+            patience = min(patience, _UNPLUGGED_SECONDS)
+        found = self._poll.poll(patience * 1e3 if self.connected else 0)
+        happened = found[0][1] if found else 0
+        if happened & select.POLLIN:
+            self.connected = True
+            with suppress(BlockingIOError):
+                return self._read()
+        if happened & select.POLLHUP:
+            gone, self.connected = self.connected, False
+            if gone:
+                return None
+            time.sleep(patience)
+            return b""
+        self.connected = True
+        if happened & select.POLLOUT:
+            self.send(b"")
+        return b""
+
+    def send(self, data: bytes) -> None:
+        """Send, or keep for later what the host has no room for."""
+        self._unsent += data
+        try:
+            if self._unsent:
+                self._unsent = self._unsent[os.write(self.fd, self._unsent) :]
+        except BlockingIOError:
+            return
+        except OSError as error:
+            if error.errno != errno.EIO:
+                raise
+            self._unsent = b""
+
+    def close(self) -> None:
+        """Take the terminal away: whoever has it open sees the device's end."""
+        os.close(self.fd)
+
+    def _read(self) -> bytes | None:
+        try:
+            return os.read(self.fd, _CHUNK)
+        except OSError as error:
+            if error.errno != errno.EIO:
+                raise
+        self.connected = False
+        self._unsent = b""
+        return None

@@ -1,0 +1,85 @@
+"""The simulated bench on a serial line: a `Device` behind a pty, until told to end.
+
+When the last program closes the port, the device notices as one that watches DTR would: its
+host is lost.
+"""
+
+from __future__ import annotations
+
+import logging
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from types import FrameType
+
+from hil_sim.device.device import Device, Plant
+from hil_sim.device.lifetime import PARENT_SECONDS, Owner
+from hil_sim.device.pty_line import PtyLine
+from hil_sim.device.serial_session import SerialSession
+from rig.model.rig import Rig
+
+logger = logging.getLogger(__name__)
+
+
+def serve_serial(
+    rig: Rig,
+    plant: Plant,
+    *,
+    realtime: bool = False,
+    on_ready: Callable[[str], None] = logger.info,
+    parent: int | None = None,
+) -> None:
+    """Serve a plant on a new pty until SIGTERM, SIGINT or the end of process `parent`.
+
+    `on_ready` is called once with the endpoint, ``serial:///dev/pts/3``. The sample clock starts
+    with this call. Raises EndpointError where there are no pseudo terminals.
+    """
+    line = PtyLine()
+    device = Device(rig, plant, realtime=realtime)
+    try:
+        with _told_to_end() as ended:
+            on_ready(f"serial://{line.name}")
+            _serve(line, device, ended, None if parent is None else Owner(parent))
+    finally:
+        device.zero()
+        line.close()
+
+
+def _serve(line: PtyLine, device: Device, ended: list[int], owner: Owner | None) -> None:
+    session = SerialSession(device)
+    look = time.monotonic()
+    while not ended:
+        received = line.receive(device.idle_seconds())
+        if received is None:
+            session.ended()
+        elif received:
+            line.send(session.receive(received))
+        device.poll()
+        while line.free and (block := session.push()):
+            line.send(block)
+        if owner is not None and time.monotonic() > look:
+            look = time.monotonic() + PARENT_SECONDS
+            if owner.has_ended():
+                logger.info("the process that this server belongs to has ended")
+                return
+
+
+@contextmanager
+def _told_to_end() -> Iterator[list[int]]:
+    """Collect SIGTERM and SIGINT in the list given, instead of dying of them."""
+    told: list[int] = []
+
+    def note(number: int, _frame: FrameType | None) -> None:
+        told.append(number)
+
+    before = {}
+    # Only a main thread has signals; elsewhere the caller ends its process.
+    with suppress(ValueError):
+        for number in (signal.SIGTERM, signal.SIGINT):
+            before[number] = signal.signal(number, note)
+    try:
+        yield told
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,27 @@
+"""The integrator's bench on a serial line, in a process of its own.
+
+``python -m tests.hil_sim.serial_bench realtime|virtual [parent]`` prints its endpoint.
+"""
+
+from __future__ import annotations
+
+import sys
+
+from hil_sim.device.serial_server import serve_serial
+from tests.hil_sim.integrator import IntegratorPlant, seed_rig
+
+
+def main() -> None:
+    """Serve the plant, print the endpoint first."""
+    rig = seed_rig()
+    serve_serial(
+        rig,
+        IntegratorPlant(rig),
+        realtime=sys.argv[1] == "realtime",
+        on_ready=lambda endpoint: print(endpoint, flush=True),  # noqa: T201
+        parent=int(sys.argv[2]) if len(sys.argv) > 2 else None,
+    )
+
+
+if __name__ == "__main__":
+    main()
