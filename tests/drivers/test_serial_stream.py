@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import random
 import signal
 import subprocess
 import sys
@@ -348,12 +349,43 @@ def test_a_request_that_comes_twice_is_carried_out_once(driver: SerialStreamDriv
 
 def test_another_session_is_refused_what_needs_control(driver: SerialStreamDriver) -> None:
     session = driver._link._session ^ 1
-    for kind in (Message.START, Message.APPLY, Message.CLOSE, Message.RESET):
-        answer = bytes_answered(driver, Frame(kind, 40_000, session))
+    for kind, payload in (
+        (Message.START, b""),
+        (Message.APPLY, msg.pack_apply(1, [[0.0] * 5] * 2)),
+        (Message.CLOSE, b""),
+        (Message.RESET, b"RS"),
+    ):
+        answer = bytes_answered(driver, Frame(kind, 40_000, session, payload))
         assert answer.type == Message.REFUSED
         assert msg.unpack_refusal(answer.payload).reason == reg.Refusal.NOT_IN_CONTROL
     opened = bytes_answered(driver, Frame(Message.OPEN, 40_001, session, b"\x01\x00"))
     assert msg.unpack_refusal(opened.payload).reason == reg.Refusal.NOT_IN_CONTROL
+
+
+def test_noise_and_nonsense_leave_a_device_that_answers(port: str) -> None:
+    driver = host(port)
+    driver.connect()
+    transport, rng = driver._link._transport, random.Random(3)
+    sizes = {Message.APPLY: 42, Message.RESET: 2, Message.OPEN: 2, Message.UPLOAD_BEGIN: 6}
+    for number in range(2_000):
+        kind = rng.choice([*Message, rng.randrange(256)])
+        size = sizes.get(kind, 0) if rng.random() < 0.7 else rng.randrange(253)
+        payload = rng.randbytes(size) if rng.random() < 0.7 else bytes(size)
+        session = driver._link._session if rng.random() < 0.8 else rng.getrandbits(32)
+        wire = bytearray(encode_frame(Frame(kind, number + 10, session, payload)))
+        if rng.random() < 0.3:
+            wire[rng.randrange(len(wire))] ^= 1 << rng.randrange(8)
+        if rng.random() < 0.1:
+            wire += rng.randbytes(rng.randrange(600))
+        transport.write(bytes(wire))
+        transport.read(0.0)
+    driver._link._number = 3_000
+    driver.close()
+    driver = connected_soon(port)
+    driver.reset()
+    driver.start()
+    assert read(driver, 3).shape == (30, 12)
+    driver.close()
 
 
 def test_a_host_that_vanished_leaves_a_trip_that_only_a_reset_clears(port: str) -> None:
