@@ -14,7 +14,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 
-from drivers.base import DeviceError
+from drivers.base import DeviceBusy, DeviceError
 from drivers.bench_protocol import DeviceRefused, DeviceSilent
 from drivers.serial_transport import Transport
 from rig.model import registers as reg
@@ -175,6 +175,8 @@ class SerialLink:
         what = f"device at {self.where} refused {about}{at}"
         if refusal.reason not in Refusal.__members__.values():
             return DeviceRefused(f"{what}: reason {refusal.reason}")
+        if refusal.reason == Refusal.NOT_IN_CONTROL:
+            return DeviceBusy(f"another client has control of the device at {self.where}")
         return SerialRefused(what, Refusal(refusal.reason))
 
     def _silence(self) -> str:

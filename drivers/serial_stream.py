@@ -7,15 +7,24 @@ import secrets
 import struct
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import astuple
 from itertools import count
-from typing import Literal
+from typing import Any, ClassVar
+from urllib.parse import SplitResult, parse_qs
 
 from pydantic import Field
 
-from drivers.base import Array, DeviceError, DeviceInfo, DeviceLost, OutputLaw, SampleBlock
+from drivers.base import (
+    Array,
+    DeviceError,
+    DeviceInfo,
+    DeviceLost,
+    OutputLaw,
+    SampleBlock,
+    WireSettings,
+)
 from drivers.bench_protocol import (
     VIRTUAL_PATIENCE,
     DeviceRefused,
@@ -29,8 +38,7 @@ from drivers.modbus_blocks import BlockDecoder, unwrap
 from drivers.serial_link import SerialLink, SerialRefused
 from drivers.serial_transport import PortInUse, PySerialTransport, Transport
 from rig.model import registers as reg
-from rig.model.parts import Part
-from rig.model.quantity import Time
+from rig.model.parts import Wire
 from rig.model.registers import Refusal, Status, TripCause
 from rig.model.rig import Rig
 from rig.model.wire import serial_messages as msg
@@ -44,31 +52,43 @@ _RESEND_SECONDS = 0.1  # without a block, beyond the time that one takes
 _NOTES_BEFORE_STATUS = 3
 
 
-class SerialWire(Part):
-    """How a bench on a serial line is reached; a pty or USB-CDC ignores the baud rate."""
+class SerialSettings(WireSettings):
+    """The serial line: its port and its speed; a pty or USB-CDC ignores the speed."""
 
-    kind: Literal["serial"] = "serial"
+    example: ClassVar = "serial:///dev/ttyUSB0?baud=921600"
+
     device: str = Field(min_length=1, description="the port: /dev/ttyUSB0, COM3")
     baud: int = Field(default=921_600, ge=1200, le=20_000_000, description="[bit/s]")
-    timeout: Time = Field(default=1.0, gt=0, description="answer expected within [s]")
-    watchdog: Time = Field(default=0.5, gt=0, description="host silence after which outputs zero")
+
+    @classmethod
+    def of_endpoint(cls, url: SplitResult) -> Mapping[str, Any]:
+        """Return device and speed; raises ValueError where the device is missing."""
+        device = url.netloc + url.path  # serial://COM3 has no path
+        if not device:
+            raise ValueError("no device")
+        query = {key: values[-1] for key, values in parse_qs(url.query).items()}
+        return {"device": device, **query}
 
 
 class SerialStreamDriver:
     """`drivers.base.Driver` over a serial line; see there for what each call promises."""
 
+    settings: ClassVar[type[WireSettings]] = SerialSettings
+
     def __init__(
         self,
-        wire: SerialWire,
+        wire: Wire,
         rig: Rig,
         *,
         transport: Transport | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        at = SerialSettings.of(wire)
         self._wire = wire
+        self._baud = at.baud
         self._rig = rig
         self._link = SerialLink(
-            PySerialTransport(wire.device, wire.baud) if transport is None else transport,
+            PySerialTransport(at.device, at.baud) if transport is None else transport,
             wire.timeout,
             clock,
         )
@@ -111,6 +131,20 @@ class SerialStreamDriver:
                 self._command(Message.CLOSE)
         except DeviceError as error:
             logger.debug("while closing: %s", error)
+        finally:
+            self._stream = None
+            self._link.close()
+
+    def close_tripped(self) -> None:
+        """Zero the outputs, then close while it streams: the device latches a lost host.
+
+        A device that does not see its line closed latches it when the watchdog time is over.
+        """
+        try:
+            if self._link.is_open:
+                self._command(Message.ZERO)
+        except DeviceError as error:
+            logger.debug("while closing after a trip: %s", error)
         finally:
             self._stream = None
             self._link.close()
@@ -207,15 +241,15 @@ class SerialStreamDriver:
 
     def _check_rate(self) -> None:
         needed = msg.line_rate(self._layout, self._rig.sample_rate)
-        if self._wire.baud < needed:
+        if self._baud < needed:
             raise DeviceError(
-                f"{self._wire.baud} baud on {self._wire.device} cannot carry "
+                f"{self._baud} baud on {self._link.where} cannot carry "
                 f"{len(self._rig.recorded)} values at {self._rig.sample_rate:g} Hz; "
                 f"{needed:.0f} at least"
             )
 
     def _identify(self) -> DeviceInfo:
-        where = f"{self._link.where} ({self._wire.baud} baud)"
+        where = f"{self._link.where} ({self._baud} baud)"
         try:
             data = self._link.request(Message.IDENTIFY, size=_IDENTITY_BYTES)
         except DeviceRefused as refused:

@@ -11,7 +11,7 @@ from typing import Protocol
 
 import serial
 
-from drivers.base import DeviceError, DeviceLost
+from drivers.base import DeviceBusy, DeviceError, DeviceLost
 
 _SLICE_SECONDS = 0.02  # how long pyserial waits at a time: reading ends that much late, at most
 _ERRORS: tuple[type[Exception], ...] = (OSError,)  # pyserial's own are OSErrors
@@ -53,7 +53,7 @@ class Transport(Protocol):
         """Close the port; never raises."""
 
 
-class PortInUse(DeviceError):
+class PortInUse(DeviceBusy):
     """Another program has the port."""
 
 

@@ -9,8 +9,9 @@ import pytest
 
 import drivers.serial_link
 from drivers.base import OFF, DeviceError, OutputLaw
-from drivers.serial_stream import SerialStreamDriver, SerialWire
+from drivers.serial_stream import SerialStreamDriver
 from rig.model import registers as reg
+from rig.model.parts import Wire
 from rig.model.registers import Refusal
 from rig.model.wire import frames
 from rig.model.wire import serial_messages as msg
@@ -63,7 +64,7 @@ def spoken(monkeypatch: pytest.MonkeyPatch) -> list[str]:
             return [data]
 
         monkeypatch.setattr(faults, "pass_on", heard)
-    wire = SerialWire(device="loop", watchdog=0.5)
+    wire = Wire(kind="serial", device="loop", watchdog=0.5)
     driver = SerialStreamDriver(wire, seed_rig(), transport=loop, clock=loop.clock)
     driver.connect()
     driver._heartbeat = 8

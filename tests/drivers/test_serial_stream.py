@@ -9,13 +9,15 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
 
 from drivers.base import OFF, DeviceError, DeviceLost, OutputLaw
-from drivers.serial_stream import SerialStreamDriver, SerialWire
+from drivers.serial_stream import SerialSettings, SerialStreamDriver
 from rig.model import registers as reg
+from rig.model.parts import Wire
 from rig.model.registers import TripCause
 from rig.model.rig import Rig
 from rig.model.wire import serial_messages as msg
@@ -44,7 +46,7 @@ def port(command: Callable[[str], list[str]]) -> Iterator[str]:
 
 
 def host(port: str, **wire: float) -> SerialStreamDriver:
-    return SerialStreamDriver(SerialWire(device=port, **wire), seed_rig())
+    return SerialStreamDriver(Wire(kind="serial", device=port, **wire), seed_rig())
 
 
 @pytest.fixture
@@ -194,7 +196,7 @@ def test_a_device_of_another_rig_is_refused(
     port: str, make: Callable[[Rig], Rig], says: str
 ) -> None:
     with pytest.raises(DeviceError, match=says):
-        SerialStreamDriver(SerialWire(device=port), make(seed_rig())).connect()
+        SerialStreamDriver(Wire(kind="serial", device=port), make(seed_rig())).connect()
 
 
 @pytest.mark.parametrize(
@@ -388,6 +390,20 @@ def test_noise_and_nonsense_leave_a_device_that_answers(port: str) -> None:
     driver.close()
 
 
+def test_closing_after_a_trip_leaves_one_in_the_device(port: str) -> None:
+    driver = host(port)
+    driver.connect()
+    driver.reset()
+    driver.start()
+    driver.apply(DRIVING)
+    driver.read_block()
+    driver.close_tripped()
+    after = connected_soon(port)
+    assert "connection ended" in (after.trip_cause() or "")
+    after.reset()
+    after.close()
+
+
 def test_a_host_that_vanished_leaves_a_trip_that_only_a_reset_clears(port: str) -> None:
     gone = host(port)
     gone.connect()
@@ -432,10 +448,11 @@ def connected_soon(port: str, **wire: float) -> SerialStreamDriver:
 HOST = """
 import sys
 from drivers.base import OFF, OutputLaw
-from drivers.serial_stream import SerialStreamDriver, SerialWire
+from drivers.serial_stream import SerialStreamDriver
+from rig.model.parts import Wire
 from tests.hil_sim.integrator import seed_rig
 
-wire = SerialWire(device=sys.argv[1], timeout=20.0, watchdog=float(sys.argv[2]))
+wire = Wire(kind="serial", device=sys.argv[1], timeout=20.0, watchdog=float(sys.argv[2]))
 driver = SerialStreamDriver(wire, seed_rig())
 driver.connect()
 driver.start()
@@ -593,6 +610,17 @@ def test_a_line_with_another_baud_rate_says_what_to_check(line: BadLine) -> None
         host(line.port, timeout=TIMEOUT).connect()
 
 
+def test_an_endpoint_names_port_and_speed() -> None:
+    for endpoint, settings in {
+        "serial:///dev/ttyUSB0": {"device": "/dev/ttyUSB0"},
+        "serial:///dev/ttyUSB0?baud=460800": {"device": "/dev/ttyUSB0", "baud": "460800"},
+        "serial://COM3": {"device": "COM3"},
+    }.items():
+        assert SerialSettings.of_endpoint(urlsplit(endpoint)) == settings
+    with pytest.raises(ValueError, match="no device"):
+        SerialSettings.of_endpoint(urlsplit("serial://"))
+
+
 # -- without a device -----------------------------------------------------------------------
 
 
@@ -615,7 +643,7 @@ def test_a_line_too_slow_for_the_stream_is_refused_before_anything_is_opened() -
 
 
 def looped(loop: Loop) -> SerialStreamDriver:
-    wire = SerialWire(device="loop", timeout=1.0, watchdog=0.5)
+    wire = Wire(kind="serial", device="loop", timeout=1.0, watchdog=0.5)
     return SerialStreamDriver(wire, seed_rig(), transport=loop, clock=loop.clock)
 
 
