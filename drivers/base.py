@@ -4,7 +4,9 @@ The device owns the sample clock. It evaluates one output law per joint at every
 
     v = clip(gain wave[(tick - start) mod period] + bias + position_gain (setpoint - s), +-limit)
 
-so that waveforms are device-timed, and streams what it measured as numbered blocks.
+so that waveforms are device-timed, and streams what it measured as numbered blocks. For a device
+that only reads and writes, the driver does the same at the host's rate (`drivers.polled`); the
+class attribute `host_timed` says which of the two it is.
 """
 
 from __future__ import annotations
@@ -75,7 +77,9 @@ class SampleBlock:
     `len(data)`); `data` has shape (n, channels + joints): measured channels, then the commands
     put out [V]; `saturated` marks samples at an end of their converter's range, same shape as the
     measured part; `backlog` counts the blocks still waiting in the device; `tripped` says that
-    the device itself has zeroed its outputs (watchdog or fault).
+    the device itself has zeroed its outputs (watchdog or fault). A host-timed driver adds
+    `read_at`, shape (n,): when each row's own sample was taken [s since tick 0], NaN for a row
+    that has none of its own.
     """
 
     sequence: int
@@ -84,6 +88,7 @@ class SampleBlock:
     saturated: NDArray[np.bool_]
     backlog: int
     tripped: bool
+    read_at: Array | None = None
 
 
 class WireSettings(Part):
@@ -122,9 +127,12 @@ class Driver(Protocol):
 
     A driver is a class of `(wire, rig)`, found by the entry point group ``bramah.drivers`` under
     the name of its kind of wire; its class attribute `settings` is the `WireSettings` it reads.
+    `host_timed` is False where the device has the sample clock, waveforms and output laws, True
+    where this process has them and samples and outputs are as late as it is.
     """
 
     settings: ClassVar[type[WireSettings]]
+    host_timed: ClassVar[bool]
 
     def __init__(self, wire: Wire, rig: Rig) -> None: ...
 

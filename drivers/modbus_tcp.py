@@ -62,6 +62,7 @@ class ModbusTcpDriver:
     """`drivers.base.Driver` over Modbus TCP; see there for what each call promises."""
 
     settings: ClassVar[type[WireSettings]] = TcpSettings
+    host_timed: ClassVar[bool] = False
 
     def __init__(
         self, wire: Wire, rig: Rig, *, sleep: Callable[[float], None] = time.sleep

@@ -1,0 +1,510 @@
+"""A bench without a sample clock: waveform, position loop and limits run here, at the host's rate.
+
+Glossary: a *tick* is a time k / sample_rate since the first connect; to *serve* a tick is to read
+the inputs, evaluate the output laws and write the outputs; the device's *silence* is the time
+since its outputs were last written.
+
+The law of tick k is that of `drivers.base`, with the position s read in that tick. A host that is
+late serves the newest tick that is due, so that waveforms keep their phase; the ticks it left out
+are interpolated or missing (`drivers.resample`). The command of a row is the voltage put out in its
+tick or, where the tick was left out, the one still held then.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import astuple, dataclass, replace
+from typing import ClassVar, Final, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.base import (
+    OFF,
+    Array,
+    DeviceError,
+    DeviceInfo,
+    DeviceLost,
+    OutputLaw,
+    SampleBlock,
+    WireSettings,
+)
+from drivers.resample import LONGEST, Resampler, Row
+from rig.model import channels as ch
+from rig.model.parse import InputError
+from rig.model.parts import Wire
+from rig.model.rig import Rig
+
+logger = logging.getLogger(__name__)
+Result = TypeVar("Result")
+
+MAX_BLOCK_SAMPLES: Final = 10
+BLOCK_SECONDS: Final = 0.05  # at low rates a block is shorter, so that limits are checked as soon
+LATE: Final = 0.5  # [periods] after its tick from which on a sample counts as late
+_EARLY: Final = 1e-6  # [periods] that rounding may take from a tick that is due
+_TRIALS: Final = 3  # exchanges at connect, of which the fastest must fit into a period
+_PERIODS_OF_SILENCE: Final = 3  # a watchdog must let at least so many sample periods pass
+_ROUNDING: Final = 1e-9  # of a sensor's range
+
+
+class InputsOutputs(Protocol):
+    """A device that only reads and writes: all that a class for a new one has to do.
+
+    Every method may raise DeviceLost (it does not answer) or DeviceError (it answers nonsense, or
+    refuses); an OSError counts as lost, any other exception as an error of the device.
+    """
+
+    @property
+    def watchdog(self) -> float | None:
+        """Seconds without a write after which the device zeroes its outputs; None: never."""
+
+    def open(self) -> str:
+        """Open the device and set its watchdog; return who it is. May be called again."""
+
+    def read(self) -> Array:
+        """Return one sample of every channel [SI], shape (channels,), ordered as Rig.channels."""
+
+    def write(self, volts: Array) -> None:
+        """Put out voltages [V], shape (joints,), at once; it also feeds the device's watchdog."""
+
+    def close(self) -> None:
+        """Close the device; closing twice does nothing."""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How well a host kept its sample clock since connecting.
+
+    `served` ticks were read and written, `late` of them more than half a period after their
+    time, the worst by `worst` [s]; `missing` ticks are in no block.
+    """
+
+    served: int = 0
+    late: int = 0
+    missing: int = 0
+    worst: float = 0.0
+
+
+class PolledDriver:
+    """`drivers.base.Driver` over an `InputsOutputs`; see there for what each call promises.
+
+    Only `read_block` serves ticks: between two calls the outputs hold their voltage. If more than
+    `wire.watchdog` (or the device's own watchdog) passes so, the next tick zeroes the outputs and
+    latches a trip. `clock` [s] and `sleep` [s] may be replaced in tests. Raises InputError for a
+    rig it cannot run, or a device that does not zero its outputs by itself, unless
+    `accept_no_watchdog`.
+    """
+
+    settings: ClassVar[type[WireSettings]] = WireSettings
+    host_timed: ClassVar[bool] = True
+
+    def __init__(
+        self,
+        wire: Wire,
+        rig: Rig,
+        device: InputsOutputs,
+        *,
+        accept_no_watchdog: bool = False,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        if rig.electric:
+            raise InputError(
+                f"wire: kind: {wire.kind} puts out valve voltages; rig {rig.name!r} has electric "
+                "joints"
+            )
+        self._silence_allowed = _silence_allowed(wire, rig, device.watchdog, accept_no_watchdog)
+        self._wire, self._rig, self._device = wire, rig, device
+        self._clock, self._sleep = clock, sleep
+        self._block_samples = _block_samples(rig.sample_rate)
+        sensors = [rig.sensors.of(ch.kind_of(name)[0]) for name in rig.channels]
+        low, high = np.array([sensor.range for sensor in sensors], dtype=np.float64).T
+        rounding = _ROUNDING * (high - low)
+        self._low, self._high = low + rounding, high - rounding
+        self._ranges = [joint.valve.command_range for joint in rig.joints]
+        self._positions = [
+            rig.channels.index(ch.channel(rig.position_kind, i + 1)) for i in range(len(rig.joints))
+        ]
+        self._uploaded: list[Array] = [np.zeros(1) for _ in rig.joints]
+        self._laws = _Laws(len(rig.joints))
+        self._resampler = Resampler()
+        self._rows: deque[tuple[Row, Array, float]] = deque()
+        self._origin: float | None = None
+        self._open = self._streaming = False
+        self._sequence = 0
+        self._last = -1  # newest tick that is served or in a row
+        self._volts = np.zeros(len(rig.joints))
+        self._written = 0.0
+        self._cause: str | None = None
+        self._timing = Timing()
+
+    @property
+    def timing(self) -> Timing:
+        """How well the sample clock was kept so far."""
+        return replace(self._timing, missing=self._resampler.missing)
+
+    # -- session ----------------------------------------------------------------------------
+
+    def connect(self) -> DeviceInfo:
+        """Open the device, zero its outputs, and check that it is fast enough for the rig."""
+        self._zero_laws()
+        self._streaming = False
+        identity = self._safely(self._device.open)
+        self._open = True
+        try:
+            self._put(self._volts)
+            self._prove_speed()
+        except BaseException:
+            self._drop()
+            raise
+        if self._device.watchdog is None:
+            logger.warning(
+                "%s does not zero its outputs by itself: if this program or the wire fails, the "
+                "valves stay where they are; keep the emergency stop within reach",
+                identity,
+            )
+        if self._origin is None:
+            self._origin = self._clock()
+        rig = self._rig
+        return DeviceInfo(
+            identity,
+            len(rig.joints),
+            len(rig.channels),
+            rig.sample_rate,
+            self._block_samples,
+            virtual_time=False,
+        )
+
+    def close(self) -> None:
+        """Zero the outputs if the device still answers, then close; never raises."""
+        self._zero_laws()
+        self._streaming = False
+        try:
+            if self._open:
+                self._put(self._volts)
+        except DeviceError as error:
+            logger.debug("while closing: %s", error)
+        finally:
+            self._drop()
+
+    def zero_outputs(self) -> None:
+        """Put every output to zero now, and keep them so; opens the device anew if need be."""
+        self._zero_laws()
+        if self._open:
+            try:
+                self._put(self._volts)
+            except DeviceError as error:
+                logger.warning("zeroing needs a second try: %s", error)
+            else:
+                return
+        self._streaming = False
+        self._drop()
+        self._safely(self._device.open)
+        self._open = True
+        try:
+            self._put(self._volts)
+        except DeviceError:
+            self._drop()
+            raise
+
+    def trip_cause(self) -> str | None:
+        """Say why the driver has zeroed the outputs by itself, or None if it has not."""
+        return self._cause
+
+    def reset(self) -> None:
+        """Clear a latched trip; only on a person's word."""
+        self._cause = None
+
+    # -- outputs ----------------------------------------------------------------------------
+
+    def upload(self, joint: int, wave: Array) -> None:
+        """Store one period of joint `joint`'s (0-based) waveform [V]; it acts from `apply` on."""
+        if not 0 <= joint < len(self._ranges):
+            raise DeviceError(f"no joint {joint + 1} on a rig of {len(self._ranges)}")
+        volts = np.array(wave, dtype=np.float64).ravel()
+        limit = self._ranges[joint]
+        if not len(volts):
+            raise DeviceError(f"waveform of joint {joint + 1} is empty")
+        wrong = np.flatnonzero(~(np.abs(volts) <= limit))
+        if len(wrong):
+            raise DeviceError(
+                f"waveform of joint {joint + 1}: sample {wrong[0]} is {volts[wrong[0]]:g} V, "
+                f"outside the output's range of +-{limit:g} V"
+            )
+        self._uploaded[joint] = volts
+
+    def apply(self, laws: Sequence[OutputLaw], *, restart: bool = False) -> int:
+        """Set all laws at one tick; `restart` starts the waveforms there. Returns that tick."""
+        if len(laws) != len(self._ranges):
+            raise DeviceError(f"{len(laws)} laws for a rig of {len(self._ranges)} joints")
+        for joint, (law, most) in enumerate(zip(laws, self._ranges, strict=True), start=1):
+            if not all(math.isfinite(number) for number in astuple(law)):
+                raise DeviceError(f"law of joint {joint} has a value that is not finite: {law}")
+            if not 0.0 <= law.limit <= most:
+                raise DeviceError(
+                    f"law of joint {joint} has the limit {law.limit:g} V, expected 0 to {most:g} V"
+                )
+        if self._cause is not None and any(law.limit > 0.0 for law in laws):
+            raise DeviceError(f"tripped: {self._cause}; find the cause, then reset it")
+        tick = self._next_tick()
+        self._laws.set(laws, self._uploaded, tick if restart else None)
+        return tick
+
+    # -- samples ----------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Start serving ticks, blocks numbered and waveforms played from their beginning."""
+        if not self._open or self._origin is None:
+            raise DeviceLost(f"the device of wire {self._wire.kind} is closed; connect first")
+        self._rows.clear()
+        self._resampler.restart()
+        self._sequence = 0
+        self._written = self._clock()
+        self._last = max(self._last, math.floor(self._periods(self._written) + _EARLY))
+        self._laws.restart(self._last + 1)
+        values, at = self._take()  # what the first tick is interpolated from
+        self._resampler.add(at, values, self._saturated(values))
+        self._streaming = True
+
+    def stop(self) -> None:
+        """Stop serving ticks; nothing follows a law then, so the outputs go to zero."""
+        self._streaming = False
+        self._rows.clear()
+        self._zero_laws()
+        if self._open:
+            self._put(self._volts)
+
+    def read_block(self) -> SampleBlock:
+        """Serve ticks until a block is full or a gap ends it, and return it.
+
+        Raises DeviceLost or DeviceError with the outputs zeroed if the device still obeys.
+        """
+        if not self._streaming:
+            raise DeviceError(f"the device of wire {self._wire.kind} is not started; start it")
+        patience = self._wire.timeout + self._block_samples / self._rig.sample_rate
+        deadline = self._clock() + self._silence_allowed + patience
+        try:
+            while (block := self._block(full=self._clock() <= deadline)) is None:
+                if self._clock() > deadline:
+                    raise DeviceError(
+                        f"no two samples of wire {self._wire.kind} came within {LONGEST:g} periods "
+                        f"of {self._rig.sample_rate:g} Hz; lower the rig's sample_rate"
+                    )
+                self._serve()
+        except BaseException:
+            self._make_safe()
+            raise
+        return block
+
+    # -- inside -----------------------------------------------------------------------------
+
+    def _serve(self) -> None:
+        """Wait for the next tick; read, evaluate the laws, write; keep the rows that result."""
+        self._heed_silence()
+        tick = self._wait()
+        values, at = self._take()
+        self._heed_silence()
+        held, self._volts = self._volts, self._laws.volts(tick, values[self._positions])
+        self._put(self._volts)
+        lateness = at - tick
+        own = at / self._rig.sample_rate
+        for row in self._resampler.add(at, values, self._saturated(values)):
+            commands = self._volts if row.tick == tick else held
+            self._rows.append((row, commands, own if row.tick == tick else math.nan))
+            self._last = row.tick
+        self._last = max(self._last, tick)
+        old = self._timing
+        self._timing = replace(
+            old,
+            served=old.served + 1,
+            late=old.late + (lateness > LATE),
+            worst=max(old.worst, lateness / self._rig.sample_rate),
+        )
+
+    def _block(self, *, full: bool) -> SampleBlock | None:
+        """Return the oldest rows as a block; with `full` None, unless it is or a gap follows."""
+        rows = self._rows
+        count = 0
+        for row, _, _ in rows:
+            if count == self._block_samples or row.tick != rows[0][0].tick + count:
+                break
+            count += 1
+        if count == 0 or (full and count < self._block_samples and count == len(rows)):
+            return None
+        taken = [rows.popleft() for _ in range(count)]
+        block = SampleBlock(
+            sequence=self._sequence,
+            tick=taken[0][0].tick,
+            data=np.array([np.concatenate((row.values, volts)) for row, volts, _ in taken]),
+            saturated=np.array([row.saturated for row, _, _ in taken]),
+            backlog=0,
+            tripped=self._cause is not None,
+            read_at=np.array([at for _, _, at in taken]),
+        )
+        self._sequence += 1
+        return block
+
+    def _periods(self, now: float) -> float:
+        """Return the time `now` [s] of the clock in periods since tick 0."""
+        origin = now if self._origin is None else self._origin
+        return (now - origin) * self._rig.sample_rate
+
+    def _next_tick(self) -> int:
+        """Return the tick to serve next: the newest that is due, never one already in a row."""
+        due = math.floor(self._periods(self._clock()) + _EARLY)
+        return max(self._last + 1, due)
+
+    def _wait(self) -> int:
+        while True:
+            tick = self._next_tick()
+            ahead = tick - self._periods(self._clock())
+            if ahead <= _EARLY:
+                return tick
+            self._sleep(ahead / self._rig.sample_rate)
+
+    def _take(self) -> tuple[Array, float]:
+        """Read one sample; return it with its time [periods], midway through the reading."""
+        before = self._clock()
+        values = np.asarray(self._safely(self._device.read), dtype=np.float64)
+        after = self._clock()
+        wanted = (len(self._rig.channels),)
+        if values.shape != wanted:
+            raise DeviceError(
+                f"a sample of shape {values.shape} came, expected {wanted}: one value for each of "
+                f"{' '.join(self._rig.channels)}"
+            )
+        return values, self._periods((before + after) / 2)
+
+    def _saturated(self, values: Array) -> NDArray[np.bool_]:
+        marks: NDArray[np.bool_] = (values <= self._low) | (values >= self._high)
+        return marks
+
+    def _put(self, volts: Array) -> None:
+        self._safely(lambda: self._device.write(volts.copy()))
+        self._written = self._clock()
+
+    def _heed_silence(self) -> None:
+        """Zero and trip if the outputs were not written for longer than the watchdog allows."""
+        silence = self._clock() - self._written
+        if silence <= self._silence_allowed:
+            return
+        self._zero_laws()
+        if self._cause is None:
+            self._cause = (
+                f"watchdog: the host did not serve the outputs for {silence:.3g} s, allowed "
+                f"{self._silence_allowed:g} s (before sample {self._next_tick()})"
+            )
+            logger.warning("%s", self._cause)
+        self._put(self._volts)
+
+    def _prove_speed(self) -> None:
+        period = 1.0 / self._rig.sample_rate
+        fastest = math.inf
+        for _ in range(_TRIALS):
+            before = self._clock()
+            self._take()
+            self._put(self._volts)
+            fastest = min(fastest, self._clock() - before)
+        if fastest > period:
+            raise DeviceError(
+                f"one reading and writing takes {fastest * 1e3:.3g} ms, but the rig's sample_rate "
+                f"of {self._rig.sample_rate:g} Hz leaves {period * 1e3:.3g} ms; lower it to "
+                f"{0.5 / fastest:.3g} Hz or less"
+            )
+
+    def _zero_laws(self) -> None:
+        self._laws.zero()
+        self._volts = np.zeros(len(self._ranges))
+
+    def _make_safe(self) -> None:
+        """After a failed tick: no law acts any more, and zero is tried once."""
+        self._zero_laws()
+        self._streaming = False
+        if self._open:
+            with suppress(DeviceError):
+                self._put(self._volts)
+
+    def _drop(self) -> None:
+        self._open = False
+        try:
+            self._device.close()
+        except Exception as error:  # a device that fails in closing is closed
+            logger.debug("while closing: %s", error)
+
+    def _safely(self, call: Callable[[], Result]) -> Result:
+        """Call the device; raises only DeviceLost and DeviceError."""
+        try:
+            return call()
+        except DeviceError:
+            raise
+        except OSError as error:
+            raise DeviceLost(f"the device of wire {self._wire.kind} is gone: {error}") from error
+        except Exception as error:
+            raise DeviceError(
+                f"the device of wire {self._wire.kind} failed: {type(error).__name__}: {error}"
+            ) from error
+
+
+class _Laws:
+    """The laws in force, as arrays over the joints."""
+
+    def __init__(self, joints: int) -> None:
+        self._joints = joints
+        self._waves: list[Array] = [np.zeros(1)] * joints
+        self._starts = [0] * joints
+        self._numbers = np.zeros((5, joints))
+
+    def set(self, laws: Sequence[OutputLaw], waves: Sequence[Array], start: int | None) -> None:
+        """Take over laws and waveforms; `start` is the tick of the waveforms' first sample."""
+        self._numbers = np.array([astuple(law) for law in laws], dtype=np.float64).T
+        self._waves = list(waves)
+        if start is not None:
+            self.restart(start)
+
+    def restart(self, tick: int) -> None:
+        """Let every waveform begin at a tick."""
+        self._starts = [tick] * self._joints
+
+    def zero(self) -> None:
+        """Switch every law off."""
+        self._numbers = np.array([astuple(OFF)] * self._joints, dtype=np.float64).T
+
+    def volts(self, tick: int, positions: NDArray[np.float64]) -> Array:
+        """Return the outputs [V] at a tick; zero for a joint whose position is no number."""
+        gain, bias, position_gain, setpoint, limit = self._numbers
+        waves = zip(self._waves, self._starts, strict=True)
+        wave = np.array([samples[(tick - start) % len(samples)] for samples, start in waves])
+        known = np.isfinite(positions)
+        pull = position_gain * (setpoint - np.where(known, positions, 0.0))
+        return np.where(known, np.clip(gain * wave + bias + pull, -limit, limit), 0.0)
+
+
+def _block_samples(rate: float) -> int:
+    return min(MAX_BLOCK_SAMPLES, max(1, round(BLOCK_SECONDS * rate)))
+
+
+def _silence_allowed(wire: Wire, rig: Rig, watchdog: float | None, accepted: bool) -> float:
+    """Return the silence [s] from which on outputs are zeroed; raises InputError if unfit."""
+    if watchdog is None and not accepted:
+        raise InputError(
+            f"wire: zero_by: the device of wire {wire.kind} does not zero its outputs when the "
+            "host falls silent; name its watchdog, or say accept_no_watchdog: true"
+        )
+    if watchdog is not None and watchdog > wire.watchdog:
+        raise InputError(
+            f"wire: zero_by: the device zeroes its outputs after {watchdog:g} s, wire.watchdog "
+            f"promises {wire.watchdog:g} s; shorten the one or lengthen the other"
+        )
+    allowed = wire.watchdog if watchdog is None else watchdog
+    least = _PERIODS_OF_SILENCE / rig.sample_rate
+    if allowed < least:
+        raise InputError(
+            f"wire: watchdog: {allowed:g} s is shorter than {_PERIODS_OF_SILENCE} sample periods "
+            f"({least:g} s); outputs are written once a period"
+        )
+    return allowed
