@@ -1,0 +1,76 @@
+"""Numbers in 16-bit registers: type and word order to values and back.
+
+A register's two bytes come high byte first, as Modbus has them. A wider number takes consecutive
+registers; `big` has its high word first, `little` its low word.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from enum import StrEnum
+from typing import Final
+
+
+class RegisterType(StrEnum):
+    """Form of a number."""
+
+    INT16 = "int16"
+    UINT16 = "uint16"
+    INT32 = "int32"
+    UINT32 = "uint32"
+    INT64 = "int64"
+    FLOAT32 = "float32"
+    FLOAT64 = "float64"
+
+
+class WordOrder(StrEnum):
+    """Which word of a wide number stands at the lowest address."""
+
+    BIG = "big"
+    LITTLE = "little"
+
+
+_FORMS: Final = {
+    RegisterType.INT16: ">h",
+    RegisterType.UINT16: ">H",
+    RegisterType.INT32: ">i",
+    RegisterType.UINT32: ">I",
+    RegisterType.INT64: ">q",
+    RegisterType.FLOAT32: ">f",
+    RegisterType.FLOAT64: ">d",
+}
+
+
+def word_count(form: RegisterType) -> int:
+    """Return how many registers a number takes."""
+    return struct.calcsize(_FORMS[form]) // 2
+
+
+def decode_registers(data: bytes, form: RegisterType, order: WordOrder) -> float:
+    """Return the number in the bytes of its registers; int64 is rounded to double precision."""
+    if order is WordOrder.LITTLE:
+        data = _swapped(data)
+    (value,) = struct.unpack(_FORMS[form], data)
+    return float(value)
+
+
+def encode_registers(value: float, form: RegisterType, order: WordOrder) -> list[int]:
+    """Return the registers that hold a number, rounded where the type is one of integers.
+
+    Raises ValueError for a number that is not finite or outside the type's range.
+    """
+    if not math.isfinite(value):
+        raise ValueError(f"{value} is no number for a register")
+    floating = form in (RegisterType.FLOAT32, RegisterType.FLOAT64)
+    try:
+        data = struct.pack(_FORMS[form], value if floating else round(value))
+    except (struct.error, OverflowError) as error:
+        raise ValueError(f"{value:.6g} is outside the range of {form}") from error
+    if order is WordOrder.LITTLE:
+        data = _swapped(data)
+    return list(struct.unpack(f">{len(data) // 2}H", data))
+
+
+def _swapped(data: bytes) -> bytes:
+    return b"".join(data[i : i + 2] for i in range(len(data) - 2, -1, -2))
