@@ -23,7 +23,7 @@ from drivers.bench_protocol import DeviceRefused, DeviceSilent
 logger = logging.getLogger(__name__)
 
 
-class _RawAnswer:
+class RawAnswer:
     """Mixin: an answer kept as the bytes of its registers, not as a list of integers."""
 
     payload = b""
@@ -38,11 +38,11 @@ class _RawAnswer:
         return type(self).__name__
 
 
-class _Read(_RawAnswer, ReadHoldingRegistersResponse):
+class _Read(RawAnswer, ReadHoldingRegistersResponse):
     pass
 
 
-class _ReadWrite(_RawAnswer, ReadWriteMultipleRegistersResponse):
+class _ReadWrite(RawAnswer, ReadWriteMultipleRegistersResponse):
     pass
 
 
@@ -139,7 +139,7 @@ class ModbusConnection:
             answer = self._checked(self._usable().execute(False, request))
         except (ModbusException, OSError) as error:
             raise self._failure(error) from error
-        payload = answer.payload if isinstance(answer, _RawAnswer) else b""
+        payload = answer.payload if isinstance(answer, RawAnswer) else b""
         if len(payload) != 2 * count:
             self.close()  # what else is under way would be taken for the next answer
             raise DeviceError(

@@ -1,0 +1,405 @@
+"""The driver of any I/O module or PLC over Modbus TCP: its register map stands in the rig file.
+
+Documented for people in docs/wire-modbus-map.md. The device has no sample clock: `drivers.polled`
+reads and writes it at the host's rate. Answers carry the transaction number of their request, and
+one with another number is dropped by the library; after any timeout the connection ends.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, ClassVar, Final, Literal
+from urllib.parse import SplitResult
+
+import numpy as np
+from pydantic import Field
+from pymodbus.exceptions import ModbusException
+from pymodbus.pdu import ModbusPDU
+from pymodbus.pdu.register_message import (
+    ReadHoldingRegistersRequest,
+    ReadInputRegistersRequest,
+    ReadInputRegistersResponse,
+    WriteMultipleRegistersRequest,
+    WriteSingleRegisterRequest,
+)
+
+from drivers.base import Array, DeviceError, WireSettings
+from drivers.modbus_transport import DeviceRefused, ModbusConnection, RawAnswer
+from drivers.polled import PolledDriver
+from drivers.register_types import (
+    RegisterType,
+    WordOrder,
+    decode_registers,
+    encode_registers,
+    word_count,
+)
+from drivers.wire_entries import (
+    inputs_by_channel,
+    offset_of,
+    outputs_by_joint,
+    read_entry,
+    scale_of,
+)
+from rig.model.parse import InputError
+from rig.model.parts import Part, Wire
+from rig.model.rig import Rig
+
+logger = logging.getLogger(__name__)
+
+HOLDING: Final = 3
+INPUT: Final = 4
+MAX_READ: Final = 125  # registers in one answer: the protocol's own limit
+MAX_WRITE: Final = 123
+_LAST_REGISTER: Final = 0xFFFF
+_NO_WATCHDOG: Final = "none"
+
+
+class MapSettings(WireSettings):
+    """The module's address and its register map, entry by entry."""
+
+    example: ClassVar = "modbus-tcp://127.0.0.1:5020 (a register map fits into a rig file only)"
+
+    host: str = Field(min_length=1)
+    port: int = Field(default=502, ge=1, le=65535)
+    unit: int = Field(default=1, ge=0, le=255)
+    inputs: dict[str, Any]
+    outputs: dict[int, Any]
+    zero_by: dict[str, Any] | Literal["none"] = _NO_WATCHDOG
+    accept_no_watchdog: bool = False
+
+    @classmethod
+    def of_endpoint(cls, url: SplitResult) -> Mapping[str, Any]:
+        """Raise ValueError: no endpoint says what the registers mean."""
+        raise ValueError(f"no register map in {url.geturl()}")
+
+
+class _Number(Part):
+    address: int = Field(ge=0, le=_LAST_REGISTER)
+    type: RegisterType
+    word_order: WordOrder = WordOrder.BIG
+    scale: str | float
+    offset: str | float | None = None
+
+
+class InputEntry(_Number):
+    """One channel: value = offset + scale * number in its registers."""
+
+    function: Literal[3, 4]
+
+
+class OutputEntry(_Number):
+    """One joint's valve: the number is (voltage - offset) / scale."""
+
+
+class ZeroByEntry(Part):
+    """The module's own watchdog: its register takes the time in milliseconds."""
+
+    watchdog_register: int = Field(ge=0, le=_LAST_REGISTER)
+    milliseconds: int = Field(ge=1, le=0xFFFF)
+
+
+@dataclass(frozen=True)
+class Point:
+    """One number of the map: where it stands, its form, and value = offset + scale * number."""
+
+    name: str
+    function: int
+    address: int
+    form: RegisterType
+    order: WordOrder
+    scale: float
+    offset: float
+
+    @property
+    def words(self) -> int:
+        """How many registers it takes."""
+        return word_count(self.form)
+
+    @property
+    def end(self) -> int:
+        """The address after its last register."""
+        return self.address + self.words
+
+    def value(self, data: bytes) -> float:
+        """Return the value [SI] that the bytes of its registers mean."""
+        return self.offset + self.scale * decode_registers(data, self.form, self.order)
+
+    def registers(self, value: float) -> list[int]:
+        """Return its registers for a value [SI]; raises ValueError outside the type's range."""
+        return encode_registers((value - self.offset) / self.scale, self.form, self.order)
+
+
+@dataclass(frozen=True)
+class Span:
+    """Consecutive registers for one request; `points` are (index in the map, point)."""
+
+    function: int
+    address: int
+    words: int
+    points: tuple[tuple[int, Point], ...]
+
+    def __str__(self) -> str:
+        names = " ".join(point.name for _, point in self.points)
+        return f"registers {self.address} to {self.address + self.words - 1} ({names})"
+
+
+@dataclass(frozen=True)
+class RegisterMap:
+    """Where every channel and every output stands; `watchdog` is None where the module has none."""
+
+    inputs: tuple[Point, ...]
+    outputs: tuple[Point, ...]
+    watchdog: ZeroByEntry | None
+
+
+def register_map(settings: MapSettings, rig: Rig) -> RegisterMap:
+    """Return the map that a rig file describes; raises InputError naming the key at fault."""
+    inputs = tuple(
+        _point(f"inputs.{name}", name, entry, entry.function, rig.unit_of(name))
+        for name, entry in zip(
+            rig.channels, inputs_by_channel(InputEntry, settings.inputs, rig), strict=True
+        )
+    )
+    outputs = tuple(
+        _point(f"outputs.{i}", f"{i}", entry, HOLDING, "V")
+        for i, entry in enumerate(outputs_by_joint(OutputEntry, settings.outputs, rig), start=1)
+    )
+    _refuse_overlap("inputs", inputs)
+    _refuse_overlap("outputs", outputs)
+    for point, joint in zip(outputs, rig.joints, strict=True):
+        _refuse_narrow(point, joint.valve.command_range)
+    if settings.zero_by == _NO_WATCHDOG:
+        return RegisterMap(inputs, outputs, None)
+    watchdog = read_entry(ZeroByEntry, settings.zero_by, "zero_by")
+    for point in outputs:
+        if point.address <= watchdog.watchdog_register < point.end:
+            raise InputError(
+                f"wire: zero_by.watchdog_register: {watchdog.watchdog_register} is a register of "
+                f"outputs.{point.name}"
+            )
+    return RegisterMap(inputs, outputs, watchdog)
+
+
+def _point(key: str, name: str, entry: _Number, function: int, unit: str) -> Point:
+    point = Point(
+        name,
+        function,
+        entry.address,
+        entry.type,
+        entry.word_order,
+        scale_of(entry.scale, unit, f"{key}.scale"),
+        offset_of(entry.offset, unit, f"{key}.offset"),
+    )
+    if point.end > _LAST_REGISTER + 1:
+        raise InputError(
+            f"wire: {key}.address: {entry.type} at {entry.address} reaches past register "
+            f"{_LAST_REGISTER}"
+        )
+    return point
+
+
+def _refuse_overlap(table: str, points: Sequence[Point]) -> None:
+    ordered = sorted(points, key=lambda p: (p.function, p.address))
+    for one, other in pairwise(ordered):
+        if one.function == other.function and other.address < one.end:
+            raise InputError(
+                f"wire: {table}.{other.name}.address: register {other.address} belongs to "
+                f"{table}.{one.name} ({one.form} at {one.address}) as well"
+            )
+
+
+def _refuse_narrow(point: Point, reach: float) -> None:
+    for volts in (-reach, 0.0, reach):
+        try:
+            point.registers(volts)
+        except ValueError as error:
+            raise InputError(
+                f"wire: outputs.{point.name}.scale: for {volts:g} V of the valve's command_range "
+                f"the register must hold {error}"
+            ) from error
+
+
+def spans(points: Iterable[Point], most: int = MAX_READ) -> tuple[Span, ...]:
+    """Return the fewest requests for all points that ask for no register beside theirs."""
+    ordered = sorted(enumerate(points), key=lambda item: (item[1].function, item[1].address))
+    groups: list[list[tuple[int, Point]]] = []
+    for index, point in ordered:
+        if groups:
+            first, last = groups[-1][0][1], groups[-1][-1][1]
+            if (
+                point.function == last.function
+                and point.address == last.end
+                and point.end - first.address <= most
+            ):
+                groups[-1].append((index, point))
+                continue
+        groups.append([(index, point)])
+    return tuple(
+        Span(
+            group[0][1].function,
+            group[0][1].address,
+            group[-1][1].end - group[0][1].address,
+            tuple(group),
+        )
+        for group in groups
+    )
+
+
+class _ReadInput(RawAnswer, ReadInputRegistersResponse):
+    pass
+
+
+class UnitConnection(ModbusConnection):
+    """A connection to one unit behind an address, that ends with the first unanswered request."""
+
+    def __init__(self, host: str, port: int, unit: int, timeout: float) -> None:
+        super().__init__(host, port, timeout)
+        self._unit = unit
+
+    def _connected(self, client: Any) -> None:
+        super()._connected(client)
+        client.register(_ReadInput)
+
+    def fetch(self, function: int, address: int, count: int) -> bytes:
+        """Read registers by function 3 or 4 as big-endian bytes; DeviceLost, DeviceError."""
+        made = ReadInputRegistersRequest if function == INPUT else ReadHoldingRegistersRequest
+        answer = self._answer(made(address=address, count=count))
+        payload = answer.payload if isinstance(answer, RawAnswer) else b""
+        if answer.function_code != function or len(payload) != 2 * count:
+            self.close()
+            raise DeviceError(
+                f"the device at {self.where} answered {len(payload)} bytes to function "
+                f"{answer.function_code}, expected {2 * count} to function {function}"
+            )
+        return payload
+
+    def store(self, address: int, words: list[int]) -> None:
+        """Write registers by function 6 (one) or 16; raises DeviceLost, DeviceError."""
+        if len(words) == 1:
+            request: ModbusPDU = WriteSingleRegisterRequest(address=address, registers=words)
+        else:
+            request = WriteMultipleRegistersRequest(address=address, registers=words)
+        answer = self._answer(request)
+        confirmed = answer.registers == words if len(words) == 1 else answer.count == len(words)
+        same = answer.function_code == request.function_code and answer.address == address
+        if not (same and confirmed):
+            self.close()
+            raise DeviceError(
+                f"the device at {self.where} confirmed another write than that of register "
+                f"{address}"
+            )
+
+    def _answer(self, request: ModbusPDU) -> ModbusPDU:
+        request.dev_id = self._unit
+        client = self._usable()
+        try:
+            return self._checked(client.execute(False, request))
+        except (ModbusException, OSError) as error:
+            failure = self._failure(error)
+            self.close()  # what comes late then comes to nobody
+            raise failure from error
+
+
+class MappedModule:
+    """`drivers.polled.InputsOutputs` over a register map."""
+
+    def __init__(self, settings: MapSettings, found: RegisterMap, timeout: float) -> None:
+        self._link = UnitConnection(settings.host, settings.port, settings.unit, timeout)
+        self._who = f"I/O module at {settings.host}:{settings.port}, unit {settings.unit}"
+        self._map = found
+        self._reads = spans(found.inputs)
+        self._writes = spans(found.outputs, MAX_WRITE)
+
+    @property
+    def watchdog(self) -> float | None:
+        """Seconds after which the module zeroes its outputs by itself, None if never."""
+        entry = self._map.watchdog
+        return None if entry is None else entry.milliseconds * 1e-3
+
+    def open(self) -> str:
+        """Connect, set the module's watchdog and read it back; return address and unit."""
+        self._link.open()
+        try:
+            self._set_watchdog()
+        except DeviceError:
+            self._link.close()
+            raise
+        return self._who
+
+    def read(self) -> Array:
+        """Return one value [SI] of every channel, in the order of the rig."""
+        values = np.empty(len(self._map.inputs))
+        for span in self._reads:
+            with self._explained(str(span)):
+                data = self._link.fetch(span.function, span.address, span.words)
+            for index, point in span.points:
+                first = 2 * (point.address - span.address)
+                values[index] = point.value(data[first : first + 2 * point.words])
+        return values
+
+    def write(self, volts: Array) -> None:
+        """Put out one voltage [V] per joint."""
+        for span in self._writes:
+            words: list[int] = []
+            for index, point in span.points:
+                words += point.registers(float(volts[index]))
+            with self._explained(str(span)):
+                self._link.store(span.address, words)
+
+    def close(self) -> None:
+        """End the connection."""
+        self._link.close()
+
+    @contextmanager
+    def _explained(self, registers: str) -> Iterator[None]:
+        try:
+            yield
+        except DeviceRefused as refused:
+            raise DeviceError(
+                f"{refused}: {registers}; compare address and function in the rig file with the "
+                "module's manual"
+            ) from refused
+
+    def _set_watchdog(self) -> None:
+        entry = self._map.watchdog
+        if entry is None:
+            return
+        where = f"register {entry.watchdog_register} (zero_by.watchdog_register)"
+        with self._explained(where):
+            self._link.store(entry.watchdog_register, [entry.milliseconds])
+            data = self._link.fetch(HOLDING, entry.watchdog_register, 1)
+        found = int.from_bytes(data, "big")
+        if found != entry.milliseconds:
+            raise DeviceError(
+                f"{where} of the {self._who} holds {found} after {entry.milliseconds} was "
+                "written; it is no watchdog time in milliseconds"
+            )
+
+
+class ModbusMapDriver(PolledDriver):
+    """`drivers.base.Driver` over a register map; raises InputError for one that cannot be."""
+
+    settings: ClassVar[type[WireSettings]] = MapSettings
+
+    def __init__(
+        self,
+        wire: Wire,
+        rig: Rig,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        found = MapSettings.of(wire)
+        super().__init__(
+            wire,
+            rig,
+            MappedModule(found, register_map(found, rig), wire.timeout),
+            accept_no_watchdog=found.accept_no_watchdog,
+            clock=clock,
+            sleep=sleep,
+        )

@@ -1,0 +1,77 @@
+"""The tables of a rig file's section `wire`: one entry for every channel and for every output.
+
+Whoever describes a device's channels in a rig file has the same mistakes to find: a channel that
+the rig does not measure, one that is not described, a wrong key, a unit of another dimension.
+Each is refused with the key's name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeVar
+
+from pydantic import ValidationError
+
+from rig.model.parse import InputError, read_quantity
+from rig.model.parts import Part
+from rig.model.rig import Rig
+
+Entry = TypeVar("Entry", bound=Part)
+
+# What a step of a scale is measured in, where a point on it has an offset.
+_DIFFERENCE = {"degC": "delta_degC"}
+
+
+def read_entry(model: type[Entry], raw: Any, key: str) -> Entry:
+    """Read the keys below `key` as `model`; raises InputError naming key and expectation."""
+    if not isinstance(raw, Mapping):
+        raise InputError(f"wire: {key}: expected keys and values, found {raw!r}")
+    try:
+        return model.model_validate(raw)
+    except ValidationError as error:
+        problems = sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
+        problem = problems[0]
+        where = ".".join([key, *(str(part) for part in problem["loc"][:1])])
+        known = " ".join(model.model_fields)
+        if problem["type"] == "extra_forbidden":
+            text = f"unknown key; expected: {known}"
+        elif problem["type"] == "missing":
+            text = f"is missing; expected: {known}"
+        else:
+            text = f"{problem['msg'].removeprefix('Value error, ')}, found {problem['input']!r}"
+        raise InputError(f"wire: {where}: {text}") from error
+
+
+def inputs_by_channel(model: type[Entry], raw: Mapping[str, Any], rig: Rig) -> tuple[Entry, ...]:
+    """Read one entry per measured channel, in the order of `Rig.channels`; raises InputError."""
+    _complete("inputs", list(raw), rig.channels, f"rig {rig.name!r} measures")
+    return tuple(read_entry(model, raw[name], f"inputs.{name}") for name in rig.channels)
+
+
+def outputs_by_joint(model: type[Entry], raw: Mapping[int, Any], rig: Rig) -> tuple[Entry, ...]:
+    """Read one entry per joint, numbered from 1 in the file; raises InputError."""
+    joints = range(1, len(rig.joints) + 1)
+    _complete("outputs", [str(key) for key in raw], [str(i) for i in joints], "the joints are")
+    return tuple(read_entry(model, raw[i], f"outputs.{i}") for i in joints)
+
+
+def _complete(table: str, found: Sequence[str], wanted: Sequence[str], about: str) -> None:
+    for name in found:
+        if name not in wanted:
+            raise InputError(f"wire: {table}.{name}: unknown; {about}: {' '.join(wanted)}")
+    missing = [name for name in wanted if name not in found]
+    if missing:
+        raise InputError(f"wire: {table}: nothing stands for: {' '.join(missing)}")
+
+
+def scale_of(text: Any, unit: str, key: str, per: str = "") -> float:
+    """Read a step in a channel's SI unit, `per` something, such as '/V'; not zero; InputError."""
+    scale = read_quantity(text, f"{_DIFFERENCE.get(unit, unit)}{per}", f"wire: {key}")
+    if scale == 0.0:
+        raise InputError(f"wire: {key}: is zero; every reading would be the same")
+    return scale
+
+
+def offset_of(text: Any, unit: str, key: str) -> float:
+    """Read the value [SI] at a reading of zero, 0 where none is given; raises InputError."""
+    return 0.0 if text is None else read_quantity(text, unit, f"wire: {key}")
