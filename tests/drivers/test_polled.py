@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from drivers.base import OFF, DeviceError, DeviceLost, OutputLaw, SampleBlock
 from drivers.modbus_rtu import ModbusRtuDriver
@@ -117,6 +120,62 @@ def test_uneven_wakings_are_interpolated_onto_the_grid() -> None:
     assert np.all(read_at >= ticks / 100.0 - 1e-9)
     assert driver.timing.missing == 0
     assert 0.0 < driver.timing.worst <= 0.004
+
+
+@settings(deadline=None)
+@given(
+    late=st.lists(st.floats(0.0, 0.03), min_size=1, max_size=30),
+    reading=st.lists(st.floats(0.0, 0.02), min_size=1, max_size=30),
+    pauses=st.lists(st.floats(0.0, 0.7), min_size=1, max_size=12),
+)
+def test_however_late_the_host_no_row_is_wrong_or_uncounted(
+    late: list[float], reading: list[float], pauses: list[float]
+) -> None:
+    """What is linear in time must come out exactly, whatever the times it was read at."""
+    driver, module, clock = polled_bench()
+    driver.connect()
+    origin = clock.now
+    reads = iter(range(1_000_000))
+    clock.late = lambda nap: late[nap % len(late)]
+
+    def signal(_: float) -> np.ndarray:
+        half = reading[next(reads) % len(reading)] / 2
+        clock.pass_(half)
+        values = 1e-3 * np.arange(10) + 2e-3 * (clock.now - origin)
+        clock.pass_(half)
+        return values
+
+    module.signal = signal
+    driver.start()
+    wave = np.arange(7) / 7
+    driver.upload(0, wave)
+    start = driver.apply([OutputLaw(gain=2.0, limit=1.5), OFF], restart=True)
+    seen: list[SampleBlock] = []
+    try:
+        for pause in pauses:
+            seen.append(driver.read_block())
+            clock.pass_(pause)
+    except DeviceError as error:
+        assert "lower the rig's sample_rate" in str(error)  # noqa: PT017
+        assert (module.volts == 0.0).all()
+    rows = 0
+    for block in seen:
+        ticks = np.arange(block.tick, block.tick + len(block.data))
+        expected = 1e-3 * np.arange(10) + 2e-3 * ticks[:, None] / 100.0
+        assert block.data[:, :10] == pytest.approx(expected, abs=1e-7)
+        assert block.read_at is not None
+        own = np.isfinite(block.read_at)
+        played = np.minimum(2.0 * wave[(ticks - start) % 7], 1.5)
+        if not block.tripped:
+            assert block.data[own, COMMAND_1] == pytest.approx(played[own])
+        rows += len(block.data)
+    for before, after in pairwise(seen):
+        assert after.tick >= before.tick + len(before.data)
+        assert after.sequence == before.sequence + 1
+        assert before.tripped <= after.tripped
+    if seen:
+        span = seen[-1].tick + len(seen[-1].data) - seen[0].tick
+        assert 0 <= span - rows <= driver.timing.missing
 
 
 def test_lateness_of_more_than_half_a_period_is_counted() -> None:
