@@ -29,7 +29,8 @@ from pymodbus.pdu.register_message import (
 )
 
 from drivers.base import Array, DeviceError, WireSettings
-from drivers.modbus_transport import DeviceRefused, ModbusConnection, RawAnswer
+from drivers.bench_protocol import DeviceRefused
+from drivers.modbus_transport import ModbusConnection, RawAnswer
 from drivers.polled import PolledDriver
 from drivers.register_types import (
     RegisterType,

@@ -191,6 +191,15 @@ class PolledDriver:
             logger.debug("while closing: %s", error)
         finally:
             self._drop()
+        timing = self.timing
+        if timing.served:
+            logger.info(
+                "%d ticks served, %d late by more than half a period, worst %.3g ms; %d missing",
+                timing.served,
+                timing.late,
+                timing.worst * 1e3,
+                timing.missing,
+            )
 
     def zero_outputs(self) -> None:
         """Put every output to zero now, and keep them so; opens the device anew if need be."""

@@ -305,6 +305,15 @@ def test_stopping_and_closing_leave_zero_outputs() -> None:
         driver.start()
 
 
+def test_closing_tells_how_well_the_clock_was_kept(caplog: pytest.LogCaptureFixture) -> None:
+    driver, _, clock = started()
+    clock.late = lambda nap: 0.006 if nap == 3 else 0.0
+    driver.read_block()
+    with caplog.at_level(logging.INFO):
+        driver.close()
+    assert "4 ticks served, 1 late by more than half a period, worst 6 ms; 1 missing" in caplog.text
+
+
 def test_the_clock_does_not_go_back_between_two_streams() -> None:
     driver, _, clock = started()
     last = driver.read_block().tick + 5

@@ -1,0 +1,105 @@
+"""What the pages for people with their own device show can be read and run as it stands."""
+
+from __future__ import annotations
+
+import re
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from drivers.base import DeviceLost, OutputLaw
+from drivers.modbus_map import InputEntry, MapSettings, OutputEntry, register_map
+from drivers.nidaqmx_card import CardInput, CardOutput, CardSettings, wiring
+from drivers.polled import InputsOutputs, PolledDriver
+from drivers.register_types import RegisterType
+from drivers.resample import LONGEST
+from rig.model.parse import parse_model
+from rig.model.parts import Wire
+from rig.model.rig import Rig
+from tests.hil_sim.integrator import seed_rig
+
+DOCS = Path(__file__).parents[2] / "docs"
+MAP_PAGE = (DOCS / "wire-modbus-map.md").read_text("utf-8")
+OWN_PAGE = (DOCS / "own-device.md").read_text("utf-8")
+
+
+def listing(page: str, language: str) -> str:
+    found = re.search(rf"```{language}\n(.*?)```", page, re.S)
+    assert found is not None
+    return found[1]
+
+
+def boom(wire: str) -> Rig:
+    text = (files("rig") / "shipped" / "boom-1dof.yaml").read_text("utf-8")
+    return parse_model(Rig, re.sub(r"^wire:.*$", lambda _: wire, text, flags=re.M), "boom.yaml")
+
+
+def test_the_pages_maps_fit_the_shipped_bench_of_one_joint() -> None:
+    mapped = boom(listing(MAP_PAGE, "yaml"))
+    found = register_map(MapSettings.of(mapped.wire), mapped)
+    assert found.watchdog is not None
+    wired = boom(listing(OWN_PAGE, "yaml"))
+    assert wiring(CardSettings.of(wired.wire), wired).outputs == ("Dev1/ao0",)
+
+
+def test_every_key_and_type_stands_on_its_page() -> None:
+    for model in (MapSettings, InputEntry, OutputEntry):
+        for name in model.model_fields:
+            assert re.search(rf"^\|.*`{name}`", MAP_PAGE, re.M), name
+    for form in RegisterType:
+        assert f"`{form}`" in MAP_PAGE
+    for model in (CardInput, CardOutput, CardSettings):
+        for name in model.model_fields:
+            assert re.search(rf"`{name}[`:]|\b{name}:", OWN_PAGE), name
+    assert f"{LONGEST:g} periods" in OWN_PAGE
+    assert "No card was at hand" in OWN_PAGE
+
+
+class Line:
+    """The line that the page's example speaks over."""
+
+    def __init__(self) -> None:
+        self.sent: list[str] = []
+        self.channels = "0.001 " * 10
+
+    def write(self, text: str) -> None:
+        self.sent.append(text)
+
+    def ask(self, text: str) -> str:
+        return "seven" if text == "name" else self.channels
+
+    def close(self) -> None:
+        pass
+
+
+def test_the_pages_small_class_is_a_driver(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = Line()
+    names: dict[str, Any] = {"open_line": lambda _: line, "__name__": "my_bench.gauge"}
+    exec(compile(listing(OWN_PAGE, "python"), "own-device.md", "exec"), names)
+    rig = seed_rig().model_copy(update={"sample_rate": 100.0})
+    wire = Wire(kind="gauge-box", timeout=0.2, watchdog=0.5, address="COM3")  # type: ignore[call-arg]
+    driver = names["GaugeDriver"](wire, rig)
+    assert isinstance(driver, PolledDriver)
+    box: InputsOutputs = names["GaugeBox"](line)
+    assert box.watchdog == 0.2
+    assert driver.connect().identity == "gauge box seven"
+    driver.start()
+    driver.apply([OutputLaw(bias=1.0, limit=2.0), OutputLaw()])
+    assert driver.read_block().data.shape[1] == 12
+    assert line.sent[-1] == "put 1.0000 0.0000"
+    line.channels = ""
+    with pytest.raises(DeviceLost, match="switched on"):
+        driver.read_block()
+    assert line.sent[-1] == "put 0.0000 0.0000"
+    driver.close()
+
+
+def test_the_page_names_every_call_of_a_whole_driver() -> None:
+    from drivers.base import Driver
+
+    calls = [name for name, value in vars(Driver).items() if callable(value) and name[0] != "_"]
+    assert len(calls) == 10
+    for name in calls:
+        assert f"`{name}`" in OWN_PAGE, name
