@@ -310,6 +310,18 @@ def test_an_answer_with_another_transaction_number_is_not_taken() -> None:
             fetched(lambda _, number=number: words(number, [111, 111]))
 
 
+def test_the_first_unanswered_request_ends_the_connection() -> None:
+    server = Answers(lambda _: b"")
+    link = UnitConnection("127.0.0.1", server.port, 7, timeout=0.3)
+    link.open()
+    with pytest.raises(DeviceLost, match=r"does not answer \(0.3 s\)"):
+        link.fetch(3, 0, 2)
+    assert not link.is_open
+    with pytest.raises(DeviceLost, match="is closed"):
+        link.fetch(3, 0, 2)
+    server.join()
+
+
 def test_an_answer_of_another_size_or_function_ends_the_connection() -> None:
     with pytest.raises(DeviceError, match=r"6 bytes to function 3, expected 4 to function 3"):
         fetched(lambda request: words(numbered(request), [5, 6, 7]))

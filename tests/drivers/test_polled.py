@@ -268,6 +268,21 @@ def test_a_reading_that_takes_longer_than_the_watchdog_trips_before_anything_is_
     assert all((volts == 0.0).all() for _, volts in module.written[before:])
 
 
+def test_after_a_silence_zero_is_written_before_anything_is_read() -> None:
+    driver, module, clock = started()
+    driver.apply([OutputLaw(bias=1.0, limit=2.0), OFF])
+    driver.read_block()
+    clock.pass_(0.6)
+    module.before_read = raising(ConnectionResetError("reset"))
+    before = len(module.written)
+    with pytest.raises(DeviceLost):
+        driver.read_block()
+    at, volts = module.written[before]
+    assert at == clock.now
+    assert (volts == 0.0).all()
+    assert driver.trip_cause() is not None
+
+
 def test_the_modules_own_shorter_watchdog_is_what_counts() -> None:
     driver, _, clock = started(watchdog=0.1)
     driver.read_block()
