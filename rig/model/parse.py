@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from rig.model.quantity import FROM_FILE
+from rig.model.quantity import FROM_FILE, UnitError, parse_quantity
 
 Model = TypeVar("Model", bound=BaseModel)
 Path = tuple[str | int, ...]
@@ -120,3 +120,13 @@ def validate_model(model: type[Model], data: Any, lines: dict[Path, int], source
         raise InputError(_first_problem(error, lines, source, model)) from error
     except RecursionError as error:
         raise InputError(f"{source}:1: refers to itself (a YAML alias?)") from error
+
+
+def read_quantity(text: Any, si: str, source: str) -> float:
+    """Read one quantity of a file in the SI unit `si`; raises InputError prefixed by `source`."""
+    try:
+        if not isinstance(text, str):
+            raise UnitError(f"{text!r} has no unit; write one beside the number, like '1 {si}'")
+        return parse_quantity(text, si)
+    except UnitError as error:
+        raise InputError(f"{source}: {error}") from error
