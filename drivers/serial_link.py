@@ -20,7 +20,7 @@ from drivers.serial_transport import Transport
 from rig.model import registers as reg
 from rig.model.registers import Refusal
 from rig.model.wire import serial_messages as msg
-from rig.model.wire.frames import FRAME_VERSION, Frame, FrameDecoder, encode_frame
+from rig.model.wire.frames import FRAME_VERSION, FrameDecoder, WireFrame, encode_frame
 from rig.model.wire.serial_messages import ANSWER, Message
 
 logger = logging.getLogger(__name__)
@@ -54,10 +54,10 @@ class SerialLink:
         self._decoder = FrameDecoder()
         self._session = 0
         self._number = 0
-        self._answers: dict[int, Frame] = {}
+        self._answers: dict[int, WireFrame] = {}
         self._damaged = self._received = 0  # when the line was opened
         self._whole = 0
-        self.blocks: deque[Frame] = deque(maxlen=4 * msg.WINDOW)
+        self.blocks: deque[WireFrame] = deque(maxlen=4 * msg.WINDOW)
         self.late = 0  # answers and blocks of earlier requests, streams and sessions
 
     @property
@@ -111,7 +111,7 @@ class SerialLink:
         """
         self._number = self.next_number()
         self._answers.clear()
-        wire = encode_frame(Frame(kind, self._number, self._session, payload))
+        wire = encode_frame(WireFrame(kind, self._number, self._session, payload))
         end = self._clock() + self._patience
         while (now := self._clock()) < end:
             self._transport.write(wire)
@@ -122,14 +122,14 @@ class SerialLink:
 
     def note(self, kind: Message, number: int, payload: bytes) -> None:
         """Send a message that is not answered; raises DeviceLost when the port has gone."""
-        self._transport.write(encode_frame(Frame(kind, number, self._session, payload)))
+        self._transport.write(encode_frame(WireFrame(kind, number, self._session, payload)))
 
     def listen(self, patience: float) -> None:
         """Take in what is waiting, or what comes within `patience` [s]; raises DeviceLost."""
         for frame in self._decoder.feed(self._transport.read(patience)):
             self._sort(frame)
 
-    def _awaited(self, end: float) -> Frame | None:
+    def _awaited(self, end: float) -> WireFrame | None:
         while self._number not in self._answers:
             left = end - self._clock()
             if left <= 0.0:
@@ -137,7 +137,7 @@ class SerialLink:
             self.listen(left)
         return self._answers.pop(self._number)
 
-    def _sort(self, frame: Frame) -> None:
+    def _sort(self, frame: WireFrame) -> None:
         self._whole += 1
         if frame.session != self._session:
             self.late += 1
@@ -149,7 +149,7 @@ class SerialLink:
             self.late += 1
             logger.debug("late answer to request %d dropped", frame.number)
 
-    def _checked(self, answer: Frame, kind: Message, size: int, about: str) -> bytes:
+    def _checked(self, answer: WireFrame, kind: Message, size: int, about: str) -> bytes:
         about = about or kind.name.lower()
         if answer.version != FRAME_VERSION:
             raise DeviceError(

@@ -15,7 +15,7 @@ from analysis.identify.result import Identification
 from analysis.report import format as fm
 from analysis.report import paper
 from analysis.report.plots.interval_plots import relative_half_width
-from analysis.report.tables import Table4, worst_fit
+from analysis.report.tables import FitTable, worst_fit
 from analysis.simulation.model import Estimate
 from analysis.simulation.validate import RecordValidation
 from rig.model.parameters import parameter_names
@@ -175,7 +175,7 @@ def tiles(
     identification: Identification,
     validation: Sequence[RecordValidation],
     truth: Mapping[str, float] | None,
-    table4: Table4,
+    table4: FitTable,
 ) -> list[Tile]:
     """Return the headline's figures."""
     estimates = identification.estimates

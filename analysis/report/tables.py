@@ -90,7 +90,7 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Table4Row:
+class ComparedFit:
     """One joint of one kind of record against one column of the paper's Table IV."""
 
     record: str
@@ -101,21 +101,21 @@ class Table4Row:
 
 
 @dataclass(frozen=True)
-class Table4:
+class FitTable:
     """The paper's Table IV: rows, how many cells were compared, how many lie above."""
 
-    rows: tuple[Table4Row, ...]
+    rows: tuple[ComparedFit, ...]
     compared: int
     above: int
 
 
-def table_iv(rig_name: str, validation: Sequence[RecordValidation]) -> Table4:
+def table_iv(rig_name: str, validation: Sequence[RecordValidation]) -> FitTable:
     """Set the FIT of the records named as the paper's columns beside its numbers.
 
     Repeats of a record are averaged; empty for another rig or without such records.
     """
     if rig_name != paper.RIG:
-        return Table4((), 0, 0)
+        return FitTable((), 0, 0)
     rows = []
     compared = above = 0
     for column in paper.TABLE_IV:
@@ -132,8 +132,10 @@ def table_iv(rig_name: str, validation: Sequence[RecordValidation]) -> Table4:
             compared += bool(theirs is not None)
             above += mark == ABOVE
             cells.append(Cell(fm.fit(ours), fm.fit(theirs), mark))
-        rows.append(Table4Row(column.step, column.joint, len(results), tuple(cells), column.figure))
-    return Table4(tuple(rows), compared, above)
+        rows.append(
+            ComparedFit(column.step, column.joint, len(results), tuple(cells), column.figure)
+        )
+    return FitTable(tuple(rows), compared, above)
 
 
 def mark_of(ours: float, theirs: float) -> str:
@@ -142,7 +144,7 @@ def mark_of(ours: float, theirs: float) -> str:
 
 
 @dataclass(frozen=True)
-class Table3Row:
+class ComparedParameter:
     """One parameter against the paper's Table III, ready to be read."""
 
     name: str
@@ -157,7 +159,7 @@ class Table3Row:
 
 def table_iii(
     rig_name: str, identification: Identification, scatter: Mapping[str, Scatter]
-) -> list[Table3Row]:
+) -> list[ComparedParameter]:
     """Set the parameters beside the paper's Table III; empty for another rig."""
     if rig_name != paper.RIG:
         return []
@@ -172,7 +174,7 @@ def table_iii(
         deviation = 100 * (estimate.value / theirs.mean - 1)
         mark = mark_of(ours.rsd, theirs.rsd) if ours and math.isfinite(ours.rsd) else ""
         out.append(
-            Table3Row(
+            ComparedParameter(
                 name, unit.text, fm.significant(estimate.value, 4, unit.scale),
                 tuple(fm.significant(v, 4, unit.scale) for v in spread),
                 fm.column_percent(ours.rsd if ours else None),

@@ -17,7 +17,7 @@ from hil_sim.device.register_map import RegisterMap
 from rig.model import registers as reg
 from rig.model.registers import BlockHeader, Refusal, Register, Status
 from rig.model.wire import serial_messages as msg
-from rig.model.wire.frames import FRAME_VERSION, Frame, FrameDecoder, encode_frame
+from rig.model.wire.frames import FRAME_VERSION, FrameDecoder, WireFrame, encode_frame
 from rig.model.wire.serial_messages import ANSWER, FOR_ANYBODY, WINDOW, Message
 
 logger = logging.getLogger(__name__)
@@ -77,7 +77,7 @@ class SerialSession:
         backlog = len(device.queue) - place - 1
         header = BlockHeader(block.sequence, block.tick & _U32, status, backlog)
         payload = msg.pack_block(msg.PushedBlock(oldest.sequence, header, block.samples))
-        return encode_frame(Frame(Message.BLOCK, self._stream, host.session, payload))
+        return encode_frame(WireFrame(Message.BLOCK, self._stream, host.session, payload))
 
     def ended(self) -> None:
         """Note that nobody holds the other end of the line any more."""
@@ -88,7 +88,7 @@ class SerialSession:
 
     # -- requests ---------------------------------------------------------------------------
 
-    def _answer(self, frame: Frame) -> bytes:
+    def _answer(self, frame: WireFrame) -> bytes:
         if frame.type == Message.ALIVE_NOTE:
             self._alive(frame)
             return b""
@@ -105,19 +105,19 @@ class SerialSession:
             if 0 < age < _LATE:
                 host.number, host.answer = frame.number, b""
         try:
-            answer = Frame(
+            answer = WireFrame(
                 frame.type | ANSWER, frame.number, frame.session, self._carry_out(frame, known)
             )
         except Refused as refused:
             payload = msg.pack_refusal(msg.DeviceRefusal(refused.reason, refused.joint))
-            answer = Frame(Message.REFUSED, frame.number, frame.session, payload)
+            answer = WireFrame(Message.REFUSED, frame.number, frame.session, payload)
         wire = encode_frame(answer)
         host = self._host
         if host is not None and host.session == frame.session and frame.type not in FOR_ANYBODY:
             host.answer = wire
         return wire
 
-    def _carry_out(self, frame: Frame, known: bool) -> bytes:
+    def _carry_out(self, frame: WireFrame, known: bool) -> bytes:
         if frame.version != FRAME_VERSION:
             raise Refused(Refusal.NO_SUCH_REGISTER)
         if frame.type in FOR_ANYBODY:
@@ -139,7 +139,7 @@ class SerialSession:
         first, end = reg.IDENTITY_SPAN if kind == Message.IDENTIFY else reg.STATUS_SPAN
         return self._registers.read(None, first, end - first)
 
-    def _open(self, frame: Frame, known: bool) -> bytes:
+    def _open(self, frame: WireFrame, known: bool) -> bytes:
         _sized(frame.payload, 2, 2)
         host = self._host if known and self._host else _Host(frame.session, frame.number)
         self._device.take_control(host)
@@ -195,7 +195,7 @@ class SerialSession:
 
     # -- the stream -------------------------------------------------------------------------
 
-    def _alive(self, frame: Frame) -> None:
+    def _alive(self, frame: WireFrame) -> None:
         host, device = self._host, self._device
         if host is None or frame.session != host.session or frame.version != FRAME_VERSION:
             return

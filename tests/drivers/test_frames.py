@@ -12,15 +12,15 @@ from hypothesis import strategies as st
 from rig.model.wire.frames import (
     MAX_ENCODED,
     MAX_PAYLOAD,
-    Frame,
     FrameDecoder,
+    WireFrame,
     encode_frame,
 )
 
 FUZZED = 120_000
 
 frames = st.builds(
-    Frame,
+    WireFrame,
     type=st.integers(0, 0xFF),
     number=st.integers(0, 0xFFFF),
     session=st.integers(0, 0xFFFF_FFFF),
@@ -44,7 +44,7 @@ def unstuffed(data: bytes) -> bytes:
 
 
 @given(frames)
-def test_a_frame_stands_on_the_wire_as_documented(frame: Frame) -> None:
+def test_a_frame_stands_on_the_wire_as_documented(frame: WireFrame) -> None:
     wire = encode_frame(frame)
     assert (wire[0], wire[-1], wire.count(0)) == (0, 0, 2)
     body = unstuffed(wire[1:-1])
@@ -57,7 +57,7 @@ def test_a_frame_stands_on_the_wire_as_documented(frame: Frame) -> None:
 
 @given(st.lists(frames, max_size=6), st.lists(st.integers(1, 300), max_size=20), st.binary())
 def test_frames_come_back_however_the_bytes_are_cut(
-    sent: list[Frame], cuts: list[int], noise: bytes
+    sent: list[WireFrame], cuts: list[int], noise: bytes
 ) -> None:
     wire = noise.replace(b"\0", b"") + b"".join(map(encode_frame, sent))
     decoder, found = FrameDecoder(), []
@@ -69,7 +69,7 @@ def test_frames_come_back_however_the_bytes_are_cut(
 
 
 @given(frames, st.data())
-def test_flipped_bits_never_make_another_frame(frame: Frame, data: st.DataObject) -> None:
+def test_flipped_bits_never_make_another_frame(frame: WireFrame, data: st.DataObject) -> None:
     wire = bytearray(encode_frame(frame))
     for _ in range(data.draw(st.integers(1, 8))):
         bit = data.draw(st.integers(0, 8 * len(wire) - 1))
@@ -83,7 +83,7 @@ def test_noise_is_no_frame_and_takes_no_memory(noise: list[bytes]) -> None:
     for data in noise:
         assert decoder.feed(data) == []
         assert len(decoder._begun) <= MAX_ENCODED
-    whole = Frame(1, 2, 3, b"after noise")
+    whole = WireFrame(1, 2, 3, b"after noise")
     assert decoder.feed(encode_frame(whole)) == [whole]
     assert decoder.received == sum(map(len, noise)) + len(encode_frame(whole))
 
@@ -93,25 +93,25 @@ def test_a_line_without_zeros_counts_as_one_damaged_frame() -> None:
     for _ in range(1000):
         assert decoder.feed(b"\x55" * 100) == []
     assert decoder.damaged == 1
-    whole = encode_frame(Frame(1, 2, 3))
+    whole = encode_frame(WireFrame(1, 2, 3))
     assert len(decoder.feed(whole + whole)) == 2
     assert decoder.damaged == 1
 
 
 def test_what_does_not_fit_is_not_sent() -> None:
     with pytest.raises(ValueError, match="253 bytes; 252"):
-        encode_frame(Frame(1, 2, 3, bytes(253)))
+        encode_frame(WireFrame(1, 2, 3, bytes(253)))
 
 
 def test_a_torn_frame_is_counted_and_the_next_one_is_found() -> None:
     decoder = FrameDecoder()
-    wire = encode_frame(Frame(1, 2, 3, b"abcdef"))
+    wire = encode_frame(WireFrame(1, 2, 3, b"abcdef"))
     assert decoder.feed(wire[:10]) == []
-    assert decoder.feed(wire) == [Frame(1, 2, 3, b"abcdef")]
+    assert decoder.feed(wire) == [WireFrame(1, 2, 3, b"abcdef")]
     assert decoder.damaged == 1
     decoder.feed(wire[:10])
     decoder.reset()
-    assert decoder.feed(wire) == [Frame(1, 2, 3, b"abcdef")]
+    assert decoder.feed(wire) == [WireFrame(1, 2, 3, b"abcdef")]
     assert decoder.damaged == 1
 
 
@@ -121,7 +121,7 @@ def test_damaged_frames_by_the_hundred_thousand() -> None:
     decoder, sent, found, whole = FrameDecoder(), set(), [], 0
     for index in range(FUZZED):
         payload = rng.randbytes(rng.randrange(0, 40))
-        frame = Frame(rng.randrange(256), index & 0xFFFF, index, payload)
+        frame = WireFrame(rng.randrange(256), index & 0xFFFF, index, payload)
         sent.add(frame)
         wire = bytearray(encode_frame(frame))
         fault = rng.randrange(8)

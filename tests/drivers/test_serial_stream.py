@@ -21,7 +21,7 @@ from rig.model.parts import Wire
 from rig.model.registers import TripCause
 from rig.model.rig import Rig
 from rig.model.wire import serial_messages as msg
-from rig.model.wire.frames import Frame, FrameDecoder, encode_frame
+from rig.model.wire.frames import FrameDecoder, WireFrame, encode_frame
 from rig.model.wire.serial_messages import Message
 from tests.drivers.firmware import firmware_command
 from tests.drivers.serial_lines import BadLine, Loop, port_of, simulator_command
@@ -299,7 +299,7 @@ def test_a_second_host_cannot_take_over_but_can_make_it_safe(
 def test_a_bad_request_is_refused_with_its_reason(
     driver: SerialStreamDriver, kind: int, payload: bytes, says: str
 ) -> None:
-    frame = Frame(kind, driver._link.next_number(), driver._link._session, payload)
+    frame = WireFrame(kind, driver._link.next_number(), driver._link._session, payload)
     answer = bytes_answered(driver, frame)
     assert (answer.type, answer.number, answer.session) == (
         Message.REFUSED,
@@ -311,12 +311,12 @@ def test_a_bad_request_is_refused_with_its_reason(
 
 
 def test_another_version_is_named(driver: SerialStreamDriver) -> None:
-    frame = Frame(Message.IDENTIFY, 1, 7, b"", version=2)
+    frame = WireFrame(Message.IDENTIFY, 1, 7, b"", version=2)
     answer = bytes_answered(driver, frame)
     assert (answer.type, answer.version, answer.session) == (Message.REFUSED, 1, 7)
 
 
-def bytes_answered(driver: SerialStreamDriver, frame: Frame) -> Frame:
+def bytes_answered(driver: SerialStreamDriver, frame: WireFrame) -> WireFrame:
     """Send a frame past the driver, return what the device answers to it."""
     transport, decoder = driver._link._transport, FrameDecoder()
     transport.write(encode_frame(frame))
@@ -333,7 +333,7 @@ def test_a_request_that_comes_twice_is_carried_out_once(driver: SerialStreamDriv
     driver.start()
     link = driver._link
     driver.apply(DRIVING)
-    apply = Frame(
+    apply = WireFrame(
         Message.APPLY,
         link._number,
         link._session,
@@ -357,10 +357,10 @@ def test_another_session_is_refused_what_needs_control(driver: SerialStreamDrive
         (Message.CLOSE, b""),
         (Message.RESET, b"RS"),
     ):
-        answer = bytes_answered(driver, Frame(kind, 40_000, session, payload))
+        answer = bytes_answered(driver, WireFrame(kind, 40_000, session, payload))
         assert answer.type == Message.REFUSED
         assert msg.unpack_refusal(answer.payload).reason == reg.Refusal.NOT_IN_CONTROL
-    opened = bytes_answered(driver, Frame(Message.OPEN, 40_001, session, b"\x01\x00"))
+    opened = bytes_answered(driver, WireFrame(Message.OPEN, 40_001, session, b"\x01\x00"))
     assert msg.unpack_refusal(opened.payload).reason == reg.Refusal.NOT_IN_CONTROL
 
 
@@ -374,7 +374,7 @@ def test_noise_and_nonsense_leave_a_device_that_answers(port: str) -> None:
         size = sizes.get(kind, 0) if rng.random() < 0.7 else rng.randrange(253)
         payload = rng.randbytes(size) if rng.random() < 0.7 else bytes(size)
         session = driver._link._session if rng.random() < 0.8 else rng.getrandbits(32)
-        wire = bytearray(encode_frame(Frame(kind, number + 10, session, payload)))
+        wire = bytearray(encode_frame(WireFrame(kind, number + 10, session, payload)))
         if rng.random() < 0.3:
             wire[rng.randrange(len(wire))] ^= 1 << rng.randrange(8)
         if rng.random() < 0.1:

@@ -28,7 +28,7 @@ MAX_ENCODED: Final = _MAX_BODY + -(-_MAX_BODY // 254)  # between the zeros: 266 
 
 
 @dataclass(frozen=True)
-class Frame:
+class WireFrame:
     """One message: what it is, which request it is or answers, whose session it belongs to."""
 
     type: int
@@ -38,7 +38,7 @@ class Frame:
     version: int = FRAME_VERSION
 
 
-def encode_frame(frame: Frame) -> bytes:
+def encode_frame(frame: WireFrame) -> bytes:
     """Return the bytes of a frame with the zeros around it.
 
     Raises ValueError for a payload above `MAX_PAYLOAD` bytes, struct.error for a number that
@@ -64,7 +64,7 @@ class FrameDecoder:
         self._begun = b""
         self._skipping = False  # in something too long for a frame, up to the next zero
 
-    def feed(self, data: bytes) -> list[Frame]:
+    def feed(self, data: bytes) -> list[WireFrame]:
         """Return the frames that `data` completes; what is damaged is counted and left out."""
         self.received += len(data)
         *ended, begun = (self._begun + data).split(DELIMITER)
@@ -90,7 +90,7 @@ class FrameDecoder:
         self._skipping = False
 
 
-def _decode(piece: bytes) -> Frame | None:
+def _decode(piece: bytes) -> WireFrame | None:
     if len(piece) > MAX_ENCODED:
         return None
     try:
@@ -103,4 +103,4 @@ def _decode(piece: bytes) -> Frame | None:
     if _CHECK.pack(zlib.crc32(content)) != check:
         return None
     version, kind, number, session = _HEADER.unpack_from(content)
-    return Frame(kind, number, session, content[_HEADER.size :], version)
+    return WireFrame(kind, number, session, content[_HEADER.size :], version)
