@@ -27,8 +27,9 @@ def validate(
     from analysis.simulation.validate import to_json
     from analysis.simulation.validate import validate as validate_model
     from rig.cli.render import validation_text
-    from rig.runs.store import load_run
+    from rig.runs.store import load_run, refuse_repeated
 
+    refuse_repeated(runs)
     results = validate_model(load_model(model), [load_run(folder) for folder in runs])
     write_json(json, to_json(results))
     if json != Path("-"):

@@ -17,7 +17,7 @@ from analysis.trace.loop_rounds import Round, rounds_json
 from protocols.design.check import check
 from protocols.files import library
 from protocols.files.plan import resolve
-from rig.cli import looping
+from rig.cli import experiment_loop
 from rig.cli.experiment_loop import DECLINED, FLOOR, NOTHING, REFUSED, ROUNDS, Loop, Wanted
 from rig.cli.trace_text import story_text
 from rig.runs.rigs import load_rig
@@ -34,7 +34,7 @@ def air(tmp_path_factory: pytest.TempPathFactory) -> Inside:
     """A bench with 1 % of air in its oil, first moved by a sine; few candidates, to be quick."""
     few = functools.partial(trace, effects=catalogue(load_rig(RIG), FEW))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(looping, "trace", few)
+        patch.setattr(experiment_loop, "trace", few)
         return looped(
             tmp_path_factory.mktemp("air"), SINE, "{name: entrained_air, fraction: 1 %}",
             closer=True,
