@@ -74,7 +74,7 @@ def judge(
         p = inference.p_value(rest.fit.energy - winner.fit.energy, null)
         errors = inference.spread(train_data, winner.fit, used, values)
         share, others = steady[key]
-        differing = invariance(train_data, winner.fit, used, _joint(used.term))
+        differing = invariance(train_data, winner.fit, used, errors, _joint(used.term))
         tied = [r for r in rivals if r.tied]
         twins = [Rival(name, where, 1.0, 1.0, True) for name, where in used.term.twins()]
         gates = (
@@ -262,10 +262,13 @@ def _parameters(
     }
 
 
-def _differences(differing: Sequence[tuple[str, float]]) -> str:
+def _differences(differing: Sequence[tuple[str, str, float, float]]) -> str:
     if not differing:
         return "the same in every step, half, direction and speed"
-    return "; ".join(f"{times:.2g} times its size in {label}" for label, times in differing[:3])
+    return "; ".join(
+        f"{name} = {value:.3g} ± {error:.2g} in {label}"
+        for label, name, value, error in differing[:3]
+    )
 
 
 def _chosen(share: float, others: Mapping[str, int], tied: bool) -> str:

@@ -1,9 +1,8 @@
 """Invariance: a cause has the same size everywhere; a look-alike has another in every corner.
 
-An effect's sizes are solved again on parts of the rows: each step, each half of the records, each
-direction of motion, fast and slow, its form as it was found. A contribution that moves by more than
-noise, than what a catalogue's simpler form may cause, and than what a larger effect's form may
-spill onto it, is none.
+The tangent of a fitted set is solved again on parts of the rows: each step, each half of the
+records, each direction of motion, fast and slow. A size that moves by more than noise, than what a
+catalogue's simpler form may cause, and than what a larger effect's form may spill onto it, is none.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from analysis.effects.base import Effect, shapes_of
 from analysis.terms.base import Used
 from analysis.trace.data.noise_floor import STATED
 from analysis.trace.data.regression_data import RegressionData
-from analysis.trace.judge.inference import blocks, others
+from analysis.trace.judge.inference import EffectErrors, blocks, others
 from analysis.trace.search.linear_fit import FORM, orthonormal
 from analysis.trace.search.refinement import ExactFit, jacobian, table
 
@@ -24,8 +23,7 @@ Array = NDArray[np.float64]
 TOLERANCE = 0.2  # relative disagreement that a catalogue's simpler form may cause
 DEVIATIONS = 3.5
 TELLS = 0.05  # of a column's energy off the others': a subset with less says nothing of a size
-POWER = 0.25  # a subset judges a size that it knows this well, relative
-HIDDEN = 0.1  # of a contribution must stand out of the model's own columns
+POWER = 0.25  # a subset judges a parameter that it knows this well, relative
 
 
 def subsets(train_data: RegressionData, joint: int | None) -> dict[str, Array]:
@@ -70,11 +68,10 @@ def _unmeasured(train_data: RegressionData) -> NDArray[np.int64] | None:
     return numbers
 
 
-def _clustered(basis: Array, residual: Array, clusters: NDArray[np.int64]) -> float:
-    """Return the root of the sum over blocks of (column . residual)^2, largest of the columns."""
+def _clustered(own: Array, residual: Array, clusters: NDArray[np.int64]) -> float:
+    """Return the root of the sum over blocks of (own . left)^2."""
     _, index = np.unique(clusters, return_inverse=True)
-    sums = [np.bincount(index, weights=column * residual) for column in basis.T]
-    return max((float(np.linalg.norm(s)) for s in sums), default=0.0)
+    return float(np.linalg.norm(np.bincount(index, weights=own * residual)))
 
 
 def _larger(model: ExactFit, train_data: RegressionData, used: Used, mask: Array) -> float:
@@ -95,60 +92,59 @@ def _larger(model: ExactFit, train_data: RegressionData, used: Used, mask: Array
     return most if most > mine else 0.0
 
 
-def _contribution(train_data: RegressionData, model: ExactFit, used: Used) -> Array:
-    """Return what an effect adds to the model's side of the rows (M,), whitened."""
-    rig = train_data.rig
-    neutral = tuple(
-        value if s.neutral is None else s.neutral
-        for s, value in zip(shapes_of(rig, used), used.shape, strict=True)
-    )
-    terms = tuple(Used(u.term, neutral) if u is used else u for u in model.terms)
-    shared = {c.parameter for u in model.terms if u is not used for c in u.term.coefficients(rig)}
-    own = {c.parameter for c in used.term.coefficients(rig)} - shared
-    beta = {**model.beta, **dict.fromkeys(own, 0.0)}
-    return np.asarray(table(train_data, terms).residual(beta) - model.residual)
+def _alone(columns: Array, k: int) -> Array:
+    """Return column k (m,) without what the others say."""
+    rest, own = np.delete(columns, k, axis=1), columns[:, k]
+    if not rest.shape[1]:
+        return own
+    Q = orthonormal(rest)
+    return np.asarray(own - Q @ (Q.T @ own))
 
 
 def invariance(
-    train_data: RegressionData, model: ExactFit, used: Used, joint: int | None
-) -> list[tuple[str, float]]:
-    """Return where an effect is not of the size it has over all rows: (subset, size there over it).
-
-    What the effect's sizes, all together, would change in its contribution to a subset's rows is
-    held against that contribution: two numbers that only their product decides are judged by it.
-    """
+    train_data: RegressionData, model: ExactFit, used: Used, value: EffectErrors, joint: int | None
+) -> list[tuple[str, str, float, float]]:
+    """Return where a parameter disagrees with itself: (subset, parameter, value there, error)."""
     names, J = jacobian(train_data, model, used)
     base = others(train_data, model, names)
+    residual = model.residual
     # A shape such as the presliding distance is the form's, not the effect's size.
     sizes = {c.parameter for c in used.term.coefficients(train_data.rig)}
     sizes |= {s.parameter for s in shapes_of(train_data.rig, used) if s.neutral is not None}
-    own = J[:, [k for k, name in enumerate(names) if name in sizes]]
-    contribution = _contribution(train_data, model, used)
-    whole = float(np.linalg.norm(_off(base, contribution)))
-    clusters = _unmeasured(train_data)
+    units = {c.parameter: c.unit for c in used.term.coefficients(train_data.rig)}
+    units |= {s.parameter: s.unit for s in shapes_of(train_data.rig, used)}
+    nothing = {s.parameter: s.neutral or 0.0 for s in shapes_of(train_data.rig, used)}
+    neutral = np.array([nothing.get(n, 0.0) for n in names])
     out = []
+    clusters = _unmeasured(train_data)
+    J_all = J - base @ (base.T @ J)
+    whole = [float(np.sum(_alone(J_all, k) ** 2)) for k in range(len(names))]
     for label, mask in subsets(train_data, joint).items():
+        if not mask.any():
+            continue
         B = orthonormal(base[mask])
-        here = _off(B, contribution[mask])
-        size = float(np.linalg.norm(here))
-        # What hardly acts there, or not beside the model's own parameters, tells of no size.
-        if size < max(HIDDEN * np.linalg.norm(contribution[mask]), np.sqrt(TELLS) * whole):
-            continue
-        Q = orthonormal(_off(B, own[mask]))
-        left = _off(B, model.residual[mask])
-        change = Q @ (Q.T @ left)
-        error = 1.0
-        if clusters is not None:
-            error = max(error, _clustered(Q, left - change, clusters[mask]))
-        if error > POWER * size:
-            continue
-        spill = np.sqrt(FORM * _larger(model, train_data, used, mask))
-        allowed = spill + float(np.hypot(DEVIATIONS * error, TOLERANCE * size))
-        if float(np.linalg.norm(change)) > allowed:
-            out.append((label, 1.0 + float(here @ change) / size**2))
+        J_s = J[mask] - B @ (B.T @ J[mask])
+        for k, name in enumerate(names):
+            if name not in sizes:
+                continue
+            if np.linalg.norm(J_s[:, k]) < 0.1 * np.linalg.norm(J[mask][:, k]):
+                continue
+            own = _alone(J_s, k)
+            size = float(own @ own)
+            # What hardly acts there tells its form's tail, not its size.
+            if size < TELLS * whole[k] or size <= 0 or not np.isfinite(value.value[k]):
+                continue
+            shift = float(own @ residual[mask]) / size
+            error = 1.0 / np.sqrt(size)
+            if clusters is not None:
+                rest_of = residual[mask] - B @ (B.T @ residual[mask]) - own * shift
+                error = max(error, _clustered(own, rest_of, clusters[mask]) / size)
+            spill = np.sqrt(FORM * _larger(model, train_data, used, mask) / size)
+            # Two levels of one effect are judged by the larger: 2 N beside 100 N is a detail.
+            alike = [j for j, n in enumerate(names) if n in sizes and units[n] == units[name]]
+            full = float(np.max(np.abs(value.value[alike] - neutral[alike])))
+            if error > POWER * full:
+                continue
+            if abs(shift) > spill + DEVIATIONS * np.hypot(error, TOLERANCE / DEVIATIONS * full):
+                out.append((label, name, float(value.value[k]) + shift, error))
     return out
-
-
-def _off(basis: Array, columns: Array) -> Array:
-    """Return columns without their part in the span of an orthonormal basis."""
-    return np.asarray(columns - basis @ (basis.T @ columns))
