@@ -52,6 +52,7 @@ from analysis.terms.base import (
 )
 from rig.model.rig import Rig
 
+BREAKAWAY: Final = 0.1  # of the sliding level: less is the form of the contact, not a breakaway
 LEAST_LEVEL: Final = 1e-6  # of the breakaway, where it has long vanished: no division by zero
 
 
@@ -289,9 +290,15 @@ class StribeckFriction(Friction):
         return np.array([self.joint, values[f"Fs{self.joint + 1}"], falling, distance, speed])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Refuse a breakaway below Coulomb's level, too much of it, and a speed at its bounds."""
+        """Refuse a breakaway below Coulomb's level, too much of it, and a speed at its bounds.
+
+        One of less than `BREAKAWAY` of Coulomb's level beside it is a detail of the contact.
+        """
         name = f"Fs{self.joint + 1}"
-        found = beyond(name, values[name], "N", force_limit(rig, self.joint))
+        force, level = values[name], values.get(f"Fc{self.joint + 1}", 0.0)
+        if 0.0 < force < BREAKAWAY * level:
+            return f"{name} = {force:.3g} N is {force / level:.1%} of the sliding level"
+        found = beyond(name, force, "N", force_limit(rig, self.joint))
         return found or Effect.outside(self, rig, shape[:1])
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -238,7 +240,7 @@ def test_sliding_and_sticking_follow_an_independent_integrator() -> None:
 
     def rates(at: float, y: np.ndarray) -> list[float]:
         force = 35.15065 * np.interp(at, t, u[:, 0])
-        dry = SLIDE["Fc1"] * np.tanh(y[1] / 1e-4)
+        dry = SLIDE["Fc1"] * math.erf(y[1] / 1e-4)
         return [y[1], (force - SLIDE["Fv1"] * y[1] - dry - SLIDE["offset1"]) / SLIDE["M1"]]
 
     other = solve_ivp(rates, (0, t[-1]), [0, 0], "Radau", t, rtol=1e-8, atol=1e-10, max_step=2e-3)
