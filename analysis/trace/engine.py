@@ -49,6 +49,10 @@ log = logging.getLogger(__name__)
 
 # The other estimators add small faults of sensors of their own accord: here they are candidates.
 PLAIN = "plain"
+# Relative change of a baseline coefficient from which an effect matters to the user though what it
+# explains is within the band: beyond it a parameter would be wrong by more than its use allows.
+MATERIAL = 0.1
+SHOWN = 30.0  # whitened length of a coefficient's rows, the noise of one row being 1
 LEAST_ROWS = 40  # of an equation's rows in one record
 ELSEWHERE = (
     "the training records are met to within the noise, the held-out ones are not: train on "
@@ -234,8 +238,10 @@ def _named(
         more = hypotheses.closer(winner, {r.equation for r in rest})
         wider = gates.judge(hypotheses, more, holdout_data, rng) if more else ()
         later = left_over(hypotheses, more, holdout_data) if more else rest
-        # What speaks against nothing is named if nothing else fits as well: else it is left alone.
+        # What speaks against nothing is named if nothing else fits as well, or if it would move a
+        # parameter of the baseline by much: else it is left alone.
         needed = any(r.veto for r in rest) or _tied(wider) == _tied(found)
+        needed = needed or (more is not None and _moved(hypotheses, winner, more) > MATERIAL)
         stand = needed and all(map(gates.stands, wider))
         if more is None or len(later) >= len(rest) or not stand:
             break
@@ -243,6 +249,23 @@ def _named(
     if any(r.veto for r in rest):
         return (*found, *refused), winner, UNEXPLAINED, rest
     return found, winner, CONFOUNDED if _tied(found) else EXPLAINED, rest
+
+
+def _moved(hypotheses: HypothesisSet, winner: Hypothesis, more: Hypothesis) -> float:
+    """Return the largest relative change of a baseline coefficient between two sets of effects.
+
+    Of coefficients whose rows stand out of the noise (`SHOWN` times): others are what they may be.
+    """
+    before, after = winner.fit.beta, more.fit.beta
+    sizes = np.linalg.norm(hypotheses.stage.base, axis=0)
+    return max(
+        (
+            abs(before[name] / after[name] - 1.0)
+            for name, size in zip(hypotheses.stage.names, sizes, strict=True)
+            if name in before and abs(after.get(name, 0.0)) * size > SHOWN
+        ),
+        default=0.0,
+    )
 
 
 def _tied(found: Sequence[Found]) -> bool:
