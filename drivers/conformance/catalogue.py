@@ -1,0 +1,79 @@
+"""The list of checks: each is a function of a `Trial` with a docstring, found under its name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+from drivers.conformance.subject import Bench, Capabilities
+from drivers.conformance.trial import Trial
+
+Body = Callable[[Trial], None]
+
+OUTPUTS: Final = "outputs"
+TWO_JOINTS: Final = "two joints"
+PROBE: Final = "probe of the outputs"
+CUT: Final = "cut of the link"
+SILENCE: Final = "silence of the host"
+LATCH: Final = "latched trips"
+FAULTS: Final = "faults of the wire"
+LOSS: Final = "a fault that loses the device"
+IDENTITY: Final = "refusal of other rigs"
+SATURATION: Final = "a sensor at the end of its range"
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing that every driver must do.
+
+    `needs` are the capabilities without which it is skipped; `moves` says whether it asks the
+    device for outputs other than zero.
+    """
+
+    name: str
+    says: str
+    needs: tuple[str, ...]
+    moves: bool
+    body: Body
+
+
+_found: list[Check] = []
+
+
+def described(body: Body) -> str:
+    """Return a check's docstring in one line."""
+    return " ".join((body.__doc__ or "").split())
+
+
+def check(*needs: str, moves: bool = True) -> Callable[[Body], Body]:
+    """Enter a function into the catalogue under its name, with its docstring as description."""
+
+    def enter(body: Body) -> Body:
+        wanted = (OUTPUTS, *needs) if moves else needs
+        _found.append(Check(body.__name__, described(body), wanted, moves, body))
+        return body
+
+    return enter
+
+
+def catalogue() -> tuple[Check, ...]:
+    """Return every check whose module was imported."""
+    return tuple(_found)
+
+
+def lacking(check: Check, bench: Bench, claims: Capabilities) -> str | None:
+    """Return the first capability that a check needs and a bench has not, or None."""
+    has = {
+        OUTPUTS: claims.outputs,
+        TWO_JOINTS: len(bench.rig.joints) > 1,
+        PROBE: bench.outputs is not None,
+        CUT: bench.cut is not None,
+        SILENCE: bench.silence is not None,
+        LATCH: claims.latches_trips,
+        FAULTS: bench.spoil is not None and bool(bench.faults),
+        LOSS: bench.spoil is not None and bool(bench.lost),
+        IDENTITY: claims.refuses_other_rigs,
+        SATURATION: bench.saturate is not None,
+    }
+    return next((need for need in check.needs if not has[need]), None)

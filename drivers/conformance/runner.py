@@ -1,0 +1,142 @@
+"""Running the checks: named results with a reason in one line each."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+from drivers.base import DeviceError
+from drivers.conformance import fault_checks, output_checks, session_checks
+from drivers.conformance.catalogue import Check, catalogue, described, lacking
+from drivers.conformance.random_calls import Effort, try_random_calls
+from drivers.conformance.subject import Subject
+from drivers.conformance.trial import Trial
+from drivers.conformance.watched import NotConforming, Skipped
+
+logger = logging.getLogger(__name__)
+
+MODULES: Final = (session_checks, output_checks, fault_checks)
+
+
+class Verdict(StrEnum):
+    """How one check ended."""
+
+    PASSED = "passed"
+    FAILED = "failed"
+    SKIPPED = "skipped"
+
+
+@dataclass(frozen=True)
+class Result:
+    """One check's verdict; `reason` says in one line why it failed or was skipped."""
+
+    check: str
+    verdict: Verdict
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a subject did in every check that was run."""
+
+    subject: str
+    results: tuple[Result, ...]
+
+    def of(self, verdict: Verdict) -> tuple[Result, ...]:
+        """Return the results of one verdict."""
+        return tuple(result for result in self.results if result.verdict == verdict)
+
+    @property
+    def conforms(self) -> bool:
+        """Whether no check failed and at least one passed."""
+        return bool(self.of(Verdict.PASSED)) and not self.of(Verdict.FAILED)
+
+
+def random_calls(trial: Trial) -> None:
+    """Random sequences of every call, losses and faults among them: ticks rise, samples follow
+    the law, and after zero, close or an error the outputs are zero."""
+    try_random_calls(trial.subject, Effort())
+
+
+RANDOM_CALLS: Final = Check("random_calls", described(random_calls), (), True, random_calls)
+
+
+def all_checks() -> tuple[Check, ...]:
+    """Return every check: of sessions, outputs and faults; the random calls last."""
+    order = [module.__name__ for module in MODULES]
+    known = [check for check in catalogue() if check.body.__module__ in order]
+    return (*sorted(known, key=lambda check: order.index(check.body.__module__)), RANDOM_CALLS)
+
+
+def run_check(check: Check, subject: Subject, effort: Effort | None = None) -> Result:
+    """Run one check on a fresh bench of the subject; never raises for what the driver does."""
+    try:
+        if check is RANDOM_CALLS:
+            try_random_calls(subject, effort or Effort())
+        else:
+            with subject.make() as bench:
+                need = lacking(check, bench, subject.capabilities)
+                if need is not None:
+                    raise Skipped(f"not claimed: {need}")
+                _run_on(check, Trial(subject, bench))
+    except Skipped as why:
+        return Result(check.name, Verdict.SKIPPED, str(why))
+    except NotConforming as error:
+        return Result(check.name, Verdict.FAILED, _line(str(error)))
+    except DeviceError as error:
+        text = f"unexpected {type(error).__name__}: {error}"
+        return Result(check.name, Verdict.FAILED, _line(text))
+    logger.debug("%s: %s passed", subject.name, check.name)
+    return Result(check.name, Verdict.PASSED)
+
+
+def _run_on(check: Check, trial: Trial) -> None:
+    try:
+        check.body(trial)
+    except BaseException:
+        # The first failure is the one to tell; a driver that fails may fail to close as well.
+        try:
+            trial.end()
+        except NotConforming as error:
+            logger.debug("after %s: %s", check.name, error)
+        raise
+    trial.end()
+
+
+def _line(text: str) -> str:
+    return " ".join(text.split())
+
+
+def run(
+    subject: Subject,
+    *,
+    only: Sequence[str] = (),
+    outputs: bool = True,
+    effort: Effort | None = None,
+    until_failure: bool = False,
+) -> Report:
+    """Run the checks on a subject and return their results.
+
+    `only` names checks to run instead of all; `outputs` False leaves out whatever asks for
+    outputs other than zero; `until_failure` ends at the first failure. Raises ValueError for a
+    name that no check has.
+    """
+    known = {check.name: check for check in all_checks()}
+    for name in only:
+        if name not in known:
+            raise ValueError(f"no check is called {name!r}; there are: {' '.join(known)}")
+    results: list[Result] = []
+    for check in known.values():
+        if only and check.name not in only:
+            continue
+        if check.moves and not outputs:
+            why = "asks for outputs other than zero"
+            results.append(Result(check.name, Verdict.SKIPPED, why))
+            continue
+        results.append(run_check(check, subject, effort))
+        if until_failure and results[-1].verdict == Verdict.FAILED:
+            break
+    return Report(subject.name, tuple(results))

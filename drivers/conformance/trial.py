@@ -1,0 +1,184 @@
+"""What a check works with: drivers of a fresh bench, laws to ask for, and what must hold."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+
+import numpy as np
+
+from drivers.base import OFF, Array, DeviceError, DeviceLost, OutputLaw, SampleBlock
+from drivers.conformance.law import Playing, commands, in_volts, require_law
+from drivers.conformance.subject import HEALTHY, Bench, Subject
+from drivers.conformance.watched import NotConforming, Watched, follows, require, rows_of
+from rig.model.rig import Rig
+
+PATIENCE = 40  # tries at what needs the device to have noticed the end of a link
+PAUSE = 0.05  # [s] between them
+SETTLING = 3  # blocks after zeroing that may still show the law before, if time is real
+
+
+class Trial:
+    """One run of one check: a bench, and drivers that are closed at its end."""
+
+    def __init__(self, subject: Subject, bench: Bench) -> None:
+        self.subject = subject
+        self.bench = bench
+        self.rig = bench.rig
+        self.claims = subject.capabilities
+        self.volts = subject.volts
+        self.joints = len(bench.rig.joints)
+        self._made: list[Watched] = []
+
+    def driver(self, rig: Rig | None = None) -> Watched:
+        """Return an unconnected driver of the bench's rig or another one."""
+        wanted = self.rig if rig is None else rig
+        made = Watched(self.bench.driver(wanted), wanted)
+        self._made.append(made)
+        return made
+
+    def connected(self, driver: Watched | None = None) -> Watched:
+        """Return a connected driver; waits while the device still serves the session before."""
+        found = self.driver() if driver is None else driver
+        patiently(found.connect)
+        return found
+
+    def ready(self) -> Watched:
+        """Return a connected driver of a device that is not tripped and streams."""
+        found = self.connected()
+        if found.trip_cause() is not None:
+            found.reset()
+        found.start()
+        return found
+
+    def spoil(self, fault: str) -> None:
+        """Make the wire do `fault` from now on."""
+        assert self.bench.spoil is not None
+        self.bench.spoil(fault)
+
+    def end(self) -> None:
+        """Close every driver, the wire healthy again; raises nothing but NotConforming."""
+        if self.bench.spoil is not None:
+            self.bench.spoil(HEALTHY)
+        for driver in self._made:
+            driver.close()
+
+    # -- laws -------------------------------------------------------------------------------
+
+    def off(self) -> list[OutputLaw]:
+        """Return laws that keep every output at zero."""
+        return [OFF] * self.joints
+
+    def law(self, joint: int = 0, **values: float) -> list[OutputLaw]:
+        """Return laws of which one joint's has these values, bounded by the subject's volts."""
+        laws = self.off()
+        laws[joint] = OutputLaw(**{"limit": self.volts, **values})
+        return laws
+
+    def driving(self) -> list[OutputLaw]:
+        """Return a law that puts out most of the subject's volts on every joint."""
+        sign = [1.0 if joint % 2 == 0 else -1.0 for joint in range(self.joints)]
+        return [OutputLaw(bias=s * 0.8 * self.volts, limit=self.volts) for s in sign]
+
+    def playing(
+        self, laws: Sequence[OutputLaw], waves: dict[int, Array] | None = None, origin: int = 0
+    ) -> Playing:
+        """Return the model of laws with the waveforms uploaded so far."""
+        known = waves or {}
+        each = tuple(known.get(joint, np.zeros(1)) for joint in range(self.joints))
+        return Playing(tuple(laws), each, origin)
+
+    def wave(self, samples: int = 97, seed: int = 1) -> Array:
+        """Return a waveform [V] no two places of which look alike."""
+        return np.random.default_rng(seed).uniform(-self.volts, self.volts, samples)
+
+    # -- requirements -----------------------------------------------------------------------
+
+    def refused(self, what: str, call: Callable[[], object]) -> None:
+        """Require that a call raises DeviceError."""
+        try:
+            call()
+        except DeviceError:
+            return
+        raise NotConforming(f"not refused: {what}")
+
+    def zero_at_device(self, when: str) -> None:
+        """Require that the device's outputs are zero, where there is a probe."""
+        if self.bench.outputs is None:
+            return
+        found = np.asarray(self.bench.outputs(), dtype=np.float64)
+        require(not found.any(), f"{when} the device puts out {in_volts(found)}")
+
+    def zero_in_stream(self, driver: Watched, when: str, *, soon: bool = False) -> None:
+        """Require a block of zero commands; `soon` lets older blocks come before it."""
+        block = driver.read_block()
+        older = block.backlog + (0 if self.claims.virtual_time else SETTLING)
+        for _ in range(older if soon else 0):
+            if not commands(block, self.rig).any():
+                return
+            block = driver.read_block()
+        found = commands(block, self.rig)
+        wrong = np.flatnonzero(found.any(axis=1))
+        if len(wrong):
+            shown = in_volts(found[wrong[-1]])
+            raise NotConforming(f"{when} the samples show commands of {shown}")
+
+    def zero_somehow(self, driver: Watched, when: str) -> None:
+        """Require that zeroing works within two calls."""
+        for left in (1, 0):
+            try:
+                driver.zero_outputs()
+            except DeviceError as error:
+                require(left, f"{when} zero_outputs failed twice: {error}")
+            else:
+                break
+        self.zero_at_device(f"{when} and after zero_outputs")
+
+    def until_law(self, driver: Watched, playing: Playing, first: int, count: int) -> None:
+        """Read until `count` blocks from tick `first` on follow the law; earlier ones may not."""
+        before: SampleBlock | None = None
+        seen = 0
+        for _ in range(count + 50):
+            block = driver.read_block()
+            if before is not None:
+                follows(before, block)
+            before = block
+            skip = max(0, first - block.tick)
+            if skip < len(block.data):
+                require_law(rows_of(block, skip), playing, self.rig)
+                seen += 1
+            if seen == count:
+                return
+        raise NotConforming(f"no block at or after tick {first}, from which the laws act")
+
+
+def patiently(call: Callable[[], object]) -> None:
+    """Make a call that a device refuses until it has noticed the end of the link before."""
+    for left in reversed(range(PATIENCE)):
+        try:
+            call()
+        except DeviceError:
+            if not left:
+                raise
+            time.sleep(PAUSE)
+        else:
+            return
+
+
+def lost(call: Callable[[], object], tries: int = 3) -> DeviceLost | None:
+    """Return the DeviceLost that a call raises within `tries`, None where it raises none."""
+    for _ in range(tries):
+        try:
+            call()
+        except DeviceLost as error:
+            return error
+        except DeviceError:
+            continue
+    return None
+
+
+def quietly(call: Callable[[], object]) -> None:
+    """Make a call that may fail with a DeviceError."""
+    with suppress(DeviceError):
+        call()
