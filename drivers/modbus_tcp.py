@@ -233,7 +233,10 @@ class ModbusTcpDriver:
             logger.warning("%s; asking again", silent)
             try:
                 self._link.settle()
-                return self._exchange_once()
+                answer = self._exchange_once()
+                # It may have been the late answer to the first try; then another is on its way.
+                self._link.settle()
+                return answer
             except DeviceSilent:
                 self._link.close()
                 raise DeviceLost(

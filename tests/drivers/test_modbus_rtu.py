@@ -123,3 +123,13 @@ def test_a_missing_port_and_a_wrong_key_say_what_to_change() -> None:
         make_driver(rig.wire.reached_by("carrier-pigeon", {}), rig)
     with pytest.raises(InputError, match="wire: prot: unknown key of wire modbus-tcp; expected"):
         make_driver(rig.wire.reached_by("modbus-tcp", {"prot": 502}), rig)
+
+
+def test_after_a_late_answer_the_next_request_gets_its_own(
+    driver: ModbusRtuDriver, line: BadLine
+) -> None:
+    driver.start()
+    driver.read_block()
+    line.fault = "late"
+    driver.read_block()
+    driver.upload(1, np.zeros(7))
