@@ -1,0 +1,244 @@
+"""A driver over any Python object that advances in this process: for tests, twins and notebooks.
+
+The object has one method, `advance(ticks, laws)`: it measures, evaluates one `ActiveLaw` per joint
+and holds the output, `ticks` times, and returns what it measured, shape (ticks, channels), and what
+it put out, shape (ticks, joints). Whole numbers are converter codes (`rig.model.codes`), floats are
+SI. Time is virtual: nothing runs while no block is read.
+
+In a rig file `object: package.module:name` names a callable that takes the rig and returns it;
+naming it runs that module's code.
+"""
+
+from __future__ import annotations
+
+import importlib
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import astuple, dataclass
+from typing import Any, ClassVar, Protocol
+from urllib.parse import SplitResult
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from drivers.base import (
+    OFF,
+    Array,
+    DeviceError,
+    DeviceInfo,
+    DeviceLost,
+    OutputLaw,
+    SampleBlock,
+    WireSettings,
+)
+from drivers.law_checks import possible_laws, possible_wave
+from rig.model import channels as ch
+from rig.model.codes import decode_input, decode_output
+from rig.model.parts import Wire
+from rig.model.rig import Rig
+
+logger = logging.getLogger(__name__)
+
+BLOCK_SAMPLES = 10
+_SILENCE = np.zeros(1)
+
+
+@dataclass(frozen=True)
+class ActiveLaw:
+    """One joint's output law with its waveform [V] and the tick of the waveform's first sample."""
+
+    wave: Array
+    start: int
+    gain: float
+    bias: float
+    position_gain: float
+    setpoint: float
+    limit: float
+
+    def volts(self, tick: int, position: float) -> float:
+        """Return the output [V] at a tick and a position [m or rad]."""
+        played = self.gain * self.wave[(tick - self.start) % len(self.wave)] + self.bias
+        wanted = played + self.position_gain * (self.setpoint - position)
+        return float(min(max(wanted, -self.limit), self.limit))
+
+
+class Advancing(Protocol):
+    """What the object must offer."""
+
+    def advance(self, ticks: int, laws: Sequence[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Run `ticks` samples under laws like `ActiveLaw`; return (measured, outputs)."""
+
+
+class InProcessSettings(WireSettings):
+    """The object behind the wire, as the import path of a callable of the rig."""
+
+    example: ClassVar = "in-process://package.module:name"
+
+    object: str = Field(default="", pattern=r"^([\w.]+:\w+)?$")
+
+    @classmethod
+    def of_endpoint(cls, url: SplitResult) -> Mapping[str, Any]:
+        """Return the import path; raises ValueError where there is none."""
+        if ":" not in url.netloc:
+            raise ValueError("no import path")
+        return {"object": url.netloc}
+
+
+class InProcessDriver:
+    """`drivers.base.Driver` over an object of this process; see there for the calls.
+
+    `make` returns the object for each session; without it the wire's `object` is imported.
+    """
+
+    settings: ClassVar[type[WireSettings]] = InProcessSettings
+    host_timed: ClassVar[bool] = False
+
+    def __init__(
+        self, wire: Wire, rig: Rig, *, make: Callable[[Rig], Advancing] | None = None
+    ) -> None:
+        self._path = InProcessSettings.of(wire).object
+        self._rig = rig
+        self._make = make
+        self._object: Advancing | None = None
+        self._tick = 0
+        self._streaming = False
+        self._rest()
+
+    def _rest(self) -> None:
+        joints = len(self._rig.joints)
+        self._laws: tuple[OutputLaw, ...] = (OFF,) * joints
+        self._stored: list[Array] = [_SILENCE] * joints
+        self._played: list[Array] = [_SILENCE] * joints
+        self._origin = self._tick
+        self._sequence = 0
+
+    def connect(self) -> DeviceInfo:
+        """Make the object; raises DeviceError where it cannot be made or cannot advance."""
+        make = self._make or self._imported()
+        try:
+            made = make(self._rig)
+        except Exception as error:
+            raise DeviceError(f"the object of the wire in-process failed: {error!r}") from error
+        if not callable(getattr(made, "advance", None)):
+            raise DeviceError(f"{made!r} has no method advance(ticks, laws)")
+        self._object = made
+        self._streaming = False
+        self._rest()
+        rig = self._rig
+        return DeviceInfo(
+            type(made).__name__,
+            len(rig.joints),
+            len(rig.channels),
+            rig.sample_rate,
+            BLOCK_SAMPLES,
+            virtual_time=True,
+        )
+
+    def _imported(self) -> Callable[[Rig], Advancing]:
+        module, _, name = self._path.partition(":")
+        if not name:
+            raise DeviceError("wire: object: expected package.module:name, a callable of the rig")
+        try:
+            found: Callable[[Rig], Advancing] = getattr(importlib.import_module(module), name)
+        except Exception as error:  # whatever the module does when it is imported
+            raise DeviceError(f"wire: object: cannot import {self._path}: {error!r}") from error
+        return found
+
+    def close(self) -> None:
+        """Forget laws and object; never raises."""
+        self._streaming = False
+        self._rest()
+        self._object = None
+
+    def zero_outputs(self) -> None:
+        """Put every output to zero from the next sample on; nothing runs before it."""
+        self._laws = (OFF,) * len(self._rig.joints)
+
+    def reset(self) -> None:
+        """Do nothing: the object does not trip."""
+        self._open()
+
+    def trip_cause(self) -> str | None:
+        """Return None: the object does not trip."""
+        self._open()
+        return None
+
+    def upload(self, joint: int, wave: Array) -> None:
+        """Store a waveform [V]; it acts from `apply` on."""
+        self._open()
+        volts = possible_wave(joint, wave, self._rig)
+        self._stored[joint] = volts
+
+    def apply(self, laws: Sequence[OutputLaw], *, restart: bool = False) -> int:
+        """Set all laws from the next sample on; returns its tick."""
+        self._open()
+        self._laws = possible_laws(laws, self._rig)
+        self._played = list(self._stored)
+        if restart:
+            self._origin = self._tick
+        return self._tick
+
+    def start(self) -> None:
+        """Start a stream at the next sample."""
+        self._open()
+        self._streaming, self._sequence, self._origin = True, 0, self._tick
+
+    def stop(self) -> None:
+        """Stop streaming."""
+        self._open()
+        self._streaming = False
+
+    def read_block(self) -> SampleBlock:
+        """Advance the object by one block; raises DeviceLost where it fails."""
+        device = self._open()
+        if not self._streaming:
+            raise DeviceError("the object does not stream (not started)")
+        laws = [
+            ActiveLaw(wave, self._origin, *astuple(law))
+            for law, wave in zip(self._laws, self._played, strict=True)
+        ]
+        try:
+            measured, outputs = device.advance(BLOCK_SAMPLES, laws)
+            block = self._block(np.asarray(measured), np.asarray(outputs))
+        except Exception as error:  # what a stranger's object raises
+            self.close()
+            raise DeviceLost(f"the object of the wire in-process failed: {error!r}") from error
+        self._tick += BLOCK_SAMPLES
+        self._sequence += 1
+        return block
+
+    def _block(self, measured: NDArray[Any], outputs: NDArray[Any]) -> SampleBlock:
+        rig = self._rig
+        shapes = (BLOCK_SAMPLES, len(rig.channels)), (BLOCK_SAMPLES, len(rig.joints))
+        if (measured.shape, outputs.shape) != shapes:
+            raise ValueError(f"advance returned {measured.shape} and {outputs.shape}, not {shapes}")
+        data = np.empty((BLOCK_SAMPLES, len(rig.recorded)))
+        marks = np.empty(measured.shape, dtype=np.bool_)
+        for column, name in enumerate(rig.channels):
+            sensor = rig.sensors.of(ch.kind_of(name)[0])
+            values = measured[:, column]
+            ends: tuple[float, float] = sensor.range
+            if np.issubdtype(measured.dtype, np.integer):
+                data[:, column] = decode_input(values, *sensor.range, sensor.bits)
+                ends = (0, (1 << sensor.bits) - 1)
+            else:
+                data[:, column] = values
+            marks[:, column] = (values <= ends[0]) | (values >= ends[1])
+        for joint, column in enumerate(range(len(rig.channels), len(rig.recorded))):
+            valve, values = rig.joints[joint].valve, outputs[:, joint]
+            if np.issubdtype(outputs.dtype, np.integer):
+                values = decode_output(values, valve.command_range, valve.command_bits)
+            data[:, column] = values
+        return SampleBlock(self._sequence, self._tick, data, marks, 0, tripped=False)
+
+    def _open(self) -> Advancing:
+        if self._object is None:
+            raise DeviceLost("the wire in-process is not connected")
+        return self._object
+
+
+def over(made: Advancing, rig: Rig) -> InProcessDriver:
+    """Return the unconnected driver of an object made before, as in a notebook."""
+    wire = rig.wire.reached_by("in-process", {})
+    return InProcessDriver(wire, rig, make=lambda _: made)
