@@ -41,6 +41,7 @@ VERBS: Final = {
     "simulate": "rig.cli.simulate",
     "trace": "rig.cli.trace",
     "loop": "rig.cli.loop",
+    "conformance": "rig.cli.conformance",
     "bench": "rig.cli.bench.command",
 }
 GUIDE: Final = """Run a hydraulic robot's test bench, identify it, say what the model lacks.
