@@ -14,15 +14,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.design.settings import DESIGN
 from analysis.design.twin_records import PlannedStep, Played
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 Spectrum = NDArray[np.complex128]
-
-PRESSURE_MARGIN = 0.03  # of the supply, kept from tank and supply pressure
-CLIP = 0.85  # of the worst signal's peak, in the search for phases
-GIVE_SHARE = 0.6  # of a closed lock's tolerance: beyond half of it the engine closes it anew
 
 
 @dataclass(frozen=True)
@@ -65,7 +62,7 @@ def bounds(rig: Rig, step: PlannedStep, motion: Mapping[str, Array]) -> list[Bou
         both = np.append(demand, -demand)
         out.append(Bound("pump flow", -1, both, -rig.supply.flow, rig.supply.flow))
     for j, tolerance in step.gives.items():
-        piston, allowed = motion["piston"][:, j], GIVE_SHARE * tolerance
+        piston, allowed = motion["piston"][:, j], DESIGN.lock_share * tolerance
         out.append(Bound("closed lock", j, piston - piston.mean(), -allowed, allowed))
     return out
 
@@ -77,7 +74,7 @@ def _joint_bounds(rig: Rig, step: PlannedStep, motion: Mapping[str, Array], j: i
     offset = step.offsets.get(j, 0.0)
     centred = piston - piston.mean() + step.centres.get(j, 0.0)
     command = min(limits.command, valve.spool_stroke / valve.spool_gain)
-    margin = PRESSURE_MARGIN * rig.supply.pressure
+    margin = DESIGN.pressure_margin * rig.supply.pressure
     floor = max(limits.pressure[0], margin)
     top = min(limits.pressure[1], rig.supply.pressure - margin)
     out = [
@@ -158,7 +155,7 @@ class LimitForecast:
             worst = int(np.argmax(shares))
             if shares[worst] < lowest:
                 best, lowest = spectrum, float(shares[worst])
-            level = CLIP * shares[worst]
+            level = DESIGN.peak_clip * shares[worst]
             clipped = np.clip(motion[worst], -level * self.low[worst], level * self.high[worst])
             left = np.fft.rfft(clipped)[self.lines]
             spectrum = size * np.exp(1j * np.angle(left / _nonzero(self.responses[worst])))

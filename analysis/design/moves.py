@@ -9,18 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.design.limits import Spectrum
+from analysis.design.settings import DESIGN
 from analysis.design.twin_records import PlannedStep
 
 Array = NDArray[np.float64]
 Lines = NDArray[np.int64]
 
-WIDER = 1.6  # lines up to this times the highest of the protocol may be taken
-LOWER = 0.6  # and down to this times the lowest
-TILTS = (-0.8, 1.3)  # of new shapes, amplitudes f^-tilt
-ANCHORS = 4  # lowest lines that a new shape keeps: they move the piston, and so centre it
 KINDS = ("shape", "bump", "lines", "phases")
-EARLY, LATE = (0.6, 0.2, 0.1, 0.1), (0.15, 0.35, 0.25, 0.25)  # how often each
-FEWEST = 3  # lines of a tone
 
 
 @dataclass(frozen=True)
@@ -48,7 +43,7 @@ def mutated(tone: Tone, early: bool, rng: np.random.Generator) -> tuple[Spectrum
     """
     size, level = np.abs(tone.spectrum), envelope(tone)
     many = len(tone.lines)
-    kind = rng.choice(KINDS, p=EARLY if early else LATE)
+    kind = rng.choice(KINDS, p=DESIGN.early_moves if early else DESIGN.late_moves)
     x = np.log(tone.lines / tone.lines[0])
     if kind == "phases":
         spread = rng.uniform(0.1, np.pi)
@@ -63,7 +58,7 @@ def mutated(tone: Tone, early: bool, rng: np.random.Generator) -> tuple[Spectrum
         size = np.where(some, np.where(size > 0, 0.0, level), size)
     else:
         size = reshaped(tone, rng)
-    if np.count_nonzero(size) < FEWEST:
+    if np.count_nonzero(size) < DESIGN.least_lines:
         return tone.spectrum, 1
     fresh = np.exp(2j * np.pi * rng.random(many))
     turn = np.where(np.abs(tone.spectrum) > 0, np.exp(1j * np.angle(tone.spectrum)), fresh)
@@ -80,11 +75,11 @@ def tilted(tone: Tone, tilt: float, rng: np.random.Generator) -> tuple[Spectrum,
 def reshaped(tone: Tone, rng: np.random.Generator) -> Array:
     """Return amplitudes f^-tilt in a random band above the lowest lines, which stay."""
     size = np.abs(tone.spectrum)
-    lowest = np.flatnonzero(size > 0)[:ANCHORS]
+    lowest = np.flatnonzero(size > 0)[: DESIGN.anchors]
     many, first = len(size), int(lowest[-1]) + 1
     low, high = np.sort(rng.uniform(size=2) ** [2.0, 0.5]) * (many - first) + first
     inside = (np.arange(many) >= low) & (np.arange(many) < high)
-    shape = tone.lines.astype(np.float64) ** -rng.uniform(*TILTS) * inside
+    shape = tone.lines.astype(np.float64) ** -rng.uniform(*DESIGN.tilts) * inside
     power = np.linalg.norm(shape)
     if power == 0:
         return size
@@ -99,8 +94,12 @@ def tone_of(joint: int, wave: Array, empty: Sequence[int]) -> Tone:
     spectrum = np.fft.rfft(wave) * (2.0 / len(wave))
     own = np.flatnonzero(np.abs(spectrum) > 1e-6 * np.abs(spectrum).max())
     stride = int(np.gcd.reduce(np.diff(own))) if len(own) > 1 else 1
-    first = max(own[0] - stride * int((1 - LOWER) * own[0] / stride), 1)
-    last = own[-1] + stride * int((WIDER - 1) * own[-1] / stride) if len(own) > 1 else own[-1]
+    first = max(own[0] - stride * int((1 - DESIGN.lowest_line) * own[0] / stride), 1)
+    last = (
+        own[-1] + stride * int((DESIGN.highest_line - 1) * own[-1] / stride)
+        if len(own) > 1
+        else own[-1]
+    )
     lines = np.setdiff1d(np.arange(first, last + 1, stride), np.array(empty, dtype=np.int64))
     lines = np.union1d(lines, own)
     values = np.where(np.isin(lines, own), spectrum[lines], 0.0)

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from analysis.design.limits import forecast_of, used
 from analysis.design.moves import Tone, mutated, tilted, tone_of, with_tones
 from analysis.design.predict import StepInformation, coefficients, covariance, information
+from analysis.design.settings import DESIGN
 from analysis.design.twin_records import PlannedStep, Played, play
 from analysis.regression.rows import parameters_of
 from analysis.terms import baseline
@@ -37,17 +38,6 @@ Lines = NDArray[np.int64]
 log = logging.getLogger(__name__)
 Say = Callable[[str], None]
 Passes = Callable[[PlannedStep, Mapping[int, Tone]], bool]
-
-FILL = 0.95  # share of the tightest limit that a design uses on the twin
-KEEP = 1.5  # times its first error is what a parameter may lose, or more while it stays better
-# than that which the criterion is about was at first
-ROUNDS = 40  # of the search for phases, for each child
-NEAR = 0.93  # of the share to fill: a child that fills less is scaled up and played again
-TOO_FAR = 1.02  # of the share to fill: such a child is scaled down and played again
-LARGER = 3.0  # factor by which a spectrum is scaled at most, at once
-GAIN_BAND = 0.2  # of the logarithm of a piston's gain, which the bench needs to centre it
-FIRST_TILTS = (0.0, 0.5, -0.5)  # tried on every tone before anything random
-EARLY_SHARE = 0.6  # of the budget
 
 
 @dataclass(frozen=True)
@@ -107,10 +97,10 @@ def improve(
         plays += cost
     best = search.value([c.found for c in candidates])
     search.loosen([c.found for c in candidates])
-    shapes = [(s, joint, tilt) for tilt in FIRST_TILTS for s, joint in free]
+    shapes = [(s, joint, tilt) for tilt in DESIGN.first_tilts for s, joint in free]
     while plays < budget:
         s, joint, tilt = shapes.pop(0) if shapes else (*free[int(rng.integers(len(free)))], None)
-        child, cost = search.child(candidates[s], joint, tilt, plays < EARLY_SHARE * budget)
+        child, cost = search.child(candidates[s], joint, tilt, plays < DESIGN.early_share * budget)
         plays, children = plays + cost, children + 1
         if child is None:
             continue
@@ -155,7 +145,7 @@ class _Search:
         known = {n: e for n, e in errors.items() if math.isfinite(e)}
         aim = {"D": float(np.exp(np.mean(np.log(list(known.values()))))), "E": max(known.values())}
         about = aim.get(self.criterion, known.get(self.criterion, 0.0))
-        self.allowed = {n: max(KEEP * e, about) for n, e in known.items()}
+        self.allowed = {n: max(DESIGN.kept_error * e, about) for n, e in known.items()}
 
     def loosen(self, found: Sequence[StepInformation]) -> None:
         """Rate a start that had to be made smaller to keep the limits by that smaller motion."""
@@ -217,9 +207,11 @@ class _Search:
     def fitted(self, candidate: Candidate) -> tuple[Candidate, int]:
         """Make a step that passes a limit smaller until it keeps them all."""
         cost = 0
-        while candidate.share > FILL and cost < 6:
+        while candidate.share > DESIGN.fill and cost < 6:
             smaller = {
-                j: replace(t, spectrum=t.spectrum * (0.98 * FILL / min(candidate.share, 2.0)))
+                j: replace(
+                    t, spectrum=t.spectrum * (0.98 * DESIGN.fill / min(candidate.share, 2.0))
+                )
                 for j, t in candidate.tones.items()
             }
             candidate = self.judged(with_tones(candidate.played.step, smaller), smaller)
@@ -241,8 +233,8 @@ class _Search:
         base, found = parent, None
         for cost in range(1, plays + 1):
             known = forecast_of(self.rig, base.played, joint, tone.lines)
-            spectrum, share = known.flattened(spectrum, ROUNDS)
-            spectrum = spectrum * min(FILL / share, LARGER)
+            spectrum, share = known.flattened(spectrum, DESIGN.phase_rounds)
+            spectrum = spectrum * min(DESIGN.fill / share, DESIGN.largest_scaling)
             tones = {**parent.tones, joint: replace(tone, spectrum=spectrum)}
             try:
                 base = self.judged(with_tones(base.played.step, tones), tones)
@@ -251,11 +243,11 @@ class _Search:
                 continue
             if not self.centrable(base):
                 return found, cost
-            if base.share <= FILL * TOO_FAR:
+            if base.share <= DESIGN.fill * DESIGN.over_fill:
                 found = base
-                if base.share > NEAR * FILL:
+                if base.share > DESIGN.near_fill * DESIGN.fill:
                     return found, cost
-            spectrum = spectrum * (FILL / min(base.share, LARGER))
+            spectrum = spectrum * (DESIGN.fill / min(base.share, DESIGN.largest_scaling))
         return found, plays
 
     def centrable(self, candidate: Candidate) -> bool:
@@ -266,4 +258,4 @@ class _Search:
         """
         played = candidate.played
         first = self.gains[played.step.name]
-        return all(abs(math.log(k / first[j])) < GAIN_BAND for j, k in played.gains.items())
+        return all(abs(math.log(k / first[j])) < DESIGN.gain_band for j, k in played.gains.items())

@@ -21,8 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.design.sensor_noise import score_covariance
+from analysis.design.settings import DESIGN
 from analysis.design.twin_records import PlannedStep, Played, ideal, play
-from analysis.identify.reduction import SEGMENTS
+from analysis.identify.settings import IDENTIFY
 from analysis.identify.stacked_rows import build_rows
 from analysis.regression.least_squares import scaled_inverse
 from analysis.regression.noise import record_moments
@@ -38,11 +39,6 @@ from rig.model.rig import Rig
 Array = NDArray[np.float64]
 Filters = Callable[[Record], Filtering]
 log = logging.getLogger(__name__)
-
-# Relative fall of a mineral oil's bulk modulus per kelvin, about 0.4 to 0.6 % (Merritt, Hydraulic
-# Control Systems, ch. 2); the swing of `oil.temperature_band` is taken as a sine's.
-OIL_FALL = 0.005
-SEED = 0  # of the noise whose share in the rows is judged
 
 
 @dataclass(frozen=True)
@@ -140,7 +136,9 @@ def information(
     )
     share = {}
     if moments:
-        share = record_moments(exact, terms, built.conditioned, rows, np.random.default_rng(SEED))
+        share = record_moments(
+            exact, terms, built.conditioned, rows, np.random.default_rng(DESIGN.seed)
+        )
     matrix, triangles, count = {}, {}, {}
     for family in FAMILIES:
         mine = [r for name, r in rows.items() if family_of(name) == family]
@@ -223,7 +221,7 @@ def covariance(
     squares = np.zeros(int(kept.sum()))
     for one, part in zip(found, parts, strict=True):
         # identify divides the only repeat of a step into segments.
-        free = (one.repeats if one.repeats > 1 else SEGMENTS) - 1
+        free = (one.repeats if one.repeats > 1 else IDENTIFY.record_segments) - 1
         squares += (one.repeats * np.diag(part)) ** 2 / free
     dof[kept] = np.diag(inner) ** 2 / squares
     return total, dof
@@ -234,7 +232,7 @@ def _oil_scatter(rig: Rig, found: Sequence[StepInformation], kept: NDArray[np.bo
     A = np.sum([one.repeats * one.matrix["fluid"] for one in found], axis=0)
     kept = kept & (np.diag(A) > 0)
     inverse = scaled_inverse(A[np.ix_(kept, kept)])
-    spread = OIL_FALL * rig.oil.temperature_band / math.sqrt(2.0)
+    spread = DESIGN.bulk_fall * rig.oil.temperature_band / math.sqrt(2.0)
     shifts = np.array([inverse @ (one.repeats * one.oil[kept]) for one in found])
     out = np.full(len(A), np.nan)
     out[kept] = spread * np.sqrt(np.sum(shifts**2, axis=0))

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import oaconvolve
 
+from analysis.design.settings import DESIGN
 from analysis.regression.rows import Filtering, Rows, right_sides
 from analysis.signals.conditioning import Mask, Signals
 from analysis.signals.filters import FirSmoother
@@ -32,9 +33,6 @@ from rig.model.parts import AnySensor
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
-
-# What a step of a finite difference is of the noise that the filtered signal still carries.
-STEP_OF_NOISE = 0.1
 
 
 @dataclass(frozen=True)
@@ -148,7 +146,7 @@ def score_covariance(
         carried: dict[str, Array] = {}
         for what in parts:
             taps = channels.taps[what.order]
-            by = STEP_OF_NOISE * float(np.sqrt(variance) * np.linalg.norm(taps))
+            by = DESIGN.noise_step * float(np.sqrt(variance) * np.linalg.norm(taps))
             high = residuals(rig, terms, moved(rig, signals, what, by), beta)
             low = residuals(rig, terms, moved(rig, signals, what, -by), beta)
             for name, weights in back.items():

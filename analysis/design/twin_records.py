@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.design.settings import DESIGN
 from analysis.simulation.twin import simulate_commands
 from rig.model import channels as ch
 from rig.model.parse import InputError
@@ -22,12 +23,6 @@ from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
-
-LEAD = 3.0  # [s] simulated before the record, so that the start has faded
-RAMP = 1.0  # [s] in which the waveform grows
-TRIMS = 4  # simulations to find the bias that centres a piston
-DRIFT = 0.5e-3  # [m] left within a record after trimming
-FROM_END = 1e-4  # [m] a twin's piston stands this far from the end it is pushed against
 
 
 @dataclass(frozen=True)
@@ -93,7 +88,7 @@ def ideal(rig: Rig) -> Rig:
     return rig.model_copy(update={"sensors": sensors.model_copy(update={**parts, "skew": 0.0})})
 
 
-def play(rig: Rig, step: PlannedStep, trims: int = TRIMS) -> Played:
+def play(rig: Rig, step: PlannedStep, trims: int = DESIGN.trims) -> Played:
     """Play a step on the twin, trimming the biases until the pistons stay where they belong.
 
     Raises InputError where the twin's state ceases to exist or it cannot be centred.
@@ -117,7 +112,7 @@ def play(rig: Rig, step: PlannedStep, trims: int = TRIMS) -> Played:
 def _held(rig: Rig, step: PlannedStep) -> dict[int, float]:
     out = {}
     for joint, piston in step.held.items():
-        half = 0.5 * rig.joints[joint].cylinder.stroke - FROM_END
+        half = 0.5 * rig.joints[joint].cylinder.stroke - DESIGN.end_distance
         out[joint] = float(np.clip(piston, -half, half))
     return out
 
@@ -125,10 +120,10 @@ def _held(rig: Rig, step: PlannedStep) -> dict[int, float]:
 def _commands(rig: Rig, step: PlannedStep) -> tuple[Array, Array, int]:
     """Return commands (n, N) [V] that end with a record, start pistons (N,), and its first."""
     rate, joints = rig.sample_rate, len(rig.joints)
-    lead = min(step.period, round(LEAD * rate))
+    lead = min(step.period, round(DESIGN.lead * rate))
     commands = np.zeros((lead + step.samples, joints))
     start = np.zeros(joints)
-    ramp = np.minimum(1.0, np.arange(len(commands)) / (RAMP * rate))
+    ramp = np.minimum(1.0, np.arange(len(commands)) / (DESIGN.ramp * rate))
     for joint, wave in step.waves.items():
         phase = np.arange(-lead, step.samples) % len(wave)
         commands[:, joint] = ramp * (wave[phase] + step.biases.get(joint, 0.0))
@@ -156,7 +151,7 @@ def _trimmed(
             raise InputError(f"step {step.name!r}: the twin of joint {joint + 1} does not follow")
         gains[joint] = float(gain)
         off = float(s.mean()) - step.centres.get(joint, 0.0)
-        calm = abs(drift) * step.samples / rate < DRIFT and abs(off) < 4 * DRIFT
+        calm = abs(drift) * step.samples / rate < DESIGN.drift and abs(off) < 4 * DESIGN.drift
         if not calm:
             biases[joint] = float(v.mean() - drift / gain)
             centre = starts.get(joint, step.centres.get(joint, 0.0))

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.identify.checks import Check
+from analysis.identify.settings import IDENTIFY
 from analysis.regression.base_parameters import Determined, determined
 from analysis.regression.identifiability import predicted_rows
 from analysis.regression.solve import Solution
@@ -21,12 +22,6 @@ from rig.model.parameters import gain_names, parameter_names
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
-
-SHOWS = 0.02  # of unit columns: the size from which a direction shows in a step
-MOST_POSES = 81  # candidates are not looked for beyond so many poses
-SECONDS = 4.0
-LINES = ((0.5, 1.0), (1.75, 0.3), (4.0, 0.1))  # [Hz], share of the motion
-SHARE_OF_STROKE = 0.25
 
 
 def base_statements(rig: Rig, solutions: Mapping[str, Solution]) -> list[Check]:
@@ -88,7 +83,7 @@ def mechanical_help(rig: Rig, found: Determined) -> list[str]:
     while len(left):
         basis = np.linalg.qr((left * scale).T)[0]
         seen = [np.linalg.svd(X / scale @ basis, full_matrices=True) for X in rows]
-        ranks = [int(np.sum(sigma > SHOWS)) for _, sigma, _ in seen]
+        ranks = [int(np.sum(sigma > IDENTIFY.visible_direction)) for _, sigma, _ in seen]
         # As many directions as possible, then as clearly; a closed valve gives, a stop does not.
         clear = [
             float(np.sum(sigma)) * 0.9 ** steps[i][1].count(0.0)
@@ -107,19 +102,23 @@ def _candidates(rig: Rig) -> Iterator[tuple[int, tuple[float, ...]]]:
     N = len(rig.joints)
     for excited in range(N - 1, -1, -1):
         beyond = itertools.product((-1.0, 1.0, 0.0), repeat=N - 1 - excited)
-        for places in itertools.islice(beyond, MOST_POSES):
+        for places in itertools.islice(beyond, IDENTIFY.most_poses):
             yield excited, places
 
 
 def _rows(rig: Rig, excited: int, places: tuple[float, ...]) -> Array:
     """Return the triangle of the torque rows of a motion prescribed to one joint."""
-    N, n = len(rig.joints), round(SECONDS * rig.sample_rate)
+    N, n = len(rig.joints), round(IDENTIFY.advice_seconds * rig.sample_rate)
     t = np.arange(n) / rig.sample_rate
     piston = np.zeros((n, N))
     for joint, place in enumerate(places, start=excited + 1):
         piston[:, joint] = 0.5 * place * rig.joints[joint].cylinder.stroke
-    wave = sum(share * np.sin(2 * np.pi * hertz * t + hertz) for hertz, share in LINES)
-    piston[:, excited] = SHARE_OF_STROKE * rig.joints[excited].cylinder.stroke * np.asarray(wave)
+    wave = sum(
+        share * np.sin(2 * np.pi * hertz * t + hertz) for hertz, share in IDENTIFY.advice_lines
+    )
+    piston[:, excited] = (
+        IDENTIFY.advice_stroke * rig.joints[excited].cylinder.stroke * np.asarray(wave)
+    )
     level = np.full((n, N), 0.5 * rig.supply.pressure)
     moved = {"piston": piston, "spool": np.zeros((n, N)), "cap_pressure": level,
              "rod_pressure": level}  # fmt: skip

@@ -12,23 +12,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.identify.settings import IDENTIFY
 from analysis.regression.solve import Solution
 from analysis.signals.conditioning import clipped_samples
-from analysis.simulation.model import rig_difference
+from analysis.simulation.model import Estimate, rig_difference
+from analysis.terms.inertia import chain_matrix, mass_matrix
 from rig.model import channels as ch
+from rig.model.parameters import gain_names, inertia_names
 from rig.model.parse import InputError
 from rig.model.records import Record, RecordHead, Run
 from rig.model.rig import Rig
 from rig.runs.stream import RunHead
 
 Array = NDArray[np.float64]
-
-MOVED = 50.0  # an excited piston travels at least this many times its sensor's noise
-CLIPPED_SHARE = 0.01
-LOST_SHARE = 0.01
-MASKED_SHARE = 0.2
-CONDITION_LIMIT = 200.0  # scaled columns; the paper's are 10 to 27
-NOISE_BIAS = 0.01  # relative
 
 
 @dataclass(frozen=True)
@@ -98,7 +94,7 @@ def refuse_dead_channels(
         place = ch.channel(rig.position_kind, i)
         low, high = spans.get(place, (-np.inf, np.inf))
         travel, noise = high - low, rig.sensors.of(rig.position_kind).noise
-        if travel < MOVED * noise:
+        if travel < IDENTIFY.least_travel * noise:
             unit = "m" + rig.unit_of(place)
             raise InputError(
                 f"record {record.name!r}, channel {place!r}: joint {i} is not locked but moved "
@@ -141,7 +137,7 @@ def clipping(
         out.append(
             Check(
                 "clipped sensor",
-                part < CLIPPED_SHARE,
+                part < IDENTIFY.clipped_share,
                 f"record {record_name!r}, channel {name!r}: {count} samples "
                 f"({100 * part:.2g} %) at the end of {low:g}..{high:g} {rig.unit_of(name)}; "
                 "masked (the worst record of its step)",
@@ -159,7 +155,7 @@ def lost_samples(found: Iterable[tuple[Record | RecordHead, int]]) -> Check:
     worst, head = max(pairs, key=lambda pair: pair[0])
     return Check(
         "lost samples",
-        total < LOST_SHARE * sum(head.samples for _, head in pairs),
+        total < IDENTIFY.lost_share * sum(head.samples for _, head in pairs),
         f"{total} samples never arrived (most in record {head.name!r}: {worst} of "
         f"{head.samples}); the rows whose filters reach them are masked",
     )
@@ -203,9 +199,9 @@ def identifiability(solutions: Mapping[str, Solution]) -> list[Check]:
         out.append(
             Check(
                 f"condition {family}",
-                solution.condition_number < CONDITION_LIMIT,
-                f"{solution.condition_number:.1f} (scaled columns; below {CONDITION_LIMIT:g} "
-                "wanted, a richer excitation lowers it)",
+                solution.condition_number < IDENTIFY.condition_limit,
+                f"{solution.condition_number:.1f} (scaled columns; below "
+                f"{IDENTIFY.condition_limit:g} wanted, a richer excitation lowers it)",
             )
         )
     return out
@@ -229,9 +225,9 @@ def noise_bias(solutions: Mapping[str, Solution], unbiased: bool = False) -> Che
     worst, name = max(found)
     return Check(
         "noise bias",
-        bool(worst < NOISE_BIAS) or unbiased,
+        bool(worst < IDENTIFY.noise_bias) or unbiased,
         f"the stated sensor noise biases {name} most, by {100 * worst:.2g} % as predicted "
-        f"(below {100 * NOISE_BIAS:g} % wanted)"
+        f"(below {100 * IDENTIFY.noise_bias:g} % wanted)"
         + ("; that is of least squares, and these values are not from it" if unbiased else ""),
     )
 
@@ -241,8 +237,94 @@ def masked(rows: int, dropped: int) -> Check:
     share = dropped / max(rows + dropped, 1)
     return Check(
         "masked rows",
-        share < MASKED_SHARE,
+        share < IDENTIFY.masked_share,
         f"{dropped} of {rows + dropped} rows ({100 * share:.2g} %) lie outside the model's "
         "domain (chamber pressure below tank or above supply, clipped sensor, lost samples) and "
         "were left out",
     )
+
+
+def consistency(rig: Rig, estimates: Mapping[str, Estimate]) -> list[Check]:
+    """State signs, positive inertia over the workspace, R12/W2 against l1, and b."""
+    return [_signs(rig, estimates), *_inertia(rig, estimates), *_bulk(estimates)]
+
+
+def _signs(rig: Rig, estimates: Mapping[str, Estimate]) -> Check:
+    joints = range(1, len(rig.joints) + 1)
+    positive = [f"Fv{i}" for i in joints] + ["b"]
+    positive += [name for i in joints for name in gain_names(i)]
+    bad = [
+        f"{name} = {estimates[name].value:.4g}"
+        for name in positive
+        if name in estimates and estimates[name].value <= 0
+    ]
+    judged = (
+        "friction, bulk modulus and flow gains are" if "fluid" in rig.families else "friction is"
+    )
+    return Check("signs", not bad, "; ".join(bad) or f"{judged} positive")
+
+
+def _inertia(rig: Rig, estimates: Mapping[str, Estimate]) -> list[Check]:
+    N = len(rig.joints)
+    names = inertia_names(N)
+    values = {name: estimates[name].value for name in names if name in estimates}
+    if len(values) < len(names) or not np.isfinite(list(values.values())).all():
+        return [Check("inertia", False, "cannot be judged: not every inertia is identified")]
+    R = chain_matrix(values, N)
+    smallest, where = min(
+        ((float(np.linalg.eigvalsh(mass_matrix(R, q))[0]), q) for q in workspace(rig)),
+        key=lambda pair: pair[0],
+    )
+    turns = rig.unit_of_parameter(names[0]) != "kg"
+    angles = " ".join(f"{np.degrees(v):.0f} deg" if turns else f"{v:.3g} m" for v in where)
+    out = [
+        Check(
+            "inertia",
+            smallest > 0,
+            f"smallest eigenvalue of M over the workspace {smallest:.4g} "
+            f"{rig.unit_of_parameter(names[0])}, at q = {angles}",
+        )
+    ]
+    for i in range(N):
+        for j in range(i + 1, N):
+            W = estimates[f"W{j + 1}"].value if f"W{j + 1}" in estimates else np.nan
+            if np.isfinite(W) and W != 0:
+                length, ratio = rig.joints[i].link_length, R[i, j] / W
+                if not length:
+                    continue
+                off = ratio / length - 1
+                out.append(
+                    Check(
+                        "link length",
+                        bool(abs(off) < IDENTIFY.length_tolerance),
+                        f"R{i + 1}{j + 1}/W{j + 1} = {ratio:.4g} m against link {i + 1} of "
+                        f"{length:g} m ({100 * off:+.1f} %); rigid bodies give equality",
+                    )
+                )
+    return out
+
+
+def _bulk(estimates: Mapping[str, Estimate]) -> list[Check]:
+    b = estimates["b"].value if "b" in estimates else np.nan
+    if not np.isfinite(b):
+        return []
+    low, high = IDENTIFY.bulk_modulus_range
+    detail = f"b = {b / 1e6:.4g} MPa; plausible {low / 1e6:g} to {high / 1e6:g} MPa"
+    return [Check("bulk modulus", low < b < high, detail)]
+
+
+def workspace(rig: Rig, points: int = 9) -> list[Array]:
+    """Return joint angles (N,) spread over the stroke: a grid, or a fixed lattice."""
+    N = len(rig.joints)
+    if points**N <= 4096:
+        axes = np.meshgrid(*([np.linspace(0, 1, points)] * N), indexing="ij")
+        unit = np.column_stack([axis.ravel() for axis in axes])
+    else:
+        # Additive recurrence with square roots of primes fills the cube evenly.
+        steps = np.sqrt([2, 3, 5, 7, 11, 13, 17, 19, 23][:N])
+        unit = np.outer(np.arange(4096), steps) % 1.0
+    angles = np.empty_like(unit)
+    for i, joint in enumerate(rig.joints):
+        low, high = joint.position_range
+        angles[:, i] = joint.geometry(low + unit[:, i] * (high - low))[0]
+    return list(angles)

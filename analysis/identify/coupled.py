@@ -11,9 +11,8 @@ import numpy as np
 
 from analysis.identify import checks as ck
 from analysis.identify.advice import base_statements
-from analysis.identify.checks import Check
+from analysis.identify.checks import Check, consistency
 from analysis.identify.estimation import UNBIASED, EstimationJob, Refined, refine
-from analysis.identify.plausibility import consistency
 from analysis.identify.reduction import RecordReduction, reduce_rows, solve_reductions
 from analysis.identify.result import PLAIN, Identification, estimates_of, with_ends
 from analysis.identify.stacked_rows import build_rows, repeats_of

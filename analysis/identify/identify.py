@@ -12,6 +12,7 @@ from analysis.identify.coupled import coupled
 from analysis.identify.estimation import refuse_unknown
 from analysis.identify.methods import SearchOptions, identify_by
 from analysis.identify.result import PLAIN, Identification
+from analysis.identify.settings import IDENTIFY
 from analysis.regression.rows import Filtering, default_filtering
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
@@ -21,7 +22,6 @@ from rig.model.records import Record, Run
 Array = NDArray[np.float64]
 
 METHODS = ("coupled", "sequential", "simultaneous", "pso", "ga")
-FEWEST_DRAWS = 100  # of a bootstrap
 
 
 def identify(
@@ -63,9 +63,10 @@ def _refuse_method(method: str) -> None:
 def _refuse_estimator(estimator: str, bootstrap: int) -> None:
     if estimator != PLAIN:
         refuse_unknown(estimator)
-    if bootstrap and bootstrap < FEWEST_DRAWS:
+    if bootstrap and bootstrap < IDENTIFY.least_draws:
         raise InputError(
-            f"{bootstrap} bootstrap draws tell no 95 % interval; take {FEWEST_DRAWS} or more"
+            f"{bootstrap} bootstrap draws give no 95 % interval; "
+            f"take {IDENTIFY.least_draws} or more"
         )
     if bootstrap and estimator in (PLAIN, "output-error"):
         raise InputError(f"--bootstrap does not go with --estimator {estimator}; take ls or iv")

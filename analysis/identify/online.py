@@ -9,8 +9,8 @@ before,
 
 (Bierman, Factorization Methods, ch. V; with memory infinite, w = 1, this is the batch solution).
 Forgetting goes by the device's clock, so a parameter that changes is followed whatever is excited.
-What is not excited fades, but never below FLOOR of its column's best: there its value is held, and
-it is said to be held, in the place of numbers that come from rounding.
+What is not excited fades, but never below `online_floor` of its column's best: there its value is
+held, and said to be held, in the place of numbers that come from rounding.
 
 By default the flow rows are followed (b and the gains), which do not depend on the locked joints.
 Torque rows can be followed as well; locked joints then count as moving as measured, whereas
@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.identify.result import estimates_of
+from analysis.identify.settings import IDENTIFY
 from analysis.regression.chunks import Locks, divisible, overlap, stretch_rows
 from analysis.regression.qr import Accumulator
 from analysis.regression.rows import Filtering, Rows, default_filtering, parameters_of
@@ -41,10 +42,6 @@ from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
-CHUNK = 0.5  # [s] of new samples worked on together; one independent piece for the intervals
-FLOOR = 1e-4  # of the largest norm that a column of R has had
-SPENT = 1e-6  # weight below which a segment says nothing any more
-
 
 class RowFeed:
     """The rows of one record while its samples come in."""
@@ -56,7 +53,7 @@ class RowFeed:
         head: RecordHead,
         filtering: Filtering,
         families: Collection[str],
-        chunk: float = CHUNK,
+        chunk: float = IDENTIFY.online_chunk,
     ) -> None:
         if not divisible(filtering):
             raise InputError("rows can only be made on-line by filters of finite length")
@@ -142,7 +139,7 @@ class _Filter:
         self._peak = np.maximum(self._peak, _norms(self._sum.triangle))
         self._time = now
         here = (head.step, head.repeat, len(self._segments))
-        self._segments = [s for s in self._segments if self._weight(s) > SPENT]
+        self._segments = [s for s in self._segments if self._weight(s) > IDENTIFY.online_spent]
         self._segments.append(_Segment(*here, piece.triangle, piece.rows, now))
 
     def _weight(self, segment: _Segment) -> float:
@@ -152,7 +149,7 @@ class _Filter:
         """Forget, but hold up what has become too faint at the value it had."""
         self._sum.fade(float(np.exp(-seconds / self._memory)))
         R = self._sum.triangle
-        size, least = _norms(R), FLOOR * self._peak
+        size, least = _norms(R), IDENTIFY.online_floor * self._peak
         faint = size < least
         self.held = frozenset(n for n, low in zip(self.names, faint, strict=True) if low)
         if self.held:

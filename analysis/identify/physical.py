@@ -29,6 +29,7 @@ from scipy.stats import f as fisher
 
 from analysis.identify.checks import Check
 from analysis.identify.result import Identification, estimates_of
+from analysis.identify.settings import IDENTIFY
 from analysis.regression.constrained import Feasible, Minimum, minimise
 from analysis.regression.solve import Solution
 from analysis.simulation.model import Estimate, estimate_json, finite
@@ -39,7 +40,6 @@ from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
-REJECTED = 0.01  # p value below which the data reject a constraint
 LEVELS = ("signs", "rigid bodies")
 
 
@@ -59,7 +59,7 @@ class Price:
     @property
     def rejected(self) -> bool:
         """Whether the data contradict the constraints."""
-        return bool(self.p < REJECTED)
+        return bool(self.p < IDENTIFY.rejected_level)
 
 
 @dataclass(frozen=True)

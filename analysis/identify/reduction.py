@@ -16,16 +16,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.identify import checks as ck
+from analysis.identify.settings import IDENTIFY
 from analysis.identify.stacked_rows import RecordRows, repeats_of
-from analysis.regression.chunks import STRETCH, InMemory, Source, divisible, source_rows
+from analysis.regression.chunks import InMemory, Source, divisible, source_rows
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.noise import record_moments
 from analysis.regression.nonlinear import reduced
 from analysis.regression.qr import Accumulator
 from analysis.regression.rows import Filtering, Rows, parameters_of, record_rows
+from analysis.regression.settings import REGRESSION
 from analysis.regression.solve import RowCluster, Solution, merge, solve
 from analysis.signals.conditioning import Mask, condition, lost_samples
-from analysis.signals.locks import DECIDING_SAMPLES, moving_joints
+from analysis.signals.locks import moving_joints
+from analysis.signals.settings import SIGNALS
 from analysis.terms.base import FAMILIES, Used, family_of
 from rig.model import channels as ch
 from rig.model.records import Record, RecordHead, head_of
@@ -34,8 +37,6 @@ from rig.runs.stream import open_record
 
 Array = NDArray[np.float64]
 Part = tuple[Array, int]  # triangle (k+1, k+1) of [X y] and its rows
-
-SEGMENTS = 10  # parts of a record
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ class RecordTask:
     terms: tuple[Used, ...]
     filtering: Callable[[Record], Filtering]
     with_noise: bool
-    stretch: int = STRETCH
+    stretch: int = REGRESSION.chunk_samples
     moving: tuple[bool, ...] | None = None
 
 
@@ -105,7 +106,7 @@ def moving_task(task: StepTask) -> tuple[bool, ...]:
     repeats = []
     for name in task.records:
         with open_record(task.path, name) as reader:
-            record = reader.read(0, min(reader.head.samples, DECIDING_SAMPLES))
+            record = reader.read(0, min(reader.head.samples, SIGNALS.deciding_samples))
             places = [ch.channel(task.rig.position_kind, i) for i in record.locked]
             channels = {n: x for n, x in record.channels.items() if n in places}
             repeats.append(replace(record, channels=channels))
@@ -152,7 +153,7 @@ def reduce_record(
     terms: Sequence[Used],
     filtering: Callable[[Record], Filtering],
     with_noise: bool,
-    stretch: int = STRETCH,
+    stretch: int = REGRESSION.chunk_samples,
     moving: Mask | None = None,
 ) -> RecordReduction:
     """Reduce one record, a long one chunk by chunk; raises InputError for one that is unusable.
@@ -164,7 +165,7 @@ def reduce_record(
     filters = filtering(source.read(0, min(head.samples, stretch)))
     lost, clipped = _inspect(rig, source, stretch)
     if moving is None:
-        moving = moving_joints(rig, [source.read(0, min(head.samples, DECIDING_SAMPLES))])
+        moving = moving_joints(rig, [source.read(0, min(head.samples, SIGNALS.deciding_samples))])
     chunks = source_rows(rig, terms, source, filters, moving, stretch)
     parts, masked = _folded(rig, terms, chunks, head.samples / head.sample_rate)
     noise = None
@@ -184,7 +185,10 @@ def _folded(
 ) -> tuple[dict[str, tuple[Part, ...]], int]:
     """Return one triangle per family and part of a record of `duration` [s], and rows masked."""
     sums = {
-        family: [Accumulator(len(parameters_of(rig, terms, family))) for _ in range(SEGMENTS)]
+        family: [
+            Accumulator(len(parameters_of(rig, terms, family)))
+            for _ in range(IDENTIFY.record_segments)
+        ]
         for family in FAMILIES
     }
     masked = 0
@@ -199,8 +203,10 @@ def _folded(
 
 
 def parts_of(rows: Rows, duration: float) -> list[slice]:
-    """Cut rows, which are in the order of time, into SEGMENTS equal parts of a duration [s]."""
-    edges = np.searchsorted(rows.time, np.linspace(0.0, duration, SEGMENTS + 1)[1:-1])
+    """Cut rows in the order of time into `record_segments` equal parts of a duration [s]."""
+    edges = np.searchsorted(
+        rows.time, np.linspace(0.0, duration, IDENTIFY.record_segments + 1)[1:-1]
+    )
     ends = [0, *map(int, edges), len(rows.time)]
     return [slice(a, b) for a, b in pairwise(ends)]
 

@@ -21,12 +21,9 @@ from numpy.typing import NDArray
 from scipy.linalg import qr
 
 from analysis.regression.least_squares import factored
-from analysis.regression.solve import SHARE_OF_NOISE, SHARE_OF_NULL
+from analysis.regression.settings import REGRESSION
 
 Array = NDArray[np.float64]
-
-NEGLIGIBLE = 0.02  # of a combination's largest scaled coefficient
-ROUND = 0.02  # a coefficient this close to a whole number is written as one
 
 
 @dataclass(frozen=True)
@@ -42,7 +39,11 @@ class Combination:
         for name, coefficient in self.parts:
             size = abs(coefficient)
             whole = round(size)
-            figure = f"{whole}" if whole and abs(size - whole) < ROUND else f"{size:.3g}"
+            figure = (
+                f"{whole}"
+                if whole and abs(size - whole) < REGRESSION.rounding_share
+                else f"{size:.3g}"
+            )
             sign = ("+ " if coefficient > 0 else "- ") if words else ""
             words.append(sign + (name if figure == "1" else f"{figure} {name}"))
         return " ".join(words)
@@ -82,7 +83,7 @@ def determined(names: Sequence[str], X: Array, noise: Array | None = None) -> De
     null = np.vstack((factors.null, noisy))
     if len(null):
         null = np.linalg.qr(null.T)[0].T
-    members = np.linalg.norm(null, axis=0) > SHARE_OF_NULL
+    members = np.linalg.norm(null, axis=0) > REGRESSION.null_share
     lost = tuple(n for n, inside in zip(names, members, strict=True) if inside)
     known = tuple(n for n in names if n not in lost)
     base = _combinations(names, null, scale, np.any(X != 0.0, axis=0)) if len(null) else ()
@@ -98,7 +99,7 @@ def _noisy(Vt: Array, sigma: Array, scale: Array, noise: Array | None) -> Array:
         return np.zeros((0, len(scale)))
     white = Vt / sigma[:, None]
     share, turn = np.linalg.eigh(white @ (noise / np.outer(scale, scale)) @ white.T)
-    found = (turn.T @ white)[share > SHARE_OF_NOISE]
+    found = (turn.T @ white)[share > REGRESSION.noise_share]
     return np.asarray(found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-300))
 
 
@@ -116,7 +117,7 @@ def _combinations(
         c = np.zeros(len(names))
         c[i], c[dependent] = 1.0, -(back @ null[:, i])
         # A column of zeros carries nothing: it is lost alone, and in no combination.
-        c[(np.abs(c) < NEGLIGIBLE * np.abs(c).max()) | ~shown] = 0.0
+        c[(np.abs(c) < REGRESSION.negligible_share * np.abs(c).max()) | ~shown] = 0.0
         parts = [int(p) for p in np.flatnonzero(c)]
         plain = c * scale
         if parts:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.regression.rows import Filtering, Rows, record_rows
+from analysis.regression.settings import REGRESSION
 from analysis.signals.conditioning import Mask, align_reach, condition
 from analysis.signals.filters import FirSmoother
 from analysis.signals.locks import held_positions
@@ -24,8 +25,6 @@ from rig.model.records import Record, RecordHead, head_of
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
-
-STRETCH = 120_000  # samples read at a time; two joints then need about 150 MB
 
 
 class Source(Protocol):
@@ -103,7 +102,7 @@ def source_rows(
     source: Source,
     filtering: Filtering,
     moving: Mask,
-    stretch: int = STRETCH,
+    stretch: int = REGRESSION.chunk_samples,
 ) -> Iterator[dict[str, Rows]]:
     """Yield the rows of a record by chunks of `stretch` samples; together they are all its rows.
 

@@ -17,14 +17,10 @@ from numpy.typing import NDArray
 from scipy.linalg import null_space
 
 from analysis.regression.least_squares import least_squares
+from analysis.regression.settings import REGRESSION
 from rig.model.parse import InputError
 
 Array = NDArray[np.float64]
-
-GAP = 1e-13  # of |y|^2
-FASTER = 15.0  # factor of t from one point of the central path to the next
-NEWTON_STEPS = 60
-ACTIVE = 1e-5  # of its size where the data alone put it: a constraint this near zero is active
 
 
 @dataclass(frozen=True)
@@ -75,13 +71,13 @@ def minimise(X: Array, y: Array, feasible: Feasible) -> Minimum:
     for label, row, at, alone in zip(
         feasible.positive_labels, feasible.positive, G @ x, G @ free, strict=True
     ):
-        if at <= ACTIVE * abs(alone) and alone < 0:
+        if at <= REGRESSION.active_share * abs(alone) and alone < 0:
             rows.append(row)
             labels.append(label)
     if F.shape[1] and _least(free, F) < 0:
         values, vectors = np.linalg.eigh(np.tensordot(x, F, axes=1))
         for value, v in zip(values, vectors.T, strict=True):
-            if value <= ACTIVE * abs(_least(free, F)):
+            if value <= REGRESSION.active_share * abs(_least(free, F)):
                 rows.append(np.einsum("i,kij,j->k", v, feasible.forms, v))
                 labels.append(feasible.form_label)
     return Minimum(beta, np.array(rows).reshape(len(rows), len(scale)), tuple(labels))
@@ -163,7 +159,7 @@ def _follow(A: Array, y: Array, G: Array, F: Array, x: Array) -> Array:
     H, g = A.T @ A, A.T @ y
     t = many / size
     while True:
-        for _ in range(NEWTON_STEPS):
+        for _ in range(REGRESSION.newton_steps):
             value, gradient, hessian = _barrier(x, G, F)
             slope = t * (H @ x - g) + gradient
             step = -np.linalg.solve(t * H + hessian, slope)
@@ -183,6 +179,6 @@ def _follow(A: Array, y: Array, G: Array, F: Array, x: Array) -> Array:
             else:
                 break  # rounding: the path cannot be followed more closely
             x = x + length * step
-        if many / t < GAP * size:
+        if many / t < REGRESSION.duality_gap * size:
             return x
-        t *= FASTER
+        t *= REGRESSION.path_factor

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from analysis.regression.base_parameters import Determined, determined
 from analysis.regression.rows import Filtering, parameters_of, record_rows
+from analysis.regression.settings import REGRESSION
 from analysis.regression.solve import square
 from analysis.signals.conditioning import condition
 from analysis.signals.filters import channel_filter
@@ -27,7 +28,6 @@ from rig.model.rig import Rig
 Array = NDArray[np.float64]
 Triangles = Mapping[str, Array]  # family -> triangle (k, k) of its rows
 
-STEP = 5  # every so many samples; a millisecond later a row says the same
 _KEYS = {ch.SPOOL: "spool", ch.PISTON: "piston", ch.CAP: "cap_pressure", ch.ROD: "rod_pressure"}
 
 
@@ -51,7 +51,7 @@ def predicted_rows(
             steady = rig.supply.pressure if kind == ch.SUPPLY else rig.oil.temperature
             channels[name] = np.full(n, steady)
     record = Record("twin", "twin", tuple(locked), 1, rig.sample_rate, channels)
-    filters = Filtering(channel_filter(rig.sample_rate), None, STEP)
+    filters = Filtering(channel_filter(rig.sample_rate), None, REGRESSION.sample_step)
     moving = np.array([i + 1 not in locked for i in range(len(rig.joints))])
     rows = record_rows(ideal, used, condition(ideal, record, filters.channels, moving), filters)
     stacked: dict[str, list[Array]] = {}

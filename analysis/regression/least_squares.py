@@ -13,12 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from analysis.regression.settings import REGRESSION
 
-# Smallest singular value of the scaled matrix over the largest. A direction below it is a thousand
-# times less visible than the best; measured records show such directions by their noise alone.
-RANK_TOLERANCE = 1e-3
-ROUNDING = 1e-12  # the same of normal equations X'X, where rounding alone sets the limit
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -36,7 +33,7 @@ class ScaledFactors:
     @property
     def strong(self) -> NDArray[np.bool_]:
         """Which directions (k,) the rows determine."""
-        return np.asarray(self.sigma > RANK_TOLERANCE * max(self.sigma[0], 1e-300))
+        return np.asarray(self.sigma > REGRESSION.rank_tolerance * max(self.sigma[0], 1e-300))
 
     @property
     def null(self) -> Array:
@@ -82,6 +79,6 @@ def scaled_inverse(A: Array) -> Array:
     kept = scale > 0.0
     size = np.outer(scale[kept], scale[kept])
     inverse = np.zeros_like(A)
-    inner = np.linalg.pinv(A[np.ix_(kept, kept)] / size, ROUNDING)
+    inner = np.linalg.pinv(A[np.ix_(kept, kept)] / size, REGRESSION.rank_tolerance_normal)
     inverse[np.ix_(kept, kept)] = inner / size
     return inverse

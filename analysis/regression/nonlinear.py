@@ -19,15 +19,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.regression.settings import REGRESSION
 from analysis.regression.solve import RowCluster, Solution, merge, solve
 from analysis.terms.base import ParameterReduction, Used
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
-
-ROUNDS = 30
-TOLERANCE = 1e-10  # of a parameter, against the largest
 
 
 def reduced(
@@ -62,15 +60,17 @@ def _reduce(
     p = np.concatenate((x[others], reduction.start(x[places])))
     # All clusters as one: the step needs the sum only, the scatter comes at the end.
     whole = [RowCluster("all", "all", merge(c.triangle for c in clusters), linear.rows)]
-    for _ in range(ROUNDS):
+    for _ in range(REGRESSION.rounds):
         change = _transform(reduction, places, others, p)
         stepped = solve(new, _transformed(whole, change), None, False)
         found = np.where(np.isfinite(stepped.value), stepped.value, p)
         step, p = np.abs(found - p).max(), found
-        if step <= TOLERANCE * np.abs(p).max():
+        if step <= REGRESSION.tolerance * np.abs(p).max():
             break
     else:
-        log.warning("%s: no convergence in %d rounds", " ".join(reduction.parameters), ROUNDS)
+        log.warning(
+            "%s: no convergence in %d rounds", " ".join(reduction.parameters), REGRESSION.rounds
+        )
     change = _transform(reduction, places, others, p)
     moved = _transformed(clusters, change)
     moment = None if noise is None else change.T @ noise @ change

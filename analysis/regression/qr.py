@@ -16,15 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-Array = NDArray[np.float64]
+from analysis.regression.settings import REGRESSION
 
-BLOCK_ROWS = 4096  # times 10 columns: 0.3 MB, in a second-level cache; flat from 1024 to 16384
+Array = NDArray[np.float64]
 
 
 class Accumulator:
     """The triangle of all rows folded so far; memory does not grow with their number."""
 
-    def __init__(self, columns: int, block_rows: int = BLOCK_ROWS) -> None:
+    def __init__(self, columns: int, block_rows: int = REGRESSION.block_rows) -> None:
         self.rows = 0
         self._width = columns + 1
         self._block = max(block_rows, self._width)

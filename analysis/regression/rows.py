@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import upfirdn
 
+from analysis.regression.settings import REGRESSION
 from analysis.signals.conditioning import Mask, Signals
 from analysis.signals.filters import (
     FirSmoother,
@@ -31,14 +32,6 @@ from rig.model.records import Record
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
-
-ROW_CUTOFF = 15.0  # [Hz] where a record names no excited lines
-ROW_CUTOFF_RANGE = (8.0, 30.0)  # [Hz]
-# An electric joint's rows need one derivative less of anything noisy, and its friction flips in
-# milliseconds: narrower loses of the flips (`python -m tests.studies emps` prints the figures).
-ROW_CUTOFF_ELECTRIC = 30.0  # [Hz] where a record names no excited lines
-LINES_FACTOR = 1.5  # row filter over the highest excited line; the noise goes with its 5th power
-MASKED_SHARE = 1e-3  # of a filter's weight on masked samples: a row with more is dropped
 
 
 @dataclass(frozen=True)
@@ -69,7 +62,11 @@ class Rows:
 def default_filtering(record: Record) -> Filtering:
     """Return the filters that the bias study chose, fitted to the record's excitation."""
     rate = record.sample_rate
-    cutoff = ROW_CUTOFF_ELECTRIC if ch.channel(ch.POSITION, 1) in record.channels else ROW_CUTOFF
+    cutoff = (
+        REGRESSION.row_cutoff_electric
+        if ch.channel(ch.POSITION, 1) in record.channels
+        else REGRESSION.row_cutoff
+    )
     if record.period and record.lines:
         cutoff = lines_cutoff(record)
     return Filtering(channel_filter(rate), row_filter(rate, cutoff), row_step(rate, cutoff))
@@ -78,7 +75,7 @@ def default_filtering(record: Record) -> Filtering:
 def lines_cutoff(record: Record) -> float:
     """Return the row filter's cutoff [Hz] for a record whose excited lines are known."""
     highest = max(record.lines) * record.sample_rate / record.period
-    return float(np.clip(LINES_FACTOR * highest, *ROW_CUTOFF_RANGE))
+    return float(np.clip(REGRESSION.lines_factor * highest, *REGRESSION.row_cutoff_range))
 
 
 def paper_filtering(record: Record) -> Filtering:
@@ -249,7 +246,7 @@ def _low_passed(
     weights = np.abs(rows.taps[0]) / np.abs(rows.taps[0]).sum()
     # What stands for a lost sample is made up: not even the filter's tails may touch it.
     for mask, taps, limit in (
-        (masks.bad, weights, MASKED_SHARE),
+        (masks.bad, weights, REGRESSION.masked_share),
         (masks.lost, np.ones(len(weights)), 0.5),
     ):
         if mask.any():

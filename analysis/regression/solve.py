@@ -23,11 +23,9 @@ from numpy.typing import NDArray
 from scipy.stats import t as student
 
 from analysis.regression.least_squares import factored
+from analysis.regression.settings import REGRESSION
 
 Array = NDArray[np.float64]
-
-SHARE_OF_NOISE = 0.1  # of a column's own information: beyond, the parameter rests on noise
-SHARE_OF_NULL = 0.05  # a parameter with more of a null direction than this is not identifiable
 
 
 @dataclass(frozen=True)
@@ -106,7 +104,7 @@ def solve(
         noise_bias = -bread @ (noise[:k, :k] @ beta - noise[:k, k])
         share = np.diag(bread @ noise[:k, :k])
         for name, part in zip(names, share, strict=True):
-            if reject_noise and part > SHARE_OF_NOISE:
+            if reject_noise and part > REGRESSION.noise_share:
                 lost.setdefault(name, "what these records show of it is mostly sensor noise")
     rows = sum(c.rows for c in clusters)
     squares = np.sum((y - X @ beta) ** 2) + R[k, k] ** 2
@@ -141,7 +139,9 @@ def _confounded(names: Sequence[str], null: Array) -> dict[str, str]:
     """Say of every parameter in a null direction with which others it cannot be told apart."""
     lost = {}
     for direction in null:
-        members = [n for n, v in zip(names, direction, strict=True) if abs(v) > SHARE_OF_NULL]
+        members = [
+            n for n, v in zip(names, direction, strict=True) if abs(v) > REGRESSION.null_share
+        ]
         for name in members:
             others = " ".join(m for m in members if m != name) or "nothing else"
             lost[name] = f"only a combination with {others} shows in these records"

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from analysis.identify.checks import Check
-from analysis.identify.plausibility import LENGTH_TOLERANCE
 from analysis.identify.result import Identification
+from analysis.identify.settings import IDENTIFY
 from analysis.report import format as fm
 from analysis.report import paper
 from analysis.report.plots.interval_plots import relative_half_width
@@ -66,7 +66,7 @@ def truth_remark(rig: Rig, truth: Mapping[str, float] | None) -> str:
     for i, j in itertools.combinations(range(1, len(rig.joints) + 1), 2):
         R, W = (truth or {}).get(f"R{i}{j}"), (truth or {}).get(f"W{j}")
         length = rig.joints[i - 1].link_length
-        if R is not None and W and abs(R / W / length - 1) >= LENGTH_TOLERANCE:
+        if R is not None and W and abs(R / W / length - 1) >= IDENTIFY.length_tolerance:
             found.append(
                 f"R{i}{j}/W{j} = {fm.significant(R / W)} m for a link of {fm.significant(length)} m"
             )

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.signals.filters import ALIGN_HALF_WIDTH, Smoother, align, bridged, channel_filter
+from analysis.signals.filters import Smoother, align, bridged, channel_filter
 from analysis.signals.locks import held_positions, moving_joints
+from analysis.signals.settings import SIGNALS
 from rig.model import channels as ch
 from rig.model.parse import InputError
 from rig.model.records import Record
@@ -90,7 +91,7 @@ def _shifts(rig: Rig, rate: float) -> dict[str, float]:
 def align_reach(rig: Rig, rate: float) -> int:
     """Return how many samples either side an aligned sample depends on."""
     shifts = [abs(shift) for shift in _shifts(rig, rate).values()]
-    return ALIGN_HALF_WIDTH + int(np.floor(max(shifts, default=0.0) + 0.5))
+    return SIGNALS.align_half_width + int(np.floor(max(shifts, default=0.0) + 0.5))
 
 
 def lost_samples(rig: Rig, record: Record) -> Mask:

@@ -25,13 +25,11 @@ from numpy.typing import NDArray
 from scipy.signal import butter, kaiserord, oaconvolve, sosfiltfilt, upfirdn
 from scipy.special import i0
 
+from analysis.signals.settings import SIGNALS
 from rig.model.parse import InputError
 
 Array = NDArray[np.float64]
 
-CHANNEL_CUTOFF = 80.0  # [Hz] pass band edge of the channels' filter
-CHANNEL_TRANSITION = 40.0  # [Hz] from pass band to stop band
-ATTENUATION = 80.0  # [dB] in the stop band: 1e-4, below 16-bit sensors in noise
 # Central differences: (first, second) derivative stencils by order of accuracy.
 _DIFFERENCES = {
     2: (np.array([-1 / 2, 0, 1 / 2]), np.array([1.0, -2.0, 1.0])),
@@ -40,7 +38,6 @@ _DIFFERENCES = {
         np.array([-1 / 560, 8 / 315, -1 / 5, 8 / 5, -205 / 72, 8 / 5, -1 / 5, 8 / 315, -1 / 560]),
     ),
 }
-ALIGN_HALF_WIDTH = 16  # [samples] of the interpolation kernel
 
 
 class Smoother(Protocol):
@@ -115,7 +112,7 @@ def windowed_sinc(rate: float, cutoff: float, transition: float) -> FirSmoother:
             f"a filter open to {cutoff:g} Hz needs a sample rate above "
             f"{2 * (cutoff + transition):g} Hz, not {rate:g} Hz"
         )
-    count, beta = kaiserord(ATTENUATION, transition / (0.5 * rate))
+    count, beta = kaiserord(SIGNALS.attenuation, transition / (0.5 * rate))
     reach = count // 2 + 1
     t = np.arange(-reach, reach + 1) / rate
     h0 = _kernel(t, cutoff + 0.5 * transition, (reach + 1) / rate, beta)
@@ -161,8 +158,8 @@ def butterworth(rate: float, cutoff: float, order: int = 4) -> FirSmoother:
 
 def channel_filter(rate: float) -> FirSmoother:
     """Return the default filter of all channels: wide, scaled down for a slow sample rate."""
-    scale = min(1.0, 0.3 * rate / (CHANNEL_CUTOFF + CHANNEL_TRANSITION))
-    return windowed_sinc(rate, CHANNEL_CUTOFF * scale, CHANNEL_TRANSITION * scale)
+    scale = min(1.0, 0.3 * rate / (SIGNALS.channel_cutoff + SIGNALS.channel_transition))
+    return windowed_sinc(rate, SIGNALS.channel_cutoff * scale, SIGNALS.channel_transition * scale)
 
 
 def row_filter(rate: float, cutoff: float) -> FirSmoother:
@@ -186,10 +183,10 @@ def align(x: Array, shift: float) -> Array:
     fraction = shift - whole
     if abs(shift) < 1e-9:
         return x
-    reach = ALIGN_HALF_WIDTH + abs(whole)
+    reach = SIGNALS.align_half_width + abs(whole)
     offsets = np.arange(-reach, reach + 1)
     distance: Array = np.asarray(offsets - whole - fraction, dtype=np.float64)
-    taps = _kernel(distance, 0.425, ALIGN_HALF_WIDTH + 0.5, 8.0)
+    taps = _kernel(distance, 0.425, SIGNALS.align_half_width + 0.5, 8.0)
     # Convolution turns the taps round.
     return _convolve(_extended(x, reach, "alignment"), taps[::-1] / taps.sum())
 

@@ -3,8 +3,8 @@
 A locked joint may move a little all the same. Measured on a finer plant, leaving out the motion of
 a joint held by a closed valve made M2 47 % and Fv2 190 % too large, and that of an end-stop contact
 R12 1.5 %; with it the error is below 0.05 %. A locked joint counts as moving where its acceleration
-within GIVE_BAND exceeds GIVE_THRESHOLD times what sensor noise alone would show; any other is held
-at its mean, because noise in the place of an absent motion would make unidentifiable parameters
+within `moving_band` exceeds `moving_ratio` times that of sensor noise alone; any other is held at
+its mean, because noise in the place of an absent motion would make unidentifiable parameters
 look identified.
 
 Decided record by record, a motion near the noise enters the rows of some repeats and not those of
@@ -20,16 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.signals.filters import bridged, row_filter
+from analysis.signals.settings import SIGNALS
 from rig.model import channels as ch
 from rig.model.records import Record
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-
-GIVE_THRESHOLD = 1.2  # acceleration over that of sensor noise, both rms
-GIVE_BAND = 15.0  # [Hz]
-DECIDING_SAMPLES = 120_000  # of a longer record, its first so many decide
 
 
 def moving_by_step(rig: Rig, records: Sequence[Record]) -> dict[str, Mask]:
@@ -53,7 +50,7 @@ def moving_joints(rig: Rig, repeats: Sequence[Record]) -> Mask:
         if len(locked) < len(repeats):
             found.append(True)
             continue
-        length = min(DECIDING_SAMPLES, *(r.samples for r in locked))
+        length = min(SIGNALS.deciding_samples, *(r.samples for r in locked))
         every = np.array([bridged(np.asarray(r.channels[name])[:length]) for r in locked])
         # Repeats that were not synchronised after all would cancel in the mean.
         found.append(
@@ -65,12 +62,12 @@ def moving_joints(rig: Rig, repeats: Sequence[Record]) -> Mask:
 
 def gives(position: Array, rate: float, noise: float) -> bool:
     """Tell whether a locked position (n,) accelerates visibly above its sensor's noise [m]."""
-    band = row_filter(rate, GIVE_BAND)
+    band = row_filter(rate, SIGNALS.moving_band)
     if len(position) <= 4 * band.reach:
         return False
     inner = band.apply(bridged(position), 2)[band.reach : -band.reach]
     floor = noise * float(np.linalg.norm(band.taps[2]))
-    return bool(np.std(inner) > GIVE_THRESHOLD * floor)
+    return bool(np.std(inner) > SIGNALS.moving_ratio * floor)
 
 
 def held_positions(rig: Rig, parts: Iterable[Record]) -> Array:

@@ -7,8 +7,9 @@ import pytest
 
 from analysis.design.limits import bounds, forecast_of
 from analysis.design.moves import tone_of
-from analysis.design.optimise import FILL, KEEP, TOO_FAR, Design, improve
+from analysis.design.optimise import Design, improve
 from analysis.design.predict import predict
+from analysis.design.settings import DESIGN
 from analysis.design.twin_records import play
 from rig.model.parse import InputError
 from rig.model.rig import Rig
@@ -30,7 +31,7 @@ def test_b_gets_better_and_no_other_parameter_pays_too_much(rig: Rig, design: De
     assert design.kept > 0
     assert design.after["b"] < 0.9 * design.before["b"]
     for name, error in design.after.items():
-        assert error <= 1.01 * max(KEEP * design.before[name], design.before["b"])
+        assert error <= 1.01 * max(DESIGN.kept_error * design.before[name], design.before["b"])
     # The prediction of the finished steps says the same as the search did.
     again = predict(rig, design.steps)
     assert again.parameters["b"].std == pytest.approx(design.after["b"], rel=0.02)
@@ -40,7 +41,7 @@ def test_every_limit_is_kept_on_the_twin(rig: Rig, design: Design) -> None:
     for step in design.steps:
         motion = play(rig, step).motion
         for bound in bounds(rig, step, motion):
-            assert bound.share <= 1.02 * FILL * TOO_FAR, (step.name, bound.name)
+            assert bound.share <= 1.02 * DESIGN.fill * DESIGN.over_fill, (step.name, bound.name)
     for step in design.steps:
         for joint, wave in step.waves.items():
             assert np.abs(wave).max() < rig.joints[joint].limits.command

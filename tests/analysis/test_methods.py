@@ -11,7 +11,6 @@ import pytest
 from analysis.identify.identify import identify
 from analysis.identify.methods.search import (
     COMPLEX,
-    DEAD,
     DIVERGED,
     SearchOptions,
     SearchTask,
@@ -21,6 +20,7 @@ from analysis.identify.methods.search import (
     step_one,
 )
 from analysis.identify.result import Identification, to_json
+from analysis.identify.settings import IDENTIFY
 from analysis.regression.rows import default_filtering
 from analysis.terms import baseline
 from analysis.terms.base import Used
@@ -158,7 +158,7 @@ def test_the_truth_scores_well_and_a_wrong_machine_badly_or_not_at_all(task: Sea
     # Eight times too much cap flow one way: the rod chamber is driven beyond the supply.
     torn = score(task, {**truth, "C_pp_2": 8 * truth["C_pp_2"]})
     assert torn.fate in {COMPLEX, DIVERGED}
-    assert torn.error >= DEAD
+    assert torn.error >= IDENTIFY.dead_error
 
 
 @pytest.mark.parametrize("method", ["pso", "ga"])

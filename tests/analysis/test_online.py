@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from analysis.identify.identify import identify
-from analysis.identify.online import FLOOR, RowFeed, Tracker, track
+from analysis.identify.online import RowFeed, Tracker, track
 from analysis.identify.reduction import reduce_rows, solve_reductions
 from analysis.identify.result import PLAIN
+from analysis.identify.settings import IDENTIFY
 from analysis.identify.stacked_rows import build_rows
 from analysis.regression.chunks import Locks, stretch_rows
 from analysis.regression.rows import default_filtering
@@ -165,7 +166,7 @@ def test_what_is_not_excited_is_held_not_lost(multisine_run: Run, rig: Rig) -> N
         assert "held" in found[name].note
         assert np.isnan(found[name].std)
     assert found["b"].std > 0
-    assert np.exp(-40.0 / 2.0) < FLOOR  # without the floor nothing would be left
+    assert np.exp(-40.0 / 2.0) < IDENTIFY.online_floor  # without the floor nothing would be left
 
 
 @pytest.mark.parametrize("memory", [0.0, -1.0, float("nan")])

@@ -24,11 +24,10 @@ from numpy.typing import NDArray
 from scipy.stats import f as fisher
 
 from analysis.identify.estimators.equations import Pieces
+from analysis.identify.settings import IDENTIFY
 from analysis.regression.solve import satterthwaite, stratified
 
 Array = NDArray[np.float64]
-
-VISIBLE = 0.01  # level of the F test below which lack of fit counts as seen
 
 
 @dataclass(frozen=True)
@@ -80,7 +79,7 @@ def lack_of_fit(pieces: Pieces, inverse: Array) -> Array:
     with np.errstate(divide="ignore", invalid="ignore"):
         dof = np.where(size > 0, size**2 / np.sum(u**4, axis=0), 1.0)
         p = fisher.sf(size / floor, np.maximum(dof, 1.0), np.maximum(noise[1], 1.0))
-    excess = np.where(p < VISIBLE, np.maximum(size - floor, 0.0), 0.0)
+    excess = np.where(p < IDENTIFY.lack_of_fit_level, np.maximum(size - floor, 0.0), 0.0)
     scale = np.sqrt(excess / np.where(size > 0, size, 1.0))
     return np.asarray(found * np.outer(scale, scale))
 

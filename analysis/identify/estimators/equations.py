@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.identify.settings import IDENTIFY
 from analysis.identify.stacked_rows import RecordRows
 from analysis.regression.least_squares import scaled_inverse
 from analysis.signals.filters import bridged
@@ -20,11 +21,6 @@ from rig.model.records import Record
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
-
-SEGMENTS = 10  # of one period of the excitation
-LEVELS = 8  # bins of an equation's state
-AVERAGED = 0.02  # [s] of a channel, for sorting
-SHORTEST_SEGMENT = 0.25  # [s]: longer than the row filter's memory of the noise
 
 
 @dataclass(frozen=True)
@@ -77,14 +73,16 @@ class EquationFit:
         return [b.y - b.X @ self.beta for b in self.blocks]
 
 
-def segments(time: Array, period: float, segments_wanted: int = SEGMENTS) -> Indices:
+def segments(
+    time: Array, period: float, segments_wanted: int = IDENTIFY.period_segments
+) -> Indices:
     """Return which part of the excitation's period each row (m,) lies in.
 
     Without a period [s] (0) the record itself is cut. Rows of the same part of later periods
     belong together: what the model lacks comes back there.
     """
     span = period if period > 0 else float(time[-1] - time[0]) + 1e-9 if len(time) else 1.0
-    count = int(np.clip(span / SHORTEST_SEGMENT, 1, segments_wanted))
+    count = int(np.clip(span / IDENTIFY.shortest_segment, 1, segments_wanted))
     place = (time - (0.0 if period > 0 else time[0] if len(time) else 0.0)) / span
     return np.asarray(np.floor((place % 1.0) * count), dtype=np.int64)
 
@@ -210,7 +208,7 @@ def levelled(
     for number, (key, found) in enumerate(sorted(states.items())):
         mean = np.array([np.mean(v) for v in found.values()])
         rank = np.argsort(np.argsort(mean))
-        label = number * LEVELS + rank * LEVELS // len(rank)
+        label = number * IDENTIFY.state_levels + rank * IDENTIFY.state_levels // len(rank)
         bins[key] = dict(zip(found, label.tolist(), strict=True))
     return [
         replace(
@@ -229,7 +227,7 @@ def _state(b: RepeatBlock, record: Record) -> Array:
     place = ch.POSITION if ch.channel(ch.POSITION, int(joint)) in record.channels else ch.PISTON
     channel = {"flow_cap": ch.CAP, "flow_rod": ch.ROD}.get(kind, place)
     x = bridged(np.asarray(record.channels[ch.channel(channel, int(joint))], dtype=np.float64))
-    width = max(1, round(AVERAGED * record.sample_rate))
+    width = max(1, round(IDENTIFY.averaging_time * record.sample_rate))
     smooth = np.convolve(x, np.full(width, 1.0 / width), mode="same")
     return np.asarray(np.interp(b.time, record.time, smooth))
 

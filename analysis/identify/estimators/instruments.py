@@ -26,11 +26,10 @@ from analysis.identify.estimators.equations import (
     pieces,
     solve,
 )
+from analysis.identify.settings import IDENTIFY
 from analysis.regression.solve import stratified
 
 Array = NDArray[np.float64]
-
-LEVEL = 0.01  # of the test, over all parameters together (Bonferroni)
 
 
 @dataclass(frozen=True)
@@ -45,7 +44,7 @@ class Hausman:
     @property
     def certain(self) -> NDArray[np.bool_]:
         """Where (k,) the difference is more than chance."""
-        return np.asarray(self.p < LEVEL / len(self.p))
+        return np.asarray(self.p < IDENTIFY.instrument_level / len(self.p))
 
 
 def instrumental_variables(blocks: Sequence[RepeatBlock]) -> EquationFit:

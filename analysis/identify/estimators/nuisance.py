@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.identify.estimators.covariance import CovarianceParts
+from analysis.identify.settings import IDENTIFY
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import Coefficient, Columns, Term, Used, equation
 from rig.model import channels as ch
@@ -36,10 +37,6 @@ from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
-SLOPE, SLOPE_STD = -0.003, 0.003  # [1/K] d ln b / dT: middle and spread of what is plausible
-TRANSITION = 1e5  # [Pa] dp_t^2 is 0 +- TRANSITION^2 beforehand
-LEAST_DROP = 2.0  # drops below this many TRANSITIONs are beyond the first order, and held there
-IMPLAUSIBLE = 4.0  # standard deviations from what is known beforehand: then something else is there
 
 KAPPA, TAU = "1/b per kelvin", "transition pressure squared"
 
@@ -97,7 +94,9 @@ class LaminarTransition(Term):
 
 
 def _lost(drop: Array) -> Array:
-    return np.asarray(-0.25 * np.maximum(drop, LEAST_DROP * TRANSITION) ** -1.5)
+    return np.asarray(
+        -0.25 * np.maximum(drop, IDENTIFY.least_drop * IDENTIFY.transition_drop) ** -1.5
+    )
 
 
 @dataclass(frozen=True)
@@ -134,19 +133,19 @@ def beliefs(names: Sequence[str], value: Array) -> list[Belief]:
     if KAPPA in names and "b" in names:
         h = np.zeros(len(names))
         b = names.index("b")
-        h[names.index(KAPPA)], h[b] = 1.0, SLOPE
-        out.append(Belief(KAPPA, h, SLOPE_STD * abs(float(value[b]))))
+        h[names.index(KAPPA)], h[b] = 1.0, IDENTIFY.bulk_slope
+        out.append(Belief(KAPPA, h, IDENTIFY.bulk_slope_std * abs(float(value[b]))))
     if TAU in names:
         h = np.zeros(len(names))
         h[names.index(TAU)] = 1.0
-        out.append(Belief(TAU, h, TRANSITION**2))
+        out.append(Belief(TAU, h, IDENTIFY.transition_drop**2))
     return out
 
 
 def implausible(belief: Belief, beta: Array, covariance: Array) -> bool:
     """Tell whether the data contradict what is known: something else is in that column."""
     variance = belief.std**2 + float(belief.h @ covariance @ belief.h)
-    return bool(abs(belief.h @ beta) > IMPLAUSIBLE * np.sqrt(variance))
+    return bool(abs(belief.h @ beta) > IDENTIFY.implausible_deviations * np.sqrt(variance))
 
 
 def joined(

@@ -16,15 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.identify.estimators.equations import EquationFit, RepeatBlock, least_squares
+from analysis.identify.settings import IDENTIFY
 
 Array = NDArray[np.float64]
-
-HUBER, TUKEY = 1.345, 4.685  # 95 % efficient on Gaussian noise
-LEVERAGE = 12.0  # robust standard deviations of a column from the repeats' median
-ROUNDS = 30
-SETTLED = 1e-9
-GAUSSIAN = 1.4826  # standard deviation over median absolute deviation
-FEW = 3  # repeats below this have no median worth the name
 
 
 def robust(blocks: Sequence[RepeatBlock]) -> EquationFit:
@@ -32,14 +26,14 @@ def robust(blocks: Sequence[RepeatBlock]) -> EquationFit:
     before = leverage_weights(blocks)
     fit = least_squares(blocks, before)
     for loss in (_huber, _tukey):
-        for _ in range(ROUNDS):
+        for _ in range(IDENTIFY.robust_rounds):
             scales = _scales(blocks, fit.residuals(), before)
             weights = [
                 start * loss(e / s)
                 for start, e, s in zip(before, fit.residuals(), scales, strict=True)
             ]
             last, fit = fit.beta, least_squares(blocks, weights)
-            if np.all(np.abs(fit.beta - last) <= SETTLED * np.abs(fit.beta)):
+            if np.all(np.abs(fit.beta - last) <= IDENTIFY.robust_settled * np.abs(fit.beta)):
                 break
     return fit
 
@@ -53,11 +47,13 @@ def outlying(fit: EquationFit) -> dict[str, float]:
 
 
 def _huber(r: Array) -> Array:
-    return np.asarray(np.minimum(1.0, HUBER / np.maximum(np.abs(r), 1e-300)))
+    return np.asarray(np.minimum(1.0, IDENTIFY.huber / np.maximum(np.abs(r), 1e-300)))
 
 
 def _tukey(r: Array) -> Array:
-    return np.asarray(np.where(np.abs(r) < TUKEY, (1.0 - (r / TUKEY) ** 2) ** 2, 0.0))
+    return np.asarray(
+        np.where(np.abs(r) < IDENTIFY.tukey, (1.0 - (r / IDENTIFY.tukey) ** 2) ** 2, 0.0)
+    )
 
 
 def _scales(
@@ -67,7 +63,8 @@ def _scales(
     for b, e, w in zip(blocks, residuals, weights, strict=True):
         found.setdefault((*b.stratum, b.equation), []).append(np.abs(e[w > 0.5]))
     scale = {
-        k: max(GAUSSIAN * float(np.median(np.concatenate(v))), 1e-300) for k, v in found.items()
+        k: max(IDENTIFY.mad_to_std * float(np.median(np.concatenate(v))), 1e-300)
+        for k, v in found.items()
     }
     return [scale[*b.stratum, b.equation] for b in blocks]
 
@@ -79,7 +76,7 @@ def leverage_weights(blocks: Sequence[RepeatBlock]) -> list[Array]:
         groups.setdefault((*b.stratum, b.equation), []).append(i)
     out = [np.ones(len(b.y)) for b in blocks]
     for members in groups.values():
-        if len(members) < FEW:
+        if len(members) < IDENTIFY.least_repeats:
             continue
         times = np.unique(np.concatenate([np.round(blocks[i].time, 9) for i in members]))
         width = blocks[members[0]].X.shape[1] + 1
@@ -89,9 +86,11 @@ def leverage_weights(blocks: Sequence[RepeatBlock]) -> list[Array]:
             stack[n, at] = np.column_stack((blocks[i].X, blocks[i].y))
         off = np.abs(stack - np.nanmedian(stack, axis=0))
         # Repeats differ a little throughout (drift, trim): a record is measured by its own usual.
-        usual = GAUSSIAN * np.nanmedian(off, axis=1, keepdims=True)
+        usual = IDENTIFY.mad_to_std * np.nanmedian(off, axis=1, keepdims=True)
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = np.nanmax(np.where(usual > 0, off / usual, 0.0), axis=2)
         for n, (i, at) in enumerate(zip(members, places, strict=True)):
-            out[i] = (LEVERAGE / np.maximum(distance[n, at], LEVERAGE)) ** 4
+            out[i] = (
+                IDENTIFY.leverage_limit / np.maximum(distance[n, at], IDENTIFY.leverage_limit)
+            ) ** 4
     return out

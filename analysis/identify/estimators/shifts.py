@@ -18,13 +18,10 @@ from numpy.typing import NDArray
 from analysis.identify.estimators.covariance import CovarianceParts
 from analysis.identify.estimators.equations import EquationFit, Prepared
 from analysis.identify.estimators.instruments import Hausman
+from analysis.identify.settings import IDENTIFY
 from analysis.regression.solve import half_width
 
 Array = NDArray[np.float64]
-
-LIMIT, LIMIT_OF_B = 0.005, 0.02  # relative: a shift beyond always matters
-SHARE = 0.5  # of the half width of the 95 % interval: a shift beyond it matters as well,
-LEAST = 0.1  # ... unless it is below this part of the limit: then nobody needs to know of it
 
 
 @dataclass(frozen=True)
@@ -44,13 +41,16 @@ class Shift:
     @property
     def limit(self) -> float:
         """The relative shift that always matters."""
-        return LIMIT_OF_B if self.name == "b" else LIMIT
+        return IDENTIFY.shift_limit_of_b if self.name == "b" else IDENTIFY.shift_limit
 
     @property
     def material(self) -> bool:
         """Whether it is large enough to matter, were it certain."""
         size = abs(self.relative)
-        return size > self.limit or (self.of_half_width > SHARE and size > LEAST * self.limit)
+        return size > self.limit or (
+            self.of_half_width > IDENTIFY.shift_of_interval
+            and size > IDENTIFY.shift_least * self.limit
+        )
 
 
 def shifts_of(

@@ -12,11 +12,11 @@ from analysis.identify.estimators import nuisance as nu
 from analysis.identify.estimators.covariance import CovarianceParts
 from analysis.identify.estimators.equations import EquationFit
 from analysis.identify.estimators.robust import outlying
-from analysis.identify.estimators.shifts import LEAST, SHARE, Shift
+from analysis.identify.estimators.shifts import Shift
+from analysis.identify.settings import IDENTIFY
 
 Array = NDArray[np.float64]
 
-FEW_OUTLIERS = 0.02
 NOISE_CHECK = "noise in regressors"
 
 
@@ -30,10 +30,11 @@ def nuisance_statement(
         compliance = float(beta[list(names).index("b")])
         alpha, spread_ = -100 * value / compliance, 100 * std / abs(compliance)
         said = f"b changes by {alpha:.2f} +- {2 * spread_:.2f} % per kelvin by these records"
-        if spread_ > 100 * nu.SLOPE_STD:
+        if spread_ > 100 * IDENTIFY.bulk_slope_std:
             said = (
                 "the oil's temperature hardly varied: its effect on b is taken as "
-                f"{100 * nu.SLOPE:.1f} +- {200 * nu.SLOPE_STD:.1f} % per kelvin"
+                f"{100 * IDENTIFY.bulk_slope:.1f} +- {200 * IDENTIFY.bulk_slope_std:.1f} % per "
+                "kelvin"
             )
         if wrong:
             said += ", which no oil does: b is that of the records' mean temperature"
@@ -94,8 +95,8 @@ def _figures(s: Shift) -> str:
 
 def _bounds(s: Shift) -> str:
     return (
-        f"it would matter beyond {100 * s.limit:g} %, or beyond {SHARE:g} of the half width and "
-        f"{100 * LEAST * s.limit:g} %"
+        f"it would matter beyond {100 * s.limit:g} %, or beyond {IDENTIFY.shift_of_interval:g} of "
+        f"the half width and {100 * IDENTIFY.shift_least * s.limit:g} %"
     )
 
 
@@ -105,7 +106,7 @@ def outlier_statement(family: str, fit: EquationFit) -> Check:
     record, share = max(shares.items(), key=lambda item: item[1])
     return Check(
         f"outliers {family}",
-        share < FEW_OUTLIERS,
+        share < IDENTIFY.few_outliers,
         f"{100 * share:.2g} % of the rows of record {record!r} lie far outside the scatter and "
         "were left out (the worst record)",
     )

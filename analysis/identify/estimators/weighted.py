@@ -19,18 +19,17 @@ from analysis.identify.estimators.equations import (
     least_squares,
     residual_scatter,
 )
+from analysis.identify.settings import IDENTIFY
 from rig.model.parse import InputError
 
 Array = NDArray[np.float64]
-
-ROUNDS = 2  # of weights from residuals; the first solution is close already
 
 
 def weighted_least_squares(blocks: Sequence[RepeatBlock]) -> EquationFit:
     """Solve with weights 1 / sigma^2 of each step's equation; blocks need repeats."""
     blocks = common(blocks)
     fit = least_squares(blocks)
-    for _ in range(ROUNDS):
+    for _ in range(IDENTIFY.weight_rounds):
         whitened = _whitened(blocks, replace(fit, blocks=tuple(blocks)))
         fit = least_squares(whitened)
     return fit

@@ -8,8 +8,8 @@ parameters play no part. Error of a candidate, over piston, cap and rod pressure
 
 Not every candidate has a state: where a chamber's pressure leaves [0, p_s] an orifice's root is
 complex, and where the state diverges there is nothing left to compare (the paper's section II.B).
-Such a candidate is counted by its fate, and its error is DEAD or more, worse than any that lives
-(more, the more of the windows it lost, so that a search among the dead is not blind).
+Such a candidate is counted by its fate, and its error is `dead_error` or more, worse than any with
+a state, and larger the more windows it lost, so that a search among such candidates has a slope.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.identify.settings import IDENTIFY
 from analysis.regression.rows import Filtering
 from analysis.signals.conditioning import Mask, aligned_channels, condition
 from analysis.simulation.model import Model, model_of
@@ -34,9 +35,7 @@ from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
-DEAD = 1e6  # error of a candidate without a state; the living are far below
 COMPLEX, DIVERGED = "pressure outside 0..supply", "state diverged"
-PLAIN = 1.0  # of parameters that play no part, where the rig has no nominal value
 
 
 @dataclass(frozen=True)
@@ -170,7 +169,9 @@ def _template(rig: Rig, terms: Sequence[Used], names: Sequence[str]) -> Model:
     known = [c.parameter for used in terms for c in used.term.coefficients(rig)]
     if set(names) - set(known):
         raise InputError("a search needs the paper's terms: inertia, friction, gravity, oil, gains")
-    return model_of(rig, terms, {name: rig.nominal.get(name, PLAIN) for name in known})
+    return model_of(
+        rig, terms, {name: rig.nominal.get(name, IDENTIFY.idle_value) for name in known}
+    )
 
 
 def _stilled(drive: DrivingInput) -> DrivingInput:
@@ -209,5 +210,5 @@ def score(task: SearchTask, values: Mapping[str, float]) -> Score:
                 off = (y - channels[name])[window.here]
                 total += float(np.sum(off**2)) / window.spread[name]
     if fate:
-        return Score(DEAD * (1.0 + lost / samples), fate)
+        return Score(IDENTIFY.dead_error * (1.0 + lost / samples), fate)
     return Score(total / (len(task.windows) * len(task.windows[0].measured)), "")

@@ -20,11 +20,11 @@ from typing import Any
 import numpy as np
 
 from analysis.identify import checks as ck
-from analysis.identify.checks import Check
+from analysis.identify.checks import Check, consistency
 from analysis.identify.methods.stages import Outcome, StepRows, as_solution, solve_stages
-from analysis.identify.plausibility import consistency
 from analysis.identify.reduction import RecordReduction, clusters_of, noise_of, reduce_rows
 from analysis.identify.result import Identification, estimates_of
+from analysis.identify.settings import IDENTIFY
 from analysis.identify.stacked_rows import build_rows, repeats_of
 from analysis.regression.rows import Filtering, parameters_of
 from analysis.simulation.model import Estimate, Model, estimate_json, finite
@@ -32,8 +32,6 @@ from analysis.terms.base import FAMILIES, Used
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
-
-WORST = 3  # disagreements that the check spells out; the table has them all
 
 
 def sequential(
@@ -147,7 +145,7 @@ def _uniqueness(shown: Mapping[str, Sequence[tuple[str, Estimate]]]) -> Check:
         return Check("one value each", True, "no parameter is identified by more than one step")
     by_size = sorted(several, key=lambda n: -disagreement([e for _, e in several[n]]))
     texts = []
-    for name in by_size[:WORST]:
+    for name in by_size[: IDENTIFY.worst_shown]:
         values = ", ".join(f"{step} {estimate.value:.5g}" for step, estimate in several[name])
         apart = disagreement([e for _, e in several[name]])
         texts.append(f"{name}: {values} ({apart:.1f} of their 95 % intervals apart)")

@@ -12,11 +12,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.identify.settings import IDENTIFY
 from analysis.regression.solve import RowCluster, Solution, half_width, merge, solve, triangle
 
 Array = NDArray[np.float64]
-
-PRECISION = 0.02  # a step gives a value where its relative 95 % half-width is below this
 
 
 @dataclass(frozen=True)
@@ -36,7 +35,9 @@ class Value:
     @property
     def sharp(self) -> bool:
         """Whether the interval is narrow enough for the value to count."""
-        return bool(np.isfinite(self.value) and self.half < PRECISION * abs(self.value))
+        return bool(
+            np.isfinite(self.value) and self.half < IDENTIFY.stage_precision * abs(self.value)
+        )
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,6 @@ from analysis.identify import checks as ck
 from analysis.identify.checks import Check
 from analysis.identify.methods.search import (
     COMPLEX,
-    DEAD,
     DIVERGED,
     SearchOptions,
     SearchTask,
@@ -33,6 +32,7 @@ from analysis.identify.methods.search import (
     step_one,
 )
 from analysis.identify.result import Identification, estimates_of
+from analysis.identify.settings import IDENTIFY
 from analysis.regression.rows import Filtering, parameters_of
 from analysis.regression.solve import Solution
 from analysis.simulation.model import Model
@@ -43,7 +43,6 @@ from rig.model.records import Record, Run
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
-AT_BOUND = 0.02  # of the decades searched: nearer to an end than this, the bound made the value
 
 _PYMOO = {
     "pso": "algorithms.soo.nonconvex.pso",
@@ -93,7 +92,7 @@ def search(
     ck.refuse_dead_channels(rig, record)
     task = make_task(rig, record, terms, filtering(record), options)
     trail = run_search(method, task, options, rng)
-    if trail.error >= DEAD:
+    if trail.error >= IDENTIFY.dead_error:
         raise InputError(
             f"{method}: every one of {trail.evaluations} candidates lost its state "
             f"({_fates(trail)}); try more --evaluations"
@@ -217,7 +216,7 @@ def _statements(
     stuck = [
         name
         for name, x, width in zip(task.names, place, span, strict=True)
-        if min(x, width - x) < AT_BOUND * width
+        if min(x, width - x) < IDENTIFY.at_bound * width
     ]
     records = [record for run in runs for record in run.records]
     return (
@@ -260,9 +259,9 @@ def trail_json(task: SearchTask, trail: Trail, options: SearchOptions) -> dict[s
         "lost_first_generation": trail.lost_first,
         "lost_by_generation": list(trail.lost_by_generation),
         "generation_sizes": list(trail.sizes),
-        "error_first_generation": trail.first if trail.first < DEAD else None,
+        "error_first_generation": trail.first if trail.first < IDENTIFY.dead_error else None,
         "error": trail.error,
-        "error_by_generation": [e if e < DEAD else None for e in trail.errors],
+        "error_by_generation": [e if e < IDENTIFY.dead_error else None for e in trail.errors],
         "bounds": {
             name: [float(a), float(b)]
             for name, a, b in zip(task.names, task.low, task.high, strict=True)

@@ -24,7 +24,8 @@ from analysis.identify.estimators import nuisance as nu
 from analysis.identify.estimators.covariance import CovarianceParts, spread
 from analysis.identify.estimators.equations import Pieces
 from analysis.identify.output_error.window_data import Reduced
-from analysis.identify.output_error.windows import WINDOW, Windows
+from analysis.identify.output_error.windows import Windows
+from analysis.identify.settings import IDENTIFY
 from analysis.regression.least_squares import scaled_inverse
 from analysis.regression.solve import Solution
 from analysis.terms.base import Used
@@ -34,10 +35,6 @@ from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
-
-ROUNDS = 8
-HALVINGS = 5
-SETTLED = 0.1  # of its standard error, that a parameter still moves
 
 
 @dataclass(frozen=True)
@@ -98,7 +95,7 @@ class Search:
         sigma = self.windows.sigma()
         reduced = self.windows.linearised(theta, starts, sigma)
         rounds, moved = 0, np.inf
-        for rounds in range(1, ROUNDS + 1):
+        for rounds in range(1, IDENTIFY.fit_rounds + 1):
             if rounds == 2:
                 sigma = self._refined(reduced, sigma)
                 reduced = self.windows.linearised(theta, starts, sigma)
@@ -106,7 +103,7 @@ class Search:
             std = np.sqrt(np.diag(inverse))
             moved = float(np.max(np.abs(step[std > 0]) / std[std > 0], initial=0.0))
             theta, starts, reduced, better = self._try(theta, starts, sigma, reduced, step)
-            if not better or (moved < SETTLED and rounds >= 2):
+            if not better or (moved < IDENTIFY.fit_settled and rounds >= 2):
                 break
         return self._result(theta, reduced, rounds, moved)
 
@@ -120,7 +117,7 @@ class Search:
     ) -> tuple[Array, list[Array], list[Reduced | None], bool]:
         """Take the step, halved until the cost falls."""
         before = sum(r.cost for r in reduced if r is not None)
-        for halving in range(HALVINGS):
+        for halving in range(IDENTIFY.fit_halvings):
             size = 0.5**halving
             new_theta = np.clip(theta + size * step, self.low, self.high)
             taken = new_theta - theta
@@ -190,8 +187,8 @@ class Search:
         failed = len(self.stretches) - len(pairs)
         settled = moved < 1.0
         detail = (
-            f"{len(pairs)} windows of {WINDOW:g} s, {rounds} rounds from least squares, the last "
-            f"moved no parameter by more than {moved:.2g} of its standard error"
+            f"{len(pairs)} windows of {IDENTIFY.window:g} s, {rounds} rounds from least squares, "
+            f"the last moved no parameter by more than {moved:.2g} of its standard error"
         )
         if failed:
             detail += f"; {failed} windows could not be simulated and were left out"

@@ -24,8 +24,9 @@ from scipy.optimize import OptimizeResult, least_squares
 
 from analysis.identify.checks import Check
 from analysis.identify.estimators.covariance import spread
-from analysis.identify.estimators.equations import SEGMENTS, Pieces
+from analysis.identify.estimators.equations import Pieces
 from analysis.identify.output_error.fit import refuse_undetermined
+from analysis.identify.settings import IDENTIFY
 from analysis.regression.conditioned import ConditionedRecord, condition_runs
 from analysis.regression.least_squares import scaled_inverse
 from analysis.regression.solve import Solution
@@ -40,10 +41,6 @@ from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
-
-STEP = 1e-2  # relative, of a parameter for its slope
-MOST = 60  # simulations of all records for each parameter
-FAILED = 1e3  # [m or rad] in place of a state that ceased to exist
 
 
 class _Record:
@@ -65,7 +62,7 @@ class _Record:
         """Return measured less simulated positions (n, F)."""
         found = simulate(compiled(model), self.drive, self.start)
         if found.failure:
-            return np.full(self.measured.shape, FAILED)
+            return np.full(self.measured.shape, IDENTIFY.failed_state)
         simulated = found.channels()
         return self.measured - np.column_stack([simulated[n] for n in self.names])[self.here]
 
@@ -102,7 +99,9 @@ def free_run_fit(
         return np.concatenate([part.ravel() for part in left])
 
     first = solution.value / scale
-    found = least_squares(stacked, first, diff_step=STEP, max_nfev=MOST)
+    found = least_squares(
+        stacked, first, diff_step=IDENTIFY.free_run_step, max_nfev=IDENTIFY.free_run_simulations
+    )
     before = float(np.sqrt(np.mean(stacked(first) ** 2)))
     after = float(np.sqrt(np.mean(found.fun**2)))
     jacobian = found.jac / scale
@@ -127,7 +126,7 @@ def _pieces(records: Sequence[_Record], found: OptimizeResult, jacobian: Array) 
     start = 0
     for record in records:
         stop = start + record.measured.size
-        edges = np.linspace(start, stop, SEGMENTS + 1).astype(int)
+        edges = np.linspace(start, stop, IDENTIFY.period_segments + 1).astype(int)
         for k, (low, high) in enumerate(itertools.pairwise(edges)):
             J, r = jacobian[low:high], found.fun[low:high]
             stratum.append(strata[record.key])

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from analysis.effects.base import Effect, Shape, shape_values, shapes_of
 from analysis.identify.output_error.fit import Search
 from analysis.identify.output_error.windows import Windows
+from analysis.identify.settings import IDENTIFY
 from analysis.regression.solve import half_width
 from analysis.simulation.model import Estimate, Model
 from analysis.terms.base import inverted
@@ -29,8 +30,6 @@ from rig.model.records import Run
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
-
-SECONDS = 8.0  # of windows of a fit: a shape is one number, and a trace must not take minutes
 
 
 @dataclass(frozen=True)
@@ -136,7 +135,7 @@ def _windows(
         raise InputError(f"joint {effect.joint + 1} moves in no record")
     names = tuple(c.parameter for u in model.terms for c in u.term.coefficients(rig))
     shapes = tuple(s.parameter for s in _shapes(model, effect))
-    return Windows(rig, moving, model.terms, names, shapes, SECONDS, free)
+    return Windows(rig, moving, model.terms, names, shapes, IDENTIFY.shape_seconds, free)
 
 
 def _shapes(model: Model, effect: Effect) -> tuple[Shape, ...]:

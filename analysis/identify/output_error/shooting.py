@@ -17,6 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from analysis.identify.settings import IDENTIFY
 from analysis.simulation import integrator
 from analysis.simulation.simulate import Compiled
 from analysis.terms.base import OUT_ROWS, X_ROWS, Used
@@ -24,7 +25,6 @@ from analysis.terms.base import OUT_ROWS, X_ROWS, Used
 Array = NDArray[np.float64]
 
 SAMPLES_PER_STEP = 2
-STABLE = 2.0  # step times relaxation rate; the fourth-order rule diverges from 2.78
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -60,7 +60,7 @@ def _shoot(model, pars, starts, inputs, rate, locked, geometry, first, every, pa
 def parts_of(terms: Sequence[Used], rate: float) -> int:
     """Return into how many steps two samples are cut, so that every hidden state is stable."""
     fastest = max((used.term.fastest(used.shape) for used in terms), default=0.0)
-    return max(1, math.ceil(fastest * SAMPLES_PER_STEP / (rate * STABLE)))
+    return max(1, math.ceil(fastest * SAMPLES_PER_STEP / (rate * IDENTIFY.stable_step)))
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from analysis.identify.output_error.shooting import (
     shoot,
 )
 from analysis.identify.output_error.window_data import Nudged, Reduced, Stretch, WindowSource
+from analysis.identify.settings import IDENTIFY
 from analysis.regression.conditioned import condition_runs
 from analysis.signals.conditioning import Mask
 from analysis.signals.filters import channel_filter
@@ -31,15 +32,6 @@ from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
-# The measured spool drives the simulation, and its noise is integrated: after a second it moves the
-# piston by as much as its sensor's noise. Tried were 3, 1 and 0.5 s; shorter was the more exact.
-WINDOW = 0.5  # [s]
-WORKERS = 2
-MOST_SECONDS = 150.0  # with more data, fewer windows of each record, evenly spread
-POINT_RATE = 250.0  # [Hz] at which outputs are compared; the channels are filtered to 80 Hz
-NUDGE = 1e-5  # relative change of a parameter for its sensitivity
-NUDGES = (1e-6, 1e-5, 20.0, 20.0)  # [rad, rad/s, Pa, Pa] of a window's first state
-
 
 class Windows:
     """The data of one fit by windows, and the simulations of them.
@@ -50,7 +42,7 @@ class Windows:
 
     def __init__(
         self, rig: Rig, runs: Sequence[Run], terms: tuple[Used, ...], names: tuple[str, ...],
-        shapes: tuple[str, ...] = (), seconds: float = MOST_SECONDS,
+        shapes: tuple[str, ...] = (), seconds: float = IDENTIFY.window_seconds,
         free: frozenset[str] | None = None,
     ) -> None:  # fmt: skip
         self.rig, self.terms, self.seconds, self.free = rig, ordered(terms), seconds, free
@@ -75,7 +67,7 @@ class Windows:
     def _cut(self, runs: Sequence[Run]) -> None:
         records = condition_runs(self.rig, runs)
         strata = {s: k for k, s in enumerate(sorted({one.group for one in records}))}
-        most = max(1, round(self.seconds / WINDOW) // len(records))
+        most = max(1, round(self.seconds / IDENTIFY.window) // len(records))
         for one in records:
             record, signals = one.record, put_right(self.rig, self.terms, one.signals)
             drive = drive_of(signals)
@@ -88,7 +80,7 @@ class Windows:
             )
             free = ~drive.locked
             every = self.every
-            points = round(WINDOW * record.sample_rate) // (SAMPLES_PER_STEP * every)
+            points = round(IDENTIFY.window * record.sample_rate) // (SAMPLES_PER_STEP * every)
             length = points * SAMPLES_PER_STEP * every
             good: Mask = np.asarray(signals.valid[:, free].all(axis=1))
             if signals.lost is not None:  # of any joint: the locked ones drive the others
@@ -106,8 +98,8 @@ class Windows:
                 )  # fmt: skip
         if not self.stretches:
             raise InputError(
-                f"no record holds {WINDOW:g} s without a clipped sensor or a lost sample: output "
-                "error has nothing to simulate; use --estimator ls"
+                f"no record holds {IDENTIFY.window:g} s without a clipped sensor or a lost sample: "
+                "output error has nothing to simulate; use --estimator ls"
             )
 
     @staticmethod
@@ -125,7 +117,7 @@ class Windows:
     @property
     def every(self) -> int:
         """Steps between two points compared."""
-        return max(1, round(self.rig.sample_rate / POINT_RATE / SAMPLES_PER_STEP))
+        return max(1, round(self.rig.sample_rate / IDENTIFY.point_rate / SAMPLES_PER_STEP))
 
     @property
     def parts(self) -> int:
@@ -166,10 +158,10 @@ class Windows:
 
     def _nudged(self, theta: Array, source: WindowSource) -> Nudged:
         """Compile the model with every parameter nudged, and find where its own states stand."""
-        nudges = NUDGE * np.where(theta == 0.0, 1.0, np.abs(theta))
+        nudges = IDENTIFY.sensitivity_step * np.where(theta == 0.0, 1.0, np.abs(theta))
         if self.warm:
             b = abs(theta[self.names.index("b")])
-            nudges[-1] = NUDGE * b
+            nudges[-1] = IDENTIFY.sensitivity_step * b
         rows = [theta, *(theta + n * e for n, e in zip(nudges, np.eye(len(theta)), strict=True))]
         models = [self.model(row, source.kelvin) for row in rows]
         ready = [compiled(model) for model in models]
@@ -209,7 +201,7 @@ class Windows:
             if stretch.record not in self._idle:
                 found[k] = one(k)
         rest = [k for k in range(len(self.stretches)) if k not in found]
-        with ThreadPoolExecutor(WORKERS) as pool:
+        with ThreadPoolExecutor(IDENTIFY.window_workers) as pool:
             found |= zip(rest, pool.map(one, rest), strict=True)
         return [found[k] for k in range(len(self.stretches))]
 
@@ -221,7 +213,7 @@ class Windows:
         source = self.sources[stretch.record]
         places = self._state_places(stretch)
         free = len(places) // 4
-        state_nudges = np.repeat(NUDGES, free)
+        state_nudges = np.repeat(IDENTIFY.start_steps, free)
         active = self._active(stretch.record)
         y0 = np.zeros((1 + len(places) + len(active), len(start) + int(ready.hidden_ends[-1])))
         y0[:, : len(start)] = start

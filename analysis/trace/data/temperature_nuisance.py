@@ -14,13 +14,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from analysis.identify.estimators.nuisance import (
-    IMPLAUSIBLE,
-    KAPPA,
-    SLOPE,
-    SLOPE_STD,
-    BulkTemperature,
-)
+from analysis.identify.estimators.nuisance import KAPPA, BulkTemperature
+from analysis.identify.settings import IDENTIFY
 from analysis.simulation.model import Estimate, Model
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
@@ -67,7 +62,11 @@ def _temperatures(runs: Sequence[Run]) -> list[float]:
 def plausible(kappa: float, beta: Mapping[str, float]) -> float:
     """Return 1/b's change per kelvin [1/(Pa K)], held to what oil and hoses can do."""
     size = abs(beta.get("b", 0.0))  # of the rows: 1/b
-    low, high = (-(SLOPE + sign * IMPLAUSIBLE * SLOPE_STD) * size for sign in (1.0, -1.0))
+    low, high = (
+        -(IDENTIFY.bulk_slope + sign * IDENTIFY.implausible_deviations * IDENTIFY.bulk_slope_std)
+        * size
+        for sign in (1.0, -1.0)
+    )
     return float(np.clip(kappa, low, high))
 
 
@@ -98,7 +97,7 @@ def _at(b: Estimate, kappa: Estimate, kelvin: float) -> tuple[Estimate, float]:
 
     1/b(T) = 1/b + kappa (T - T0); kappa is the records' joined to what is known beforehand.
     """
-    believed, spread = -SLOPE / b.value, SLOPE_STD / b.value
+    believed, spread = -IDENTIFY.bulk_slope / b.value, IDENTIFY.bulk_slope_std / b.value
     own = kappa.std if math.isfinite(kappa.std) else math.inf
     weight = spread**2 / (spread**2 + own**2) if math.isfinite(kappa.value) else 0.0
     slope = weight * kappa.value + (1.0 - weight) * believed if weight else believed

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.regression.rows import ROW_CUTOFF
+from analysis.regression.settings import REGRESSION
 from analysis.signals.conditioning import Signals
 from analysis.signals.filters import channel_filter, row_filter, row_step
 from analysis.terms import make
@@ -56,7 +56,7 @@ def free_rows(rig: Rig, swing: Swing) -> dict[str, Array]:
 
     Of `rig` only the number of joints and gravity are used.
     """
-    filters, rows = channel_filter(swing.rate), row_filter(swing.rate, ROW_CUTOFF)
+    filters, rows = channel_filter(swing.rate), row_filter(swing.rate, REGRESSION.row_cutoff)
     theta, rate, acceleration = (filters.apply(swing.theta, order) for order in range(3))
     signals = _signals(swing.rate, *(_relative(x) for x in (theta, rate, acceleration)))
     names = mechanical_names(len(rig.joints))
@@ -69,7 +69,9 @@ def free_rows(rig: Rig, swing: Swing) -> dict[str, Array]:
                 term.columns(rig, signals, ()).get(equation("torque", i), {}).items()
             ):
                 matrix[:, names.index(name)] += column
-        out[equation("torque", i)] = rows.decimate(matrix[inside], row_step(swing.rate, ROW_CUTOFF))
+        out[equation("torque", i)] = rows.decimate(
+            matrix[inside], row_step(swing.rate, REGRESSION.row_cutoff)
+        )
     return out
 
 

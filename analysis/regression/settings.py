@@ -1,0 +1,58 @@
+"""Thresholds of building, reducing and solving rows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+
+@dataclass(frozen=True)
+class RegressionSettings:
+    """Row filter, memory of a reduction, rank rules and limits of the iterative solvers."""
+
+    # Row filter [Hz]: its cutoff where a record names no excited lines, the range it stays within,
+    # and its ratio to the highest excited line otherwise; noise grows with its 5th power.
+    row_cutoff: float = 15.0
+    row_cutoff_range: tuple[float, float] = (8.0, 30.0)
+    lines_factor: float = 1.5
+    # An electric joint's rows need one derivative less of anything noisy, and its friction reverses
+    # within milliseconds: narrower loses of the reversals (`python -m tests.studies emps`).
+    row_cutoff_electric: float = 30.0
+    # A row is dropped where more than this share of the filter's weight is on masked samples.
+    masked_share: float = 1e-3
+
+    # Samples read at a time: two joints then need about 150 MB.
+    chunk_samples: int = 120_000
+    # Rows of one QR update: times 10 columns 0.3 MB, within a second-level cache; the time is flat
+    # from 1024 to 16384.
+    block_rows: int = 4096
+
+    # Smallest over largest singular value of the scaled matrix. A direction below it is a thousand
+    # times less visible than the best; measured records show such directions by their noise alone.
+    rank_tolerance: float = 1e-3
+    # The same of normal equations X'X, where rounding alone sets the limit.
+    rank_tolerance_normal: float = 1e-12
+
+    # A parameter rests on noise where noise makes more than this share of its column's information,
+    # and is not identifiable with more than this share of a null direction.
+    noise_share: float = 0.1
+    null_share: float = 0.05
+    # Samples between rows that are looked at for identifiability: the next says the same.
+    sample_step: int = 5
+    # Coefficients of a base parameter: left out below this share of the largest, written as a whole
+    # number within this share of it.
+    negligible_share: float = 0.02
+    rounding_share: float = 0.02
+
+    # Nonlinear least squares: rounds, and the last step over the largest parameter.
+    rounds: int = 30
+    tolerance: float = 1e-10
+    # Interior-point method: duality gap over |y|^2, factor from one point of the central path to
+    # the next, Newton steps; a constraint is active within this share of its unconstrained size.
+    duality_gap: float = 1e-13
+    path_factor: float = 15.0
+    newton_steps: int = 60
+    active_share: float = 1e-5
+
+
+REGRESSION: Final = RegressionSettings()
