@@ -45,12 +45,7 @@ def proof_text(proof: Proof) -> str:
         for r in proof.reasons
     ]
     header = ["step", *(f"{family} rank, cond." for family in families), "why"]
-    widths = [max(len(row[k]) for row in (header, *rows)) for k in range(len(header))]
-    lines = [
-        "  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip()
-        for row in (header, ["-" * w for w in widths], *rows)
-    ]
-    lines.append("")
+    lines = [table(header, rows, left=len(header)), ""]
     for family, verdict in proof.verdicts.items():
         size = len(verdict.names)
         if verdict.complete:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -61,7 +61,8 @@ def markdown(title: str, sections: Sequence[Section], figures: str) -> str:
             lines += [f"## {section.title}", ""]
         for part in section.parts:
             if isinstance(part, Table):
-                lines += [f"**{part.caption}**", "", *_table(part), ""]
+                rows = markdown_table(part.header, part.rows, numbers=True)
+                lines += [f"**{part.caption}**", "", *rows, ""]
             elif isinstance(part, Picture):
                 lines += [f"![{part.caption}]({figures}/{part.file})", "", f"*{part.caption}*", ""]
             else:
@@ -69,12 +70,16 @@ def markdown(title: str, sections: Sequence[Section], figures: str) -> str:
     return "\n".join(lines).rstrip() + "\n"
 
 
-def _table(table: Table) -> list[str]:
+def markdown_table(
+    header: Sequence[str], rows: Iterable[Sequence[str]], *, numbers: bool = False
+) -> list[str]:
+    """Return the lines of a Markdown table; `numbers`: all but the first column to the right."""
+
     def row(cells: Sequence[str]) -> str:
         return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
-    rule = "|:--" + "|--:" * (len(table.header) - 1) + "|"
-    return [row(table.header), rule, *(row(cells) for cells in table.rows)]
+    plain, right = ("|:--", "|--:") if numbers else ("|---", "|---")
+    return [row(header), plain + right * (len(header) - 1) + "|", *map(row, rows)]
 
 
 def write_page(path: Path, title: str, sections: Sequence[Section]) -> None:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Final
 
 from analysis.effects.base import Effect
 from analysis.terms import known
 from rig.model.parameters import gain_names
 from rig.model.rig import Rig
+from tests.studies.pages import markdown_table
 
 FAMILIES: Final[Mapping[str, str]] = {
     "friction": "Dry friction of a cylinder's seals. All four act as a force at the piston, so "
@@ -54,16 +55,12 @@ def parameter_rows(rig: Rig) -> list[tuple[str, str, str, str, str]]:
 def table(rig: Rig) -> str:
     """Return the Markdown table of names, places, parameters (of joint 1), bounds."""
     head = ("effect", "where", "parameter", "unit", "found as")
-    return _markdown(head, (_quoted(row) for row in parameter_rows(rig)))
+    rows = (_quoted(row) for row in parameter_rows(rig))
+    return "\n".join(markdown_table(head, rows)) + "\n"
 
 
 def _quoted(row: tuple[str, ...]) -> tuple[str, ...]:
     return (f"`{row[0]}`", f"`{row[1]}`", f"`{row[2]}`", *row[3:])
-
-
-def _markdown(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)]) + "\n"
 
 
 def overview(rig: Rig) -> str:

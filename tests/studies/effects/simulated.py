@@ -26,6 +26,7 @@ from hil_sim.scenario.file import parse_scenario
 from protocols.files.plan import Overrides
 from rig.model.rig import Rig
 from tests.studies.direct_bench import simulated_run
+from tests.studies.pages import markdown_table
 
 Array = NDArray[np.float64]
 PROTOCOL: Final = "lock-and-excite-multisine"
@@ -248,15 +249,14 @@ def _picture(
 
 def table(outcomes: Sequence[Outcome]) -> str:
     """Return the Markdown table of sizes and residuals."""
-    head = "| effect | where | parameter | true | found | row | before | after |"
-    lines = [head, "|---|---|---|---|---|---|---|---|"]
+    header = ("effect", "where", "parameter", "true", "found", "row", "before", "after")
+    rows = []
     for o in outcomes:
         for k, (name, (true, found)) in enumerate(o.sizes.items()):
             ends = (f"`{o.equation}`", f"{o.before:.1f}", f"{o.after:.2f}") if k == 0 else ("",) * 3
             who = (f"`{o.effect.name}`", f"`{o.effect.place}`") if k == 0 else ("", "")
-            cells = (*who, f"`{name}`", f"{true:.4g}", f"{found:.4g}", *ends)
-            lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+            rows.append((*who, f"`{name}`", f"{true:.4g}", f"{found:.4g}", *ends))
+    return "\n".join(markdown_table(header, rows)) + "\n"
 
 
 def figures(outcomes: Sequence[Outcome]) -> dict[str, str]:

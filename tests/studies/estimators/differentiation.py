@@ -31,6 +31,7 @@ from tests.studies.estimators.other_filters import (
     savitzky_golay,
     smoothing_spline,
 )
+from tests.studies.pages import markdown_table
 
 Choice = Callable[[Record], Filtering]
 
@@ -121,9 +122,9 @@ def as_json(entries: Sequence[Entry]) -> list[dict[str, Any]]:
 
 def markdown(entries: Sequence[Entry]) -> str:
     """Return the table as Markdown: worst bias / standard error [%] of each group."""
-    head = "| excitation | filter of channels; of rows | " + " | ".join(GROUPS) + " |"
-    lines = [head, "|---" * (2 + len(GROUPS)) + "|"]
-    for e in entries:
-        cells = " | ".join(f"{e.bias[g]:.3f} / {e.scatter[g]:.3f}" for g in GROUPS)
-        lines.append(f"| {e.excitation} | {e.filtering} | {cells} |")
-    return "\n".join(lines)
+    rows = [
+        (e.excitation, e.filtering, *(f"{e.bias[g]:.3f} / {e.scatter[g]:.3f}" for g in GROUPS))
+        for e in entries
+    ]
+    header = ("excitation", "filter of channels; of rows", *GROUPS)
+    return "\n".join(markdown_table(header, rows))

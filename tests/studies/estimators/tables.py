@@ -20,6 +20,7 @@ from tests.studies.estimators.coverage import (
     rows,
 )
 from tests.studies.estimators.jobs import JUDGING_SEED, MODEL, Experiment, all_of
+from tests.studies.pages import markdown_table
 from tests.studies.pool import Workers
 
 Say = Callable[[str], None]
@@ -80,17 +81,21 @@ def coverage_text(found: dict[str, Any]) -> str:
             f"{data['seconds']:.1f} s of processor time each, "
             f"{data['experiments'] * data['seconds'] / 60.0:.0f} minutes in all",
             "",
-            "| parameter | coverage % (95 % interval) | bias % | RSD % | half width % |",
-            "|---|---|---|---|---|",
         ]
         table = [Row(**p) for p in data["parameters"].values()]
-        lines += [
-            f"| {r.name} | {100 * r.coverage:.1f} "
-            f"({100 * r.coverage_low:.1f} to {100 * r.coverage_high:.1f}) | "
-            f"{100 * r.bias:+.4f} ± {196 * r.bias_error:.4f} | {100 * r.rsd:.4f} | "
-            f"{100 * r.half_width:.4f} |"
+        header = ("parameter", "coverage % (95 % interval)", "bias %", "RSD %", "half width %")
+        rows = [
+            (
+                r.name,
+                f"{100 * r.coverage:.1f} "
+                f"({100 * r.coverage_low:.1f} to {100 * r.coverage_high:.1f})",
+                f"{100 * r.bias:+.4f} ± {196 * r.bias_error:.4f}",
+                f"{100 * r.rsd:.4f}",
+                f"{100 * r.half_width:.4f}",
+            )
             for r in table
         ]
+        lines += markdown_table(header, rows)
         lines += ["", *_judged(table, data["overall"], found["goal"]), ""]
     return "\n".join(lines).rstrip()
 
@@ -165,9 +170,8 @@ def estimator_text(found: dict[str, Any]) -> str:
             f"{found['kind']}, seeds {found['seeds'][0]} to {found['seeds'][1]}; bias / RSD in %"
             + _preferred(part["used"].get("auto", {}), found["experiments"]),
             "",
-            "| parameter | " + " | ".join(names) + " |",
-            "|---" * (1 + len(names)) + "|",
         ]
+        rows = []
         for parameter in part["estimators"][names[0]]:
             cells = []
             for name in names:
@@ -175,10 +179,11 @@ def estimator_text(found: dict[str, Any]) -> str:
                 cells.append(
                     f"{100 * p['bias']:+.3f} / {100 * p['rsd']:.3f}" if p is not None else "—"
                 )
-            lines.append(f"| {parameter} | " + " | ".join(cells) + " |")
+            rows.append((parameter, *cells))
         times = [part["seconds"].get(name) for name in names]
         cells = [f"{t:.2g}" if t is not None else "—" for t in times]
-        lines += [f"| processor's seconds, median | {' | '.join(cells)} |", ""]
+        rows.append(("processor's seconds, median", *cells))
+        lines += [*markdown_table(("parameter", *names), rows), ""]
     return "\n".join(lines).rstrip()
 
 
