@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -11,16 +11,22 @@ from rig.cli.errors import WorkError
 from rig.cli.output import progress
 from rig.cli.simulate import channel_simulator
 
+if TYPE_CHECKING:
+    from analysis.simulation.model import Model
+
 RunArgument = Annotated[Path, typer.Argument(help="A run folder.")]
 ModelOption = Annotated[
     Path | None,
-    typer.Option(help="A model file: what it simulates stands beside the measured channels."),
+    typer.Option(
+        help="A model file: what it simulates stands beside the measured channels; with fmu, the "
+        "model to write [default: identified from the run]."
+    ),
 ]
 
 
 def export(
     run: RunArgument,
-    kind: Annotated[str, typer.Option("--format", help="csv, mat, parquet or mf4.")] = "csv",
+    kind: Annotated[str, typer.Option("--format", help="csv, mat, parquet, mf4 or fmu.")] = "csv",
     out: Annotated[
         Path | None, typer.Option(help="The folder to make.  [default: RUN-FORMAT beside the run]")
     ] = None,
@@ -28,11 +34,19 @@ def export(
 ) -> None:
     """Write a run for other programs, a file per record; csv and mat can be imported again.
 
+    `--format fmu` writes the identified model instead, with its effects, as functional mock-up
+    units (FMI 2 and 3, co-simulation, for 64-bit Linux and Windows).
+
     Example: bramah export runs/monday --format mat
     """
     from rig.runs.exchange.export import export_run, library_missing
     from rig.runs.stream import read_run_head
 
+    folder = run if run.name not in ("", "..") else run.resolve()
+    wanted = folder.with_name(f"{folder.name}-{kind}") if out is None else out
+    if kind == "fmu":
+        typer.echo(str(_write_units(run, wanted, model)))
+        return
     missing = library_missing(kind)
     if missing:
         raise WorkError(
@@ -40,11 +54,51 @@ def export(
             "pip install 'bramah[export]'"
         )
     more = None if model is None else channel_simulator(model, read_run_head(run).rig, str(run))
-    folder = run if run.name not in ("", "..") else run.resolve()
-    wanted = folder.with_name(f"{folder.name}-{kind}") if out is None else out
     files = export_run(run, wanted, kind, more)
     progress(f"{len(files)} files")
     typer.echo(str(wanted))
+
+
+def _write_units(run: Path, out: Path, path: Path | None) -> Path:
+    """Write the model's mock-up units into `out`; return the folder."""
+    from analysis.simulation.fmu.archive import (
+        TARGETS,
+        CompilationError,
+        compiler_missing,
+        write_fmus,
+    )
+    from rig.runs.store import refuse_occupied
+
+    if compiler_missing():
+        raise WorkError(
+            "--format fmu needs the package ziglang, a C compiler, which is not installed: "
+            "pip install 'bramah[fmu]'"
+        )
+    refuse_occupied(out)
+    model = _model_of(run, path)
+    source = run.name if path is None else path.name
+    about = f"{model.rig.name}, identified: {source}"
+    progress("compiling for Linux and Windows (a minute the first time)")
+    try:
+        files = write_fmus(model, out, model.rig.name, about, TARGETS)
+    except CompilationError as error:
+        raise WorkError(str(error)) from error
+    progress(" ".join(file.name for file in files))
+    return out
+
+
+def _model_of(run: Path, path: Path | None) -> Model:
+    """Return the model of a file for this run's rig, or the one identified from the run."""
+    from analysis.identify.identify import identify
+    from analysis.simulation.model import load_model, refuse_other_rig
+    from rig.runs.store import load_run
+    from rig.runs.stream import read_run_head
+
+    if path is None:
+        return identify([load_run(run)]).model
+    model = load_model(path)
+    refuse_other_rig(model, read_run_head(run).rig, str(run))
+    return model
 
 
 def register(app: typer.Typer) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from pyarrow import parquet
 from typer.testing import CliRunner
 
 from analysis.identify.identify import identify
+from analysis.simulation.fmu.archive import LINUX
 from analysis.simulation.model import load_model, save_model
 from analysis.terms import with_effects
 from analysis.terms.base import Used
@@ -125,6 +127,22 @@ def test_another_program_gets_measured_and_modelled_side_by_side(folder: Path) -
 def test_without_a_word_the_files_lie_beside_the_run(folder: Path) -> None:
     assert bramah("export", folder / "run").strip() == str(folder / "run-csv")
     assert (folder / "run-csv" / "manifest.yaml").is_file()
+
+
+def test_a_model_leaves_as_a_mock_up_unit_with_its_effects(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("analysis.simulation.fmu.archive.TARGETS", (LINUX,))
+    line = ("export", folder / "run", "--format", "fmu", "--model", folder / "rubbing.json")
+    made = Path(bramah(*line, "--out", folder / "units").strip())
+    units = sorted(made.iterdir())
+    assert [u.name for u in units] == ["shinshu-2dof-fmi2.fmu", "shinshu-2dof-fmi3.fmu"]
+    for unit in units:
+        with zipfile.ZipFile(unit) as archive:
+            described = archive.read("modelDescription.xml").decode()
+        assert 'name="parameters.Fc2"' in described
+    with pytest.raises(InputError, match="not empty"):
+        bramah(*line, "--out", folder / "units")
 
 
 def test_what_cannot_be_is_said_before_anything_is_written(
