@@ -1,192 +1,54 @@
-"""One host's session on a serial line: requests that return their own answer, blocks beside them.
-
-A request is sent again, with the same number, until its answer comes: the device carries it out
-once. An answer counts only with the number and the session of the request under way, so that a
-late one to an earlier request is dropped.
-"""
+"""Messages over the bytes of a serial port: frames, and what a wrong baud rate looks like."""
 
 from __future__ import annotations
 
-import logging
-import secrets
-import struct
-import time
-from collections import deque
-from collections.abc import Callable
-
-from drivers.base import DeviceBusy, DeviceError
-from drivers.bench_protocol import DeviceRefused, DeviceSilent
 from drivers.serial_transport import Transport
-from rig.model import registers as reg
-from rig.model.registers import Refusal
-from rig.model.wire import serial_messages as msg
-from rig.model.wire.frames import FRAME_VERSION, FrameDecoder, WireFrame, encode_frame
-from rig.model.wire.serial_messages import ANSWER, Message
-
-logger = logging.getLogger(__name__)
-
-_NO_SUCH = "it knows no such request, or not of this size"
-_TRIES = 5  # within the time after which a silent device counts as lost
+from rig.model.wire.frames import FrameDecoder, WireFrame, encode_frame
 
 
-class SerialRefused(DeviceRefused):
-    """A refusal with the reason that the device gave; `what` was refused by whom."""
+class SerialLine:
+    """`drivers.message_link.MessageLine` over a `Transport`; see there for what each call does."""
 
-    def __init__(self, what: str, reason: Refusal) -> None:
-        text = _NO_SUCH if reason == Refusal.NO_SUCH_REGISTER else reg.REFUSAL_TEXT[reason]
-        super().__init__(f"{what}: {text}")
-        self.what, self.reason = what, reason
-
-
-class SerialLink:
-    """A line that is opened once and, broken once, stays closed until opened again.
-
-    `blocks` holds the frames of pushed blocks of this session as they came, at most four windows
-    of them; the oldest goes when a device sends more than it may.
-    """
-
-    def __init__(
-        self, transport: Transport, timeout: float, clock: Callable[[], float] = time.monotonic
-    ) -> None:
-        self._transport = transport
-        self._timeout = self._patience = timeout
-        self._clock = clock
+    def __init__(self, transport: Transport) -> None:
+        self.transport = transport
         self._decoder = FrameDecoder()
-        self._session = 0
-        self._number = 0
-        self._answers: dict[int, WireFrame] = {}
         self._damaged = self._received = 0  # when the line was opened
-        self._whole = 0
-        self.blocks: deque[WireFrame] = deque(maxlen=4 * msg.WINDOW)
-        self.late = 0  # answers and blocks of earlier requests, streams and sessions
 
     @property
     def where(self) -> str:
         """The port's name."""
-        return self._transport.where
+        return self.transport.where
 
     @property
     def is_open(self) -> bool:
-        """Whether a request may be sent."""
-        return self._transport.is_open
-
-    @property
-    def patience(self) -> float:
-        """How long an answer is waited for [s]."""
-        return self._patience
-
-    @property
-    def damaged(self) -> int:
-        """Damaged frames received since the line was opened."""
-        return self._decoder.damaged - self._damaged
+        """Whether messages can be sent and received."""
+        return self.transport.is_open
 
     def open(self, *, shared: bool = False) -> None:
-        """Open the line for a new session; raises what `Transport.open` does."""
-        self._transport.open(shared=shared)
+        """Open the port; raises what `Transport.open` does."""
+        self.transport.open(shared=shared)
         self._decoder.reset()
         self._damaged, self._received = self._decoder.damaged, self._decoder.received
-        self._whole = 0
-        self._session = secrets.randbits(32)
-        self._patience = self._timeout
-        self._answers.clear()
-        self.blocks.clear()
 
-    def be_patient(self, factor: float) -> None:
-        """Wait `factor` times as long for every answer until the line is opened anew."""
-        self._patience = factor * self._timeout
+    def send(self, message: WireFrame) -> None:
+        """Send a message; raises DeviceLost when the port has gone."""
+        self.transport.write(encode_frame(message))
+
+    def receive(self, patience: float) -> list[WireFrame]:
+        """Return the messages that are whole; raises DeviceLost when the port has gone."""
+        return self._decoder.feed(self.transport.read(patience))
+
+    def complaint(self, heard: int) -> str:
+        """Say what came that may explain a silence, or nothing."""
+        came = self._decoder.received - self._received
+        if came and not heard:
+            return (
+                f"{came} bytes came, none of them a frame: check that both ends use the same "
+                "baud rate and that this is the bench's port"
+            )
+        damaged = self._decoder.damaged - self._damaged
+        return f"{damaged} frames came damaged: check cable and baud rate" if damaged else ""
 
     def close(self) -> None:
-        """Close the line if it is open; never raises."""
-        self._transport.close()
-
-    def next_number(self) -> int:
-        """Return the number that the next request will have."""
-        return (self._number + 1) & 0xFFFF
-
-    def request(self, kind: Message, payload: bytes = b"", size: int = 0, about: str = "") -> bytes:
-        """Return the answer's payload, `size` bytes.
-
-        Raises DeviceSilent without an answer in time, DeviceRefused with the device's reason,
-        DeviceError for an answer of another size or version, DeviceLost when the port has gone.
-        """
-        self._number = self.next_number()
-        self._answers.clear()
-        wire = encode_frame(WireFrame(kind, self._number, self._session, payload))
-        end = self._clock() + self._patience
-        while (now := self._clock()) < end:
-            self._transport.write(wire)
-            answer = self._awaited(min(end, now + self._timeout / _TRIES))
-            if answer is not None:
-                return self._checked(answer, kind, size, about)
-        raise DeviceSilent(self._silence())
-
-    def note(self, kind: Message, number: int, payload: bytes) -> None:
-        """Send a message that is not answered; raises DeviceLost when the port has gone."""
-        self._transport.write(encode_frame(WireFrame(kind, number, self._session, payload)))
-
-    def listen(self, patience: float) -> None:
-        """Take in what is waiting, or what comes within `patience` [s]; raises DeviceLost."""
-        for frame in self._decoder.feed(self._transport.read(patience)):
-            self._sort(frame)
-
-    def _awaited(self, end: float) -> WireFrame | None:
-        while self._number not in self._answers:
-            left = end - self._clock()
-            if left <= 0.0:
-                return None
-            self.listen(left)
-        return self._answers.pop(self._number)
-
-    def _sort(self, frame: WireFrame) -> None:
-        self._whole += 1
-        if frame.session != self._session:
-            self.late += 1
-        elif frame.type == Message.BLOCK:
-            self.blocks.append(frame)
-        elif frame.type & ANSWER and frame.number == self._number:
-            self._answers[frame.number] = frame
-        else:
-            self.late += 1
-            logger.debug("late answer to request %d dropped", frame.number)
-
-    def _checked(self, answer: WireFrame, kind: Message, size: int, about: str) -> bytes:
-        about = about or kind.name.lower()
-        if answer.version != FRAME_VERSION:
-            raise DeviceError(
-                f"the device at {self.where} speaks version {answer.version} of the serial "
-                f"protocol, this program version {FRAME_VERSION}; update the older of the two"
-            )
-        if answer.type == Message.REFUSED:
-            raise self._refused(answer.payload, about)
-        if answer.type != kind | ANSWER or len(answer.payload) != size:
-            raise DeviceError(
-                f"the device at {self.where} answered {about} with a message of type "
-                f"0x{answer.type:02X} and {len(answer.payload)} bytes; type "
-                f"0x{kind | ANSWER:02X} and {size} bytes expected"
-            )
-        return answer.payload
-
-    def _refused(self, payload: bytes, about: str) -> DeviceError:
-        try:
-            refusal = msg.unpack_refusal(payload)
-        except struct.error:
-            return DeviceError(f"the device at {self.where} refused {about} without a reason")
-        at = f" (joint {refusal.joint})" if refusal.joint else ""
-        what = f"device at {self.where} refused {about}{at}"
-        if refusal.reason not in Refusal.__members__.values():
-            return DeviceRefused(f"{what}: reason {refusal.reason}")
-        if refusal.reason == Refusal.NOT_IN_CONTROL:
-            return DeviceBusy(f"another client has control of the device at {self.where}")
-        return SerialRefused(what, Refusal(refusal.reason))
-
-    def _silence(self) -> str:
-        text = f"the device at {self.where} has not answered for {self._patience:g} s"
-        came = self._decoder.received - self._received
-        if came and not self._whole:
-            return (
-                f"{text}; {came} bytes came, none of them a frame: check that both ends use the "
-                "same baud rate and that this is the bench's port"
-            )
-        if self.damaged:
-            return f"{text}; {self.damaged} frames came damaged: check cable and baud rate"
-        return text
+        """Close the port; never raises."""
+        self.transport.close()

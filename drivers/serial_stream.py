@@ -2,54 +2,21 @@
 
 from __future__ import annotations
 
-import logging
-import secrets
-import struct
 import time
-from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import astuple
-from itertools import count
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 from urllib.parse import SplitResult, parse_qs
 
 from pydantic import Field
 
-from drivers.base import (
-    Array,
-    DeviceError,
-    DeviceInfo,
-    DeviceLost,
-    OutputLaw,
-    SampleBlock,
-    WireSettings,
-)
-from drivers.bench_protocol import (
-    VIRTUAL_PATIENCE,
-    DeviceRefused,
-    DeviceSilent,
-    check_identity,
-    refusal_text,
-    trip_text,
-    wave_codes,
-)
-from drivers.modbus_blocks import BlockDecoder, unwrap
-from drivers.serial_link import SerialLink, SerialRefused
-from drivers.serial_transport import PortInUse, PySerialTransport, Transport
+from drivers.base import DeviceError, DeviceInfo, WireSettings
+from drivers.message_stream import MessageStreamDriver
+from drivers.serial_link import SerialLine
+from drivers.serial_transport import PySerialTransport, Transport
 from rig.model import registers as reg
 from rig.model.parts import Wire
-from rig.model.registers import Refusal, Status, TripCause
 from rig.model.rig import Rig
 from rig.model.wire import serial_messages as msg
-from rig.model.wire.serial_messages import Message
-
-logger = logging.getLogger(__name__)
-
-_STATUS_BYTES = 2 * (reg.STATUS_SPAN[1] - reg.STATUS_SPAN[0])
-_IDENTITY_BYTES = 2 * (reg.IDENTITY_SPAN[1] - reg.IDENTITY_SPAN[0])
-_RESEND_SECONDS = 0.1  # without a block, beyond the time that one takes
-_NOTES_BEFORE_STATUS = 3
 
 
 class SerialSettings(WireSettings):
@@ -70,7 +37,7 @@ class SerialSettings(WireSettings):
         return {"device": device, **query}
 
 
-class SerialStreamDriver:
+class SerialStreamDriver(MessageStreamDriver):
     """`drivers.base.Driver` over a serial line; see there for what each call promises."""
 
     settings: ClassVar[type[WireSettings]] = SerialSettings
@@ -84,271 +51,23 @@ class SerialStreamDriver:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         at = SerialSettings.of(wire)
-        self._wire = wire
         self._baud = at.baud
-        self._rig = rig
-        self._link = SerialLink(
-            PySerialTransport(at.device, at.baud) if transport is None else transport,
-            wire.timeout,
-            clock,
-        )
-        self._clock = clock
-        self._layout = reg.block_layout(len(rig.channels), len(rig.joints))
-        self._decoder = BlockDecoder(rig)
-        self._heartbeat = secrets.randbits(16)
-        self._capacity = reg.WAVE_CAPACITY
-        self._stream: int | None = None  # number of the request that started it
-        self._expected = 0  # number of the block to come, modulo 2^16
-        self._ready: deque[msg.PushedBlock] = deque()
-        self._asked_for: int | None = None  # the block that a gap was reported before
-        self.info: DeviceInfo | None = None
-
-    # -- session ----------------------------------------------------------------------------
+        port = PySerialTransport(at.device, at.baud) if transport is None else transport
+        super().__init__(wire, rig, SerialLine(port), clock)
 
     def connect(self) -> DeviceInfo:
         """Open the line, check that the device fits the rig, leave its outputs at zero."""
-        self._check_rate()
-        self._stream = None
-        self._link.open()
-        try:
-            self.info = self._identify()
-            if self.info.virtual_time:
-                self._link.be_patient(VIRTUAL_PATIENCE)
-            # Zeroes the outputs and stops a stream as well.
-            self._command(Message.OPEN, struct.pack(">H", round(self._wire.watchdog * 1e3)))
-            self._decoder.restart(_u32(self._status(), reg.STATUS_TICK))
-        except BaseException:
-            self._link.close()
-            raise
-        return self.info
-
-    def close(self) -> None:
-        """Zero the outputs if the device still answers, then close; never raises."""
-        try:
-            if self._link.is_open:
-                # Whoever has control or not: zero first, then give it up.
-                self._command(Message.ZERO)
-                self._command(Message.CLOSE)
-        except DeviceError as error:
-            logger.debug("while closing: %s", error)
-        finally:
-            self._stream = None
-            self._link.close()
-
-    def close_tripped(self) -> None:
-        """Zero the outputs, then close while it streams: the device latches a lost host.
-
-        A device that does not see its line closed latches it when the watchdog time is over.
-        """
-        try:
-            if self._link.is_open:
-                self._command(Message.ZERO)
-        except DeviceError as error:
-            logger.debug("while closing after a trip: %s", error)
-        finally:
-            self._stream = None
-            self._link.close()
-
-    def zero_outputs(self) -> None:
-        """Put every output to zero now; opens the line anew if need be, zero needs no control."""
-        if self._link.is_open:
-            try:
-                self._link.request(Message.ZERO)
-            except DeviceError as error:
-                logger.warning("zeroing needs a second try: %s", error)
-            else:
-                return
-        with suppress(PortInUse):
-            self._link.open()
-            self._zero_once()
-            return
-        # Another program has the port; what both write arrives whole, and zero is for anybody.
-        self._link.open(shared=True)
-        self._zero_once()
-        self._link.close()
-
-    def reset(self) -> None:
-        """Clear a latched trip of the device; only on a person's word."""
-        self._command(Message.RESET, struct.pack(">H", reg.RESET_KEY))
-
-    def trip_cause(self) -> str | None:
-        """Say why the device has zeroed its outputs, or None if it has not."""
-        return _trip_text(self._status())
-
-    # -- outputs ----------------------------------------------------------------------------
-
-    def upload(self, joint: int, wave: Array) -> None:
-        """Store one period of joint `joint`'s (0-based) waveform [V]; it acts from `apply` on."""
-        codes = wave_codes(self._rig, joint, wave, self._capacity)
-        about = f"waveform of joint {joint + 1}"
-        begin = msg.pack_upload_begin(joint + 1, len(codes))
-        self._command(Message.UPLOAD_BEGIN, begin, about=about)
-        samples = codes.astype(">i2").tobytes()
-        for first in range(0, len(codes), msg.PAGE_SAMPLES):
-            page = samples[2 * first : 2 * (first + msg.PAGE_SAMPLES)]
-            self._command(Message.UPLOAD_PAGE, msg.pack_u32(first) + page, about=about)
-        end = msg.pack_u32(reg.wave_checksum(codes))
-        self._command(Message.UPLOAD_END, end, about=about)
-
-    def apply(self, laws: Sequence[OutputLaw], *, restart: bool = False) -> int:
-        """Set all laws at one tick; `restart` starts the waveforms there. Returns that tick."""
-        if len(laws) != len(self._rig.joints):
-            raise DeviceError(f"{len(laws)} laws for a rig of {len(self._rig.joints)} joints")
-        flag = reg.APPLY_AND_RESTART if restart else reg.APPLY
-        payload = msg.pack_apply(flag, [astuple(law) for law in laws])
-        answer = self._command(Message.APPLY, payload, 4, f"laws {list(laws)}")
-        return unwrap(int.from_bytes(answer, "big"), self._decoder.tick, 32)
-
-    # -- samples ----------------------------------------------------------------------------
-
-    def start(self) -> None:
-        """Start streaming blocks, sequence and waveform phase anew."""
-        self._decoder.restart()
-        self._ready.clear()
-        self._expected, self._asked_for = 0, None
-        # The first block may come before the answer, if that is lost once.
-        self._stream = self._link.next_number()
-        self._command(Message.START)
-
-    def stop(self) -> None:
-        """Stop streaming."""
-        self._stream = None
-        self._command(Message.STOP)
-
-    def read_block(self) -> SampleBlock:
-        """Return the next block, waiting for it; also feeds the device's watchdog."""
-        if self._stream is None:
-            self._why_no_block(overdue=True)
-        self._alive()
-        period = self._layout.samples / self._rig.sample_rate
-        pause = period + min(_RESEND_SECONDS, self._wire.watchdog / 5)
-        deadline = self._clock() + period + self._link.patience
-        for asked in count(1):
-            due = min(self._clock() + pause, deadline)
-            while not self._ready and (left := due - self._clock()) > 0.0:
-                self._link.listen(left)
-                self._accept()
-            if self._ready:
-                break
-            # The note or the block was lost; the watchdog wants another note in any case.
-            self._alive(resend=True)
-            if asked % _NOTES_BEFORE_STATUS == 0:
-                self._why_no_block(overdue=self._clock() >= deadline)
-        block = self._ready.popleft()
-        return self._decoder.decode(block.header, reg.pack_header(block.header) + block.samples)
-
-    # -- inside -----------------------------------------------------------------------------
-
-    def _check_rate(self) -> None:
-        needed = msg.line_rate(self._layout, self._rig.sample_rate)
+        needed = msg.line_rate(
+            reg.block_layout(len(self._rig.channels), len(self._rig.joints)), self._rig.sample_rate
+        )
         if self._baud < needed:
             raise DeviceError(
                 f"{self._baud} baud on {self._link.where} cannot carry "
                 f"{len(self._rig.recorded)} values at {self._rig.sample_rate:g} Hz; "
                 f"{needed:.0f} at least"
             )
+        return super().connect()
 
-    def _identify(self) -> DeviceInfo:
-        where = f"{self._link.where} ({self._baud} baud)"
-        try:
-            data = self._link.request(Message.IDENTIFY, size=_IDENTITY_BYTES)
-        except DeviceRefused as refused:
-            raise DeviceError(f"{refused}: it is no bench of this protocol") from refused
-        except DeviceSilent as silent:
-            raise DeviceLost(
-                f"nothing answers at {where}; is the device (or `bramah sim`) running there? "
-                f"({silent})"
-            ) from None
-        info = check_identity(data, self._rig, where)
-        self._capacity = _u32(data, reg.IDENTITY_CAPACITY, reg.IDENTITY_SPAN[0])
-        return info
-
-    def _zero_once(self) -> None:
-        try:
-            self._link.request(Message.ZERO)
-        except DeviceError:
-            self._link.close()
-            raise
-
-    def _status(self) -> bytes:
-        return self._link.request(Message.STATUS, size=_STATUS_BYTES)
-
-    def _command(
-        self, kind: Message, payload: bytes = b"", size: int = 0, about: str = ""
-    ) -> bytes:
-        try:
-            return self._link.request(kind, payload, size, about)
-        except SerialRefused as refused:
-            if refused.reason != Refusal.TRIPPED:
-                raise
-            text = refusal_text(refused.reason, self.trip_cause())
-            raise DeviceRefused(f"{refused.what}: {text}") from refused
-
-    def _alive(self, *, resend: bool = False) -> None:
-        if self._stream is None:  # between two streams nobody waits for blocks
-            return
-        self._heartbeat = (self._heartbeat + 1) & 0xFFFF
-        alive = msg.Alive((self._expected - 1) & 0xFFFF, self._heartbeat, resend)
-        self._link.note(Message.ALIVE_NOTE, self._stream, msg.pack_alive(alive))
-
-    def _accept(self) -> None:
-        """Move the blocks that came, as far as they are in order, to those that are ready."""
-        while self._link.blocks:
-            frame = self._link.blocks.popleft()
-            if frame.number != self._stream:
-                self._link.late += 1
-                continue
-            try:
-                block = msg.unpack_block(frame.payload, self._layout)
-            except ValueError as error:
-                self._link.close()
-                raise DeviceError(f"the device at {self._link.where} sent a {error}") from error
-            ahead = (block.header.sequence - self._expected) & 0xFFFF
-            gone = (block.oldest - self._expected) & 0xFFFF
-            if 0 < ahead == gone <= 0x7FFF:
-                ahead = 0  # what lies between is lost in the device; the decoder says so
-            if ahead == 0:
-                self._ready.append(block)
-                self._expected = (block.header.sequence + 1) & 0xFFFF
-                self._asked_for = None
-            elif ahead <= 0x7FFF and self._asked_for != self._expected:
-                logger.warning(
-                    "block %d from %s is missing; asking again", self._expected, self._link.where
-                )
-                self._asked_for = self._expected
-                self._alive(resend=True)
-
-    def _why_no_block(self, *, overdue: bool) -> None:
-        """Raise the reason why the device sends no blocks, if it is one that lasts."""
-        where = self._link.where
-        try:
-            status = self._status()
-        except DeviceSilent as silent:
-            self._link.close()
-            raise DeviceLost(str(silent)) from None
-        cause = _trip_text(status)
-        flags = Status(_u16(status, reg.STATUS_FLAGS))
-        if not flags & Status.STREAMING or self._stream is None:
-            raise DeviceError(f"the device at {where} does not stream ({cause or 'not started'})")
-        if _u16(status, reg.STATUS_CAUSE) == TripCause.FAULT:
-            raise DeviceError(f"the device at {where} measures nothing any more: {cause}")
-        self._accept()
-        if overdue and not self._ready:
-            raise DeviceLost(
-                f"the device at {where} answers, but has measured nothing for "
-                f"{self._link.patience:g} s"
-            )
-
-
-def _trip_text(status: bytes) -> str | None:
-    return trip_text(_u16(status, reg.STATUS_CAUSE), _u32(status, reg.STATUS_TRIP_TICK))
-
-
-def _u16(data: bytes, register: reg.Register) -> int:
-    at = 2 * (register.address - reg.STATUS_SPAN[0])
-    return int.from_bytes(data[at : at + 2], "big")
-
-
-def _u32(data: bytes, register: reg.Register, first: int = reg.STATUS_SPAN[0]) -> int:
-    at = 2 * (register.address - first)
-    return int.from_bytes(data[at : at + 4], "big")
+    def _place(self) -> str:
+        """Return the port and its speed."""
+        return f"{self._link.where} ({self._baud} baud)"

@@ -1,218 +1,30 @@
-"""The device's side of the serial wire: frames in, frames out; no port, no clock.
-
-Glossary: a request is *late* when a newer one of its session was carried out: it is dropped. The
-newest one is *remembered* with its answer, which is given again when the request comes again.
-"""
+"""The device's side of the serial wire: bytes in, bytes out; no port, no clock."""
 
 from __future__ import annotations
 
-import logging
-import struct
-from collections.abc import Callable
-from dataclasses import dataclass
-
 from hil_sim.device.device import Device
-from hil_sim.device.laws import Refused
-from hil_sim.device.register_map import RegisterMap
-from rig.model import registers as reg
-from rig.model.registers import BlockHeader, Refusal, Register, Status
-from rig.model.wire import serial_messages as msg
-from rig.model.wire.frames import FRAME_VERSION, FrameDecoder, WireFrame, encode_frame
-from rig.model.wire.serial_messages import ANSWER, FOR_ANYBODY, WINDOW, Message
-
-logger = logging.getLogger(__name__)
-
-_U32 = 0xFFFF_FFFF
-_LATE = 0x8000  # numbers that far ahead are behind
-
-
-@dataclass(eq=False)
-class _Host:
-    """One session: the device's client."""
-
-    session: int
-    number: int  # of the newest request carried out
-    answer: bytes = b""
+from hil_sim.device.message_session import MessageSession
+from rig.model.wire.frames import FrameDecoder, encode_frame
 
 
 class SerialSession:
-    """Carries out on one device what arrives as bytes; returns what is to be sent."""
+    """A `MessageSession` behind the frames of a serial line."""
 
     def __init__(self, device: Device) -> None:
-        self._device = device
-        self._registers = RegisterMap(device)
+        self._session = MessageSession(device)
         self._decoder = FrameDecoder()
-        self._host: _Host | None = None
-        self._stream = 0  # number of the request that started it
-        self._next = 0  # number of the block to be sent next
-        self._requests: dict[int, Callable[[_Host, bytes], bytes]] = {
-            Message.CLOSE: self._close,
-            Message.START: self._start,
-            Message.STOP: self._stop,
-            Message.APPLY: self._apply,
-            Message.RESET: self._reset,
-            Message.UPLOAD_BEGIN: self._writing(reg.UPLOAD_JOINT, 6, 6),
-            Message.UPLOAD_PAGE: self._writing(reg.UPLOAD_OFFSET, 6, 4 + 2 * msg.PAGE_SAMPLES),
-            Message.UPLOAD_END: self._writing(reg.UPLOAD_COMMIT, 4, 4),
-        }
 
     def receive(self, data: bytes) -> bytes:
         """Carry out what `data` completes; returns the answers."""
-        return b"".join(map(self._answer, self._decoder.feed(data)))
+        answers = map(self._session.receive, self._decoder.feed(data))
+        return b"".join(encode_frame(answer) for answer in answers if answer is not None)
 
     def push(self) -> bytes:
         """Return the frame of the next block that may be sent, nothing if none may."""
-        device, host = self._device, self._host
-        oldest = device.queue.waiting(0)
-        if host is None or oldest is None or not device.streaming:
-            return b""
-        place = (self._next - oldest.sequence) & 0xFFFF
-        if place > len(device.queue):
-            place = 0  # what would have been next was dropped from a full queue
-        block = device.queue.waiting(place)
-        if block is None or place >= WINDOW:
-            return b""
-        self._next = (block.sequence + 1) & 0xFFFF
-        status = device.status | Status.BLOCK
-        backlog = len(device.queue) - place - 1
-        header = BlockHeader(block.sequence, block.tick & _U32, status, backlog)
-        payload = msg.pack_block(msg.PushedBlock(oldest.sequence, header, block.samples))
-        return encode_frame(WireFrame(Message.BLOCK, self._stream, host.session, payload))
+        block = self._session.push()
+        return b"" if block is None else encode_frame(block)
 
     def ended(self) -> None:
         """Note that nobody holds the other end of the line any more."""
         self._decoder.reset()
-        host, self._host = self._host, None
-        if host is not None:
-            self._device.disconnected(host)
-
-    # -- requests ---------------------------------------------------------------------------
-
-    def _answer(self, frame: WireFrame) -> bytes:
-        if frame.type == Message.ALIVE_NOTE:
-            self._alive(frame)
-            return b""
-        host = self._host
-        known = host is not None and host.session == frame.session
-        if host is not None and known and frame.version == FRAME_VERSION:
-            age = (frame.number - host.number) & 0xFFFF
-            if frame.type not in FOR_ANYBODY:
-                if age == 0 and host.answer:
-                    return host.answer
-                if age == 0 or age >= _LATE:
-                    logger.debug("late request %d dropped", frame.number)
-                    return b""
-            if 0 < age < _LATE:
-                host.number, host.answer = frame.number, b""
-        try:
-            answer = WireFrame(
-                frame.type | ANSWER, frame.number, frame.session, self._carry_out(frame, known)
-            )
-        except Refused as refused:
-            payload = msg.pack_refusal(msg.DeviceRefusal(refused.reason, refused.joint))
-            answer = WireFrame(Message.REFUSED, frame.number, frame.session, payload)
-        wire = encode_frame(answer)
-        host = self._host
-        if host is not None and host.session == frame.session and frame.type not in FOR_ANYBODY:
-            host.answer = wire
-        return wire
-
-    def _carry_out(self, frame: WireFrame, known: bool) -> bytes:
-        if frame.version != FRAME_VERSION:
-            raise Refused(Refusal.NO_SUCH_REGISTER)
-        if frame.type in FOR_ANYBODY:
-            _sized(frame.payload, 0, 0)
-            return self._for_anybody(frame.type)
-        if frame.type == Message.OPEN:
-            return self._open(frame, known)
-        request = self._requests.get(frame.type)
-        if request is None:
-            raise Refused(Refusal.NO_SUCH_REGISTER)
-        if self._host is None or not known:
-            raise Refused(Refusal.NOT_IN_CONTROL)
-        return request(self._host, frame.payload)
-
-    def _for_anybody(self, kind: int) -> bytes:
-        if kind == Message.ZERO:
-            self._device.zero()
-            return b""
-        first, end = reg.IDENTITY_SPAN if kind == Message.IDENTIFY else reg.STATUS_SPAN
-        return self._registers.read(None, first, end - first)
-
-    def _open(self, frame: WireFrame, known: bool) -> bytes:
-        _sized(frame.payload, 2, 2)
-        host = self._host if known and self._host else _Host(frame.session, frame.number)
-        self._device.take_control(host)
-        self._host = host
-        self._registers.write(host, reg.CONTROL_WATCHDOG.address, frame.payload)
-        self._device.zero()
-        self._device.stop()
-        return b""
-
-    def _close(self, host: _Host, payload: bytes) -> bytes:
-        _sized(payload, 0, 0)
-        self._device.take_control(host)
-        self._device.zero()
-        self._device.stop()
-        self._device.disconnected(host)
-        return b""
-
-    def _start(self, host: _Host, payload: bytes) -> bytes:
-        _sized(payload, 0, 0)
-        self._command(host, reg.CONTROL_STREAM, reg.STREAM_START)
-        self._stream, self._next = host.number, 0
-        return b""
-
-    def _stop(self, host: _Host, payload: bytes) -> bytes:
-        _sized(payload, 0, 0)
-        self._command(host, reg.CONTROL_STREAM, reg.STREAM_STOP)
-        return b""
-
-    def _reset(self, host: _Host, payload: bytes) -> bytes:
-        _sized(payload, 2, 2)
-        self._registers.write(host, reg.CONTROL_RESET.address, payload)
-        return b""
-
-    def _apply(self, host: _Host, payload: bytes) -> bytes:
-        size = 2 + 2 * reg.LAW_WORDS * self._device.laws.joints
-        _sized(payload, size, size)
-        self._registers.write(host, reg.LAWS.address, payload[2:])
-        self._registers.write(host, reg.CONTROL_APPLY.address, payload[:2])
-        return self._registers.read(host, reg.STATUS_APPLY_TICK.address, 2)
-
-    def _writing(
-        self, register: Register, least: int, most: int
-    ) -> Callable[[_Host, bytes], bytes]:
-        def write(host: _Host, payload: bytes) -> bytes:
-            _sized(payload, least, most)
-            self._registers.write(host, register.address, payload)
-            return b""
-
-        return write
-
-    def _command(self, host: _Host, register: Register, value: int) -> None:
-        self._registers.write(host, register.address, struct.pack(">H", value))
-
-    # -- the stream -------------------------------------------------------------------------
-
-    def _alive(self, frame: WireFrame) -> None:
-        host, device = self._host, self._device
-        if host is None or frame.session != host.session or frame.version != FRAME_VERSION:
-            return
-        try:
-            alive = msg.unpack_alive(frame.payload)
-            device.beat(host, alive.heartbeat)
-            if frame.number != self._stream or not device.streaming:
-                return
-            device.queue.release(alive.acknowledge)
-            oldest = device.queue.waiting(0)
-            if alive.resend and oldest is not None:
-                self._next = oldest.sequence
-            device.measure_ahead()
-        except (Refused, struct.error) as error:
-            logger.debug("note of the host dropped: %s", error)
-
-
-def _sized(payload: bytes, least: int, most: int) -> None:
-    if not least <= len(payload) <= most or len(payload) % 2:
-        raise Refused(Refusal.NO_SUCH_REGISTER)
+        self._session.ended()

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-import drivers.serial_link
+import drivers.message_link
 from drivers.base import OFF, DeviceError, OutputLaw
 from drivers.serial_stream import SerialStreamDriver
 from rig.model import registers as reg
@@ -54,7 +54,7 @@ def test_sizes_and_codes_are_those_of_the_page() -> None:
 
 def spoken(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The bytes of a little session, as the page prints them."""
-    monkeypatch.setattr(drivers.serial_link.secrets, "randbits", lambda _bits: SESSION)
+    monkeypatch.setattr(drivers.message_link.secrets, "randbits", lambda _bits: SESSION)
     loop = Loop(realtime=False)
     lines: list[tuple[str, bytes]] = []
     for arrow, faults in (("->", loop.forth), ("<-", loop.back)):

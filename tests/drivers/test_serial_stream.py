@@ -318,7 +318,7 @@ def test_another_version_is_named(driver: SerialStreamDriver) -> None:
 
 def bytes_answered(driver: SerialStreamDriver, frame: WireFrame) -> WireFrame:
     """Send a frame past the driver, return what the device answers to it."""
-    transport, decoder = driver._link._transport, FrameDecoder()
+    transport, decoder = driver._link._line.transport, FrameDecoder()
     transport.write(encode_frame(frame))
     if frame.session == driver._link._session:
         driver._link._number = frame.number
@@ -345,7 +345,7 @@ def test_a_request_that_comes_twice_is_carried_out_once(driver: SerialStreamDriv
     assert first.type == Message.APPLY | msg.ANSWER
     driver.zero_outputs()
     # The same bytes once more, late: after a newer request they do nothing and get no answer.
-    link._transport.write(encode_frame(apply))
+    link._line.transport.write(encode_frame(apply))
     assert np.all(read(driver, 3)[:, 10:] == 0.0)
 
 
@@ -367,7 +367,7 @@ def test_another_session_is_refused_what_needs_control(driver: SerialStreamDrive
 def test_noise_and_nonsense_leave_a_device_that_answers(port: str) -> None:
     driver = host(port)
     driver.connect()
-    transport, rng = driver._link._transport, random.Random(3)
+    transport, rng = driver._link._line.transport, random.Random(3)
     sizes = {Message.APPLY: 42, Message.RESET: 2, Message.OPEN: 2, Message.UPLOAD_BEGIN: 6}
     for number in range(2_000):
         kind = rng.choice([*Message, rng.randrange(256)])

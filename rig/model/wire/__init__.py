@@ -1,1 +1,1 @@
-"""What both ends of a serial line must agree on: frames and messages (docs/wire-serial.md)."""
+"""What both ends of a serial line or a CAN bus must agree on: frames and messages."""

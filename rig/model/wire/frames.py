@@ -1,7 +1,8 @@
-"""Frames on a serial line: a checked message between two zero bytes.
+"""Messages of a bench as bytes, and their frames on a serial line.
 
-    frame = 00, COBS(header, payload, CRC-32 of both), 00
+    body = header, payload, CRC-32 of both
     header = version u8, type u8, number u16, session u32; high byte first
+    frame on a serial line = 00, COBS(body), 00
 
 COBS (consistent overhead byte stuffing) leaves no zero inside, so that a receiver finds the next
 frame after any damage. The header's layout is the same in every version of the protocol.
@@ -23,8 +24,8 @@ DELIMITER: Final = b"\0"
 _HEADER: Final = struct.Struct(">BBHI")
 _CHECK: Final = struct.Struct(">I")
 _MIN_BODY: Final = _HEADER.size + _CHECK.size
-_MAX_BODY: Final = _MIN_BODY + MAX_PAYLOAD
-MAX_ENCODED: Final = _MAX_BODY + -(-_MAX_BODY // 254)  # between the zeros: 266 bytes
+MAX_BODY: Final = _MIN_BODY + MAX_PAYLOAD
+MAX_ENCODED: Final = MAX_BODY + -(-MAX_BODY // 254)  # between the zeros: 266 bytes
 
 
 @dataclass(frozen=True)
@@ -38,8 +39,8 @@ class WireFrame:
     version: int = FRAME_VERSION
 
 
-def encode_frame(frame: WireFrame) -> bytes:
-    """Return the bytes of a frame with the zeros around it.
+def encode_body(frame: WireFrame) -> bytes:
+    """Return header, payload and checksum of a message.
 
     Raises ValueError for a payload above `MAX_PAYLOAD` bytes, struct.error for a number that
     does not fit its field.
@@ -48,7 +49,23 @@ def encode_frame(frame: WireFrame) -> bytes:
         raise ValueError(f"payload of {len(frame.payload)} bytes; {MAX_PAYLOAD} at most")
     head = _HEADER.pack(frame.version, frame.type, frame.number, frame.session)
     body = head + frame.payload
-    stuffed: bytes = cobs.encode(body + _CHECK.pack(zlib.crc32(body)))
+    return body + _CHECK.pack(zlib.crc32(body))
+
+
+def decode_body(body: bytes) -> WireFrame | None:
+    """Return the message of a body, None where its size or checksum is none."""
+    if not _MIN_BODY <= len(body) <= MAX_BODY:
+        return None
+    content, check = body[: -_CHECK.size], body[-_CHECK.size :]
+    if _CHECK.pack(zlib.crc32(content)) != check:
+        return None
+    version, kind, number, session = _HEADER.unpack_from(content)
+    return WireFrame(kind, number, session, content[_HEADER.size :], version)
+
+
+def encode_frame(frame: WireFrame) -> bytes:
+    """Return the bytes of a frame with the zeros around it; raises as `encode_body`."""
+    stuffed: bytes = cobs.encode(encode_body(frame))
     return DELIMITER + stuffed + DELIMITER
 
 
@@ -94,13 +111,6 @@ def _decode(piece: bytes) -> WireFrame | None:
     if len(piece) > MAX_ENCODED:
         return None
     try:
-        body = cobs.decode(piece)
+        return decode_body(cobs.decode(piece))
     except cobs.DecodeError:
         return None
-    if not _MIN_BODY <= len(body) <= _MAX_BODY:
-        return None
-    content, check = body[: -_CHECK.size], body[-_CHECK.size :]
-    if _CHECK.pack(zlib.crc32(content)) != check:
-        return None
-    version, kind, number, session = _HEADER.unpack_from(content)
-    return WireFrame(kind, number, session, content[_HEADER.size :], version)

@@ -1,4 +1,6 @@
-"""The messages of a bench on a serial line: one definition for both ends (docs/wire-serial.md).
+"""The messages of a bench on a serial line or a CAN bus: one definition for both ends.
+
+docs/wire-serial.md and docs/wire-can.md describe them for people.
 
 Glossary: a *request* is answered, with its number and session; a *note* is not. A *session* is
 the time of one host, named by a number that it draws. Values and codes are those of
