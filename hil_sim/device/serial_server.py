@@ -7,14 +7,11 @@ host is lost.
 from __future__ import annotations
 
 import logging
-import signal
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from types import FrameType
+from collections.abc import Callable
 
 from hil_sim.device.device import Device, Plant
-from hil_sim.device.lifetime import PARENT_SECONDS, Owner
+from hil_sim.device.lifetime import PARENT_SECONDS, Owner, told_to_end
 from hil_sim.device.pty_line import PtyLine
 from hil_sim.device.serial_session import SerialSession
 from rig.model.rig import Rig
@@ -38,7 +35,7 @@ def serve_serial(
     line = PtyLine()
     device = Device(rig, plant, realtime=realtime)
     try:
-        with _told_to_end() as ended:
+        with told_to_end() as ended:
             on_ready(f"serial://{line.name}")
             _serve(line, device, ended, None if parent is None else Owner(parent))
     finally:
@@ -63,23 +60,3 @@ def _serve(line: PtyLine, device: Device, ended: list[int], owner: Owner | None)
             if owner.has_ended():
                 logger.info("the process that this server belongs to has ended")
                 return
-
-
-@contextmanager
-def _told_to_end() -> Iterator[list[int]]:
-    """Collect SIGTERM and SIGINT in the list given, instead of dying of them."""
-    told: list[int] = []
-
-    def note(number: int, _frame: FrameType | None) -> None:
-        told.append(number)
-
-    before = {}
-    # Only a main thread has signals; elsewhere the caller ends its process.
-    with suppress(ValueError):
-        for number in (signal.SIGTERM, signal.SIGINT):
-            before[number] = signal.signal(number, note)
-    try:
-        yield told
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

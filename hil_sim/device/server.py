@@ -8,7 +8,7 @@ import os
 import signal
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from pymodbus.constants import ExcCodes
 from pymodbus.pdu import ModbusPDU
@@ -26,9 +26,14 @@ from hil_sim.device.serial_server import serve_serial
 from rig.model import registers as reg
 from rig.model.rig import Rig
 
+if TYPE_CHECKING:
+    from rig.model.wire.can_layout import CanLayout
+
 __all__ = [
+    "CAN",
     "RTU",
     "SERIAL",
+    "SLCAN",
     "TCP",
     "WIRES",
     "BenchServer",
@@ -43,7 +48,10 @@ logger = logging.getLogger(__name__)
 TCP: Final = "modbus-tcp"
 RTU: Final = "modbus-rtu"
 SERIAL: Final = "serial"
-WIRES: Final = (TCP, RTU, SERIAL)
+CAN: Final = "can"
+SLCAN: Final = "can-slcan"
+WIRES: Final = (TCP, RTU, SERIAL, CAN, SLCAN)
+BITRATE: Final = 1_000_000  # of the simulated bus, where nothing else is said
 
 
 class _Session:
@@ -140,8 +148,13 @@ def serve(
     on_ready: Callable[[str], None] = logger.info,
     parent: int | None = None,
     wire: str = TCP,
+    layout: CanLayout | None = None,
+    bitrate: int = BITRATE,
 ) -> None:
     """Serve a plant on a wire of `WIRES` until SIGTERM, SIGINT or the end of process `parent`.
+
+    `layout` are the messages on a CAN bus (default: those of the DBC made for the rig), `bitrate`
+    [bit/s] is its rate.
 
     `on_ready` is called once with the real endpoint, before any client is answered. The sample
     clock starts with this call and a host waits no longer than its timeout: where a plant's first
@@ -150,6 +163,17 @@ def serve(
     """
     if wire == SERIAL:
         serve_serial(rig, plant, realtime=realtime, on_ready=on_ready, parent=parent)
+        return
+    if wire in (CAN, SLCAN):
+        # Half a second of imports that no other wire needs.
+        from hil_sim.device.can import adapters, server  # noqa: PLC0415
+
+        adapter = (
+            adapters.SlcanLine(bitrate) if wire == SLCAN else adapters.SocketcandServer(host, port)
+        )
+        server.serve_can(
+            rig, plant, adapter, layout=layout, realtime=realtime, on_ready=on_ready, parent=parent
+        )
         return
     # The library's messages are about frames; what matters to people is raised or logged here.
     logging.getLogger("pymodbus").setLevel(logging.CRITICAL)

@@ -74,7 +74,7 @@ def _user() -> str:
 
 
 def _folder_name(wire: Wire) -> str:
-    kind, _, place = wire.endpoint.lower().partition("://")
+    kind, _, place = wire.endpoint.lower().partition("?")[0].partition("://")
     for name in _THIS_COMPUTER:
         place = re.sub(rf"^{re.escape(name)}(?=:|$)", LOCALHOST, place)
     return re.sub(r"[^a-z0-9.-]", "_", f"{kind}_{place}")

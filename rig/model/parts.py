@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any, ClassVar, Final, Literal, Self
+from urllib.parse import urlencode
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
@@ -320,8 +321,11 @@ class Wire(Part):
 
     @property
     def endpoint(self) -> str:
-        """Where the bench answers, as `--endpoint` takes it: a device file, or host and port."""
+        """Where the bench answers, as `--endpoint` takes it: device file, bus, or host and port."""
         at = self.settings
+        if "bus" in at:
+            rest = urlencode({key: value for key, value in at.items() if key != "bus"}, safe="/")
+            return f"{self.kind}://{at['bus']}{'?' if rest else ''}{rest}"
         if "device" in at:
             return f"{self.kind}://{at['device']}"
         host = str(at.get("host", LOCALHOST))

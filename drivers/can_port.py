@@ -1,0 +1,345 @@
+"""Frames of a CAN bus by python-can: one thread of our own receives, whoever calls sends.
+
+Nothing is sent by python-can's periodic sender: its thread ends silently with the first error of
+the bus, and the device's watchdog would be all that is left.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import queue
+import select
+import socket
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, Final
+
+import can
+
+from drivers.base import DeviceError, DeviceLost
+from rig.model.wire.can_frames import CanFrame
+from rig.model.wire.can_layout import EXTENDED
+
+logger = logging.getLogger(__name__)
+
+SOCKETCAND: Final = "socketcand"
+SLCAN: Final = "slcan"
+_GREETING: Final = b"< hi >"
+_SLICE_SECONDS: Final = 0.05  # how long the receiver waits at a time: closing takes that long
+_OPEN_SECONDS: Final = 5.0  # for an interface to open; some libraries wait for ever
+_SEND_SECONDS: Final = 1.0  # for a place in the adapter's transmit queue
+_FULL_SECONDS: Final = 0.001  # between two tries at a full one
+_MOST_WAITING: Final = 100_000  # frames received and not taken: memory stays bounded
+_OPENINGS: Final = 3  # socketcand's last answer may come glued to the first frame
+_ERRORS: Final = (can.CanError, OSError, ValueError, ImportError, NotImplementedError)
+
+
+@dataclass(frozen=True)
+class BusPlace:
+    """Where a bus is: python-can's interface and what it needs to open it."""
+
+    text: str
+    interface: str
+    channel: str
+    host: str = ""
+    port: int = 0
+
+    @classmethod
+    def of(cls, text: str) -> BusPlace:
+        """Read ``INTERFACE/CHANNEL``; raises ValueError saying what was expected."""
+        interface, _, channel = text.partition("/")
+        if interface not in can.VALID_INTERFACES:
+            known = " ".join(sorted(can.VALID_INTERFACES))
+            raise ValueError(
+                f"no interface {interface!r}; expected INTERFACE/CHANNEL, one of {known}"
+            )
+        if not channel:
+            raise ValueError(f"expected {interface}/CHANNEL, the channel is missing")
+        if interface == SOCKETCAND:
+            address, _, channel = channel.partition("/")
+            host, _, port = address.rpartition(":")
+            if not host or not port.isdigit() or not channel:
+                raise ValueError("expected socketcand/HOST:PORT/CHANNEL")
+            return cls(text, interface, channel, host.strip("[]"), int(port))
+        if interface == SLCAN and "/" in channel:
+            channel = f"/{channel.lstrip('/')}"  # a device file; COM3 has no slash
+        return cls(text, interface, channel)
+
+
+class CanPort:
+    """A CAN bus that can be opened and closed any number of times.
+
+    `wanted` are the keys (`CanMessage.key`) of the frames to keep. `errors` counts error frames
+    since opening, `foreign` frames of other keys, `kept` those of `wanted`, `overrun` those that
+    nobody took in time.
+    """
+
+    def __init__(
+        self,
+        place: BusPlace,
+        bitrate: int,
+        data_bitrate: int | None,
+        wanted: frozenset[int],
+        make: Callable[..., Any] = can.Bus,
+    ) -> None:
+        self._place, self._bitrate, self._data_bitrate = place, bitrate, data_bitrate
+        self._wanted = wanted
+        self._make = make
+        self._reader: _Reader | None = None
+
+    @property
+    def where(self) -> str:
+        """The bus's name."""
+        return self._place.text
+
+    @property
+    def is_open(self) -> bool:
+        """Whether frames can be sent and received."""
+        return self._reader is not None
+
+    @property
+    def seen(self) -> Seen:
+        """What came since the bus was opened last."""
+        return Seen() if self._reader is None else self._reader.seen
+
+    def open(self) -> None:
+        """Open the bus; raises DeviceLost where there is none, DeviceError where it may not be."""
+        self.close()
+        # python-can warns of what is ordinary, such as half a line; we report what is not.
+        logging.getLogger("can").setLevel(logging.CRITICAL)
+        if self._place.interface == SOCKETCAND:
+            self._greeted()
+        reader = _Reader(self._opened, self._wanted)
+        if not reader.opened.wait(_OPEN_SECONDS):
+            reader.end()
+            raise DeviceLost(f"{self.where} did not open within {_OPEN_SECONDS:g} s")
+        if reader.fault is not None:
+            raise self._why_not(reader.fault) from reader.fault
+        self._reader = reader
+
+    def send(self, frame: CanFrame) -> None:
+        """Send a frame; raises DeviceLost when the bus has gone or takes none."""
+        reader = self._usable()
+        message = can.Message(
+            arbitration_id=frame.identifier,
+            data=frame.data,
+            is_extended_id=frame.extended,
+            is_fd=frame.fd,
+            bitrate_switch=frame.fd,
+        )
+        end = time.monotonic() + _SEND_SECONDS
+        while True:
+            try:
+                reader.bus.send(message, timeout=_SEND_SECONDS)
+            except _ERRORS as error:
+                if not _is_full(error):
+                    raise self._gone(error) from error
+                if time.monotonic() > end:
+                    self.close()
+                    raise DeviceLost(
+                        f"{self.where} takes no more frames: no other node acknowledges them; "
+                        f"check wiring, termination and that the bus runs at {self._bitrate} bit/s"
+                    ) from error
+                time.sleep(_FULL_SECONDS)
+            else:
+                return
+
+    def receive(self, patience: float) -> list[tuple[int, bytes]]:
+        """Return (key, bytes) of the frames waiting; nothing after `patience` [s].
+
+        Raises DeviceLost when the bus has gone.
+        """
+        reader = self._usable()
+        frames: list[tuple[int, bytes]] = []
+        with suppress(queue.Empty):
+            frames.append(reader.frames.get(timeout=max(patience, 0.0)))
+            while True:
+                frames.append(reader.frames.get_nowait())
+        if not frames and reader.fault is not None:
+            raise self._gone(reader.fault) from reader.fault
+        return [frame for frame in frames if frame[0] >= 0]
+
+    def close(self) -> None:
+        """Close the bus; never raises."""
+        reader, self._reader = self._reader, None
+        if reader is not None:
+            reader.end()
+
+    # -- inside -----------------------------------------------------------------------------
+
+    def _usable(self) -> _Reader:
+        if self._reader is None:
+            raise DeviceLost(f"the bus {self.where} is closed")
+        return self._reader
+
+    def _gone(self, error: BaseException) -> DeviceLost:
+        self.close()
+        return DeviceLost(f"the bus {self.where} has gone: {_line(error)}")
+
+    def _greeted(self) -> None:
+        """Refuse what is no socketcand: python-can would wait for its answer for ever."""
+        place = self._place
+        try:
+            with socket.create_connection((place.host, place.port), _OPEN_SECONDS) as asked:
+                said = asked.recv(64)
+        except ConnectionError as error:
+            raise DeviceLost(
+                f"nobody listens at {place.host}:{place.port} ({error.strerror}); is socketcand "
+                "(or `bramah sim`) running there?"
+            ) from error
+        except OSError as error:  # a name that is none, a silent host
+            raise DeviceLost(
+                f"no socketcand at {place.host}:{place.port}: {error.strerror or error}"
+            ) from error
+        if not said.startswith(_GREETING):
+            raise DeviceError(
+                f"{place.host}:{place.port} is no socketcand: it said {said[:20]!r}, expected "
+                f"{_GREETING!r}"
+            )
+
+    def _opened(self) -> Any:
+        place = self._place
+        rates: dict[str, Any] = {"bitrate": self._bitrate}
+        if place.interface == SOCKETCAND:
+            rates = {"host": place.host, "port": place.port, "tcp_tune": True}
+        elif place.interface == SLCAN:
+            rates["sleep_after_open"] = 0.0
+            if self._data_bitrate is not None:
+                rates["timing"] = can.BitTimingFd.from_sample_point(
+                    f_clock=80_000_000,
+                    nom_bitrate=self._bitrate,
+                    nom_sample_point=80.0,
+                    data_bitrate=self._data_bitrate,
+                    data_sample_point=75.0,
+                )
+        elif self._data_bitrate is not None:
+            rates |= {"fd": True, "data_bitrate": self._data_bitrate}
+        for left in reversed(range(_OPENINGS)):
+            try:
+                return self._make(interface=place.interface, channel=place.channel, **rates)
+            except can.CanError as error:
+                if "got: '< ok ><" not in str(error) or not left:
+                    raise
+        raise AssertionError("unreachable")
+
+    def _why_not(self, error: BaseException) -> DeviceError:
+        number, text = _errno(error), _line(error)
+        interface = self._place.interface
+        if isinstance(error, can.CanInterfaceNotImplementedError | ImportError):
+            return DeviceError(f"the interface {interface} cannot be used here: {text}")
+        if number in (errno.EPERM, errno.EACCES):
+            return DeviceError(
+                f"no permission to open {self.where}; on Linux join the group that owns the "
+                "device (often `dialout`), or have an administrator bring the interface up"
+            )
+        if number == errno.EAFNOSUPPORT:
+            return DeviceError(
+                f"{self.where}: this system has no SocketCAN; load the kernel's module can_raw, or "
+                "reach the bus by another interface"
+            )
+        if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
+            return DeviceLost(
+                f"there is no {self.where}; is the adapter plugged in (or `bramah sim` running "
+                "there)?"
+            )
+        if number == errno.ENETDOWN:
+            return DeviceLost(
+                f"{self.where} is down: ip link set {self._place.channel} up type can bitrate "
+                f"{self._bitrate}"
+            )
+        return DeviceLost(f"cannot open {self.where} at {self._bitrate} bit/s: {text}")
+
+
+@dataclass
+class Seen:
+    """Frames since a bus was opened, by what they were."""
+
+    kept: int = 0
+    foreign: int = 0
+    errors: int = 0
+    overrun: int = 0
+
+
+class _Reader:
+    """The receive thread of one opened bus: it opens, receives, and closes it."""
+
+    def __init__(self, make: Callable[[], Any], wanted: frozenset[int]) -> None:
+        self.bus: Any = None
+        self.opened = threading.Event()
+        self.fault: BaseException | None = None
+        self.frames: queue.SimpleQueue[tuple[int, bytes]] = queue.SimpleQueue()
+        self.seen = Seen()
+        self._make, self._wanted = make, wanted
+        self._ending = False
+        self._thread = threading.Thread(target=self._run, name="can-receive", daemon=True)
+        self._thread.start()
+
+    def end(self) -> None:
+        """End the thread and close the bus; one that hangs in a library is left behind."""
+        self._ending = True
+        if threading.current_thread() is not self._thread:
+            self._thread.join(_OPEN_SECONDS)
+
+    def _run(self) -> None:
+        try:
+            self.bus = self._make()
+        except Exception as error:  # whatever a vendor's library raises
+            self.fault = error
+            self.opened.set()
+            return
+        self.opened.set()
+        try:
+            while not self._ending:
+                message = self.bus.recv(_SLICE_SECONDS)
+                if message is not None:
+                    self._take(message)
+                elif _has_ended(self.bus):
+                    raise ConnectionResetError(errno.ECONNRESET, "the other end closed it")
+        except Exception as error:
+            self.fault = error
+            self.frames.put((-1, b""))  # wakes whoever waits
+        finally:
+            with suppress(Exception):
+                self.bus.shutdown()
+
+    def _take(self, message: Any) -> None:
+        key = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
+        if message.is_error_frame:
+            self.seen.errors += 1
+        elif message.is_remote_frame or key not in self._wanted:
+            self.seen.foreign += 1
+        elif self.frames.qsize() >= _MOST_WAITING:
+            self.seen.overrun += 1
+        else:
+            self.seen.kept += 1
+            self.frames.put((key, bytes(message.data)))
+
+
+def _has_ended(bus: Any) -> bool:
+    """Tell whether a socketcand has closed its connection, which python-can passes over."""
+    end = getattr(bus, "_SocketCanDaemonBus__socket", None)
+    if end is None:
+        return False
+    return bool(select.select([end], [], [], 0)[0]) and not end.recv(1, socket.MSG_PEEK)
+
+
+def _is_full(error: BaseException) -> bool:
+    return _errno(error) == errno.ENOBUFS or "buffer full" in str(error)
+
+
+def _errno(error: BaseException | None) -> int | None:
+    """Return the system's number of an error, wherever in its causes it stands."""
+    while error is not None:
+        number = getattr(error, "errno", None) or getattr(error, "error_code", None)
+        if isinstance(number, int):
+            return number
+        error = error.__cause__ or error.__context__
+    return None
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(str(error).split())[:200] or type(error).__name__

@@ -1,0 +1,78 @@
+"""The simulated bench on a CAN bus: a `Device` behind an adapter, until told to end.
+
+A node of a bus does not see a program end; its watchdog is what zeroes the outputs then.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+
+from hil_sim.device.can.adapters import Adapter
+from hil_sim.device.can.session import CanSession
+from hil_sim.device.device import Device, Plant
+from hil_sim.device.lifetime import PARENT_SECONDS, Owner, told_to_end
+from rig.model.rig import Rig
+from rig.model.wire.can_database import database_text
+from rig.model.wire.can_layout import CanLayout, read_layout
+
+logger = logging.getLogger(__name__)
+
+
+def layout_of(rig: Rig, *, fd: bool = False) -> CanLayout:
+    """Return the messages of the DBC file that is made for a rig without one."""
+    return read_layout(database_text(rig, fd=fd), f"the DBC made for {rig.name}", rig)
+
+
+def serve_can(
+    rig: Rig,
+    plant: Plant,
+    adapter: Adapter,
+    *,
+    layout: CanLayout | None = None,
+    realtime: bool = False,
+    on_ready: Callable[[str], None] = logger.info,
+    parent: int | None = None,
+) -> None:
+    """Serve a plant on a bus until SIGTERM, SIGINT or the end of process `parent`.
+
+    `on_ready` is called once with the adapter's endpoint; the sample clock starts with this call.
+    """
+    device = Device(rig, plant, realtime=realtime)
+    try:
+        with told_to_end() as ended:
+            on_ready(adapter.endpoint)
+            run_device(
+                adapter,
+                device,
+                layout_of(rig) if layout is None else layout,
+                ended,
+                None if parent is None else Owner(parent),
+            )
+    finally:
+        device.zero()
+        adapter.close()
+
+
+def run_device(
+    adapter: Adapter,
+    device: Device,
+    layout: CanLayout,
+    ended: Sequence[object],
+    owner: Owner | None = None,
+) -> None:
+    """Serve a device until `ended` is not empty, or its owner has ended."""
+    session = CanSession(device, layout)
+    look = time.monotonic()
+    while not ended:
+        for frame in adapter.receive(device.idle_seconds()):
+            adapter.send(session.receive(frame))
+        device.poll()
+        while adapter.free and (block := session.push()):
+            adapter.send(block)
+        if owner is not None and time.monotonic() > look:
+            look = time.monotonic() + PARENT_SECONDS
+            if owner.has_ended():
+                logger.info("the process that this server belongs to has ended")
+                return
