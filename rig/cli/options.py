@@ -20,7 +20,7 @@ WaveSeedOption = Annotated[
 ]
 StepOption = Annotated[list[str] | None, typer.Option("--step", help="Only this step; repeatable.")]
 EndpointOption = Annotated[
-    str | None, typer.Option(help="modbus-tcp://HOST:PORT instead of the rig's wire.")
+    str | None, typer.Option(help="KIND://..., such as modbus-tcp://HOST:PORT, not the rig's wire.")
 ]
 JsonOption = Annotated[
     Path | None,

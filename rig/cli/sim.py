@@ -15,7 +15,11 @@ from rig.cli.options import (
 def sim(
     rig: RigOption,
     wire: Annotated[
-        str, typer.Option(help="modbus-tcp or modbus-rtu (on a pseudo-terminal).")
+        str,
+        typer.Option(
+            help="modbus-tcp, modbus-rtu or serial (on a pseudo-terminal), can (by socketcand), "
+            "or can-slcan (on a pseudo-terminal)."
+        ),
     ] = "modbus-tcp",
     scenario: Annotated[
         str | None,

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from drivers.modbus_tcp import TcpSettings
-from hil_sim.device.server import TCP, WIRES, EndpointError, serve, warm_up
+from hil_sim.device.server import CAN, SLCAN, TCP, WIRES, EndpointError, serve, warm_up
 from hil_sim.plant.faulty import FaultyPlant
 from hil_sim.plant.plant import Plant
 from hil_sim.scenario.file import Scenario, load_shipped, parse_scenario, shipped_scenarios
@@ -63,13 +64,11 @@ def serve_bench(what: Served) -> None:
     # Compiled before anybody waits for an answer, on a spare so that this one starts at rest.
     warm_up(rig, Plant(rig, scenario, what.seed))
     write_truth(what.truth, plant.plant.truth(), scenario.model_dump(mode="json"))
-    tcp = TcpSettings.of(rig.wire) if rig.wire.kind == TCP else TcpSettings()
     try:
         serve(
             rig,
             plant,
-            host=tcp.host,
-            port=tcp.port if what.port is None else what.port,
+            **_place(what, rig),
             wire=what.wire,
             realtime=what.real_time,
             on_ready=_endpoint_first,
@@ -77,3 +76,25 @@ def serve_bench(what: Served) -> None:
         )
     except EndpointError as error:
         raise WorkError(str(error)) from error
+
+
+def _place(what: Served, rig: Rig) -> dict[str, Any]:
+    """Return where to serve, as keywords of `serve`; raises InputError for a wire it cannot be."""
+    if what.wire in (CAN, SLCAN):
+        return _bus(what, rig)
+    tcp = TcpSettings.of(rig.wire) if rig.wire.kind == TCP else TcpSettings()
+    return {"host": tcp.host, "port": tcp.port if what.port is None else what.port}
+
+
+def _bus(what: Served, rig: Rig) -> dict[str, Any]:
+    from drivers.can_port import SOCKETCAND, BusPlace
+    from drivers.can_stream import CanSettings, can_layout
+
+    if rig.wire.kind != CAN:
+        return {"port": what.port or 0}
+    at = CanSettings.of(rig.wire)
+    place = BusPlace.of(at.bus)
+    here = {"host": place.host, "port": place.port} if place.interface == SOCKETCAND else {}
+    if what.port is not None:
+        here["port"] = what.port
+    return {**here, "layout": can_layout(at, rig), "bitrate": at.bitrate}
