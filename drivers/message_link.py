@@ -145,6 +145,11 @@ class MessageLink:
                 return self._checked(answer, kind, size, about)
         raise DeviceSilent(self._silence())
 
+    def tell(self, kind: Message) -> None:
+        """Send a request once and wait for no answer; raises DeviceLost when the line has gone."""
+        self._number = self.next_number()
+        self.note(kind, self._number, b"")
+
     def note(self, kind: Message, number: int, payload: bytes) -> None:
         """Send a message that is not answered; raises DeviceLost when the line has gone."""
         self._line.send(WireFrame(kind, number, self._session, payload))

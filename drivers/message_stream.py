@@ -106,6 +106,9 @@ class MessageStreamDriver:
                 self._command(Message.CLOSE)
         except DeviceError as error:
             logger.debug("while closing: %s", error)
+            # Perhaps only the answers are lost: then the next host need not wait for the watchdog.
+            with suppress(DeviceError):
+                self._link.tell(Message.CLOSE)
         finally:
             self._stream = None
             self._link.close()

@@ -9,6 +9,7 @@ from drivers.conformance.catalogue import CUT, IDENTITY, LATCH, LOSS, PROBE, SIL
 from drivers.conformance.subject import HEALTHY
 from drivers.conformance.trial import Trial, lost, patiently, quietly
 from drivers.conformance.watched import NotConforming, Watched, follows, require
+from rig.model.parse import InputError
 from rig.model.rig import Rig
 
 
@@ -42,7 +43,10 @@ def _others(rig: Rig) -> Iterator[tuple[str, Rig]]:
 def other_rig_refused(trial: Trial) -> None:
     """A device of another rate, number of joints or channels is refused by `connect`."""
     for what, rig in _others(trial.rig):
-        driver = trial.driver(rig)
+        try:
+            driver = trial.driver(rig)
+        except InputError:
+            continue  # refused before a device was asked: the wire cannot carry that rig
         trial.refused(f"a rig with {what}", driver.connect)
         driver.close()
 

@@ -37,13 +37,14 @@ def serve_serial(
     try:
         with told_to_end() as ended:
             on_ready(f"serial://{line.name}")
-            _serve(line, device, ended, None if parent is None else Owner(parent))
+            serve_line_until(line, device, ended, None if parent is None else Owner(parent))
     finally:
         device.zero()
         line.close()
 
 
-def _serve(line: PtyLine, device: Device, ended: list[int], owner: Owner | None) -> None:
+def serve_line_until(line: PtyLine, device: Device, ended: list[int], owner: Owner | None) -> None:
+    """Serve a device on a pty until `ended` is not empty, or its owner has ended."""
     session = SerialSession(device)
     look = time.monotonic()
     while not ended:

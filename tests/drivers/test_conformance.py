@@ -9,7 +9,7 @@ import pytest
 from drivers.conformance import Effort, Verdict, live_subject, run
 from drivers.conformance.subject import Subject
 from drivers.modbus_tcp import ModbusTcpDriver
-from tests.drivers.conformance_benches import MODBUS_RTU, MODBUS_TCP
+from tests.drivers.conformance_benches import CAN, MODBUS_RTU, MODBUS_TCP, SERIAL
 from tests.drivers.memory_bench import memory_subject
 from tests.drivers.wires import device_process
 from tests.hil_sim.integrator import seed_rig
@@ -22,9 +22,11 @@ NO_CUT = {"lost_host_zeroes", "zero_after_lost_link", "cut_link_is_lost"}
 
 
 @pytest.mark.parametrize(
-    ("subject", "skipped"), [(MODBUS_TCP, set()), (MODBUS_RTU, NO_CUT)], ids=["tcp", "rtu"]
+    ("subject", "skipped"),
+    [(MODBUS_TCP, set()), (MODBUS_RTU, NO_CUT), (SERIAL, NO_CUT), (CAN, set())],
+    ids=["tcp", "rtu", "serial", "can"],
 )
-def test_modbus_conforms(subject: Subject, skipped: set[str]) -> None:
+def test_a_shipped_driver_conforms(subject: Subject, skipped: set[str]) -> None:
     report = run(subject, effort=QUICK)
     assert report.of(Verdict.FAILED) == ()
     assert {result.check for result in report.of(Verdict.SKIPPED)} == skipped
