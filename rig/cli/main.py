@@ -42,6 +42,7 @@ VERBS: Final = {
     "trace": "rig.cli.trace",
     "loop": "rig.cli.loop",
     "conformance": "rig.cli.conformance",
+    "dbc": "rig.cli.dbc",
     "bench": "rig.cli.bench.command",
 }
 GUIDE: Final = """Run a hydraulic robot's test bench, identify it, say what the model lacks.
