@@ -1,137 +1,64 @@
-"""Limits on every sample: which one was passed, by how much, where and when.
+"""The guard: every sample of every block against bands, rates, ranges and plausibility.
 
 Glossary: a *role* is what one joint does now (excited, moving freely, locked) and decides which
-piston limits hold; a *window* is the span over which a rate is taken; a *violation* is the first
-sample, in device time, that a limit does not allow.
-
-Rates are differences over the shortest window in which the sensor's own noise stays below a
-tenth of the limit: |x[k] - x[k-w]| fs / w, 6 sqrt(2) sigma fs / w <= 0.1 limit. A block is
-checked together with the tail of the one before it, so nothing falls between blocks.
-
-A sensor is *frozen* when an excited joint's channel keeps one value over `frozen_after` while that
-joint's command and another of its channels move. This cannot be a slow signal on a coarse
-converter: only sensors whose stated noise is a code or more are judged. Even at rest, two samples
-in a row of such a sensor read the same code with a probability of at most q / (2 sigma sqrt(pi)) <
-0.29 (q: one code), 250 of them with 0.29^249. Noise four times smaller than stated would still need
-a pressure or position constant to a code while the joint moves. What rests at an end of its range
-is left to the check for saturation.
+piston limits hold; a *violation* is the first sample, in device time, that a check does not allow.
+What trips is returned, and the bench zeroes its outputs; what only warns stands in `warnings`
+until it has returned. The checks are modules of `rig.bench.checks`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.base import SampleBlock
+from rig.bench.checks import bands
+from rig.bench.checks.frozen import Frozen
+from rig.bench.checks.plausibility import Plausibility
+from rig.bench.checks.rates import rate_window, rates
+from rig.bench.checks.roles import EXCITED, FREE, JointRole, piston_bounds
+from rig.bench.checks.saturation import Saturation
+from rig.bench.checks.settings import GuardSettings
+from rig.bench.checks.standing import Key, Standing
 from rig.model import channels as ch
 from rig.model.rig import Rig
-from rig.model.trips import DEVICE, FINITE, FROZEN, Violation
+from rig.model.trips import (
+    ABOVE_SUPPLY,
+    DEVICE,
+    DRIFTS,
+    EMPTY_CHAMBER,
+    FINITE,
+    FROZEN,
+    GAP,
+    NOISY,
+    NOT_FOLLOWING,
+    NOTHING_MOVES,
+    STALE,
+    SUPPLY_LOST,
+    Violation,
+)
+
+__all__ = [
+    "EXCITED", "FREE", "Guard", "GuardSettings", "JointRole", "piston_bounds", "rate_window",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
-Counts = NDArray[np.int64]
 
-_HUGE = float(np.finfo(np.float64).max)  # finite, so that an infinite sample still violates it
-_VACUUM = -90e3  # no gauge pressure far below this exists, so none hides under such a range
-_SWING = 0.05  # of the command's limit, peak to peak: such a command moves the joint
-_MOVED = 12.0  # standard deviations, peak to peak: noise alone reaches some 7 in 250 samples
-_STROKE_MARGIN = 0.02  # of the stroke: give of the end stop and offset of the sensor
-
-
-@dataclass(frozen=True)
-class JointRole:
-    """What one joint does now.
-
-    An `excited` joint keeps `limits.piston`; any other may touch the ends of its stroke. A locked
-    one has `locked_at` [m] and may leave it by `tolerance` [m] at most.
-    """
-
-    excited: bool = False
-    locked_at: float | None = None
-    tolerance: float = math.inf
-
-
-FREE = JointRole()
-EXCITED = JointRole(excited=True)
-
-
-@dataclass(frozen=True)
-class GuardSettings:
-    """Patience of the checks that no rig file states."""
-
-    saturated_samples: int = 5  # so many in a row blind a channel
-    saturated_samples_vacuum: int = 50  # cavitating oil rests at the low end, but with noise
-    max_gap: float = 0.1  # [s] of device time without samples
-    frozen_after: float = 0.25  # [s] of device time that a moving joint's sensor keeps one value
-    stale_after: float | None = None  # [s] of wall time; default: the rig's watchdog
-
-
-@dataclass(frozen=True)
-class _Rate:
-    """A bound on |x[k] - x[k-window]| of some columns."""
-
-    limit: str
-    columns: NDArray[np.intp]
-    window: int
-    bounds: Array
-
-
-def rate_window(noise: float, limit: float, sample_rate: float) -> int:
-    """Return the samples over which a rate is taken: the fewest that keep noise below limit/10."""
-    return max(1, math.ceil(6.0 * math.sqrt(2.0) * noise * sample_rate / (0.1 * limit)))
-
-
-def _rates(rig: Rig) -> tuple[_Rate, ...]:
-    found: dict[tuple[str, int], list[tuple[int, float]]] = {}
-    for column, name in enumerate(rig.channels):
-        kind, joint = ch.kind_of(name)
-        if joint is None or kind not in (ch.PISTON, ch.CAP, ch.ROD):
-            continue
-        limits = rig.joints[joint - 1].limits
-        limit = limits.speed if kind == ch.PISTON else limits.pressure_rate
-        window = rate_window(rig.sensors.of(kind).noise, limit, rig.sample_rate)
-        what = "piston speed" if kind == ch.PISTON else "pressure rate"
-        found.setdefault((what, window), []).append((column, limit))
-    return tuple(
-        _Rate(
-            what,
-            np.array([column for column, _ in entries]),
-            window,
-            np.array([limit for _, limit in entries]) * (window / rig.sample_rate),
-        )
-        for (what, window), entries in found.items()
-    )
-
-
-class _Frozen:
-    """Finds a channel of one joint (0-based) that stands still while the joint moves."""
-
-    def __init__(self, rig: Rig, joint: int) -> None:
-        own = [(c, *ch.kind_of(name)) for c, name in enumerate(rig.channels)]
-        parts = [(c, rig.sensors.of(kind)) for c, kind, which in own if which == joint + 1]
-        self._columns = np.array([column for column, _ in parts])
-        codes = np.array([np.ptp(s.range) / ((1 << s.bits) - 1) for _, s in parts])
-        noise = np.array([s.noise for _, s in parts])
-        self._judged = noise >= codes
-        self._moved = _MOVED * np.maximum(noise, codes)
-        self._low = np.array([s.range[0] for _, s in parts]) + codes
-        self._high = np.array([s.range[1] for _, s in parts]) - codes
-        self._command = rig.recorded.index(ch.channel(ch.COMMAND, joint + 1))
-        self._swing = _SWING * rig.joints[joint].limits.command
-
-    def find(self, window: Array) -> int | None:
-        """Return the column that kept one value over a window of samples, None if none did."""
-        values = window[:, self._columns]
-        still = (values == values[0]).all(axis=0) & self._judged
-        still &= (values[0] > self._low) & (values[0] < self._high)
-        if not still.any() or np.ptp(window[:, self._command]) < self._swing:
-            return None
-        if not (np.ptp(values, axis=0) > self._moved).any():
-            return None
-        return int(self._columns[np.argmax(still)])
+# Where the rig file says what a check does (`rig.model.alarms.bands.CheckActions`).
+ACTIONS: Final = {
+    FROZEN: "frozen_sensor",
+    NOT_FOLLOWING: "spool_not_following",
+    EMPTY_CHAMBER: "chamber_without_pressure",
+    SUPPLY_LOST: "supply_lost",
+    NOTHING_MOVES: "nothing_moves",
+    ABOVE_SUPPLY: "pressure_above_supply",
+    DRIFTS: "drift_at_rest",
+    NOISY: "noisy_sensor",
+}
 
 
 class Guard:
@@ -141,114 +68,148 @@ class Guard:
         self.rig = rig
         self.settings = settings or GuardSettings()
         self.stale_after = self.settings.stale_after or rig.wire.watchdog
-        self._rates = _rates(rig)
-        self._frozen = tuple(_Frozen(rig, j) for j in range(len(rig.joints)))
+        self._actions = {limit: getattr(rig.alarms.checks, key) for limit, key in ACTIONS.items()}
+        self._rates = rates(rig)
+        self._frozen = tuple(Frozen(rig, j) for j in range(len(rig.joints)))
         self._window = max(2, round(self.settings.frozen_after * rig.sample_rate))
         self._keep = max((rate.window for rate in self._rates), default=0)
         self._keep = max(self._keep, self._window)
-        self._allowed_run = self._saturation_patience()
-        self.roles: tuple[JointRole, ...] = (FREE,) * len(rig.joints)
-        self.set_roles(self.roles)
+        self._saturation = Saturation(rig, self.settings)
+        self._plausibility = Plausibility(rig, self.settings)
+        warning, trip = bands.delays(rig, self.settings)
+        self._outside_trip = bands.Delayed(trip)
+        self._outside_warning = bands.Delayed(warning)
+        self._standing = Standing(round(self.settings.return_after * rig.sample_rate))
+        self.roles: tuple[JointRole, ...] = ()
+        self.set_roles((FREE,) * len(rig.joints))
         self.forget()
 
-    def _saturation_patience(self) -> tuple[Counts, Array]:
-        """Return the allowed run per measured channel at (high end, low end), and mid-ranges."""
-        counts, middles = [], []
-        for name in self.rig.channels:
-            kind, _ = ch.kind_of(name)
-            low, high = self.rig.sensors.of(kind).range
-            vacuum = kind in (ch.CAP, ch.ROD) and low <= _VACUUM
-            usual = self.settings.saturated_samples
-            counts.append((usual, self.settings.saturated_samples_vacuum if vacuum else usual))
-            middles.append((low + high) / 2)
-        return np.array(counts).T, np.array(middles)
+    @property
+    def warnings(self) -> Mapping[Key, Violation]:
+        """What stands without tripping: the first violation of each, until it has returned."""
+        return self._standing.warnings
 
     def forget(self) -> None:
         """Drop the tail of the previous block: what comes next does not continue it."""
         self._tail: Array = np.empty((0, len(self.rig.recorded)))
-        self._runs: Counts = np.zeros(len(self.rig.channels), dtype=np.int64)
+        for check in (self._saturation, self._outside_trip, self._outside_warning):
+            check.forget()
+        self._plausibility.forget()
 
     def set_roles(self, roles: Sequence[JointRole]) -> None:
         """Say what each joint does from the next block on; raises ValueError for a wrong number."""
         joints = self.rig.joints
         if len(roles) != len(joints):
             raise ValueError(f"{len(roles)} roles given for {len(joints)} joints")
+        if tuple(roles) == self.roles:
+            return
         self.roles = tuple(roles)
-        low, high = [], []
-        for name in self.rig.recorded:
-            bottom, top = self._bounds(name)
-            low.append(bottom)
-            high.append(top)
-        self._low, self._high = np.array(low), np.array(high)
-
-    def _bounds(self, name: str) -> tuple[float, float]:
-        kind, joint = ch.kind_of(name)
-        if joint is None:
-            limits = self.rig.limits
-            shared = limits.supply_pressure if kind == ch.SUPPLY else limits.oil_temperature
-            return shared or (-_HUGE, _HUGE)
-        if kind == ch.SPOOL:
-            return -_HUGE, _HUGE
-        part = self.rig.joints[joint - 1]
-        if kind == ch.COMMAND:  # the output converter may round up by a step
-            step = part.valve.command_range / ((1 << (part.valve.command_bits - 1)) - 1)
-            return -part.limits.command - step, part.limits.command + step
-        if kind in (ch.CAP, ch.ROD):
-            return part.limits.pressure
-        _, low, high = piston_bounds(self.roles[joint - 1], self.rig, joint - 1)
-        return low, high
+        self._trip = bands.trip_bounds(self.rig, self.roles)
+        self._warn = bands.warning_bounds(self.rig, self.roles, self.settings)
+        self._inner = bands.inner_bounds(self.rig, self._warn, self.settings)
+        self._plausibility.restart()
 
     def gap(self, lost: int, tick: int) -> Violation | None:
-        """Return the violation of `lost` missing samples before `tick`; rates start anew there."""
+        """Return the violation of `lost` missing samples before `tick`; rates start anew there.
+
+        Fewer than may be missing are a warning.
+        """
         self.forget()
         allowed = self.settings.max_gap
         seconds = lost / self.rig.sample_rate
-        if seconds <= allowed:
-            return None
-        return Violation("sample gap", seconds, (-math.inf, allowed), "s", None, "", tick)
+
+        def longer(than: float) -> Violation:
+            return Violation(GAP, seconds, (-math.inf, than), "s", None, "", tick)
+
+        if seconds > allowed:
+            return longer(allowed)
+        self._standing.see([longer(0.0)], tick)
+        return None
 
     def stale(self, age: float, tick: int) -> Violation | None:
         """Return the violation of data `age` [s] old by wall time (real-time mode only)."""
-        if age <= self.stale_after:
-            return None
-        return Violation("stale data", age, (-math.inf, self.stale_after), "s", None, "", tick)
+        if age > self.stale_after:
+            return Violation(STALE, age, (-math.inf, self.stale_after), "s", None, "", tick)
+        near = self.settings.stale_warning * self.stale_after
+        if age > near:
+            self._standing.see(
+                [Violation(STALE, age, (-math.inf, near), "s", None, "", tick)], tick
+            )
+        return None
 
     def device_tripped(self, tick: int) -> Violation:
         """Return the violation of a device that has zeroed its own outputs."""
         return Violation(DEVICE, math.nan, (math.nan, math.nan), "", None, "", tick)
 
     def check(self, block: SampleBlock) -> Violation | None:
-        """Return the first violation in a block that continues the previous one, or None."""
+        """Return the first violation that trips in a block that continues the previous one.
+
+        What warns is in `warnings` from here on.
+        """
         data = block.data
-        found: list[Violation] = []
-        inside = (data >= self._low) & (data <= self._high)  # a NaN is never inside
-        if not inside.all():
-            row = int(np.argmin(inside.all(axis=1)))
-            found.append(self._range_violation(block, row, int(np.argmin(inside[row]))))
+        last = block.tick + len(data) - 1
+        trips = [self._band_trip(block)]
         joined = np.concatenate((self._tail, data))
         for rate in self._rates:
-            found += self._rate_violation(rate, joined, block.tick - len(self._tail))
-        found += self._saturation(block)
-        found += self._frozen_sensor(joined[-self._window :], block)
+            first = block.tick - len(self._tail)
+            share = self.rig.alarms.warning_share
+            trip, near = rate.find(self.rig, joined, first, len(data), share)
+            trips.append(trip)
+            self._standing.see(near, last)
+        measured = data[:, : block.saturated.shape[1]]
+        trips.append(self._saturation.find(block.saturated, measured, block.tick))
+        trips += self._act(self._frozen_sensors(joined[-self._window :], last), last)
+        trips += self._act(self._plausibility.look(block, self.roles) or (), last)
+        self._band_warnings(block, last)
+        self._standing.expire(last)
         self._tail = joined[-self._keep :]
+        found = [violation for violation in trips if violation is not None]
         return min(found, key=lambda violation: violation.tick, default=None)
 
-    def _range_violation(self, block: SampleBlock, row: int, column: int) -> Violation:
+    def _act(self, found: Sequence[Violation], last: int) -> list[Violation]:
+        """Do with each finding what the rig file wants; returns those that trip."""
+        self._standing.see([v for v in found if self._actions[v.limit] == "warn"], last)
+        return [v for v in found if self._actions[v.limit] == "trip"]
+
+    def _band_trip(self, block: SampleBlock) -> Violation | None:
+        over = self._outside_trip.over(self._trip.outside(block.data))
+        if over is None:
+            return None
+        row, column = bands.first_of(over)
+        return self._of_band(block, row, column, self._trip)
+
+    def _band_warnings(self, block: SampleBlock, last: int) -> None:
+        over = self._outside_warning.over(self._warn.outside(block.data))
+        if over is not None:
+            columns = np.flatnonzero(over.any(axis=0)).tolist()
+            rows = [int(np.argmax(over[:, column])) for column in columns]
+            pairs = zip(rows, columns, strict=True)
+            self._standing.see([self._of_band(block, r, c, self._warn) for r, c in pairs], last)
+        if self._standing.warnings:
+            outside = self._inner.outside(block.data).any(axis=0)
+            for column in np.flatnonzero(outside).tolist():
+                name = self.rig.recorded[column]
+                self._standing.keep(name, self._band_of(name), last)
+
+    def _band_of(self, name: str) -> str:
+        """Name the band of a channel: its limit, by its joint's role."""
+        kind, joint = ch.kind_of(name)
+        if kind == ch.PISTON and joint is not None:
+            return piston_bounds(self.roles[joint - 1], self.rig, joint - 1)[0]
+        usual = {ch.SUPPLY: "supply pressure", ch.TEMPERATURE: "oil temperature", ch.SPOOL: "spool"}
+        return usual.get(kind, "command" if kind == ch.COMMAND else "pressure")
+
+    def _of_band(
+        self, block: SampleBlock, row: int, column: int, bounds: bands.Bounds
+    ) -> Violation:
         name = self.rig.recorded[column]
         value = float(block.data[row, column])
-        kind, joint = ch.kind_of(name)
-        allowed = (float(self._low[column]), float(self._high[column]))
-        if not math.isfinite(value):
-            limit = FINITE
-        elif kind == ch.PISTON and joint is not None:
-            limit = piston_bounds(self.roles[joint - 1], self.rig, joint - 1)[0]
-        elif joint is None:
-            limit = "supply pressure" if kind == ch.SUPPLY else "oil temperature"
-        else:
-            limit = "command" if kind == ch.COMMAND else "pressure"
-        return Violation(limit, value, allowed, ch.unit_of(name), joint, name, block.tick + row)
+        limit = self._band_of(name) if math.isfinite(value) else FINITE
+        joint = ch.kind_of(name)[1]
+        tick = block.tick + row
+        return Violation(limit, value, bounds.of(column), ch.unit_of(name), joint, name, tick)
 
-    def _frozen_sensor(self, window: Array, block: SampleBlock) -> list[Violation]:
+    def _frozen_sensors(self, window: Array, last: int) -> list[Violation]:
         """Return the violation of an excited joint's channel that kept one value all the window."""
         if len(window) < self._window:
             return []
@@ -257,62 +218,7 @@ class Guard:
             if column is None:
                 continue
             name = self.rig.recorded[column]
-            value, tick = float(window[-1, column]), block.tick + len(block.data) - 1
             allowed = (-math.inf, self.settings.frozen_after)
-            return [Violation(FROZEN, value, allowed, ch.unit_of(name), joint, name, tick)]
+            value = float(window[-1, column])
+            return [Violation(FROZEN, value, allowed, ch.unit_of(name), joint, name, last)]
         return []
-
-    def _rate_violation(self, rate: _Rate, joined: Array, first: int) -> list[Violation]:
-        values = joined[:, rate.columns]
-        with np.errstate(invalid="ignore"):  # inf - inf: the range check names it
-            steps = values[rate.window :] - values[: -rate.window]
-        over = np.abs(steps) > rate.bounds
-        if not over.any():
-            return []
-        row = int(np.argmax(over.any(axis=1)))
-        column = int(np.argmax(over[row]))
-        name = self.rig.recorded[rate.columns[column]]
-        per_second = self.rig.sample_rate / rate.window
-        bound = float(rate.bounds[column]) * per_second
-        value = float(steps[row, column]) * per_second
-        joint = ch.kind_of(name)[1]
-        unit = f"{ch.unit_of(name)}/s"
-        tick = first + row + rate.window
-        return [Violation(rate.limit, value, (-bound, bound), unit, joint, name, tick)]
-
-    def _saturation(self, block: SampleBlock) -> list[Violation]:
-        marks = block.saturated
-        if not marks.any():
-            self._runs[:] = 0
-            return []
-        rows = np.arange(len(marks))[:, None]
-        # Length of the run of marks that ends at each row: rows since the last clear sample.
-        clear = np.where(marks, -1, rows)
-        last = np.maximum.accumulate(clear, axis=0)
-        runs = np.where(last < 0, rows + 1 + self._runs, rows - last)
-        (at_high, at_low), middle = self._allowed_run
-        measured = block.data[:, : marks.shape[1]]
-        allowed = np.where(measured > middle, at_high, at_low)
-        over = runs >= allowed
-        self._runs = runs[-1].astype(np.int64)
-        if not over.any():
-            return []
-        row = int(np.argmax(over.any(axis=1)))
-        column = int(np.argmax(over[row]))
-        name = self.rig.channels[column]
-        kind, joint = ch.kind_of(name)
-        ends = self.rig.sensors.of(kind).range
-        value = float(measured[row, column])
-        tick = block.tick + row
-        return [Violation("saturated sensor", value, ends, ch.unit_of(name), joint, name, tick)]
-
-
-def piston_bounds(role: JointRole, rig: Rig, joint: int) -> tuple[str, float, float]:
-    """Return (name of the limit, lowest, highest) of a joint's piston in its role."""
-    part = rig.joints[joint]
-    if role.locked_at is not None and math.isfinite(role.tolerance):
-        return "lock", role.locked_at - role.tolerance, role.locked_at + role.tolerance
-    if role.excited:
-        return "piston", *part.limits.piston
-    reach = part.cylinder.stroke * (0.5 + _STROKE_MARGIN)
-    return "stroke end", -reach, reach

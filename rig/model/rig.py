@@ -7,6 +7,7 @@ rig file chooses by `type: electric` at its joints, and `Rig.model_validate` ret
 
 from __future__ import annotations
 
+import math
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -19,6 +20,7 @@ from pydantic import (
 )
 
 from rig.model import channels as ch
+from rig.model.alarms.bands import Alarms, Range, refuse_unseen
 from rig.model.electric import (
     UNKNOWN,
     ElectricJoint,
@@ -45,6 +47,7 @@ class Rig(Part):
     joints: tuple[Joint, ...] = Field(min_length=1, max_length=MAX_JOINTS)
     sensors: Sensors
     limits: BenchLimits = BenchLimits()
+    alarms: Alarms = Alarms()
     wire: Wire = Wire()
     nominal: dict[str, float] = Field(
         default_factory=dict,
@@ -86,6 +89,8 @@ class Rig(Part):
         if self.electric:
             if self.limits != BenchLimits():
                 raise ValueError("an electric rig has neither supply nor oil; remove limits")
+            if self.alarms != Alarms():
+                raise ValueError("an electric rig is not run by a bench; remove alarms")
             return self
         top = self.sensors.chamber_pressure.range[1]
         for joint in self.joints:
@@ -107,7 +112,34 @@ class Rig(Part):
                     f"limits {name}: the upper one, {limits[1]:g}, can never be seen to be passed: "
                     f"the sensor's range ends at {sensor.range[1]:g}"
                 )
+        limits = {name: self.limits_of(name) for name in self.recorded}
+        refuse_unseen(self.alarms, self.recorded, self.range_of, limits)
         return self
+
+    def range_of(self, channel: str) -> Range:
+        """Return what a channel can read: its sensor's range, or that of the output."""
+        kind, joint = ch.kind_of(channel)
+        if kind == ch.COMMAND and joint is not None:
+            reach = self.joints[joint - 1].valve.command_range
+            return -reach, reach
+        return self.sensors.of(kind).range
+
+    def limits_of(self, channel: str) -> Range:
+        """Return the limits of a channel in SI, whatever its joint does; infinite where none."""
+        kind, joint = ch.kind_of(channel)
+        everything = (-math.inf, math.inf)
+        if joint is None:
+            shared = self.limits
+            limits = shared.supply_pressure if kind == ch.SUPPLY else shared.oil_temperature
+            return limits or everything
+        own = self.joints[joint - 1].limits
+        limits_by_kind = {
+            ch.CAP: own.pressure,
+            ch.ROD: own.pressure,
+            ch.PISTON: own.piston,
+            ch.COMMAND: (-own.command, own.command),
+        }
+        return limits_by_kind.get(kind, everything)
 
     @property
     def electric(self) -> bool:

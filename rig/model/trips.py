@@ -9,9 +9,20 @@ from typing import Final
 from rig.model.rig import Rig
 
 FINITE: Final = "finite samples"
-FROZEN: Final = "frozen sensor"
+SATURATED: Final = "saturated sensor"
+GAP: Final = "sample gap"
+STALE: Final = "stale data"
 DEVICE: Final = "device watchdog or fault"
+FROZEN: Final = "frozen sensor"
+NOT_FOLLOWING: Final = "spool does not follow"
+EMPTY_CHAMBER: Final = "chamber without pressure"
+SUPPLY_LOST: Final = "supply lost"
+NOTHING_MOVES: Final = "nothing moves"
+ABOVE_SUPPLY: Final = "pressure above supply"
+DRIFTS: Final = "drift at rest"
+NOISY: Final = "noisy sensor"
 
+_LARGEST = 1e300  # an end beyond is none
 # People read bar-sized and millimetre-sized numbers better than exponents.
 _SHOWN = {"Pa": (1e-6, "MPa"), "Pa/s": (1e-9, "GPa/s"), "m": (1e3, "mm")}
 
@@ -35,6 +46,10 @@ def show(value: float, unit: str) -> str:
     return f"{value * factor:.4g} {shown}"
 
 
+def _open(end: float) -> bool:
+    return math.isinf(end) or abs(end) > _LARGEST
+
+
 def _value(violation: Violation) -> str:
     return show(violation.value, violation.unit) if violation.unit else "reported by the device"
 
@@ -47,7 +62,9 @@ def _allowed(violation: Violation) -> str:
         return f"only values that change within {high:g} s while the joint moves"
     if violation.limit == FINITE:
         return "finite numbers only"
-    if math.isinf(low):
+    if _open(high):
+        return f"at least {show(low, violation.unit)}"
+    if _open(low):
         return f"at most {show(high, violation.unit)}"
     factor, shown = _SHOWN.get(violation.unit, (1.0, violation.unit))
     return f"{low * factor:.4g} to {high * factor:.4g} {shown}"

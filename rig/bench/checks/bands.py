@@ -1,0 +1,171 @@
+"""Bands of every channel: what a sample may be without a warning, and without a trip.
+
+A value counts as outside after `delay` samples in a row (0: the first one). All channels of a block
+are judged at once; a run that began in the block before goes on.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.bench.checks.roles import JointRole, piston_bounds
+from rig.bench.checks.settings import GuardSettings
+from rig.model import channels as ch
+from rig.model.alarms.bands import AlarmBand, Range, ends
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+Counts = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+_HUGE = float(np.finfo(np.float64).max)  # finite, so that an infinite sample still violates it
+_NO_BAND = AlarmBand()
+
+
+def run_lengths(marks: Flags, before: Counts) -> Counts:
+    """Return the length of the run of marks that ends at each row, shape of marks (n, channels).
+
+    `before` (channels,) is the run at the end of the block before.
+    """
+    rows = np.arange(len(marks))[:, None]
+    last_clear = np.maximum.accumulate(np.where(marks, -1, rows), axis=0)
+    runs = np.where(last_clear < 0, rows + 1 + before, rows - last_clear)
+    return runs.astype(np.int64)
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Ends of the bands of all recorded channels, shape (channels,) each."""
+
+    low: Array
+    high: Array
+
+    def outside(self, data: Array) -> Flags:
+        """Mark the samples outside; a NaN is outside."""
+        inside = (data >= self.low) & (data <= self.high)
+        return ~inside
+
+    def of(self, column: int) -> Range:
+        """Return the band of one channel."""
+        return float(self.low[column]), float(self.high[column])
+
+
+class Delayed:
+    """Finds the samples that have been outside for longer than a delay, across blocks."""
+
+    def __init__(self, delay: Counts) -> None:
+        self._delay = delay
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin anew: what comes next does not continue what came before."""
+        self._runs: Counts = np.zeros(len(self._delay), dtype=np.int64)
+
+    def over(self, outside: Flags) -> Flags | None:
+        """Mark the samples whose run outside is longer than the delay; None where none is."""
+        if not outside.any():
+            self._runs[:] = 0
+            return None
+        runs = run_lengths(outside, self._runs)
+        self._runs = runs[-1]
+        over: Flags = runs > self._delay
+        return over if over.any() else None
+
+
+def first_of(marks: Flags) -> tuple[int, int]:
+    """Return (row, column) of the first mark in time."""
+    row = int(np.argmax(marks.any(axis=1)))
+    return row, int(np.argmax(marks[row]))
+
+
+def trip_bounds(rig: Rig, roles: tuple[JointRole, ...]) -> Bounds:
+    """Return what trips each channel: its limits by its joint's role, narrowed by `alarms`."""
+    return _bounds(_trip_band(rig, roles, name) for name in rig.recorded)
+
+
+def warning_bounds(rig: Rig, roles: tuple[JointRole, ...], settings: GuardSettings) -> Bounds:
+    """Return what warns on each channel: its `alarms` band, or the share of its limits."""
+    return _bounds(_warning_band(rig, roles, name, settings) for name in rig.recorded)
+
+
+def _bounds(bands: object) -> Bounds:
+    low, high = np.array(list(bands), dtype=np.float64).T  # type: ignore[call-overload]
+    return Bounds(np.maximum(low, -_HUGE), np.minimum(high, _HUGE))
+
+
+def _trip_band(rig: Rig, roles: tuple[JointRole, ...], name: str) -> Range:
+    kind, joint = ch.kind_of(name)
+    low, high = rig.limits_of(name)
+    if joint is not None and kind == ch.PISTON:
+        _, low, high = piston_bounds(roles[joint - 1], rig, joint - 1)
+    elif joint is not None and kind == ch.COMMAND:  # the output converter may round up by a step
+        valve = rig.joints[joint - 1].valve
+        step = valve.command_range / ((1 << (valve.command_bits - 1)) - 1)
+        low, high = low - step, high + step
+    own = ends(rig.alarms.channels.get(name, _NO_BAND).trip)
+    return max(low, own[0]), min(high, own[1])
+
+
+def _warning_band(
+    rig: Rig, roles: tuple[JointRole, ...], name: str, settings: GuardSettings
+) -> Range:
+    given = rig.alarms.channels.get(name, _NO_BAND).warning
+    if given is not None:
+        return ends(given)
+    kind, joint = ch.kind_of(name)
+    share = rig.alarms.warning_share
+    if joint is not None:
+        return _joint_warning(rig, roles[joint - 1], name, share)
+    limits = rig.limits_of(name)
+    if math.isfinite(limits[0]):
+        return towards_zero(limits, share)
+    if kind == ch.SUPPLY:
+        low, high = settings.supply_warning
+        return low * rig.supply.pressure, high * rig.supply.pressure
+    width = settings.oil_warning * rig.oil.temperature_band
+    return rig.oil.temperature - width, rig.oil.temperature + width
+
+
+def _joint_warning(rig: Rig, role: JointRole, name: str, share: float) -> Range:
+    kind, _ = ch.kind_of(name)
+    if kind in (ch.CAP, ch.ROD):
+        return towards_zero(rig.limits_of(name), share)
+    if kind == ch.PISTON and role.locked_at is not None and role.locked:
+        reach = share * role.tolerance
+        return role.locked_at - reach, role.locked_at + reach
+    if kind == ch.PISTON and role.excited:
+        return towards_zero(rig.limits_of(name), share)
+    return -_HUGE, _HUGE  # a command at its limit, a free piston at its end: nothing to warn of
+
+
+def towards_zero(limits: Range, share: float) -> Range:
+    """Return limits drawn in to a share of each: 9 MPa to 8.1 MPa; a low limit above 0 grows."""
+    low, high = limits
+    return (low * share if low < 0 else low / share), (high * share if high > 0 else high / share)
+
+
+def delays(rig: Rig, settings: GuardSettings) -> tuple[Counts, Counts]:
+    """Return the (warning, trip) delays of all recorded channels [samples]."""
+    found = []
+    for name in rig.recorded:
+        band = rig.alarms.channels.get(name, _NO_BAND)
+        warning = settings.warning_delay if band.warning_delay is None else band.warning_delay
+        trip = band.trip_delay or 0.0
+        found.append((round(warning * rig.sample_rate), round(trip * rig.sample_rate)))
+    warnings, trips = np.array(found, dtype=np.int64).T
+    return warnings, trips
+
+
+def inner_bounds(rig: Rig, outer: Bounds, settings: GuardSettings) -> Bounds:
+    """Return the warning bounds narrowed by each channel's dead band: inside, a warning returns."""
+    widths = []
+    for column, name in enumerate(rig.recorded):
+        low, high = outer.of(column)
+        given = rig.alarms.channels.get(name, _NO_BAND).dead_band
+        usual = settings.dead_band * (high - low) if high - low < _HUGE else 0.0
+        widths.append(usual if given is None else given)
+    return Bounds(outer.low + np.array(widths), outer.high - np.array(widths))

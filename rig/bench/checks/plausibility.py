@@ -1,0 +1,197 @@
+"""Plausibility: what no single sample shows, but the channels of a joint together do.
+
+Features are taken over a window of the latest samples, `hop` apart, so every sample is in several.
+A finding counts when it lasts for `confirm`. A window never reaches across a change of roles or a
+gap.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.base import SampleBlock
+from rig.bench.checks.expected_spool import ExpectedSpool
+from rig.bench.checks.frozen import SWING
+from rig.bench.checks.roles import JointRole
+from rig.bench.checks.settings import GuardSettings
+from rig.bench.checks.standing import Key, key_of
+from rig.model import channels as ch
+from rig.model.rig import Rig
+from rig.model.trips import (
+    ABOVE_SUPPLY,
+    DRIFTS,
+    EMPTY_CHAMBER,
+    NOISY,
+    NOT_FOLLOWING,
+    NOTHING_MOVES,
+    SUPPLY_LOST,
+    Violation,
+)
+
+Array = NDArray[np.float64]
+Roles = Sequence[JointRole]
+
+_NORMAL_MEDIAN = 0.6745  # median of |x| of a standard normal x
+_THIRD_DIFFERENCE = math.sqrt(20.0)  # deviation of the third difference of white noise: 1 3 3 1
+_SLOWEST_RATE = 400.0  # [Hz]; below it, the third difference of a motion is no longer small
+_FEWEST = 20  # samples in a window
+
+
+class Plausibility:
+    """Looks at windows of blocks that continue each other."""
+
+    def __init__(self, rig: Rig, settings: GuardSettings) -> None:
+        self._rig = rig
+        self._settings = settings
+        rate = rig.sample_rate
+        self._window = max(_FEWEST, round(settings.window * rate))
+        self._hop = max(1, round(settings.hop * rate))
+        self._confirm = round(settings.confirm * rate)
+        self._expected = ExpectedSpool(rig)
+        each = range(1, len(rig.joints) + 1)
+
+        def columns(kind: str) -> list[int]:
+            return [rig.recorded.index(ch.channel(kind, i)) for i in each]
+
+        self._spool, self._piston = columns(ch.SPOOL), columns(ch.PISTON)
+        self._cap, self._rod = columns(ch.CAP), columns(ch.ROD)
+        self._command = columns(ch.COMMAND)
+        self._supply = rig.recorded.index(ch.SUPPLY) if ch.SUPPLY in rig.recorded else None
+        sensors = [rig.sensors.of(ch.kind_of(name)[0]) for name in rig.channels]
+        codes = np.array([np.ptp(s.range) / ((1 << s.bits) - 1) for s in sensors])
+        self._noise = np.maximum([s.noise for s in sensors], codes)
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin anew: what comes next does not continue what came before."""
+        self._expected.forget()
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin a new window: the joints do something else from the next block on."""
+        self._parts: list[Array] = []
+        self._parts_expected: list[Array] = []
+        self._since_look = 0
+        self._pending: dict[Key, Violation] = {}
+
+    def look(self, block: SampleBlock, roles: Roles) -> list[Violation] | None:
+        """Take a block; return what has lasted long enough, None between two looks."""
+        self._parts.append(block.data)
+        self._parts_expected.append(self._expected.follow(block.data[:, self._command]))
+        self._since_look += len(block.data)
+        if self._since_look < self._hop:
+            return None
+        self._since_look = 0
+        data = np.concatenate(self._parts)[-self._window :]
+        expected = np.concatenate(self._parts_expected)[-self._window :]
+        self._parts, self._parts_expected = [data], [expected]
+        if len(data) < self._window:
+            return None
+        tick = block.tick + len(block.data) - 1
+        found = {key_of(v): v for v in self._findings(data, expected, roles, tick)}
+        self._pending = {key: self._pending.get(key, found[key]) for key in found}
+        return [
+            found[key]
+            for key, first in self._pending.items()
+            if tick - first.tick >= self._confirm
+        ]  # fmt: skip
+
+    def _findings(
+        self, data: Array, expected: Array, roles: Roles, tick: int
+    ) -> Iterator[Violation]:
+        def say(
+            limit: str, column: int, value: float, allowed: tuple[float, float], unit: str = ""
+        ) -> Violation:
+            name = self._rig.recorded[column]
+            joint = ch.kind_of(name)[1]
+            return Violation(limit, value, allowed, unit or ch.unit_of(name), joint, name, tick)
+
+        yield from self._spools(data, expected, say)
+        yield from self._pistons(data, roles, say)
+        yield from self._pressures(data, roles, say)
+        yield from self._noisy(data, say)
+
+    def _spools(self, data: Array, expected: Array, say: Callable[..., Violation]) -> Iterator[
+        Violation
+    ]:  # fmt: skip
+        settings = self._settings
+        off = data[:, self._spool] - expected
+        constant = off.mean(axis=0)
+        moving = np.abs(off - constant).mean(axis=0)
+        commanded = np.abs(expected - expected.mean(axis=0)).mean(axis=0)
+        for j, joint in enumerate(self._rig.joints):
+            stroke = joint.valve.spool_stroke
+            least = max(settings.spool_floor * stroke, 5.0 * self._noise[self._spool[j]])
+            bound = max(settings.spool_share * float(commanded[j]), least)
+            if moving[j] > bound:
+                yield say(NOT_FOLLOWING, self._spool[j], float(moving[j]), (-math.inf, bound))
+            elif abs(constant[j]) > settings.spool_constant * stroke:
+                bound = settings.spool_constant * stroke
+                yield say(NOT_FOLLOWING, self._spool[j], float(constant[j]), (-bound, bound))
+
+    def _pistons(self, data: Array, roles: Roles, say: Callable[..., Violation]) -> Iterator[
+        Violation
+    ]:  # fmt: skip
+        settings = self._settings
+        half = len(data) // 2
+        piston, spool = data[:, self._piston], data[:, self._spool]
+        swing = np.ptp(piston, axis=0)
+        opening = np.abs(spool).mean(axis=0)
+        step = piston[half:].mean(axis=0) - piston[:half].mean(axis=0)
+        speed = step * self._rig.sample_rate / (len(data) - half)
+        at_rest = (data[:, self._command] == 0.0).all(axis=0)
+        for j, (joint, role) in enumerate(zip(self._rig.joints, roles, strict=True)):
+            if role.locked:
+                continue  # the band of its lock is watched
+            column, stroke = self._piston[j], joint.cylinder.stroke
+            reach = stroke * (0.5 - settings.stroke_end)
+            inside = bool((np.abs(piston[:, j]) < reach).all())
+            still = settings.still_piston * float(self._noise[column])
+            if (
+                inside
+                and swing[j] < still
+                and opening[j] > settings.open_spool * joint.valve.spool_stroke
+            ):
+                yield say(NOTHING_MOVES, column, float(swing[j]), (still, math.inf))
+            drift = settings.drift * joint.limits.speed
+            if at_rest[j] and abs(speed[j]) > drift:
+                yield say(DRIFTS, column, float(speed[j]), (-drift, drift), "m/s")
+
+    def _pressures(self, data: Array, roles: Roles, say: Callable[..., Violation]) -> Iterator[
+        Violation
+    ]:  # fmt: skip
+        settings, nominal = self._settings, self._rig.supply.pressure
+        supply = nominal if self._supply is None else float(data[:, self._supply].mean())
+        top = settings.above_supply * max(supply, nominal)
+        least = settings.empty_chamber * nominal
+        lost = settings.supply_lost * nominal
+        excited = any(role.excited for role in roles)
+        if excited and self._supply is not None and data[:, self._supply].max() < lost:
+            yield say(SUPPLY_LOST, self._supply, supply, (lost, math.inf))
+        swing = np.ptp(data[:, self._command], axis=0)
+        for j, (joint, role) in enumerate(zip(self._rig.joints, roles, strict=True)):
+            driven = role.excited and swing[j] > SWING * joint.limits.command
+            for column in (self._cap[j], self._rod[j]):
+                mean, peak = float(data[:, column].mean()), float(data[:, column].max())
+                if mean > top:
+                    yield say(ABOVE_SUPPLY, column, mean, (-math.inf, top))
+                if driven and peak < least:
+                    yield say(EMPTY_CHAMBER, column, peak, (least, math.inf))
+
+    def _noisy(self, data: Array, say: Callable[..., Violation]) -> Iterator[Violation]:
+        """Estimate each channel's noise from its third difference, in which motion is small.
+
+        The median over the window leaves out the few samples of a step or an impact.
+        """
+        if self._rig.sample_rate < _SLOWEST_RATE:
+            return
+        third = np.diff(data[:, : len(self._noise)], 3, axis=0)
+        seen = np.median(np.abs(third), axis=0) / (_NORMAL_MEDIAN * _THIRD_DIFFERENCE)
+        allowed = self._settings.noise * self._noise
+        for column in np.flatnonzero(seen > allowed).tolist():
+            bound = float(allowed[column])
+            yield say(NOISY, column, float(seen[column]), (-math.inf, bound))

@@ -1,0 +1,94 @@
+"""Rates of change: speed of a piston, rate of a pressure.
+
+Rates are differences over the shortest window in which the sensor's own noise stays below a
+tenth of the limit: |x[k] - x[k-w]| fs / w, 6 sqrt(2) sigma fs / w <= 0.1 limit. A block is
+checked together with the tail of the one before it, so nothing falls between blocks.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.bench.checks.bands import first_of
+from rig.model import channels as ch
+from rig.model.rig import Rig
+from rig.model.trips import Violation
+
+Array = NDArray[np.float64]
+
+
+def rate_window(noise: float, limit: float, sample_rate: float) -> int:
+    """Return the samples over which a rate is taken: the fewest that keep noise below limit/10."""
+    return max(1, math.ceil(6.0 * math.sqrt(2.0) * noise * sample_rate / (0.1 * limit)))
+
+
+@dataclass(frozen=True)
+class Rate:
+    """A bound on |x[k] - x[k-window]| of some columns; a share of it warns."""
+
+    limit: str
+    columns: NDArray[np.intp]
+    window: int
+    bounds: Array
+
+    def find(
+        self, rig: Rig, joined: Array, first: int, new: int, share: float
+    ) -> tuple[Violation | None, list[Violation]]:
+        """Return the first violation of the limit and one per channel past `share` of it.
+
+        `joined` (n, recorded) begins at tick `first`; only its last `new` samples are judged.
+        """
+        values = joined[-(new + self.window) :, self.columns]
+        start = first + len(joined) - len(values) + self.window
+        with np.errstate(invalid="ignore"):  # inf - inf: the check of bands names it
+            steps = values[self.window :] - values[: -self.window]
+        near = np.abs(steps) > share * self.bounds
+        if not near.any():
+            return None, []
+        over = np.abs(steps) > self.bounds
+        trip = None
+        if over.any():
+            trip = self._violation(rig, steps, start, *first_of(over), 1.0)
+        warnings = [
+            self._violation(rig, steps, start, int(np.argmax(near[:, column])), column, share)
+            for column in np.flatnonzero(near.any(axis=0)).tolist()
+        ]
+        return trip, warnings
+
+    def _violation(
+        self, rig: Rig, steps: Array, start: int, row: int, column: int, share: float
+    ) -> Violation:
+        name = rig.recorded[self.columns[column]]
+        per_second = rig.sample_rate / self.window
+        bound = share * float(self.bounds[column]) * per_second
+        value = float(steps[row, column]) * per_second
+        unit = f"{ch.unit_of(name)}/s"
+        joint = ch.kind_of(name)[1]
+        return Violation(self.limit, value, (-bound, bound), unit, joint, name, start + row)
+
+
+def rates(rig: Rig) -> tuple[Rate, ...]:
+    """Return the bounds on rates of a rig, one per kind and window."""
+    found: dict[tuple[str, int], list[tuple[int, float]]] = {}
+    for column, name in enumerate(rig.channels):
+        kind, joint = ch.kind_of(name)
+        if joint is None or kind not in (ch.PISTON, ch.CAP, ch.ROD):
+            continue
+        limits = rig.joints[joint - 1].limits
+        limit = limits.speed if kind == ch.PISTON else limits.pressure_rate
+        window = rate_window(rig.sensors.of(kind).noise, limit, rig.sample_rate)
+        what = "piston speed" if kind == ch.PISTON else "pressure rate"
+        found.setdefault((what, window), []).append((column, limit))
+    return tuple(
+        Rate(
+            what,
+            np.array([column for column, _ in entries]),
+            window,
+            np.array([limit for _, limit in entries]) * (window / rig.sample_rate),
+        )
+        for (what, window), entries in found.items()
+    )

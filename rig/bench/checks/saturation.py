@@ -1,0 +1,55 @@
+"""Sensors at an end of their converter's range: blind, or dead."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.bench.checks.bands import Counts, first_of, run_lengths
+from rig.bench.checks.settings import GuardSettings
+from rig.model import channels as ch
+from rig.model.rig import Rig
+from rig.model.trips import SATURATED, Violation
+
+_VACUUM = -90e3  # no gauge pressure far below this exists, so none hides under such a range
+
+
+class Saturation:
+    """Finds the channels whose samples stand at an end of their range, across blocks."""
+
+    def __init__(self, rig: Rig, settings: GuardSettings) -> None:
+        self._rig = rig
+        counts, middles = [], []
+        for name in rig.channels:
+            kind, _ = ch.kind_of(name)
+            low, high = rig.sensors.of(kind).range
+            vacuum = kind in (ch.CAP, ch.ROD) and low <= _VACUUM
+            usual = settings.saturated_samples
+            counts.append((usual, settings.saturated_samples_vacuum if vacuum else usual))
+            middles.append((low + high) / 2)
+        self._at_high, self._at_low = np.array(counts).T
+        self._middles = np.array(middles)
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin anew: what comes next does not continue what came before."""
+        self._runs: Counts = np.zeros(len(self._middles), dtype=np.int64)
+
+    def find(
+        self, marks: NDArray[np.bool_], measured: NDArray[np.float64], tick: int
+    ) -> Violation | None:
+        """Return the first channel too long at an end; marks and measured are (n, channels)."""
+        if not marks.any():
+            self._runs[:] = 0
+            return None
+        runs = run_lengths(marks, self._runs)
+        self._runs = runs[-1]
+        over = runs >= np.where(measured > self._middles, self._at_high, self._at_low)
+        if not over.any():
+            return None
+        row, column = first_of(over)
+        name = self._rig.channels[column]
+        kind, joint = ch.kind_of(name)
+        ends = self._rig.sensors.of(kind).range
+        value = float(measured[row, column])
+        return Violation(SATURATED, value, ends, ch.unit_of(name), joint, name, tick + row)

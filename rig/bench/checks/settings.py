@@ -1,0 +1,50 @@
+"""Thresholds of every check that no rig file states: unit, meaning, origin."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class GuardSettings:
+    """Patience and thresholds of the checks.
+
+    "Seen" below is the largest value on the shipped benches, shipped protocols, clean and with
+    each shipped effect (`make study NAME=guard`).
+    """
+
+    # Single samples
+    saturated_samples: int = 5  # so many in a row blind a channel
+    saturated_samples_vacuum: int = 50  # cavitating oil rests at the low end, but with noise
+    max_gap: float = 0.1  # [s] of device time without samples
+    stale_after: float | None = None  # [s] of wall time; default: the rig's watchdog
+    stale_warning: float = 0.5  # of `stale_after`; half the time is left to look
+
+    # Warnings: against chatter
+    warning_delay: float = 0.05  # [s] outside the band; five blocks of the shipped bench
+    dead_band: float = 0.02  # of the band's width; four times the noise of a worn sensor
+    return_after: float = 1.0  # [s] inside before a warning returns; a person reads no faster
+
+    # Plausibility: features over a window, looked at every `hop`
+    window: float = 0.5  # [s]; half of a 1 Hz period, the slowest wave of the seed's protocol
+    hop: float = 0.1  # [s] between two looks
+    confirm: float = 0.2  # [s] a finding must last, so that a passing through is none
+
+    frozen_after: float = 0.25  # [s] that a moving joint's sensor keeps one value
+    # A spool stands off its command by the part that moves, or by a constant part.
+    spool_share: float = 0.5  # of the movement commanded, mean deviation; seen: 0.04
+    spool_floor: float = 0.005  # of the stroke, mean deviation; seen: 0.0001
+    spool_constant: float = 0.1  # of the stroke; an LVDT's own offset stays below 0.03
+    # A chamber of an excited joint that never reaches this share of the set pressure is open.
+    empty_chamber: float = 0.03  # seen: 0.13, with external leakage
+    supply_lost: float = 0.25  # of the set pressure, while a joint is excited: no load is moved
+    open_spool: float = 0.05  # of the stroke, mean; overlap and shift of a null stay below
+    still_piston: float = 12.0  # standard deviations, peak to peak; noise alone reaches some 7
+    stroke_end: float = 0.02  # of the stroke from its end: a piston there is stopped, not stuck
+    above_supply: float = 1.1  # of the supply, mean; seen: 1.03, by a sensor's gain
+    drift: float = 0.1  # of limits.speed at zero command; seen: 0.045, coming to rest
+    noise: float = 5.0  # times the stated noise; seen: 1.25, by the steps of the converter
+
+    # Bands of the bench, where the rig file gives none
+    supply_warning: tuple[float, float] = (0.8, 1.15)  # of supply.pressure; seen: 0.97 to 1.01
+    oil_warning: float = 2.0  # times oil.temperature_band either way; seen: 1.1
