@@ -11,7 +11,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import asdict, replace
 from types import TracebackType
 from typing import Any, Self
@@ -29,6 +29,7 @@ from drivers.base import (
     SampleBlock,
 )
 from rig.bench.after_zero import record_zero
+from rig.bench.alarms import AlarmLog
 from rig.bench.guard import Guard, GuardSettings, JointRole
 from rig.bench.handles import RecordHandle
 from rig.bench.latch import BenchState
@@ -38,6 +39,7 @@ from rig.bench.outputs import UNSURE, Outputs
 from rig.bench.screens.display import Display
 from rig.bench.screens.sockets import Publisher
 from rig.bench.stops import StopFlag
+from rig.model.alarms.states import AlarmTable
 from rig.model.rig import Rig
 from rig.model.trips import (
     Latched,
@@ -88,6 +90,7 @@ class Bench:
         self._driver = driver
         self._clock = clock
         self._guard = Guard(rig, settings)
+        self._alarms = AlarmLog(rig, lambda event, tick, about: self.event(event, tick, **about))
         self._stop = StopFlag()
         self._signals = signals
         self._display = Display(rig, publisher, str(recorder.folder) if recorder else "", clock)
@@ -241,6 +244,7 @@ class Bench:
             self.zero_outputs()
             trip = self._latch(violation)
         self._keep(block, late, lost)
+        self._outputs.safely(lambda: self._note_alarms(violation))
         self.observers.block(block)
         self._display.show(block, late or 0.0, self.lost_samples, self._guard.roles)
         if trip is not None:
@@ -248,6 +252,14 @@ class Bench:
             raise trip
         self._heed()
         return block
+
+    def _note_alarms(self, trip: Violation | None) -> None:
+        """Write down what warns and what tripped, and let the screens see it."""
+        with suppress(RecordingFailed) if trip is not None else nullcontext():
+            self._alarms.update(self._guard.warnings, self.tick)
+            if trip is not None:
+                self._alarms.trip(trip)
+        self._display.alarms = self._alarms.table
 
     def _continue(self, block: SampleBlock) -> int:
         """Return how many samples are missing before a block; raises DeviceError if it is odd."""
@@ -301,8 +313,11 @@ class Bench:
 
     def _heed(self) -> None:
         """Honour a wish to stop and a latched trip before anything else is done."""
-        if self._display.commands():
-            self._stop.request("stopped by operator (from the screen)")
+        for command in self._display.commands():
+            if command.word == "stop":
+                self._stop.request("stopped by operator (from the screen)")
+            else:
+                self.acknowledge(command.alarm)
         if self._stop.reason is not None:
             self.zero_outputs()
             with suppress(RecordingFailed):
@@ -311,6 +326,17 @@ class Bench:
         if self.trip is not None:
             self.zero_outputs()
             raise self.trip
+
+    @property
+    def alarms(self) -> AlarmTable:
+        """The alarms that stand."""
+        return self._alarms.table
+
+    def acknowledge(self, alarm: str | None = None) -> None:
+        """Note that a person has seen an alarm by its key, or all of them."""
+        with suppress(RecordingFailed):  # the next block says so, with the outputs at zero
+            self._alarms.acknowledge(alarm, self.tick)
+        self._display.alarms = self._alarms.table
 
     def run_for(self, seconds: float, watch: Callable[[SampleBlock], None] | None = None) -> Array:
         """Exchange until `seconds` of device time have passed; returns their samples.

@@ -70,6 +70,18 @@ def _allowed(violation: Violation) -> str:
     return f"{low * factor:.4g} to {high * factor:.4g} {shown}"
 
 
+def describe(violation: Violation, rig: Rig) -> str:
+    """Return where, how much, when and what was allowed: one clause."""
+    where = "the bench"
+    if violation.joint is not None:
+        where = f"joint {violation.joint} ({rig.joints[violation.joint - 1].name})"
+    subject = f"{violation.channel} of {where}" if violation.channel else where
+    return (
+        f"{subject}: {_value(violation)} at {violation.tick / rig.sample_rate:.4f} s, "
+        f"allowed {_allowed(violation)}"
+    )
+
+
 class SafetyTrip(Exception):
     """A limit was passed and the outputs are at zero; the message names everything (exit 3).
 
@@ -87,17 +99,7 @@ class SafetyTrip(Exception):
         self.channel = violation.channel
         self.tick = violation.tick
         self.device_time = violation.tick / rig.sample_rate
-        super().__init__(self._message(rig))
-
-    def _message(self, rig: Rig) -> str:
-        where = "the bench"
-        if self.joint is not None:
-            where = f"joint {self.joint} ({rig.joints[self.joint - 1].name})"
-        subject = f"{self.channel} of {where}" if self.channel else where
-        return (
-            f"safety trip: limit '{self.limit}', {subject}: {_value(self.violation)} "
-            f"at {self.device_time:.4f} s, allowed {_allowed(self.violation)}"
-        )
+        super().__init__(f"safety trip: limit '{self.limit}', {describe(violation, rig)}")
 
 
 def reset_command(rig: Rig) -> str:

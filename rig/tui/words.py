@@ -11,6 +11,7 @@ from rich.text import Text
 from rig.bench.outputs import UNSURE
 from rig.bench.screens.sockets import ChannelView, Endpoint, Snapshot
 from rig.model import channels as ch
+from rig.model.alarms.states import AlarmState, AlarmTable, folded
 from rig.tui.link import ENDED_STATES, QUIET, Frame, LinkStage
 from rig.tui.story import trip_text
 from rig.tui.units import Band, age_text, band, clock_text, limit, shown
@@ -78,6 +79,8 @@ def notices(frame: Frame, stop: Stop | None, now: float, *, paused: bool) -> lis
         found.append(Notice("alarm", f"{UNSURE.upper()}: keep away from the machine. {EMERGENCY}"))
     if snapshot is not None and snapshot.trip is not None:
         found.append(Notice("alarm", f"TRIP  {trip_text(snapshot.trip)}"))
+    if snapshot is not None and not frame.over:
+        found += alarm_notices(snapshot)
     if stop is not None and (stop.endpoint == frame.endpoint or now - stop.at < LINGER):
         found.append(stop_notice(frame, stop, now))
     if frame.over:
@@ -89,6 +92,18 @@ def notices(frame: Frame, stop: Stop | None, now: float, *, paused: bool) -> lis
     if paused:
         found.append(Notice("warn", "DISPLAY PAUSED, the run goes on: p shows it live again"))
     return found
+
+
+def alarm_notices(snapshot: Snapshot) -> list[Notice]:
+    """Return one line on the warnings that stand: the most urgent, and how many there are."""
+    groups = folded(AlarmTable(tuple(a for a in snapshot.alarms if not a.trips)))
+    if not groups:
+        return []
+    first, rest = groups[0]
+    more = sum(1 + len(others) for _, others in groups[1:]) + len(rest)
+    tail = f" (and {more} more)" if more else ""
+    back = ", back within its band" if first.state is AlarmState.RETURNED else ""
+    return [Notice("warn", f"WARNING  {first.sentence}{back}{tail}")]
 
 
 def stop_notice(frame: Frame, stop: Stop, now: float) -> Notice:

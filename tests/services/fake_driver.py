@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 
 def samples(rig: Rig, ticks: NDArray[np.int64]) -> Array:
-    """What the sensors say at these ticks (commands left at zero), shape (n, recorded)."""
+    """What the sensors say at these ticks, shape (n, recorded); commands and spools at zero."""
     t = ticks / rig.sample_rate
     data = np.zeros((len(ticks), len(rig.recorded)))
     for column, name in enumerate(rig.channels):
@@ -32,8 +32,6 @@ def samples(rig: Rig, ticks: NDArray[np.int64]) -> Array:
             data[:, column] = 3e6 + 1e6 * wave
         elif name.startswith("oil"):
             data[:, column] = 40 + 0.1 * wave
-        else:
-            data[:, column] = 0.1 * wave
     return data
 
 
@@ -146,7 +144,10 @@ class FakeDriver:
             n = self.info.block_samples
             ticks = np.arange(self.tick, self.tick + n)
             data = samples(self.rig, ticks)
-            data[:, len(self.rig.channels) :] = self._commands(ticks, data)
+            data[:, len(self.rig.channels) :] = commands = self._commands(ticks, data)
+            for j, joint in enumerate(self.rig.joints):  # a spool without inertia
+                spool = self.rig.channels.index(f"spool_{j + 1}")
+                data[:, spool] = joint.valve.spool_gain * commands[:, j]
             marks = np.zeros((n, len(self.rig.channels)), dtype=bool)
             block = SampleBlock(self.sequence, self.tick, data, marks, 0, False)
             self.tick += n

@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 from drivers.base import SampleBlock
 from rig.bench.guard import EXCITED, JointRole
 from rig.bench.screens.snapshot import Snapshot, decimate, from_json, to_json
-from rig.bench.screens.sockets import AttachError, Attachment, Endpoint, Publisher
+from rig.bench.screens.sockets import AttachError, Attachment, Command, Endpoint, Publisher
 from rig.bench.session import Bench
 from rig.model.trips import OperatorStop, SafetyTrip
 from rig.runs.recorder import Recorder
@@ -199,7 +199,7 @@ def test_rubbish_on_the_command_socket_is_answered_and_does_nothing(folder: Path
         asking.setsockopt(zmq.LINGER, 0)
         asking.connect(f"ipc://{publisher.endpoint.cmd}")
         asking.send_multipart([raw, b"more"])
-        found: list[str] = []
+        found: list[Command] = []
         wait_for(lambda a=asking, f=found: f.extend(publisher.commands()) or a.poll(10))
         assert found == []
         assert b'"ok": false' in asking.recv()

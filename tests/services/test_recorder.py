@@ -52,6 +52,7 @@ def test_every_sample_of_every_record_comes_back_with_its_attributes(tmp_path: P
     ticks = np.arange(5043, 5143)
     expected = samples(RIG, ticks)
     expected[:, -1] = 0.5 * np.sin(2 * np.pi * (ticks - 5040) / 50)
+    expected[:, RIG.recorded.index("spool_2")] = RIG.joints[1].valve.spool_gain * expected[:, -1]
     for column, name in enumerate(RIG.recorded):
         np.testing.assert_allclose(first.channels[name], expected[:, column], rtol=0, atol=1e-9)
     assert (first.step, first.locked, first.repeat, first.sample_rate) == ("step1", (1,), 1, 1000)

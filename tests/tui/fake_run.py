@@ -43,7 +43,7 @@ def main(arguments: list[str]) -> None:
             time.sleep(max(started + k * PERIOD - time.monotonic(), 0.0))
             view = replace(view, wall_time=time.time())
             deaf = asked.deaf is not None and now >= asked.deaf
-            if not deaf and "stop" in publisher.commands():
+            if not deaf and any(c.word == "stop" for c in publisher.commands()):
                 publisher.publish(stopped(view))
                 return
             if asked.trip is not None and now >= asked.trip:

@@ -42,7 +42,7 @@ class GuardSettings:
     still_piston: float = 12.0  # standard deviations, peak to peak; noise alone reaches some 7
     stroke_end: float = 0.02  # of the stroke from its end: a piston there is stopped, not stuck
     above_supply: float = 1.1  # of the supply, mean; seen: 1.03, by a sensor's gain
-    drift: float = 0.1  # of limits.speed at zero command; seen: 0.045, coming to rest
+    drift: float = 0.05  # of limits.speed, mean over the window at zero command; seen: 0.01
     noise: float = 5.0  # times the stated noise; seen: 1.25, by the steps of the converter
 
     # Bands of the bench, where the rig file gives none

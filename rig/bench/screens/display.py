@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from drivers.base import SampleBlock
 from rig.bench.guard import JointRole, piston_bounds
 from rig.bench.screens.snapshot import BenchView, Progress, take_snapshot
-from rig.bench.screens.sockets import Publisher
+from rig.bench.screens.sockets import Command, Publisher
 from rig.model import channels as ch
+from rig.model.alarms.states import AlarmTable
 from rig.model.rig import Rig
 from rig.runs import runstate
 
@@ -31,6 +32,7 @@ class Display:
     ) -> None:
         self.progress = Progress()
         self.trip: str | None = None
+        self.alarms = AlarmTable()
         self._rig = rig
         self._publisher = publisher
         self._run = run
@@ -43,7 +45,7 @@ class Display:
         self._lost = 0
         self._roles: Sequence[JointRole] = ()
 
-    def commands(self) -> list[str]:
+    def commands(self) -> list[Command]:
         """Return what the screens asked for."""
         return [] if self._publisher is None else self._publisher.commands()
 
@@ -78,6 +80,7 @@ class Display:
             block_age=age,
             lost_samples=self._lost,
             trip=self.trip,
+            alarms=self.alarms.alarms,
         )
         snapshot = take_snapshot(view, self.progress, samples, self._units, self._limits())
         self._publisher.publish(snapshot)

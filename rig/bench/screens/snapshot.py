@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.model.alarms.states import Alarm, AlarmState
+
 Array = NDArray[np.float64]
 
 BUCKETS = 25  # of new samples per snapshot: at 20 snapshots a second, 500 columns for a plot
@@ -34,6 +36,7 @@ class Snapshot:
 
     `state` is running, tripped, done or aborted; `device_time` and `wall_time` are in seconds
     (the latter since the epoch); `block_age` [s] is how late the newest block came.
+    `alarms` are those that stand (`rig.model.alarms.states.folded` orders them).
     """
 
     run: str
@@ -54,6 +57,7 @@ class Snapshot:
     trip: str | None
     message: str
     channels: dict[str, ChannelView]
+    alarms: tuple[Alarm, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -82,6 +86,7 @@ class BenchView:
     block_age: float
     lost_samples: int
     trip: str | None
+    alarms: tuple[Alarm, ...] = ()
 
 
 def decimate(samples: Array, buckets: int = BUCKETS) -> tuple[Array, Array]:
@@ -108,7 +113,13 @@ def take_snapshot(
         channels[name] = ChannelView(
             unit, *limits[name], last, low[:, column].tolist(), high[:, column].tolist()
         )
-    return Snapshot(pid=os.getpid(), channels=channels, **asdict(view), **asdict(progress))
+    shown = {name: getattr(view, name) for name in view.__dataclass_fields__}
+    return Snapshot(pid=os.getpid(), channels=channels, **shown, **asdict(progress))
+
+
+def _alarm(view: dict[str, Any]) -> Alarm:
+    low, high = view.pop("limit")
+    return Alarm(**{**view, "limit": (low, high), "state": AlarmState(view["state"])})
 
 
 def to_json(snapshot: Snapshot) -> bytes:
@@ -121,6 +132,7 @@ def from_json(raw: bytes) -> Snapshot:
     try:
         data: dict[str, Any] = json.loads(raw)
         channels = {name: ChannelView(**view) for name, view in data.pop("channels").items()}
-        return Snapshot(**data, channels=channels)
+        alarms = tuple(_alarm(view) for view in data.pop("alarms", ()))
+        return Snapshot(**data, channels=channels, alarms=alarms)
     except (TypeError, KeyError, AttributeError) as error:
         raise ValueError(f"not a snapshot: {error}") from error

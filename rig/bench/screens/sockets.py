@@ -1,8 +1,8 @@
 """The local sockets through which a screen watches a run and stops it; only their owner may.
 
 Two ZeroMQ sockets per session in a folder of mode 0700: `<rig>-<pid>.pub` (PUB: snapshots) and
-`<rig>-<pid>.cmd` (REP: "stop"). The run never waits for a screen: snapshots that nobody
-takes are dropped, commands are polled.
+`<rig>-<pid>.cmd` (REP: "stop", "acknowledge"). The run never waits for a screen:
+snapshots that nobody takes are dropped, commands are polled.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ __all__ = ["AttachError", "Attachment", "ChannelView", "Endpoint", "Publisher", 
 
 log = logging.getLogger(__name__)
 
-COMMANDS = ("stop",)
+COMMANDS = ("stop", "acknowledge")
 _MAX_PATH = 100  # a Unix socket's address holds 107 bytes
 _MAX_NAME = 32
 _FILE = re.compile(r"^(?P<rig>.+)-(?P<pid>\d+)\.(?:pub|cmd)$")
@@ -36,6 +36,14 @@ _COMMANDS_AT_ONCE = 16
 
 class AttachError(Exception):
     """The local sockets cannot be made or trusted; the message says why."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """What a screen asks for: a word of `COMMANDS`; `alarm` is the key of one, None for all."""
+
+    word: str
+    alarm: str | None = None
 
 
 @dataclass(frozen=True)
@@ -142,9 +150,9 @@ class Publisher:
         with suppress(zmq.ZMQError):
             self._pub.send(to_json(snapshot), zmq.NOBLOCK)
 
-    def commands(self) -> list[str]:
+    def commands(self) -> list[Command]:
         """Return the commands that came since the last call, each answered; never waits."""
-        found: list[str] = []
+        found: list[Command] = []
         for _ in range(_COMMANDS_AT_ONCE):
             try:
                 raw = self._cmd.recv_multipart(zmq.NOBLOCK)[0]
@@ -174,12 +182,15 @@ class Publisher:
                 path.unlink(missing_ok=True)
 
 
-def _command(raw: bytes) -> str | None:
+def _command(raw: bytes) -> Command | None:
     try:
-        word = json.loads(raw)["command"]
-    except (ValueError, TypeError, KeyError):
+        said = json.loads(raw)
+        word, alarm = said["command"], said.get("alarm")
+    except (ValueError, TypeError, KeyError, AttributeError):
         return None
-    return word if word in COMMANDS else None
+    if word not in COMMANDS or not isinstance(alarm, str | None):
+        return None
+    return Command(word, alarm)
 
 
 class Attachment:
@@ -210,13 +221,16 @@ class Attachment:
             log.debug("no snapshot: %s", error)
             return None
 
-    def send(self, command: str, timeout: float = 2.0) -> bool:
-        """Send a command; True when the run has taken it, False without an answer in `timeout`."""
+    def send(self, command: str, timeout: float = 2.0, *, alarm: str | None = None) -> bool:
+        """Send a command, for one alarm by its key or for all.
+
+        True when the run has taken it, False without an answer in `timeout` [s].
+        """
         asking = self._context.socket(zmq.REQ)  # a new one: an unanswered one is of no use again
         asking.setsockopt(zmq.LINGER, 0)
         try:
             asking.connect(_address(self.endpoint.cmd))
-            asking.send(json.dumps({"command": command}).encode(), zmq.NOBLOCK)
+            asking.send(json.dumps({"command": command, "alarm": alarm}).encode(), zmq.NOBLOCK)
             if not asking.poll(round(timeout * 1000)):
                 return False
             return bool(json.loads(asking.recv(zmq.NOBLOCK)).get("ok"))

@@ -1,0 +1,86 @@
+"""The alarms of a session: what the guard finds, as a table of alarms and as events of the run."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from typing import Any
+
+from rig.bench.checks.catalogue import catalogue
+from rig.bench.checks.standing import Key
+from rig.model.alarms import states
+from rig.model.alarms.states import Alarm, AlarmTable
+from rig.model.rig import Rig
+from rig.model.trips import Violation, describe
+
+log = logging.getLogger(__name__)
+
+OnEvent = Callable[[str, int | None, Mapping[str, Any]], None]
+
+
+class AlarmLog:
+    """Keeps the table of a session's alarms; every change of it is one event."""
+
+    def __init__(self, rig: Rig, on_event: OnEvent) -> None:
+        """`on_event` takes what happened, its tick and the alarm's data."""
+        self.table = AlarmTable()
+        self._rig = rig
+        self._on_event = on_event
+        self._texts = {text.limit: text for text in catalogue()}
+        self._standing: dict[Key, str] = {}
+
+    def alarm_of(self, violation: Violation, *, trips: bool) -> Alarm:
+        """Return the alarm that a violation raises."""
+        text = self._texts[violation.limit]
+        return Alarm(
+            check=violation.limit,
+            channel=violation.channel,
+            joint=violation.joint,
+            value=violation.value,
+            limit=violation.allowed,
+            unit=violation.unit,
+            tick=violation.tick,
+            time=violation.tick / self._rig.sample_rate,
+            sentence=f"{text.sentence} {describe(violation, self._rig)}",
+            remedy=text.remedy,
+            trips=trips,
+        )
+
+    def update(self, warnings: Mapping[Key, Violation], tick: int) -> None:
+        """Take the warnings that stand at a tick: new ones are raised, missing ones return."""
+        if not warnings and not self._standing:
+            return
+        for key in self._standing.keys() - warnings.keys():
+            name = self._standing.pop(key)
+            self.table = states.returned(self.table, name)
+            self._on_event("alarm returned", tick, {"alarm": name})
+        for key, violation in warnings.items():
+            if key not in self._standing:
+                self._standing[key] = self._raise(self.alarm_of(violation, trips=False))
+
+    def trip(self, violation: Violation) -> Alarm:
+        """Raise the alarm of a trip, which latches; returns it."""
+        alarm = self.alarm_of(violation, trips=True)
+        self._raise(alarm)
+        return alarm
+
+    def _raise(self, alarm: Alarm) -> str:
+        self.table = states.raised(self.table, alarm)
+        found = self.table.get(alarm.key) or alarm
+        if not alarm.trips:
+            log.warning("warning: %s", alarm.sentence)
+        about = {k: v for k, v in asdict(found).items() if k != "tick"}
+        self._on_event("alarm", alarm.tick, {"alarm": alarm.key, **about})
+        return alarm.key
+
+    def acknowledge(self, key: str | None, tick: int) -> None:
+        """Note that a person has seen an alarm, or all (None); an unknown key is logged."""
+        seen = [alarm.key for alarm in self.table.unacknowledged]
+        try:
+            self.table = states.acknowledged(self.table, key)
+        except KeyError as error:
+            log.info("%s", error.args[0])
+            return
+        for one in seen if key is None else [key]:
+            self._on_event("alarm acknowledged", tick, {"alarm": one})
