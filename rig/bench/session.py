@@ -201,6 +201,13 @@ class Bench:
             if error is None:
                 raise
             log.error("%s", problem)  # what went wrong first is what the user is told
+            return
+        if self.trip is not None:
+            from rig.runs.exchange.trip_window import write_trip_window  # noqa: PLC0415 - as h5py
+
+            around = write_trip_window(self.recorder.folder)
+            if around is not None:
+                self.trip.add_note(f"the 2 s before and after it are in {around}")
 
     # Outputs
 
@@ -299,6 +306,7 @@ class Bench:
 
     def _latch(self, violation: Violation) -> SafetyTrip:
         self.trip = SafetyTrip(violation, self.rig)
+        self.trip.add_note(self._alarms.alarm_of(violation, trips=True).remedy.rstrip("."))
         self._display.trip = str(self.trip)
         folder = None if self.recorder is None else self.recorder.folder
         if self.state.latch(str(self.trip), self.rig, folder):

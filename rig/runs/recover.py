@@ -56,7 +56,11 @@ def recover(path: str | Path, *, force: bool = False) -> RecoverReport:
         stood = runstate.read_state(folder)
         runstate.take_ownership(folder)
         try:
-            return _from_journal(folder, header.rig, stood)
+            report = _from_journal(folder, header.rig, stood)
+            from rig.runs.exchange.trip_window import write_trip_window  # noqa: PLC0415 - as h5py
+
+            write_trip_window(folder)
+            return report
         finally:
             runstate.give_up_ownership(folder)
     except OSError as error:
