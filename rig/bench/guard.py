@@ -92,6 +92,7 @@ class Guard:
     def forget(self) -> None:
         """Drop the tail of the previous block: what comes next does not continue it."""
         self._tail: Array = np.empty((0, len(self.rig.recorded)))
+        self._unbroken = 0  # rows at the end of the tail without a gap among them
         for check in (self._saturation, self._outside_trip, self._outside_warning):
             check.forget()
         self._plausibility.forget()
@@ -112,9 +113,9 @@ class Guard:
     def gap(self, lost: int, tick: int) -> Violation | None:
         """Return the violation of `lost` missing samples before `tick`; rates start anew there.
 
-        Fewer than may be missing are a warning.
+        Fewer than may be missing are a warning. What is judged over a window goes on across them:
+        a device polled by a busy host loses single samples all the time, and must not be blind.
         """
-        self.forget()
         allowed = self.settings.max_gap
         seconds = lost / self.rig.sample_rate
 
@@ -122,7 +123,10 @@ class Guard:
             return Violation(GAP, seconds, (-math.inf, than), "s", None, "", tick)
 
         if seconds > allowed:
+            self.forget()
             return longer(allowed)
+        self._unbroken = 0
+        self._plausibility.skip()
         self._standing.see([longer(0.0)], tick)
         return None
 
@@ -150,10 +154,12 @@ class Guard:
         last = block.tick + len(data) - 1
         trips = [self._band_trip(block)]
         joined = np.concatenate((self._tail, data))
+        self._unbroken = min(self._unbroken, len(self._tail)) + len(data)
         for rate in self._rates:
-            first = block.tick - len(self._tail)
+            rows = joined[-self._unbroken :]
+            first = last + 1 - self._unbroken
             share = self.rig.alarms.warning_share
-            trip, near = rate.find(self.rig, joined, first, len(data), share)
+            trip, near = rate.find(self.rig, rows, first, len(data), share)
             trips.append(trip)
             self._standing.see(near, last)
         measured = data[:, : block.saturated.shape[1]]

@@ -1,8 +1,14 @@
-"""How late blocks come: their arrival on the host's clock against their own device time."""
+"""How late blocks come, and how late the samples of a device that the host clocks are taken."""
 
 from __future__ import annotations
 
+from typing import Final
+
+import numpy as np
+
 from drivers.base import SampleBlock
+
+LATE_SHARE: Final = 0.5  # [periods] after its tick from which on a sample counts as late
 
 # A crystal's error either way, doubled: the earliest arrival so far may age by as much.
 _DRIFT = 200e-6
@@ -24,3 +30,35 @@ class ArrivalClock:
         self._best = min(offset, self._best + _DRIFT * (now - self._last))
         self._last = now
         return offset - self._best
+
+
+class HostTiming:
+    """Counts what a host-timed device measured late, or not at all, by `SampleBlock.read_at`."""
+
+    def __init__(self, sample_rate: float) -> None:
+        self._sample_rate = sample_rate
+        self._samples = self._late = self._interpolated = 0
+        self._worst = 0.0
+
+    def add(self, block: SampleBlock) -> None:
+        """Take a block; one of a device with a clock of its own says nothing here."""
+        if block.read_at is None:
+            return
+        due = (block.tick + np.arange(len(block.data))) / self._sample_rate
+        late = block.read_at - due
+        own = np.isfinite(late)
+        self._samples += len(late)
+        self._interpolated += int(np.count_nonzero(~own))
+        self._late += int(np.count_nonzero(late[own] > LATE_SHARE / self._sample_rate))
+        self._worst = max(self._worst, float(late[own].max(initial=0.0)))
+
+    def summary(self) -> dict[str, float] | None:
+        """Return the counts and the worst lateness [s]; None where the device has the clock."""
+        if not self._samples:
+            return None
+        return {
+            "samples": self._samples,
+            "late": self._late,
+            "interpolated": self._interpolated,
+            "worst_late_s": self._worst,
+        }

@@ -33,7 +33,7 @@ from rig.bench.alarms import AlarmLog
 from rig.bench.guard import Guard, GuardSettings, JointRole
 from rig.bench.handles import RecordHandle
 from rig.bench.latch import BenchState
-from rig.bench.lateness import ArrivalClock
+from rig.bench.lateness import ArrivalClock, HostTiming
 from rig.bench.observers import Observers
 from rig.bench.outputs import UNSURE, Outputs
 from rig.bench.screens.display import Display
@@ -95,6 +95,7 @@ class Bench:
         self._signals = signals
         self._display = Display(rig, publisher, str(recorder.folder) if recorder else "", clock)
         self._arrival: ArrivalClock | None = None
+        self._timing = HostTiming(rig.sample_rate)
         self._expected: int | None = None
 
     # Entry and exit
@@ -195,6 +196,10 @@ class Bench:
     def _flush(self, state: str, message: str, error: BaseException | None) -> None:
         if self.recorder is None:
             return
+        timing = self._timing.summary()
+        if timing is not None:
+            with suppress(RecordingFailed):
+                self.event("host timing", None, **timing)
         try:
             self.recorder.finish(state, message)
         except RecordingFailed as problem:
@@ -251,6 +256,7 @@ class Bench:
             self.zero_outputs()
             trip = self._latch(violation)
         self._keep(block, late, lost)
+        self._timing.add(block)
         self._outputs.safely(lambda: self._note_alarms(violation))
         self.observers.block(block)
         self._display.show(block, late or 0.0, self.lost_samples, self._guard.roles)

@@ -177,3 +177,39 @@ def test_a_run_without_a_trip_has_no_such_file(tmp_path: Path) -> None:
     take(tmp_path / "run", high_between(), 0.5)
     assert write_trip_window(tmp_path / "run") is None
     assert not (tmp_path / "run/trip.csv").exists()
+
+
+def test_samples_that_the_host_took_late_are_counted_in_the_run(tmp_path: Path) -> None:
+    def host_timed(block: SampleBlock) -> SampleBlock:
+        at = (block.tick + np.arange(10)) / RIG.sample_rate
+        if block.sequence == 3:
+            at[4] += 0.7e-3  # late by more than half a period
+            at[7] = np.nan  # interpolated
+        return replace(block, read_at=at)
+
+    take(tmp_path / "run", host_timed, 0.1)
+    (said,) = [e for e in read_events(tmp_path / "run") if e["event"] == "host timing"]
+    assert (said["samples"], said["late"], said["interpolated"]) == (100, 1, 1)
+    assert said["worst_late_s"] == pytest.approx(0.7e-3)
+    take(tmp_path / "own", high_between(), 0.1)
+    assert "host timing" not in [e["event"] for e in read_events(tmp_path / "own")]
+
+
+def test_a_few_lost_samples_warn_and_do_not_blind_the_checks(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    driver = driver_of("faults: [{name: valve_stuck, where: joint 2, at: 1 s}]")
+    read = driver.read_block
+
+    def lossy() -> SampleBlock:
+        block = read()
+        return read() if block.tick % 200 == 0 and block.tick else block
+
+    driver.read_block = lossy  # type: ignore[method-assign]
+    with pytest.raises(SafetyTrip) as caught, Bench(RIG, driver, Recorder(run, RIG)) as bench:  # noqa: PT012
+        bench.upload(1, WAVES["sine"])
+        bench.guard([FREE, EXCITED])
+        bench.apply([OutputLaw(), OutputLaw(1.0, 0.0, 5.0, 0.0, 4.0)], restart=True)
+        bench.run_for(4.0)
+    assert caught.value.limit == "spool does not follow"
+    assert caught.value.device_time <= 3.0
+    assert "sample gap: bench" in [name for name, _ in alarms_of(run)]

@@ -2,7 +2,7 @@
 
 Features are taken over a window of the latest samples, `hop` apart, so every sample is in several.
 A finding counts when it lasts for `confirm`. A window never reaches across a change of roles or a
-gap.
+gap long enough to trip.
 """
 
 from __future__ import annotations
@@ -70,6 +70,10 @@ class Plausibility:
         """Begin anew: what comes next does not continue what came before."""
         self._expected.forget()
         self.restart()
+
+    def skip(self) -> None:
+        """Go on after a few lost samples: the spools are where their next command holds them."""
+        self._expected.forget()
 
     def restart(self) -> None:
         """Begin a new window: the joints do something else from the next block on."""
