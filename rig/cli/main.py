@@ -25,6 +25,7 @@ VERBS: Final = {
     "sim": "rig.cli.sim",
     "check": "rig.cli.check",
     "run": "rig.cli.run",
+    "queue": "rig.cli.queue",
     "monitor": "rig.cli.monitor",
     "runs": "rig.cli.runs",
     "recover": "rig.cli.recover",

@@ -42,13 +42,13 @@ def write_json(path: Path | None, data: Any) -> None:
     temporary.replace(path)
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1) -> str:
-    """Lay out a plain table: the first `left` columns to the left, the others to the right."""
+def table(header: Sequence[str], rows: Sequence[Sequence[str]], left: Sequence[str] = ()) -> str:
+    """Lay out a plain table: the first column and those of `left` to the left, the others right."""
     widths = [max(len(row[k]) for row in (header, *rows)) for k in range(len(header))]
     lines = [
         "  ".join(
-            cell.ljust(width) if k < left else cell.rjust(width)
-            for k, (cell, width) in enumerate(zip(row, widths, strict=True))
+            cell.ljust(width) if k == 0 or name in left else cell.rjust(width)
+            for k, (name, cell, width) in enumerate(zip(header, row, widths, strict=True))
         ).rstrip()
         for row in (header, *rows)
     ]

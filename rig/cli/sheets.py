@@ -45,7 +45,7 @@ def proof_text(proof: Proof) -> str:
         for r in proof.reasons
     ]
     header = ["step", *(f"{family} rank, cond." for family in families), "why"]
-    lines = [table(header, rows, left=len(header)), ""]
+    lines = [table(header, rows, left=header), ""]
     for family, verdict in proof.verdicts.items():
         size = len(verdict.names)
         if verdict.complete:

@@ -1,0 +1,24 @@
+"""The proof of an item on the twin, as a process of its own, when it is queued."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rig.cli.errors import BAD_INPUT, WorkError
+from rig.model.parse import InputError
+from rig.queue.items import Job
+from rig.queue.processes import BRAMAH, call
+from rig.queue.runner import Settings
+
+_KEPT = ("protocol", "rig", "seconds", "ok")  # of the proof; its pictures belong to `check`
+
+
+def prove(job: Job) -> dict[str, Any]:
+    """Run `bramah check` on an item; raises InputError where it is refused, WorkError otherwise."""
+    answer = call(BRAMAH, job.check_words(), Settings().check_seconds)
+    if answer.code == BAD_INPUT:
+        raise InputError(f"not queued: {answer.reason}")
+    if answer.code != 0:
+        raise WorkError(f"not queued: {answer.reason}")
+    found = answer.as_json()
+    return {key: found[key] for key in _KEPT if isinstance(found, dict) and key in found}

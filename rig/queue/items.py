@@ -1,0 +1,239 @@
+"""What a queue holds: items, the states they pass through, what they wait for. No I/O.
+
+Glossary: an *item* is one protocol on one bench into one run folder; an *attempt* is one start of
+it; an item *waits* while it may start later, and is *over* once it is in a final state.
+"""
+
+from __future__ import annotations
+
+import operator
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, fields
+from datetime import UTC, datetime
+from typing import Any, Final
+
+from rig.model import channels as ch
+from rig.model.parse import InputError
+from rig.model.quantity import UnitError, to_si
+
+QUEUED: Final = "queued"
+CHECKING: Final = "checking"
+RUNNING: Final = "running"
+DONE: Final = "done"
+FAILED: Final = "failed"
+REFUSED: Final = "refused"
+TRIPPED: Final = "tripped"
+LOST: Final = "device lost"
+STOPPED: Final = "stopped"
+INTERRUPTED: Final = "interrupted"
+CANCELLED: Final = "cancelled"
+SKIPPED: Final = "skipped"
+EXPIRED: Final = "expired"
+
+ACTIVE: Final = (CHECKING, RUNNING)
+OVER: Final = {
+    DONE: "ran to its end",
+    FAILED: "could not be done; the reason says why",
+    REFUSED: "the proof on the twin, or its input, was refused when it was to start",
+    TRIPPED: "a safety limit was passed; the queue stopped",
+    LOST: "the device did not answer any more",
+    STOPPED: "stopped by a person, or with the runner",
+    INTERRUPTED: "its process was killed; what it recorded was recovered",
+    CANCELLED: "cancelled by a person",
+    SKIPPED: "the item it depends on ended otherwise than wanted",
+    EXPIRED: "its condition did not come, or it was too late to start",
+}
+STATES: Final = (QUEUED, *ACTIVE, *OVER)
+ENDED: Final = "ended"  # as a wanted result: any final state
+
+_COMPARISONS: Final[dict[str, Callable[[float, float], bool]]] = {
+    "<=": operator.le,
+    ">=": operator.ge,
+    "<": operator.lt,
+    ">": operator.gt,
+}
+_CONDITION = re.compile(
+    r"^\s*(?P<name>[A-Za-z][A-Za-z0-9_]*)(?:\.(?P<part>value|std|rsd))?\s*"
+    r"(?P<sign><=|>=|<|>)\s*(?P<number>[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(?P<unit>.*?)\s*$"
+)
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A comparison of a channel's mean, or of an identified parameter, with a number in SI.
+
+    `part` is '' for a channel; value, std or rsd (standard error over value) for a parameter.
+    """
+
+    text: str
+    name: str
+    part: str
+    sign: str
+    bound: float
+
+    def holds(self, value: float) -> bool:
+        """Whether a value in SI passes the comparison; a NaN never does."""
+        return _COMPARISONS[self.sign](value, self.bound)
+
+
+def _split(text: str, option: str, example: str) -> re.Match[str]:
+    found = _CONDITION.match(text)
+    if found is None:
+        raise InputError(f"{option} {text!r}: expected NAME, one of < <= > >=, a number: {example}")
+    return found
+
+
+def channel_condition(text: str) -> Condition:
+    """Read ``oil_temperature > 40 degC``; raises InputError for an unknown channel or unit."""
+    found = _split(text, "--when", "'oil_temperature > 40 degC'")
+    name = found["name"]
+    try:
+        unit = ch.unit_of(name)
+        if found["part"]:
+            raise ValueError(f"{name}.{found['part']}: a channel has no parts")
+        if unit and not found["unit"]:
+            raise UnitError(f"{found['number']} has no unit; expected one like '1 {unit}'")
+        bound = to_si(float(found["number"]), found["unit"], unit)
+    except ValueError as error:
+        raise InputError(f"--when {text!r}: {error}") from error
+    return Condition(text, name, "", found["sign"], bound)
+
+
+def result_condition(text: str) -> Condition:
+    """Read ``b.rsd < 0.5 %`` or ``M1 > 2`` (SI); raises InputError."""
+    found = _split(text, "--if", "'b.rsd < 0.5 %'")
+    part = found["part"] or "value"
+    if part != "rsd" and found["unit"]:
+        raise InputError(f"--if {text!r}: a parameter is compared in SI, without a unit")
+    if found["unit"] not in ("", "%"):
+        raise InputError(f"--if {text!r}: the unit is {found['unit']!r}; expected % or none")
+    scale = 0.01 if found["unit"] else 1.0
+    return Condition(text, found["name"], part, found["sign"], scale * float(found["number"]))
+
+
+def check_wanted(text: str) -> None:
+    """Raise InputError unless `text` is a final state, ``ended``, or a result's condition."""
+    if text == ENDED or text in OVER:
+        return
+    if re.fullmatch(r"[a-z ]+", text):
+        raise InputError(f"--if {text!r}: expected one of: {', '.join((ENDED, *OVER))}")
+    result_condition(text)
+
+
+def parse_time(text: str, now: datetime, option: str) -> datetime:
+    """Read a time of day (the next 22:30, this computer's zone) or ISO 8601; raises InputError."""
+    try:
+        clock = datetime.strptime(text, "%H:%M").time()
+    except ValueError:
+        try:
+            return datetime.fromisoformat(text).astimezone(UTC)
+        except ValueError:
+            raise InputError(
+                f"{option} {text!r}: expected a time as 22:30 or 2026-03-01T22:30"
+            ) from None
+    local = now.astimezone()
+    wanted = local.replace(hour=clock.hour, minute=clock.minute, second=0, microsecond=0)
+    if wanted < local.replace(second=0, microsecond=0):
+        # Through naive time: a day on which the clocks change is not 24 h long.
+        day = wanted.date().toordinal() + 1
+        naive = datetime.combine(datetime.fromordinal(day).date(), clock)
+        wanted = naive.astimezone()
+    return wanted.astimezone(UTC)
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a person asked for; times are ISO 8601 in UTC, paths absolute, '' where not given.
+
+    `options` are words that `bramah check` and `bramah run` both take, `run_options` those that
+    only `run` takes. `after` is an item's number, `wanted` what its result must be.
+    """
+
+    protocol: str
+    rig: str
+    out: str
+    name: str
+    endpoint: str = ""
+    options: tuple[str, ...] = ()
+    run_options: tuple[str, ...] = ()
+    not_before: str = ""
+    not_after: str = ""
+    after: int | None = None
+    wanted: str = DONE
+    when: str = ""
+    identify: bool = True
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as plain data."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Job:
+        """Return it from plain data; keys of a later version are ignored."""
+        known = {f.name for f in fields(cls)}
+        kept = {key: value for key, value in data.items() if key in known}
+        for name in ("options", "run_options"):
+            kept[name] = tuple(kept.get(name, ()))
+        return cls(**kept)
+
+    def check_words(self) -> list[str]:
+        """Return the words of its proof on the twin, result as JSON on standard output."""
+        return ["check", self.protocol, "--rig", self.rig, *self.options, "--json", "-"]
+
+    def run_words(self, folder: str) -> list[str]:
+        """Return the words that run it into `folder`."""
+        place = ["--endpoint", self.endpoint] if self.endpoint else []
+        line = ["run", self.protocol, "--rig", self.rig, "--out", folder, *place]
+        return [*line, *self.options, *self.run_options]
+
+
+@dataclass(frozen=True)
+class Item:
+    """An item as it stands in the queue.
+
+    `priority`: higher starts first; `place` orders equal ones. `run` is the folder of the latest
+    attempt, `proof` what the proof said when queued, `found` what was identified from the run.
+    """
+
+    id: int
+    priority: int
+    place: float
+    state: str
+    reason: str
+    job: Job
+    attempt: int = 0
+    run: str = ""
+    pid: int | None = None
+    cancel: bool = False
+    added: str = ""
+    started: str = ""
+    ended: str = ""
+    proof: dict[str, Any] = field(default_factory=dict)
+    found: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def over(self) -> bool:
+        """Whether it is in a final state."""
+        return self.state in OVER
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as plain data for JSON."""
+        return {**asdict(self), "job": self.job.as_dict()}
+
+    def next_folder(self) -> str:
+        """Return the run folder of the next attempt: the first as named, later ones numbered."""
+        return self.job.out if self.attempt == 0 else f"{self.job.out}-{self.attempt + 1}"
+
+
+def result_value(found: Mapping[str, Any], condition: Condition) -> float | None:
+    """Return the part of an identified parameter that a condition compares, None if unknown."""
+    entry = found.get("parameters", {}).get(condition.name)
+    if not entry or entry.get("value") is None:
+        return None
+    value, std = float(entry["value"]), entry.get("std")
+    if condition.part == "value":
+        return value
+    if std is None:
+        return None
+    return float(std) if condition.part == "std" else (abs(float(std) / value) if value else None)

@@ -1,0 +1,78 @@
+"""From how an item's process ended to the state of the item."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+from rig.queue import items as it
+from rig.runs import runstate, store
+
+# The exit codes of `bramah run` (the command line's contract).
+_STATES: Final = {
+    0: it.DONE,
+    1: it.FAILED,
+    2: it.REFUSED,
+    3: it.TRIPPED,
+    4: it.LOST,
+    130: it.STOPPED,
+}
+_DEVICE: Final = ("device:", "device in use:")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The state an item ends in, and why; `latched`: an earlier trip kept it from starting."""
+
+    state: str
+    reason: str
+    latched: bool = False
+
+    def adding(self, more: str) -> Outcome:
+        """Return it with a further reason."""
+        return replace(self, reason=f"{self.reason}; {more}".removeprefix("; "))
+
+    def asked(self, state: str) -> Outcome:
+        """Return it as `state` where the process ended because it was asked to for that."""
+        if not state or self.state in (it.DONE, it.TRIPPED, it.LOST):
+            return self
+        return replace(self, state=state, latched=False)
+
+
+def outcome_of(code: int, reason: str, *, began: bool) -> Outcome:
+    """Judge an exit code; `began`: a run folder was made."""
+    if code < 0:
+        return Outcome(it.INTERRUPTED, f"its process was killed by signal {-code}")
+    if code not in _STATES:
+        return Outcome(it.FAILED, f"ended with {code}: {reason or 'no message'}")
+    latched = code == 3 and not began
+    return Outcome(_STATES[code], reason if code else "", latched)
+
+
+def outcome_of_folder(folder: Path, said: str) -> Outcome:
+    """Judge a process whose exit code nobody saw: its run folder and last line say how it ended."""
+    unseen = "no runner saw its end"
+    if not store.is_run(folder):
+        if not said:
+            return Outcome(it.INTERRUPTED, "its process was killed before anything was recorded")
+        return Outcome(_told(said), f"{said}; {unseen}")
+    state = runstate.read_state(folder)
+    if state == runstate.DONE:
+        return Outcome(it.DONE, unseen)
+    if state == runstate.TRIPPED:
+        return Outcome(it.TRIPPED, said or _end_message(folder) or unseen)
+    if state == runstate.ABORTED:
+        return Outcome(_told(said), f"{said or _end_message(folder)}; {unseen}".removeprefix("; "))
+    return Outcome(it.INTERRUPTED, "its process was killed while no runner watched")
+
+
+def _told(said: str) -> str:
+    if said.startswith(_DEVICE):
+        return it.LOST
+    return it.STOPPED if said.startswith("stopped") else it.FAILED
+
+
+def _end_message(folder: Path) -> str:
+    ends = [e for e in runstate.read_events(folder) if e.get("event") == "end"]
+    return str(ends[-1].get("message", "")) if ends else ""

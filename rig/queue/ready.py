@@ -1,0 +1,113 @@
+"""Whether an item may start now, must wait, or never will: decisions without I/O."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+
+from rig.queue.items import (
+    DONE,
+    ENDED,
+    EXPIRED,
+    OVER,
+    QUEUED,
+    SKIPPED,
+    Item,
+    Job,
+    channel_condition,
+    result_condition,
+    result_value,
+)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """May an item start? `state` is '' while it may still come to that, else the final state."""
+
+    start: bool
+    reason: str = ""
+    state: str = ""
+
+
+Reading = Callable[[Job], Mapping[str, float] | str]  # channel means in SI, or why there are none
+
+
+def _shown(moment: datetime) -> str:
+    return moment.astimezone().strftime("%Y-%m-%d %H:%M")
+
+
+def _wait(reason: str) -> Verdict:
+    return Verdict(False, reason)
+
+
+def dependence(item: Item, others: Mapping[int, Item]) -> Verdict:
+    """Judge what an item wants of the result of an earlier one."""
+    wanted = item.job.wanted
+    if item.job.after is None:
+        return Verdict(True)
+    other = others[item.job.after]
+    if not other.over:
+        return _wait(f"item {other.id} is {other.state}")
+    if wanted in (ENDED, other.state):
+        return Verdict(True)
+    if wanted in OVER or other.state != DONE:
+        expected = wanted if wanted in OVER else DONE
+        return Verdict(False, f"item {other.id} is {other.state}; wanted: {expected}", SKIPPED)
+    return _compared(wanted, other)
+
+
+def _compared(wanted: str, other: Item) -> Verdict:
+    condition = result_condition(wanted)
+    value = result_value(other.found, condition)
+    if value is None:
+        why = other.found.get("error", f"{condition.name} was not identified")
+        return Verdict(False, f"{wanted!r} of item {other.id} cannot be judged: {why}", SKIPPED)
+    if condition.holds(value):
+        return Verdict(True)
+    part = f"{condition.name}.{condition.part}"
+    return Verdict(False, f"{part} of item {other.id} is {value:.4g}; wanted: {wanted}", SKIPPED)
+
+
+def judge(item: Item, others: Mapping[int, Item], moment: datetime, read: Reading) -> Verdict:
+    """Judge one queued item; `read` is asked last, and only where a channel decides."""
+    job = item.job
+    if job.not_after and moment >= datetime.fromisoformat(job.not_after):
+        late = _shown(datetime.fromisoformat(job.not_after))
+        wait = dependence(item, others).reason or (job.when and f"waited for {job.when}")
+        return Verdict(False, f"could not start before {late}" + (wait and f": {wait}"), EXPIRED)
+    depends = dependence(item, others)
+    if not depends.start:
+        return depends
+    if job.not_before and moment < datetime.fromisoformat(job.not_before):
+        return _wait(f"not before {_shown(datetime.fromisoformat(job.not_before))}")
+    return _channel(job, read) if job.when else Verdict(True)
+
+
+def _channel(job: Job, read: Reading) -> Verdict:
+    condition = channel_condition(job.when)
+    found = read(job)
+    if isinstance(found, str):
+        return _wait(f"waits for {job.when}; the bench cannot be read: {found}")
+    value = found.get(condition.name)
+    if value is None:
+        return _wait(f"waits for {job.when}; the bench does not measure {condition.name}")
+    if condition.holds(value):
+        return Verdict(True)
+    return _wait(f"waits for {job.when}; it is {value:.4g}")
+
+
+def choose(
+    items: Sequence[Item], moment: datetime, read: Reading
+) -> tuple[Item | None, list[tuple[Item, Verdict]]]:
+    """Return the first item that may start now, and the verdicts on those before it."""
+    others = {item.id: item for item in items}
+    passed: list[tuple[Item, Verdict]] = []
+    for item in items:
+        if item.state != QUEUED:
+            continue
+        verdict = judge(item, others, moment, read)
+        if verdict.start:
+            return item, passed
+        passed.append((item, verdict))
+    return None, passed

@@ -1,0 +1,408 @@
+"""The runner of a queue: one process that starts items, one at a time, and survives what they do.
+
+Every item runs as a child of its own. The state `running` is on the disk before the child starts,
+and the child holds the item's lock for as long as it lives: a runner that is killed is followed by
+one that finds out whether the child still runs (it then waits for it), has ended (its run folder
+says how) or died (its run is recovered). No item is started a second time unless a person says so.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import signal
+import subprocess
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final, Self
+
+from rig.bench.outputs import UNSURE
+from rig.bench.stops import StopFlag
+from rig.model.parse import InputError
+from rig.model.trips import OperatorStop
+from rig.queue import items as it
+from rig.queue import processes, ready
+from rig.queue.hook import Hook
+from rig.queue.items import Item, Job
+from rig.queue.locks import LockFile, held, holder
+from rig.queue.outcome import Outcome, outcome_of, outcome_of_folder
+from rig.queue.store import QueueStore
+from rig.runs import runstate, store
+
+log = logging.getLogger(__name__)
+Say = Callable[[str], None]
+
+ENDED: Final = "nothing more to start"
+PAUSED: Final = "paused"
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Times [s] and counts of a runner."""
+
+    poll: float = 0.2  # between two looks at a child and at what a person wishes
+    wait_poll: float = 2.0  # between two looks at a queue in which nothing may start yet
+    probe_every: float = 30.0  # between two readings of a bench whose channel decides
+    probe_seconds: float = 60.0  # a reading takes one connection and one block
+    check_seconds: float = 1800.0  # the longest proof; the shipped ones take seconds
+    recover_seconds: float = 3600.0  # an archive of hours is written and verified at disk speed
+    identify_seconds: float = 3600.0  # of a night's largest run
+    stop_seconds: float = 600.0  # to zero the outputs and write the archive before it is killed
+    lost_in_a_row: int = 2  # devices lost one after another: the bench is gone, not one run's luck
+
+
+@dataclass(frozen=True)
+class Report:
+    """How a runner ended: exit code of the contract, why, and the items it ended, in order."""
+
+    code: int
+    reason: str
+    ended: tuple[Item, ...]
+
+
+class _Ending(Exception):
+    """The queue stops: the exit code, and why."""
+
+    def __init__(self, code: int, reason: str) -> None:
+        super().__init__(reason)
+        self.code = code
+        self.reason = reason
+
+
+def folder_of(queue: Path) -> Path:
+    """Return the folder beside a queue file for its locks and logs."""
+    return queue.with_name(queue.name + ".d")
+
+
+def runner_of(queue: Path) -> int | None:
+    """Return the process that runs a queue now, None if nobody does."""
+    path = folder_of(queue) / "runner.lock"
+    return holder(path) if held(path) else None
+
+
+def item_lock(queue: Path, number: int) -> Path:
+    """Return the lock that the process of an item holds while it lives."""
+    return folder_of(queue) / f"item-{number}.lock"
+
+
+def log_of(queue: Path, item: Item) -> Path:
+    """Return the log of an item's latest attempt."""
+    return folder_of(queue) / f"item-{item.id}-{item.attempt}.log"
+
+
+def end_orphan(queue: Path, item: Item) -> bool:
+    """Ask an item's process to end where no runner watches it; says whether one was asked."""
+    if runner_of(queue) is not None or not held(item_lock(queue, item.id)):
+        return False
+    pid = _pid_of(item)
+    if pid is not None:
+        processes.ask_to_end(pid)
+    return pid is not None
+
+
+def _pid_of(item: Item) -> int | None:
+    if item.pid is not None:
+        return item.pid
+    owner = runstate.read_owner(Path(item.run))
+    return owner.pid if owner is not None and runstate.owner_alive(owner) else None
+
+
+class Runner:
+    """Runs a queue; a context manager that holds the queue's lock.
+
+    `program` starts a verb (by default this `bramah`). Raises InputError on entry where another
+    process runs the queue.
+    """
+
+    def __init__(
+        self, queue: QueueStore, say: Say, hook: Hook, *, serve: bool = False,
+        program: Sequence[str] = processes.BRAMAH, settings: Settings | None = None,
+    ) -> None:  # fmt: skip
+        self._queue = queue
+        self._say = say
+        self._hook = hook
+        self._serve = serve
+        self._program = tuple(program)
+        self._settings = settings or Settings()
+        self._stop = StopFlag()
+        self._lock: LockFile | None = None
+        self._ended: list[Item] = []
+        self._lost = 0  # devices lost one after another
+        self._readings: dict[tuple[str, str], tuple[float, dict[str, float] | str]] = {}
+        self._told: dict[int, str] = {}
+
+    def __enter__(self) -> Self:
+        path = folder_of(self._queue.path) / "runner.lock"
+        stale = holder(path)
+        try:
+            self._lock = LockFile.take(path)
+        except OSError as error:
+            raise InputError(f"{path}: cannot be locked: {error.strerror}") from error
+        if self._lock is None:
+            raise InputError(
+                f"{self._queue.path}: process {holder(path)} runs this queue already; "
+                "`bramah queue pause` stops it after the present item"
+            )
+        if stale is not None:
+            self._say(f"the runner before this, process {stale}, ended without saying so")
+        self._stop.install()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.restore()
+        self._hook.wait()
+        if self._lock is not None:
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._lock.fileno(), 0)
+            self._lock.close()
+
+    def run(self) -> Report:
+        """Run until nothing more may start, the queue is paused, or it must stop."""
+        self._queue.note("runner begins", f"process {os.getpid()} on {runstate.here()}")
+        try:
+            self._resolve_leftovers()
+            reason = self._loop()
+            bad = [item for item in self._ended if item.state != it.DONE]
+            report = Report(1 if bad else 0, reason, tuple(self._ended))
+        except OperatorStop as stopped:
+            report = Report(130, str(stopped), tuple(self._ended))
+        except _Ending as ending:
+            report = Report(ending.code, ending.reason, tuple(self._ended))
+        self._queue.note("runner ends", report.reason)
+        self._notify("end", None, report.reason)
+        return report
+
+    def _loop(self) -> str:
+        while True:
+            self._heed()
+            self._identify_due()
+            paused = self._queue.paused
+            if paused and not self._serve:
+                return f"{PAUSED}: {paused}"
+            item, verdicts = (None, []) if paused else self._choose()
+            if item is not None:
+                claimed = self._queue.claim(item.id)
+                if claimed is not None:
+                    self._start(claimed)
+                continue
+            waiting = [item for item, verdict in verdicts if not verdict.state]
+            if not waiting and not self._serve and not paused:
+                return ENDED
+            self._pause(self._settings.wait_poll)
+
+    def _heed(self) -> None:
+        if self._stop.reason is not None:
+            raise OperatorStop(self._stop.reason)
+
+    def _pause(self, seconds: float) -> None:
+        until = time.monotonic() + seconds
+        while time.monotonic() < until and self._stop.reason is None:
+            time.sleep(min(self._settings.poll, seconds))
+
+    # Which item
+
+    def _choose(self) -> tuple[Item | None, list[tuple[Item, ready.Verdict]]]:
+        item, verdicts = ready.choose(self._queue.items(), datetime.now(UTC), self._read)
+        for other, verdict in verdicts:
+            if verdict.state:
+                self._finish(other, Outcome(verdict.state, verdict.reason))
+            elif self._told.get(other.id) != verdict.reason:
+                self._told[other.id] = verdict.reason
+                self._say(f"item {other.id} {other.job.name}: {verdict.reason}")
+        return item, verdicts
+
+    def _read(self, job: Job) -> dict[str, float] | str:
+        """Return the means of a bench's channels, read again after a while; moves nothing."""
+        key = (job.rig, job.endpoint)
+        kept = self._readings.get(key)
+        if kept is None or time.monotonic() - kept[0] > self._settings.probe_every:
+            place = ["--endpoint", job.endpoint] if job.endpoint else []
+            words = ["probe", "--rig", job.rig, *place, "--json", "-"]
+            answer = self._call(words, self._settings.probe_seconds)
+            found = answer.as_json()
+            means: dict[str, float] | str = answer.reason or "no answer"
+            if isinstance(found, list):  # also with an implausible channel, which is no reason
+                means = {
+                    one["channel"]: float(one["mean"]) for one in found if one["mean"] is not None
+                }
+            kept = (time.monotonic(), means)
+            self._readings[key] = kept
+        return kept[1]
+
+    def _call(self, words: Sequence[str], seconds: float) -> processes.Answer:
+        return processes.call(self._program, words, seconds, lambda: self._stop.reason)
+
+    # One item
+
+    def _start(self, item: Item) -> None:
+        """Check a claimed item against the limits of now, then run it to its end."""
+        self._say(f"item {item.id} {item.job.name}: checking")
+        try:
+            proof = self._call(item.job.check_words(), self._settings.check_seconds)
+        except OperatorStop:
+            self._queue.release(item.id, "the runner was stopped during its check")
+            raise
+        if proof.code != 0:
+            self._finish(item, outcome_of(proof.code, proof.reason, began=False))
+            return
+        if self._queue.item(item.id).cancel:
+            self._finish(item, Outcome(it.CANCELLED, "cancelled during its check"))
+            return
+        begun = self._queue.begin(item.id)
+        self._after(begun, self._run(begun))
+
+    def _run(self, item: Item) -> Outcome:
+        """Run an item's process to its end and say how it ended."""
+        lock = LockFile.take(item_lock(self._queue.path, item.id))
+        if lock is None:
+            return Outcome(
+                it.FAILED, "a process of this item still lives; it was not started again"
+            )
+        self._say(f"item {item.id} {item.job.name}: running into {item.run}")
+        path = log_of(self._queue.path, item)
+        words = [*self._program, *item.job.run_words(item.run)]
+        with path.open("wb") as output:
+            child = processes.start(words, output, subprocess.STDOUT, lock)
+        try:
+            self._queue.note_process(item.id, child.pid)
+            asked = self._watch(item, lambda: child.poll() is not None, lambda: child.pid)
+        except BaseException:
+            # Whatever went wrong here: the bench is made safe by the child before this goes on.
+            processes.ask_to_end(child.pid)
+            child.wait()
+            raise
+        began = store.is_run(Path(item.run))
+        found = outcome_of(child.returncode, processes.reason_of(path), began=began)
+        return found.asked(asked)
+
+    def _watch(self, item: Item, over: Callable[[], bool], pid: Callable[[], int | None]) -> str:
+        """Wait until a process has ended; returns the state it was asked to end for, or ''."""
+        asked, since = "", 0.0
+        while not over():
+            wish = it.STOPPED if self._stop.reason else ""
+            if not wish and self._queue.item(item.id).cancel:
+                wish = it.CANCELLED
+            process = pid()
+            if wish and not asked and process is not None:
+                self._say(f"item {item.id} {item.job.name}: asked to end")
+                processes.ask_to_end(process)
+                asked, since = wish, time.monotonic()
+            if asked and process and time.monotonic() - since > self._settings.stop_seconds:
+                log.error("item %d: did not end within %g s and is killed", item.id,
+                          self._settings.stop_seconds)  # fmt: skip
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(process, signal.SIGKILL)
+                since = time.monotonic()
+            time.sleep(self._settings.poll)
+        return asked
+
+    def _after(self, item: Item, outcome: Outcome) -> None:
+        """Finish an item, recover what its death left, and stop the queue where it must."""
+        if outcome.latched:
+            self._queue.release(item.id, f"not started: {outcome.reason}")
+            self._notify("trip", item, outcome.reason)
+            raise _Ending(3, outcome.reason)
+        if outcome.state == it.INTERRUPTED:
+            outcome = self._make_safe(item, outcome)
+        if self._unfinished(item):
+            outcome = self._recover(item, outcome)
+        self._finish(item, outcome)
+        self._lost = self._lost + 1 if outcome.state == it.LOST else 0
+        if UNSURE in outcome.reason:
+            raise _Ending(4, f"item {item.id}: {outcome.reason}")
+        if outcome.state == it.TRIPPED:
+            raise _Ending(3, f"item {item.id} tripped: {outcome.reason}")
+        if self._lost >= self._settings.lost_in_a_row:
+            raise _Ending(4, f"the device was lost {self._lost} times in a row: {outcome.reason}")
+        self._heed()
+
+    def _make_safe(self, item: Item, outcome: Outcome) -> Outcome:
+        """Zero the outputs of a bench whose process died; its watchdog will have done so."""
+        job = item.job
+        place = ["--endpoint", job.endpoint] if job.endpoint else []
+        words = ["stop", "--rig", job.rig, *place]
+        answer = processes.call(self._program, words, self._settings.probe_seconds)
+        if answer.code == 0:
+            return outcome.adding("outputs confirmed at zero")
+        # Without the phrase that stops the queue: whether this bench answers, the next item tells.
+        return outcome.adding(f"outputs left to the watchdog: {answer.reason.replace(UNSURE, '')}")
+
+    def _unfinished(self, item: Item) -> bool:
+        folder = Path(item.run)
+        return store.is_run(folder) and (
+            (folder / runstate.JOURNAL).exists() or runstate.read_owner(folder) is not None
+        )
+
+    def _recover(self, item: Item, outcome: Outcome) -> Outcome:
+        # Not stopped by a wish to end: what was recorded is safe before this process goes.
+        answer = processes.call(
+            self._program, ["recover", item.run], self._settings.recover_seconds
+        )
+        if answer.code == 0:
+            return outcome.adding(f"recovered: {answer.output.strip()}")
+        return outcome.adding(f"recover: {answer.reason}")
+
+    def _finish(self, item: Item, outcome: Outcome) -> None:
+        ended = self._queue.finish(item.id, outcome.state, outcome.reason)
+        self._ended.append(ended)
+        why = f": {outcome.reason}" if outcome.reason else ""
+        self._say(f"item {item.id} {item.job.name}: {outcome.state}{why}")
+        if outcome.state == it.TRIPPED:
+            self._notify("trip", ended, outcome.reason)
+        elif outcome.state not in (it.DONE, it.CANCELLED, it.STOPPED):
+            self._notify("failure", ended, outcome.reason)
+
+    def _identify_due(self) -> None:
+        """Identify from the runs that are done, for what waits on their result and for the page."""
+        for item in self._queue.items():
+            if item.state != it.DONE or not item.job.identify or item.found:
+                continue
+            self._say(f"item {item.id} {item.job.name}: identifying")
+            words = ["identify", item.run, "--json", "-"]
+            answer = self._call(words, self._settings.identify_seconds)
+            found = answer.as_json() if answer.code == 0 else None
+            why = answer.reason or "no result"
+            self._queue.keep_found(item.id, found if isinstance(found, dict) else {"error": why})
+
+    # What another runner left behind
+
+    def _resolve_leftovers(self) -> None:
+        for item in self._queue.items():
+            if item.state == it.CHECKING:
+                self._queue.release(item.id, "the runner ended during its check")
+            elif item.state == it.RUNNING:
+                self._after(item, self._left_running(item))
+
+    def _left_running(self, item: Item) -> Outcome:
+        lock = item_lock(self._queue.path, item.id)
+        asked = ""
+        if held(lock):
+            self._say(f"item {item.id} {item.job.name}: its process still runs and is waited for")
+            asked = self._watch(item, lambda: not held(lock), lambda: _pid_of(item))
+        said = processes.reason_of(log_of(self._queue.path, item))
+        return outcome_of_folder(Path(item.run), said).asked(asked)
+
+    def _notify(self, event: str, item: Item | None, reason: str) -> None:
+        counts = Counter(other.state for other in self._queue.items())
+        about: dict[str, Any] | None = None
+        if item is not None:
+            about = {
+                "id": item.id, "name": item.job.name, "state": item.state, "run": item.run,
+                "protocol": item.job.protocol, "rig": item.job.rig, "attempt": item.attempt,
+            }  # fmt: skip
+        self._hook.send(
+            {
+                "event": event,
+                "time": runstate.now(),
+                "host": runstate.here(),
+                "queue": str(self._queue.path),
+                "reason": reason,
+                "item": about,
+                "counts": dict(counts),
+            }
+        )
