@@ -25,6 +25,8 @@ log = logging.getLogger(__name__)
 
 SECONDS = 30.0  # a mail server that does not answer by then is not waited for
 
+IN_ORDER = 5.0  # [s] a message waits for the one before it: a trip is not held up by one that hangs
+
 
 def parse_command(text: str) -> tuple[str, ...]:
     """Split a command line as a shell does; raises InputError."""
@@ -51,7 +53,10 @@ class Hook:
         if not self._command:
             return
         text = json.dumps(dict(message), default=str).encode() + b"\n"
-        thread = threading.Thread(target=self._deliver, args=(text,), daemon=True, name="notify")
+        before = self._threads[-1] if self._threads else None
+        thread = threading.Thread(
+            target=self._deliver, args=(text, before), daemon=True, name="notify"
+        )
         self._threads = [t for t in self._threads if t.is_alive()] + [thread]
         thread.start()
 
@@ -61,7 +66,9 @@ class Hook:
         for thread in self._threads:
             thread.join(max(0.0, deadline - time.monotonic()))
 
-    def _deliver(self, text: bytes) -> None:
+    def _deliver(self, text: bytes, before: threading.Thread | None) -> None:
+        if before is not None:
+            before.join(IN_ORDER)
         try:
             with self._log.open("ab") as output:
                 self._run(text, output.fileno())

@@ -35,7 +35,7 @@ class Outcome:
 
     def asked(self, state: str) -> Outcome:
         """Return it as `state` where the process ended because it was asked to for that."""
-        if not state or self.state in (it.DONE, it.TRIPPED, it.LOST):
+        if not state or self.state not in (it.STOPPED, it.FAILED):
             return self
         return replace(self, state=state, latched=False)
 

@@ -380,10 +380,10 @@ class Runner:
 
     def _left_running(self, item: Item) -> Outcome:
         lock = item_lock(self._queue.path, item.id)
-        asked = ""
+        asked = it.CANCELLED if item.cancel else ""
         if held(lock):
             self._say(f"item {item.id} {item.job.name}: its process still runs and is waited for")
-            asked = self._watch(item, lambda: not held(lock), lambda: _pid_of(item))
+            asked = self._watch(item, lambda: not held(lock), lambda: _pid_of(item)) or asked
         said = processes.reason_of(log_of(self._queue.path, item))
         return outcome_of_folder(Path(item.run), said).asked(asked)
 
