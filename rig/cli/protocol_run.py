@@ -17,6 +17,7 @@ from protocols.files.plan import Overrides, Plan, resolve
 from rig.bench.latch import reset_bench
 from rig.bench.screens.sockets import AttachError, Publisher
 from rig.bench.session import Bench
+from rig.cli.provenance import provenance_of
 from rig.model.rig import Rig
 from rig.runs.recorder import Recorder
 from rig.runs.rigs import load_bench
@@ -111,7 +112,11 @@ def run_protocol(job: ProtocolJob, say: Say) -> Path:
         say(f"note: {note}")
     say(f"running {len(plan.records)} records, about {plan.seconds:.0f} s of the device's time")
     recorder = Recorder(
-        job.out, rig, protocol=plan.protocol.model_dump(mode="json"), operator=job.operator
+        job.out,
+        rig,
+        protocol=plan.protocol.model_dump(mode="json"),
+        operator=job.operator,
+        provenance=provenance_of(job.protocol, job.rig, job.overrides, plan),
     )
     with ExitStack() as stack:
         tracking = _tracking(job, rig, say, stack)

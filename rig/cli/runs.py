@@ -1,10 +1,12 @@
-"""The `runs` verb: run folders with their state."""
+"""The `runs` verb: run folders with their state, what they hold, and filters."""
 
 from __future__ import annotations
 
 from dataclasses import asdict
+from datetime import UTC, datetime, timedelta
+from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -13,40 +15,102 @@ from rig.cli.options import (
 )
 from rig.cli.output import progress, table, write_json
 
+if TYPE_CHECKING:
+    from rig.runs.listing.summary import RunSummary
+
+Names = list[str] | None
+
 
 def runs(
     folder: Annotated[Path, typer.Argument(help="A folder that holds run folders.")] = Path(),
+    state: Annotated[
+        Names, typer.Option("--state", help="running, done, aborted, tripped, interrupted.")
+    ] = None,
+    since: Annotated[
+        str | None, typer.Option(help="Begun since 2026-03-01, 2026-03-01T22:00, or 12h, 7d ago.")
+    ] = None,
+    rig: Annotated[Names, typer.Option("--rig", help="Only of this rig; * stands for any.")] = None,
+    protocol: Annotated[
+        Names, typer.Option("--protocol", help="Only of this protocol; * stands for any.")
+    ] = None,
+    rebuild: Annotated[
+        bool, typer.Option("--rebuild", help="Make the folder's index from the run folders anew.")
+    ] = False,
     json: JsonOption = None,
 ) -> None:
-    """List runs with their state.
+    """List runs with their state and what they hold; options that repeat name alternatives.
 
-    Example: bramah runs runs/
+    Example: bramah runs runs/ --state interrupted --since 12h
     """
-    from rig.runs.store import list_runs
+    from rig.model.parse import InputError
+    from rig.runs.listing.index import indexed_runs
+    from rig.runs.listing.index import rebuild as rebuild_index
+    from rig.runs.listing.summary import UNREADABLE
+    from rig.runs.runstate import STATES
 
-    found = list_runs(folder)
+    for wanted in state or ():
+        if wanted not in (*STATES, UNREADABLE):
+            raise InputError(
+                f"--state {wanted}: expected one of: {', '.join((*STATES, UNREADABLE))}"
+            )
+    begun = None if since is None else _since(since, datetime.now(UTC))
+    if rebuild:
+        progress(f"{rebuild_index(folder)} runs in the index of {folder}")
+    listed = indexed_runs(folder)
+    found = [
+        one
+        for one in listed
+        if (not state or one.state in state)
+        and (begun is None or (one.created and datetime.fromisoformat(one.created) >= begun))
+        and _named(one.rig, rig)
+        and _named(one.protocol, protocol)
+    ]
     write_json(json, [{**asdict(one), "path": str(one.path)} for one in found])
     if json == Path("-"):
         return
     if not found:
-        progress(f"no runs in {folder}")
+        progress(f"no runs in {folder}" + (f" that fit, of {len(listed)}" if listed else ""))
         return
-    header = ("run", "state", "rig", "protocol", "created", "records")
-    rows = [
-        (
-            one.path.name,
-            one.state,
-            one.rig,
-            one.protocol,
-            one.created[:16],
-            str(one.records) if one.records >= 0 else "—",
-        )
-        for one in found
-    ]
-    typer.echo(table(header, rows))
-    for one in found:
-        if one.message:
-            typer.echo(f"{one.path.name}: {one.message}")
+    header = ("run", "state", "rig", "protocol", "created", "records", "samples", "lost", "min")
+    typer.echo(table(header, [_row(one) for one in found], left=("state", "rig", "protocol")))
+    for summary in found:
+        if summary.message:
+            typer.echo(f"{summary.path.name}: {summary.message}")
+
+
+def _named(name: str, wanted: Names) -> bool:
+    return not wanted or any(fnmatchcase(name, pattern) for pattern in wanted)
+
+
+def _since(text: str, now: datetime) -> datetime:
+    from rig.model.parse import InputError
+
+    units = {"h": "hours", "d": "days", "m": "minutes"}
+    if text[:-1].isdigit() and text[-1] in units:
+        return now - timedelta(**{units[text[-1]]: int(text[:-1])})
+    try:
+        return datetime.fromisoformat(text).astimezone(UTC)
+    except ValueError:
+        raise InputError(
+            f"--since {text!r}: expected a date as 2026-03-01, a time as 2026-03-01T22:00, or a "
+            "length as 12h or 7d"
+        ) from None
+
+
+def _row(one: RunSummary) -> tuple[str, ...]:
+    state = f"{one.state}, recovered" if one.recovered else one.state
+    partial = f" +{one.partial}" if one.partial else ""
+    return (
+        one.path.name,
+        state,
+        one.rig,
+        one.protocol,
+        one.created[:16],
+        f"{one.records}{partial}" if one.records >= 0 else "—",
+        str(one.samples) if one.samples >= 0 else "—",
+        str(one.lost_samples) if one.samples >= 0 else "—",
+        f"{one.seconds / 60.0:.1f}" if one.seconds >= 0 else "—",
+    )
 
 
 def register(app: typer.Typer) -> None:

@@ -5,6 +5,7 @@ Source of the geometry and constants: Sakai and Maeshima, section II and Table I
 
 from __future__ import annotations
 
+import datetime
 from collections.abc import Mapping
 from typing import Any, ClassVar, Final, Literal, Self
 from urllib.parse import urlencode
@@ -184,6 +185,14 @@ class Joint(Part):
         return q, self.linkage.jacobian(q), self.linkage.jacobian_rate(q)
 
 
+class Calibration(Part):
+    """When, as which piece and by whom a channel's sensor was last calibrated."""
+
+    date: datetime.date
+    serial: str = Field(min_length=1, description="serial number of the sensor")
+    certificate: str = Field(default="", description="number of the certificate, or who did it")
+
+
 class _Sensor(Part):
     bits: int = Field(ge=8, le=16)
     delay: Time = Field(default=0.0, ge=0, description="the channel lags the world by this [s]")
@@ -229,6 +238,16 @@ class Sensors(Part):
     supply_pressure: PressureSensor | None = None
     oil_temperature: TemperatureSensor | None = None
     skew: Time = Field(default=0.0, ge=0, description="between neighbours in the multiplexer [s]")
+    calibrations: dict[str, Calibration] = Field(default={}, description="by channel: piston_1")
+
+    @model_validator(mode="after")
+    def _calibrated(self) -> Self:
+        for name in self.calibrations:
+            try:
+                ch.kind_of(name)
+            except ValueError as error:
+                raise ValueError(f"calibrations {name}: {error}") from error
+        return self
 
     @model_validator(mode="after")
     def _ranges(self) -> Self:

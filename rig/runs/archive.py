@@ -26,7 +26,7 @@ from rig.model.trips import RecordingFailed
 from rig.runs.archive_reader import FORMAT
 from rig.runs.files import sync_file, sync_folder
 from rig.runs.journal import Journal
-from rig.runs.runstate import BETWEEN
+from rig.runs.runstate import BETWEEN, StreamClock, read_events, stream_clocks
 from rig.runs.sections import Assembled, Section, Written, assemble, blocks_of, plan
 
 log = logging.getLogger(__name__)
@@ -88,9 +88,12 @@ def record_attributes(
     }
 
 
-def _attributes(section: Section, sample_rate: float, counted: Assembled) -> dict[str, Any]:
+def _attributes(
+    section: Section, sample_rate: float, counted: Assembled, clock: StreamClock | None
+) -> dict[str, Any]:
     meta = section.meta
-    start = section.start / sample_rate
+    device = section.start / sample_rate
+    start = device if clock is None else clock.at(section.start, sample_rate)
     found: dict[str, Any]
     if meta:
         found = record_attributes(
@@ -110,6 +113,8 @@ def _attributes(section: Section, sample_rate: float, counted: Assembled) -> dic
         **found,
         "stream": section.stream,
         "start_tick": section.start,
+        "device_s": device,
+        **({} if clock is None else {"stream_host_time": clock.host, "stream_s": clock.began}),
         "ticks": section.ticks,
         "lost_samples": counted.lost,
         "damaged_blocks": counted.damaged_blocks,
@@ -142,7 +147,8 @@ def write_from_journal(journal: Journal, folder: Path, rig_name: str) -> Written
     """
     spans = journal.spans()
     sections = plan(journal, spans)
-    columns = journal.meta("columns")
+    columns, rate = journal.meta("columns"), float(journal.meta("sample_rate"))
+    clocks = stream_clocks(read_events(folder))
     needed = sum(section.ticks for section in sections) * len(columns) * 8
     fresh = folder / f"{NAME}.tmp"
     lost = 0
@@ -152,7 +158,7 @@ def write_from_journal(journal: Journal, folder: Path, rig_name: str) -> Written
         with create(fresh, rig_name) as file:
             for section in sections:
                 found = assemble(journal, spans, section)
-                attributes = _attributes(section, float(journal.meta("sample_rate")), found)
+                attributes = _attributes(section, rate, found, clocks.get(section.stream))
                 each = {name: found.data[:, i] for i, name in enumerate(columns)}
                 write_group(file, section.group, each, attributes)
                 _note_saturation(file[section.group], columns, found)
@@ -167,8 +173,9 @@ def write_from_journal(journal: Journal, folder: Path, rig_name: str) -> Written
         ) from error
     records = [section for section in sections if section.meta]
     partial = sum(not section.complete for section in records)
-    samples = sum(section.ticks for section in records)
-    return Written(len(records), partial, samples, lost, damaged)
+    samples = sum(section.ticks for section in records) - lost
+    outside = sum(section.ticks for section in sections if not section.meta)
+    return Written(len(records), partial, samples, lost, damaged, outside)
 
 
 def _note_saturation(group: h5py.Group, columns: Sequence[str], found: Assembled) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from rig.model.parse import InputError
 from rig.model.records import Record, RecordHead
 from rig.runs.runstate import BETWEEN
+from rig.runs.sections import Written
 
 FORMAT = 1
 _OWN = ("step", "locked", "repeat", "sample_rate", "start_s", "period", "lines", "complete")
@@ -91,6 +92,23 @@ def read_heads(file: h5py.File, path: Path) -> list[RecordHead]:
     """Return the heads of every record in the order it was taken."""
     found = [head_of(name, group, path) for name, group in file.items() if name != BETWEEN]
     return sorted(found, key=_taken)
+
+
+def count(path: Path) -> Written:
+    """Count what an archive holds without reading a sample; raises InputError."""
+    with readable(path), open_archive(path) as file:
+        heads = read_heads(file, path)
+        lost = sum(int(head.attributes.get("lost_samples", 0)) for head in heads)
+        between = file[BETWEEN].values() if BETWEEN in file else ()
+        outside = sum(len(next(iter(group.values()))) for group in between if len(group))
+    return Written(
+        records=len(heads),
+        partial=sum(not head.attributes["complete"] for head in heads),
+        samples=sum(head.samples for head in heads) - lost,
+        lost_samples=lost,
+        damaged_blocks=0,
+        outside=outside,
+    )
 
 
 def read_records(path: Path) -> list[Record]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
+import time
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -21,8 +22,11 @@ from rig.runs.runstate import (
     JOURNAL,
     RUNNING,
     STATES,
+    STREAM,
     EventLog,
+    StreamClock,
     give_up_ownership,
+    now,
     write_state,
 )
 from rig.runs.sections import Written
@@ -83,16 +87,25 @@ class Recorder:
         protocol: Mapping[str, Any] | None = None,
         seed: int | None = None,
         operator: str | None = None,
+        provenance: Mapping[str, Any] | None = None,
         max_pages: int | None = None,
     ) -> None:
         self.folder = Path(folder)
         self.rig = rig
-        self._about = {"protocol": protocol, "seed": seed, "operator": operator}
+        self._about = {
+            "protocol": protocol,
+            "seed": seed,
+            "operator": operator,
+            "provenance": provenance,
+        }
         self._max_pages = max_pages
         self._journal: Journal | None = None
         self._events: EventLog | None = None
         self._names: set[str] = set()
         self._stream = 0
+        self._clock: StreamClock | None = None  # of the present stream, from its first block on
+        self._newest = 0.0  # [s] since the run began, of the newest sample
+        self._began = 0.0  # [s] by the host's clock, at the arrival of the first block
         store.refuse_occupied(self.folder)
 
     @property
@@ -131,16 +144,38 @@ class Recorder:
     def begin_stream(self) -> None:
         """Note that the device counts its ticks anew from the next block on."""
         self._stream += 1
+        self._clock = None
 
     def append(self, block: SampleBlock, late: float | None) -> None:
         """Keep one block, `late` [s] behind its time (None in virtual time)."""
-        self._open_journal().append(self._stream, block, late)
+        journal = self._open_journal()
+        journal.append(self._stream, block, late)
+        if self._clock is None:
+            self._begin_clock(block, virtual=late is None)
+        else:
+            self._newest = self._clock.at(block.tick + len(block.data), self.rig.sample_rate)
+
+    def _begin_clock(self, block: SampleBlock, *, virtual: bool) -> None:
+        """Place a stream's first tick in the time since the run began, which no restart resets."""
+        arrived = time.monotonic()
+        length = len(block.data) / self.rig.sample_rate
+        first = not self._began
+        self._began = self._began or arrived
+        # In virtual time the host's clock says nothing about the device's: streams adjoin there.
+        began = 0.0 if first else self._newest if virtual else arrived - self._began
+        self._newest = began
+        self._clock = StreamClock(block.tick, began, now())
+        self.event(STREAM, block.tick, stream=self._stream)
+        self._newest = began + length
 
     def event(self, event: str, tick: int | None = None, **fields: Any) -> None:
         """Note one event; it is on the disk when this returns."""
         if self._events is None:
             raise RecordingFailed(f"{self.folder}: the run is not open for recording")
-        self._events.append(event, tick, fields)
+        at = self._newest
+        if tick is not None and self._clock is not None:
+            at = self._clock.at(tick, self.rig.sample_rate)
+        self._events.append(event, tick, {"t": round(at, 6), **fields})
 
     def begin_record(self, meta: RecordMeta, start: int) -> int:
         """Open a record at a tick; raises ValueError if its name was used before."""

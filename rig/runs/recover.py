@@ -24,6 +24,9 @@ log = logging.getLogger(__name__)
 class RecoverReport:
     """What `recover` found and did; `records` counts complete and partial ones.
 
+    `samples` were measured within records, `lost_samples` are missing there, `outside` were
+    measured between them.
+
     `damaged` is where a damaged journal is kept, of which `missing` samples are known to be lost.
     """
 
@@ -37,6 +40,7 @@ class RecoverReport:
     message: str
     damaged: Path | None = None
     missing: int = 0
+    outside: int = 0
 
 
 def recover(path: str | Path, *, force: bool = False) -> RecoverReport:
@@ -147,7 +151,8 @@ def _outcome(path: Path) -> str | None:
 def _counts(written: Written) -> str:
     return (
         f"{written.records} record(s), {written.partial} of them unfinished, "
-        f"{written.samples} samples, {written.lost_samples} lost"
+        f"{written.samples} samples in them, {written.lost_samples} lost; "
+        f"{written.outside} samples outside of records"
     )
 
 
@@ -159,19 +164,12 @@ def _without_journal(folder: Path) -> RecoverReport:
         message = "nothing had been recorded"
         _note(folder, state, message)
         return _report(folder, state, Written(0, 0, 0, 0, 0), message)
-    from rig.runs.archive_reader import read_records  # noqa: PLC0415 - h5py loads slowly
+    from rig.runs.archive_reader import count  # noqa: PLC0415 - h5py loads slowly
 
-    records = read_records(archive)
+    written = count(archive)
     runstate.write_state(folder, state)
     with suppress(OSError):
         runstate.give_up_ownership(folder)
-    written = Written(
-        len(records),
-        sum(not r.attributes["complete"] for r in records),
-        sum(r.samples for r in records),
-        sum(int(r.attributes.get("lost_samples", 0)) for r in records),
-        0,
-    )
     return _report(folder, state, written, "was finalised already")
 
 
@@ -185,6 +183,7 @@ def _report(folder: Path, state: str, written: Written, message: str) -> Recover
         written.lost_samples,
         written.damaged_blocks,
         message,
+        outside=written.outside,
     )
 
 

@@ -2,7 +2,8 @@
 
 `state` is one word, replaced atomically. `owner.json` names the process that writes the folder,
 with its start time so that a reused process number is not mistaken for it. `events.jsonl` has one
-JSON object per line, each on the disk before the next begins; a torn last line is ignored.
+JSON object per line, each on the disk before the next begins; a torn last line is ignored. An
+event's `t` [s] counts from the run's first sample; `tick` is the device's clock, `time` the host's.
 """
 
 from __future__ import annotations
@@ -11,7 +12,8 @@ import json
 import logging
 import os
 import socket
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -161,6 +163,36 @@ class EventLog:
             self._stream.close()
         except OSError as error:
             log.warning("%s: %s", self.path, error)
+
+
+@dataclass(frozen=True)
+class StreamClock:
+    """The clocks of one stream: its first tick, when that was [s] since the run began, and where.
+
+    `host` is the wall clock (ISO 8601, UTC) at the arrival of the stream's first block.
+    """
+
+    tick: int
+    began: float
+    host: str
+
+    def at(self, tick: int, sample_rate: float) -> float:
+        """Return the time [s] since the run began of a device tick."""
+        return self.began + (tick - self.tick) / sample_rate
+
+
+STREAM: Final = "stream begins"
+
+
+def stream_clocks(events: Iterable[Mapping[str, Any]]) -> dict[int, StreamClock]:
+    """Return the clocks of every stream that a run's events tell of."""
+    found: dict[int, StreamClock] = {}
+    for event in events:
+        if event.get("event") == STREAM:
+            with suppress(KeyError, TypeError, ValueError):
+                began, host = float(event["t"]), str(event["time"])
+                found[int(event["stream"])] = StreamClock(int(event["tick"]), began, host)
+    return found
 
 
 def read_events(folder: Path) -> list[dict[str, Any]]:

@@ -52,13 +52,17 @@ class Assembled:
 
 @dataclass(frozen=True)
 class Written:
-    """What an archive holds: records (complete or not), their samples, what is missing in them."""
+    """What an archive holds: records (complete or not), samples measured in them, and missing.
+
+    `outside` are the samples measured between records.
+    """
 
     records: int
     partial: int
     samples: int
     lost_samples: int
     damaged_blocks: int
+    outside: int = 0
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Run folders: make one, list them with their state, load one as data."""
+"""Run folders: make one, load one as data."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import logging
 import os
 import socket
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -27,7 +26,6 @@ from rig.runs.runstate import (
     JOURNAL,
     RUNNING,
     now,
-    read_events,
     read_owner,
     read_state,
     take_ownership,
@@ -56,21 +54,9 @@ class Header(BaseModel):
     source: str = ""
     device: str = ""
     versions: dict[str, str] = {}
+    provenance: dict[str, Any] = {}
     rig: Rig
     protocol: dict[str, Any] | None = None
-
-
-@dataclass(frozen=True)
-class RunSummary:
-    """One line of a list of runs; `records` are the complete ones, -1 if not known."""
-
-    path: Path
-    state: str
-    rig: str
-    protocol: str
-    created: str
-    records: int
-    message: str
 
 
 def refuse_occupied(folder: Path) -> None:
@@ -102,11 +88,13 @@ def create_run(
     operator: str | None = None,
     source: str = "",
     device: str = "",
+    provenance: Mapping[str, Any] | None = None,
 ) -> Path:
     """Make a run folder in state `running`, owned by this process.
 
-    `protocol` is the resolved protocol as plain data, with a `name`. Raises InputError if the
-    folder is occupied or cannot be made.
+    `protocol` is the resolved protocol as plain data, with a `name`; `provenance` what else a
+    reader needs to take the same run again: command, files with checksums, seeds. Raises InputError
+    if the folder is occupied or cannot be made.
     """
     refuse_occupied(folder)
     head = {
@@ -118,6 +106,7 @@ def create_run(
         "source": source,
         "device": device,
         "versions": versions(),
+        "provenance": dict(provenance or {}),
         "protocol": None if protocol is None else json.loads(json.dumps(dict(protocol))),
         "rig": rig.model_dump(mode="json"),
     }
@@ -232,35 +221,6 @@ def _digest(path: Path) -> str:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-
-
-def summarise(folder: Path) -> RunSummary:
-    """Summarise one run; never raises: what cannot be read is said in the message."""
-    try:
-        header = read_header(folder)
-    except InputError as error:
-        return RunSummary(folder, "unreadable", "", "", "", -1, str(error))
-    events = read_events(folder)
-    ends = [e for e in events if e.get("event") == "end"]
-    message = str(ends[-1].get("message", "")) if ends else ""
-    records = sum(e.get("event") == "record complete" for e in events)
-    state = read_state(folder)
-    if state == INTERRUPTED and not ends:
-        message = f"finalise it with `bramah recover {folder}`"
-    protocol = str((header.protocol or {}).get("name", "")) or header.source
-    return RunSummary(folder, state, header.rig.name, protocol, header.created, records, message)
-
-
-def list_runs(folder: str | Path) -> list[RunSummary]:
-    """List the runs in a folder (or the one it is), oldest first; raises InputError."""
-    root = Path(folder)
-    if not root.is_dir():
-        raise InputError(f"{root}: no such folder")
-    try:
-        children = [root] if is_run(root) else [c for c in root.iterdir() if is_run(c)]
-    except OSError as error:
-        raise InputError(f"{root}: cannot be read: {error.strerror}") from error
-    return sorted((summarise(c) for c in children), key=lambda s: (s.created, s.path.name))
 
 
 def mark_done(folder: Path) -> None:

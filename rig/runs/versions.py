@@ -7,6 +7,8 @@ import subprocess
 from importlib import metadata
 from pathlib import Path
 
+# What turns bytes into numbers and numbers into files: a run taken again wants the same.
+_LIBRARIES = ("numpy", "scipy", "numba", "h5py", "pymodbus", "pyserial", "pydantic")
 _ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -35,16 +37,20 @@ def commit() -> str | None:
     return f"{head}-dirty" if _git("status", "--porcelain", "--untracked-files=no") else head
 
 
+def _version(name: str) -> str | None:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
+
+
 def versions() -> dict[str, str]:
     """Return what a reader needs to take the same run again: software and where it ran."""
-    try:
-        version = metadata.version("bramah")
-    except metadata.PackageNotFoundError:
-        version = "unknown"
     found = {
-        "bramah": version,
+        "bramah": _version("bramah") or "unknown",
         "python": platform.python_version(),
         "platform": platform.platform(),
+        **{name: version for name in _LIBRARIES if (version := _version(name)) is not None},
     }
     source = commit()
     return found if source is None else {**found, "commit": source}

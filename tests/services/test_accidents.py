@@ -13,9 +13,10 @@ import pytest
 
 from rig.model.parse import InputError
 from rig.model.trips import RecordingFailed
+from rig.runs.listing.summary import list_runs
 from rig.runs.recover import recover
 from rig.runs.runstate import read_events
-from rig.runs.store import list_runs, load_run
+from rig.runs.store import load_run
 from tests.services.children import RIG, acknowledged, assert_all_there, finish, measured, start
 from tests.services.fake_driver import samples
 
@@ -142,7 +143,7 @@ def test_a_missing_state_and_a_torn_event_do_not_stop_the_recovery(interrupted: 
     assert recover(interrupted).state == "interrupted"
     found = [e["event"] for e in read_events(interrupted)]
     assert found[-1] == "recovered"
-    assert found[:2] == ["start", "record begins"]
+    assert found[:3] == ["start", "stream begins", "record begins"]
 
 
 def test_a_run_copied_from_another_computer_is_recovered_by_force_only(interrupted: Path) -> None:

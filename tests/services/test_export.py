@@ -18,8 +18,9 @@ from rig.runs.exchange import export
 from rig.runs.exchange.export import export_run, library_missing
 from rig.runs.exchange.fixtures import write_run
 from rig.runs.exchange.importer import import_records
+from rig.runs.listing.summary import list_runs
 from rig.runs.rigs import load_rig
-from rig.runs.store import list_runs, load_run
+from rig.runs.store import load_run
 from tests.services.fake_driver import samples
 
 RIG = load_rig("shinshu-2dof")

@@ -12,8 +12,9 @@ from scipy.io import savemat
 
 from rig.model.parse import InputError
 from rig.runs.exchange.importer import import_records
+from rig.runs.listing.summary import list_runs
 from rig.runs.rigs import load_rig
-from rig.runs.store import list_runs, load_run
+from rig.runs.store import load_run
 from tests.services.fake_driver import samples
 
 RIG = load_rig("shinshu-2dof")

@@ -16,11 +16,12 @@ from rig.model.channels import unit_of
 from rig.model.parse import InputError
 from rig.model.trips import RecordingFailed
 from rig.runs import archive
+from rig.runs.listing.summary import list_runs
 from rig.runs.recorder import Recorder, RecordMeta
 from rig.runs.recover import recover
 from rig.runs.rigs import load_rig
 from rig.runs.runstate import read_events
-from rig.runs.store import list_runs, load_run, read_header
+from rig.runs.store import load_run, read_header
 from tests.services.fake_driver import FakeDriver, samples
 
 RIG = load_rig("shinshu-2dof")
@@ -56,7 +57,8 @@ def test_every_sample_of_every_record_comes_back_with_its_attributes(tmp_path: P
     for column, name in enumerate(RIG.recorded):
         np.testing.assert_allclose(first.channels[name], expected[:, column], rtol=0, atol=1e-9)
     assert (first.step, first.locked, first.repeat, first.sample_rate) == ("step1", (1,), 1, 1000)
-    assert (first.period, first.lines, first.start) == (50, (1,), 5.043)
+    assert (first.period, first.lines, first.start) == (50, (1,), 0.043)
+    assert first.attributes["device_s"] == 5.043
     assert first.attributes["lock_1"] == "closed"
     counts = {k: first.attributes[k] for k in ("lost_samples", "late_blocks", "saturated_samples")}
     assert counts == {"lost_samples": 0, "late_blocks": 0, "saturated_samples": 0}

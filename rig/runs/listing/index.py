@@ -1,0 +1,136 @@
+"""An index of a folder's runs: what each line says is read again only where a folder has changed.
+
+The folders are what counts: the index may be deleted, damaged or behind, and is made from them
+anew. A run that is being written is never taken from it.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import sqlite3
+from contextlib import closing
+from dataclasses import asdict
+from pathlib import Path
+from typing import Final
+
+from rig.runs.listing.summary import RunSummary, in_order, run_folders, summarise
+from rig.runs.runstate import EVENTS, HEADER, JOURNAL, RUNNING
+from rig.runs.store import ARCHIVE, is_run
+
+log = logging.getLogger(__name__)
+
+INDEX: Final = ".bramah-runs.sqlite"
+_VERSION = 1
+_SCHEMA = """
+CREATE TABLE IF NOT EXISTS run (
+    name TEXT PRIMARY KEY, signature TEXT NOT NULL, state TEXT NOT NULL, rig TEXT NOT NULL,
+    protocol TEXT NOT NULL, created TEXT NOT NULL, samples INTEGER NOT NULL, line TEXT NOT NULL)
+"""
+_WATCHED = (HEADER, "state", "owner.json", EVENTS, ARCHIVE, JOURNAL)
+
+
+def _signature(folder: Path) -> str:
+    """Return what changes when a run does: sizes and times of its files."""
+    parts: list[object] = []
+    for name in _WATCHED:
+        try:
+            about = (folder / name).stat()
+            parts += [about.st_size, about.st_mtime_ns]
+        except OSError:
+            parts += [None]
+    return json.dumps(parts)
+
+
+def _open(path: Path) -> sqlite3.Connection:
+    db = sqlite3.connect(path, isolation_level=None, timeout=5.0)
+    try:
+        version = int(db.execute("PRAGMA user_version").fetchone()[0])
+        if version != _VERSION:
+            db.execute("DROP TABLE IF EXISTS run")
+            db.execute(f"PRAGMA user_version={_VERSION}")
+        db.execute(_SCHEMA)
+    except sqlite3.Error:
+        db.close()
+        raise
+    return db
+
+
+def _line(summary: RunSummary) -> str:
+    return json.dumps({**asdict(summary), "path": summary.path.name})
+
+
+def _summary(folder: Path, line: str) -> RunSummary:
+    return RunSummary(**{**json.loads(line), "path": folder})
+
+
+def rebuild(root: Path) -> int:
+    """Delete a folder's index and make it from the run folders; returns how many there are.
+
+    Raises InputError where the folder cannot be read; an index that cannot be written is logged.
+    """
+    for suffix in ("", "-journal", "-wal", "-shm"):
+        root.joinpath(INDEX + suffix).unlink(missing_ok=True)
+    return len(indexed_runs(root))
+
+
+def indexed_runs(root: Path) -> list[RunSummary]:
+    """List the runs in a folder, oldest first, unchanged ones from its index; raises InputError."""
+    folders = run_folders(root)
+    if is_run(root):
+        return [summarise(root)]
+    path = root / INDEX
+    for attempt in (1, 2):
+        try:
+            with closing(_open(path)) as db:
+                return in_order(_read(db, folders))
+        except (sqlite3.Error, ValueError, TypeError) as error:
+            if attempt == 1 and isinstance(error, (sqlite3.DatabaseError, ValueError, TypeError)):
+                log.info("%s: made anew: %s", path, error)
+                if not _removed(path):
+                    break
+    return in_order([summarise(folder) for folder in folders])
+
+
+def _removed(path: Path) -> bool:
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:  # a folder that may only be read: listed without an index
+        log.info("%s: %s", path, error)
+        return False
+    return True
+
+
+def _read(db: sqlite3.Connection, folders: list[Path]) -> list[RunSummary]:
+    kept = {name: (signature, line) for name, signature, line in
+            db.execute("SELECT name, signature, line FROM run")}  # fmt: skip
+    found, fresh = [], []
+    for folder in folders:
+        signature = _signature(folder)
+        known = kept.get(folder.name)
+        if known is not None and known[0] == signature:
+            found.append(_summary(folder, known[1]))
+            continue
+        summary = summarise(folder)
+        found.append(summary)
+        if summary.state != RUNNING:  # its writer may die without touching a file
+            fresh.append((signature, summary))
+    gone = set(kept) - {folder.name for folder in folders}
+    if fresh or gone:
+        _write(db, fresh, gone)
+    return found
+
+
+def _write(
+    db: sqlite3.Connection, fresh: list[tuple[str, RunSummary]], gone: set[str]
+) -> None:  # fmt: skip
+    db.execute("BEGIN IMMEDIATE")
+    db.executemany("DELETE FROM run WHERE name = ?", [(name,) for name in gone])
+    db.executemany(
+        "INSERT OR REPLACE INTO run VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+        [
+            (s.path.name, signature, s.state, s.rig, s.protocol, s.created, s.samples, _line(s))
+            for signature, s in fresh
+        ],
+    )
+    db.execute("COMMIT")

@@ -1,0 +1,143 @@
+"""One line for a run folder: its state, what it is of, and what it holds."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from rig.model.parse import InputError
+from rig.runs.runstate import INTERRUPTED, JOURNAL, RUNNING, read_events, read_state
+from rig.runs.sections import Written
+from rig.runs.store import ARCHIVE, is_run, read_header
+
+UNREADABLE: Final = "unreadable"
+_UNKNOWN = Written(-1, 0, -1, 0, 0, -1)
+
+
+@dataclass(frozen=True)
+class RunSummary:
+    """One line of a list of runs; counts are -1 where they are not known.
+
+    `records` are complete, `partial` ones are not; `samples` were measured within records,
+    `lost_samples` are missing there, `outside` were measured between them; `seconds` is the
+    device's time of all. `recovered`: its process died and `recover` has finalised it since.
+    """
+
+    path: Path
+    state: str
+    rig: str
+    protocol: str
+    created: str
+    records: int
+    message: str
+    partial: int = 0
+    samples: int = -1
+    lost_samples: int = 0
+    outside: int = -1
+    seconds: float = -1.0
+    recovered: bool = False
+    operator: str = ""
+
+
+def summarise(folder: Path) -> RunSummary:
+    """Summarise one run; never raises: what cannot be read is said in the message."""
+    try:
+        header = read_header(folder)
+    except InputError as error:
+        return RunSummary(folder, UNREADABLE, "", "", "", -1, str(error))
+    state = read_state(folder)
+    recovered, message = _story(read_events(folder), state, folder)
+    counted = _UNKNOWN
+    try:
+        counted = _count(folder)
+    except (InputError, sqlite3.Error) as error:
+        message = f"{message}; {error}".removeprefix("; ")
+    total = counted.samples + counted.lost_samples + counted.outside
+    known = counted.samples >= 0
+    return RunSummary(
+        path=folder,
+        state=state,
+        rig=header.rig.name,
+        protocol=str((header.protocol or {}).get("name", "")) or header.source,
+        created=header.created,
+        records=counted.records - counted.partial if known else -1,
+        message=message,
+        partial=counted.partial,
+        samples=counted.samples,
+        lost_samples=counted.lost_samples,
+        outside=counted.outside,
+        seconds=total / header.rig.sample_rate if known else -1.0,
+        recovered=recovered,
+        operator=header.operator,
+    )
+
+
+def _story(events: list[dict[str, Any]], state: str, folder: Path) -> tuple[bool, str]:
+    """Return whether a run was recovered, and the message of its latest end."""
+    ends = [e for e in events if e.get("event") in ("end", "recovered")]
+    waiting = (folder / JOURNAL).exists()
+    if state != RUNNING and waiting:
+        return False, f"finalise it with `bramah recover {folder}`"
+    recovered = any(e["event"] == "recovered" for e in ends)
+    if state == INTERRUPTED and not ends:
+        return False, f"finalise it with `bramah recover {folder}`"
+    last = str(ends[-1].get("message", "")) if ends else ""
+    return recovered, f"recovered: {last}" if ends and ends[-1]["event"] == "recovered" else last
+
+
+def _count(folder: Path) -> Written:
+    archive, journal = folder / ARCHIVE, folder / JOURNAL
+    if journal.exists():
+        return _count_journal(journal)
+    if not archive.exists():
+        return Written(0, 0, 0, 0, 0)
+    from rig.runs.archive_reader import count  # noqa: PLC0415 - h5py loads slowly
+
+    return count(archive)
+
+
+def _count_journal(path: Path) -> Written:
+    """Count what a journal holds, also while its run writes it; raises sqlite3.Error."""
+    uri = f"{path.absolute().as_uri()}?mode=ro"
+    with closing(sqlite3.connect(uri, uri=True, timeout=5.0)) as db:
+        blocks = db.execute("SELECT stream, tick, samples FROM block").fetchall()
+        marks = db.execute(
+            "SELECT stream, start, ticks, state FROM mark WHERE state != 'discarded'"
+        ).fetchall()
+    inside = lost = 0
+    for stream, start, ticks, _ in marks:
+        ends = [tick + count for of, tick, count in blocks if of == stream]
+        end = max(ends, default=start) if ticks is None else start + ticks
+        here = sum(
+            max(0, min(end, tick + count) - max(start, tick))
+            for of, tick, count in blocks
+            if of == stream
+        )
+        inside, lost = inside + here, lost + max(0, end - start - here)
+    total = sum(count for _, _, count in blocks)
+    partial = sum(state != "complete" for *_, state in marks)
+    return Written(len(marks), partial, inside, lost, 0, total - inside)
+
+
+def list_runs(folder: str | Path) -> list[RunSummary]:
+    """List the runs in a folder (or the one it is), oldest first; raises InputError."""
+    return in_order([summarise(child) for child in run_folders(folder)])
+
+
+def run_folders(folder: str | Path) -> list[Path]:
+    """Return the run folders in a folder, or itself if it is one; raises InputError."""
+    root = Path(folder)
+    if not root.is_dir():
+        raise InputError(f"{root}: no such folder")
+    try:
+        return [root] if is_run(root) else [c for c in root.iterdir() if is_run(c)]
+    except OSError as error:
+        raise InputError(f"{root}: cannot be read: {error.strerror}") from error
+
+
+def in_order(found: list[RunSummary]) -> list[RunSummary]:
+    """Return summaries oldest first."""
+    return sorted(found, key=lambda s: (s.created, s.path.name))
