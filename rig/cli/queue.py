@@ -286,6 +286,9 @@ def run(
         str | None,
         typer.Option(help="A command that gets JSON on its standard input: trip, failure, end."),
     ] = None,
+    page: Annotated[
+        Path | None, typer.Option(help="Write the page of the night here when the queue ends.")
+    ] = None,
     queue: QueueOption = None,
     json: JsonOption = None,
 ) -> None:
@@ -306,8 +309,13 @@ def run(
                 f"the queue is {store.paused}; lift it with `bramah queue pause --off`"
             )
         hook = Hook(command, folder_of(store.path) / "hook.log")
+        began = datetime.now(UTC)
         with Runner(store, progress, hook, serve=serve) as runner:
             report = runner.run()
+        if page is not None:
+            from rig.cli.night import write_page
+
+            write_page(page, store, began)
     told = {
         "code": report.code,
         "reason": report.reason,
@@ -320,6 +328,26 @@ def run(
     if report.code > 1:
         progress(f"bramah: {report.reason}")
     raise typer.Exit(report.code)
+
+
+def write_night_page(
+    out: Annotated[Path, typer.Option(help="The HTML file to write.")] = Path("night.html"),
+    since: Annotated[
+        str | None, typer.Option(help="Only since 2026-03-01T22:00, or 12h ago.")
+    ] = None,
+    queue: QueueOption = None,
+) -> None:
+    """Write the page of the night: what ran, what was found, what tripped, what drifted.
+
+    Example: bramah queue page --out night.html --since 12h
+    """
+    from rig.cli.night import write_page
+    from rig.cli.times import since as parse_since
+
+    begin = None if since is None else parse_since(since, datetime.now(UTC))
+    with _opened(queue) as store:
+        write_page(out, store, begin)
+    typer.echo(str(out))
 
 
 def pause(
@@ -396,6 +424,7 @@ def register(app: typer.Typer) -> None:
     group = typer.Typer(no_args_is_help=True, rich_markup_mode=None, callback=queue_group)
     group.command(context_settings={"allow_extra_args": True})(add)
     group.command("list")(list_items)
+    group.command("page")(write_night_page)
     for verb in (show, run, pause, cancel, move, retry):
         group.command()(verb)
     app.add_typer(group, name="queue")

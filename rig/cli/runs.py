@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -42,6 +42,7 @@ def runs(
 
     Example: bramah runs runs/ --state interrupted --since 12h
     """
+    from rig.cli.times import since as parse_since
     from rig.model.parse import InputError
     from rig.runs.listing.index import indexed_runs
     from rig.runs.listing.index import rebuild as rebuild_index
@@ -53,7 +54,7 @@ def runs(
             raise InputError(
                 f"--state {wanted}: expected one of: {', '.join((*STATES, UNREADABLE))}"
             )
-    begun = None if since is None else _since(since, datetime.now(UTC))
+    begun = None if since is None else parse_since(since, datetime.now(UTC))
     if rebuild:
         progress(f"{rebuild_index(folder)} runs in the index of {folder}")
     listed = indexed_runs(folder)
@@ -80,21 +81,6 @@ def runs(
 
 def _named(name: str, wanted: Names) -> bool:
     return not wanted or any(fnmatchcase(name, pattern) for pattern in wanted)
-
-
-def _since(text: str, now: datetime) -> datetime:
-    from rig.model.parse import InputError
-
-    units = {"h": "hours", "d": "days", "m": "minutes"}
-    if text[:-1].isdigit() and text[-1] in units:
-        return now - timedelta(**{units[text[-1]]: int(text[:-1])})
-    try:
-        return datetime.fromisoformat(text).astimezone(UTC)
-    except ValueError:
-        raise InputError(
-            f"--since {text!r}: expected a date as 2026-03-01, a time as 2026-03-01T22:00, or a "
-            "length as 12h or 7d"
-        ) from None
 
 
 def _row(one: RunSummary) -> tuple[str, ...]:

@@ -1,0 +1,269 @@
+"""The page of a night: what ran, what was found, what tripped, and how each parameter drifted.
+
+Every number comes from the arguments; the page refers to nothing outside itself.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from markupsafe import Markup
+
+from analysis.report import format as fm
+from analysis.report.page import page, write
+from analysis.report.plots.style import BLUE, CARD, GREY, INK, PALE, figure, style, svg
+
+TEMPLATE: Final = "night.html"
+INTERVAL: Final = 1.96  # standard deviations on each side of a 95 % interval
+_COLUMNS = 4  # of the drift's small figures
+_BAR_COLOURS: Final = {"done": BLUE, "tripped": "#d03030"}
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """An identified parameter, SI; `std` is NaN where it is not known."""
+
+    value: float
+    std: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class NightItem:
+    """One item as the page shows it; times are aware, None where it did not come to that.
+
+    Counts are -1 where nothing is known; `unidentified` says why nothing was identified.
+    """
+
+    number: int
+    name: str
+    state: str
+    reason: str
+    rig: str
+    run: str
+    started: datetime | None
+    ended: datetime | None
+    attempts: int = 0
+    records: int = -1
+    samples: int = -1
+    lost_samples: int = -1
+    parameters: Mapping[str, Estimate] = field(default_factory=dict)
+    unidentified: str = ""
+
+
+@dataclass(frozen=True)
+class Night:
+    """A whole night: items in the order they started, what the queue noted, and where it is."""
+
+    queue: str
+    host: str
+    made: datetime
+    items: tuple[NightItem, ...]
+    notes: tuple[tuple[datetime, str], ...] = ()
+    paused: str = ""
+
+
+def write_night(path: Path, night: Night) -> None:
+    """Write the page as one HTML file; raises InputError where it cannot be written."""
+    write(path, render(night))
+
+
+def render(night: Night) -> str:
+    """Return the page as HTML text."""
+    counts = Counter(item.state for item in night.items)
+    ended = [item for item in night.items if item.ended is not None]
+    context = {
+        "title": f"The night of {_first(night):%d %B %Y}",
+        "queue": night.queue,
+        "host": night.host,
+        "made": _clock(night.made, date=True),
+        "lead": _lead(night, counts),
+        "tripped": [_row(item) for item in night.items if item.state == "tripped"],
+        "tiles": _tiles(night, counts),
+        "timeline": _timeline(ended),
+        "rows": [_row(item) for item in night.items],
+        "drifts": [_drift(rig, found) for rig, found in _identified(night.items).items()],
+        "unidentified": [
+            (item.number, item.name, item.unidentified) for item in night.items if item.unidentified
+        ],
+        "notes": [(_clock(time, date=True), text) for time, text in night.notes],
+    }
+    return page(TEMPLATE, context)
+
+
+def _first(night: Night) -> datetime:
+    return min((item.started for item in night.items if item.started), default=night.made)
+
+
+def _clock(time: datetime | None, *, date: bool = False) -> str:
+    if time is None:
+        return fm.DASH
+    return time.astimezone().strftime("%d %b %H:%M" if date else "%H:%M:%S")
+
+
+def _lead(night: Night, counts: Mapping[str, int]) -> str:
+    total = len(night.items)
+    done = counts.get("done", 0)
+    trips = counts.get("tripped", 0)
+    first = f"{done} of {fm.count(total, 'item')} ran to {'its' if done == 1 else 'their'} end"
+    others = [f"{number} {state}" for state, number in counts.items() if state != "done"]
+    text = f"{first}; {', '.join(others)}." if others else f"{first}."
+    if trips:
+        text += " The bench stays tripped until a person has looked at it and cleared it."
+    return text + (f" The queue is {night.paused}." if night.paused else "")
+
+
+def _tiles(night: Night, counts: Mapping[str, int]) -> list[dict[str, Any]]:
+    runs = [item for item in night.items if item.samples >= 0]
+    lost = sum(item.lost_samples for item in runs)
+    seconds = sum(_seconds(item) for item in night.items)
+    bad = sum(n for state, n in counts.items() if state not in ("done", "queued", "cancelled"))
+    return [
+        {"number": str(counts.get("done", 0)), "label": "items done", "warn": False,
+         "detail": f"of {len(night.items)}"},
+        {"number": str(bad), "label": "items ended otherwise", "warn": bad > 0,
+         "detail": "the table says why"},
+        {"number": str(counts.get("queued", 0)), "label": "items still queued", "warn": False,
+         "detail": ""},
+        {"number": f"{sum(max(0, item.records) for item in runs)}", "label": "complete records",
+         "detail": f"{sum(item.samples for item in runs)} samples", "warn": False},
+        {"number": str(lost), "label": "samples lost", "warn": lost > 0, "detail": "on the wire"},
+        {"number": f"{seconds / 3600.0:.1f} h", "label": "of the bench's time", "warn": False,
+         "detail": ""},
+    ]  # fmt: skip
+
+
+def _seconds(item: NightItem) -> float:
+    if item.started is None or item.ended is None:
+        return 0.0
+    return max(0.0, (item.ended - item.started).total_seconds())
+
+
+def _row(item: NightItem) -> dict[str, Any]:
+    took = _seconds(item)
+    return {
+        "number": item.number, "name": item.name, "state": item.state, "reason": item.reason,
+        "rig": item.rig, "run": item.run, "started": _clock(item.started, date=True),
+        "minutes": f"{took / 60.0:.1f}" if took else fm.DASH,
+        "records": str(item.records) if item.records >= 0 else fm.DASH,
+        "samples": str(item.samples) if item.samples >= 0 else fm.DASH,
+        "lost": str(item.lost_samples) if item.lost_samples >= 0 else fm.DASH,
+        "good": item.state == "done", "waits": item.state == "queued",
+        "attempts": item.attempts,
+    }  # fmt: skip
+
+
+def _timeline(items: Sequence[NightItem]) -> Markup | None:
+    """Draw when each item ran: blue done, red tripped, grey otherwise; a tick at its end."""
+    shown = [item for item in items if item.started is not None]
+    if not shown:
+        return None
+    begin = min(item.started for item in shown if item.started)
+    with style():
+        made = figure(0.7 + 0.19 * len(shown), CARD * 2)
+        axes = made.add_subplot(1, 1, 1)
+        for k, item in enumerate(shown):
+            assert item.started is not None
+            left = (item.started - begin).total_seconds() / 60.0
+            width = max(_seconds(item) / 60.0, 1e-3)
+            colour = _BAR_COLOURS.get(item.state, GREY)
+            axes.barh(k, width, left=left, height=0.62, color=colour)
+            axes.plot([left + width] * 2, [k - 0.31, k + 0.31], color=INK, lw=0.8)
+        axes.set_yticks(range(len(shown)), [str(item.number) for item in shown])
+        axes.set_ylim(len(shown) - 0.4, -0.6)
+        axes.set_xlabel(f"minutes since {_clock(begin)}")
+        axes.set_ylabel("item")
+        axes.grid(visible=False, axis="y")
+        made.tight_layout()
+        return svg(made, "timeline", "When each item ran")
+
+
+def _identified(items: Sequence[NightItem]) -> dict[str, list[NightItem]]:
+    """Group what has parameters by rig, in the order of time."""
+    found: dict[str, list[NightItem]] = {}
+    for item in items:
+        if item.parameters and item.ended is not None:
+            found.setdefault(item.rig, []).append(item)
+    for group in found.values():
+        group.sort(key=lambda item: item.ended or item.started or datetime.min)
+    return found
+
+
+def _drift(rig: str, items: Sequence[NightItem]) -> dict[str, Any]:
+    names = list(dict.fromkeys(name for item in items for name in item.parameters))
+    return {
+        "rig": rig,
+        "count": fm.count(len(items), "run"),
+        "plot": _drift_plot(rig, items, names),
+        "rows": [_drift_row(name, items) for name in names],
+    }
+
+
+def change(values: Sequence[Estimate]) -> tuple[float, float]:
+    """Return the last minus the first estimate, and over the two errors together (0: unknown).
+
+    The errors of two runs are independent: their squares add.
+    """
+    first, last = values[0], values[-1]
+    moved = last.value - first.value
+    error = math.hypot(first.std, last.std)
+    return moved, moved / error if error > 0.0 and math.isfinite(error) else 0.0
+
+
+def _drift_row(name: str, items: Sequence[NightItem]) -> dict[str, Any]:
+    values = [item.parameters[name] for item in items if name in item.parameters]
+    unit = fm.display_unit(values[0].unit)
+    moved, sigmas = change(values)
+    percent = 100.0 * moved / abs(values[0].value) if values[0].value else math.nan
+    several = len(values) > 1
+    return {
+        "name": name,
+        "unit": unit.text,
+        "first": fm.significant(values[0].value, 4, unit.scale),
+        "last": fm.significant(values[-1].value, 4, unit.scale),
+        "half": fm.significant(INTERVAL * values[-1].std, 2, unit.scale),
+        "change": f"{fm.percent(percent, signed=True)} %" if several else fm.DASH,
+        "sigmas": fm.significant(abs(sigmas), 2) if several and sigmas else fm.DASH,
+        "warn": several and abs(sigmas) > INTERVAL,
+        "runs": len(values),
+    }
+
+
+def _drift_plot(rig: str, items: Sequence[NightItem], names: Sequence[str]) -> Markup:
+    """Draw every parameter over the night with its 95 % interval, in percent of its first value."""
+    begin = items[0].ended
+    assert begin is not None
+    rows = -(-len(names) // _COLUMNS)
+    with style():
+        made = figure(1.35 * rows + 0.35, CARD * 2)
+        for k, name in enumerate(names, start=1):
+            axes = made.add_subplot(rows, _COLUMNS, k)
+            shown = [item for item in items if name in item.parameters]
+            hours = np.array([_hours(begin, item) for item in shown])
+            values = np.array([item.parameters[name].value for item in shown])
+            half = INTERVAL * np.array([item.parameters[name].std for item in shown])
+            scale = 100.0 / abs(values[0]) if values[0] else 1.0
+            percent = scale * (values - values[0])
+            axes.axhline(0.0, color=PALE, lw=0.8)
+            error = np.where(np.isfinite(half), scale * half, 0.0)
+            axes.errorbar(hours, percent, yerr=error, fmt="o-", color=BLUE, ms=2.6, lw=0.8,
+                          ecolor=GREY, elinewidth=0.8, capsize=1.5)  # fmt: skip
+            axes.set_title(name)
+            if k > len(names) - _COLUMNS:
+                axes.set_xlabel("time [h]")
+            if (k - 1) % _COLUMNS == 0:
+                axes.set_ylabel("change [%]")
+        made.tight_layout()
+        key = "drift" + "".join(c for c in rig if c.isalnum())
+        return svg(made, key, "Every parameter over the night, in percent of its first value")
+
+
+def _hours(begin: datetime, item: NightItem) -> float:
+    return (item.ended - begin).total_seconds() / 3600.0 if item.ended else math.nan

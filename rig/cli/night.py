@@ -1,0 +1,77 @@
+"""From a queue and its run folders to the page of the night."""
+
+from __future__ import annotations
+
+import math
+from datetime import UTC, datetime
+from pathlib import Path
+
+from analysis.report.night import Estimate, Night, NightItem, write_night
+from rig.queue.items import Item
+from rig.queue.store import QueueStore
+from rig.runs.listing.summary import summarise
+from rig.runs.runstate import here
+from rig.runs.store import is_run
+
+
+def night_of(store: QueueStore, since: datetime | None) -> Night:
+    """Return the night of a queue: items over or started since a time, and those that wait."""
+    items = [item for item in store.items() if since is None or _recent(item, since)]
+    order = sorted(items, key=lambda item: (item.started or "9", item.id))
+    notes = [
+        (datetime.fromisoformat(line.time), f"{line.event}: {line.reason}".removesuffix(": "))
+        for line in store.history()
+        if line.item is None
+    ]
+    return Night(
+        queue=str(store.path),
+        host=here(),
+        made=datetime.now(UTC),
+        items=tuple(map(_shown, order)),
+        notes=tuple(note for note in notes if since is None or note[0] >= since),
+        paused=store.paused,
+    )
+
+
+def _recent(item: Item, since: datetime) -> bool:
+    times = (item.ended, item.started)
+    return not item.over or any(time and datetime.fromisoformat(time) >= since for time in times)
+
+
+def _time(text: str) -> datetime | None:
+    return datetime.fromisoformat(text) if text else None
+
+
+def _shown(item: Item) -> NightItem:
+    folder = Path(item.run) if item.run else None
+    found = summarise(folder) if folder is not None and is_run(folder) else None
+    parameters = item.found.get("parameters") or {}
+    return NightItem(
+        number=item.id,
+        name=item.job.name,
+        state=item.state,
+        reason=item.reason,
+        rig=found.rig if found is not None and found.rig else item.job.rig,
+        run=item.run,
+        started=_time(item.started),
+        ended=_time(item.ended),
+        attempts=item.attempt,
+        records=-1 if found is None else found.records,
+        samples=-1 if found is None else found.samples,
+        lost_samples=-1 if found is None else found.lost_samples,
+        parameters={
+            name: Estimate(float(p["value"]), _number(p.get("std")), str(p.get("unit", "")))
+            for name, p in parameters.items()
+            if p.get("value") is not None
+        },
+        unidentified=str(item.found.get("error", "")),
+    )
+
+
+def _number(value: object) -> float:
+    return float(value) if isinstance(value, int | float) else math.nan
+
+
+def write_page(path: Path, store: QueueStore, since: datetime | None = None) -> None:
+    """Write the page of a queue's night; raises InputError where it cannot be written."""
+    write_night(path, night_of(store, since))
