@@ -175,7 +175,9 @@ class MessageStreamDriver:
         flag = reg.APPLY_AND_RESTART if restart else reg.APPLY
         payload = msg.pack_apply(flag, [astuple(law) for law in laws])
         answer = self._command(Message.APPLY, payload, 4, f"laws {list(laws)}")
-        return unwrap(int.from_bytes(answer, "big"), self._decoder.tick, 32)
+        tick = int.from_bytes(answer, "big")
+        self._decoder.refuse_restarted(tick)
+        return unwrap(tick, self._decoder.tick, 32)
 
     # -- samples ----------------------------------------------------------------------------
 
@@ -302,6 +304,8 @@ class MessageStreamDriver:
         cause = _trip_text(status)
         flags = Status(_u16(status, reg.STATUS_FLAGS))
         if not flags & Status.STREAMING or self._stream is None:
+            if self._stream is not None:
+                self._decoder.refuse_restarted(_u32(status, reg.STATUS_TICK))
             raise DeviceError(f"the device at {where} does not stream ({cause or 'not started'})")
         if _u16(status, reg.STATUS_CAUSE) == TripCause.FAULT:
             raise DeviceError(f"the device at {where} measures nothing any more: {cause}")

@@ -6,7 +6,7 @@ import logging
 
 import numpy as np
 
-from drivers.base import DeviceError, SampleBlock
+from drivers.base import DeviceError, DeviceLost, SampleBlock
 from rig.model import channels as ch
 from rig.model import registers as reg
 from rig.model.registers import BlockHeader, Status
@@ -55,6 +55,15 @@ class BlockDecoder:
         behind = (self.acknowledge - header.sequence) & 0xFFFF
         return self._sequence is not None and behind <= min(self._sequence, LATE)
 
+    def refuse_restarted(self, tick: int) -> None:
+        """Raise DeviceLost where a device counts `tick` (modulo 2^32) after samples beyond it."""
+        now = unwrap(tick, self.tick, 32)
+        if now < self.tick:
+            raise DeviceLost(
+                f"the device has restarted: it counts sample {tick} where {self.tick} or a later "
+                "one was due; its waveforms and laws are gone"
+            )
+
     def decode(self, header: BlockHeader, answer: bytes) -> SampleBlock:
         """Return the block in SI; raises DeviceError if it is impossible after the last one."""
         sequence, tick = self._follow(header)
@@ -80,6 +89,8 @@ class BlockDecoder:
         last = -1 if self._sequence is None else self._sequence
         lost = (header.sequence - last - 1) & 0xFFFF
         expected = self.tick + lost * self.layout.samples
+        if self._sequence is None:
+            self.refuse_restarted(header.tick)
         # Before a stream's first block any time may pass, but none backwards.
         if lost > 0x7FFF or tick < expected or (tick > expected and self._sequence is not None):
             raise DeviceError(

@@ -67,6 +67,9 @@ class RtuConnection(ModbusConnection):
     def _connected(self, client: Any) -> None:
         client.socket.reset_input_buffer()
 
+    def _answers_earlier_request(self, data: bytes) -> bool:
+        return False  # no frame says which request it answers
+
     def settle(self) -> None:
         """Read and drop what still arrives, until the line is quiet.
 

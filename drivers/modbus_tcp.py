@@ -180,7 +180,9 @@ class ModbusTcpDriver:
             )
         except DeviceRefused as refused:
             raise self._explained(refused, "apply") from refused
-        return unwrap(unpack(">I", answer), self._decoder.tick, 32)
+        tick = unpack(">I", answer)
+        self._decoder.refuse_restarted(tick)
+        return unwrap(tick, self._decoder.tick, 32)
 
     # -- samples ----------------------------------------------------------------------------
 
@@ -209,6 +211,7 @@ class ModbusTcpDriver:
                 self._arrived = time.monotonic()
                 return self._decoder.decode(header, answer)
             elif not header.status & Status.STREAMING:
+                self._decoder.refuse_restarted(header.tick)
                 raise DeviceError(
                     f"the device at {self._link.where} does not stream "
                     f"({self.trip_cause() or 'not started'})"

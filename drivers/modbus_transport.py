@@ -22,6 +22,8 @@ from drivers.bench_protocol import DeviceRefused, DeviceSilent
 
 logger = logging.getLogger(__name__)
 
+_MBAP = struct.Struct(">HHH")  # transaction, protocol (0), length of what follows
+
 
 class RawAnswer:
     """Mixin: an answer kept as the bytes of its registers, not as a list of integers."""
@@ -54,6 +56,7 @@ class ModbusConnection:
         self._host, self._port, self._timeout = host, port, timeout
         self._client: ModbusTcpClient | ModbusSerialClient | None = None
         self._received = 0
+        self._asked = b""
         # What the library logs is raised here as well, in words for people.
         logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 
@@ -178,9 +181,21 @@ class ModbusConnection:
         return DeviceSilent(f"the device at {self.where} does not answer ({self._timeout:g} s)")
 
     def _note(self, sending: bool, data: bytes) -> bytes:
-        if not sending:
+        if sending:
+            self._asked = data
+        elif self._answers_earlier_request(data):
+            logger.warning("a late answer from %s is dropped", self.where)
+        else:
             self._received = len(data)
         return data
+
+    def _answers_earlier_request(self, data: bytes) -> bool:
+        """Tell whether what came carries the transaction number of another request."""
+        head = data[: _MBAP.size]
+        if len(head) < _MBAP.size:
+            return False
+        transaction, protocol, _ = _MBAP.unpack(head)
+        return bool(protocol == 0 and transaction != _MBAP.unpack_from(self._asked)[0])
 
 
 def unpack(form: str, data: bytes, offset: int = 0) -> int:

@@ -10,6 +10,7 @@ runs while nobody asks. Real time: the sample clock follows the wall clock, whoe
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 
 from hil_sim.device.laws import DeviceLaw, LawTable, Refused
 from hil_sim.device.queue import BlockQueue
+from hil_sim.faults.device import ClockDrift, ClockJump, DeviceFault, QueueOverrun, Reboots
 from rig.model import registers as reg
 from rig.model.parts import WATCHDOG_RANGE
 from rig.model.registers import BlockHeader, Refusal, Status, TripCause
@@ -52,7 +54,8 @@ class Device:
     """One bench: a plant with converters, a clock, laws, a queue and a watchdog.
 
     `client` arguments are any hashable that stands for one connection. Methods that a client
-    calls raise `Refused` where the device does not obey.
+    calls raise `Refused` where the device does not obey. `faults` break the device while it runs;
+    `on_restart` is called when it restarts, for a server to end what was connected.
     """
 
     def __init__(
@@ -63,10 +66,26 @@ class Device:
         realtime: bool,
         clock: Callable[[], float] = time.monotonic,
         virtual_silence: float = VIRTUAL_SILENCE,
+        faults: Sequence[DeviceFault] = (),
     ) -> None:
         self.rig = rig
         self.realtime = realtime
         self.layout = reg.block_layout(len(rig.channels), len(rig.joints))
+        self.on_restart: Callable[[], None] = lambda: None
+        self._faults = sorted(faults, key=lambda fault: fault.at)
+        self._virtual_silence = virtual_silence
+        self._plant = plant
+        self._clock = clock
+        self._heard = self._polled = self._origin = clock()
+        self._drift = 0.0  # by which share the sample clock runs fast
+        self._zero_tick = 0  # of the plant, at which this device counts 0
+        self._first_tick = plant.tick
+        self._boots_until = -math.inf  # [s] of the clock
+        self._broken = False
+        self._power_up()
+
+    def _power_up(self) -> None:
+        rig = self.rig
         self.laws = LawTable(rig)
         blocks = max(2, round(QUEUE_SECONDS * rig.sample_rate / self.layout.samples))
         self.queue = BlockQueue(self.layout, blocks)
@@ -78,20 +97,19 @@ class Device:
         self.heartbeat = 0
         self.acknowledged = 0
         self.watchdog_ms = int(np.clip(round(rig.wire.watchdog * 1e3), *WATCHDOG_RANGE_MS))
-        self._virtual_silence = virtual_silence
-        self._plant = plant
-        self._clock = clock
         self._controller: object | None = None
-        self._heard = self._polled = self._origin = clock()
-        self._first_tick = plant.tick
-        self._broken = False
 
     # -- what a client may ask --------------------------------------------------------------
 
     @property
     def tick(self) -> int:
-        """Samples measured so far."""
-        return self._plant.tick
+        """Samples measured so far, as this device counts them."""
+        return self._plant.tick - self._zero_tick
+
+    @property
+    def boots(self) -> bool:
+        """Whether it restarts and hears nothing."""
+        return self._clock() < self._boots_until
 
     @property
     def status(self) -> Status:
@@ -142,13 +160,13 @@ class Device:
             raise Refused(Refusal.TRIPPED)
         self.catch_up()
         self.apply_tick = self.tick
-        self.laws.apply(self.tick, restart=restart)
+        self.laws.apply(self._plant.tick, restart=restart)
 
     def start(self) -> None:
         """Stream from the next sample on, numbered from 0, waveforms at their first sample."""
         self.catch_up()
         self.queue.clear()
-        self.laws.restart(self.tick)
+        self.laws.restart(self._plant.tick)
         self.streaming = True
 
     def stop(self) -> None:
@@ -204,8 +222,8 @@ class Device:
         """Return how long `poll` may wait: until the block being filled is due."""
         if not self.realtime or self._broken:
             return POLL_SECONDS
-        samples = self.tick - self._first_tick + self.queue.room
-        due = self._origin + samples / self.rig.sample_rate - self._clock()
+        samples = self._plant.tick - self._first_tick + self.queue.room
+        due = self._origin + samples / self._rate - self._clock()
         return min(max(due, 0.0), POLL_SECONDS)
 
     def poll(self) -> None:
@@ -236,16 +254,51 @@ class Device:
         """In real time, run the plant up to the present."""
         if not self.realtime or self._broken:
             return
-        rate = self.rig.sample_rate
+        rate = self._rate
         # A millionth of a sample early, so that rounding does not put off one that is due now.
         elapsed = int((self._clock() - self._origin) * rate + 1e-6)
-        due = elapsed - (self.tick - self._first_tick)
+        due = elapsed - (self._plant.tick - self._first_tick)
         most = int(QUEUE_SECONDS * rate)
         if due > most:
             # The machine slept: the device's clock pauses rather than racing through hours.
             self._origin += (due - most) / rate
             due = most
         self._run(due)
+
+    def restart(self, boot: float) -> None:
+        """Lose all state as at power-on, and hear nothing for `boot` [s]."""
+        logger.warning("restarts at tick %d", self.tick)
+        self._power_up()
+        self._zero_tick = self._plant.tick
+        self._boots_until = self._clock() + boot
+        self.on_restart()
+
+    @property
+    def _rate(self) -> float:
+        """The samples that the device really takes a second."""
+        return self.rig.sample_rate * (1.0 + self._drift)
+
+    def _drift_by(self, share: float) -> None:
+        # From here on; what was sampled before stays as it is.
+        self._origin = self._clock()
+        self._first_tick = self._plant.tick
+        self._drift = share
+
+    def _begin_faults(self) -> None:
+        now = self._plant.tick / self.rig.sample_rate
+        while self._faults and self._faults[0].at <= now:
+            fault = self._faults.pop(0)
+            if isinstance(fault, Reboots):
+                self.restart(fault.boot)
+            elif isinstance(fault, ClockJump):
+                self._zero_tick -= round(fault.step * self.rig.sample_rate)
+            elif isinstance(fault, QueueOverrun):
+                self.queue.lose_next(fault.blocks)
+            elif isinstance(fault, ClockDrift):
+                self._drift_by(fault.rate)
+                if fault.until is not None:
+                    end = fault.model_copy(update={"at": fault.until, "until": None, "rate": 0.0})
+                    self._faults = sorted([*self._faults, end], key=lambda one: one.at)
 
     def _silence_allowed(self) -> float:
         seconds = self.watchdog_ms * 1e-3
@@ -257,6 +310,8 @@ class Device:
 
     def _run(self, ticks: int) -> None:
         while ticks > 0:
+            if self.queue.room == self.layout.samples:
+                self._begin_faults()
             count = min(ticks, self.queue.room)
             tick = self.tick
             measured, commands = self._advance(count, self.laws.active)

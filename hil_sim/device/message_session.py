@@ -40,6 +40,7 @@ class MessageSession:
 
     def __init__(self, device: Device) -> None:
         self._device = device
+        device.on_restart = self._restarted
         self._registers = RegisterMap(device)
         self._host: _Host | None = None
         self._stream = 0  # number of the request that started it
@@ -62,6 +63,8 @@ class MessageSession:
 
     def receive(self, frame: WireFrame) -> WireFrame | None:
         """Carry out a message; returns its answer, None for one that is not answered."""
+        if self._device.boots:
+            return None
         if frame.type == Message.ALIVE_NOTE:
             self._alive(frame)
             return None
@@ -87,7 +90,7 @@ class MessageSession:
         host = self._host
         if host is not None and host.session == frame.session and frame.type not in FOR_ANYBODY:
             host.answer = answer
-        return answer
+        return None if self._device.boots else answer
 
     def push(self) -> WireFrame | None:
         """Return the next block that may be sent, None if none may."""
@@ -107,6 +110,9 @@ class MessageSession:
         header = BlockHeader(block.sequence, block.tick & _U32, status, backlog)
         payload = msg.pack_block(msg.PushedBlock(oldest.sequence, header, block.samples))
         return WireFrame(Message.BLOCK, self._stream, host.session, payload)
+
+    def _restarted(self) -> None:
+        self._host, self._stream, self._next = None, 0, 0
 
     def ended(self) -> None:
         """Note that nobody holds the other end of the line any more."""

@@ -35,6 +35,7 @@ class BlockQueue:
         self._offered: int | None = None
         self.next_sequence = 0
         self.dropped = 0
+        self._to_lose = 0
 
     def __len__(self) -> int:
         return len(self._blocks)
@@ -53,6 +54,10 @@ class BlockQueue:
         self.next_sequence = 0
         self.dropped = 0
 
+    def lose_next(self, blocks: int) -> None:
+        """Lose the next `blocks` blocks as if they were overwritten before anybody read them."""
+        self._to_lose = blocks
+
     def add(self, tick: int, measured: Codes, commands: Codes) -> None:
         """Append samples that start at `tick`, at most `room` of them."""
         if not self._parts:
@@ -64,6 +69,11 @@ class BlockQueue:
         rows = [np.concatenate(part) for part in zip(*self._parts, strict=True)]
         self._parts.clear()
         self._filled = 0
+        if self._to_lose:
+            self._to_lose -= 1
+            self.dropped += 1
+            self.next_sequence = (self.next_sequence + 1) & 0xFFFF
+            return
         if len(self._blocks) == self._capacity:
             self._blocks.popleft()
             self.dropped += 1

@@ -44,6 +44,7 @@ class RtuLine:
     """A serial line whose registers are one device's; `endpoint` is its other end."""
 
     def __init__(self, device: Device) -> None:
+        self._device = device
         self._session = _LineSession(device)
         self._master, slave = pty.openpty()
         tty.setraw(slave)
@@ -79,6 +80,8 @@ class RtuLine:
             answer.add_done_callback(_raised)
 
     async def _answer(self, frame: bytes) -> None:
+        if self._device.boots:
+            return
         if not sound(frame):
             logger.debug("a damaged frame of %d bytes is left unanswered", len(frame))
             self._received = b""
@@ -94,6 +97,8 @@ class RtuLine:
             request.session = self._session
             request.decode(frame[2:-2])
             answer = await request.datastore_update(None, ADDRESS)  # type: ignore[arg-type]
+        if self._device.boots:  # since it has begun to answer
+            return
         body = bytes([ADDRESS, answer.function_code]) + answer.encode()
         os.write(self._master, body + checksum(body))
 

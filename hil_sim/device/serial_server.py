@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 
 from hil_sim.device.device import Device, Plant
 from hil_sim.device.lifetime import PARENT_SECONDS, Owner, told_to_end
 from hil_sim.device.pty_line import PtyLine
 from hil_sim.device.serial_session import SerialSession
+from hil_sim.faults.device import DeviceFault
 from rig.model.rig import Rig
 
 logger = logging.getLogger(__name__)
@@ -26,6 +28,7 @@ def serve_serial(
     realtime: bool = False,
     on_ready: Callable[[str], None] = logger.info,
     parent: int | None = None,
+    faults: Sequence[DeviceFault] = (),
 ) -> None:
     """Serve a plant on a new pty until SIGTERM, SIGINT or the end of process `parent`.
 
@@ -33,29 +36,40 @@ def serve_serial(
     with this call. Raises EndpointError where there are no pseudo terminals.
     """
     line = PtyLine()
-    device = Device(rig, plant, realtime=realtime)
+    device = Device(rig, plant, realtime=realtime, faults=faults)
     try:
         with told_to_end() as ended:
             on_ready(f"serial://{line.name}")
-            serve_line_until(line, device, ended, None if parent is None else Owner(parent))
+            serve_port(line, device, ended, None if parent is None else Owner(parent))
     finally:
         device.zero()
         line.close()
 
 
-def serve_line_until(line: PtyLine, device: Device, ended: list[int], owner: Owner | None) -> None:
-    """Serve a device on a pty until `ended` is not empty, or its owner has ended."""
+def serve_port(
+    line: PtyLine,
+    device: Device,
+    ended: Sequence[object],
+    owner: Owner | None = None,
+    lock: AbstractContextManager[object] | None = None,
+) -> None:
+    """Serve a device on a pty until `ended` is not empty, or its owner has ended.
+
+    Whoever else has the device takes `lock`, which is held here but while waiting for bytes.
+    """
+    lock = lock or nullcontext()
     session = SerialSession(device)
     look = time.monotonic()
     while not ended:
         received = line.receive(device.idle_seconds())
-        if received is None:
-            session.ended()
-        elif received:
-            line.send(session.receive(received))
-        device.poll()
-        while line.free and (block := session.push()):
-            line.send(block)
+        with lock:
+            if received is None:
+                session.ended()
+            elif received:
+                line.send(session.receive(received))
+            device.poll()
+            while line.free and (block := session.push()):
+                line.send(block)
         if owner is not None and time.monotonic() > look:
             look = time.monotonic() + PARENT_SECONDS
             if owner.has_ended():

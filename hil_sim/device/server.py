@@ -6,7 +6,7 @@ import asyncio
 import logging
 import os
 import signal
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
@@ -15,6 +15,7 @@ from pymodbus.pdu import ModbusPDU
 from pymodbus.server import ModbusTcpServer
 from pymodbus.server.requesthandler import ServerRequestHandler
 from pymodbus.simulator import DataType, SimData, SimDevice
+from pymodbus.transport import ModbusProtocol
 
 from hil_sim.device.device import Device, Plant
 from hil_sim.device.laws import LawTable
@@ -23,6 +24,7 @@ from hil_sim.device.pdu import REQUESTS, Request
 from hil_sim.device.register_map import RegisterMap
 from hil_sim.device.rtu_server import serve_line
 from hil_sim.device.serial_server import serve_serial
+from hil_sim.faults.device import DeviceFault
 from rig.model import registers as reg
 from rig.model.rig import Rig
 
@@ -60,6 +62,7 @@ class _Session:
     def __init__(self, device: Device, registers: RegisterMap) -> None:
         self._device = device
         self.registers = registers
+        self.handler: ServerRequestHandler | None = None
 
     def tag(self, sending: bool, pdu: ModbusPDU) -> ModbusPDU:
         """Tell an incoming request which connection it came by."""
@@ -68,9 +71,11 @@ class _Session:
         return pdu
 
     def connection(self, connected: bool) -> None:
-        """Pass the end of the connection on."""
+        """Pass the end of the connection on; a device that boots takes none."""
         if not connected:
             self._device.disconnected(self)
+        elif self._device.boots and self.handler is not None:
+            _abort(self.handler)
 
 
 class BenchServer(ModbusTcpServer):
@@ -83,6 +88,7 @@ class BenchServer(ModbusTcpServer):
         super().__init__(store, address=(host, port), custom_pdu=REQUESTS)
         self._address = (host, port)
         self._device = device
+        device.on_restart = self.abort_connections
         self._registers = RegisterMap(device)
 
     async def listen(self) -> bool:
@@ -103,9 +109,15 @@ class BenchServer(ModbusTcpServer):
     def callback_new_connection(self) -> ServerRequestHandler:
         """Make the handler of one connection."""
         session = _Session(self._device, self._registers)
-        return ServerRequestHandler(  # type: ignore[no-untyped-call]
+        session.handler = ServerRequestHandler(  # type: ignore[no-untyped-call]
             self, None, session.tag, session.connection
         )
+        return session.handler
+
+    def abort_connections(self) -> None:
+        """End every connection without a goodbye, as a restart does."""
+        for handler in list(self.active_connections.values()):
+            _abort(handler)
 
     @property
     def endpoint(self) -> str:
@@ -150,6 +162,7 @@ def serve(
     wire: str = TCP,
     layout: CanLayout | None = None,
     bitrate: int = BITRATE,
+    faults: Sequence[DeviceFault] = (),
 ) -> None:
     """Serve a plant on a wire of `WIRES` until SIGTERM, SIGINT or the end of process `parent`.
 
@@ -158,11 +171,11 @@ def serve(
 
     `on_ready` is called once with the real endpoint, before any client is answered. The sample
     clock starts with this call and a host waits no longer than its timeout: where a plant's first
-    ticks compile, `warm_up` a spare one before.
+    ticks compile, `warm_up` a spare one before. `faults` are those of the device's electronics.
     Raises EndpointError when the address cannot be listened on.
     """
     if wire == SERIAL:
-        serve_serial(rig, plant, realtime=realtime, on_ready=on_ready, parent=parent)
+        serve_serial(rig, plant, realtime=realtime, on_ready=on_ready, parent=parent, faults=faults)
         return
     if wire in (CAN, SLCAN):
         # Half a second of imports that no other wire needs.
@@ -172,8 +185,9 @@ def serve(
             adapters.SlcanLine(bitrate) if wire == SLCAN else adapters.SocketcandServer(host, port)
         )
         server.serve_can(
-            rig, plant, adapter, layout=layout, realtime=realtime, on_ready=on_ready, parent=parent
-        )
+            rig, plant, adapter, layout=layout, realtime=realtime, on_ready=on_ready, parent=parent,
+            faults=faults,
+        )  # fmt: skip
         return
     # The library's messages are about frames; what matters to people is raised or logged here.
     logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
@@ -184,7 +198,8 @@ def serve(
         else:
             await serve_until(stop, device, host=host, port=port, on_ready=on_ready)
 
-    asyncio.run(_serve(on_wire, rig, plant, realtime, parent))
+    device = Device(rig, plant, realtime=realtime, faults=faults)
+    asyncio.run(_serve(on_wire, device, parent))
 
 
 def warm_up(rig: Rig, spare: Plant) -> None:
@@ -195,9 +210,7 @@ def warm_up(rig: Rig, spare: Plant) -> None:
 
 async def _serve(
     on_wire: Callable[[asyncio.Event, Device], Awaitable[None]],
-    rig: Rig,
-    plant: Plant,
-    realtime: bool,
+    device: Device,
     parent: int | None,
 ) -> None:
     stop = asyncio.Event()
@@ -208,7 +221,7 @@ async def _serve(
             loop.add_signal_handler(number, stop.set)
     watch = None if parent is None else loop.create_task(_end_with(parent, stop))
     try:
-        await on_wire(stop, Device(rig, plant, realtime=realtime))
+        await on_wire(stop, device)
     finally:
         if watch is not None:
             watch.cancel()
@@ -222,6 +235,11 @@ async def _end_with(parent: int, stop: asyncio.Event) -> None:
             logger.info("process %d, which this server served, has ended", parent)
             stop.set()
         await asyncio.sleep(PARENT_SECONDS)
+
+
+def _abort(connection: ModbusProtocol) -> None:
+    if isinstance(connection.transport, asyncio.WriteTransport):
+        connection.transport.abort()
 
 
 async def _no_such_function(*_args: object) -> ExcCodes:

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field
 
-from hil_sim.faults import machine, sensors
+from hil_sim.faults import device, machine, sensors, wire
 from hil_sim.faults.base import Fault
 
 CLASSES: tuple[type[Fault], ...] = tuple(
     kind
-    for module in (sensors, machine)
+    for module in (sensors, machine, device, wire)
     for kind in vars(module).values()
     if isinstance(kind, type)
     and issubclass(kind, Fault)

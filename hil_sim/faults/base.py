@@ -1,9 +1,9 @@
 """What every fault of the simulated bench is: frozen data, when it acts, and what it then does.
 
 A fault breaks the bench while it runs, at `at` seconds of the device's time, and mends at `until`
-(never, where none is given). It is one class of a module of this package. Two ways to act: on the
-plant's tables (`begin` changes them, what it returns mends them) and on the converter codes of a
-block (`distort`).
+(never, where none is given). It is one class of a module of this package. Ways to act: on the
+plant's tables (`begin` changes them, what it returns mends them), on the converter codes of a
+block (`distort`), on the device (`hil_sim.faults.device`), on frames (`hil_sim.faults.wire`).
 """
 
 from __future__ import annotations

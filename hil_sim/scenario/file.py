@@ -6,6 +6,7 @@
     parameters: {b: 200 MPa}     # the machine itself, otherwise than its file says
     faults:                      # what breaks while the bench runs, by the device's time
       - {name: sensor_stuck, channel: cap_pressure_1, at: 12 s}
+      - {name: frame_lost, probability: 0.01, at: 5 s, until: 20 s}
     noise: 0.5                   # of what the rig's sensors state
 
 `Scenario()` is a bench with nothing wrong. Names are those of CONTRACT, "Effects"; their forms
@@ -23,6 +24,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validat
 from hil_sim.effects import AnyEffect
 from hil_sim.effects.base import with_units
 from hil_sim.faults import AnyFault
+from hil_sim.faults.device import DeviceFault
+from hil_sim.faults.wire import WireFault
 from rig.model.parameters import parameter_unit
 from rig.model.parse import InputError, parse_model
 from rig.model.quantity import Ratio
@@ -39,6 +42,16 @@ class Scenario(BaseModel):
     faults: tuple[AnyFault, ...] = ()
     parameters: Mapping[str, float] = {}
     noise: Annotated[Ratio, Field(ge=0, description="of the sensors' stated noise")] = 1.0
+
+    @property
+    def wire_faults(self) -> tuple[WireFault, ...]:
+        """The faults that strike frames between host and device."""
+        return tuple(fault for fault in self.faults if isinstance(fault, WireFault))
+
+    @property
+    def device_faults(self) -> tuple[DeviceFault, ...]:
+        """The faults of the device's electronics."""
+        return tuple(fault for fault in self.faults if isinstance(fault, DeviceFault))
 
     @field_validator("parameters", mode="before")
     @classmethod

@@ -26,6 +26,10 @@ def sim(
         typer.Option(help="A file of hidden effects, worn-seal, or random: drawn by the seed."),
     ] = None,
     seed: Annotated[int, typer.Option(help="Of noise, temperature, and what is drawn.", min=0)] = 0,
+    wire_faults: Annotated[
+        str | None,
+        typer.Option(help="Faults of the wire: a file, or a name such as frame_lost (1 % of all)."),
+    ] = None,
     port: Annotated[
         int | None, typer.Option(help="0 takes a free one.  [default: the rig's]", min=0, max=65535)
     ] = None,
@@ -44,7 +48,7 @@ def sim(
     """
     from rig.cli.simulator import Served, serve_bench
 
-    serve_bench(Served(rig, seed, scenario, port, real_time, truth, parent, wire))
+    serve_bench(Served(rig, seed, scenario, port, real_time, truth, parent, wire, wire_faults))
 
 
 def register(app: typer.Typer) -> None:

@@ -4,13 +4,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from drivers.modbus_tcp import TcpSettings
 from hil_sim.device.server import CAN, SLCAN, TCP, WIRES, EndpointError, serve, warm_up
+from hil_sim.faults import CLASSES
+from hil_sim.faults.wire import WireFault
+from hil_sim.link.link import FaultyLink
+from hil_sim.link.wires import faulty_link
 from hil_sim.plant.faulty import FaultyPlant
 from hil_sim.plant.plant import Plant
-from hil_sim.scenario.file import Scenario, load_shipped, parse_scenario, shipped_scenarios
+from hil_sim.scenario.file import (
+    Scenario,
+    load_shipped,
+    parse_scenario,
+    shipped_scenarios,
+)
 from hil_sim.scenario.random_draw import RANDOM, draw
 from rig.cli.errors import WorkError
 from rig.cli.truth_file import write_truth
@@ -19,13 +28,16 @@ from rig.model.rig import Rig
 from rig.runs.files import read_text
 from rig.runs.rigs import load_bench
 
+USUAL_SHARE: Final = 0.01  # of the frames that a fault given by its name strikes
+
 
 @dataclass(frozen=True)
 class Served:
     """What to serve and where.
 
     `scenario` is a file of hidden effects, a shipped one's name, or ``random``: drawn here, by
-    `seed`; `truth` is a file for the plant's true parameters and what it hides.
+    `seed`; `truth` is a file for the plant's true parameters and what it hides. `wire_faults` is a
+    file of faults or the name of a fault of the wire, which then strikes one frame in a hundred.
     """
 
     rig: str
@@ -36,6 +48,7 @@ class Served:
     truth: Path | None = None
     parent: int | None = None
     wire: str = TCP
+    wire_faults: str | None = None
 
 
 def _endpoint_first(endpoint: str) -> None:
@@ -54,28 +67,71 @@ def hidden(what: Served, rig: Rig) -> Scenario:
     return parse_scenario(read_text(Path(what.scenario), "a scenario"), what.scenario)
 
 
+def wire_faults(name: str | None) -> tuple[WireFault, ...]:
+    """Return the faults of the wire that a file holds or a name stands for; raises InputError."""
+    if name is None:
+        return ()
+    known = {kind.fault_name(): kind for kind in CLASSES if issubclass(kind, WireFault)}
+    if name in known:
+        return (known[name].model_validate({"name": name, "probability": USUAL_SHARE}),)
+    path = Path(name)
+    if not path.suffix and not path.exists():
+        raise InputError(
+            f"--wire-faults {name}: expected a file, or one of: {' '.join(sorted(known))}"
+        )
+    scenario = parse_scenario(read_text(path, "a scenario"), name)
+    if scenario != Scenario(description=scenario.description, faults=scenario.wire_faults):
+        raise InputError(
+            f"--wire-faults {name}: expected faults of the wire only ({' '.join(sorted(known))}); "
+            "give everything else as --scenario"
+        )
+    return scenario.wire_faults
+
+
 def serve_bench(what: Served) -> None:
     """Serve a simulated bench; raises InputError for bad files, WorkError for a busy port."""
     if what.wire not in WIRES:
         raise InputError(f"--wire {what.wire}: expected one of: {' '.join(WIRES)}")
     rig = load_bench(what.rig)
     scenario = hidden(what, rig)
+    faults = (*scenario.wire_faults, *wire_faults(what.wire_faults))
     plant = FaultyPlant(rig, scenario, what.seed)
     # Compiled before anybody waits for an answer, on a spare so that this one starts at rest.
     warm_up(rig, Plant(rig, scenario, what.seed))
     write_truth(what.truth, plant.plant.truth(), scenario.model_dump(mode="json"))
+    place = _place(what, rig)
+    links: list[FaultyLink] = []
+
+    def ready(endpoint: str) -> None:
+        if faults:
+            links.append(
+                faulty_link(
+                    endpoint,
+                    faults,
+                    seed=what.seed,
+                    seconds=lambda: plant.tick / rig.sample_rate,
+                    port=place.get("port", 0),
+                )
+            )
+            endpoint = links[0].endpoint
+        _endpoint_first(endpoint)
+
     try:
         serve(
             rig,
             plant,
-            **_place(what, rig),
+            **(place | {"port": 0} if faults else place),
             wire=what.wire,
             realtime=what.real_time,
-            on_ready=_endpoint_first,
+            on_ready=ready,
             parent=what.parent,
+            faults=scenario.device_faults,
         )
     except EndpointError as error:
         raise WorkError(str(error)) from error
+    finally:
+        for link in links:
+            link.close()
 
 
 def _place(what: Served, rig: Rig) -> dict[str, Any]:

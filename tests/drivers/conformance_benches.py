@@ -25,7 +25,7 @@ from hil_sim.device.can.server import layout_of, run_device
 from hil_sim.device.device import Device
 from hil_sim.device.pty_line import PtyLine
 from hil_sim.device.rtu_server import serve_line
-from hil_sim.device.serial_server import serve_line_until
+from hil_sim.device.serial_server import serve_port
 from hil_sim.device.server import serve_until
 from rig.model import channels as ch
 from rig.model.parts import Wire
@@ -307,7 +307,7 @@ def _rtu() -> Iterator[Bench]:
 @contextmanager
 def _serial() -> Iterator[Bench]:
     line = PtyLine()
-    served = Ended(line, partial(serve_line_until, owner=None))
+    served = Ended(line, partial(serve_port, owner=None))
 
     def driver(rig: Rig) -> Any:
         return SerialStreamDriver(_reached(rig, "serial", {"device": line.name}), rig)

@@ -13,6 +13,7 @@ from hil_sim.device.can.adapters import Adapter
 from hil_sim.device.can.session import CanSession
 from hil_sim.device.device import Device, Plant
 from hil_sim.device.lifetime import PARENT_SECONDS, Owner, told_to_end
+from hil_sim.faults.device import DeviceFault
 from rig.model.rig import Rig
 from rig.model.wire.can_database import database_text
 from rig.model.wire.can_layout import CanLayout, read_layout
@@ -34,12 +35,13 @@ def serve_can(
     realtime: bool = False,
     on_ready: Callable[[str], None] = logger.info,
     parent: int | None = None,
+    faults: Sequence[DeviceFault] = (),
 ) -> None:
     """Serve a plant on a bus until SIGTERM, SIGINT or the end of process `parent`.
 
     `on_ready` is called once with the adapter's endpoint; the sample clock starts with this call.
     """
-    device = Device(rig, plant, realtime=realtime)
+    device = Device(rig, plant, realtime=realtime, faults=faults)
     try:
         with told_to_end() as ended:
             on_ready(adapter.endpoint)

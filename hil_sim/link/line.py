@@ -1,0 +1,132 @@
+"""A faulty link on a serial line: a pseudo-terminal before the device's own."""
+
+from __future__ import annotations
+
+import os
+import select
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Final
+
+from hil_sim.device.lifetime import EndpointError
+from hil_sim.device.pty_line import PtyLine
+from hil_sim.faults.wire import End, WireFault
+from hil_sim.link.frames import Framing
+from hil_sim.link.link import FaultyLink
+
+_CHUNK: Final = 65_536
+_UNPLUGGED_SECONDS: Final = 0.01  # between two looks for a host while there is none
+
+
+class LineLink(FaultyLink):
+    """A pty whose name outlives a pulled plug: a link in a folder, as udev makes them by id.
+
+    A host that opens it opens the device's line at `target`, ``serial:///dev/pts/3``, and closes it
+    by closing. On a line one way that ends is silent, both that end unplug the host's side.
+    """
+
+    def __init__(
+        self,
+        target: str,
+        framing: Framing,
+        faults: Sequence[WireFault] = (),
+        seed: int = 0,
+        seconds: Callable[[], float] | None = None,
+        port: int = 0,
+    ) -> None:
+        super().__init__(framing, faults, seed, seconds)
+        kind, _, self._target = target.partition("://")
+        self._folder = TemporaryDirectory(prefix="bramah-line-")
+        self._name = Path(self._folder.name) / "line"
+        self._endpoint = f"{kind}://{self._name}"
+        self._device: int | None = None
+        self._unsent = b""
+        self._to_device, self._to_host = self._ways()
+        self._plug_in()
+        self._start()
+
+    @property
+    def endpoint(self) -> str:
+        """Where the host reaches the device through this link."""
+        return self._endpoint
+
+    def _plug_in(self) -> None:
+        self._line = PtyLine()
+        self._name.unlink(missing_ok=True)
+        self._name.symlink_to(self._line.name)
+
+    def _step(self) -> None:
+        line = self._line
+        if line.connected and self._device is not None:
+            ways = (self._to_device, self._to_host)
+            reading = [line.fd, *([] if self._to_host.full else [self._device])]
+            patience = self._patience(ways, time.monotonic())
+            ready, _, _ = select.select(reading, [], [], patience)
+            if self._device in ready:
+                self._from_device(self._device)
+        data = line.receive(0.0 if line.connected else _UNPLUGGED_SECONDS)
+        if data is None:
+            self._close_device()
+        elif data or (line.connected and self._device is None):
+            self._open_device()
+            now = time.monotonic()
+            if self._to_device.take(data, now, self.seconds()):
+                self._to_host.other_way(now)
+        self._send()
+
+    def _from_device(self, device: int) -> None:
+        data = b""
+        with suppress(BlockingIOError, OSError):
+            data = os.read(device, _CHUNK)
+        now = time.monotonic()
+        if data and self._to_host.take(data, now, self.seconds()):
+            self._to_device.other_way(now)
+        elif not data:
+            self._unplug()  # the device has ended
+
+    def _send(self) -> None:
+        now = time.monotonic()
+        for piece in self._to_device.due(now):
+            self._unsent += piece.data
+            if piece.end is End.LINK:
+                self._unplug()
+                return
+        for piece in self._to_host.due(now):
+            self._line.send(piece.data)
+            if piece.end is End.LINK:
+                self._unplug()
+                return
+        if self._unsent and self._device is not None:
+            with suppress(BlockingIOError):
+                self._unsent = self._unsent[os.write(self._device, self._unsent) :]
+
+    def _open_device(self) -> None:
+        if self._device is None:
+            try:
+                flags = os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK
+                self._device = os.open(self._target, flags)
+            except OSError as error:
+                raise EndpointError(f"cannot open {self._target}: {error.strerror}") from error
+
+    def _close_device(self) -> None:
+        device, self._device = self._device, None
+        if device is not None:
+            os.close(device)
+        self._unsent = b""
+        self._to_device, self._to_host = self._ways()
+
+    def _unplug(self) -> None:
+        self._close_device()
+        self._line.close()
+        self._plug_in()
+
+    def _hang_up(self) -> None:
+        if self._line.connected or self._device is not None:
+            self._unplug()
+
+    def _end(self) -> None:
+        self._line.close()
+        self._folder.cleanup()

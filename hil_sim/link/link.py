@@ -1,0 +1,124 @@
+"""A link that stands between a host and a device and does to their frames what its faults say.
+
+One thread carries both ways. What it needs of a kind of wire is a class with its sockets or
+terminals (`hil_sim.link.tcp`, `hil_sim.link.line`; `hil_sim.link.wires` lists them).
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Final, Self
+
+from hil_sim.faults.wire import TO_DEVICE, TO_HOST, WireFault
+from hil_sim.link.frames import Framing
+from hil_sim.link.way import Striker, Way
+
+logger = logging.getLogger(__name__)
+
+LONGEST_WAIT: Final = 0.05  # [s] of one wait for bytes: what another thread asks for waits so long
+_END_SECONDS: Final = 5.0
+
+
+class FaultyLink(ABC):
+    """A link in a thread of its own; a context manager that ends it.
+
+    `seconds` is the device's time, by which faults begin and end; without it, the time since the
+    link was made. Frames are struck as `seed` draws it, each way by its own draw.
+    """
+
+    def __init__(
+        self,
+        framing: Framing,
+        faults: Sequence[WireFault] = (),
+        seed: int = 0,
+        seconds: Callable[[], float] | None = None,
+    ) -> None:
+        self._framing = framing
+        self._strikers = (
+            Striker(TO_DEVICE, faults, (seed, 0)),
+            Striker(TO_HOST, faults, (seed, 1)),
+        )
+        made = time.monotonic()
+        self.seconds = seconds or (lambda: time.monotonic() - made)
+        self._closing = False
+        self._cut = False
+        self._thread = threading.Thread(target=self._run, name="faulty link", daemon=True)
+
+    @property
+    @abstractmethod
+    def endpoint(self) -> str:
+        """Where the host reaches the device through this link."""
+
+    @abstractmethod
+    def _step(self) -> None:
+        """Carry what there is to carry, waiting for it at most `LONGEST_WAIT`."""
+
+    @abstractmethod
+    def _hang_up(self) -> None:
+        """End every connection of both sides."""
+
+    @abstractmethod
+    def _end(self) -> None:
+        """Give back what the link holds of the system."""
+
+    @property
+    def injected(self) -> Counter[str]:
+        """How many frames each fault has struck."""
+        first, second = self._strikers
+        return first.counts + second.counts
+
+    def use(self, faults: Sequence[WireFault]) -> None:
+        """Do other things to frames from now on; without any the link is healthy."""
+        for striker in self._strikers:
+            striker.use(faults)
+
+    def cut(self) -> None:
+        """End every connection, as the death of the host's process does."""
+        self._cut = True
+        deadline = time.monotonic() + _END_SECONDS
+        while self._cut and time.monotonic() < deadline:
+            time.sleep(LONGEST_WAIT / 50)
+
+    def close(self) -> None:
+        """End the link and its thread."""
+        self._closing = True
+        self._thread.join(_END_SECONDS)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _start(self) -> None:
+        self._thread.start()
+
+    def _ways(self) -> tuple[Way, Way]:
+        """Return the ways of a new connection: to the device, to the host."""
+        to_device, to_host = self._strikers
+        framing = self._framing
+        return Way(to_device, framing.to_device), Way(to_host, framing.to_host)
+
+    def _patience(self, ways: Sequence[Way], now: float) -> float:
+        """Return how long [s] the link may wait for bytes before a piece is due."""
+        due = min((way.next_time() for way in ways), default=math.inf)
+        return min(max(due - now, 0.0), LONGEST_WAIT)
+
+    def _run(self) -> None:
+        try:
+            while not self._closing:
+                if self._cut:
+                    self._hang_up()
+                    self._cut = False
+                self._step()
+        except OSError:
+            logger.exception("the link has failed")
+        finally:
+            self._hang_up()
+            self._end()

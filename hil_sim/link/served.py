@@ -1,0 +1,104 @@
+"""A device served in a thread of this process, behind a link whose faults can be changed."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from typing import Final, Self, TypeVar
+
+from hil_sim.device.device import Device
+from hil_sim.device.pty_line import PtyLine
+from hil_sim.device.rtu_server import serve_line
+from hil_sim.device.serial_server import serve_port
+from hil_sim.device.server import RTU, SERIAL, serve_until
+from hil_sim.faults.wire import WireFault
+from hil_sim.link.wires import faulty_link
+
+Answer = TypeVar("Answer")
+_SECONDS: Final = 60.0  # nothing here takes that long; a hang ends in an error
+
+
+class ServedDevice:
+    """A device behind a wire, for benches that look into the device while a host drives it.
+
+    `link` is what the host reaches it by (`link.endpoint`); `inside` makes a call while the
+    device rests. A context manager that ends both.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        wire: str,
+        *,
+        faults: Sequence[WireFault] = (),
+        seed: int = 0,
+        seconds: Callable[[], float] | None = None,
+    ) -> None:
+        self.device = device
+        self._lock = threading.Lock()
+        self._ended: list[bool] = []
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._endpoint: Future[str] = Future()
+        work = self._serve_port if wire == SERIAL else lambda: asyncio.run(self._serve(wire))
+        self._thread = threading.Thread(target=self._serve_or_tell, args=(work,), daemon=True)
+        self._thread.start()
+        target = self._endpoint.result(_SECONDS)
+        self.link = faulty_link(target, faults, seed=seed, seconds=seconds)
+
+    def inside(self, call: Callable[[], Answer]) -> Answer:
+        """Make a call in between what the device does for its host."""
+        loop = self._loop
+        if loop is None:
+            with self._lock:
+                return call()
+        done: Future[Answer] = Future()
+
+        def work() -> None:
+            try:
+                done.set_result(call())
+            except BaseException as error:
+                done.set_exception(error)
+
+        loop.call_soon_threadsafe(work)
+        return done.result(_SECONDS)
+
+    def close(self) -> None:
+        """End link, server and thread."""
+        self.link.close()
+        self._ended.append(True)
+        if self._loop is not None:
+            self._loop.call_soon_threadsafe(self._stop.set)
+        self._thread.join(_SECONDS)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _serve_or_tell(self, work: Callable[[], None]) -> None:
+        try:
+            work()
+        except Exception as error:
+            if self._endpoint.done():
+                raise
+            self._endpoint.set_exception(error)
+
+    def _serve_port(self) -> None:
+        line = PtyLine()
+        self._endpoint.set_result(f"{SERIAL}://{line.name}")
+        try:
+            serve_port(line, self.device, self._ended, lock=self._lock)
+        finally:
+            self.device.zero()
+            line.close()
+
+    async def _serve(self, wire: str) -> None:
+        self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
+        ready = self._endpoint.set_result
+        if wire == RTU:
+            await serve_line(self._stop, self.device, on_ready=ready)
+        else:
+            await serve_until(self._stop, self.device, host="127.0.0.1", port=0, on_ready=ready)

@@ -1,0 +1,143 @@
+"""One way of a link: frames in, spoiled pieces out, each at its time. No sockets, no clock.
+
+Glossary: a *way* is one direction of one connection; its *striker* decides what becomes of each
+frame and lives as long as the link, so that a new connection does not meet the same faults again.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections import Counter, deque
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from hil_sim.faults.wire import End, Piece, Release, WireFault
+from hil_sim.link.frames import Cutter
+
+logger = logging.getLogger(__name__)
+
+STREAM: Final = 4  # of a bench's seed; 0 to 3 are the plant's, drawn scenarios' and its faults'
+QUIET: Final = 0.02  # [s] after which bytes that are no whole frame go on as they are
+MOST_WAITING: Final = 8192  # bytes that a way holds before it takes no more
+
+
+class Striker:
+    """Draws, by a seed, which frames of one way are struck by which fault."""
+
+    def __init__(self, way: str, faults: Sequence[WireFault], seed: Sequence[int]) -> None:
+        self.way = way
+        self._rng = np.random.default_rng([*seed, STREAM])
+        self._faults: tuple[WireFault, ...] = ()
+        self._struck: Counter[int] = Counter()
+        self.counts: Counter[str] = Counter()
+        self.use(faults)
+
+    def use(self, faults: Sequence[WireFault]) -> None:
+        """Strike with other faults from the next frame on; what each may do at most begins anew."""
+        self._struck = Counter()
+        self._faults = tuple(fault for fault in faults if fault.strikes(self.way))
+
+    def strike(self, frame: bytes, seconds: float) -> Sequence[Piece]:
+        """Return what becomes of a frame at `seconds` of the device's time; one fault a frame."""
+        for number, fault in enumerate(self._faults):
+            until = math.inf if fault.until is None else fault.until
+            spent = fault.most is not None and self._struck[number] >= fault.most
+            if spent or not fault.at <= seconds < until:
+                continue
+            if fault.probability < 1.0 and self._rng.random() >= fault.probability:
+                continue
+            self._struck[number] += 1
+            self.counts[fault.name] += 1
+            logger.info("%.3f s: %s, %s, %d bytes", seconds, fault.name, self.way, len(frame))
+            return fault.spoil(frame, self._rng)
+        return (Piece(frame),)
+
+
+@dataclass(frozen=True)
+class _Due:
+    """A piece with the time [s of the wall clock] from which on it may go."""
+
+    at: float
+    piece: Piece
+
+
+class Way:
+    """The frames of one direction of one connection, in order but where a fault says otherwise."""
+
+    def __init__(self, striker: Striker, cut: Cutter) -> None:
+        self._striker, self._cut = striker, cut
+        self._buffer = b""
+        self._heard = 0.0
+        self._ready: deque[_Due] = deque()
+        self._behind: list[Piece] = []  # for the next frame to go first
+        self._before: list[_Due] = []  # to go in one piece with the next frame, or at their time
+        self._asked: list[Piece] = []  # for the other way's next frame
+        self.ended = False
+
+    @property
+    def full(self) -> bool:
+        """Whether so much waits that no more should be taken in."""
+        return sum(len(due.piece.data) for due in self._ready) > MOST_WAITING
+
+    def take(self, data: bytes, now: float, seconds: float) -> int:
+        """Take bytes in; returns how many whole frames they completed."""
+        self._buffer += data
+        self._heard = now
+        frames = 0
+        while length := self._cut(self._buffer):
+            frame, self._buffer = self._buffer[:length], self._buffer[length:]
+            self._frame(frame, now, seconds)
+            frames += 1
+        return frames
+
+    def other_way(self, now: float) -> None:
+        """Note a frame of the other way: late answers go on."""
+        asked, self._asked = self._asked, []
+        self._queue(asked, now)
+
+    def due(self, now: float) -> list[Piece]:
+        """Return the pieces that go now."""
+        if self._buffer and now - self._heard > QUIET:
+            whole, self._buffer = self._buffer, b""
+            self._queue([Piece(whole)], now)
+        while self._before and self._before[0].at <= now:
+            self._queue([replace(self._before.pop(0).piece, wait=0.0)], now)
+        found = []
+        while self._ready and self._ready[0].at <= now:
+            found.append(self._ready.popleft().piece)
+        return found
+
+    def next_time(self) -> float:
+        """Return the earliest time [s] at which `due` may have something, inf if none is known."""
+        times = [due.at for due in (*list(self._ready)[:1], *self._before[:1])]
+        return min([*times, *([self._heard + QUIET] if self._buffer else [])], default=math.inf)
+
+    def _frame(self, frame: bytes, now: float, seconds: float) -> None:
+        if self.ended:
+            return
+        pieces = list(self._striker.strike(frame, seconds))
+        joined, self._before = b"".join(due.piece.data for due in self._before), []
+        behind, self._behind = self._behind, []
+        if joined:
+            first = pieces.pop(0) if pieces else Piece(b"")
+            pieces.insert(0, replace(first, data=joined + first.data))
+        self._queue(pieces, now)
+        self._queue([replace(piece, release=Release.TIME) for piece in behind], now)
+
+    def _queue(self, pieces: Sequence[Piece], now: float) -> None:
+        for piece in pieces:
+            if piece.release is Release.NEXT_FRAME:
+                self._behind.append(piece)
+            elif piece.release is Release.WITH_NEXT:
+                held = replace(piece, release=Release.TIME)
+                self._before.append(_Due(now + piece.wait, held))
+            elif piece.release is Release.OTHER_WAY:
+                self._asked.append(replace(piece, release=Release.TIME))
+            else:
+                last = self._ready[-1].at if self._ready else now
+                self._ready.append(_Due(max(last, now) + piece.wait, piece))
+            self.ended = self.ended or piece.end is not End.NONE
