@@ -89,8 +89,6 @@ class BlockDecoder:
         last = -1 if self._sequence is None else self._sequence
         lost = (header.sequence - last - 1) & 0xFFFF
         expected = self.tick + lost * self.layout.samples
-        if self._sequence is None:
-            self.refuse_restarted(header.tick)
         # Before a stream's first block any time may pass, but none backwards.
         if lost > 0x7FFF or tick < expected or (tick > expected and self._sequence is not None):
             raise DeviceError(

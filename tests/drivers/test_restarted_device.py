@@ -23,7 +23,7 @@ DRIVING = [OutputLaw(bias=0.5, limit=1.0), OutputLaw()]
 @contextmanager
 def streaming(wire: str, *faults: DeviceFault) -> Iterator[tuple[Driver, ServedDevice]]:
     """A driver that drives joint 1 of a device with these faults."""
-    rig = seed_rig(timeout=0.1)
+    rig = seed_rig(timeout=0.6)
     device = Device(rig, IntegratorPlant(rig), realtime=False, faults=faults)
     with ServedDevice(device, wire) as served:
         driver = make_driver(wire_at(served.link.endpoint, rig.wire), rig)
