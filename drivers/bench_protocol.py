@@ -31,6 +31,10 @@ class DeviceSilent(DeviceLost):
     """No answer came in time; the same request may be worth another try."""
 
 
+class AnswerDamaged(DeviceSilent):
+    """What came in time was damaged on its way; the same request may be worth another try."""
+
+
 def check_identity(data: bytes, rig: Rig, where: str) -> DeviceInfo:
     """Return who answered with the bytes of the identity group (`reg.IDENTITY_SPAN`).
 

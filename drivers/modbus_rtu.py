@@ -17,7 +17,8 @@ from pydantic import Field
 from pymodbus.client import ModbusSerialClient
 from serial import SerialException
 
-from drivers.base import DeviceLost, WireSettings
+from drivers.base import DeviceError, DeviceLost, WireSettings
+from drivers.bench_protocol import AnswerDamaged
 from drivers.modbus_tcp import ModbusTcpDriver
 from drivers.modbus_transport import ModbusConnection
 from rig.model.parts import Wire
@@ -69,6 +70,13 @@ class RtuConnection(ModbusConnection):
 
     def _answers_earlier_request(self, data: bytes) -> bool:
         return False  # no frame says which request it answers
+
+    def _no_answer(self, received: int) -> DeviceError:
+        self.settle()
+        return AnswerDamaged(
+            f"{received} bytes came from {self.where} that are no whole answer; check cable, baud "
+            "rate and parity"
+        )
 
     def settle(self) -> None:
         """Read and drop what still arrives, until the line is quiet.

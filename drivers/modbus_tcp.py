@@ -25,6 +25,7 @@ from drivers.base import (
 )
 from drivers.bench_protocol import (
     VIRTUAL_PATIENCE,
+    AnswerDamaged,
     DeviceRefused,
     DeviceSilent,
     check_identity,
@@ -240,11 +241,12 @@ class ModbusTcpDriver:
                 # It may have been the late answer to the first try; then another is on its way.
                 self._link.settle()
                 return answer
-            except DeviceSilent:
+            except DeviceSilent as again:
                 self._link.close()
+                damaged = f"; {again}" if isinstance(again, AnswerDamaged) else ""
                 raise DeviceLost(
                     f"the device at {self._link.where} has not answered for "
-                    f"{self._wire.timeout:g} s"
+                    f"{self._wire.timeout:g} s{damaged}"
                 ) from None
 
     def _exchange_once(self) -> bytes:

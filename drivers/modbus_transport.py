@@ -173,12 +173,16 @@ class ModbusConnection:
             self.close()
             return DeviceLost(f"the device at {self.where} closed the connection")
         if received:
-            self.close()
-            return DeviceError(
-                f"the device at {self.where} answered {received} bytes that are no Modbus answer "
-                "to the request; does another program listen on this port?"
-            )
+            return self._no_answer(received)
         return DeviceSilent(f"the device at {self.where} does not answer ({self._timeout:g} s)")
+
+    def _no_answer(self, received: int) -> DeviceError:
+        """Return what `received` bytes mean that are no answer; leaves nothing of them behind."""
+        self.close()
+        return DeviceError(
+            f"the device at {self.where} answered {received} bytes that are no Modbus answer "
+            "to the request; does another program listen on this port?"
+        )
 
     def _note(self, sending: bool, data: bytes) -> bytes:
         if sending:

@@ -22,6 +22,7 @@ from rig.model.quantity import Ratio, Time
 TO_HOST: Final = "to host"
 TO_DEVICE: Final = "to device"
 BOTH: Final = "both"
+TCP_SENDS_AGAIN: Final = 0.2  # [s]: the least time of Linux after which TCP does
 
 
 class Release(Enum):
@@ -70,6 +71,10 @@ class WireFault(Fault):
     def spoil(self, frame: bytes, rng: np.random.Generator) -> Sequence[Piece]:
         """Return what becomes of a frame."""
         raise NotImplementedError
+
+    def over_tcp(self, frame: bytes, rng: np.random.Generator) -> Sequence[Piece]:
+        """Return what becomes of a frame on a wire that has TCP beneath it."""
+        return self.spoil(frame, rng)
 
 
 class FrameLost(WireFault):
@@ -147,10 +152,19 @@ class FramesMerged(WireFault):
 
 
 class BitsFlipped(WireFault):
-    """Some `bits` of the frame, drawn at random, are turned."""
+    """Some `bits` of the frame, drawn at random, are turned.
+
+    TCP's own checksum drops such a frame and sends it again; `past_checksum` lets it pass, as
+    behind a gateway that damages what it hands on.
+    """
 
     name: Literal["bits_flipped"]
     bits: int = Field(default=1, ge=1, le=64)
+    past_checksum: bool = False
+
+    def over_tcp(self, frame: bytes, rng: np.random.Generator) -> Sequence[Piece]:
+        """Let TCP send the frame again, unless the damage is past its checksum."""
+        return self.spoil(frame, rng) if self.past_checksum else (Piece(frame, TCP_SENDS_AGAIN),)
 
     def spoil(self, frame: bytes, rng: np.random.Generator) -> Sequence[Piece]:
         """Turn bits, each in another place."""

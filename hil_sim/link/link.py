@@ -13,7 +13,7 @@ import time
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Sequence
-from typing import Final, Self
+from typing import ClassVar, Final, Self
 
 from hil_sim.faults.wire import TO_DEVICE, TO_HOST, WireFault
 from hil_sim.link.frames import Framing
@@ -32,6 +32,8 @@ class FaultyLink(ABC):
     link was made. Frames are struck as `seed` draws it, each way by its own draw.
     """
 
+    tcp: ClassVar[bool] = False  # whether TCP carries it, whose checksum and retries lie beneath
+
     def __init__(
         self,
         framing: Framing,
@@ -41,8 +43,8 @@ class FaultyLink(ABC):
     ) -> None:
         self._framing = framing
         self._strikers = (
-            Striker(TO_DEVICE, faults, (seed, 0)),
-            Striker(TO_HOST, faults, (seed, 1)),
+            Striker(TO_DEVICE, faults, (seed, 0), tcp=self.tcp),
+            Striker(TO_HOST, faults, (seed, 1), tcp=self.tcp),
         )
         made = time.monotonic()
         self.seconds = seconds or (lambda: time.monotonic() - made)

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Final
+from typing import ClassVar, Final
 from urllib.parse import urlsplit
 
 from hil_sim.device.lifetime import EndpointError
@@ -35,6 +35,8 @@ class _Side:
 
 class TcpLink(FaultyLink):
     """Listens on loopback, connects to the device at `target` for each host that comes."""
+
+    tcp: ClassVar[bool] = True
 
     def __init__(
         self,

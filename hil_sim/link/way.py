@@ -28,8 +28,11 @@ MOST_WAITING: Final = 8192  # bytes that a way holds before it takes no more
 class Striker:
     """Draws, by a seed, which frames of one way are struck by which fault."""
 
-    def __init__(self, way: str, faults: Sequence[WireFault], seed: Sequence[int]) -> None:
+    def __init__(
+        self, way: str, faults: Sequence[WireFault], seed: Sequence[int], *, tcp: bool = False
+    ) -> None:
         self.way = way
+        self._tcp = tcp
         self._rng = np.random.default_rng([*seed, STREAM])
         self._faults: tuple[WireFault, ...] = ()
         self._struck: Counter[int] = Counter()
@@ -53,7 +56,7 @@ class Striker:
             self._struck[number] += 1
             self.counts[fault.name] += 1
             logger.info("%.3f s: %s, %s, %d bytes", seconds, fault.name, self.way, len(frame))
-            return fault.spoil(frame, self._rng)
+            return (fault.over_tcp if self._tcp else fault.spoil)(frame, self._rng)
         return (Piece(frame),)
 
 

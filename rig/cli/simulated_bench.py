@@ -42,12 +42,14 @@ def simulated_bench(
     truth: Path | None = None,
     real_time: bool = False,
     scenario: Path | str | None = None,
+    wire: str = "modbus-tcp",
 ) -> Iterator[str]:
-    """Start `bramah sim` on a free port, yield its endpoint, end it; raises WorkError if it fails.
+    """Start `bramah sim` on a wire and a free port, yield its endpoint, end it; or raise WorkError.
 
     The child also ends by itself when this process is gone.
     """
     words = ["sim", "--rig", rig, "--port", "0", "--seed", str(seed), "--parent", str(os.getpid())]
+    words += ["--wire", wire]
     words += [] if truth is None else ["--truth", str(truth)]
     words += ["--real-time"] if real_time else []
     words += [] if scenario is None else ["--scenario", str(scenario)]

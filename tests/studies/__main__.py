@@ -12,6 +12,7 @@ from rig.cli.errors import guarded
 from tests.studies.effects import command as effects
 from tests.studies.estimators import command as estimators
 from tests.studies.estimators import design_command as design
+from tests.studies.faults import command as faults
 from tests.studies.machines import crane_command as crane
 from tests.studies.machines import electric_command as electric
 from tests.studies.machines import emps_command as emps
@@ -34,6 +35,7 @@ STUDIES = (
     pendulum,
     electric,
     measured_figures,
+    faults,
 )
 
 app = typer.Typer(

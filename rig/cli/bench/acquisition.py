@@ -56,11 +56,12 @@ def measure_acquisition(
         "lost_samples": lost,
         "out_of_order_blocks": disordered,
         "backlog_max_blocks": backlog,
-        **_timing(np.array(ends), np.array(arrivals)),
+        **timing(np.array(ends), np.array(arrivals)),
     }
 
 
-def _timing(ends: np.ndarray, arrivals: np.ndarray) -> dict[str, float | int]:
+def timing(ends: np.ndarray, arrivals: np.ndarray) -> dict[str, float | int]:
+    """Return lateness, jitter and drift of blocks whose last samples were taken at `ends` [s]."""
     late = arrivals - ends
     drift = float(np.polyfit(ends - ends[0], late, 1)[0]) if len(late) > 2 else 0.0
     late = late - drift * (ends - ends[0])

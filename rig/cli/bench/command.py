@@ -14,14 +14,14 @@ from rig.cli.output import progress, write_json
 def bench(
     json: JsonOption = None,
     minutes: Annotated[
-        float, typer.Option(min=0.02, help="Of real-time acquisition over the wire.")
+        float, typer.Option(min=0.02, help="Of real-time acquisition, over each wire.")
     ] = 10.0,
     seeds: Annotated[
         int, typer.Option(min=1, help="Simulated benches to identify, from seed 100 on.")
     ] = 10,
     only: Annotated[
         str | None,
-        typer.Option(help="One of: plant, analysis, stream, demo, acquisition."),
+        typer.Option(help="One of: plant, analysis, stream, demo, acquisition, wires, faults."),
     ] = None,
     docs: Annotated[Path | None, typer.Option(help="Also write the table as a page.")] = None,
 ) -> None:

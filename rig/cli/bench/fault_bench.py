@@ -1,0 +1,159 @@
+"""A simulated bench in a process of its own whose faults a figure can switch on and read back."""
+
+from __future__ import annotations
+
+import multiprocessing
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from typing import Any, Final
+
+from hil_sim.device.device import Device
+from hil_sim.faults.base import Fault
+from hil_sim.faults.wire import WireFault
+from hil_sim.link.served import ServedDevice
+from hil_sim.plant.faulty import FaultyPlant
+from hil_sim.scenario.file import Scenario
+from rig.model.rig import Rig
+
+SILENCE: Final = 3.0  # [s] after which a device in virtual time misses its host
+_PATIENCE: Final = 60.0
+
+
+@dataclass(frozen=True)
+class BenchState:
+    """What the device says of itself, past the driver and the wire."""
+
+    driven: bool  # an output is not zero, or a law may move one
+    seconds: float  # of device time since it was made
+    struck: int  # frames struck by faults of the wire
+
+
+class FaultBench:
+    """The host's side of that process: a fresh bench at a time."""
+
+    def __init__(self, pipe: Connection) -> None:
+        self._pipe = pipe
+
+    def begin(
+        self, rig: Rig, wire: str, faults: Sequence[Fault], seed: int, *, realtime: bool
+    ) -> str:
+        """Serve a fresh bench with faults of machine and device; returns its endpoint."""
+        return str(self._ask("begin", rig, wire, tuple(faults), seed, realtime))
+
+    def strike(self, faults: Sequence[WireFault]) -> None:
+        """Let faults of the wire act from now on; `at` and `until` count from now."""
+        self._ask("strike", tuple(faults))
+
+    def state(self) -> BenchState:
+        """Return what the device says of itself."""
+        found: BenchState = self._ask("state")
+        return found
+
+    def end(self) -> None:
+        """End the bench; another one may begin."""
+        self._ask("end")
+
+    def _ask(self, *words: Any) -> Any:
+        self._pipe.send(words)
+        if not self._pipe.poll(_PATIENCE):
+            raise TimeoutError(f"the simulated bench does not answer {words[0]!r}")
+        answer = self._pipe.recv()
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    def at_zero(self, patience: float) -> bool:
+        """Tell whether the device's outputs are at zero within `patience` [s]."""
+        deadline = time.monotonic() + patience
+        while self.state().driven:
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(0.02)
+        return True
+
+
+@contextmanager
+def fault_bench() -> Iterator[FaultBench]:
+    """Start the process, end it afterwards; it also ends when this one is gone."""
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    process = context.Process(target=_serve, args=(theirs,), daemon=True)
+    process.start()
+    theirs.close()
+    try:
+        yield FaultBench(ours)
+    finally:
+        ours.close()
+        process.join(5.0)
+        if process.is_alive():
+            process.kill()
+
+
+class _Child:
+    """The process's side: one served device, or none."""
+
+    def __init__(self) -> None:
+        self._served: ServedDevice | None = None
+        self._rate = 1.0
+
+    def begin(
+        self, rig: Rig, wire: str, faults: tuple[Fault, ...], seed: int, realtime: bool
+    ) -> str:
+        self.end()
+        scenario = Scenario(faults=faults)
+        plant = FaultyPlant(rig, scenario, seed)
+        self._rate, self._plant = rig.sample_rate, plant
+        device = Device(
+            rig,
+            plant,
+            realtime=realtime,
+            virtual_silence=SILENCE,
+            faults=scenario.device_faults,
+        )
+        self._served = ServedDevice(device, wire, seed=seed, seconds=self._seconds)
+        return self._served.link.endpoint
+
+    def _seconds(self) -> float:
+        return self._plant.tick / self._rate
+
+    def strike(self, faults: tuple[WireFault, ...]) -> None:
+        assert self._served is not None
+        now = self._seconds()
+        moved = [
+            fault.model_copy(
+                update={
+                    "at": now + fault.at,
+                    "until": None if fault.until is None else now + fault.until,
+                }
+            )
+            for fault in faults
+        ]
+        self._served.link.use(moved)
+
+    def state(self) -> BenchState:
+        served = self._served
+        assert served is not None
+        device = served.device
+        driven = served.inside(lambda: device.laws.armed or bool(device.outputs.any()))
+        return BenchState(driven, self._seconds(), sum(served.link.injected.values()))
+
+    def end(self) -> None:
+        served, self._served = self._served, None
+        if served is not None:
+            served.close()
+
+
+def _serve(pipe: Connection) -> None:
+    child = _Child()
+    try:
+        while True:
+            word, *arguments = pipe.recv()
+            try:
+                pipe.send(getattr(child, word)(*arguments))
+            except Exception as error:
+                pipe.send(error)
+    except (EOFError, OSError, KeyboardInterrupt):
+        child.end()

@@ -1,0 +1,117 @@
+"""The figures of faults, for `bramah bench`: group `faults`."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+from hil_sim.faults.wire import WireFault
+from rig.cli.bench.fault_bench import fault_bench
+from rig.cli.bench.fault_trials import Naming, Outcome, kinds, try_fault, wires
+from rig.cli.bench.figure import Figure
+from rig.model.rig import Rig
+from rig.runs.rigs import load_rig
+
+RIG: Final = "shinshu-2dof"
+GROUP: Final = "faults"
+LEAST: Final = 500  # faults
+TIMEOUT: Final = 0.2  # [s]: a device in virtual time may take ten times as long
+REAL_TIME_ONLY: Final = frozenset({"clock_drift"})
+_WITHIN: Final = 2.0  # [s] of excitation after which a frozen or stuck signal is noticed
+_FROZEN: Final = ("sensor_stuck", "valve_stuck", "broken_wire")
+Say = Callable[[str], None]
+
+
+def impatient(rig: Rig) -> Rig:
+    """Return the rig with a wire whose device counts as lost soon, for virtual time."""
+    return rig.model_copy(update={"wire": rig.wire.model_copy(update={"timeout": TIMEOUT})})
+
+
+def jobs(least: int) -> Iterator[tuple[int, str, str]]:
+    """Yield (seed, wire, fault) for trials of every fault on every wire, at least `least`."""
+    names = [name for name in kinds() if name not in REAL_TIME_ONLY]
+    each = len(names) * len(wires())
+    for number in range(-(-least // each) * each):
+        fault, wire = names[number % len(names)], wires()[number // len(names) % len(wires())]
+        yield number, wire, fault
+
+
+def fault_trials(folder: Path, least: int, say: Say) -> list[Outcome]:
+    """Run at least `least` trials in virtual time, each with a fault of its own."""
+    rig, found = impatient(load_rig(RIG)), []
+    with fault_bench() as bench, _quiet():
+        for seed, wire, name in jobs(least):
+            outcome = try_fault(
+                bench, rig, wire, name, folder / f"fault-{seed}", seed, realtime=False
+            )
+            found.append(outcome)
+            if len(found) % 25 == 0:
+                say(f"faults: {len(found)} of {least}")
+    return found
+
+
+def fault_figures(folder: Path, say: Say, least: int = LEAST) -> list[Figure]:
+    """Inject faults on every wire and count what was left on, lost, and named."""
+    say(f"faults: at least {least} trials on {', '.join(wires())}")
+    return counted(fault_trials(folder, least, say))
+
+
+def counted(outcomes: Sequence[Outcome]) -> list[Figure]:
+    """Return the counts of trials as figures."""
+    of = Counter(outcome.naming for outcome in outcomes)
+    known = kinds()
+    machine = [o for o in outcomes if not issubclass(known[o.fault], WireFault)]
+    frozen = [o for o in outcomes if o.fault in _FROZEN]
+    late = [o for o in frozen if o.seconds is None or o.seconds > _WITHIN]
+    return [
+        Figure(GROUP, "sessions, each with a fault", len(outcomes), "", LEAST, True),
+        Figure(GROUP, "of them of machine, sensor or device", len(machine)),
+        Figure(GROUP, "frames struck", sum(o.struck for o in outcomes if o not in machine)),
+        Figure(GROUP, "outputs left on", sum(not o.zeroed for o in outcomes), "", 0.0),
+        Figure(GROUP, "blocks taken", sum(o.blocks for o in outcomes)),
+        Figure(GROUP, "of them not in records.h5", sum(o.lost_blocks for o in outcomes), "", 0.0),
+        Figure(GROUP, "harmless: every sample came", of[Naming.HARMLESS]),
+        Figure(GROUP, "samples missing and counted", of[Naming.COUNTED]),
+        Figure(GROUP, "ended, named rightly", of[Naming.NAMED]),
+        Figure(GROUP, "ended, cause left open", of[Naming.UNKNOWN]),
+        Figure(GROUP, "ended, named wrongly", of[Naming.WRONG], "", 0.0),
+        Figure(GROUP, "not noticed", of[Naming.UNNOTICED], "", 0.0),
+        Figure(GROUP, "frozen or stuck, not within 2 s", len(late), "", 0.0),
+    ]
+
+
+def by_fault(outcomes: Sequence[Outcome]) -> list[list[str]]:
+    """Return a row for each fault and wire: how often each naming came, and the slowest end."""
+    rows = []
+    for name in dict.fromkeys(outcome.fault for outcome in outcomes):
+        for wire in wires():
+            own = [o for o in outcomes if o.fault == name and o.wire == wire]
+            if not own:
+                continue
+            of = Counter(str(o.naming) for o in own)
+            ends = [o.seconds for o in own if o.seconds is not None]
+            rows.append(
+                [
+                    name,
+                    wire,
+                    str(len(own)),
+                    ", ".join(f"{count} {word}" for word, count in of.most_common()),
+                    f"{max(ends):.2f} s" if ends else "",
+                ]
+            )
+    return rows
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep hundreds of provoked warnings off the terminal; they are in the outcomes."""
+    root = logging.getLogger()
+    handlers, root.handlers = root.handlers, [logging.NullHandler()]
+    try:
+        yield
+    finally:
+        root.handlers = handlers

@@ -1,0 +1,198 @@
+"""The figures of each wire, for `bramah bench`: group `wires`.
+
+The acquisition process is measured as it runs: driver, guard and recorder, against a simulated
+bench in real time in another process. The driver alone is compared with the library that carries
+it, moving the same bytes to and from the same device in virtual time, where nobody waits.
+"""
+
+from __future__ import annotations
+
+import struct
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import serial
+from pymodbus.client import ModbusSerialClient, ModbusTcpClient
+
+from drivers import make_driver, wire_at
+from drivers.base import Driver
+from drivers.serial_stream import SerialSettings
+from hil_sim.device.server import RTU, SERIAL, TCP, WIRES
+from rig.bench.session import Bench
+from rig.cli.bench.acquisition import timing
+from rig.cli.bench.figure import Figure
+from rig.cli.simulated_bench import simulated_bench
+from rig.model import registers as reg
+from rig.model.parts import Wire
+from rig.model.rig import Rig
+from rig.model.wire import serial_messages as msg
+from rig.model.wire.frames import FrameDecoder, WireFrame, encode_frame
+from rig.model.wire.serial_messages import Message
+from rig.runs.recorder import Recorder
+from rig.runs.rigs import load_rig
+
+RIG: Final = "digger-3dof"  # 14 measured channels and 3 commands at 1 kHz
+GROUP: Final = "wires"
+BLOCKS, ROUNDS = 200, 7
+_SESSION: Final = 0x0BA2E11B
+Say = Callable[[str], None]
+
+
+def wire_figures(say: Say, minutes: float) -> list[Figure]:
+    """Measure every wire of the simulated bench for `minutes` each."""
+    figures = []
+    for wire in WIRES:
+        say(f"wires: {wire}, {minutes:g} min in real time, then the bare library")
+        figures += acquisition_of(wire, 60.0 * minutes)
+        ours, bare = driver_and_bare(wire)
+        figures += [
+            Figure(GROUP, f"{wire}: a block by the driver", 1e3 * ours, "ms"),
+            Figure(GROUP, f"{wire}: driver over the bare library", ours / bare, "x as long", 1.3),
+        ]
+    return figures
+
+
+def acquisition_of(wire: str, seconds: float) -> list[Figure]:
+    """Stream all channels of one wire through driver, guard and recorder."""
+    rig = load_rig(RIG)
+    with (
+        simulated_bench(RIG, seed=0, real_time=True, wire=wire) as endpoint,
+        tempfile.TemporaryDirectory(prefix="bramah-wires-") as folder,
+    ):
+        reached = _at(rig, endpoint)
+        recorder = Recorder(Path(folder) / "run", reached)
+        with Bench(reached, make_driver(reached.wire, reached), recorder, signals=False) as bench:
+            bench.run_for(0.5)  # what is imported and opened first is not the stream
+            lost, busy, began = bench.lost_samples, time.process_time(), time.perf_counter()
+            ends, arrivals, samples, disordered = [], [], 0, 0
+            while time.perf_counter() - began < seconds:
+                before = bench.tick
+                block = bench.exchange()
+                arrivals.append(time.perf_counter())
+                ends.append((block.tick + len(block.data)) / reached.sample_rate)
+                samples += len(block.data)
+                disordered += block.tick < before
+            share = (time.process_time() - busy) / (time.perf_counter() - began)
+            lost = bench.lost_samples - lost
+    found = timing(np.array(ends), np.array(arrivals))
+    values = len(rig.recorded)
+    return [
+        Figure(GROUP, f"{wire}: samples of {values} values", samples),
+        Figure(GROUP, f"{wire}: samples lost", lost, "", 0.0),
+        Figure(GROUP, f"{wire}: blocks out of order", disordered, "", 0.0),
+        Figure(GROUP, f"{wire}: of one core, driver + guard + recorder", 1e2 * share, "%", 25.0),
+        Figure(GROUP, f"{wire}: lateness, 99 %", 1e3 * found["lateness_p99_s"], "ms"),
+        Figure(GROUP, f"{wire}: lateness, worst", 1e3 * found["lateness_max_s"], "ms", 50.0),
+    ]
+
+
+def driver_and_bare(wire: str) -> tuple[float, float]:
+    """Return the time [s] of one block by the driver and by the bare library, best of rounds."""
+    rig = load_rig(RIG)
+    ours, bare = [], []
+    with simulated_bench(RIG, seed=0, wire=wire) as endpoint:
+        reached = _at(rig, endpoint)
+        for _ in range(ROUNDS):
+            with _streaming(reached) as driver:
+                ours.append(_time_of(driver.read_block))
+            with _BARE[wire](reached) as ask:
+                bare.append(_time_of(ask))
+    return min(ours), min(bare)
+
+
+def _at(rig: Rig, endpoint: str) -> Rig:
+    return rig.model_copy(update={"wire": wire_at(endpoint, rig.wire)})
+
+
+def _time_of(ask: Callable[[], object]) -> float:
+    ask()
+    began = time.perf_counter()
+    for _ in range(BLOCKS):
+        ask()
+    return (time.perf_counter() - began) / BLOCKS
+
+
+@contextmanager
+def _streaming(rig: Rig) -> Iterator[Driver]:
+    driver = make_driver(rig.wire, rig)
+    driver.connect()
+    try:
+        driver.start()
+        yield driver
+    finally:
+        driver.close()
+
+
+@contextmanager
+def _bare_modbus(rig: Rig) -> Iterator[Callable[[], object]]:
+    """Ask for blocks with pymodbus and nothing else."""
+    client, layout = _client(rig.wire), reg.block_layout(len(rig.channels), len(rig.joints))
+    client.connect()
+    words = [0xFFFF, 0]
+
+    def ask() -> None:
+        words[1] = (words[1] + 1) & 0xFFFF
+        answer = client.readwrite_registers(
+            read_address=reg.BLOCK.address,
+            read_count=layout.words,
+            write_address=reg.CONTROL_ACK.address,
+            values=words,
+            device_id=1,
+        )
+        words[0] = answer.registers[0]
+
+    try:
+        client.write_register(reg.CONTROL_STREAM.address, reg.STREAM_START, device_id=1)
+        yield ask
+        client.write_register(reg.CONTROL_STREAM.address, reg.STREAM_STOP, device_id=1)
+    finally:
+        client.close()
+
+
+def _client(wire: Wire) -> Any:
+    at = wire.settings
+    if wire.kind == RTU:
+        return ModbusSerialClient(at["device"], baudrate=921_600, timeout=2.0)
+    return ModbusTcpClient(at["host"], port=at["port"], timeout=2.0)
+
+
+@contextmanager
+def _bare_serial(rig: Rig) -> Iterator[Callable[[], object]]:
+    """Send notes and receive blocks with pyserial and the frames' encoding, and nothing else."""
+    at, heart = SerialSettings.of(rig.wire), 0
+    decoder = FrameDecoder()
+    with serial.Serial(at.device, at.baud, timeout=2.0) as port:
+
+        def send(kind: Message, number: int, payload: bytes = b"") -> None:
+            port.write(encode_frame(WireFrame(kind, number, _SESSION, payload)))
+
+        def receive() -> list[WireFrame]:
+            frames: list[WireFrame] = []
+            while not frames:
+                frames = decoder.feed(port.read(1) + port.read(port.in_waiting))
+            return frames
+
+        def request(kind: Message, number: int, payload: bytes = b"") -> None:
+            send(kind, number, payload)
+            receive()
+
+        request(Message.OPEN, 1, struct.pack(">H", 5000))
+        request(Message.START, 2)
+        last = msg.NOTHING_YET
+
+        def ask() -> None:
+            nonlocal heart, last
+            heart = (heart + 1) & 0xFFFF
+            send(Message.ALIVE_NOTE, 2, msg.pack_alive(msg.Alive(last, heart)))
+            last = struct.unpack_from(">H", receive()[-1].payload, 2)[0]
+
+        yield ask
+        request(Message.CLOSE, 3)
+
+
+_BARE: Final = {TCP: _bare_modbus, RTU: _bare_modbus, SERIAL: _bare_serial}
