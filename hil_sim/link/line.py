@@ -53,10 +53,17 @@ class LineLink(FaultyLink):
         """Where the host reaches the device through this link."""
         return self._endpoint
 
+    def use(self, faults: Sequence[WireFault]) -> None:
+        """Do other things to frames from now on; a way that had ended is mended."""
+        super().use(faults)
+        self._to_device.mend()
+        self._to_host.mend()
+
     def _plug_in(self) -> None:
         self._line = PtyLine()
-        self._name.unlink(missing_ok=True)
-        self._name.symlink_to(self._line.name)
+        fresh = self._name.with_suffix(".new")
+        fresh.symlink_to(self._line.name)
+        fresh.replace(self._name)
 
     def _step(self) -> None:
         line = self._line
@@ -120,8 +127,9 @@ class LineLink(FaultyLink):
 
     def _unplug(self) -> None:
         self._close_device()
-        self._line.close()
-        self._plug_in()
+        old = self._line
+        self._plug_in()  # first, so that the name leads somewhere at every moment
+        old.close()
 
     def _hang_up(self) -> None:
         if self._line.connected or self._device is not None:

@@ -102,6 +102,10 @@ class Way:
         asked, self._asked = self._asked, []
         self._queue(asked, now)
 
+    def mend(self) -> None:
+        """Let a way that a fault has ended carry again."""
+        self.ended = False
+
     def due(self, now: float) -> list[Piece]:
         """Return the pieces that go now."""
         if self._buffer and now - self._heard > QUIET:

@@ -36,6 +36,7 @@ from rig.runs.recorder import Recorder
 from rig.runs.runstate import BETWEEN
 
 BEGIN: Final = 1.0  # [s] of device time before a fault begins
+REAL_BEGIN: Final = 3.0  # in real time, in which the clock runs while the session is begun
 WATCHED: Final = 3.0  # [s] of device time that a fault is watched for
 SHARE: Final = 0.1  # of the frames struck, for `STRIKING` [s]
 STRIKING: Final = 1.0
@@ -99,11 +100,14 @@ def kinds() -> dict[str, type[Fault]]:
     return {kind.fault_name(): kind for kind in CLASSES}
 
 
-def example(name: str) -> Fault:
-    """Return a fault of a name as the trials use it: of a size that a bench may well show."""
+def example(name: str, at: float = BEGIN) -> Fault:
+    """Return a fault of a name as the trials use it: of a size that a bench may well show.
+
+    A fault of machine, sensor or device begins at `at` [s], one of the wire at once.
+    """
     kind, keys = kinds()[name], dict(KEYS.get(name, {}))
     if not issubclass(kind, WireFault):
-        return kind.model_validate({"name": name, "at": BEGIN, **keys})
+        return kind.model_validate({"name": name, "at": at, **keys})
     if name not in _ONCE:
         keys.update(probability=SHARE, until=STRIKING)
     return kind.model_validate({"name": name, **keys})
@@ -143,20 +147,22 @@ def try_fault(
 
     Raises DeviceError where no session could be begun before the fault.
     """
-    fault = example(name)
+    fault = example(name, REAL_BEGIN if realtime else BEGIN)
     early = () if isinstance(fault, WireFault) else (fault,)
     endpoint = bench.begin(rig, wire, early, seed, realtime=realtime)
     reached = rig.model_copy(update={"wire": wire_at(endpoint, rig.wire)})
-    outcome, collector, warned = Outcome(name, wire), _Collector(), _Warnings()
+    outcome, warned = Outcome(name, wire), _Warnings()
     logging.getLogger().addHandler(warned)
     try:
         for left in reversed(range(_TRIES)):
             try:
-                _session(bench, reached, fault, folder / f"{left}", collector, outcome, seed)
+                _session(bench, reached, fault, folder / f"{left}", outcome, seed)
                 break
-            except DeviceError:
+            except (DeviceError, SafetyTrip):  # before the fault: a computer too busy
                 if not left:
                     raise
+                endpoint = bench.begin(rig, wire, early, seed, realtime=realtime)
+                reached = rig.model_copy(update={"wire": wire_at(endpoint, rig.wire)})
     finally:
         logging.getLogger().removeHandler(warned)
         outcome.warned = warned.lines
@@ -175,10 +181,10 @@ def _session(
     rig: Rig,
     fault: Fault,
     folder: Path,
-    collector: _Collector,
     outcome: Outcome,
     seed: int,
 ) -> None:
+    collector = _Collector()
     period = round(rig.sample_rate)
     wave = _AMPLITUDE * np.sin(2.0 * np.pi * np.arange(period) / period)
     off = [OutputLaw()] * (len(rig.joints) - 1)
@@ -202,8 +208,9 @@ def _session(
                 bench.strike([fault])
                 session.run_for(STRIKING + 0.5)
             else:
-                left = fault.at - session.tick / rig.sample_rate
-                session.run_for(max(left, 0.01))
+                left = max(fault.at - session.tick / rig.sample_rate, 0.01)
+                began = time.monotonic(), fault.at
+                session.run_for(left)
                 began = time.monotonic(), fault.at
                 session.run_for(WATCHED)
     except (DeviceError, SafetyTrip) as error:

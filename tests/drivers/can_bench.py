@@ -1,0 +1,196 @@
+"""The subject of the conformance checks on a CAN bus: frames are tampered with at the adapter."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from contextlib import contextmanager
+from dataclasses import replace
+from queue import SimpleQueue
+from typing import Any, TypeVar
+from unittest.mock import patch
+
+from drivers import message_stream
+from drivers.can_stream import CanStreamDriver
+from drivers.conformance import HEALTHY, Bench, Capabilities, Subject
+from hil_sim.device.can.adapters import SocketcandServer
+from hil_sim.device.can.server import layout_of, run_device
+from hil_sim.device.device import Device
+from rig.model import channels as ch
+from rig.model.parts import Wire
+from rig.model.rig import Rig
+from rig.model.wire.can_frames import CanFrame
+from tests.hil_sim.integrator import IntegratorPlant, seed_rig
+
+TIMEOUT = 0.5
+STEP = 0.09  # [s] of the device's clock between two polls: less than what it takes for a stall
+Answer = TypeVar("Answer")
+
+
+class CanDevice:
+    """The integrator's device behind an adapter, whose frames `spoil` tampers with.
+
+    Its clock stands still but for `silence`, so that no busy computer trips its watchdog. It stands
+    between the device and the adapter: what the device's server calls, it passes on. Faults strike
+    the frame in the middle of what is sent next.
+    """
+
+    FAULTS = ("lose one", "late", "flip", "twice", "swap", "noise", "silent")
+
+    def __init__(self, end: Any, serve: Callable[[Any, Device, list[int]], object]) -> None:
+        self.rig = seed_rig()
+        self.now = 100.0
+        self.plant = IntegratorPlant(self.rig)
+        self.device = Device(self.rig, self.plant, realtime=False, clock=lambda: self.now)
+        self._end = end
+        self._fault = HEALTHY
+        self._held: Any = None
+        self._calls: SimpleQueue[Callable[[], None]] = SimpleQueue()
+        self._ended: list[int] = []
+        self._thread = threading.Thread(
+            target=serve, args=(self, self.device, self._ended), daemon=True
+        )
+        self._thread.start()
+
+    def outputs(self) -> list[float]:
+        """Return the outputs [V] after one more block of the device's clock."""
+        device = self.device
+
+        def run() -> list[float]:
+            device._run(device.queue.room)
+            return list(self.plant.volts)
+
+        return self.inside(run)
+
+    def silence(self) -> None:
+        """Let 11 s of the device's clock pass."""
+
+        def wait() -> None:
+            for _ in range(round(11.0 / STEP)):
+                self.now += STEP
+                self.device.poll()
+
+        self.inside(wait)
+
+    def saturate(self) -> int:
+        """Move the first piston beyond its sensor."""
+        self.plant.piston[0] = 1.0
+        return self.rig.channels.index(f"{ch.PISTON}_1")
+
+    def inside(self, call: Callable[[], Answer]) -> Answer:
+        """Make a call in the device's own thread."""
+        done: Future[Answer] = Future()
+
+        def work() -> None:
+            try:
+                done.set_result(call())
+            except BaseException as error:
+                done.set_exception(error)
+
+        self._calls.put(work)
+        return done.result(60)
+
+    def spoil(self, fault: str) -> None:
+        """Tamper with what is sent from now on."""
+
+        def begin() -> None:
+            self._fault, self._held = fault, None
+
+        self.inside(begin)
+
+    def close(self) -> None:
+        """End the server and its thread."""
+        self._ended.append(1)
+        self._thread.join(60)
+        self._end.close()
+
+    # -- what the device's server calls -----------------------------------------------------
+
+    @property
+    def free(self) -> bool:
+        """Whether somebody listens."""
+        return bool(self._end.free)
+
+    def receive(self, patience: float) -> Any:
+        """Return what has come."""
+        while not self._calls.empty():
+            self._calls.get()()
+        return self._end.receive(min(patience, 0.003))
+
+    def send(self, pieces: Any) -> None:
+        """Send what the fault leaves of it."""
+        if not len(pieces):
+            return
+        fault = self._fault
+        if fault == "silent":
+            return
+        if self._held is not None:
+            pieces, self._held = pieces + self._held, None
+        if fault != HEALTHY:
+            self._fault = HEALTHY
+            pieces = self._spoiled(fault, pieces)
+        self._end.send(pieces)
+
+    def _spoiled(self, fault: str, pieces: Any) -> Any:
+        k = len(pieces) // 2
+        before, piece, after = pieces[:k], pieces[k : k + 1], pieces[k + 1 :]
+        if fault == "late":
+            self._held = piece
+        return {
+            "lose one": before + after,
+            "late": before + after,
+            "flip": before + _flipped(piece) + after,
+            "twice": before + piece + piece + after,
+            "swap": before + after[:1] + piece + after[1:],
+            "noise": _noise(pieces) + pieces,
+        }[fault]
+
+
+def _flipped(frames: list[CanFrame]) -> list[CanFrame]:
+    (frame,) = frames
+    return [replace(frame, data=bytes([frame.data[0] ^ 4]) + frame.data[1:])]
+
+
+def _noise(frames: list[CanFrame]) -> list[CanFrame]:
+    return [CanFrame(0x7E0, b"\1\2\3"), CanFrame(frames[0].identifier, b"")]
+
+
+@contextmanager
+def _can() -> Iterator[Bench]:
+    server = SocketcandServer("127.0.0.1", 0)
+
+    def serve(end: Any, device: Device, ended: list[int]) -> None:
+        run_device(end, device, layout_of(device.rig), ended)
+
+    served = CanDevice(server, serve)
+    bus = server.endpoint.removeprefix("can://")
+
+    def cut() -> None:
+        # A node of a bus does not see a program end: its watchdog does.
+        served.inside(lambda: [server._drop(client) for client in list(server._clients)])
+        served.silence()
+
+    def driver(rig: Rig) -> Any:
+        quick = Wire(kind="can", timeout=TIMEOUT, watchdog=rig.wire.watchdog)
+        return CanStreamDriver(quick.reached_by("can", {"bus": bus}), rig)
+
+    try:
+        # Let a virtual device's answers be lost as soon as a real one's.
+        with patch.object(message_stream, "VIRTUAL_PATIENCE", 1.0):
+            yield Bench(
+                served.rig,
+                driver,
+                outputs=served.outputs,
+                cut=cut,
+                silence=served.silence,
+                spoil=served.spoil,
+                faults=CanDevice.FAULTS,
+                lost=("silent",),
+                saturate=served.saturate,
+            )
+    finally:
+        served.close()
+
+
+CAN = Subject("can", _can, Capabilities())
