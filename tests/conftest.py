@@ -8,12 +8,16 @@ import pytest
 
 from rig.bench.latch import STATE_VARIABLE
 
+CACHE_VARIABLE = "BRAMAH_CACHE"
+
 
 @pytest.fixture(scope="session", autouse=True)
 def _state_folder(tmp_path_factory: pytest.TempPathFactory):
     """A state folder for what runs in fixtures that several tests share."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(STATE_VARIABLE, str(tmp_path_factory.mktemp("state")))
+        # Equations compiled by one test serve the next, and those of the next day.
+        patch.setenv(CACHE_VARIABLE, str(Path(__file__).parents[1] / ".equations_cache"))
         yield
 
 

@@ -1,13 +1,9 @@
 """The integrator of the identified model: Dormand and Prince's embedded pair 5(4) in numba.
 
-Compiled once for every model: terms come as machine addresses, so that adding a term compiles
-that term alone. Output falls on the samples by the pair's own 4th-order
+Compiled once for every model: the right-hand side comes as a machine address
+(`analysis.simulation.equations`). Output falls on the samples by the pair's own 4th-order
 interpolation, so a step may be longer than a sample. Source: Hairer, Norsett and Wanner, Solving
 Ordinary Differential Equations I, tables II.5.2 and section II.6.
-
-State y = [q (N), dq/dt (N), p_cap (N), p_rod (N), hidden]; M q'' = torques, and in each chamber
-(V/b) dp/dt = flow in - A ds/dt (cap), + A ds/dt (rod). A locked joint follows its measured motion.
-An electric joint has its drive's torque, s = q, G = 1, and pressures that stay zero.
 """
 
 from __future__ import annotations
@@ -16,287 +12,125 @@ import math
 from typing import Final
 
 import numpy as np
-from llvmlite import ir  # type: ignore[import-untyped]
-from numba import njit, types
-from numba.extending import intrinsic
+from numba import njit
 
-from analysis.terms.base import (
-    COMP_CAP,
-    COMP_ROD,
-    CONTRIBUTE,
-    FLOW_CAP,
-    FLOW_ROD,
-    KERNEL_SIGNATURE,
-    P_CAP,
-    P_ROD,
-    P_S,
-    P_TANK,
-    PREPARE,
-    QD,
-    SD,
-    TEMPERATURE,
-    THETA,
-    TIME,
-    TORQUE,
-    V_CAP,
-    V_ROD,
-    G,
-    Q,
-    S,
-    U,
-)
+from analysis.simulation.equations import NOT_FINITE, OK, STEP_TOO_SMALL, call_rates
 
-OK, LEFT_STROKE, NOT_FINITE, STEP_TOO_SMALL, BAD_INERTIA = range(5)
 MIN_STEP: Final = 1e-7  # [s]
+DOUBLE: Final = 8  # bytes
 
-# Columns of `geometry`, one row per joint.
-# GAIN is 0 of a hydraulic joint; of an
-# electric one it is the drive's, u being the drive and OFFSET the known turn of the joint's zero.
-PIN_A, PIN_C, MID, OFFSET, AREA_CAP, AREA_ROD, DEAD_CAP, DEAD_ROD, STROKE, GAIN = range(10)
-
-_A = np.array(
-    [
-        [1 / 5, 0, 0, 0, 0, 0],
-        [3 / 40, 9 / 40, 0, 0, 0, 0],
-        [44 / 45, -56 / 15, 32 / 9, 0, 0, 0],
-        [19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0, 0],
-        [9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0],
-        [35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84],
-    ]
-)
-_C = np.array([1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0, 1.0])
-_E = np.array([71 / 57600, 0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40])
-_D = np.array(
-    [
-        -12715105075 / 11282082432, 0, 87487479700 / 32700410799, -10690763975 / 1880347072,
-        701980252875 / 199316789632, -1453857185 / 822651844, 69997945 / 29380423,
-    ]
+# Weights of the stages' derivatives (rows 2 to 7 of the table), of the error, of the interpolation.
+A21: Final = 1 / 5
+A31, A32 = 3 / 40, 9 / 40
+A41, A42, A43 = 44 / 45, -56 / 15, 32 / 9
+A51, A52, A53, A54 = 19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729
+A61, A62, A63, A64, A65 = 9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656
+A71, A73, A74, A75, A76 = 35 / 384, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84
+C: Final = (0.0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0, 1.0)
+E1, E3, E4, E5, E6, E7 = (
+    71 / 57600, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40,
+)  # fmt: skip
+D1, D3, D4, D5, D6, D7 = (
+    -12715105075 / 11282082432, 87487479700 / 32700410799, -10690763975 / 1880347072,
+    701980252875 / 199316789632, -1453857185 / 822651844, 69997945 / 29380423,
 )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
-def _observe(t, y, inputs, rate, locked, geometry, bench, x, q_dd):  # type: ignore[no-untyped-def]
-    """Fill `bench` and `x` at time t; return False where a piston left its cylinder."""
-    N = x.shape[1]
-    place = min(max(t * rate, 0.0), inputs.shape[0] - 1.0)
-    low = min(int(place), inputs.shape[0] - 2)
-    w = place - low
-    bench[TIME] = t
-    bench[P_S] = inputs[low, 0] + w * (inputs[low + 1, 0] - inputs[low, 0])
-    bench[P_TANK] = 0.0
-    bench[TEMPERATURE] = inputs[low, 1] + w * (inputs[low + 1, 1] - inputs[low, 1])
-    inside = True
-    angle = 0.0
-    for i in range(N):
-        x[U, i] = inputs[low, 2 + i] + w * (inputs[low + 1, 2 + i] - inputs[low, 2 + i])
-        if locked[i]:
-            for k in range(3):
-                column = 2 + (k + 1) * N + i
-                value = inputs[low, column] + w * (inputs[low + 1, column] - inputs[low, column])
-                if k == 0:
-                    x[Q, i] = value
-                elif k == 1:
-                    x[QD, i] = value
-                else:
-                    q_dd[i] = value
-        else:
-            x[Q, i] = y[i]
-            x[QD, i] = y[N + i]
-        angle += x[Q, i]
-        if geometry[i, GAIN] != 0.0:
-            angle += geometry[i, OFFSET]
-            x[THETA, i], x[G, i], x[S, i], x[SD, i] = angle, 1.0, x[Q, i], x[QD, i]
-            x[P_CAP, i] = x[P_ROD, i] = x[V_CAP, i] = x[V_ROD, i] = 0.0
-            continue
-        x[THETA, i] = angle
-        a, c = geometry[i, PIN_A], geometry[i, PIN_C]
-        beta = x[Q, i] + geometry[i, OFFSET]
-        length = math.sqrt(a * a + c * c - 2.0 * a * c * math.cos(beta))
-        x[G, i] = a * c * math.sin(beta) / length
-        x[S, i] = length - geometry[i, MID]
-        x[SD, i] = x[G, i] * x[QD, i]
-        x[P_CAP, i] = y[2 * N + i]
-        x[P_ROD, i] = y[3 * N + i]
-        half = 0.5 * geometry[i, STROKE]
-        x[V_CAP, i] = geometry[i, DEAD_CAP] + (half + x[S, i]) * geometry[i, AREA_CAP]
-        x[V_ROD, i] = geometry[i, DEAD_ROD] + (half - x[S, i]) * geometry[i, AREA_ROD]
-        # Half a stroke past its end no cylinder is; the chamber volumes are still positive there.
-        if not (abs(x[S, i]) < 2.0 * half) or x[V_CAP, i] <= 0.0 or x[V_ROD, i] <= 0.0:
-            inside = False
-    return inside
-
-
-@njit(cache=True, error_model="numpy")
-def _impose(M, load, locked, q_dd):  # type: ignore[no-untyped-def]
-    """Replace the rows of locked joints by their given q'', moved to the others' loads."""
-    for i in range(len(load)):
-        if locked[i]:
-            for j in range(len(load)):
-                load[j] -= M[j, i] * q_dd[i]
-                M[i, j] = M[j, i] = 0.0
-            M[i, i], load[i] = 1.0, q_dd[i]
-
-
-@njit(cache=True, error_model="numpy")
-def _accelerate(M, load, q_dd):  # type: ignore[no-untyped-def]
-    """Solve M q'' = load by Cholesky, M becoming its factor; False where M is not > 0."""
-    N = len(load)
-    for i in range(N):
-        for j in range(i + 1):
-            total = M[i, j]
-            for k in range(j):
-                total -= M[i, k] * M[j, k]
-            if i > j:
-                M[i, j] = total / M[j, j]
-            elif total > 0.0:
-                M[i, i] = math.sqrt(total)
-            else:
-                return False
-    for i in range(N):
-        total = load[i]
-        for k in range(i):
-            total -= M[i, k] * q_dd[k]
-        q_dd[i] = total / M[i, i]
-    for i in range(N - 1, -1, -1):
-        total = q_dd[i]
-        for k in range(i + 1, N):
-            total -= M[k, i] * q_dd[k]
-        q_dd[i] = total / M[i, i]
-    return True
-
-
-_V, _W = types.float64[::1], types.float64[:, ::1]
-_I, _B = types.int64[::1], types.boolean[::1]
-SIGNATURE = types.Tuple((types.int64, types.int64, types.int64))(
-    types.Tuple((_I, _I, _I, _B, _V)), _W, types.float64, _B, _W, types.float64, _V, _W,
-    types.Tuple((_V, _W, _W, _W, _V)),
-)  # fmt: skip
-
-
-@intrinsic
-def _call(typing, address, phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
-    """Call the term's kernel at a machine address (numba's C convention for its own types)."""
-    signature = types.void(types.int64, *KERNEL_SIGNATURE.args)
-
-    def generate(context, builder, sig, args):  # type: ignore[no-untyped-def]
-        values = [context.get_value_type(kind) for kind in KERNEL_SIGNATURE.args]
-        result = context.get_value_type(types.none)
-        pointer = ir.FunctionType(result, values).as_pointer()
-        builder.call(builder.inttoptr(args[0], pointer), args[1:])
-        return context.get_dummy_value()
-
-    return signature, generate
-
-
-@njit(cache=True, error_model="numpy")
-def rates(t, y, dy, inputs, rate, locked, geometry, model, work):  # type: ignore[no-untyped-def]
-    """Fill dy; return OK or why there is no derivative."""
-    addresses, ends, hidden_ends, prepares, par = model
-    bench, x, out, M, q_dd = work
-    N = x.shape[1]
-    if not _observe(t, y, inputs, rate, locked, geometry, bench, x, q_dd):
-        return LEFT_STROKE
-    out[:] = 0.0
-    M[:] = 0.0
-    for phase in (PREPARE, CONTRIBUTE):
-        for m in range(len(ends) - 1):
-            if phase == CONTRIBUTE or prepares[m]:
-                z = slice(4 * N + hidden_ends[m], 4 * N + hidden_ends[m + 1])
-                p = slice(ends[m], ends[m + 1])
-                _call(addresses[m], phase, bench, x, y[z], par[p], out, M, dy[z])
-    for i in range(N):
-        if geometry[i, GAIN] != 0.0:
-            out[TORQUE, i] += geometry[i, GAIN] * x[U, i]
-            continue
-        force = geometry[i, AREA_CAP] * x[P_CAP, i] - geometry[i, AREA_ROD] * x[P_ROD, i]
-        out[TORQUE, i] += x[G, i] * force
-    _impose(M, out[TORQUE], locked, q_dd)
-    if not _accelerate(M, out[TORQUE], q_dd):
-        return BAD_INERTIA
-    for i in range(N):
-        if locked[i]:
-            dy[i] = dy[N + i] = dy[2 * N + i] = dy[3 * N + i] = 0.0
-            continue
-        dy[i] = x[QD, i]
-        dy[N + i] = q_dd[i]
-        if geometry[i, GAIN] != 0.0:
-            dy[2 * N + i] = dy[3 * N + i] = 0.0
-            continue
-        cap, rod = geometry[i, AREA_CAP] * x[SD, i], geometry[i, AREA_ROD] * x[SD, i]
-        dy[2 * N + i] = (out[FLOW_CAP, i] - cap) / out[COMP_CAP, i]
-        dy[3 * N + i] = (out[FLOW_ROD, i] + rod) / out[COMP_ROD, i]
-    return OK
-
-
-@njit(cache=True, error_model="numpy")
-def _stages(t, h, y, trial, k, inputs, rate, locked, geometry, model, work):  # type: ignore[no-untyped-def]
-    """Fill the six further stages k[1:] and the 5th-order `trial`; return (status, evaluations)."""
-    for stage in range(6):
+@njit(cache=True, error_model="numpy", nogil=True)
+def _trial(stage, h, y, k, trial):  # type: ignore[no-untyped-def]
+    """Fill the state of a further stage, 1 to 6, from the derivatives k (7, size) before it."""
+    if stage == 1:
         for j in range(len(y)):
-            total = 0.0
-            for m in range(stage + 1):
-                total += _A[stage, m] * k[m, j]
+            trial[j] = y[j] + h * (A21 * k[0, j])
+    elif stage == 2:
+        for j in range(len(y)):
+            trial[j] = y[j] + h * (A31 * k[0, j] + A32 * k[1, j])
+    elif stage == 3:
+        for j in range(len(y)):
+            trial[j] = y[j] + h * (A41 * k[0, j] + A42 * k[1, j] + A43 * k[2, j])
+    elif stage == 4:
+        for j in range(len(y)):
+            total = A51 * k[0, j] + A52 * k[1, j] + A53 * k[2, j] + A54 * k[3, j]
             trial[j] = y[j] + h * total
-        at = t + _C[stage] * h
-        status = rates(at, trial, k[stage + 1], inputs, rate, locked, geometry, model, work)
-        if status != OK:
-            return status, stage + 1
-    return OK, 6
+    elif stage == 5:
+        for j in range(len(y)):
+            total = A61 * k[0, j] + A62 * k[1, j] + A63 * k[2, j] + A64 * k[3, j] + A65 * k[4, j]
+            trial[j] = y[j] + h * total
+    else:
+        for j in range(len(y)):
+            total = A71 * k[0, j] + A73 * k[2, j] + A74 * k[3, j] + A75 * k[4, j] + A76 * k[5, j]
+            trial[j] = y[j] + h * total
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 def _error(h, y, trial, k, rtol, atol):  # type: ignore[no-untyped-def]
     """Return the embedded error over the tolerance, root mean square over the state."""
     error = 0.0
     for j in range(len(y)):
-        e = 0.0
-        for m in range(7):
-            e += _E[m] * k[m, j]
+        e = E1 * k[0, j] + E3 * k[2, j] + E4 * k[3, j] + E5 * k[4, j] + E6 * k[5, j] + E7 * k[6, j]
         scale = atol[j] + rtol * max(abs(y[j]), abs(trial[j]))
         error += (h * e / scale) ** 2
     return math.sqrt(error / len(y))
 
 
-@njit(cache=True, error_model="numpy")
-def _interpolate(t, h, y, trial, k, rate, ys, filled):  # type: ignore[no-untyped-def]
-    """Fill the samples that lie in the step just taken; return how many are filled now."""
-    n = ys.shape[0]
-    reached = filled
-    while reached < n and reached / rate <= t + h + 1e-12:
-        reached += 1
-    for j in range(len(y) if reached > filled else 0):
-        r2 = trial[j] - y[j]
-        r3 = h * k[0, j] - r2
-        r4 = r2 - h * k[6, j] - r3
-        r5 = 0.0
-        for m in range(7):
-            r5 += h * _D[m] * k[m, j]
-        for i in range(filled, reached):
-            a = min((i / rate - t) / h, 1.0)
-            ys[i, j] = y[j] + a * (r2 + (1.0 - a) * (r3 + a * (r4 + (1.0 - a) * r5)))
-    return reached
+@njit(cache=True, error_model="numpy", nogil=True)
+def _interpolate(t, h, y, trial, k, rate, r, ys, filled):  # type: ignore[no-untyped-def]
+    """Fill the samples that lie in the step just taken; return how many are filled now.
+
+    `r` (4, size) is room for the interpolation's coefficients.
+    """
+    if not (filled < len(ys) and filled / rate <= t + h + 1e-12):
+        return filled
+    for j in range(len(y)):
+        r[0, j] = trial[j] - y[j]
+        r[1, j] = h * k[0, j] - r[0, j]
+        r[2, j] = r[0, j] - h * k[6, j] - r[1, j]
+        first = h * D1 * k[0, j] + h * D3 * k[2, j] + h * D4 * k[3, j]
+        r[3, j] = first + h * D5 * k[4, j] + h * D6 * k[5, j] + h * D7 * k[6, j]
+    while filled < len(ys) and filled / rate <= t + h + 1e-12:
+        a = min((filled / rate - t) / h, 1.0)
+        b = 1.0 - a
+        for j in range(len(y)):
+            ys[filled, j] = y[j] + a * (r[0, j] + b * (r[1, j] + a * (r[2, j] + b * r[3, j])))
+        filled += 1
+    return filled
 
 
-@njit(SIGNATURE, cache=True, error_model="numpy")
-def integrate(model, inputs, rate, locked, geometry, rtol, atol, ys, work):  # type: ignore[no-untyped-def]
+@njit(cache=True, error_model="numpy", nogil=True)
+def integrate(  # type: ignore[no-untyped-def]
+    address, context, par, geometry, work, inputs, rate, locked, rtol, atol, ys
+):
     """Integrate from ys[0]; fill ys (n, size) and return (status, samples filled, evaluations).
 
-    `model` = (addresses, ends, hidden_ends, prepares, par), `work` = (bench, x, out, M, q_dd),
-    `inputs` (n, 2 + 4 N): p_s, temperature, u, and q, q', q'' of the locked joints.
+    The other arguments are those of `analysis.simulation.equations`.
     """
     n, size = ys.shape
-    k = np.zeros((7, size))
-    y, trial = ys[0].copy(), np.empty(size)
+    y, trial, k, r = ys[0].copy(), np.empty(size), np.zeros((7, size)), np.empty((4, size))
+    m, at_inputs, at_locked = inputs.shape[0], inputs.ctypes.data, locked.ctypes.data
+    at_geometry, at_par = geometry.ctypes.data, par.ctypes.data
+    at_context, at_work = context.ctypes.data, work.ctypes.data
+    at_y, at_k = trial.ctypes.data, k.ctypes.data
     t, h, filled, evaluations = 0.0, 0.2 / rate, 1, 1
     end = (n - 1) / rate + 1e-9
-    status = rates(t, y, k[0], inputs, rate, locked, geometry, model, work)
+    trial[:] = y
+    status = call_rates(
+        address, t, at_y, at_k, at_inputs, m, rate, at_locked, at_geometry, at_par, at_context,
+        at_work,
+    )  # fmt: skip
     if status != OK:
         return status, filled, evaluations
     after_failure = False
     while filled < n:
         h = max(min(h, end - t), MIN_STEP)
-        status, used = _stages(t, h, y, trial, k, inputs, rate, locked, geometry, model, work)
-        evaluations += used
+        for stage in range(1, 7):
+            _trial(stage, h, y, k, trial)
+            status = call_rates(
+                address, t + C[stage] * h, at_y, at_k + DOUBLE * size * stage, at_inputs, m, rate,
+                at_locked, at_geometry, at_par, at_context, at_work,
+            )  # fmt: skip
+            evaluations += 1
+            if status != OK:
+                break
         error = _error(h, y, trial, k, rtol, atol) if status == OK else np.inf
         if not error <= 1.0:
             if h <= MIN_STEP:
@@ -306,10 +140,10 @@ def integrate(model, inputs, rate, locked, geometry, rtol, atol, ys, work):  # t
             h *= max(0.2, 0.9 * error**-0.2) if error < 1e6 else 0.2
             after_failure = True
             continue
-        filled = _interpolate(t, h, y, trial, k, rate, ys, filled)
+        filled = _interpolate(t, h, y, trial, k, rate, r, ys, filled)
         t += h
-        y[:] = trial
-        k[0] = k[6]
+        for j in range(size):
+            y[j], k[0, j] = trial[j], k[6, j]
         grow = 0.9 * max(error, 1e-8) ** -0.2
         h *= min(grow, 1.0 if after_failure else 5.0)
         after_failure = False

@@ -2,30 +2,40 @@
 
 from __future__ import annotations
 
+import enum
 import functools
+import logging
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from analysis.signals.conditioning import Signals
-from analysis.simulation import integrator
+from analysis.simulation import compiled_sources, fused, interpreted
+from analysis.simulation import equations as eq
+from analysis.simulation.integrator import integrate
 from analysis.simulation.model import Model
-from analysis.terms.base import OUT_ROWS, X_ROWS, Used
+from analysis.terms import baseline_of
+from analysis.terms.base import Used
+from analysis.terms.specialise import NotSpecialisable
 from rig.model import channels as ch
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
+log = logging.getLogger(__name__)
 
 RTOL = 1e-6
 ATOL_ANGLE, ATOL_PRESSURE, ATOL_HIDDEN = 1e-7, 10.0, 1e-8  # rad, Pa; of rates the terms say
 _REASONS = {
-    integrator.LEFT_STROKE: "a piston went half a stroke past its end",
-    integrator.NOT_FINITE: "the state diverged",
-    integrator.STEP_TOO_SMALL: "the step needed fell below 0.1 us (the state diverged)",
-    integrator.BAD_INERTIA: "the inertia matrix is not positive definite",
+    eq.LEFT_STROKE: "a piston went half a stroke past its end",
+    eq.NOT_FINITE: "the state diverged",
+    eq.STEP_TOO_SMALL: "the step needed fell below 0.1 us (the state diverged)",
+    eq.BAD_INERTIA: "the inertia matrix is not positive definite",
 }
 
 
@@ -44,6 +54,12 @@ class DrivingInput:
     q: Array
     qd: Array
     qdd: Array
+
+    @functools.cached_property
+    def inputs(self) -> Array:
+        """Everything as the right-hand side reads it: (n, 2 + 4 N)."""
+        parts = (self.p_s, self.temperature, self.u, self.q, self.qd, self.qdd)
+        return np.ascontiguousarray(np.column_stack(parts))
 
 
 @dataclass(frozen=True)
@@ -106,19 +122,42 @@ def drive_of(signals: Signals) -> DrivingInput:
 
 @dataclass(frozen=True)
 class Compiled:
-    """A model in the integrator's arrays."""
+    """A model in the integrator's arrays: its right-hand side `rates` and what that is handed.
 
-    addresses: NDArray[np.int64]
-    ends: NDArray[np.int64]
-    hidden_ends: NDArray[np.int64]
-    prepares: NDArray[np.bool_]
+    `hidden` states follow the 4 N of the joints; `fused` says whether `rates` is the set's own.
+    """
+
+    rates: Any
+    context: NDArray[np.int64]
     par: Array
     geometry: Array
+    hidden: int
     rate_tolerance: float
+    fused: bool
+
+    @property
+    def address(self) -> int:
+        """Machine address of the right-hand side."""
+        return int(self.rates.address)
+
+    def work(self) -> Array:
+        """Return room for one thread to evaluate the right-hand side in."""
+        return np.zeros(interpreted.work_size(len(self.geometry)))
 
 
-def compiled(model: Model) -> Compiled:
-    """Lay a model out for the integrator; raises InputError where a parameter is not identified."""
+class Effort(enum.Enum):
+    """How much a model is to be simulated, which decides whether compiling it is worth while."""
+
+    ONCE = "a few records"
+    FIT = "hundreds of records"
+
+
+def compiled(model: Model, effort: Effort = Effort.ONCE) -> Compiled:
+    """Lay a model out for the integrator; raises InputError where a parameter is not identified.
+
+    The set's own right-hand side is taken where the disk has it, and made for every rig's own terms
+    and for a fit; otherwise terms are called one by one. Both give the same numbers.
+    """
     missing = [name for name, p in model.parameters.items() if not p.identified]
     if missing:
         raise InputError(
@@ -127,15 +166,37 @@ def compiled(model: Model) -> Compiled:
         )
     values = model.values
     packed = [u.term.pack(model.rig, values, u.shape) for u in model.terms]
+    hidden = [u.term.hidden(model.rig) for u in model.terms]
+    geometry = _geometry(model.rig)
+    rates = _fused(model, packed, hidden, geometry, effort)
+    no_terms = np.zeros(1, dtype=np.int64)
     return Compiled(
-        np.array([u.term.kernel.address for u in model.terms], dtype=np.int64),
-        np.cumsum([0, *(len(p) for p in packed)]),
-        np.cumsum([0, *(u.term.hidden(model.rig) for u in model.terms)]),
-        np.array([u.term.prepares for u in model.terms]),
+        rates or interpreted.compiled_rates(),
+        no_terms if rates else interpreted.context(len(geometry), model.terms, packed, hidden),
         np.concatenate(packed),
-        _geometry(model.rig),
+        geometry,
+        sum(hidden),
         min(u.term.tolerance(u.shape) for u in model.terms),
+        rates is not None,
     )
+
+
+def _fused(
+    model: Model, packed: Sequence[Array], hidden: Sequence[int], geometry: Array, effort: Effort
+) -> Any | None:
+    """Return the compiled right-hand side of the model's set of terms, None if there is none."""
+    electric = [bool(gain != 0.0) for gain in geometry[:, eq.GAIN]]
+    try:
+        source = fused.source_of(model.terms, packed, hidden, electric)
+    except NotSpecialisable as reason:
+        log.info("the equations stay term by term: %s", reason)
+        return None
+    found = compiled_sources.stored(source)
+    own = {u.term.name for u in model.terms} <= {t.name for t in baseline_of(model.rig)}
+    if found is None and (own or effort is Effort.FIT):
+        names = " ".join(dict.fromkeys(u.term.name for u in model.terms))
+        return compiled_sources.compiled_now(source, f"{len(electric)} joint(s): {names}")
+    return found
 
 
 @functools.lru_cache(maxsize=16)
@@ -147,8 +208,8 @@ def _geometry(rig: Rig) -> Array:
     if rig.electric:
         rows = [[0.0] * 10 for _ in rig.joints]
         for row, gain in zip(rows, rig.drive_gains, strict=True):
-            row[integrator.GAIN] = gain
-        rows[0][integrator.OFFSET] = rig.base_angle
+            row[eq.GAIN] = gain
+        rows[0][eq.OFFSET] = rig.base_angle
         return _geometry_cached(tuple(map(tuple, rows)))
     return _geometry_cached(
         tuple(
@@ -178,24 +239,23 @@ def simulate(
     total = len(drive.u)
     samples = total - first if samples is None else samples
     N = drive.u.shape[1]
-    hidden = int(ready.hidden_ends[-1])
+    hidden = ready.hidden
     ys = np.zeros((samples, 4 * N + hidden))
     ys[0, : 4 * N] = np.concatenate((start.q, start.qd, start.p_cap, start.p_rod))
     if start.hidden is not None:
         ys[0, 4 * N :] = start.hidden
-    inputs = _inputs(drive)[first : first + samples]
+    inputs = drive.inputs[first : first + samples]
     atol = np.repeat(
         [ATOL_ANGLE, ready.rate_tolerance, ATOL_PRESSURE, ATOL_PRESSURE, ATOL_HIDDEN],
         [N, N, N, N, hidden],
     )
-    status, filled, evaluations = integrator.integrate(
-        (ready.addresses, ready.ends, ready.hidden_ends, ready.prepares, ready.par),
-        np.ascontiguousarray(inputs), drive.rate, drive.locked, ready.geometry, RTOL, atol, ys,
-        _workspace(N),
+    status, filled, evaluations = integrate(
+        ready.address, ready.context, ready.par, ready.geometry, ready.work(),
+        inputs, drive.rate, drive.locked, RTOL, atol, ys,
     )  # fmt: skip
     ys[filled:] = ys[filled - 1]
     failure = ""
-    if status != integrator.OK:
+    if status != eq.OK:
         failure = f"{_REASONS[status]} {filled / drive.rate:.3f} s after the start"
     return _result(ready.geometry, drive, inputs, ys, failure, filled, evaluations)
 
@@ -206,51 +266,56 @@ def _result(
 ) -> Simulation:  # fmt: skip
     N = drive.u.shape[1]
     q, qd, cap, rod = (ys[:, k * N : (k + 1) * N].copy() for k in range(4))
-    q[:, drive.locked] = inputs[:, 2 + N : 2 + 2 * N][:, drive.locked]
-    qd[:, drive.locked] = inputs[:, 2 + 2 * N : 2 + 3 * N][:, drive.locked]
+    for held in map(int, np.flatnonzero(drive.locked)):
+        q[:, held], qd[:, held] = inputs[:, 2 + N + held], inputs[:, 2 + 2 * N + held]
     evaluated = int(evaluations)
-    if (geometry[:, integrator.GAIN] != 0.0).all():
+    if (geometry[:, eq.GAIN] != 0.0).all():
         return Simulation(
             drive.rate, q, qd, cap, rod, q, qd, failure, int(filled), 0, evaluated, electric=True
         )
-    a, c, mid, offset = geometry[:, :4].T
-    length = np.sqrt(a**2 + c**2 - 2 * a * c * np.cos(q + offset))
-    slope = a * c * np.sin(q + offset) / length
-    free = ~drive.locked
-    p_s = inputs[:filled, :1]
-    beyond = np.zeros(filled, dtype=bool)
-    for p in (cap, rod):
-        beyond |= ((p[:filled, free] < 0) | (p[:filled, free] > p_s)).any(axis=1)
+    piston, speed = np.empty_like(q), np.empty_like(q)
+    outside = _cylinders(geometry, inputs, drive.locked, q, qd, cap, rod, filled, piston, speed)
     return Simulation(
-        drive.rate, q, qd, cap, rod, length - mid, slope * qd, failure, int(filled),
-        int(beyond.sum()), evaluated,
-    )  # fmt: skip
+        drive.rate, q, qd, cap, rod, piston, speed, failure, int(filled), int(outside), evaluated
+    )
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _cylinders(geometry, inputs, locked, q, qd, cap, rod, filled, piston, speed):  # type: ignore[no-untyped-def]
+    """Fill piston and speed (n, N); return how many samples have a pressure outside [0, p_s]."""
+    n, N = q.shape
+    count = 0
+    for k in range(n):
+        beyond = False
+        for i in range(N):
+            a, c, beta = (
+                geometry[i, eq.PIN_A],
+                geometry[i, eq.PIN_C],
+                q[k, i] + geometry[i, eq.OFFSET],
+            )
+            length = math.sqrt(a * a + c * c - 2.0 * a * c * math.cos(beta))
+            piston[k, i] = length - geometry[i, eq.MID]
+            speed[k, i] = a * c * math.sin(beta) / length * qd[k, i]
+            if not locked[i]:
+                for p in (cap[k, i], rod[k, i]):
+                    beyond = beyond or p < 0.0 or p > inputs[k, 0]
+        count += beyond and k < filled
+    return count
 
 
 def rates_of(ready: Compiled, drive: DrivingInput) -> Callable[[float, Array], Array]:
     """Return dy/dt(t, y) of a compiled model under a drive, for other integrators to use."""
-    N = drive.u.shape[1]
-    inputs = np.ascontiguousarray(_inputs(drive))
-    work = _workspace(N)
-    parts = (ready.addresses, ready.ends, ready.hidden_ends, ready.prepares, ready.par)
+    inputs, work = drive.inputs, ready.work()
 
     def rates(t: float, y: Array) -> Array:
         dy = np.zeros_like(y)
-        integrator.rates(t, y, dy, inputs, drive.rate, drive.locked, ready.geometry, parts, work)
+        eq.evaluate(
+            ready.address, t, np.ascontiguousarray(y), dy, inputs, drive.rate, drive.locked,
+            ready.geometry, ready.par, ready.context, work,
+        )  # fmt: skip
         return dy
 
     return rates
-
-
-def _inputs(drive: DrivingInput) -> Array:
-    return np.column_stack((drive.p_s, drive.temperature, drive.u, drive.q, drive.qd, drive.qdd))
-
-
-def _workspace(joints: int) -> tuple[Array, Array, Array, Array, Array]:
-    N = joints
-    return (
-        np.zeros(4), np.zeros((X_ROWS, N)), np.zeros((OUT_ROWS, N)), np.zeros((N, N)), np.zeros(N),
-    )  # fmt: skip
 
 
 def state_at(signals: Signals, sample: int) -> State:

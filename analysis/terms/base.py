@@ -7,9 +7,7 @@ dataclass derived from `Term` and names it in `TERMS`; nothing else changes.
 Sign convention of every row: sum of columns times coefficients = right-hand side, with
 right-hand sides G F (torque_i), + A_cap ds/dt (flow_cap_i), - A_rod ds/dt (flow_rod_i).
 
-Simulation. Each term has a kernel, a numba function of fixed signature, so that the integrator is
-compiled once and is handed the addresses of the terms' functions (a call costs about 5 ns;
-composing by recompiling the integrator costs seconds per model):
+Simulation. Each term has a kernel, a plain function of fixed signature that numba can compile:
 
     kernel(phase, bench, x, z, par, out, M, dz) -> None
     phase  PREPARE: may change `bench` and `x` (what all terms see: dead band, supply sag);
@@ -21,6 +19,13 @@ composing by recompiling the integrator costs seconds per model):
     out    (OUT_ROWS, N): TORQUE generalised torque on the joint [N m], FLOW_CAP, FLOW_ROD flow
            into the chamber [m^3/s], COMP_CAP, COMP_ROD compressibility V/b [m^3/Pa]
     M      (N, N) inertia in joint coordinates [kg m^2]
+
+A kernel is used in two ways that give the same numbers. A model that is simulated seldom calls each
+kernel by its address (`analysis.simulation.interpreted`). For one that is simulated often, source
+is generated from the kernels' source and compiled once (`analysis.simulation.fused`); for that, a
+kernel keeps to loops over joints, `if`, assignments, functions of `math` and `numpy`, and functions
+marked `njit`. An index comes from a loop or is `int(par[k])`, where `par[k]` is a joint (0-based)
+and no parameter. What goes beyond this works term by term.
 """
 
 from __future__ import annotations

@@ -24,7 +24,15 @@ from analysis.identify.settings import IDENTIFY
 from analysis.regression.rows import Filtering
 from analysis.signals.conditioning import Mask, aligned_channels, condition
 from analysis.simulation.model import Model, model_of
-from analysis.simulation.simulate import DrivingInput, State, compiled, drive_of, simulate, state_at
+from analysis.simulation.simulate import (
+    DrivingInput,
+    Effort,
+    State,
+    compiled,
+    drive_of,
+    simulate,
+    state_at,
+)
 from analysis.simulation.validate import arrived
 from analysis.terms.base import Used
 from rig.model import channels as ch
@@ -191,7 +199,7 @@ def with_values(model: Model, values: Mapping[str, float]) -> Model:
 
 def score(task: SearchTask, values: Mapping[str, float]) -> Score:
     """Simulate a candidate over all windows and return its error and its fate."""
-    ready = compiled(with_values(task.model, values))
+    ready = compiled(with_values(task.model, values), Effort.FIT)
     total, lost, samples, fate = 0.0, 0, 0, ""
     for window in task.windows:
         samples += window.samples

@@ -32,7 +32,7 @@ from analysis.regression.least_squares import scaled_inverse
 from analysis.regression.solve import Solution
 from analysis.signals.conditioning import Mask, aligned_channels
 from analysis.simulation.model import Model, model_of
-from analysis.simulation.simulate import DrivingInput, State, compiled, drive_of, simulate
+from analysis.simulation.simulate import DrivingInput, Effort, State, compiled, drive_of, simulate
 from analysis.simulation.validate import arrived, first_state
 from analysis.terms.base import Used
 from rig.model import channels as ch
@@ -60,7 +60,7 @@ class _Record:
 
     def left(self, model: Model) -> Array:
         """Return measured less simulated positions (n, F)."""
-        found = simulate(compiled(model), self.drive, self.start)
+        found = simulate(compiled(model, Effort.FIT), self.drive, self.start)
         if found.failure:
             return np.full(self.measured.shape, IDENTIFY.failed_state)
         simulated = found.channels()

@@ -18,9 +18,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from analysis.identify.settings import IDENTIFY
-from analysis.simulation import integrator
+from analysis.simulation.equations import OK, evaluate
 from analysis.simulation.simulate import Compiled
-from analysis.terms.base import OUT_ROWS, X_ROWS, Used
+from analysis.terms.base import Used
 
 Array = NDArray[np.float64]
 
@@ -28,31 +28,46 @@ SAMPLES_PER_STEP = 2
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _shoot(model, pars, starts, inputs, rate, locked, geometry, first, every, parts, out, work):  # type: ignore[no-untyped-def]
+def _shoot(  # type: ignore[no-untyped-def]
+    address, context, pars, geometry, work, starts, inputs, rate, locked, first, every, parts, out
+):
     """Fill out (P, points, size), a point every `every` steps of `parts` each; return success."""
     trajectories, points, size = out.shape
     h = SAMPLES_PER_STEP / (rate * parts)
     start = first / rate
-    k = np.zeros((4, size))
+    k1, k2, k3, k4 = np.zeros(size), np.zeros(size), np.zeros(size), np.zeros(size)
     trial = np.zeros(size)
     for p in range(trajectories):
         y = starts[p].copy()
-        mine = (model[0], model[1], model[2], model[3], pars[p])
+        par = pars[p]
         out[p, 0] = y
         for point in range(1, points):
             for step in range(every * parts):
                 t = start + h * ((point - 1) * every * parts + step)
-                for stage in range(4):
-                    part = 0.0 if stage == 0 else (1.0 if stage == 3 else 0.5)
-                    for j in range(size):
-                        trial[j] = y[j] + (part * h * k[stage - 1, j] if stage else 0.0)
-                    status = integrator.rates(
-                        t + part * h, trial, k[stage], inputs, rate, locked, geometry, mine, work
-                    )
-                    if status != integrator.OK:
-                        return False
+                status = evaluate(
+                    address, t, y, k1, inputs, rate, locked, geometry, par, context, work
+                )
                 for j in range(size):
-                    y[j] += h / 6.0 * (k[0, j] + 2.0 * (k[1, j] + k[2, j]) + k[3, j])
+                    trial[j] = y[j] + 0.5 * h * k1[j]
+                status += evaluate(
+                    address, t + 0.5 * h, trial, k2, inputs, rate, locked, geometry, par, context,
+                    work,
+                )  # fmt: skip
+                for j in range(size):
+                    trial[j] = y[j] + 0.5 * h * k2[j]
+                status += evaluate(
+                    address, t + 0.5 * h, trial, k3, inputs, rate, locked, geometry, par, context,
+                    work,
+                )  # fmt: skip
+                for j in range(size):
+                    trial[j] = y[j] + h * k3[j]
+                status += evaluate(
+                    address, t + h, trial, k4, inputs, rate, locked, geometry, par, context, work
+                )
+                if status != OK:
+                    return False
+                for j in range(size):
+                    y[j] += h / 6.0 * (k1[j] + 2.0 * (k2[j] + k3[j]) + k4[j])
             out[p, point] = y
     return bool(np.isfinite(out).all())
 
@@ -87,14 +102,9 @@ def shoot(
     A point every 2 x `every` samples, each two samples in `parts` steps. None where a state ceased
     to exist.
     """
-    N = len(locked)
-    work = (
-        np.zeros(4), np.zeros((X_ROWS, N)), np.zeros((OUT_ROWS, N)), np.zeros((N, N)), np.zeros(N),
-    )  # fmt: skip
     out = np.zeros((len(starts), window.points, starts.shape[1]))
-    model = (ready.addresses, ready.ends, ready.hidden_ends, ready.prepares)
     good = _shoot(
-        model, pars, starts, inputs, rate, locked, ready.geometry, window.first, every, parts, out,
-        work,
+        ready.address, ready.context, pars, ready.geometry, ready.work(), starts, inputs, rate,
+        locked, window.first, every, parts, out,
     )  # fmt: skip
     return out if good else None

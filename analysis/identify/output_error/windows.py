@@ -23,7 +23,7 @@ from analysis.regression.conditioned import condition_runs
 from analysis.signals.conditioning import Mask
 from analysis.signals.filters import channel_filter
 from analysis.simulation.model import Model, model_of
-from analysis.simulation.simulate import compiled, drive_of, hidden_paths, put_right
+from analysis.simulation.simulate import Effort, compiled, drive_of, hidden_paths, put_right
 from analysis.terms.base import Used, inverted
 from rig.model import channels as ch
 from rig.model.parse import InputError
@@ -71,13 +71,8 @@ class Windows:
         for one in records:
             record, signals = one.record, put_right(self.rig, self.terms, one.signals)
             drive = drive_of(signals)
-            inputs = np.column_stack(
-                (drive.p_s, drive.temperature, drive.u, drive.q, drive.qd, drive.qdd)
-            )
             kelvin = float(np.mean(signals.temperature)) - self.rig.oil.temperature
-            self.sources.append(
-                WindowSource(signals, np.ascontiguousarray(inputs), drive.locked, kelvin)
-            )
+            self.sources.append(WindowSource(signals, drive.inputs, drive.locked, kelvin))
             free = ~drive.locked
             every = self.every
             points = round(IDENTIFY.window * record.sample_rate) // (SAMPLES_PER_STEP * every)
@@ -164,7 +159,7 @@ class Windows:
             nudges[-1] = IDENTIFY.sensitivity_step * b
         rows = [theta, *(theta + n * e for n, e in zip(nudges, np.eye(len(theta)), strict=True))]
         models = [self.model(row, source.kelvin) for row in rows]
-        ready = [compiled(model) for model in models]
+        ready = [compiled(model, Effort.FIT) for model in models]
         first = hidden_paths(models[0], source.signals)
         hidden = [
             hidden_paths(model, source.signals) if first.size and name in self.places else first
@@ -215,7 +210,7 @@ class Windows:
         free = len(places) // 4
         state_nudges = np.repeat(IDENTIFY.start_steps, free)
         active = self._active(stretch.record)
-        y0 = np.zeros((1 + len(places) + len(active), len(start) + int(ready.hidden_ends[-1])))
+        y0 = np.zeros((1 + len(places) + len(active), len(start) + ready.hidden))
         y0[:, : len(start)] = start
         for row, (place, nudge) in enumerate(zip(places, state_nudges, strict=True), start=1):
             y0[row, place] += nudge

@@ -1,0 +1,188 @@
+"""The limit for the model's free run: the same equations written by hand, for two joints only.
+
+The paper's model with both joints free, its state in local variables, the same Runge-Kutta pair
+with the same choice of steps and the same output. Nothing of the program's own simulation is used,
+and nothing of it could be general: what it takes is what a model-independent program may aim at.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+
+
+def constants(rig: Rig, values: Mapping[str, float]) -> Array:
+    """Return the parameters (13 + 2 x 9,) in the order that `_rates` reads them."""
+    g = rig.gravity
+    names = ("M1", "M2", "R12", "Fv1", "Fv2")
+    gains = [values[f"C_{edge}_{i}"] for i in (1, 2) for edge in ("pp", "pm", "mp", "mm")]
+    out = [*(values[name] for name in names), g * values["W1"], g * values["W2"]]
+    out += [1.0 / values["b"], *gains]
+    for joint in rig.joints:
+        link, cylinder = joint.linkage, joint.cylinder
+        a, c = link.base_pin, link.arm_pin
+        out += [a * a + c * c, a * c, link.mid_length, link.offset]
+        out += [cylinder.cap_area, cylinder.rod_area, cylinder.cap_pipe_volume]
+        out += [cylinder.rod_pipe_volume, 0.5 * cylinder.stroke]
+    return np.array(out)
+
+
+@njit(error_model="numpy", inline="always")
+def _root(drop):  # type: ignore[no-untyped-def]
+    return math.sqrt(drop) if drop >= 0.0 else -math.sqrt(-drop)
+
+
+@njit(error_model="numpy", inline="always")
+def _linkage(q, squares, product, mid, offset):  # type: ignore[no-untyped-def]
+    """Return the piston's place and dl/dq."""
+    length = math.sqrt(squares - 2.0 * product * math.cos(q + offset))
+    return length - mid, product * math.sin(q + offset) / length
+
+
+@njit(error_model="numpy")
+def _rates(t, y, dy, u, supply, rate, p):  # type: ignore[no-untyped-def]
+    """Fill dy/dt of y = (q1, q2, q1', q2', cap1, cap2, rod1, rod2)."""
+    q1, q2, v1, v2, cap1, cap2, rod1, rod2 = y[0], y[1], y[2], y[3], y[4], y[5], y[6], y[7]
+    place = min(max(t * rate, 0.0), len(supply) - 1.0)
+    low = min(int(place), len(supply) - 2)
+    w = place - low
+    p_s = supply[low] + w * (supply[low + 1] - supply[low])
+    u1 = u[low, 0] + w * (u[low + 1, 0] - u[low, 0])
+    u2 = u[low, 1] + w * (u[low + 1, 1] - u[low, 1])
+    s1, G1 = _linkage(q1, p[16], p[17], p[18], p[19])
+    s2, G2 = _linkage(q2, p[25], p[26], p[27], p[28])
+    c, s = p[2] * math.cos(q2), p[2] * math.sin(q2)
+    M11, M12, M22 = p[0] + 2.0 * c, p[1] + c, p[1]
+    both = v1 + v2
+    pull = p[6] * math.sin(q1 + q2)
+    tau2 = G2 * (p[29] * cap2 - p[30] * rod2) - p[4] * v2 - pull - s * v1 * v1
+    tau1 = (
+        G1 * (p[20] * cap1 - p[21] * rod1) - p[3] * v1 - pull - p[5] * math.sin(q1)
+        + s * (both * both - v1 * v1)
+    )  # fmt: skip
+    det = M11 * M22 - M12 * M12
+    a1, a2 = (M22 * tau1 - M12 * tau2) / det, (M11 * tau2 - M12 * tau1) / det
+    if u1 > 0.0:
+        in1, out1 = p[8] * _root(p_s - cap1) * u1, p[10] * _root(rod1) * u1
+    else:
+        in1, out1 = p[9] * _root(cap1) * u1, p[11] * _root(p_s - rod1) * u1
+    if u2 > 0.0:
+        in2, out2 = p[12] * _root(p_s - cap2) * u2, p[14] * _root(rod2) * u2
+    else:
+        in2, out2 = p[13] * _root(cap2) * u2, p[15] * _root(p_s - rod2) * u2
+    sd1, sd2 = G1 * v1, G2 * v2
+    dy[0], dy[1], dy[2], dy[3] = v1, v2, a1, a2
+    dy[4] = (in1 - p[20] * sd1) / (p[7] * (p[22] + (p[24] + s1) * p[20]))
+    dy[5] = (in2 - p[29] * sd2) / (p[7] * (p[31] + (p[33] + s2) * p[29]))
+    dy[6] = (p[21] * sd1 - out1) / (p[7] * (p[23] + (p[24] - s1) * p[21]))
+    dy[7] = (p[30] * sd2 - out2) / (p[7] * (p[32] + (p[33] - s2) * p[30]))
+
+
+_A = np.array(
+    [
+        [1 / 5, 0, 0, 0, 0, 0],
+        [3 / 40, 9 / 40, 0, 0, 0, 0],
+        [44 / 45, -56 / 15, 32 / 9, 0, 0, 0],
+        [19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0, 0],
+        [9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0],
+        [35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84],
+    ]
+)
+_C = (1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0, 1.0)
+_E = (71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40)
+_D = (
+    -12715105075 / 11282082432, 0.0, 87487479700 / 32700410799, -10690763975 / 1880347072,
+    701980252875 / 199316789632, -1453857185 / 822651844, 69997945 / 29380423,
+)  # fmt: skip
+
+
+@njit(error_model="numpy")
+def free_run(start, u, supply, rate, p, rtol, atol, out):  # type: ignore[no-untyped-def]  # noqa: PLR0912  unrolled
+    """Fill out (n, 12) with the state, both pistons and both speeds; return the evaluations.
+
+    `start` (8,) q, q', p_cap, p_rod; `u` (n, 2), `supply` (n,) sampled at `rate`; the error of a
+    step is kept below `atol` (8,) + `rtol` |y|, root mean square.
+    """
+    n = len(out)
+    k1, k2, k3, k4, k5, k6, k7 = (
+        np.zeros(8), np.zeros(8), np.zeros(8), np.zeros(8), np.zeros(8), np.zeros(8), np.zeros(8),
+    )  # fmt: skip
+    y, z = start.copy(), np.empty(8)
+    r2, r3, r4, r5 = np.empty(8), np.empty(8), np.empty(8), np.empty(8)
+    out[0, :8] = y
+    t, h, filled, evaluations = 0.0, 0.2 / rate, 1, 1
+    end = (n - 1) / rate + 1e-9
+    _rates(t, y, k1, u, supply, rate, p)
+    failed = False
+    while filled < n:
+        h = min(h, end - t)
+        for j in range(8):
+            z[j] = y[j] + h * (_A[0, 0] * k1[j])
+        _rates(t + _C[0] * h, z, k2, u, supply, rate, p)
+        for j in range(8):
+            z[j] = y[j] + h * (_A[1, 0] * k1[j] + _A[1, 1] * k2[j])
+        _rates(t + _C[1] * h, z, k3, u, supply, rate, p)
+        for j in range(8):
+            z[j] = y[j] + h * (_A[2, 0] * k1[j] + _A[2, 1] * k2[j] + _A[2, 2] * k3[j])
+        _rates(t + _C[2] * h, z, k4, u, supply, rate, p)
+        for j in range(8):
+            z[j] = y[j] + h * (
+                _A[3, 0] * k1[j] + _A[3, 1] * k2[j] + _A[3, 2] * k3[j] + _A[3, 3] * k4[j]
+            )
+        _rates(t + _C[3] * h, z, k5, u, supply, rate, p)
+        for j in range(8):
+            z[j] = y[j] + h * (
+                _A[4, 0] * k1[j] + _A[4, 1] * k2[j] + _A[4, 2] * k3[j] + _A[4, 3] * k4[j]
+                + _A[4, 4] * k5[j]
+            )  # fmt: skip
+        _rates(t + h, z, k6, u, supply, rate, p)
+        for j in range(8):
+            z[j] = y[j] + h * (
+                _A[5, 0] * k1[j] + _A[5, 2] * k3[j] + _A[5, 3] * k4[j] + _A[5, 4] * k5[j]
+                + _A[5, 5] * k6[j]
+            )  # fmt: skip
+        _rates(t + h, z, k7, u, supply, rate, p)
+        evaluations += 6
+        error = 0.0
+        for j in range(8):
+            e = _E[0] * k1[j] + _E[2] * k3[j] + _E[3] * k4[j] + _E[4] * k5[j] + _E[5] * k6[j]
+            e += _E[6] * k7[j]
+            error += (h * e / (atol[j] + rtol * max(abs(y[j]), abs(z[j])))) ** 2
+        error = math.sqrt(error / 8.0)
+        if error > 1.0:
+            h *= max(0.2, 0.9 * error**-0.2)
+            failed = True
+            continue
+        for j in range(8):
+            r2[j] = z[j] - y[j]
+            r3[j] = h * k1[j] - r2[j]
+            r4[j] = r2[j] - h * k7[j] - r3[j]
+            r5[j] = h * (
+                _D[0] * k1[j] + _D[2] * k3[j] + _D[3] * k4[j] + _D[4] * k5[j] + _D[5] * k6[j]
+                + _D[6] * k7[j]
+            )  # fmt: skip
+        while filled < n and filled / rate <= t + h + 1e-12:
+            a = min((filled / rate - t) / h, 1.0)
+            b = 1.0 - a
+            for j in range(8):
+                out[filled, j] = y[j] + a * (r2[j] + b * (r3[j] + a * (r4[j] + b * r5[j])))
+            filled += 1
+        t += h
+        y[:], k1[:] = z, k7
+        h *= min(0.9 * max(error, 1e-8) ** -0.2, 1.0 if failed else 5.0)
+        failed = False
+    for k in range(n):
+        for i in range(2):
+            place, slope = _linkage(
+                out[k, i], p[16 + 9 * i], p[17 + 9 * i], p[18 + 9 * i], p[19 + 9 * i]
+            )
+            out[k, 8 + i], out[k, 10 + i] = place, slope * out[k, 2 + i]
+    return evaluations
