@@ -20,11 +20,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import oaconvolve
 
 from analysis.design.settings import DESIGN
 from analysis.regression.rows import Filtering, Rows, right_sides
 from analysis.signals.conditioning import Mask, Signals
+from analysis.signals.convolution import same_convolved
 from analysis.signals.filters import FirSmoother
 from analysis.terms.base import Used, family_of
 from rig.model import channels as ch
@@ -173,5 +173,5 @@ def _transposed(weights: Array, taps: Array) -> Array:
     filled = np.flatnonzero(weights.any(axis=0))
     out = np.zeros_like(weights)
     if len(filled):
-        out[:, filled] = oaconvolve(weights[:, filled], taps[::-1, None], mode="same", axes=0)
+        out[:, filled] = same_convolved(weights[:, filled], taps[::-1])
     return out

@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import f as fisher
+from scipy.special import fdtrc
 
 from analysis.identify.checks import Check
 from analysis.identify.result import Identification, estimates_of
@@ -236,7 +236,7 @@ def _probability(solution: Solution, C: Array, apart: Array) -> float:
     if not free > 0:
         return float("nan")
     t2 = float(apart @ np.linalg.solve(V, apart))
-    return float(fisher.sf(t2 * free / (dof * q), q, free))
+    return float(fdtrc(q, free, t2 * free / (dof * q)))
 
 
 def _statement(level: Level) -> Check:

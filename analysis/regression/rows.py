@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import upfirdn
 
 from analysis.regression.settings import REGRESSION
 from analysis.signals.conditioning import Mask, Signals
+from analysis.signals.convolution import decimated
 from analysis.signals.filters import (
     FirSmoother,
     Smoother,
@@ -250,6 +250,5 @@ def _low_passed(
         (masks.lost, np.ones(len(weights)), 0.5),
     ):
         if mask.any():
-            share = upfirdn(taps, mask.astype(np.float64), 1, step)
-            dropped |= share[start : start + len(filtered)] > limit
+            dropped |= decimated(mask.astype(np.float64), taps, step) > limit
     return filtered, dropped, time[centres]

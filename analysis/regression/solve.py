@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from analysis.regression.least_squares import factored
 from analysis.regression.settings import REGRESSION
@@ -201,4 +201,4 @@ def satterthwaite(variance: Array, squares: Array) -> Array:
 
 def half_width(std: Array, dof: Array, level: float = 0.95) -> Array:
     """Return the half width of confidence intervals, Student's t with `dof` (arrays alike)."""
-    return np.asarray(student.ppf(0.5 + 0.5 * level, np.maximum(dof, 1.0)) * std)
+    return np.asarray(stdtrit(np.maximum(dof, 1.0), 0.5 + 0.5 * level) * std)

@@ -17,14 +17,14 @@ choice.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import butter, kaiserord, oaconvolve, sosfiltfilt, upfirdn
-from scipy.special import i0
 
+from analysis.signals.convolution import convolved, decimated
 from analysis.signals.settings import SIGNALS
 from rig.model.parse import InputError
 
@@ -69,13 +69,11 @@ class FirSmoother:
 
     def apply(self, x: Array, order: int = 0) -> Array:
         """Return the filtered (d/dt)^order of x (n, ...); raises InputError if x is too short."""
-        return _convolve(_extended(x, self.reach, self.name), self.taps[order])
+        return convolved(_extended(x, self.reach, self.name), self.taps[order])
 
     def decimate(self, x: Array, step: int) -> Array:
         """Return every `step`-th filtered sample whose support lies inside x, shape (m, ...)."""
-        first = -(-2 * self.reach // step)
-        filtered = upfirdn(self.taps[0], x, 1, step, axis=0)
-        return np.asarray(filtered[first : (len(x) - 1) // step + 1])
+        return decimated(x, self.taps[0], step)
 
 
 def _extended(x: Array, reach: int, name: str) -> Array:
@@ -90,15 +88,10 @@ def _extended(x: Array, reach: int, name: str) -> Array:
     return np.concatenate((before, x, after))
 
 
-def _convolve(x: Array, taps: Array) -> Array:
-    shape = (-1,) + (1,) * (x.ndim - 1)
-    return np.asarray(oaconvolve(x, taps.reshape(shape), mode="valid", axes=0))
-
-
 def _kernel(t: Array, cutoff: float, half_width: float, beta: float) -> Array:
     """Return the continuous kernel of a low-pass: 2 fc sinc(2 fc t) under a Kaiser window."""
     inside = np.clip(1.0 - (t / half_width) ** 2, 0.0, None)
-    window = np.where(np.abs(t) <= half_width, i0(beta * np.sqrt(inside)) / i0(beta), 0.0)
+    window = np.where(np.abs(t) <= half_width, np.i0(beta * np.sqrt(inside)) / np.i0(beta), 0.0)
     return np.asarray(2 * cutoff * np.sinc(2 * cutoff * t) * window)
 
 
@@ -112,7 +105,10 @@ def windowed_sinc(rate: float, cutoff: float, transition: float) -> FirSmoother:
             f"a filter open to {cutoff:g} Hz needs a sample rate above "
             f"{2 * (cutoff + transition):g} Hz, not {rate:g} Hz"
         )
-    count, beta = kaiserord(SIGNALS.attenuation, transition / (0.5 * rate))
+    # Kaiser's formulas (Oppenheim and Schafer, Discrete-Time Signal Processing, section 7.6).
+    beta = 0.1102 * (SIGNALS.attenuation - 8.7)
+    width = 2.285 * 2.0 * math.pi * transition / rate
+    count = math.ceil((SIGNALS.attenuation - 7.95) / width + 1.0)
     reach = count // 2 + 1
     t = np.arange(-reach, reach + 1) / rate
     h0 = _kernel(t, cutoff + 0.5 * transition, (reach + 1) / rate, beta)
@@ -146,6 +142,8 @@ def butterworth(rate: float, cutoff: float, order: int = 4) -> FirSmoother:
 
     Its response is cut where it has decayed to 1e-6. `cutoff` [Hz] is -6 dB, both ways together.
     """
+    from scipy.signal import butter, sosfiltfilt  # noqa: PLC0415 - loads slowly
+
     half = int(np.ceil(6 * order * rate / (2 * np.pi * cutoff)))
     impulse = np.zeros(2 * half + 1)
     impulse[half] = 1.0
@@ -188,7 +186,7 @@ def align(x: Array, shift: float) -> Array:
     distance: Array = np.asarray(offsets - whole - fraction, dtype=np.float64)
     taps = _kernel(distance, 0.425, SIGNALS.align_half_width + 0.5, 8.0)
     # Convolution turns the taps round.
-    return _convolve(_extended(x, reach, "alignment"), taps[::-1] / taps.sum())
+    return convolved(_extended(x, reach, "alignment"), taps[::-1] / taps.sum())
 
 
 def bridged(x: Array) -> Array:

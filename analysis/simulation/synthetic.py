@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import resample
 
 from analysis.simulation.model import Model, nominal_model
 from analysis.simulation.simulate import DrivingInput, Simulation, simulate
@@ -82,6 +81,8 @@ def synthetic_run(
     `rms` [V] of spool, `noise` scales the rig's stated sensor noise. Channels are sampled at the
     tick, without skew or quantisation.
     """
+    from scipy.signal import resample  # noqa: PLC0415 - loads slowly
+
     rate = rig.sample_rate
     ideal = rig.model_copy(update={"sensors": rig.sensors.model_copy(update={"skew": 0.0})})
     model = nominal_model(rig, tuple(Used(term) for term in baseline()))

@@ -7,8 +7,9 @@ import logging
 from collections.abc import Mapping
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
-from scipy.signal import cont2discrete, lfilter
+from scipy.linalg import expm
 
 from analysis.simulation.model import Model, nominal_model
 from analysis.simulation.simulate import DrivingInput, State, simulate
@@ -27,18 +28,33 @@ def spool_response(valve: Valve, command: Array, rate: float) -> Array:
 
     u'' + 2 d w u' + w^2 u = w^2 k v with natural frequency w and damping d of the rig file.
     """
-    b, a = _held_response(valve.natural_frequency, valve.damping_ratio, rate)
+    step = _held_response(valve.natural_frequency, valve.damping_ratio, rate)
     held = np.clip(command, -valve.command_range, valve.command_range) * valve.spool_gain
-    spool = lfilter(b, a, np.clip(held, -valve.spool_stroke, valve.spool_stroke))
+    spool = _followed(step, np.clip(held, -valve.spool_stroke, valve.spool_stroke))
     return np.asarray(np.clip(spool, -valve.spool_stroke, valve.spool_stroke))
 
 
 @functools.lru_cache(maxsize=32)
-def _held_response(frequency: float, damping: float, rate: float) -> tuple[Array, Array]:
-    """Return the digital filter (b, a) of a unit second-order lag between held samples."""
+def _held_response(frequency: float, damping: float, rate: float) -> Array:
+    """Return (2, 3): u and u' of a unit second-order lag after one sample, by u, u' and input."""
     w, d = 2 * np.pi * frequency, damping
-    b, a, _ = cont2discrete(([w * w], [1.0, 2 * d * w, w * w]), 1 / rate, method="zoh")
-    return b.ravel(), a
+    generator = np.array([[0.0, 1.0, 0.0], [-w * w, -2 * d * w, w * w], [0.0, 0.0, 0.0]])
+    return np.ascontiguousarray(expm(generator / rate)[:2])
+
+
+@njit(cache=True)
+def _followed(step, held):  # type: ignore[no-untyped-def]
+    """Return u (n,) at the samples of a held input (n,), from rest."""
+    out = np.zeros_like(held)
+    u, rate = 0.0, 0.0
+    for k in range(1, len(held)):
+        v = held[k - 1]
+        u, rate = (
+            step[0, 0] * u + step[0, 1] * rate + step[0, 2] * v,
+            step[1, 0] * u + step[1, 1] * rate + step[1, 2] * v,
+        )
+        out[k] = u
+    return out
 
 
 def holding_state(rig: Rig, model: Model, piston: Array) -> State:

@@ -33,11 +33,13 @@ def check(
 
     Example: bramah check lock-and-excite --rig shinshu-2dof
     """
+    from protocols.files.plan import Overrides
     from rig.cli.predicted_errors import as_dict, foresee, prediction_text
-    from rig.cli.protocol_run import overridden
     from rig.cli.sheets import check_text
 
-    found = foresee(protocol, rig, overridden(repeats, duration, amplitude_scale, wave_seed, step))
+    steps = tuple(step) if step else None
+    changes = Overrides(repeats, duration, amplitude_scale, wave_seed, steps)
+    found = foresee(protocol, rig, changes)
     write_json(json, as_dict(found))
     if json != Path("-"):
         typer.echo(f"{check_text(found.limits)}\n\n{prediction_text(found)}")

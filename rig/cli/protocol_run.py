@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -136,14 +136,3 @@ def reset_device(rig: str, endpoint: str | None, reason: str) -> str:
     wire = described.wire if endpoint is None else wire_at(endpoint, described.wire)
     described = described.model_copy(update={"wire": wire})
     return reset_bench(described, make_driver(wire, described), reason)
-
-
-def overridden(
-    repeats: int | None,
-    duration: float | None,
-    amplitude_scale: float,
-    seed: int | None,
-    steps: Sequence[str] | None,
-) -> Overrides:
-    """Return what a person changed of a protocol on the command line."""
-    return Overrides(repeats, duration, amplitude_scale, seed, tuple(steps) if steps else None)

@@ -43,9 +43,11 @@ def run(
 
     Example: bramah run lock-and-excite-multisine --rig shinshu-2dof --out runs/monday
     """
-    from rig.cli.protocol_run import ProtocolJob, overridden, run_protocol
+    from protocols.files.plan import Overrides
+    from rig.cli.protocol_run import ProtocolJob, run_protocol
 
-    changes = overridden(repeats, duration, amplitude_scale, wave_seed, step)
+    steps = tuple(step) if step else None
+    changes = Overrides(repeats, duration, amplitude_scale, wave_seed, steps)
     job = ProtocolJob(protocol, rig, out, endpoint, changes, operator, track, memory)
     folder = run_protocol(job, progress)
     typer.echo(str(folder))

@@ -12,8 +12,9 @@ import math
 import re
 from typing import Annotated, Any, cast
 
-import pint
 from pydantic import BeforeValidator, ValidationInfo
+
+from rig.model.units import linear_map
 
 FROM_FILE: dict[str, bool] = {"from_file": True}
 
@@ -28,7 +29,9 @@ class UnitError(ValueError):
 
 
 @functools.cache
-def _registry() -> pint.UnitRegistry[Any]:
+def _registry() -> Any:
+    import pint  # noqa: PLC0415 - loads slowly, and files seldom need it
+
     return pint.UnitRegistry(autoconvert_offset_to_baseunit=True, cache_folder=None)
 
 
@@ -38,6 +41,11 @@ def _linear_map(unit: str, si: str) -> tuple[float, float]:
 
     Raises UnitError for an unknown unit or one of another dimension.
     """
+    return linear_map(unit, si) or map_by_pint(unit, si)
+
+
+def map_by_pint(unit: str, si: str) -> tuple[float, float]:
+    """Return the same of any unit that pint knows; raises UnitError."""
     registry = _registry()
     text = unit or "dimensionless"
     target = si or "dimensionless"
@@ -48,7 +56,7 @@ def _linear_map(unit: str, si: str) -> tuple[float, float]:
     try:
         zero = registry.Quantity(0.0, parsed).to(target).magnitude
         one = registry.Quantity(1.0, parsed).to(target).magnitude
-    except pint.PintError as error:
+    except Exception as error:  # of another dimension, or one that no conversion exists for
         raise UnitError(
             f"unit {text!r} does not measure what is wanted here; expected one like {target!r}"
         ) from error

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.signal import convolve
 
 from analysis.signals import filters as d
+from analysis.signals.convolution import convolved, decimated, same_convolved
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 from tests.studies.estimators import other_filters
@@ -115,3 +119,22 @@ def test_the_study_shows_why_the_default_is_the_default(rig: Rig) -> None:
         )
         assert paper.bias["inertia"] >= default.bias["inertia"] or "rows" in paper.filtering
     assert markdown(entries).count("\n") == len(entries) + 1
+
+
+@given(
+    st.integers(1, 400), st.sampled_from([(), (1,), (3,)]), st.integers(0, 40), st.integers(1, 30),
+    st.integers(0, 1000),
+)  # fmt: skip
+def test_own_convolutions_are_scipys(
+    extra: int, shape: tuple[int, ...], reach: int, step: int, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    taps = rng.normal(size=2 * reach + 1)
+    x = rng.normal(size=(2 * reach + extra, *shape))
+    along = taps.reshape(-1, *(1 for _ in shape))
+    whole = convolve(x, along, "full", "direct")
+    inside = whole[2 * reach : len(x)]
+    np.testing.assert_allclose(convolved(x, taps), inside, atol=1e-11)
+    np.testing.assert_allclose(same_convolved(x, taps), whole[reach : reach + len(x)], atol=1e-11)
+    every = [k for k in range(0, len(x), step) if k >= 2 * reach]
+    np.testing.assert_allclose(decimated(x, taps, step), whole[every], atol=1e-11)

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import contextlib
+import subprocess
+import sys
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.model.quantity import UnitError, parse_quantity, to_si, unit_map
+from rig.model import units
+from rig.model.quantity import UnitError, map_by_pint, parse_quantity, to_si, unit_map
+from rig.model.units import linear_map, measure
+
+SHIPPED = ("boom-1dof", "digger-3dof", "electric-2dof", "emps", "shinshu-2dof", "uia-crane")
 
 
 @pytest.mark.parametrize(
@@ -50,3 +56,87 @@ def test_the_array_map_agrees_with_the_single_number(value: float, unit: str) ->
 def test_any_text_is_a_quantity_or_a_unit_error(text: str) -> None:
     with contextlib.suppress(UnitError):
         assert isinstance(parse_quantity(text, "Pa"), float)
+
+
+NAMES = sorted(units._NAMES)
+WANTED = (
+    "m", "m^2", "m^3", "rad", "m/s", "m/s^2", "Pa", "Pa/s", "m^3/s", "Hz", "s", "V", "kg/m^3",
+    "degC", "delta_degC", "", "N*m/rad", "m^3/(s*V*Pa^0.5)", "kg*m^2", "N*s/m",
+)  # fmt: skip
+
+
+def by_pint(unit: str, si: str) -> tuple[float, float] | None:
+    try:
+        return map_by_pint(unit, si)
+    except UnitError:
+        return None
+
+
+def assert_as_pint(unit: str, si: str) -> None:
+    """Where our own table answers, pint answers the same."""
+    found = linear_map(unit, si)
+    if found is not None:
+        expected = by_pint(unit, si)
+        assert expected is not None, (unit, si)
+        assert found == pytest.approx(expected, rel=1e-14, abs=1e-12), (unit, si)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_name_of_the_own_table_is_pints(name: str) -> None:
+    for si in (
+        "m",
+        "kg",
+        "s",
+        "A",
+        "degC",
+        "delta_degC",
+        "Hz",
+        "N",
+        "Pa",
+        "J",
+        "W",
+        "V",
+        "m^3",
+        "",
+    ):
+        assert_as_pint(name, si)
+
+
+factor = st.tuples(st.sampled_from(NAMES), st.sampled_from(["", "^2", "**3", "^-1", "^0.5"])).map(
+    "".join
+)
+product = st.lists(factor, min_size=1, max_size=3).flatmap(
+    lambda parts: st.lists(
+        st.sampled_from(["*", "/", " * ", " / "]), min_size=len(parts) - 1, max_size=len(parts) - 1
+    ).map(lambda signs: "".join(p + s for p, s in zip(parts, [*signs, ""], strict=True)))
+)
+unit_text = st.one_of(product, st.tuples(product, product).map(lambda t: f"{t[0]}/({t[1]})"))
+
+
+@given(unit_text, st.sampled_from(WANTED))
+def test_a_made_up_unit_is_what_pint_makes_of_it(unit: str, si: str) -> None:
+    assert_as_pint(unit, si)
+
+
+@given(unit_text)
+def test_a_made_up_unit_has_pints_size_in_its_own_si_units(unit: str) -> None:
+    known = measure(unit)
+    if known is not None and all(float(p).is_integer() for p in known.powers):
+        names = ("m", "kg", "s", "A", "delta_degC")
+        si = "*".join(f"{n}^{p:g}" for n, p in zip(names, known.powers, strict=True) if p)
+        assert_as_pint(unit, si)
+
+
+@given(st.text(alphabet="mkgsPaVrdeC*/^()123. -bin", max_size=12), st.sampled_from(WANTED))
+def test_any_text_is_answered_as_pint_answers_or_left_to_it(unit: str, si: str) -> None:
+    assert_as_pint(unit, si)
+
+
+def test_the_shipped_rigs_are_read_without_pint() -> None:
+    code = (
+        "import sys; from rig.runs.rigs import load_rig\n"
+        f"for name in {SHIPPED!r}: load_rig(name)\n"
+        "assert 'pint' not in sys.modules"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

@@ -14,8 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
-from scipy.stats import t as student
+from scipy.special import ndtri, stdtrit
 
 from analysis.identify.estimators.equations import RepeatBlock, rows_of
 
@@ -44,7 +43,7 @@ def bootstrap(
     stretch = np.sqrt(n / max(n - 1, 1))
     if n > 1:
         dof = sum(len(m) - 1 for m in _units(blocks).values())
-        stretch *= student.ppf(0.975, dof) / norm.ppf(0.975)
+        stretch *= stdtrit(dof, 0.975) / ndtri(0.975)
     low, high = np.quantile(drawn, (0.025, 0.975), axis=0) - value
     std = np.sqrt(n / max(n - 1, 1)) * drawn.std(axis=0, ddof=1)
     return Drawn(std, value + stretch * low, value + stretch * high)

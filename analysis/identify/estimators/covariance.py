@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import f as fisher
+from scipy.special import fdtrc
 
 from analysis.identify.estimators.equations import Pieces
 from analysis.identify.settings import IDENTIFY
@@ -78,7 +78,7 @@ def lack_of_fit(pieces: Pieces, inverse: Array) -> Array:
     size, floor = np.diag(found), np.diag(noise[0])
     with np.errstate(divide="ignore", invalid="ignore"):
         dof = np.where(size > 0, size**2 / np.sum(u**4, axis=0), 1.0)
-        p = fisher.sf(size / floor, np.maximum(dof, 1.0), np.maximum(noise[1], 1.0))
+        p = fdtrc(np.maximum(dof, 1.0), np.maximum(noise[1], 1.0), size / floor)
     excess = np.where(p < IDENTIFY.lack_of_fit_level, np.maximum(size - floor, 0.0), 0.0)
     scale = np.sqrt(excess / np.where(size > 0, size, 1.0))
     return np.asarray(found * np.outer(scale, scale))

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
+from scipy.special import stdtr
 
 from analysis.identify.estimators.equations import (
     EquationFit,
@@ -73,4 +73,4 @@ def hausman(blocks: Sequence[RepeatBlock]) -> Hausman:
     with np.errstate(divide="ignore", invalid="ignore"):
         statistic = np.where(error > 0, np.abs(difference) / error, 0.0)
         relative = difference / iv.beta
-    return Hausman(difference, error, 2 * student.sf(statistic, dof), relative)
+    return Hausman(difference, error, 2 * stdtr(dof, -statistic), relative)

@@ -1,0 +1,55 @@
+"""What a verb loads before it does anything: by the names of modules, not by the clock."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+HEAVY = (
+    "numpy",
+    "scipy",
+    "pydantic",
+    "pint",
+    "numba",
+    "h5py",
+    "yaml",
+    "matplotlib",
+    "pymodbus",
+    "zmq",
+)
+SLOW = ("pint", "scipy.signal", "scipy.stats", "scipy.interpolate", "matplotlib", "pymodbus")
+
+
+def loaded(*arguments: str) -> set[str]:
+    """The modules in memory at the end of a command that ended well."""
+    code = (
+        "import sys\n"
+        "from rig.cli.main import run\n"
+        "try:\n"
+        f"    run({list(arguments)!r})\n"
+        "except SystemExit as end:\n"
+        "    assert not end.code, end.code\n"
+        "print('MODULES', *sys.modules)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return set(done.stdout.rpartition("MODULES ")[2].split())
+
+
+@pytest.mark.parametrize("arguments", [("--help",), ("--version",), ("check", "--help")])
+def test_help_loads_no_library_but_the_command_lines(arguments: tuple[str, ...]) -> None:
+    modules = loaded(*arguments)
+    assert "typer" in modules
+    # Typer itself asks pydantic about the options of the verb that is called.
+    assert modules.isdisjoint(set(HEAVY) - ({"pydantic"} if len(arguments) > 1 else set()))
+    verbs = {name for name in modules if name.startswith(("analysis", "protocols", "hil_sim"))}
+    assert verbs == set()
+
+
+def test_a_protocol_is_proved_without_the_slow_libraries() -> None:
+    modules = loaded("check", "lock-and-excite", "--rig", "shinshu-2dof", "--step", "step1")
+    assert "analysis.simulation.simulate" in modules  # it did its work
+    assert modules.isdisjoint(SLOW)
+    assert "rig.bench.session" not in modules
