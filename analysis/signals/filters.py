@@ -17,6 +17,7 @@ choice.
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import Protocol
@@ -95,6 +96,7 @@ def _kernel(t: Array, cutoff: float, half_width: float, beta: float) -> Array:
     return np.asarray(2 * cutoff * np.sinc(2 * cutoff * t) * window)
 
 
+@functools.lru_cache(maxsize=64)
 def windowed_sinc(rate: float, cutoff: float, transition: float) -> FirSmoother:
     """Return a Kaiser-windowed sinc: flat to `cutoff` [Hz], closed beyond cutoff + transition.
 
@@ -112,7 +114,9 @@ def windowed_sinc(rate: float, cutoff: float, transition: float) -> FirSmoother:
     reach = count // 2 + 1
     t = np.arange(-reach, reach + 1) / rate
     h0 = _kernel(t, cutoff + 0.5 * transition, (reach + 1) / rate, beta)
-    return differenced(f"windowed sinc, {cutoff:g} Hz", h0, rate)
+    smoother = differenced(f"windowed sinc, {cutoff:g} Hz", h0, rate)
+    smoother.taps.setflags(write=False)  # everybody shares them
+    return smoother
 
 
 def differenced(name: str, h0: Array, rate: float, order: int = 8) -> FirSmoother:
