@@ -26,14 +26,14 @@ def model_header(model: Model, variables: UnitVariables, token: str) -> str:
     parameter is not identified, UntranslatableKernelError where a term has no translation.
     """
     ready = sim.compiled(model)
-    joints, hidden = len(model.rig.joints), int(ready.hidden_ends[-1])
+    joints, hidden = len(model.rig.joints), 0
     library = KernelLibrary()
     calls, packs = [], []
     for m, used in enumerate(model.terms):
-        par = ready.par[ready.ends[m] : ready.ends[m + 1]]
+        par = used.term.pack(model.rig, model.values, used.shape)
         function = library.add(used.term.kernel.function, KERNEL_KINDS)
-        state = int(ready.hidden_ends[m])
-        when = "" if ready.prepares[m] else "if (phase == CONTRIBUTE) "
+        state, hidden = hidden, hidden + used.term.hidden(model.rig)
+        when = "" if used.term.prepares else "if (phase == CONTRIBUTE) "
         packs.append(f"static double par{m}[] = {_braces(par)}; /* {used.term.name} */")
         calls.append(
             f"    {when}{function}(phase, bench, x, z + {state}, par{m}, out, M, dz + {state});"
