@@ -162,6 +162,14 @@ def test_a_rig_file_sets_bands_in_its_own_units(tmp_path: Path) -> None:
     assert math.isinf(rig.limits_of("spool_1")[1])
 
 
+def test_the_example_of_the_page_is_a_rig_file(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs/rig-files.md").read_text()
+    (example,) = [part for part in page.split("```yaml\n")[1:] if part.startswith("alarms:")]
+    path = tmp_path / "page.yaml"
+    path.write_text(f"{SHINSHU}\n{example.split('```')[0]}")
+    assert load_rig(str(path)).alarms.channels["oil_temperature"].trip_delay == 1.0
+
+
 @pytest.mark.parametrize(
     ("alarms", "words"),
     [

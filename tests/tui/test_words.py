@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rig.bench.screens.sockets import ChannelView
+from rig.model.alarms.states import Alarm, AlarmTable, raised, returned
 from rig.tui.app import farewell
 from rig.tui.gauge import bar, gauge
 from rig.tui.link import Frame, LinkStage
@@ -29,6 +30,22 @@ def said(frame: Frame, stop: Stop | None = None, now: float = 100.0) -> list[tup
 
 def test_a_healthy_run_needs_no_notice() -> None:
     assert said(LIVE) == []
+
+
+def test_warnings_that_stand_are_one_line_with_the_first_cause() -> None:
+    supply = Alarm(
+        "supply pressure", "supply_pressure", None, 5e6, (5.6e6, 8e6), "Pa", 100, 0.1,
+        "The supply pressure is outside its band.", "Check the pump.",
+    )  # fmt: skip
+    still = replace(supply, check="nothing moves", joint=1, sentence="Nothing moves.", time=0.2)
+    table = raised(raised(AlarmTable(), supply), still)
+    frame = replace(LIVE, snapshot=replace(VIEW, alarms=table.alarms))
+    line = "WARNING  The supply pressure is outside its band. (and 1 more)"
+    assert said(frame) == [("warn", line)]
+    back = returned(table, supply.key)
+    frame = replace(LIVE, snapshot=replace(VIEW, alarms=back.alarms[:1]))
+    assert "back within its band" in said(frame)[0][1]
+    assert said(replace(LIVE, snapshot=replace(VIEW, alarms=()))) == []
 
 
 def test_old_data_turns_from_a_warning_into_an_alarm() -> None:
