@@ -45,6 +45,18 @@ def test_after_a_trip_nothing_moves_until_a_reset_with_a_reason(
     assert len(put_out) > 2000
     assert not put_out[-2000:].any()
 
+    around = (tmp_path / "first" / "trip.csv").read_text().splitlines()
+    assert f"are in {tmp_path / 'first' / 'trip.csv'}" in first.stderr
+    names = around[0].split(",")
+    offending = next(k for k, row in enumerate(around[1:]) if float(row.split(",")[0]) == 0.0)
+    moved = [
+        k
+        for k, row in enumerate(around[1:])
+        if any(float(v) for n, v in zip(names, row.split(","), strict=True) if "command" in n)
+    ]
+    # Over the wire, on the device's clock: from the offending sample to zero at most two blocks.
+    assert max(moved, default=0) - offending < 2 * 10
+
     refused = run("second")
     assert refused.returncode == 3, refused.stderr
     for word in ("cap_pressure_2", str(tmp_path / "first"), f"--endpoint {faulty} --reason"):
