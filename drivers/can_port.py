@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import can
+from can.interfaces.socketcand import SocketCanDaemonBus
 
 from drivers.base import DeviceError, DeviceLost
 from rig.model.wire.can_frames import CanFrame
@@ -29,12 +30,12 @@ logger = logging.getLogger(__name__)
 SOCKETCAND: Final = "socketcand"
 SLCAN: Final = "slcan"
 _GREETING: Final = b"< hi >"
+_OPENED: Final = b"< ok >"
 _SLICE_SECONDS: Final = 0.05  # how long the receiver waits at a time: closing takes that long
 _OPEN_SECONDS: Final = 5.0  # for an interface to open; some libraries wait for ever
 _SEND_SECONDS: Final = 1.0  # for a place in the adapter's transmit queue
 _FULL_SECONDS: Final = 0.001  # between two tries at a full one
 _MOST_WAITING: Final = 100_000  # frames received and not taken: memory stays bounded
-_OPENINGS: Final = 3  # socketcand's last answer may come glued to the first frame
 _ERRORS: Final = (can.CanError, OSError, ValueError, ImportError, NotImplementedError)
 
 
@@ -186,6 +187,8 @@ class CanPort:
         try:
             with socket.create_connection((place.host, place.port), _OPEN_SECONDS) as asked:
                 said = asked.recv(64)
+                asked.sendall(f"< open {place.channel} >".encode())
+                opened = asked.recv(64) if said.startswith(_GREETING) else b""
         except ConnectionError as error:
             raise DeviceLost(
                 f"nobody listens at {place.host}:{place.port} ({error.strerror}); is socketcand "
@@ -200,13 +203,20 @@ class CanPort:
                 f"{place.host}:{place.port} is no socketcand: it said {said[:20]!r}, expected "
                 f"{_GREETING!r}"
             )
+        if not opened.startswith(_OPENED):
+            raise DeviceLost(
+                f"the socketcand at {place.host}:{place.port} has no bus {place.channel}: it said "
+                f"{opened[:60]!r}"
+            )
 
     def _opened(self) -> Any:
         place = self._place
         rates: dict[str, Any] = {"bitrate": self._bitrate}
         if place.interface == SOCKETCAND:
-            rates = {"host": place.host, "port": place.port, "tcp_tune": True}
-        elif place.interface == SLCAN:
+            return _SocketcandBus(  # type: ignore[no-untyped-call]
+                place.channel, place.host, place.port, tcp_tune=True
+            )
+        if place.interface == SLCAN:
             rates["sleep_after_open"] = 0.0
             if self._data_bitrate is not None:
                 rates["timing"] = can.BitTimingFd.from_sample_point(
@@ -218,13 +228,7 @@ class CanPort:
                 )
         elif self._data_bitrate is not None:
             rates |= {"fd": True, "data_bitrate": self._data_bitrate}
-        for left in reversed(range(_OPENINGS)):
-            try:
-                return self._make(interface=place.interface, channel=place.channel, **rates)
-            except can.CanError as error:
-                if "got: '< ok ><" not in str(error) or not left:
-                    raise
-        raise AssertionError("unreachable")
+        return self._make(interface=place.interface, channel=place.channel, **rates)
 
     def _why_not(self, error: BaseException) -> DeviceError:
         number, text = _errno(error), _line(error)
@@ -252,6 +256,31 @@ class CanPort:
                 f"{self._bitrate}"
             )
         return DeviceLost(f"cannot open {self.where} at {self._bitrate} bit/s: {text}")
+
+
+class _SocketcandBus(SocketCanDaemonBus):
+    """python-can's client, which a busy bus keeps from opening and an ended one keeps spinning."""
+
+    def _expect_msg(self, msg: str) -> None:
+        # The last answer of the greeting may come together with the first frames.
+        said = b""
+        while not said.endswith(b">") and (byte := self._end.recv(1)):
+            said += byte
+        if said.decode("ascii", "replace") != msg:
+            self._end.close()
+            raise can.CanInitializationError(f"expected {msg!r}, got {said!r}")
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        message, filtered = super()._recv_internal(timeout)  # type: ignore[no-untyped-call]
+        waiting = message is None and bool(select.select([self._end], [], [], 0)[0])
+        if waiting and not self._end.recv(1, socket.MSG_PEEK):
+            raise ConnectionResetError(errno.ECONNRESET, "the other end closed it")
+        return message, filtered
+
+    @property
+    def _end(self) -> socket.socket:
+        end: socket.socket = getattr(self, "_SocketCanDaemonBus__socket")  # noqa: B009 - mangled
+        return end
 
 
 @dataclass
@@ -297,8 +326,6 @@ class _Reader:
                 message = self.bus.recv(_SLICE_SECONDS)
                 if message is not None:
                     self._take(message)
-                elif _has_ended(self.bus):
-                    raise ConnectionResetError(errno.ECONNRESET, "the other end closed it")
         except Exception as error:
             self.fault = error
             self.frames.put((-1, b""))  # wakes whoever waits
@@ -317,14 +344,6 @@ class _Reader:
         else:
             self.seen.kept += 1
             self.frames.put((key, bytes(message.data)))
-
-
-def _has_ended(bus: Any) -> bool:
-    """Tell whether a socketcand has closed its connection, which python-can passes over."""
-    end = getattr(bus, "_SocketCanDaemonBus__socket", None)
-    if end is None:
-        return False
-    return bool(select.select([end], [], [], 0)[0]) and not end.recv(1, socket.MSG_PEEK)
 
 
 def _is_full(error: BaseException) -> bool:
