@@ -74,9 +74,9 @@ class BusPlace:
 class CanPort:
     """A CAN bus that can be opened and closed any number of times.
 
-    `wanted` are the keys (`CanMessage.key`) of the frames to keep. `errors` counts error frames
-    since opening, `foreign` frames of other keys, `kept` those of `wanted`, `overrun` those that
-    nobody took in time.
+    `wanted` are the keys (`CanMessage.key`) of the frames to keep; where `deliver` is given, it is
+    called with each of them in the receive thread, and `receive` returns none. `seen` counts what
+    came since opening.
     """
 
     def __init__(
@@ -86,8 +86,10 @@ class CanPort:
         data_bitrate: int | None,
         wanted: frozenset[int],
         make: Callable[..., Any] = can.Bus,
+        deliver: Callable[[int, bytes], object] | None = None,
     ) -> None:
         self._place, self._bitrate, self._data_bitrate = place, bitrate, data_bitrate
+        self._deliver = deliver
         self._wanted = wanted
         self._make = make
         self._reader: _Reader | None = None
@@ -103,6 +105,11 @@ class CanPort:
         return self._reader is not None
 
     @property
+    def fault(self) -> BaseException | None:
+        """Why the bus has gone, None while it has not."""
+        return None if self._reader is None else self._reader.fault
+
+    @property
     def seen(self) -> Seen:
         """What came since the bus was opened last."""
         return Seen() if self._reader is None else self._reader.seen
@@ -114,7 +121,7 @@ class CanPort:
         logging.getLogger("can").setLevel(logging.CRITICAL)
         if self._place.interface == SOCKETCAND:
             self._greeted()
-        reader = _Reader(self._opened, self._wanted)
+        reader = _Reader(self._opened, self._wanted, self._deliver)
         if not reader.opened.wait(_OPEN_SECONDS):
             reader.end()
             raise DeviceLost(f"{self.where} did not open within {_OPEN_SECONDS:g} s")
@@ -296,7 +303,13 @@ class Seen:
 class _Reader:
     """The receive thread of one opened bus: it opens, receives, and closes it."""
 
-    def __init__(self, make: Callable[[], Any], wanted: frozenset[int]) -> None:
+    def __init__(
+        self,
+        make: Callable[[], Any],
+        wanted: frozenset[int],
+        deliver: Callable[[int, bytes], object] | None,
+    ) -> None:
+        self._deliver = deliver
         self.bus: Any = None
         self.opened = threading.Event()
         self.fault: BaseException | None = None
@@ -343,7 +356,10 @@ class _Reader:
             self.seen.overrun += 1
         else:
             self.seen.kept += 1
-            self.frames.put((key, bytes(message.data)))
+            if self._deliver is None:
+                self.frames.put((key, bytes(message.data)))
+            else:
+                self._deliver(key, bytes(message.data))
 
 
 def _is_full(error: BaseException) -> bool:

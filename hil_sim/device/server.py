@@ -37,6 +37,7 @@ __all__ = [
     "SERIAL",
     "SLCAN",
     "TCP",
+    "VALVES",
     "WIRES",
     "BenchServer",
     "EndpointError",
@@ -52,7 +53,8 @@ RTU: Final = "modbus-rtu"
 SERIAL: Final = "serial"
 CAN: Final = "can"
 SLCAN: Final = "can-slcan"
-WIRES: Final = (TCP, RTU, SERIAL, CAN, SLCAN)
+VALVES: Final = "canopen-408"  # always in real time: the host is the sample clock
+WIRES: Final = (TCP, RTU, SERIAL, CAN, SLCAN, VALVES)
 BITRATE: Final = 1_000_000  # of the simulated bus, where nothing else is said
 
 
@@ -176,6 +178,12 @@ def serve(
     """
     if wire == SERIAL:
         serve_serial(rig, plant, realtime=realtime, on_ready=on_ready, parent=parent, faults=faults)
+        return
+    if wire == VALVES:
+        from hil_sim.device.can import adapters, valve_bench  # noqa: PLC0415 - as below
+
+        bus = adapters.SocketcandServer(host, port)
+        valve_bench.serve_valves(rig, plant, bus, on_ready=on_ready, parent=parent)
         return
     if wire in (CAN, SLCAN):
         # Half a second of imports that no other wire needs.

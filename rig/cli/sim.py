@@ -18,7 +18,7 @@ def sim(
         str,
         typer.Option(
             help="modbus-tcp, modbus-rtu or serial (on a pseudo-terminal), can (by socketcand), "
-            "or can-slcan (on a pseudo-terminal)."
+            "can-slcan (on a pseudo-terminal), or canopen-408 (by socketcand, in real time)."
         ),
     ] = "modbus-tcp",
     scenario: Annotated[

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from drivers.modbus_tcp import TcpSettings
-from hil_sim.device.server import CAN, SLCAN, TCP, WIRES, EndpointError, serve, warm_up
+from hil_sim.device.server import CAN, SLCAN, TCP, VALVES, WIRES, EndpointError, serve, warm_up
 from hil_sim.faults import CLASSES
 from hil_sim.faults.wire import WireFault
 from hil_sim.link.link import FaultyLink
@@ -136,6 +136,8 @@ def serve_bench(what: Served) -> None:
 
 def _place(what: Served, rig: Rig) -> dict[str, Any]:
     """Return where to serve, as keywords of `serve`; raises InputError for a wire it cannot be."""
+    if what.wire == VALVES:
+        return {"port": what.port or 0}
     if what.wire in (CAN, SLCAN):
         return _bus(what, rig)
     tcp = TcpSettings.of(rig.wire) if rig.wire.kind == TCP else TcpSettings()

@@ -1,0 +1,357 @@
+"""The driver of valves of CiA 408 on a CANopen bus (docs/wire-canopen-408.md).
+
+One node for each joint. The host is the sample clock: each tick it sends SYNC, takes the nodes'
+synchronous TPDOs, and sends control word, set point and its heartbeat (`drivers.polled`). The
+package `canopen` is an extra of this project, imported when a rig names this kind of wire.
+"""
+
+from __future__ import annotations
+
+import importlib
+import io
+import logging
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, ClassVar, Final
+from urllib.parse import SplitResult, parse_qs
+
+import numpy as np
+from pydantic import Field, field_validator
+
+from drivers.base import Array, DeviceError, DeviceInfo, DeviceLost, OutputLaw, WireSettings
+from drivers.can_port import BusPlace, CanPort
+from drivers.polled import PolledDriver
+from rig.model import channels as ch
+from rig.model.codes import decode_input
+from rig.model.parse import InputError
+from rig.model.parts import Wire
+from rig.model.rig import Rig
+from rig.model.wire import cia408
+from rig.model.wire.can_frames import CanFrame
+from rig.model.wire.cia408 import Control, ValveState
+
+logger = logging.getLogger(__name__)
+
+PACKAGE: Final = "canopen"
+_HEARTBEATS: Final = 5  # within the time after which a node misses its host
+_STATE_SECONDS: Final = 0.5  # for a node to reach a state
+_COMMON: Final = frozenset({ch.SUPPLY, ch.TEMPERATURE})
+
+
+class ValveBusSettings(WireSettings):
+    """The bus, the valves' node numbers by joint, and what they are."""
+
+    example: ClassVar = "canopen-408://socketcan/can0?bitrate=500000"
+
+    bus: str = Field(description="INTERFACE/CHANNEL, as of wire can")
+    bitrate: int = Field(default=1_000_000, ge=10_000, le=1_000_000, description="[bit/s]")
+    nodes: tuple[int, ...] | None = Field(default=None, description="default: 1, 2 ...")
+    host: int = Field(default=127, ge=1, le=127, description="the node number of this program")
+    eds: str | None = Field(default=None, description="an EDS file; default: the shipped valve's")
+
+    @field_validator("bus")
+    @classmethod
+    def _is_a_place(cls, value: str) -> str:
+        BusPlace.of(value)
+        return value
+
+    @classmethod
+    def of_endpoint(cls, url: SplitResult) -> Mapping[str, Any]:
+        """Return bus and rate; raises ValueError where the bus has another form."""
+        bus = url.netloc + url.path
+        BusPlace.of(bus)
+        return {"bus": bus, **{key: values[-1] for key, values in parse_qs(url.query).items()}}
+
+
+class CanOpenValves:
+    """`drivers.polled.InputsOutputs` over the nodes of a bus."""
+
+    def __init__(self, wire: Wire, rig: Rig) -> None:
+        at = ValveBusSettings.of(wire)
+        self._wire, self._rig, self._at = wire, rig, at
+        self._numbers = at.nodes or tuple(range(1, len(rig.joints) + 1))
+        if len(set(self._numbers)) != len(rig.joints) or at.host in self._numbers:
+            raise InputError(
+                f"wire: nodes: {list(self._numbers)}; expected {len(rig.joints)} different "
+                f"numbers, none of them the host's {at.host}"
+            )
+        try:
+            self._canopen = importlib.import_module(PACKAGE)
+        except ImportError as error:
+            raise InputError(
+                f"wire: kind: {wire.kind} needs the package {PACKAGE}: "
+                "pip install 'bramah[canopen]'"
+            ) from error
+        self._eds, self._source = _eds(at)
+        self._received = threading.Condition()
+        self._waited: set[int] = set()
+        self._network: Any = None
+        self._nodes: list[Any] = []
+        self._places = self._find_sensors()
+        wanted = {0x580 + n for n in self._numbers} | self._tpdo_ids
+        wanted |= {cia408.HEARTBEAT_ID + n for n in self._numbers}
+        self._port = CanPort(
+            BusPlace.of(at.bus), at.bitrate, None, frozenset(wanted), deliver=self._deliver
+        )
+        self._beat = 0.0
+        self._states: list[int] = [ValveState.INIT] * len(rig.joints)
+
+    @property
+    def watchdog(self) -> float | None:
+        """Seconds after which a node that misses the host's heartbeat zeroes its output."""
+        return self._wire.watchdog
+
+    def open(self) -> str:
+        """Open the bus, configure the nodes, bring them to HOLD; a fault in one stays."""
+        self.close()
+        self._port.open()
+        self._make_network()
+        milliseconds = round(1e3 * self._wire.watchdog)
+        for node in self._nodes:
+            self._settle(node, milliseconds)
+        self._heartbeat(force=True)
+        for number in self._numbers:
+            self._network.send_message(0, bytes([1, number]))  # NMT: operational
+        self._send(np.zeros(len(self._nodes)), Control.DISABLED)
+        self.read()
+        self._send(np.zeros(len(self._nodes)), Control.DISABLED | Control.HOLD)
+        return f"{len(self._nodes)} valve(s) of CiA 408 at {self._at.bus}"
+
+    def read(self) -> Array:
+        """Return one sample of every channel [SI] by SYNC and the nodes' TPDOs."""
+        self._usable()
+        self._heartbeat()
+        with self._received:
+            self._waited = set(self._tpdo_ids)
+        self._port.send(CanFrame(cia408.SYNC_ID, b""))
+        end = time.monotonic() + self._wire.timeout
+        with self._received:
+            while self._waited:
+                left = end - time.monotonic()
+                if left <= 0.0 or self._port.fault is not None:
+                    break
+                self._received.wait(min(left, 0.05))
+            missing = sorted({1 + (cob - 1) % 0x80 for cob in self._waited})
+        if missing:
+            # A late answer would pass for the next one.
+            self._port.close()
+            nodes = " ".join(str(number) for number in missing)
+            raise DeviceLost(
+                f"node {nodes} at {self._at.bus} did not answer SYNC for {self._wire.timeout:g} s; "
+                f"check wiring, node numbers and that the bus runs at {self._at.bitrate} bit/s"
+            )
+        self._states = [node.tpdo[cia408.STATUS_WORD].raw & 0xF for node in self._nodes]
+        return np.array([self._value(name) for name in self._rig.channels])
+
+    def write(self, volts: Array) -> None:
+        """Put out voltages [V]: set points in ACTIVE, or HOLD where all are zero."""
+        self._usable()
+        self._heartbeat()
+        hold = Control.DISABLED | Control.HOLD
+        self._send(volts, hold | Control.ACTIVE if volts.any() else hold)
+
+    def close(self) -> None:
+        """Disable the valves if the bus is still there; never raises anything but DeviceError."""
+        if self._port.is_open and self._nodes:
+            with suppress(DeviceError):
+                self._send(np.zeros(len(self._nodes)), Control.DISABLED)
+        self._port.close()
+
+    def fault(self) -> str | None:
+        """Say which valves are in a fault, None where none is."""
+        for number, state in zip(self._numbers, self._states, strict=True):
+            if not state & 0b1000:
+                name = ValveState(state).name if state in set(ValveState) else f"{state:04b}"
+                return (
+                    f"valve {number} is in {name}: it missed the host's heartbeat or has found a "
+                    "fault of its own"
+                )
+        return None
+
+    def reset(self) -> None:
+        """Leave the faults by a rising reset bit, the outputs at zero."""
+        zero = np.zeros(len(self._nodes))
+        self._heartbeat(force=True)
+        for word in (Control.DISABLED, Control.DISABLED | Control.RESET, Control.DISABLED):
+            self._send(zero, word)
+        end = time.monotonic() + _STATE_SECONDS
+        self.read()
+        while self.fault() is not None and time.monotonic() < end:
+            self.read()
+        if (fault := self.fault()) is not None:
+            raise DeviceError(f"{fault}; the reset did not clear it")
+        self._send(zero, Control.DISABLED | Control.HOLD)
+
+    # -- inside -----------------------------------------------------------------------------
+
+    def _find_sensors(self) -> dict[str, tuple[int, int, int]]:
+        """Return (node's place, TPDO, place in it) of every channel but the spools."""
+        nodes = self._remote_nodes(self._canopen.Network())
+        self._tpdo_ids = set()
+        places: dict[str, tuple[int, int, int]] = {}
+        for index, node in enumerate(nodes):
+            for number, pdo in node.tpdo.items():
+                for place, variable in enumerate(pdo):
+                    kind = variable.name.rpartition(".")[2]
+                    name = kind if kind in _COMMON else ch.channel(kind, index + 1)
+                    if name in self._rig.channels and name not in places:
+                        places[name] = (index, number, place)
+                        self._tpdo_ids.add(pdo.cob_id)
+            for wanted in (cia408.STATUS_WORD, cia408.ACTUAL_VALUE):
+                pdo = next((p for p in node.tpdo.values() if _maps(p, wanted)), None)
+                if pdo is None:
+                    raise InputError(f"{self._source}: no TPDO carries object 0x{wanted:X}")
+                self._tpdo_ids.add(pdo.cob_id)
+        for name in self._rig.channels:
+            if ch.kind_of(name)[0] != ch.SPOOL and name not in places:
+                kind = ch.kind_of(name)[0]
+                raise InputError(f"{self._source}: no TPDO carries {kind}, which {name} needs")
+        return places
+
+    def _remote_nodes(self, network: Any) -> list[Any]:
+        nodes = []
+        for number in self._numbers:
+            text = io.StringIO(self._eds)
+            text.name = "valve.eds"  # the library chooses its reader by the name's ending
+            try:
+                node = self._canopen.RemoteNode(number, text)
+                network.add_node(node)
+                node.tpdo.read(from_od=True)
+                node.rpdo.read(from_od=True)
+            except Exception as error:  # whatever a damaged file makes of the reader
+                reason = " ".join(str(error).split())
+                raise InputError(f"{self._source}: not an EDS file of a valve: {reason}") from error
+            nodes.append(node)
+        return nodes
+
+    def _make_network(self) -> None:
+        port = self._port
+
+        class Network(self._canopen.Network):  # type: ignore[misc,name-defined]
+            """The library's network over our port: no thread and no periodic sender of its own."""
+
+            def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
+                port.send(CanFrame(can_id, bytes(data)))
+
+        network = Network()
+        self._nodes = self._remote_nodes(network)
+        self._network = network
+        for node in self._nodes:
+            node.sdo.RESPONSE_TIMEOUT = self._wire.timeout
+            node.tpdo.subscribe()
+
+    def _settle(self, node: Any, milliseconds: int) -> None:
+        """Check who a node is and set what it must do without its host."""
+        try:
+            kind = node.sdo[0x1000].raw & 0xFFFF
+            if kind != cia408.DEVICE_TYPE:
+                raise DeviceError(
+                    f"node {node.id} at {self._at.bus} is of profile {kind}, expected "
+                    f"{cia408.DEVICE_TYPE}"
+                )
+            node.sdo[cia408.CONSUMER_HEARTBEAT][1].raw = self._at.host << 16 | milliseconds
+            node.sdo[cia408.DEVICE_MODE].raw = cia408.BY_BUS
+            node.sdo[cia408.CONTROL_MODE].raw = cia408.POSITION_OPEN_LOOP
+        except self._canopen.SdoAbortedError as error:
+            raise DeviceError(f"node {node.id} refused its configuration: {error}") from error
+        except self._canopen.SdoCommunicationError as error:
+            raise DeviceLost(
+                f"no valve answers as node {node.id} at {self._at.bus}: check wiring, node numbers "
+                f"and that the bus runs at {self._at.bitrate} bit/s"
+            ) from error
+
+    def _deliver(self, key: int, data: bytes) -> None:
+        network = self._network
+        if network is None:
+            return
+        network.notify(key, bytearray(data), time.time())
+        with self._received:
+            self._waited.discard(key)
+            if not self._waited:
+                self._received.notify_all()
+
+    def _heartbeat(self, *, force: bool = False) -> None:
+        # From whoever serves the outputs, so that a host that stands still is silent.
+        now = time.monotonic()
+        if force or now - self._beat > self._wire.watchdog / _HEARTBEATS:
+            state = bytes([cia408.OPERATIONAL])
+            self._port.send(CanFrame(cia408.HEARTBEAT_ID + self._at.host, state))
+            self._beat = now
+
+    def _send(self, volts: Array, word: int) -> None:
+        for node, volt, joint in zip(self._nodes, volts, self._rig.joints, strict=True):
+            pdo = node.rpdo[1]
+            pdo[cia408.CONTROL_WORD].raw = int(word)
+            share = float(volt) / joint.valve.command_range
+            pdo[cia408.SET_POINT].raw = round(share * cia408.FULL_SCALE)
+            self._port.send(CanFrame(pdo.cob_id, bytes(pdo.data)))
+
+    def _value(self, name: str) -> float:
+        kind, joint = ch.kind_of(name)
+        sensor = self._rig.sensors.of(kind)
+        if kind == ch.SPOOL:
+            share = self._nodes[(joint or 1) - 1].tpdo[cia408.ACTUAL_VALUE].raw / cia408.FULL_SCALE
+            return float(share * max(map(abs, sensor.range)))
+        node, pdo, place = self._places[name]
+        raw = self._nodes[node].tpdo[pdo][place].raw
+        return float(decode_input(raw, *sensor.range, sensor.bits))
+
+    def _usable(self) -> None:
+        if not self._port.is_open:
+            raise DeviceLost(f"the bus {self._at.bus} is closed")
+        if self._port.fault is not None:
+            self._port.receive(0.0)
+
+
+class CanOpen408Driver(PolledDriver):
+    """`drivers.base.Driver` of valves of CiA 408; a valve's own fault is a latched trip."""
+
+    settings: ClassVar[type[WireSettings]] = ValveBusSettings
+
+    def __init__(self, wire: Wire, rig: Rig) -> None:
+        self._valves = CanOpenValves(wire, rig)
+        super().__init__(wire, rig, self._valves)
+
+    def connect(self) -> DeviceInfo:
+        """Open the bus, zero the outputs; a fault in a valve stays until `reset`."""
+        info = super().connect()
+        self._note()
+        return info
+
+    def apply(self, laws: Sequence[OutputLaw], *, restart: bool = False) -> int:
+        """Set all laws at one tick; refused while a valve is in a fault."""
+        self._note()
+        return super().apply(laws, restart=restart)
+
+    def trip_cause(self) -> str | None:
+        """Say why outputs were zeroed without the host's word, or None if they were not."""
+        self._note()
+        return super().trip_cause()
+
+    def reset(self) -> None:
+        """Clear a latched trip, in the valves as well; only on a person's word."""
+        self._zero_laws()
+        self._safely(self._valves.reset)
+        super().reset()
+
+    def _note(self) -> None:
+        fault = self._valves.fault()
+        if fault is not None and self._cause is None:
+            self._zero_laws()
+            self._cause = fault
+
+
+def _maps(pdo: Any, index: int) -> bool:
+    return any(variable.index == index for variable in pdo)
+
+
+def _eds(at: ValveBusSettings) -> tuple[str, str]:
+    if at.eds is None:
+        return cia408.shipped_eds(), "valve-408.eds (shipped)"
+    try:
+        return Path(at.eds).expanduser().read_text("utf-8", "replace"), at.eds
+    except OSError as error:
+        raise InputError(f"wire: eds: {at.eds}: {error.strerror}; expected an EDS file") from error

@@ -1,0 +1,204 @@
+"""Simulated valves of CiA 408 on one bus: a node for each joint, in real time.
+
+A node puts out what its set point says in state ACTIVE and zero in every other. Without the
+heartbeat of its host for the time in object 0x1016 it goes to FAULT_DISABLED, and stays there until
+a reset.
+"""
+
+from __future__ import annotations
+
+import io
+import logging
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import canopen
+import numpy as np
+
+from hil_sim.device.can.adapters import Adapter
+from hil_sim.device.device import Plant
+from hil_sim.device.laws import OFF, DeviceLaw
+from hil_sim.device.lifetime import PARENT_SECONDS, Owner, told_to_end
+from rig.model import channels as ch
+from rig.model.codes import decode_input
+from rig.model.rig import Rig
+from rig.model.wire import cia408
+from rig.model.wire.can_frames import CanFrame
+from rig.model.wire.cia408 import ValveState
+
+logger = logging.getLogger(__name__)
+
+POLL_SECONDS = 0.01
+_MOST_SECONDS = 4.0  # that are caught up at once: a machine that slept goes on from there
+
+
+class AdapterNetwork(canopen.Network):
+    """A CANopen network whose frames go through an `Adapter`."""
+
+    def __init__(self, adapter: Adapter) -> None:
+        super().__init__()
+        self._adapter = adapter
+
+    def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
+        """Send one frame."""
+        self._adapter.send([CanFrame(can_id, bytes(data))])
+
+
+class ValveNode:
+    """One valve: its object dictionary, state and watch on the host's heartbeat."""
+
+    def __init__(self, network: canopen.Network, number: int, clock: Callable[[], float]) -> None:
+        eds: Any = io.StringIO(cia408.shipped_eds())
+        eds.name = "valve-408.eds"
+        self.state = ValveState.INIT
+        self._word = 0
+        self._clock = clock
+        self._heard: float | None = None
+        # The library's types leave open what a variable holds; here every one is a whole number.
+        self.node: Any = canopen.LocalNode(number, eds)
+        node: Any = self.node
+        network.add_node(node)
+        node.tpdo.read(from_od=True)
+        node.rpdo.read(from_od=True)
+        node.rpdo.subscribe()
+        node.rpdo[1].add_callback(self._commanded)
+        node.add_write_callback(self._written)
+        node.nmt.state = "PRE-OPERATIONAL"
+
+    @property
+    def set_point(self) -> float:
+        """What acts of the set point [1]; 0 in every state but ACTIVE."""
+        if self.state != ValveState.ACTIVE or self.node.nmt.state != "OPERATIONAL":
+            return 0.0
+        value = self.node.rpdo[1][1].raw / cia408.FULL_SCALE
+        return float(np.clip(value, -1.0, 1.0))
+
+    def heartbeat(self, producer: int) -> None:
+        """Note a sign of life of node `producer`."""
+        if producer == self._consumed()[0]:
+            self._heard = self._clock()
+
+    def watch(self) -> bool:
+        """Go to FAULT_DISABLED where the host has been silent too long; returns whether it did."""
+        allowed = self._consumed()[1]
+        if self._heard is None or not allowed or self._clock() - self._heard <= allowed:
+            return False
+        self._heard = None
+        self.state = ValveState.FAULT_DISABLED
+        logger.warning("valve %d: the host's heartbeat is lost; outputs zero", self.node.id)
+        return True
+
+    def transmit(self, spool: float, sensors: Sequence[int]) -> None:
+        """Send the synchronous TPDOs: spool as a share of its range, the sensors' codes."""
+        if self.node.nmt.state != "OPERATIONAL":
+            return
+        tpdo = self.node.tpdo
+        tpdo[1][0].raw = int(self.state)
+        tpdo[1][1].raw = round(spool * cia408.FULL_SCALE)
+        for place, code in enumerate(sensors):
+            tpdo[2 + place // 3][place % 3].raw = code
+        for number in (1, 2, 3):
+            tpdo[number].transmit()
+
+    def _consumed(self) -> tuple[int, float]:
+        entry = self.node.sdo[cia408.CONSUMER_HEARTBEAT][1].raw
+        return entry >> 16 & 0x7F, 1e-3 * (entry & 0xFFFF)
+
+    def _commanded(self, pdo: Any) -> None:
+        self._follow(pdo[0].raw)
+
+    def _written(self, index: int, data: bytes, **_: object) -> None:
+        if index == cia408.CONTROL_WORD:
+            self._follow(int.from_bytes(data, "little"))
+
+    def _follow(self, word: int) -> None:
+        self.state = cia408.next_state(self.state, self._word, word)
+        self._word = word
+
+
+class ValveBench:
+    """All valves of a rig and the plant behind them; `volts` are what the valves put out."""
+
+    def __init__(
+        self,
+        rig: Rig,
+        plant: Plant,
+        adapter: Adapter,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._rig, self._plant, self._adapter, self._clock = rig, plant, adapter, clock
+        self._network = AdapterNetwork(adapter)
+        joints = range(1, len(rig.joints) + 1)
+        self.valves = [ValveNode(self._network, number, clock) for number in joints]
+        self._origin, self._first = clock(), plant.tick
+        self._codes = np.zeros(len(rig.channels), dtype=np.int64)
+
+    @property
+    def volts(self) -> list[float]:
+        """The outputs [V]."""
+        pairs = zip(self.valves, self._rig.joints, strict=True)
+        return [valve.set_point * joint.valve.command_range for valve, joint in pairs]
+
+    def poll(self, patience: float) -> None:
+        """Take in frames for `patience` [s] at most, run the plant, watch the heartbeat."""
+        for frame in self._adapter.receive(patience):
+            self._catch_up()
+            if frame.identifier == cia408.SYNC_ID:
+                self._transmit()
+            elif frame.identifier >> 7 == cia408.HEARTBEAT_ID >> 7:
+                for valve in self.valves:
+                    valve.heartbeat(frame.identifier & 0x7F)
+            else:
+                self._network.notify(frame.identifier, bytearray(frame.data), time.time())
+        self._catch_up()
+        for valve in self.valves:
+            valve.watch()
+
+    def _catch_up(self) -> None:
+        rate = self._rig.sample_rate
+        due = int((self._clock() - self._origin) * rate) - (self._plant.tick - self._first)
+        most = int(_MOST_SECONDS * rate)
+        if due > most:
+            self._origin += (due - most) / rate
+            due = most
+        if due > 0:
+            laws = [DeviceLaw(OFF.wave, bias=volts, limit=abs(volts)) for volts in self.volts]
+            measured, _ = self._plant.advance(due, laws)
+            self._codes = measured[-1]
+
+    def _transmit(self) -> None:
+        names = self._rig.channels
+        sensor = self._rig.sensors.spool
+        for index, valve in enumerate(self.valves, start=1):
+            code = self._codes[names.index(ch.channel(ch.SPOOL, index))]
+            spool = decode_input(code, *sensor.range, sensor.bits) / max(map(abs, sensor.range))
+            wanted = [ch.channel(kind, index) for kind in (ch.PISTON, ch.CAP, ch.ROD)]
+            wanted += [ch.SUPPLY, ch.TEMPERATURE]
+            codes = [int(self._codes[names.index(n)]) if n in names else 0 for n in wanted]
+            valve.transmit(float(spool), codes)
+
+
+def serve_valves(
+    rig: Rig,
+    plant: Plant,
+    adapter: Adapter,
+    *,
+    on_ready: Callable[[str], None] = logger.info,
+    parent: int | None = None,
+) -> None:
+    """Serve a plant behind valve nodes 1 to N until SIGTERM, SIGINT or the end of `parent`."""
+    bench = ValveBench(rig, plant, adapter)
+    owner = None if parent is None else Owner(parent)
+    look = time.monotonic()
+    try:
+        with told_to_end() as ended:
+            on_ready(adapter.endpoint.replace("can://", "canopen-408://", 1))
+            while not ended:
+                bench.poll(POLL_SECONDS)
+                if owner is not None and time.monotonic() > look:
+                    look = time.monotonic() + PARENT_SECONDS
+                    if owner.has_ended():
+                        return
+    finally:
+        adapter.close()

@@ -1,0 +1,179 @@
+"""Valves of CiA 408 on a bus: their states, and that they need their host's heartbeat."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.base import DeviceError, DeviceLost, OutputLaw
+from drivers.canopen_408 import CanOpen408Driver
+from drivers.registry import wire_at
+from rig.model.parse import InputError
+from rig.model.parts import Wire
+from rig.model.rig import Rig
+from rig.model.wire import cia408
+from rig.model.wire.cia408 import Control, ValveState, next_state
+from tests.drivers.wires import ROOT, device_at
+from tests.hil_sim.integrator import seed_rig
+
+PATIENCE = 30.0
+DRIVING = [OutputLaw(bias=1.0, limit=2.0), OutputLaw(bias=-0.5, limit=2.0)]
+
+
+def slow_rig() -> Rig:
+    return seed_rig().model_copy(update={"sample_rate": 40.0})
+
+
+@pytest.fixture
+def at() -> Iterator[str]:
+    with device_at("realtime", "canopen-408") as (_, endpoint):
+        yield endpoint
+
+
+def host(endpoint: str, watchdog: float = 5.0) -> CanOpen408Driver:
+    rig = slow_rig()
+    wire = wire_at(endpoint, rig.wire)
+    return CanOpen408Driver(wire.model_copy(update={"watchdog": watchdog, "timeout": 5.0}), rig)
+
+
+def test_valves_follow_their_set_points_and_return_to_zero(at: str) -> None:
+    driver = host(at)
+    assert driver.connect().identity.startswith("2 valve(s) of CiA 408")
+    driver.start()
+    before = driver.read_block()
+    assert before.data[-1, 2] == pytest.approx(2.0e6, abs=200)  # the plant's pressure
+    driver.apply(DRIVING)
+    blocks = [driver.read_block() for _ in range(20)]
+    after = blocks[-1].data[-1]
+    assert after[10:] == pytest.approx([1.0, -0.5])
+    assert after[0] == pytest.approx(0.1, abs=2e-3)  # the spool, by object 0x6301
+    assert after[1] > before.data[-1, 1] + 1e-4  # the first piston extends
+    assert after[5] < before.data[-1, 5] - 1e-4
+    assert driver._valves._states == [ValveState.ACTIVE] * 2
+    driver.zero_outputs()
+    data = np.vstack([driver.read_block().data for _ in range(10)])
+    assert np.all(data[:, 10:] == 0.0)
+    assert driver._valves._states == [ValveState.HOLD] * 2
+    driver.close()
+    driver.connect()
+    assert driver.trip_cause() is None
+    driver.close()
+
+
+HOST = """
+import sys
+from drivers.base import OutputLaw
+from tests.drivers.test_canopen_408 import host
+
+driver = host(sys.argv[1], watchdog=0.4)
+driver.connect()
+driver.start()
+driver.apply([OutputLaw(bias=1.0, limit=2.0)] * 2)
+while True:
+    if driver.read_block().data[-1, 0] > 0.09:
+        print("driving", flush=True)
+"""
+
+
+@pytest.mark.parametrize("sign", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_host_that_ends_or_stands_still_leaves_valves_in_fault(
+    at: str, sign: signal.Signals
+) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", HOST, at], stdout=subprocess.PIPE, text=True, cwd=ROOT
+    ) as driving:
+        assert driving.stdout is not None
+        assert driving.stdout.readline() == "driving\n"
+        os.kill(driving.pid, sign)
+        time.sleep(1.0)
+        driver = host(at)
+        driver.connect()
+        driving.kill()
+        driving.wait(PATIENCE)
+    assert "valve 1 is in FAULT_DISABLED: it missed the host's heartbeat" in (
+        driver.trip_cause() or ""
+    )
+    driver.start()
+    block = driver.read_block()
+    assert block.tripped
+    assert block.data[-1, 0] == pytest.approx(0.0, abs=1e-3)  # the spool has closed
+    with pytest.raises(DeviceError, match=r"tripped: valve 1 .*reset"):
+        driver.apply(DRIVING)
+    driver.reset()
+    driver.start()
+    driver.apply(DRIVING)
+    data = np.vstack([driver.read_block().data for _ in range(10)])
+    assert data[-1, 10:] == pytest.approx([1.0, -0.5])
+    driver.close()
+
+
+def test_a_bus_without_the_valve_names_the_node(at: str) -> None:
+    rig = slow_rig()
+    wire = wire_at(at, rig.wire).model_copy(update={"timeout": 0.3})
+    wrong = wire.reached_by("canopen-408", {**wire.settings, "nodes": [1, 9]})
+    with pytest.raises(DeviceLost, match=r"no valve answers as node 9 .*node numbers"):
+        CanOpen408Driver(wrong, rig).connect()
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"nodes": [1]}, r"nodes: \[1\]; expected 2 different numbers"),
+        ({"nodes": [1, 127]}, ".*none of them the host's 127"),
+        ({"eds": "absent.eds"}, "eds: absent.eds: No such file"),
+        ({"bus": "nowhere/1"}, "bus: no interface 'nowhere'"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(settings: dict[str, object], says: str) -> None:
+    wire = Wire(kind="canopen-408", **{"bus": "virtual/x", **settings})
+    with pytest.raises(InputError, match=f"wire: {says}"):
+        CanOpen408Driver(wire, slow_rig())
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "says"),
+    [
+        ("ParameterName=piston", "ParameterName=stroke", "no TPDO carries piston, which piston_1"),
+        ("0x60410010", "0x21000110", "no TPDO carries object 0x6041"),
+        ("[6041]", "[6099", "not an EDS file of a valve"),
+    ],
+)
+def test_an_eds_file_that_lacks_something_is_refused(
+    tmp_path: Path, before: str, after: str, says: str
+) -> None:
+    file = tmp_path / "my.eds"
+    assert before in cia408.shipped_eds()
+    file.write_text(cia408.shipped_eds().replace(before, after, 1), "utf-8")
+    wire = Wire(kind="canopen-408", bus="virtual/x", eds=str(file))
+    with pytest.raises(InputError, match=rf"my.eds: {says}") as caught:
+        CanOpen408Driver(wire, slow_rig())
+    assert "\n" not in str(caught.value)
+
+
+words = st.lists(st.integers(0, 15), max_size=30)
+
+
+@given(st.sampled_from(ValveState), words)
+def test_only_all_three_bits_make_a_valve_active_and_only_a_reset_ends_a_fault(
+    state: ValveState, sent: list[int]
+) -> None:
+    before = 0
+    for word in sent:
+        after = next_state(state, before, word)
+        if state.in_fault:
+            rising = bool(word & Control.RESET) and not before & Control.RESET
+            assert after == (ValveState.DISABLED if rising else state)
+        else:
+            assert (after == ValveState.ACTIVE) == (word & 7 == 7)
+            assert not after.in_fault
+        state, before = after, word
