@@ -31,7 +31,7 @@ DRIVING = [OutputLaw(bias=1.0, limit=2.0), OutputLaw(bias=-0.5, limit=2.0)]
 
 
 def slow_rig() -> Rig:
-    return seed_rig().model_copy(update={"sample_rate": 40.0})
+    return seed_rig().model_copy(update={"sample_rate": 20.0})
 
 
 @pytest.fixture
