@@ -154,10 +154,17 @@ class CanOpenValves:
         self._send(volts, hold | Control.ACTIVE if volts.any() else hold)
 
     def close(self) -> None:
-        """Disable the valves if the bus is still there; never raises anything but DeviceError."""
+        """Disable the valves if the bus is still there, and let them expect no heartbeat."""
+        errors = (
+            DeviceError,
+            self._canopen.SdoCommunicationError,
+            self._canopen.SdoAbortedError,
+        )
         if self._port.is_open and self._nodes:
-            with suppress(DeviceError):
+            with suppress(*errors):
                 self._send(np.zeros(len(self._nodes)), Control.DISABLED)
+                for node in self._nodes:
+                    node.sdo[cia408.CONSUMER_HEARTBEAT][1].raw = 0
         self._port.close()
 
     def fault(self) -> str | None:

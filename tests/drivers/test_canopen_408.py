@@ -34,7 +34,7 @@ def slow_rig() -> Rig:
     return seed_rig().model_copy(update={"sample_rate": 20.0})
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def at() -> Iterator[str]:
     with device_at("realtime", "canopen-408") as (_, endpoint):
         yield endpoint
@@ -65,6 +65,15 @@ def test_valves_follow_their_set_points_and_return_to_zero(at: str) -> None:
     assert np.all(data[:, 10:] == 0.0)
     assert driver._valves._states == [ValveState.HOLD] * 2
     driver.close()
+
+
+def test_a_host_that_says_goodbye_leaves_no_fault(at: str) -> None:
+    driver = host(at, watchdog=0.4)
+    driver.connect()
+    driver.start()
+    driver.read_block()
+    driver.close()
+    time.sleep(1.0)
     driver.connect()
     assert driver.trip_cause() is None
     driver.close()

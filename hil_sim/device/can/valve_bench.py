@@ -111,6 +111,8 @@ class ValveNode:
     def _written(self, index: int, data: bytes, **_: object) -> None:
         if index == cia408.CONTROL_WORD:
             self._follow(int.from_bytes(data, "little"))
+        elif index == cia408.CONSUMER_HEARTBEAT:
+            self._heard = None  # CiA 301: the watch begins with the first heartbeat after that
 
     def _follow(self, word: int) -> None:
         self.state = cia408.next_state(self.state, self._word, word)
