@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -230,24 +231,32 @@ class ModbusTcpDriver:
     # -- inside -----------------------------------------------------------------------------
 
     def _exchange(self) -> bytes:
-        try:
-            return self._exchange_once()
-        except DeviceSilent as silent:
-            # The block stays in the device until acknowledged, so the same one comes again.
-            logger.warning("%s; asking again", silent)
+        # Asked again early enough for a lost answer to trip neither watchdog.
+        wait = min(self._wire.timeout / 2, self._wire.watchdog / 4)
+        tries = math.ceil(self._wire.timeout / wait - 1e-9)
+        last: DeviceSilent | None = None
+        for number in range(tries):
             try:
-                self._link.settle()
-                answer = self._exchange_once()
+                if number:
+                    self._link.settle()
+                with self._link.waiting(wait):
+                    answer = self._exchange_once()
+            except DeviceSilent as silent:
+                # The block stays in the device until acknowledged, so the same one comes again.
+                last = silent
+                if number < tries - 1:
+                    logger.warning("%s; asking again", silent)
+                continue
+            if number:
                 # It may have been the late answer to the first try; then another is on its way.
                 self._link.settle()
-                return answer
-            except DeviceSilent as again:
-                self._link.close()
-                damaged = f"; {again}" if isinstance(again, AnswerDamaged) else ""
-                raise DeviceLost(
-                    f"the device at {self._link.where} has not answered for "
-                    f"{self._wire.timeout:g} s{damaged}"
-                ) from None
+            return answer
+        self._link.close()
+        damaged = f"; {last}" if isinstance(last, AnswerDamaged) else ""
+        raise DeviceLost(
+            f"the device at {self._link.where} has not answered for {self._wire.timeout:g} s"
+            f"{damaged}"
+        )
 
     def _exchange_once(self) -> bytes:
         self._heartbeat = (self._heartbeat + 1) & 0xFFFF

@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import socket
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from pymodbus.client import ModbusSerialClient, ModbusTcpClient
@@ -48,6 +50,11 @@ class _ReadWrite(RawAnswer, ReadWriteMultipleRegistersResponse):
     pass
 
 
+def answer_classes() -> tuple[type[ModbusPDU], ...]:
+    """Return the answers that a connection understands beside the library's own."""
+    return _Read, _ReadWrite
+
+
 class ModbusConnection:
     """A connection that is opened once and, broken once, stays closed until opened again."""
 
@@ -57,6 +64,7 @@ class ModbusConnection:
         self._client: ModbusTcpClient | ModbusSerialClient | None = None
         self._received = 0
         self._asked = b""
+        self._factor = 1.0
         # What the library logs is raised here as well, in words for people.
         logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 
@@ -68,10 +76,11 @@ class ModbusConnection:
     def open(self) -> None:
         """Connect; raises DeviceLost when nothing listens there."""
         self.close()
+        self._factor = 1.0
         client = self._new_client()
         client.set_max_no_responses(1_000_000)  # when to give up is decided by the driver
-        client.register(_Read)
-        client.register(_ReadWrite)
+        for kind in answer_classes():
+            client.register(kind)
         if not client.connect() or client.socket is None:
             raise DeviceLost(
                 f"nothing answers at {self.where}; is the device (or `bramah sim`) running there?"
@@ -96,8 +105,21 @@ class ModbusConnection:
 
     def be_patient(self, factor: float) -> None:
         """Wait `factor` times as long for every answer of the open connection."""
+        self._factor = factor
+        self._wait(self._timeout)
+
+    @contextmanager
+    def waiting(self, seconds: float) -> Iterator[None]:
+        """Wait no longer than this for each answer meanwhile."""
+        self._wait(min(seconds, self._timeout))
+        try:
+            yield
+        finally:
+            self._wait(self._timeout)
+
+    def _wait(self, seconds: float) -> None:
         if self._client is not None:
-            self._client.comm_params.timeout_connect = factor * self._timeout
+            self._client.comm_params.timeout_connect = self._factor * seconds
 
     def close(self) -> None:
         """Close the connection if there is one."""

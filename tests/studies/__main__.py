@@ -13,6 +13,7 @@ from tests.studies.effects import command as effects
 from tests.studies.estimators import command as estimators
 from tests.studies.estimators import design_command as design
 from tests.studies.faults import command as faults
+from tests.studies.fuzz import command as fuzz
 from tests.studies.guard import command as guard
 from tests.studies.machines import crane_command as crane
 from tests.studies.machines import electric_command as electric
@@ -38,6 +39,7 @@ STUDIES = (
     electric,
     measured_figures,
     faults,
+    fuzz,
 )
 
 app = typer.Typer(

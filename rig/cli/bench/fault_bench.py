@@ -18,7 +18,7 @@ from hil_sim.plant.faulty import FaultyPlant
 from hil_sim.scenario.file import Scenario
 from rig.model.rig import Rig
 
-SILENCE: Final = 3.0  # [s] after which a device in virtual time misses its host
+SILENCE: Final = 2.0  # [s] after which a device in virtual time misses its host
 _PATIENCE: Final = 60.0
 
 

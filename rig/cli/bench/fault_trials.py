@@ -40,7 +40,8 @@ REAL_BEGIN: Final = 3.0  # in real time, in which the clock runs while the sessi
 WATCHED: Final = 3.0  # [s] of device time that a fault is watched for
 SHARE: Final = 0.1  # of the frames struck, for `STRIKING` [s]
 STRIKING: Final = 1.0
-_TRIES: Final = 3  # at connecting, on a busy computer
+STALE: Final = "stale data"  # the guard's limit that is one of the wall's clock
+_TRIES: Final = 5  # at connecting, on a busy computer
 _AMPLITUDE, _PULL = 0.8, 20.0  # [V], [V/m]
 _LOCK: Final = 2e-3  # [m]
 
@@ -156,7 +157,7 @@ def try_fault(
     try:
         for left in reversed(range(_TRIES)):
             try:
-                _session(bench, reached, fault, folder / f"{left}", outcome, seed)
+                _session(bench, reached, fault, folder / f"{left}", outcome, seed, realtime)
                 break
             except (DeviceError, SafetyTrip):  # before the fault: a computer too busy
                 if not left:
@@ -183,6 +184,7 @@ def _session(
     folder: Path,
     outcome: Outcome,
     seed: int,
+    realtime: bool,
 ) -> None:
     collector = _Collector()
     period = round(rig.sample_rate)
@@ -203,24 +205,26 @@ def _session(
             session.run_for(0.3)
             session.guard([EXCITED, *_locked(rig, collector.blocks[-1])])
             session.run_for(0.3 + float(rng.uniform(0.0, 0.3)))
-            if isinstance(fault, WireFault):
-                began = time.monotonic(), session.tick / rig.sample_rate
-                bench.strike([fault])
-                session.run_for(STRIKING + 0.5)
-            else:
-                left = max(fault.at - session.tick / rig.sample_rate, 0.01)
-                began = time.monotonic(), fault.at
-                session.run_for(left)
-                began = time.monotonic(), fault.at
-                session.run_for(WATCHED)
+            try:
+                if isinstance(fault, WireFault):
+                    began = time.monotonic(), session.tick / rig.sample_rate
+                    bench.strike([fault])
+                    session.run_for(STRIKING + 0.5)
+                else:
+                    left = max(fault.at - session.tick / rig.sample_rate, 0.01)
+                    began = time.monotonic() + left * realtime, fault.at
+                    session.run_for(left)
+                    session.run_for(WATCHED)
+            finally:
+                ended = time.monotonic()
     except (DeviceError, SafetyTrip) as error:
         if began is None:
             raise
         outcome.error = error
-        if isinstance(error, SafetyTrip):
+        if isinstance(error, SafetyTrip) and error.limit != STALE:
             outcome.seconds = error.device_time - began[1]
         else:
-            outcome.seconds = time.monotonic() - began[0]
+            outcome.seconds = max(0.0, ended - began[0])
     outcome.blocks = len(collector.blocks)
     outcome.missing = session.lost_samples
     outcome.lost_blocks = _not_in(folder / "run" / NAME, rig, collector.blocks)
@@ -278,7 +282,7 @@ def naming(fault: Fault, outcome: Outcome) -> Naming:
 
 def _of_wire(fault: Fault, error: Exception, trip: SafetyTrip | None) -> Naming:
     if trip is not None:
-        known = trip.limit in (DEVICE, "sample gap", "stale data")
+        known = trip.limit in (DEVICE, "sample gap", STALE)
         return Naming.UNKNOWN if known else Naming.WRONG
     text = str(error)
     if isinstance(fault, Reboots):
