@@ -1,0 +1,133 @@
+"""Sessions with a fault: what ends them, what is kept, and the page that lists them all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from drivers.base import DeviceError, DeviceLost
+from hil_sim.faults.base import Fault
+from rig.cli.bench.fault_bench import FaultBench, fault_bench
+from rig.cli.bench.fault_figures import RIG, counted, jobs
+from rig.cli.bench.fault_trials import Naming, Outcome, example, kinds, naming, try_fault, wires
+from rig.model.rig import Rig
+from rig.model.trips import SafetyTrip, Violation
+from rig.runs.rigs import load_rig
+from tests.studies.faults.page import table_rows
+
+PAGE = (Path(__file__).parents[2] / "docs" / "faults.md").read_text("utf-8")
+
+
+def patient_rig() -> Rig:
+    rig = load_rig(RIG)
+    return rig.model_copy(update={"wire": rig.wire.model_copy(update={"timeout": 0.6})})
+
+
+@pytest.fixture(scope="module")
+def bench() -> Iterator[FaultBench]:
+    with fault_bench() as found:
+        yield found
+
+
+@pytest.mark.parametrize(
+    ("wire", "fault", "naming", "says"),
+    [
+        ("modbus-tcp", "sensor_stuck", Naming.NAMED, "cap_pressure_1 of joint 1"),
+        ("modbus-tcp", "link_closed", Naming.NAMED, "closed the connection"),
+        ("modbus-rtu", "queue_overrun", Naming.COUNTED, ""),
+        ("serial", "reboots", Naming.NAMED, "has restarted"),
+        ("serial", "frame_duplicated", Naming.HARMLESS, ""),
+    ],
+)
+def test_a_session_meets_a_fault_ends_safe_and_keeps_every_block(
+    bench: FaultBench, tmp_path: Path, wire: str, fault: str, naming: Naming, says: str
+) -> None:
+    found = try_fault(bench, patient_rig(), wire, fault, tmp_path, 3, realtime=False)
+    assert (found.naming, found.zeroed, found.lost_blocks) == (naming, True, 0)
+    assert found.blocks > 60
+    assert found.struck >= 1
+    assert says in found.says
+    assert (found.missing == 30) == (fault == "queue_overrun")
+
+
+def test_the_device_itself_says_that_its_outputs_were_on_before(bench: FaultBench) -> None:
+    from drivers import make_driver, wire_at
+    from drivers.base import OutputLaw
+
+    rig = patient_rig()
+    endpoint = bench.begin(rig, "modbus-tcp", (), 1, realtime=False)
+    driver = make_driver(wire_at(endpoint, rig.wire), rig)
+    driver.connect()
+    assert not bench.state().driven
+    driver.apply([OutputLaw(bias=0.5, limit=1.0), OutputLaw()])
+    assert bench.state().driven
+    assert not bench.at_zero(0.05)
+    driver.close()
+    assert bench.at_zero(1.0)
+
+
+def test_every_fault_of_the_scenario_file_has_an_example_and_a_row_in_the_page() -> None:
+    for name in kinds():
+        assert isinstance(example(name), Fault)
+    section = PAGE.partition("<!-- noticed -->")[2].partition("<!-- end of noticed -->")[0]
+    rows = [line.split(" | ") for line in section.strip().splitlines()[2:]]
+    listed = [(row[0].strip("| `"), row[1]) for row in rows]
+    wanted = [(fault, wire) for fault, wire in table_rows()]
+    assert [fault for fault, _ in listed] == [fault for fault, _ in wanted]
+    for (fault, on), (_, wire) in zip(listed, wanted, strict=True):
+        assert on in ("any", wire), fault
+
+
+def test_every_fault_but_a_drifting_clock_is_tried_on_every_wire_and_counted_in_the_page() -> None:
+    section = PAGE.partition("<!-- counts -->")[2].partition("<!-- end of counts -->")[0]
+    total = 0
+    for wire in wires():
+        chosen = list(jobs(wire, 500))
+        total += len(chosen)
+        assert {name for _, name in chosen} == set(kinds()) - {"clock_drift"}
+        for name in {name for _, name in chosen}:
+            assert f"| {name} | {wire} |" in section
+    assert total >= 500
+
+
+def trip(limit: str, joint: int | None, channel: str) -> SafetyTrip:
+    return SafetyTrip(Violation(limit, 1.0, (0.0, 0.5), "m", joint, channel, 5), load_rig(RIG))
+
+
+@pytest.mark.parametrize(
+    ("fault", "error", "expected"),
+    [
+        ("sensor_stuck", trip("frozen sensor", 1, "cap_pressure_1"), Naming.NAMED),
+        ("sensor_stuck", trip("frozen sensor", 2, "cap_pressure_2"), Naming.WRONG),
+        ("sensor_stuck", DeviceLost("gone"), Naming.WRONG),
+        ("sensor_drift", None, Naming.UNNOTICED),
+        ("valve_stuck", trip("piston", 1, "piston_1"), Naming.NAMED),
+        ("pump_off", trip("supply pressure", None, "supply_pressure"), Naming.NAMED),
+        ("hose_burst", trip("supply pressure", None, "supply_pressure"), Naming.UNKNOWN),
+        ("frame_lost", None, Naming.HARMLESS),
+        ("frame_lost", DeviceLost("the device has not answered"), Naming.NAMED),
+        ("frame_lost", trip("stale data", None, ""), Naming.UNKNOWN),
+        ("bits_flipped", trip("pressure rate", 1, "cap_pressure_1"), Naming.WRONG),
+        ("reboots", DeviceLost("the device has restarted"), Naming.NAMED),
+        ("reboots", DeviceLost("closed the connection"), Naming.UNKNOWN),
+        ("clock_jump", DeviceError("impossible block: ..."), Naming.NAMED),
+    ],
+)
+def test_a_message_is_judged_by_what_was_done(
+    fault: str, error: Exception | None, expected: Naming
+) -> None:
+    assert naming(example(fault), Outcome(fault, "serial", error=error)) == expected
+
+
+def test_a_missed_number_shows_in_the_figures() -> None:
+    good = Outcome("sensor_stuck", "serial", struck=1, seconds=0.3, blocks=9, naming=Naming.NAMED)
+    bad = Outcome("frame_lost", "serial", struck=4, blocks=9, lost_blocks=1, zeroed=False)
+    late = Outcome("valve_stuck", "serial", struck=1, seconds=2.5, naming=Naming.NAMED)
+    figures = {figure.name: figure for figure in counted([good, bad, late])}
+    assert not figures["outputs left on"].ok
+    assert not figures["of them not in records.h5"].ok
+    assert figures["frozen or stuck, not within 2 s"].value == 1
+    assert figures["frames struck"].value == 4
+    assert not figures["sessions, each with a fault"].ok
