@@ -19,8 +19,15 @@ FORMAT = 1
 _OWN = ("step", "locked", "repeat", "sample_rate", "start_s", "period", "lines", "complete")
 
 
-def head_of(name: str, group: h5py.Group, path: Path) -> RecordHead:
-    """Return what a record's group says without its samples; raises InputError."""
+def head_of(name: str, group: h5py.Group | None, path: Path) -> RecordHead:
+    """Return what a record's group says without its samples; raises InputError.
+
+    A group that h5py cannot open is None.
+    """
+    if not isinstance(group, h5py.Group):
+        raise InputError(
+            f"{path}: record {name} cannot be read: the file is damaged; take it from a backup"
+        )
     attributes = {key: _python(value) for key, value in group.attrs.items()}
     missing = [key for key in _OWN if key not in attributes]
     if missing:

@@ -162,6 +162,7 @@ def try_fault(
             except (DeviceError, SafetyTrip):  # before the fault: a computer too busy
                 if not left:
                     raise
+                rig = _more_patient(rig)
                 endpoint = bench.begin(rig, wire, early, seed, realtime=realtime)
                 reached = rig.model_copy(update={"wire": wire_at(endpoint, rig.wire)})
     finally:
@@ -228,6 +229,11 @@ def _session(
     outcome.blocks = len(collector.blocks)
     outcome.missing = session.lost_samples
     outcome.lost_blocks = _not_in(folder / "run" / NAME, rig, collector.blocks)
+
+
+def _more_patient(rig: Rig) -> Rig:
+    wire = rig.wire.model_copy(update={"timeout": 2.0 * rig.wire.timeout})
+    return rig.model_copy(update={"wire": wire})
 
 
 def _locked(rig: Rig, block: SampleBlock) -> list[JointRole]:

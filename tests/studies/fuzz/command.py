@@ -33,7 +33,7 @@ def fuzz(
                 found.name,
                 str(found.cases),
                 str(found.refused),
-                f"{1e3 * found.slowest:.1f} ms",
+                f"{1e3 * found.slowest:.1f} ms (case {found.slowest_case})",
                 f"{found.grown / 1e6:.0f} MB",
                 "; ".join(f"{n} x {what}" for what, n in found.wrong.most_common(3)) or "nothing",
             ]

@@ -17,7 +17,7 @@ from tests.studies.fuzz.mutation import damaged
 from tests.studies.fuzz.targets import MAKERS, Target
 
 LONGEST = 20.0  # [s] for one case; a hang is named after that
-REPORTED = 500  # cases between two signs of life
+REPORTED = 1.0  # [s] between two signs of life
 _MEMORY = 400e6  # [bytes] that a process may grow by
 
 
@@ -29,13 +29,14 @@ class Found:
     cases: int = 0
     refused: int = 0
     slowest: float = 0.0  # [s]
+    slowest_case: int = 0
     grown: float = 0.0  # [bytes] of the process's largest size since its first case
     wrong: Counter[str] = field(default_factory=Counter)  # errors that may not come, and how often
 
 
 def cases(target: Target, count: int, seed: int, found: Found, tell: Callable[[], None]) -> None:
     """Read `count` damaged examples of a target; notes what may not happen in `found`."""
-    before = _size()
+    before, said = _size(), time.perf_counter()
     for number in range(count):
         rng = random.Random(f"{seed} {target.name} {number}")
         data = damaged(rng, rng.choice(target.examples), target.examples)
@@ -46,10 +47,12 @@ def cases(target: Target, count: int, seed: int, found: Found, tell: Callable[[]
             found.refused += 1
         except Exception as error:
             found.wrong[f"{type(error).__name__}: {error} (case {number})"[:200]] += 1
-        found.slowest = max(found.slowest, time.perf_counter() - began)
+        now = time.perf_counter()
+        if now - began > found.slowest:
+            found.slowest, found.slowest_case = now - began, number
         found.cases += 1
-        if number % REPORTED == 0 or found.slowest > LONGEST / 10:
-            found.grown = max(0.0, _size() - before)
+        if now > said + REPORTED:
+            found.grown, said = max(0.0, _size() - before), now
             tell()
     found.grown = max(0.0, _size() - before)
     if found.grown > _MEMORY:
@@ -65,7 +68,7 @@ def fuzz(key: str, count: int, seed: int) -> Found:
     theirs.close()
     found, whole = Found(key), False
     try:
-        while ours.poll(LONGEST * 4):
+        while ours.poll(LONGEST * 4):  # a busy computer gets some time more
             found, whole = ours.recv()
             if whole:
                 break
