@@ -129,5 +129,6 @@ def test_a_missed_number_shows_in_the_figures() -> None:
     assert not figures["outputs left on"].ok
     assert not figures["of them not in records.h5"].ok
     assert figures["frozen or stuck, not within 2 s"].value == 1
-    assert figures["frames struck"].value == 4
-    assert not figures["sessions, each with a fault"].ok
+    assert figures["faults injected"].value == 6
+    assert figures["of them of machine, sensor or device"].value == 2
+    assert not figures["faults injected"].ok

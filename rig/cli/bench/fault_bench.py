@@ -19,7 +19,7 @@ from hil_sim.scenario.file import Scenario
 from rig.model.rig import Rig
 
 SILENCE: Final = 2.0  # [s] after which a device in virtual time misses its host
-_PATIENCE: Final = 60.0
+_PATIENCE: Final = 300.0  # [s]: a busy computer may take long to begin
 
 
 @dataclass(frozen=True)

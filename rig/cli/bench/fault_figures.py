@@ -73,9 +73,9 @@ def counted(outcomes: Sequence[Outcome]) -> list[Figure]:
     frozen = [o for o in outcomes if o.fault in _FROZEN]
     late = [o for o in frozen if o.seconds is None or o.seconds > _WITHIN]
     return [
-        Figure(GROUP, "sessions, each with a fault", len(outcomes), "", LEAST, True),
+        Figure(GROUP, "faults injected", sum(o.struck for o in outcomes), "", LEAST, True),
         Figure(GROUP, "of them of machine, sensor or device", len(machine)),
-        Figure(GROUP, "frames struck", sum(o.struck for o in outcomes if o not in machine)),
+        Figure(GROUP, "sessions, each with one kind of fault", len(outcomes)),
         Figure(GROUP, "outputs left on", sum(not o.zeroed for o in outcomes), "", 0.0),
         Figure(GROUP, "blocks taken", sum(o.blocks for o in outcomes)),
         Figure(GROUP, "of them not in records.h5", sum(o.lost_blocks for o in outcomes), "", 0.0),
