@@ -26,19 +26,26 @@ ModelOption = Annotated[
 
 def export(
     run: RunArgument,
-    kind: Annotated[str, typer.Option("--format", help="csv, mat, parquet, mf4 or fmu.")] = "csv",
+    kind: Annotated[
+        str, typer.Option("--format", help="csv, mat, parquet, mf4, fmu or ro-crate.")
+    ] = "csv",
     out: Annotated[
         Path | None, typer.Option(help="The folder to make.  [default: RUN-FORMAT beside the run]")
     ] = None,
     model: ModelOption = None,
+    licence: Annotated[
+        str, typer.Option("--license", help="Of ro-crate: the URL of the data's licence.")
+    ] = "",
 ) -> None:
     """Write a run for other programs, a file per record; csv and mat can be imported again.
 
     `--format fmu` writes the identified model instead, with its effects, as functional mock-up
-    units (FMI 2 and 3, co-simulation, for 64-bit Linux and Windows).
+    units (FMI 2 and 3, co-simulation, for 64-bit Linux and Windows); ro-crate is the run's own
+    files with a description for archives and repositories.
 
     Example: bramah export runs/monday --format mat
     """
+    from rig.model.parse import InputError
     from rig.runs.exchange.export import export_run, library_missing
     from rig.runs.stream import read_run_head
 
@@ -53,6 +60,16 @@ def export(
             f"--format {kind} needs the package {missing}, which is not installed: "
             "pip install 'bramah[export]'"
         )
+    if kind == "ro-crate":
+        if model is not None:
+            raise InputError(
+                "--model does not go with --format ro-crate: it holds the run as it is"
+            )
+        from rig.runs.exchange.ro_crate import export_crate
+
+        progress(f"{len(export_crate(run, wanted, licence))} files")
+        typer.echo(str(wanted))
+        return
     more = None if model is None else channel_simulator(model, read_run_head(run).rig, str(run))
     files = export_run(run, wanted, kind, more)
     progress(f"{len(files)} files")

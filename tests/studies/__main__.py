@@ -20,6 +20,7 @@ from tests.studies.machines import electric_command as electric
 from tests.studies.machines import emps_command as emps
 from tests.studies.machines import measured_figures
 from tests.studies.machines import pendulum_command as pendulum
+from tests.studies.nights import command as nights
 from tests.studies.reproduction import command as reproduction
 from tests.studies.trace import command as trace
 
@@ -40,6 +41,7 @@ STUDIES = (
     measured_figures,
     faults,
     fuzz,
+    nights,
 )
 
 app = typer.Typer(

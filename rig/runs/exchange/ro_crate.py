@@ -1,0 +1,231 @@
+"""A run as an RO-Crate: the run's own files and a JSON-LD description that archives understand.
+
+RO-Crate 1.1 (https://w3id.org/ro/crate/1.1) with the Process Run Crate profile: the run is a
+`CreateAction` of this software on the rig, by the operator, from run.yaml to records.h5.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final
+
+from rig.model.parse import InputError
+from rig.runs import store
+from rig.runs.runstate import ABORTED, DONE, EVENTS, HEADER, read_events
+from rig.runs.store import ARCHIVE, Header
+from rig.runs.stream import RunHead, read_run_head
+
+METADATA: Final = "ro-crate-metadata.json"
+CONTEXT: Final = "https://w3id.org/ro/crate/1.1/context"
+CRATE: Final = "https://w3id.org/ro/crate/1.1"
+PROFILE: Final = "https://w3id.org/ro/wfrun/process/0.5"
+_FILES: Final = {
+    HEADER: ("application/yaml", "How the run was taken: rig, protocol, versions, seeds"),
+    ARCHIVE: ("application/x-hdf5", "Every record and what lies between, SI units as attributes"),
+    EVENTS: ("application/jsonl", "What happened, one line an event"),
+    "state": ("text/plain", "How the run ended"),
+}
+# UN/CEFACT common codes, as schema.org wants them.
+_UNIT_CODES: Final = {"V": "VLT", "m": "MTR", "Pa": "PAL", "degC": "CEL", "rad": "C81", "N": "NEW"}
+Entity = dict[str, Any]
+
+
+def _ref(identifier: str) -> Entity:
+    return {"@id": identifier}
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def export_crate(run: Path, out: Path, licence: str = "") -> list[Path]:
+    """Copy a run into the folder `out` and describe it; returns the files.
+
+    `licence` is the URL of the data's licence; without one the crate says that none was given.
+    Raises InputError for a run that cannot be read or a folder that is occupied.
+    """
+    head = read_run_head(run, partial=True)
+    header = store.read_header(run)
+    store.refuse_occupied(out)
+    names = [name for name in _FILES if (run / name).is_file()]
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        files = [Path(shutil.copyfile(run / name, out / name)) for name in names]
+        text = json.dumps(describe(out, head, header, names, licence), indent=2) + "\n"
+        (out / METADATA).write_text(text, encoding="utf-8")
+    except OSError as error:
+        shutil.rmtree(out, ignore_errors=True)
+        raise InputError(f"{out}: the crate cannot be written: {error.strerror}") from error
+    return [*files, out / METADATA]
+
+
+def describe(
+    folder: Path, head: RunHead, header: Header, names: list[str], licence: str
+) -> dict[str, Any]:
+    """Return the crate's metadata document for the copied files `names` of `folder`."""
+    name = Path(head.source).resolve().name
+    variables = _variables(head, header)
+    licence_id = licence or "#no-licence"
+    root: Entity = {
+        "@id": "./",
+        "@type": "Dataset",
+        "name": f"Run {name} on {header.rig.name}",
+        "description": _story(head, header),
+        "datePublished": datetime.now(UTC).date().isoformat(),
+        "dateCreated": header.created,
+        "license": _ref(licence_id),
+        "creator": _ref("#operator"),
+        "conformsTo": _ref(PROFILE),
+        "hasPart": [_ref(part) for part in names],
+        "mentions": _ref("#run"),
+        "variableMeasured": [_ref(one["@id"]) for one in variables],
+    }
+    graph: list[Entity] = [
+        {
+            "@id": METADATA,
+            "@type": "CreativeWork",
+            "conformsTo": _ref(CRATE),
+            "about": _ref("./"),
+        },
+        root,
+        *(_file(folder / part) for part in names),
+        _action(folder, head, header, names),
+        {"@id": "#operator", "@type": "Person", "name": header.operator or "unknown"},
+        {
+            "@id": licence_id,
+            "@type": "CreativeWork",
+            "name": "Licence of the data" if licence else "No licence was given",
+            "description": licence or "The exporting person named no licence: ask them.",
+        },
+        _instrument(header),
+        *_software(header.versions),
+        {"@id": PROFILE, "@type": "CreativeWork", "name": "Process Run Crate", "version": "0.5"},
+        *variables,
+        *_calibrations(header),
+    ]
+    return {"@context": CONTEXT, "@graph": graph}
+
+
+def _story(head: RunHead, header: Header) -> str:
+    protocol = str((header.protocol or {}).get("name", "")) or header.source or "no protocol"
+    whole = sum(bool(record.attributes["complete"]) for record in head.records)
+    return (
+        f"{whole} complete and {len(head.records) - whole} unfinished records of {protocol} at "
+        f"{header.rig.sample_rate:g} Hz; the run ended as {head.state}"
+    )
+
+
+def _file(path: Path) -> Entity:
+    kind, about = _FILES[path.name]
+    return {
+        "@id": path.name,
+        "@type": "File",
+        "name": path.name,
+        "description": about,
+        "encodingFormat": kind,
+        "contentSize": str(path.stat().st_size),
+        "sha256": _digest(path),
+    }
+
+
+def _action(folder: Path, head: RunHead, header: Header, names: list[str]) -> Entity:
+    events = read_events(folder)
+    failed = head.state != DONE
+    found: Entity = {
+        "@id": "#run",
+        "@type": "CreateAction",
+        "name": header.provenance.get("command") or f"Run on {header.rig.name}",
+        "startTime": header.created,
+        "endTime": str(events[-1].get("time", header.created)) if events else header.created,
+        "agent": _ref("#operator"),
+        "instrument": _ref("#bramah"),
+        "object": [_ref(HEADER), _ref("#rig")],
+        "result": [_ref(name) for name in names if name in (ARCHIVE, EVENTS)],
+        "actionStatus": _ref(
+            f"http://schema.org/{'FailedActionStatus' if failed else 'CompletedActionStatus'}"
+        ),
+    }
+    if failed:
+        ends = [e for e in events if e.get("event") in ("trip", "end", "recovered")]
+        last = str(ends[-1].get("message", "")) if ends else ""
+        found["error"] = last or (ABORTED if head.state == ABORTED else head.state)
+    return found
+
+
+def _instrument(header: Header) -> Entity:
+    return {
+        "@id": "#rig",
+        "@type": ["IndividualProduct", "Thing"],
+        "name": header.rig.name,
+        "description": f"Test bench with {len(header.rig.joints)} joint(s); device: "
+        f"{header.device or 'unknown'}; computer: {header.host or 'unknown'}",
+    }
+
+
+def _software(versions: Mapping[str, str]) -> list[Entity]:
+    main: Entity = {
+        "@id": "#bramah",
+        "@type": "SoftwareApplication",
+        "name": "bramah",
+        "version": versions.get("bramah", "unknown"),
+        "softwareRequirements": [_ref(f"#{n}") for n in versions if n not in ("bramah", "commit")],
+    }
+    if "commit" in versions:
+        main["identifier"] = versions["commit"]
+    others = [
+        {"@id": f"#{name}", "@type": "SoftwareApplication", "name": name, "version": version}
+        for name, version in versions.items()
+        if name not in ("bramah", "commit")
+    ]
+    return [main, *others]
+
+
+def _variables(head: RunHead, header: Header) -> list[Entity]:
+    names = dict.fromkeys(name for record in head.records for name in record.channels)
+    found = []
+    for name in names:
+        unit = header.rig.unit_of(name)
+        one: Entity = {
+            "@id": f"#channel-{name}",
+            "@type": "PropertyValue",
+            "name": name,
+            "unitText": unit or "1",
+        }
+        if unit in _UNIT_CODES:
+            one["unitCode"] = _UNIT_CODES[unit]
+        if name in _calibrated(header):
+            one["measurementTechnique"] = _ref(f"#calibration-{name}")
+        found.append(one)
+    return found
+
+
+def _calibrated(header: Header) -> Mapping[str, Any]:
+    return getattr(getattr(header.rig, "sensors", None), "calibrations", None) or {}
+
+
+def _calibrations(header: Header) -> list[Entity]:
+    return [
+        {
+            "@id": f"#calibration-{name}",
+            "@type": "CreateAction",
+            "name": f"Calibration of {name}",
+            "endTime": one.date.isoformat(),
+            "object": _ref(f"#sensor-{name}"),
+            "description": one.certificate or "no certificate was named",
+        }
+        for name, one in _calibrated(header).items()
+    ] + [
+        {
+            "@id": f"#sensor-{name}",
+            "@type": "IndividualProduct",
+            "name": f"Sensor of {name}",
+            "serialNumber": one.serial,
+        }
+        for name, one in _calibrated(header).items()
+    ]
