@@ -19,7 +19,7 @@ def kills(
     seed: Annotated[int, typer.Option(min=0)] = 1,
     longest: Annotated[
         float, typer.Option(help="Kill up to this long after the start [s].")
-    ] = 26.0,
+    ] = 14.0,
     json: JsonOption = None,
 ) -> None:
     """Kill runs at random moments over Modbus TCP, RTU and serial; count what is lost.
