@@ -107,24 +107,29 @@ class Journal:
         max_pages: int | None = None,
     ) -> Journal:
         """Start the journal of `columns` (the first `measured` are sensors); RecordingFailed."""
+        # Made under another name, renamed when whole: a kill leaves no journal or a usable one.
+        fresh = path.with_name(f"{path.name}.tmp")
         try:
-            db = sqlite3.connect(path, isolation_level=None)
-            db.execute("PRAGMA journal_mode=WAL")
-            # NORMAL: a kill loses nothing, a power cut at most the blocks since the last sync;
-            # FULL would hold up the acquisition by a disk sync for every block.
-            db.execute("PRAGMA synchronous=NORMAL")
-            if max_pages is not None:
-                db.execute(f"PRAGMA max_page_count={int(max_pages)}")
-            db.executescript(_SCHEMA)
+            db = sqlite3.connect(fresh, isolation_level=None)
             meta = {
                 "format": _FORMAT,
                 "columns": list(columns),
                 "measured": measured,
                 "sample_rate": sample_rate,
             }
+            db.executescript(_SCHEMA)
             rows = [(key, json.dumps(value)) for key, value in meta.items()]
             db.executemany("INSERT INTO meta VALUES (?, ?)", rows)
-        except sqlite3.Error as error:
+            db.execute("PRAGMA journal_mode=WAL")
+            db.close()
+            fresh.replace(path)
+            db = sqlite3.connect(path, isolation_level=None)
+            # NORMAL: a kill loses nothing, a power cut at most the blocks since the last sync;
+            # FULL would hold up the acquisition by a disk sync for every block.
+            db.execute("PRAGMA synchronous=NORMAL")
+            if max_pages is not None:
+                db.execute(f"PRAGMA max_page_count={int(max_pages)}")
+        except (sqlite3.Error, OSError) as error:
             raise RecordingFailed(f"{path}: the journal cannot be written: {error}") from error
         return cls(db, path)
 

@@ -88,8 +88,7 @@ def _refuse_if_alive(folder: Path, force: bool) -> None:
 
 
 def _from_journal(folder: Path, rig: Rig, stood: str) -> RecoverReport:
-    for stray in folder.glob("*.tmp"):
-        stray.unlink(missing_ok=True)
+    _tidy(folder)
     path = folder / runstate.JOURNAL
     damage = find_damage(path, rig)
     if damage is not None:
@@ -156,7 +155,14 @@ def _counts(written: Written) -> str:
     )
 
 
+def _tidy(folder: Path) -> None:
+    """Remove what a killed process had begun and not yet given its name."""
+    for stray in folder.glob("*.tmp*"):
+        stray.unlink(missing_ok=True)
+
+
 def _without_journal(folder: Path) -> RecoverReport:
+    _tidy(folder)
     state = runstate.read_state(folder)
     archive = folder / store.ARCHIVE
     if not archive.exists():

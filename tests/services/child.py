@@ -76,6 +76,9 @@ def prepare(mode: str, number: int) -> dict[str, Any]:
             lambda: dying(store, "replace_text", after=True),
             lambda: dying(journal.Journal, "create"),
             lambda: dying(journal.Journal, "create", after=True),
+            lambda: dying(journal.sqlite3, "connect", after=True),
+            lambda: dying(journal.json, "dumps"),
+            lambda: dying(journal.sqlite3, "connect", 1),
         ]
         starts[number]()
     elif mode in ("file limit", "disk full"):

@@ -62,7 +62,7 @@ def test_killed_while_the_archive_is_written_the_run_is_finished_by_recover(
     assert left == {"events.jsonl", "records.h5", "run.yaml", "state"}
 
 
-@pytest.mark.parametrize("place", range(5))
+@pytest.mark.parametrize("place", range(8))
 def test_killed_while_the_folder_is_made_it_is_an_empty_run_or_none(
     tmp_path: Path, place: int
 ) -> None:
