@@ -15,16 +15,9 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 
-from protocols.files.schema import (
-    CLOSED,
-    END_MAX,
-    END_MIN,
-    Centring,
-    Excite,
-    Lock,
-    Multisine,
-    Step,
-)
+from protocols.signals.multisine import Multisine
+from protocols.steps.excite import Step
+from protocols.steps.parts import CLOSED, END_MAX, END_MIN, Centring, Excite, Lock
 from rig.model.rig import Rig
 
 ALL_POSES = 3  # joints beyond the excited one, up to which every combination is a candidate

@@ -17,7 +17,8 @@ import numpy as np
 
 from protocols.design.check_report import CheckReport, MotionPrediction, StepCheck
 from protocols.engine.centring import Array, follow, under_loop
-from protocols.files.plan import ExcitePlan, Plan, StepPlan
+from protocols.files.plan import Plan
+from protocols.steps.plans import ExcitePlan, StepPlan
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 
@@ -51,7 +52,7 @@ def check(plan: Plan, rig: Rig, twin: Twin) -> CheckReport:
     Raises InputError where the twin cannot follow the commands at all; whether limits are kept
     is in the report.
     """
-    steps = tuple(check_step(step, rig, twin) for step in plan.steps)
+    steps = tuple(check_step(step, rig, twin) for step in plan.excitations)
     return CheckReport(plan.protocol.name, rig.name, plan.seconds, steps)
 
 

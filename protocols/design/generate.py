@@ -81,7 +81,7 @@ def prove(protocol: Protocol, rig: Rig, predictor: Predictor) -> Proof:
     done: list[Sized] = []
     reasons: list[Reason] = []
     before = judge([])
-    for step, planned in zip(plan.protocol.steps, plan.steps, strict=True):
+    for step, planned in zip(plan.protocol.excitations, plan.steps, strict=True):
         _, moved = centred(planned, rig, predictor.twin)
         rows = predictor.rows(rig, moved, [part.joint + 1 for part in planned.locks])
         done.append(Sized(step, rows))

@@ -16,7 +16,8 @@ import numpy as np
 
 from protocols.design.proof import Triangles, Verdicts
 from protocols.engine.centring import Array
-from protocols.files.schema import CLOSED, Step
+from protocols.steps.excite import Step
+from protocols.steps.parts import CLOSED
 
 Judge = Callable[[Sequence[Triangles]], Verdicts]
 

@@ -10,7 +10,9 @@ from protocols.design.check import Twin, centred, judge_motion
 from protocols.design.check_report import MotionPrediction
 from protocols.engine.centring import Array
 from protocols.files.plan import resolve
-from protocols.files.schema import Multisine, Protocol, Step
+from protocols.files.schema import Protocol
+from protocols.signals.multisine import Multisine
+from protocols.steps.excite import Step
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 

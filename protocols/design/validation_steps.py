@@ -5,7 +5,10 @@ from __future__ import annotations
 from protocols.design.candidates import CENTRING, CLOSED_TOLERANCE
 from protocols.design.check import Twin
 from protocols.design.sizing import SIZES, SMALLER, SPARE, motion_within
-from protocols.files.schema import CLOSED, Excite, Lock, Protocol, Sine, Step
+from protocols.files.schema import Protocol
+from protocols.signals.sine import Sine
+from protocols.steps.excite import Step
+from protocols.steps.parts import CLOSED, Excite, Lock
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 

@@ -1,211 +1,117 @@
-"""Runs a resolved plan on a bench: place, lock, warm up, centre, record, step after step.
+"""Runs a resolved plan on a bench, step after step, and ends with the outputs at zero.
 
 The engine only asks; the bench checks every sample, writes it down, and zeroes the outputs on any
-exit. What ends a run early (SafetyTrip, OperatorStop, DeviceLost, ProtocolAborted) passes through.
+exit. What ends a run early (SafetyTrip, OperatorStop, DeviceLost, ProtocolAborted) passes through,
+after the outputs were zeroed and the state was noted.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 
-from protocols.engine.errors import ProtocolAborted
-from protocols.engine.excited_joint import Driven
-from protocols.engine.locking import Hold, JointLock, give, lock
-from protocols.engine.placing import look, move
-from protocols.engine.playback import Playback
-from protocols.engine.session import BenchSession, Session
-from protocols.files.plan import LockPlan, Plan, StepPlan
-from protocols.files.schema import CLOSED
-from rig.bench.guard import EXCITED, FREE, JointRole
+from drivers.base import DeviceError, DeviceLost
+from protocols.engine.conductor import Conductor
+from protocols.engine.desk import Desk
+from protocols.engine.errors import ProtocolAborted, RunEnded
+from protocols.engine.session import BenchSession
+from protocols.engine.states import State
+from protocols.files.plan import Plan
+from protocols.steps.base import PlannedStep
 from rig.model.rig import Rig
-from rig.runs.recorder import RecordMeta
+from rig.model.trips import RecordingFailed, SafetyTrip
 
 log = logging.getLogger(__name__)
 
 # step, phase, repeat (0 outside of records), repeats, message
 OnPhase = Callable[[str, str, int, int, str], None]
 
-GUARD_SHARE = 2.0  # the bench trips at twice the tolerance at which the engine gives up a lock
-RELOCK_SHARE = 0.5  # of the tolerance; a closed valve that gave more is closed anew
-SPARE = 5.0  # [s] of samples remembered beyond a record and the two periods before it
 
-
-def run(plan: Plan, rig: Rig, bench: BenchSession, on_phase: OnPhase | None = None) -> None:
+def run(
+    plan: Plan,
+    rig: Rig,
+    bench: BenchSession,
+    on_phase: OnPhase | None = None,
+    desk: Desk | None = None,
+) -> None:
     """Run every step of a plan; the records are in the bench's recorder when it returns.
 
-    `on_phase` is told every phase: "place", "lock", "warm-up", "centre", "record", "stop",
-    "done". Raises ProtocolAborted (or its LockFailed) if the bench does not do what a step needs,
-    and whatever the bench raises.
+    `on_phase` is called with every phase: "place", "lock", "warm-up", "centre", "record", "stop",
+    "done" and those of the other steps; `desk` is where people and estimates come in. Raises
+    ProtocolAborted (or its LockFailed) if the bench does not do what a step needs, and whatever the
+    bench raises; in every case the outputs were put to zero first.
     """
-    tell = on_phase or _nobody
-    keep = max(s.record + 2 * s.period for s in plan.steps)
-    session = Session(bench, rig, keep + round(SPARE * rig.sample_rate))
-    for step in plan.steps:
-        _StepRun(session, plan, step, tell).run()
-    tell(plan.steps[-1].name, "done", 0, 0, f"{len(plan.records)} records")
+    conductor = Conductor(plan, rig, bench, on_phase or _nobody, desk or Desk())
+    machine = conductor.machine
+    machine.listen(conductor.note_state)
+    bench.listen(conductor.desk.control.accept)
+    machine.to(State.IDLE, "the plan is proved")
+    try:
+        _all(plan, conductor)
+        conductor.tell(plan.sequence[-1].name, "done", 0, 0, f"{conductor.records} records")
+    except SafetyTrip as trip:
+        _trip(plan, conductor, trip)
+        raise
+    finally:
+        _make_safe(conductor)
 
 
 def _nobody(step: str, phase: str, repeat: int, repeats: int, message: str) -> None:
     log.debug("%s %s %d/%d %s", step, phase, repeat, repeats, message)
 
 
-class _StepRun:
-    """One step from rest to rest."""
-
-    def __init__(self, session: Session, plan: Plan, step: StepPlan, tell: OnPhase) -> None:
-        self.session = session
-        self.place = plan.place
-        self.step = step
-        self._tell = tell
-        self.locks: list[JointLock] = []
-
-    def tell(self, phase: str, message: str, repeat: int = 0) -> None:
-        log.info("%s: %s %s", self.step.name, phase, message)
-        self._tell(self.step.name, phase, repeat, self.step.repeats, message)
-
-    def run(self) -> None:
-        self.session.bench.guard(self._roles(moving=True))
-        nulls = self._place()
-        self.locks = self._lock()
-        self.session.bench.guard(self._roles())
-        excitation = Playback(self.session, self.step, self.place, self.locks)
-        self.tell("warm-up", "waveforms grow under the position loop")
-        excitation.warm_up(nulls)
-        self.tell("centre", "open loop; biases are trimmed")
-        excitation.settle_bias()
-        self._records(excitation)
-        self.tell("stop", "waveforms shrink, valves close")
-        excitation.stop()
-
-    def _roles(self, moving: bool = False) -> list[JointRole]:
-        """Return what each joint does; a joint on its way may touch the ends of its stroke."""
-        roles = [FREE] * self.session.joints
-        if moving:
-            return roles
-        for part in self.step.excite:
-            roles[part.joint] = EXCITED
-        for held in self.locks:
-            tolerance = GUARD_SHARE * held.tolerance
-            roles[held.joint] = JointRole(locked_at=held.piston, tolerance=tolerance)
-        return roles
-
-    def _place(self) -> dict[int, float]:
-        targets = {e.joint: e.centre for e in self.step.excite}
-        where = ", ".join(f"joint {j + 1} to {1e3 * s:g} mm" for j, s in targets.items())
-        self.tell("place", where)
-        self.session.wait(0.01)  # so that the session knows the device's time
-        # They are centred again when they move: here half of what that allows is near enough.
-        near = 0.5 * min(e.settings.centring.offset for e in self.step.excite)
-        tolerance = max(self.place.tolerance, near)
-        settle, name = self.step.settle, self.step.name
-        return move(self.session, targets, self.place, tolerance, settle, name)
-
-    def _lock(self) -> list[JointLock]:
-        """Lock the joints: end stops first, because the push shakes what is merely closed."""
-        hold = Hold(self.step.name, self.step.settle, self.step.record / self.session.rate)
-        locks = []
-        for part in sorted(self.step.locks, key=lambda p: p.at == CLOSED):
-            self.tell("lock", f"joint {part.joint + 1} {_lock_text(part)}")
-            locks.append(lock(self.session, part, self.place, hold))
-        return locks
-
-    def _records(self, excitation: Playback) -> None:
-        disturbed = 0
-        repeat = 1
-        while repeat <= self.step.repeats:
-            if self._record(excitation, repeat):
-                repeat += 1
-                if repeat <= self.step.repeats and self._relock(excitation):
-                    excitation.settle_bias()
-                continue
-            disturbed += 1
-            if disturbed > self.step.tries:
-                raise ProtocolAborted(
-                    f"{self.step.name}: record {repeat} was about to leave the piston limits "
-                    f"{disturbed} times; lower the amplitude, or find out what makes it drift"
-                )
-            self.tell("centre", f"record {repeat} was disturbed and is taken again", repeat)
-            excitation.settle_bias()
-
-    def _record(self, excitation: Playback, repeat: int) -> bool:
-        """Take one record; False if it was disturbed, and so is none."""
-        self.tell("record", f"record {repeat} of {self.step.repeats}", repeat)
-        first, driven = excitation.at, excitation.joints
-        meta = self._meta(repeat)
-        with self.session.bench.record(meta, start_tick=first, ticks=self.step.record) as record:
-            if not excitation.record():
-                record.discard("a bias had to be corrected within it")
-                return False
-            record.note(**self._attributes(first, driven, excitation))
-        return True
-
-    def _meta(self, repeat: int) -> RecordMeta:
-        attributes: dict[str, str | float | int] = {
-            "excited": " ".join(str(e.joint + 1) for e in self.step.excite)
-        }
-        for e in self.step.excite:
-            if e.wave.detection_lines:
-                lines = " ".join(str(k) for k in e.wave.detection_lines)
-                attributes[f"detection_lines_{e.joint + 1}"] = lines
-        return RecordMeta(
-            step=self.step.name,
-            repeat=repeat,
-            locked=tuple(held.joint + 1 for held in self.locks),
-            period=self.step.period,
-            lines=self.step.lines,
-            attributes=attributes,
-        )
-
-    def _attributes(
-        self, first: int, driven: Sequence[Driven], excitation: Playback
-    ) -> dict[str, str | float | int]:
-        """Return what is known of a record only when it has been taken."""
-        found: dict[str, str | float | int] = {}
-        last = first + self.step.record
-        for held in self.locks:
-            j = held.joint + 1
-            found[f"lock_{j}"] = held.at
-            found[f"lock_piston_m_{j}"] = held.piston
-            found[f"lock_gain_v_per_m_{j}"] = held.law.position_gain
-            found[f"lock_give_m_{j}"] = give(self.session, held, first, last)
-        for before, after in zip(driven, excitation.joints, strict=True):
-            j = before.joint + 1
-            found[f"bias_v_{j}"] = before.bias
-            found[f"position_gain_v_per_m_{j}"] = before.loop
-            found[f"drift_m_{j}"] = after.moved.drift * self.step.record / self.session.rate
-            found[f"centre_m_{j}"] = after.moved.mean
-        return found
-
-    def _relock(self, excitation: Playback) -> bool:
-        """Close a valve anew that let its piston creep; says whether one had to be."""
-        changed = False
-        for n, held in enumerate(self.locks):
-            if held.at != CLOSED:
-                continue
-            first = self.session.now - self.step.period
-            off = look(self.session, held.joint, first, self.session.now).piston - held.piston
-            if abs(off) <= RELOCK_SHARE * held.tolerance:
-                continue
-            self.tell("lock", f"joint {held.joint + 1} crept {1e3 * off:.2f} mm; closed anew")
-            plan = next(part for part in self.step.locks if part.joint == held.joint)
-            excitation.hold()
-            self.session.bench.guard(self._roles_without(held.joint))
-            hold = Hold(self.step.name, self.step.settle, self.step.record / self.session.rate)
-            self.locks[n] = lock(self.session, plan, self.place, hold)
-            changed = True
-        if changed:
-            excitation.resume(self.locks)
-            self.session.bench.guard(self._roles())
-        return changed
-
-    def _roles_without(self, joint: int) -> list[JointRole]:
-        roles = self._roles()
-        roles[joint] = FREE
-        return roles
+def _all(plan: Plan, conductor: Conductor) -> None:
+    """Run the steps; what fails is skipped or retried as the protocol allows."""
+    skipped, lost = 0, 0
+    rule, retry = plan.protocol.on_error, plan.protocol.retry
+    waiting: Sequence[PlannedStep] = plan.sequence
+    while waiting:
+        part = waiting[0]
+        conductor.begin(part, waiting[1:])
+        try:
+            conductor.do(part)
+        except DeviceLost as error:
+            lost += 1
+            if retry is None or lost > retry.times:
+                raise
+            _reconnect(conductor, error, retry.wait, retry.times - lost)
+            continue
+        except RunEnded:
+            raise
+        except ProtocolAborted as error:
+            conductor.rest_now(f"{part.name} failed")
+            if rule.then != "skip" or skipped >= rule.at_most:
+                raise
+            skipped += 1
+            conductor.mark(rule.mark or f"{part.name} is skipped: {error}")
+            log.warning("%s is skipped: %s", part.name, error)
+        waiting = waiting[1:]
 
 
-def _lock_text(part: LockPlan) -> str:
-    if part.at == CLOSED:
-        return f"to {1e3 * part.piston:g} mm, valve closed there"
-    return f"to its end stop ({part.at}), held there"
+def _reconnect(conductor: Conductor, error: DeviceLost, wait: float, left: int) -> None:
+    """Come to rest and connect anew; each further loss uses up the budget in the caller."""
+    log.warning("%s; connecting again in %g s, %d more allowed", error, wait, left)
+    conductor.rest_now("the device was lost", confirmed=False)
+    conductor.bench.event("device lost", conductor.bench.tick, message=str(error), retries=left)
+    conductor.reconnect(wait)
+    conductor.bench.event("device back", conductor.bench.tick)
+
+
+def _trip(plan: Plan, conductor: Conductor, trip: SafetyTrip) -> None:
+    conductor.machine.to(State.TRIPPED, str(trip))
+    if plan.protocol.on_trip.mark:
+        with suppress(RecordingFailed):
+            conductor.mark(plan.protocol.on_trip.mark)
+
+
+def _make_safe(conductor: Conductor) -> None:
+    """Zero the outputs and say so; a device that does not confirm leaves the state as it was."""
+    try:
+        sure = conductor.bench.zero_outputs()
+    except DeviceError as error:
+        log.error("%s", error)
+        sure = False
+    if sure:
+        with suppress(RecordingFailed):
+            conductor.machine.to(State.SAFE, "outputs confirmed at zero")

@@ -19,3 +19,7 @@ class LockFailed(ProtocolAborted):
             f"lock failed in {step}: joint {joint} {what}: piston measured at "
             f"{1e3 * measured:.2f} mm, expected {expected}"
         )
+
+
+class RunEnded(ProtocolAborted):
+    """A person, or what stands for one, ended the run; no rule of the protocol goes on after it."""

@@ -21,8 +21,8 @@ from protocols.engine.centring import (
     trim,
 )
 from protocols.engine.errors import ProtocolAborted
-from protocols.files.plan import ExcitePlan
-from protocols.files.schema import OPEN_LOOP, Centring
+from protocols.steps.parts import OPEN_LOOP, Centring
+from protocols.steps.plans import ExcitePlan
 
 log = logging.getLogger(__name__)
 

@@ -17,8 +17,8 @@ from drivers.base import OFF, OutputLaw
 from protocols.engine.errors import LockFailed
 from protocols.engine.placing import LOOK, STILL, Look, look, move, position_law
 from protocols.engine.session import Session
-from protocols.files.plan import LockPlan
-from protocols.files.schema import CLOSED, END_MAX, Place
+from protocols.steps.parts import CLOSED, END_MAX, Place
+from protocols.steps.plans import LockPlan
 
 log = logging.getLogger(__name__)
 

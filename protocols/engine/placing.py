@@ -15,7 +15,7 @@ import numpy as np
 from drivers.base import OutputLaw
 from protocols.engine.errors import ProtocolAborted
 from protocols.engine.session import Session
-from protocols.files.schema import Place
+from protocols.steps.parts import Place
 
 log = logging.getLogger(__name__)
 

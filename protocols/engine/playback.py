@@ -26,8 +26,8 @@ from protocols.engine.excited_joint import (
 )
 from protocols.engine.locking import JointLock, verify
 from protocols.engine.session import Session
-from protocols.files.plan import FIRM_SECONDS, StepPlan
-from protocols.files.schema import Place
+from protocols.steps.parts import Place
+from protocols.steps.plans import FIRM_SECONDS, StepPlan
 
 log = logging.getLogger(__name__)
 
@@ -211,6 +211,10 @@ class Playback:
 
     def _loose(self) -> float:
         return min(d.centring.position_gain for d in self.joints)
+
+    def keep_on(self, seconds: float) -> None:
+        """Play on under the slow loop, without records, with an eye on the locks."""
+        self._go_on(seconds)
 
     def _go_on(self, seconds: float) -> None:
         """Play on for a time, wherever that ends, with an eye on the locks."""

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from types import TracebackType
-from typing import Protocol, Self
+from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.base import OFF, DeviceInfo, OutputLaw, SampleBlock
+from protocols.engine.states import Machine
 from rig.bench.guard import JointRole
+from rig.bench.screens.commands import Judge
 from rig.model import channels as ch
 from rig.model.rig import Rig
 from rig.runs.recorder import RecordMeta
@@ -45,6 +47,25 @@ class BenchSession(Protocol):
 
     info: DeviceInfo
 
+    @property
+    def tick(self) -> int:
+        """The tick after the last sample read."""
+
+    def zero_outputs(self) -> bool:
+        """Put the outputs to zero now; False if the device does not answer."""
+
+    def reconnect(self, wait: float) -> None:
+        """Connect anew to a device that was lost."""
+
+    def listen(self, judge: Judge) -> None:
+        """Let `judge` take or refuse the commands of screens."""
+
+    def status(self, **changes: Any) -> None:
+        """Say where the protocol stands."""
+
+    def event(self, event: str, tick: int | None = None, **fields: Any) -> None:
+        """Note one event in the run's log."""
+
     def upload(self, joint: int, wave: Array) -> None:
         """Store one period of a joint's (0-based) waveform [V]."""
 
@@ -67,9 +88,13 @@ class BenchSession(Protocol):
 class Session:
     """Holds the laws in force and the samples read lately; every wait is in device time."""
 
-    def __init__(self, bench: BenchSession, rig: Rig, keep: int) -> None:
-        """Remember the last `keep` samples."""
+    def __init__(
+        self, bench: BenchSession, rig: Rig, keep: int, machine: Machine, heed: Watch
+    ) -> None:
+        """Remember the last `keep` samples; `heed` is called before each block."""
         self.bench = bench
+        self._machine = machine
+        self._heed = heed
         self.rig = rig
         self.rate = rig.sample_rate
         self.joints = len(rig.joints)
@@ -80,7 +105,12 @@ class Session:
         self._stamps = np.full(keep, -1, dtype=np.int64)
 
     def apply(self, changes: Mapping[int, OutputLaw], restart: bool = False) -> int:
-        """Put new laws in force for some joints; returns the tick from which they hold."""
+        """Put new laws in force for some joints; returns the tick from which they hold.
+
+        Raises RuntimeError for any law but zero while the engine is at rest.
+        """
+        if not self._machine.energised and any(law.limit > 0.0 for law in changes.values()):
+            raise RuntimeError(f"an output law was asked for in state {self._machine.state}")
         for joint, law in changes.items():
             self.laws[joint] = law
         return self.bench.apply(tuple(self.laws), restart)
@@ -89,9 +119,16 @@ class Session:
         """Put every output to zero."""
         self.apply(dict.fromkeys(range(self.joints), OFF))
 
+    def forget(self) -> None:
+        """Drop what was read and the laws: the device was connected anew."""
+        self._stamps[:] = -1
+        self.laws = [OFF] * self.joints
+        self.now = 0
+
     def until(self, tick: int, watch: Watch | None = None) -> None:
         """Read blocks until sample `tick` - 1 is in; `watch` is called after each."""
         while self.now < tick:
+            self._heed()
             block = self.bench.exchange()
             ticks = np.arange(block.tick, block.tick + len(block.data))
             places = ticks % len(self._stamps)
@@ -108,9 +145,13 @@ class Session:
 
     def samples(self, kind: str, joint: int, first: int, last: int) -> Array:
         """Return a channel of joint `joint` (0-based) over ticks [first, last), NaN where lost."""
+        return self.channel(ch.channel(kind, joint + 1), first, last)
+
+    def channel(self, name: str, first: int, last: int) -> Array:
+        """Return a channel by its name over ticks [first, last), NaN where lost."""
         ticks = np.arange(first, last)
         places = ticks % len(self._stamps)
-        values = self._ring[places, self._columns[ch.channel(kind, joint + 1)]]
+        values = self._ring[places, self._columns[name]]
         return np.where(self._stamps[places] == ticks, values, np.nan)
 
     def piston(self, joint: int, first: int, last: int) -> Array:

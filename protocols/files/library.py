@@ -2,11 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
-from protocols.files.schema import Protocol
-from rig.model.parse import InputError, parse_model
+import yaml
+
+from protocols.files.expansion import (
+    Expander,
+    RawStep,
+    Scope,
+    made_unique,
+    substituted,
+    unknown_parameter,
+)
+from protocols.files.schema import VERSION, Protocol, later_version
+from rig.model.parse import InputError, load_yaml, validate_model
 
 
 def shipped_names() -> tuple[str, ...]:
@@ -15,14 +27,48 @@ def shipped_names() -> tuple[str, ...]:
     return tuple(sorted(f.name[:-5] for f in folder.iterdir() if f.name.endswith(".yaml")))
 
 
-def load(name: str | Path) -> Protocol:
-    """Read a shipped protocol by name or a file by path; raises InputError saying what is wrong."""
-    if str(name) in shipped_names():
+def load(name: str | Path, values: Mapping[str, Any] | None = None) -> Protocol:
+    """Read a shipped protocol by name or a file by path; raises InputError saying what is wrong.
+
+    `values` replace those of the file's `parameters`. A path that ends in `.py` is a Python
+    protocol (`protocols.files.generator`).
+    """
+    if str(name) not in shipped_names() and str(name).endswith(".py"):
+        from protocols.files.generator import load_generator  # noqa: PLC0415 - seldom wanted
+
+        return load_generator(Path(name), values or {})
+    return _read(str(name), None, values or {}, ())
+
+
+def read_protocol(
+    text: str, source: str, values: Mapping[str, Any] | None = None, folder: Path | None = None
+) -> Protocol:
+    """Read the text of a protocol file; `folder` is where the files it names are."""
+    return _protocol(text, source, values or {}, folder, (source,))[0]
+
+
+def parsed_values(settings: Sequence[str]) -> dict[str, Any]:
+    """Return the values of `NAME=VALUE` texts as a file would state them; InputError if not so."""
+    found: dict[str, Any] = {}
+    for setting in settings:
+        name, equals, value = setting.partition("=")
+        if not equals or not name.strip() or not value.strip():
+            raise InputError(f"--set {setting}: expected NAME=VALUE, like amplitude=20mm")
+        try:
+            found[name.strip()] = yaml.safe_load(value)
+        except yaml.YAMLError as error:
+            raise InputError(f"--set {setting}: {value!r} is no value") from error
+    return found
+
+
+def _text(name: str, folder: Path | None) -> tuple[str, str, Path | None]:
+    """Return a protocol's text, its shown name, and the folder of the files it names."""
+    if name in shipped_names():
         text = (resources.files("protocols") / "shipped" / f"{name}.yaml").read_text("utf-8")
-        return parse_model(Protocol, text, f"{name}.yaml")
-    path = Path(name)
+        return text, f"{name}.yaml", None
+    path = Path(name) if folder is None else folder / name
     try:
-        text = path.read_text("utf-8")
+        return path.read_text("utf-8"), str(path), path.parent
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: not a text file in UTF-8") from error
     except OSError as error:
@@ -30,4 +76,63 @@ def load(name: str | Path) -> Protocol:
             f"{path}: cannot be read ({error.strerror or error}); "
             f"shipped protocols are: {' '.join(shipped_names())}"
         ) from error
-    return parse_model(Protocol, text, str(path))
+
+
+def _read(
+    name: str, folder: Path | None, values: Mapping[str, Any], chain: tuple[str, ...]
+) -> Protocol:
+    text, shown, own_folder = _text(name, folder)
+    return _protocol(text, shown, values, own_folder, (*chain, shown))[0]
+
+
+def _protocol(
+    text: str, source: str, values: Mapping[str, Any], folder: Path | None, chain: tuple[str, ...]
+) -> tuple[Protocol, list[Any]]:
+    """Return a protocol and its steps as plain data, everything in them replaced."""
+    data, lines = load_yaml(text, source)
+    if not isinstance(data, dict):
+        raise InputError(f"{source}:1: expected keys and values, found {type(data).__name__}")
+    version = data.get("version", VERSION)
+    if isinstance(version, int) and not isinstance(version, bool) and version > VERSION:
+        raise InputError(f"{source}:{lines.get(('version',), 1)}: {later_version(version)}")
+    declared = data.get("parameters") or {}
+    steps: list[RawStep] = []
+    if isinstance(data.get("steps"), list) and isinstance(declared, dict):
+        for name in values:
+            if name not in declared:
+                raise InputError(f"{source}: {unknown_parameter(name, declared)}")
+        scope = Scope({**declared, **values})
+        expander = Expander(source, lines, _Includes(folder, chain, source))
+        steps = made_unique(expander.steps(data["steps"], ("steps",), scope))
+        head = {key: value for key, value in data.items() if key not in ("steps", "parameters")}
+        data = substituted(
+            {k: v for k, v in head.items() if k not in ("name", "description")}, scope, source
+        ) | {k: v for k, v in head.items() if k in ("name", "description")}
+        data["parameters"] = dict(scope.values)
+        data["steps"] = [step.data for step in steps]
+        lines = {path: line for path, line in lines.items() if path[:1] != ("steps",)}
+        for number, step in enumerate(steps):
+            lines |= {("steps", number, *path): line for path, line in step.lines.items()}
+    made = validate_model(Protocol, data, lines, source, {"folder": folder})
+    return made, [step.data for step in steps]
+
+
+class _Includes:
+    """Reads the protocols that one file includes; `chain` are the files that led to it."""
+
+    def __init__(self, folder: Path | None, chain: tuple[str, ...], source: str) -> None:
+        self._folder, self._chain, self._source = folder, chain, source
+
+    def __call__(self, name: str, values: Mapping[str, Any], line: int) -> Sequence[Any]:
+        """Return the raw steps of a protocol; InputError for a cycle, or what is wrong in it."""
+        text, shown, folder = _text(name, self._folder)
+        same = [seen for seen in self._chain if _same_file(seen, shown)]
+        if same:
+            circle = " -> ".join((*self._chain[self._chain.index(same[0]) :], shown))
+            raise InputError(f"{self._source}:{line}: include: a circle: {circle}")
+        _, steps = _protocol(text, shown, values, folder, (*self._chain, shown))
+        return steps
+
+
+def _same_file(one: str, other: str) -> bool:
+    return one == other or Path(one).resolve() == Path(other).resolve()

@@ -6,20 +6,24 @@ A plan is in device terms: waveforms in samples at the rig's rate, joints counte
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
-from protocols.files.schema import CLOSED, END_MAX, Excite, Lock, Multisine, Place, Protocol, Step
-from protocols.files.waveforms import Waveform, make_waveform, scaled
+from protocols.files.schema import Protocol
+from protocols.language.conditions import Condition, parse_condition, require_known
+from protocols.language.waveforms import Waveform
+from protocols.steps.base import PlannedStep, StepKind
+from protocols.steps.excite import Step
+from protocols.steps.parts import CLOSED, END_MAX, Excite, Lock, Place
+from protocols.steps.plans import ExcitePlan, LockPlan, StepPlan
+from protocols.steps.warm_up import WarmUpStep
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 
-MOVE_SECONDS = 4.0  # a joint's way to its place, for the estimate of the duration only
 TRIAL_SECONDS = 3.0  # drift is judged over about this long, or one period if that is longer
-FIRM_SECONDS = 3.0  # at full size under the firm loop, until its mean correction is known
-LOOSEN_SECONDS = 8.0  # about as long as it takes to loosen that loop, for the estimate only
 LONGEST_PERIOD = 600.0  # [s] a common period of two joints beyond this is a mistake
 NYQUIST_SHARE = 4.0  # excited lines stay below Nyquist / 4
 
@@ -29,7 +33,7 @@ class Overrides:
     """What a person changes of a protocol without editing its file; None leaves it alone.
 
     `amplitude_scale` multiplies every amplitude, `seed` gives the steps' multisines the seeds
-    seed, seed + 1, ..., `steps` keeps only the steps named.
+    seed, seed + 1, ..., `steps` keeps only the steps named; `parameters` are for the reader.
     """
 
     repeats: int | None = None
@@ -37,78 +41,17 @@ class Overrides:
     amplitude_scale: float = 1.0
     seed: int | None = None
     steps: tuple[str, ...] | None = None
-
-
-@dataclass(frozen=True)
-class LockPlan:
-    """A joint (0-based) to be held; `piston` [m] is where it is to stand."""
-
-    joint: int
-    at: str
-    piston: float
-    tolerance: float
-
-
-@dataclass(frozen=True)
-class ExcitePlan:
-    """A joint (0-based) to be moved by one waveform about a centre [m]."""
-
-    joint: int
-    wave: Waveform
-    settings: Excite
-
-    @property
-    def centre(self) -> float:
-        """Where the mean of the piston is kept [m]."""
-        return self.settings.centre
-
-
-@dataclass(frozen=True)
-class StepPlan:
-    """One step, lengths in samples.
-
-    `period` is common to all its waveforms; `record`, `trial` (over which the bias is judged)
-    and `warm_up` (under the slow loop) are multiples of it. `ramp` and `settle` are in seconds.
-    """
-
-    name: str
-    locks: tuple[LockPlan, ...]
-    excite: tuple[ExcitePlan, ...]
-    repeats: int
-    period: int
-    record: int
-    trial: int
-    warm_up: int
-    ramp: float
-    settle: float
-
-    @property
-    def lines(self) -> tuple[int, ...]:
-        """The lines any joint excites, as multiples of 1 / the common period."""
-        found = {k * (self.period // e.wave.period) for e in self.excite for k in e.wave.lines}
-        return tuple(sorted(found))
-
-    @property
-    def tries(self) -> int:
-        """How often a bias is trimmed, or a disturbed record repeated, before giving up."""
-        return max(e.settings.centring.tries for e in self.excite)
-
-    def samples(self, rate: float) -> int:
-        """Samples from the start of the waveform to its end, if the second trim is good."""
-        growing = (self.ramp + 1.5 * FIRM_SECONDS + LOOSEN_SECONDS) * rate
-        settling = math.ceil(growing / self.period) * self.period + self.warm_up
-        return settling + 2 * self.trial + self.repeats * self.record
+    parameters: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What the engine runs: the protocol with its overrides, its steps, its expected length."""
+    """What the engine runs: the protocol with its overrides, its steps in order, as resolved."""
 
     protocol: Protocol
     rig: str
     sample_rate: float
-    steps: tuple[StepPlan, ...]
-    seconds: float
+    sequence: tuple[PlannedStep, ...]
 
     @property
     def place(self) -> Place:
@@ -116,9 +59,45 @@ class Plan:
         return self.protocol.place
 
     @property
+    def steps(self) -> tuple[StepPlan, ...]:
+        """The excitations that leave records."""
+        return tuple(
+            plan
+            for part in every_planned(self.sequence)
+            if isinstance(part.step, Step)
+            for plan in part.excitations
+        )
+
+    @property
+    def excitations(self) -> tuple[StepPlan, ...]:
+        """Everything that moves a joint by a waveform, in order."""
+        return tuple(plan for part in self.sequence for plan in part.all_excitations)
+
+    @property
+    def seconds(self) -> float:
+        """Expected length [s]; what only the bench decides counts as little as it may."""
+        return sum(part.seconds for part in self.sequence)
+
+    @property
+    def longest(self) -> float:
+        """Length [s] where every condition comes at its time-out."""
+        return sum(part.longest for part in self.sequence)
+
+    @property
     def records(self) -> tuple[str, ...]:
-        """Names of the records it leaves, in their order."""
-        return tuple(f"{s.name}_r{r}" for s in self.steps for r in range(1, s.repeats + 1))
+        """Names of the records it leaves, in their order; of a repetition those of one round."""
+        return tuple(name for part in every_planned(self.sequence) for name in part.records)
+
+    @property
+    def estimates(self) -> tuple[str, ...]:
+        """The parameters whose on-line estimates its conditions ask for."""
+        conditions = (part.condition for part in every_planned(self.sequence))
+        return tuple(dict.fromkeys(name for c in conditions if c for name in c.estimates))
+
+
+def every_planned(parts: Sequence[PlannedStep]) -> tuple[PlannedStep, ...]:
+    """Return planned steps with those nested in them, in order."""
+    return tuple(one for part in parts for one in (part, *every_planned(part.nested)))
 
 
 def resolve(protocol: Protocol, rig: Rig, overrides: Overrides | None = None) -> Plan:
@@ -135,8 +114,8 @@ def resolve(protocol: Protocol, rig: Rig, overrides: Overrides | None = None) ->
                 f"protocol {changed.name!r}: place.limit {changed.place.limit:g} V is above "
                 f"the limit of joint {joint.name!r}, command {joint.limits.command:g} V"
             )
-    steps = tuple(_step(step, rig) for step in changed.steps)
-    return Plan(changed, rig.name, rig.sample_rate, steps, _seconds(steps, rig))
+    sequence = _RigPlanner(rig).nested(changed.steps)
+    return Plan(changed, rig.name, rig.sample_rate, sequence)
 
 
 def override(protocol: Protocol, overrides: Overrides) -> Protocol:
@@ -148,14 +127,30 @@ def override(protocol: Protocol, overrides: Overrides) -> Protocol:
     if overrides.seed is not None and overrides.seed < 0:
         raise InputError(f"the seed is {overrides.seed}; expected 0 or more")
     kept = _kept(protocol, overrides.steps)
-    steps = tuple(_changed(step, place, overrides) for place, step in enumerate(kept))
-    return protocol.model_copy(update={"steps": steps})
+    numbers = iter(range(len(protocol.excitations)))
+
+    def change(step: StepKind) -> StepKind:
+        return _changed(step, next(numbers), overrides) if isinstance(step, Step) else step
+
+    return protocol.model_copy(update={"steps": mapped(kept, change)})
 
 
-def _kept(protocol: Protocol, names: Sequence[str] | None) -> tuple[Step, ...]:
+def mapped(
+    steps: Sequence[StepKind], change: Callable[[StepKind], StepKind]
+) -> tuple[StepKind, ...]:  # fmt: skip
+    """Return steps with every one of them, nested ones too, replaced by `change`."""
+    found = []
+    for step in steps:
+        inner = getattr(step, "steps", None)
+        new = step if inner is None else step.model_copy(update={"steps": mapped(inner, change)})
+        found.append(change(new))
+    return tuple(found)
+
+
+def _kept(protocol: Protocol, names: Sequence[str] | None) -> tuple[StepKind, ...]:
     if names is None:
         return protocol.steps
-    known = [step.name for step in protocol.steps]
+    known = [step.name for step in protocol.steps if step.name]
     for name in names:
         if name not in known:
             raise InputError(
@@ -167,9 +162,9 @@ def _kept(protocol: Protocol, names: Sequence[str] | None) -> tuple[Step, ...]:
 def _changed(step: Step, place: int, overrides: Overrides) -> Step:
     excite = []
     for part in step.excite:
-        signal = scaled(part.signal, overrides.amplitude_scale)
-        if overrides.seed is not None and isinstance(signal, Multisine):
-            signal = signal.model_copy(update={"seed": overrides.seed + place})
+        signal = part.signal.scaled(overrides.amplitude_scale)
+        if overrides.seed is not None:
+            signal = signal.reseeded(overrides.seed + place)
         excite.append(part.model_copy(update={"signal": signal}))
     return step.model_copy(
         update={
@@ -180,46 +175,95 @@ def _changed(step: Step, place: int, overrides: Overrides) -> Step:
     )
 
 
-def _step(step: Step, rig: Rig) -> StepPlan:
-    excite = tuple(_excite(part, step, rig) for part in step.excite)
-    period = math.lcm(*(e.wave.period for e in excite))
-    if period > LONGEST_PERIOD * rig.sample_rate:
-        raise InputError(
-            f"step {step.name!r}: its waveforms repeat together only after "
-            f"{period / rig.sample_rate:g} s; choose frequencies with a short common period"
+class _RigPlanner:
+    """Resolves steps on one rig; keeps the locks in force (`protocols.steps.base.Planner`)."""
+
+    def __init__(self, rig: Rig) -> None:
+        self._rig = rig
+        self._standing: dict[int, Lock] = {}
+        self._waves: dict[tuple[str, int], Waveform] = {}
+
+    @property
+    def rig(self) -> Rig:
+        """The rig."""
+        return self._rig
+
+    def condition(self, text: str) -> Condition:
+        """Read a condition; InputError where the rig cannot judge it."""
+        try:
+            found = parse_condition(text)
+            require_known(found, self._rig)
+        except ValueError as error:
+            raise InputError(f"condition: {error}") from error
+        return found
+
+    def nested(self, steps: Sequence[StepKind]) -> tuple[PlannedStep, ...]:
+        """Resolve steps in their order."""
+        return tuple(step.plan(self) for step in steps)
+
+    def locked(self, locks: Sequence[Lock]) -> None:
+        """Remember locks for the steps that follow."""
+        self._standing = {part.joint: part for part in locks}
+
+    def locks(self, step: StepKind, locks: Sequence[Lock]) -> tuple[LockPlan, ...]:
+        """Resolve locks; InputError naming step, joint and stroke."""
+        return tuple(_lock(part, step.name or step.key, self._rig) for part in locks)
+
+    def excitation(self, step: StepKind) -> StepPlan:
+        """Resolve what a step locks and excites."""
+        assert isinstance(step, Step | WarmUpStep)
+        parts = step.excite if isinstance(step, Step) else step.move
+        excite = tuple(self._excite(part, step.name) for part in parts)
+        named = {part.joint for part in parts} | {part.joint for part in step.lock}
+        inherited = tuple(lock for joint, lock in self._standing.items() if joint not in named)
+        rate = self._rig.sample_rate
+        period = math.lcm(*(e.wave.period for e in excite))
+        if period > LONGEST_PERIOD * rate:
+            raise InputError(
+                f"step {step.name!r}: its waveforms repeat together only after "
+                f"{period / rate:g} s; choose frequencies with a short common period"
+            )
+        duration, repeats, warm_up = None, 1, 1
+        if isinstance(step, Step):
+            duration, repeats, warm_up = step.duration, step.repeats, step.warm_up
+        record = period if duration is None else _whole(step.name, duration, period, rate)
+        return StepPlan(
+            name=step.name,
+            locks=self.locks(step, (*step.lock, *inherited)),
+            excite=excite,
+            repeats=repeats,
+            period=period,
+            record=record,
+            trial=period * max(1, round(min(record, TRIAL_SECONDS * rate) / period)),
+            warm_up=period * warm_up,
+            ramp=step.ramp,
+            settle=step.settle,
         )
-    record = period if step.duration is None else _whole(step, period, rig.sample_rate)
-    return StepPlan(
-        name=step.name,
-        locks=tuple(_lock(part, step, rig) for part in step.lock),
-        excite=excite,
-        repeats=step.repeats,
-        period=period,
-        record=record,
-        trial=period * max(1, round(min(record, TRIAL_SECONDS * rig.sample_rate) / period)),
-        warm_up=period * step.warm_up,
-        ramp=step.ramp,
-        settle=step.settle,
-    )
+
+    def _excite(self, part: Excite, step: str) -> ExcitePlan:
+        # Steps of a sweep often share a waveform, and the flattest multisine takes a while.
+        name = (part.signal.model_dump_json(), part.joint)
+        if name not in self._waves:
+            self._waves[name] = _waveform(part, step, self._rig)
+        return _excite(part, step, self._waves[name], self._rig)
 
 
-def _whole(step: Step, period: int, rate: float) -> int:
-    assert step.duration is not None
-    count = step.duration * rate / period
+def _whole(step: str, duration: float, period: int, rate: float) -> int:
+    count = duration * rate / period
     if round(count) < 1 or abs(count - round(count)) > 1e-6 * count:
         raise InputError(
-            f"step {step.name!r}: duration {step.duration:g} s is {count:.6g} periods of "
+            f"step {step!r}: duration {duration:g} s is {count:.6g} periods of "
             f"{period / rate:g} s; expected a whole number, so that repeats start alike"
         )
     return round(count) * period
 
 
-def _lock(part: Lock, step: Step, rig: Rig) -> LockPlan:
+def _lock(part: Lock, step: str, rig: Rig) -> LockPlan:
     half = rig.joints[part.joint - 1].cylinder.stroke / 2
     if part.at == CLOSED:
         if abs(part.piston) > half:
             raise InputError(
-                f"step {step.name!r}: joint {part.joint} is to be locked at "
+                f"step {step!r}: joint {part.joint} is to be locked at "
                 f"{1e3 * part.piston:g} mm, outside its stroke of +-{1e3 * half:g} mm"
             )
         piston = part.piston
@@ -228,13 +272,41 @@ def _lock(part: Lock, step: Step, rig: Rig) -> LockPlan:
     return LockPlan(part.joint - 1, part.at, piston, part.tolerance)
 
 
-def _excite(part: Excite, step: Step, rig: Rig) -> ExcitePlan:
-    joint = rig.joints[part.joint - 1]
-    where = f"step {step.name!r}, joint {part.joint}"
+def piston_gain(rig: Rig, joint: int) -> float:
+    """Return the steady speed [m/s] per volt of command of a joint (0-based), both ways' mean.
+
+    Without load: A_c p_c = A_r p_r, A_c v = C_pp u sqrt(p_s - p_c), A_r v = C_mp u sqrt(p_r) give
+    (v/u)^2 = A_c p_s / (A_c^3 / C_pp^2 + A_r^3 / C_mp^2) for u > 0, and alike with C_pm, C_mm and
+    A_r p_s for u < 0. Raises InputError for a rig without these nominal values.
+    """
+    part = rig.joints[joint]
+    names = [f"C_{signs}_{joint + 1}" for signs in ("pp", "mp", "pm", "mm")]
+    lost = [name for name in names if not rig.nominal.get(name, 0.0) > 0.0]
+    if rig.electric or lost:
+        raise InputError(
+            f"rig {rig.name!r} states no nominal {' '.join(lost) or 'valve gains'}: an amplitude "
+            "of a length needs them; expected volts"
+        )
+    pp, mp, pm, mm = (rig.nominal[name] for name in names)
+    cap, rod = part.cylinder.cap_area, part.cylinder.rod_area
+    out = math.sqrt(cap * rig.supply.pressure / (cap**3 / pp**2 + rod**3 / mp**2))
+    back = math.sqrt(rod * rig.supply.pressure / (cap**3 / pm**2 + rod**3 / mm**2))
+    return 0.5 * (out + back) * part.valve.spool_gain
+
+
+def _waveform(part: Excite, step: str, rig: Rig) -> Waveform:
+    where = f"step {step!r}, joint {part.joint}"
     try:
-        wave = make_waveform(part.signal, rig.sample_rate)
+        if getattr(part.signal, "travel", None) is None:
+            return part.signal.waveform(rig.sample_rate)
+        return part.signal.sized(piston_gain(rig, part.joint - 1), rig.sample_rate)
     except ValueError as error:
         raise InputError(f"{where}: {error}") from error
+
+
+def _excite(part: Excite, step: str, wave: Waveform, rig: Rig) -> ExcitePlan:
+    joint = rig.joints[part.joint - 1]
+    where = f"step {step!r}, joint {part.joint}"
     peak = float(np.max(np.abs(wave.samples)))
     if peak > joint.limits.command:
         raise InputError(
@@ -260,8 +332,3 @@ def _excite(part: Excite, step: Step, rig: Rig) -> ExcitePlan:
             f"{1e3 * low:g} to {1e3 * high:g} mm"
         )
     return ExcitePlan(part.joint - 1, wave, part)
-
-
-def _seconds(steps: Sequence[StepPlan], rig: Rig) -> float:
-    moves = sum(MOVE_SECONDS * (1 + len(s.locks)) + 2.0 * s.settle for s in steps)
-    return moves + sum(s.samples(rig.sample_rate) for s in steps) / rig.sample_rate

@@ -22,16 +22,17 @@ def record_zero(
     read: Callable[[], SampleBlock],
     keep: Callable[[SampleBlock], None],
     clock: Callable[[], float],
+    seconds: float = SECONDS,
 ) -> bool | None:
-    """Read and keep blocks until `SECONDS` of samples in a row have every command at zero.
+    """Read and keep blocks until `seconds` of samples in a row have every command at zero.
 
     To be called with the outputs zeroed. Returns True when they are there, False when the device
     still reports a command, None when it or the disk failed before either was known. Ends after
-    `SECONDS + QUEUED` of device time, or that much wall time and two answer times.
+    `seconds + QUEUED` of device time, or that much wall time and two answer times.
     """
-    wanted = round(SECONDS * rig.sample_rate)
-    most = round((SECONDS + QUEUED) * rig.sample_rate)
-    deadline = clock() + SECONDS + QUEUED + 2 * rig.wire.timeout
+    wanted = round(seconds * rig.sample_rate)
+    most = round((seconds + QUEUED) * rig.sample_rate)
+    deadline = clock() + seconds + QUEUED + 2 * rig.wire.timeout
     quiet = taken = 0
     moving = False
     while quiet < wanted and taken < most and clock() < deadline:

@@ -28,7 +28,7 @@ from drivers.base import (
     OutputLaw,
     SampleBlock,
 )
-from rig.bench.after_zero import record_zero
+from rig.bench.after_zero import SECONDS, record_zero
 from rig.bench.alarms import AlarmLog
 from rig.bench.guard import Guard, GuardSettings, JointRole
 from rig.bench.handles import RecordHandle
@@ -36,6 +36,7 @@ from rig.bench.latch import BenchState
 from rig.bench.lateness import ArrivalClock, HostTiming
 from rig.bench.observers import Observers
 from rig.bench.outputs import UNSURE, Outputs
+from rig.bench.screens.commands import ACKNOWLEDGE, STOP, Judge
 from rig.bench.screens.display import Display
 from rig.bench.screens.sockets import Publisher
 from rig.bench.stops import StopFlag
@@ -97,6 +98,8 @@ class Bench:
         self._arrival: ArrivalClock | None = None
         self._timing = HostTiming(rig.sample_rate)
         self._expected: int | None = None
+        self._judge: Judge | None = None
+        self.recorded_after = SECONDS  # [s] with the outputs at zero, after an early end
 
     # Entry and exit
 
@@ -139,6 +142,22 @@ class Bench:
         self._arrival = None if self.info.virtual_time else ArrivalClock(self.info.sample_rate)
         if self.recorder is not None:
             self.recorder.begin_stream()
+
+    def reconnect(self, wait: float) -> None:
+        """Connect anew to a device that was lost, after `wait` seconds; outputs zeroed first.
+
+        Raises OperatorStop within the wait, DeviceError and its kin if the device is not back.
+        """
+        self._outputs.close()
+        until = self._clock() + wait
+        while self._clock() < until:
+            self._heed()
+            time.sleep(min(0.1, max(0.0, until - self._clock())))
+        self.info = self._connect()
+        cause = self._outputs.safely(self._driver.trip_cause)
+        if cause is not None:
+            raise Latched(f"the device tripped meanwhile and stays so: {cause}", self.rig)
+        self.restart()
 
     def __exit__(
         self,
@@ -191,7 +210,9 @@ class Bench:
         def keep(block: SampleBlock) -> None:
             self._keep(block, None, self._continue(block))
 
-        return record_zero(self.rig, self._driver.read_block, keep, self._clock) is not False
+        seconds = self.recorded_after
+        found = record_zero(self.rig, self._driver.read_block, keep, self._clock, seconds)
+        return found is not False
 
     def _flush(self, state: str, message: str, error: BaseException | None) -> None:
         if self.recorder is None:
@@ -327,11 +348,11 @@ class Bench:
 
     def _heed(self) -> None:
         """Honour a wish to stop and a latched trip before anything else is done."""
-        for command in self._display.commands():
-            if command.word == "stop":
+        for command in self._display.commands(self._judge):
+            if command.word == STOP:
                 self._stop.request("stopped by operator (from the screen)")
-            else:
-                self.acknowledge(command.alarm)
+            elif command.word == ACKNOWLEDGE:
+                self.acknowledge(command.value or None)
         if self._stop.reason is not None:
             self.zero_outputs()
             with suppress(RecordingFailed):
@@ -376,8 +397,12 @@ class Bench:
         """Say what each joint does from the next block on: one role per joint."""
         self._guard.set_roles(roles)
 
+    def listen(self, judge: Judge) -> None:
+        """Let `judge` take or refuse the commands of screens, all but the stop."""
+        self._judge = judge
+
     def status(self, **changes: Any) -> None:
-        """Say where the protocol stands: step phase repeat repeats total_s message."""
+        """Say where the protocol stands: step phase repeat repeats total_s message engine."""
         self._display.progress = replace(self._display.progress, **changes)
 
     def event(self, event: str, tick: int | None = None, **fields: Any) -> None:

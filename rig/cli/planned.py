@@ -9,9 +9,13 @@ import numpy as np
 from analysis.design.moves import Tone
 from analysis.design.optimise import Design
 from analysis.design.twin_records import PlannedStep
-from protocols.files.plan import Plan, StepPlan
-from protocols.files.schema import CLOSED, Protocol, Step
-from protocols.files.waveforms import Waveform, chosen_lines
+from protocols.files.plan import Plan, mapped
+from protocols.files.schema import Protocol
+from protocols.language.waveforms import Waveform
+from protocols.signals.lines import chosen_lines
+from protocols.steps.excite import Step
+from protocols.steps.parts import CLOSED
+from protocols.steps.plans import StepPlan
 
 
 def planned_steps(
@@ -52,7 +56,7 @@ def empty_lines(plan: Plan) -> dict[tuple[str, int], tuple[int, ...]]:
 def designed_step(plan: Plan, planned: PlannedStep, tones: Mapping[int, Tone]) -> Step:
     """Return a protocol's step with the designed lines in place of its signals."""
     step = next(s for s in plan.steps if s.name == planned.name)
-    source = next(s for s in plan.protocol.steps if s.name == planned.name)
+    source = next(s for s in plan.protocol.excitations if s.name == planned.name)
     excite = []
     for part in source.excite:
         tone = tones[part.joint - 1]
@@ -66,13 +70,14 @@ def designed_step(plan: Plan, planned: PlannedStep, tones: Mapping[int, Tone]) -
 
 def designed_protocol(plan: Plan, design: Design, criterion: str) -> Protocol:
     """Return the plan's protocol with all its steps as designed."""
-    steps = (
-        designed_step(plan, planned, tones)
+    better = {
+        planned.name: designed_step(plan, planned, tones)
         for planned, tones in zip(design.steps, design.tones, strict=True)
-    )
+    }
+    steps = mapped(plan.protocol.steps, lambda step: better.get(step.name or "", step))
     update = {
         "name": f"{plan.protocol.name}-{criterion.lower().replace('_', '-')}",
         "description": f"{plan.protocol.description}; designed for {criterion}",
-        "steps": tuple(steps),
+        "steps": steps,
     }
     return plan.protocol.model_copy(update=update)

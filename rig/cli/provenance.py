@@ -31,7 +31,7 @@ def _seeds(plan: Plan) -> dict[str, int]:
     """Return the seeds of the signals as they were played, by step and joint."""
     return {
         f"{step.name} joint {excited.joint}": int(seed)
-        for step in plan.protocol.steps
+        for step in plan.protocol.excitations
         for excited in step.excite
         if (seed := getattr(excited.signal, "seed", None)) is not None
     }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from typing import Any, TypeVar
 
 import yaml
@@ -91,6 +92,8 @@ def _first_problem(
     for part in path:
         if (*known, part) in lines:
             known = (*known, part)
+    if lines:
+        path = (*known, path[-1]) if problem["type"] == "missing" else known
     line = lines.get(known, 1)
     where = ".".join(str(part) for part in path) or model.__name__.lower()
     text = problem["msg"].removeprefix("Value error, ")
@@ -110,12 +113,21 @@ def parse_model(model: type[Model], text: str, source: str) -> Model:
     return validate_model(model, data, lines, source)
 
 
-def validate_model(model: type[Model], data: Any, lines: dict[Path, int], source: str) -> Model:
-    """Validate loaded YAML as `model`; raises InputError naming file, line, key and expectation."""
+def validate_model(
+    model: type[Model],
+    data: Any,
+    lines: dict[Path, int],
+    source: str,
+    context: Mapping[str, Any] | None = None,
+) -> Model:
+    """Validate loaded YAML as `model`; raises InputError naming file, line, key and expectation.
+
+    `context` is passed to the model's validators beside `FROM_FILE`.
+    """
     if not isinstance(data, dict):
         raise InputError(f"{source}:1: expected keys and values, found {type(data).__name__}")
     try:
-        return model.model_validate(data, context=FROM_FILE)
+        return model.model_validate(data, context={**FROM_FILE, **(context or {})})
     except ValidationError as error:
         raise InputError(_first_problem(error, lines, source, model)) from error
     except RecursionError as error:

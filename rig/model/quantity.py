@@ -12,7 +12,7 @@ import math
 import re
 from typing import Annotated, Any, cast
 
-from pydantic import BeforeValidator, ValidationInfo
+from pydantic import BeforeValidator, ValidationInfo, WithJsonSchema
 
 from rig.model.units import linear_map
 
@@ -104,19 +104,26 @@ def _validator(si: str) -> BeforeValidator:
     return BeforeValidator(validate)
 
 
-Length = Annotated[float, _validator("m")]
-Area = Annotated[float, _validator("m^2")]
-Volume = Annotated[float, _validator("m^3")]
-Angle = Annotated[float, _validator("rad")]
-Speed = Annotated[float, _validator("m/s")]
-Acceleration = Annotated[float, _validator("m/s^2")]
-Pressure = Annotated[float, _validator("Pa")]
-PressureRate = Annotated[float, _validator("Pa/s")]
-Flow = Annotated[float, _validator("m^3/s")]
-Frequency = Annotated[float, _validator("Hz")]
-Time = Annotated[float, _validator("s")]
-Voltage = Annotated[float, _validator("V")]
-Density = Annotated[float, _validator("kg/m^3")]
-Temperature = Annotated[float, _validator("degC")]
-TemperatureDifference = Annotated[float, _validator("delta_degC")]
-Ratio = Annotated[float, _validator("")]
+def shown_in_schema(si: str) -> WithJsonSchema:
+    """Return how a quantity in `si` appears in a JSON schema: a text with its unit."""
+    if not si:
+        return WithJsonSchema({"anyOf": [{"type": "number"}, {"type": "string"}]})
+    return WithJsonSchema({"type": "string", "examples": [f"1 {si}"]})
+
+
+Length = Annotated[float, _validator("m"), shown_in_schema("m")]
+Area = Annotated[float, _validator("m^2"), shown_in_schema("m^2")]
+Volume = Annotated[float, _validator("m^3"), shown_in_schema("m^3")]
+Angle = Annotated[float, _validator("rad"), shown_in_schema("rad")]
+Speed = Annotated[float, _validator("m/s"), shown_in_schema("m/s")]
+Acceleration = Annotated[float, _validator("m/s^2"), shown_in_schema("m/s^2")]
+Pressure = Annotated[float, _validator("Pa"), shown_in_schema("Pa")]
+PressureRate = Annotated[float, _validator("Pa/s"), shown_in_schema("Pa/s")]
+Flow = Annotated[float, _validator("m^3/s"), shown_in_schema("m^3/s")]
+Frequency = Annotated[float, _validator("Hz"), shown_in_schema("Hz")]
+Time = Annotated[float, _validator("s"), shown_in_schema("s")]
+Voltage = Annotated[float, _validator("V"), shown_in_schema("V")]
+Density = Annotated[float, _validator("kg/m^3"), shown_in_schema("kg/m^3")]
+Temperature = Annotated[float, _validator("degC"), shown_in_schema("degC")]
+TemperatureDifference = Annotated[float, _validator("delta_degC"), shown_in_schema("delta_degC")]
+Ratio = Annotated[float, _validator(""), shown_in_schema("")]

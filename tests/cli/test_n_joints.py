@@ -18,9 +18,10 @@ from hil_sim.scenario.file import Scenario
 from protocols.design.generate import generate
 from protocols.design.validation_steps import validation
 from protocols.files import library
-from protocols.files.plan import Plan, StepPlan, resolve
+from protocols.files.plan import Plan, resolve
 from protocols.files.schema import Protocol
 from protocols.files.writer import protocol_text
+from protocols.steps.plans import StepPlan
 from rig.cli.step_planning import predictor
 from rig.model.codes import decode_input
 from rig.model.parameters import parameter_names

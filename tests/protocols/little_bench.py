@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from drivers.base import DeviceInfo, OutputLaw, SampleBlock
 from rig.bench.guard import JointRole
+from rig.bench.screens.commands import Judge
 from rig.model import channels as ch
 from rig.model.rig import Rig
 from rig.runs.recorder import RecordMeta
@@ -89,7 +90,28 @@ class LittleBench:
         self.lose = set(lose)  # numbers of blocks that never arrive
         self.blocks = 0
         self.applied: list[tuple[int, tuple[OutputLaw, ...]]] = []
+        self.events: list[dict[str, Any]] = []
+        self.shown: dict[str, Any] = {}
+        self.reconnected = 0
+        self.judge: Judge | None = None
         self.happenings: dict[int, Callable[[], None]] = {}  # what befalls the bench, by tick
+
+    def zero_outputs(self) -> bool:
+        self.laws = [OutputLaw()] * len(self.laws)
+        return True
+
+    def reconnect(self, wait: float) -> None:
+        self.zero_outputs()
+        self.reconnected += 1
+
+    def listen(self, judge: Judge) -> None:
+        self.judge = judge
+
+    def status(self, **changes: Any) -> None:
+        self.shown.update(changes)
+
+    def event(self, event: str, tick: int | None = None, **fields: Any) -> None:
+        self.events.append({"event": event, "tick": tick, **fields})
 
     def upload(self, joint: int, wave: Array) -> None:
         self.waves[joint] = np.array(wave)

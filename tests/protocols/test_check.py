@@ -13,7 +13,7 @@ from protocols.design.check import check
 from protocols.design.check_report import CheckReport, worst
 from protocols.files.library import load
 from protocols.files.plan import Overrides, resolve
-from protocols.files.waveforms import Array
+from protocols.language.waveforms import Array
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 from rig.runs.rigs import load_rig

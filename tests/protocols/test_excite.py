@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocols.files.schema import Multisine, Sine
-from protocols.files.waveforms import Array, make_multisine, make_sine, whole_period
+from protocols.language.waveforms import Array, whole_period
+from protocols.signals.multisine import Multisine
+from protocols.signals.sine import Sine
 
 RATE = 1000.0
 
@@ -27,7 +28,7 @@ def multisine(**changes: object) -> Multisine:
 
 
 def test_a_one_hertz_sine_is_one_line_of_the_asked_amplitude() -> None:
-    wave = make_sine(Sine(kind="sine", frequency=1.0, amplitude=0.8), RATE)
+    wave = Sine(kind="sine", frequency=1.0, amplitude=0.8).waveform(RATE)
     assert wave.period == 1000
     assert wave.lines == (1,)
     lines = amplitudes(wave.samples)
@@ -37,7 +38,7 @@ def test_a_one_hertz_sine_is_one_line_of_the_asked_amplitude() -> None:
 
 def test_three_hertz_repeats_with_the_sample_clock_after_three_cycles() -> None:
     """333.3 samples are no period: three cycles are, and records of them start alike."""
-    wave = make_sine(Sine(kind="sine", frequency=3.0, amplitude=1.0), RATE)
+    wave = Sine(kind="sine", frequency=3.0, amplitude=1.0).waveform(RATE)
     assert (wave.period, wave.lines) == (1000, (3,))
     twice = np.tile(wave.samples, 2)
     assert np.abs(np.diff(twice)).max() < 1.001 * 2 * np.pi * 3 / RATE  # no jump at the seam
@@ -45,7 +46,7 @@ def test_three_hertz_repeats_with_the_sample_clock_after_three_cycles() -> None:
 
 def test_a_frequency_that_never_meets_the_clock_is_refused() -> None:
     with pytest.raises(ValueError, match="never meets the sample clock"):
-        make_sine(Sine(kind="sine", frequency=3.00017, amplitude=1.0), RATE)
+        Sine(kind="sine", frequency=3.00017, amplitude=1.0).waveform(RATE)
 
 
 @given(
@@ -67,10 +68,9 @@ def test_whole_periods_are_whole_and_shortest(cycles: int, samples: int, rate: f
 def test_a_multisine_has_the_asked_spectrum(
     seed: int, tilt: float, fraction: float, measure: str
 ) -> None:
-    wave = make_multisine(
-        multisine(seed=seed, tilt=tilt, detection_fraction=fraction, amplitude_is=measure, draws=5),
-        RATE,
-    )
+    wave = multisine(
+        seed=seed, tilt=tilt, detection_fraction=fraction, amplitude_is=measure, draws=5
+    ).waveform(RATE)
     lines = amplitudes(wave.samples)
     excited = np.array(wave.lines)
     assert wave.period == 10_000
@@ -87,7 +87,7 @@ def test_a_multisine_has_the_asked_spectrum(
 
 
 def test_detection_lines_are_spread_over_the_band_one_in_each_group() -> None:
-    wave = make_multisine(multisine(detection_fraction=0.25), RATE)
+    wave = multisine(detection_fraction=0.25).waveform(RATE)
     candidates = list(range(3, 96, 2))
     for start in range(0, len(candidates) - 3, 4):
         group = set(candidates[start : start + 4])
@@ -97,14 +97,14 @@ def test_detection_lines_are_spread_over_the_band_one_in_each_group() -> None:
 
 
 def test_named_detection_lines_are_left_empty() -> None:
-    wave = make_multisine(multisine(detection_lines=(5, 7, 90)), RATE)
+    wave = multisine(detection_lines=(5, 7, 90)).waveform(RATE)
     assert wave.detection_lines == (5, 7, 90)
     assert not {5, 7, 90} & set(wave.lines)
     assert {3, 9, 11, 95} <= set(wave.lines)
 
 
 def test_the_same_seed_gives_the_same_samples_and_another_does_not() -> None:
-    first, again, other = (make_multisine(multisine(seed=s), RATE) for s in (1, 1, 2))
+    first, again, other = (multisine(seed=s).waveform(RATE) for s in (1, 1, 2))
     np.testing.assert_array_equal(first.samples, again.samples)
     assert not np.allclose(first.samples, other.samples)
 
@@ -112,7 +112,7 @@ def test_the_same_seed_gives_the_same_samples_and_another_does_not() -> None:
 def test_more_draws_of_the_phases_give_a_flatter_waveform() -> None:
     def size(draws: int) -> float:
         """Product of peaks of command and of motion: what binds voltage and stroke."""
-        waves = [make_multisine(multisine(seed=s, draws=draws), RATE).samples for s in range(10)]
+        waves = [multisine(seed=s, draws=draws).waveform(RATE).samples for s in range(10)]
         return float(np.mean([np.ptp(w) * np.ptp(np.cumsum(w)) for w in waves]))
 
     assert size(100) < 0.8 * size(1)
@@ -121,16 +121,16 @@ def test_more_draws_of_the_phases_give_a_flatter_waveform() -> None:
 @pytest.mark.parametrize("seed", range(5))
 def test_a_piston_driven_by_it_stays_about_where_it_started(seed: int) -> None:
     """The integral begins at its own mean, so a centred piston needs no run-up."""
-    wave = make_multisine(multisine(seed=seed), RATE)
+    wave = multisine(seed=seed).waveform(RATE)
     piston = np.cumsum(wave.samples) / RATE
     assert abs(piston.mean()) < 0.01 * np.ptp(piston)
 
 
 def test_a_period_that_is_no_whole_number_of_samples_is_refused() -> None:
     with pytest.raises(ValueError, match="not a whole number"):
-        make_multisine(multisine(base_frequency=0.3, f_min=0.3), RATE)
+        multisine(base_frequency=0.3, f_min=0.3).waveform(RATE)
 
 
 def test_a_band_without_a_line_is_refused() -> None:
     with pytest.raises(ValueError, match="no line is left"):
-        make_multisine(multisine(f_min=0.4, f_max=0.4), RATE)
+        multisine(f_min=0.4, f_max=0.4).waveform(RATE)

@@ -8,9 +8,9 @@ from pydantic import ValidationError
 
 from protocols.files import library
 from protocols.files.plan import Overrides, override
-from protocols.files.schema import Lines, Protocol
-from protocols.files.waveforms import chosen_lines, make_waveform, scaled
+from protocols.files.schema import Protocol
 from protocols.files.writer import protocol_text
+from protocols.signals.lines import Lines, chosen_lines
 from rig.model.parse import InputError, parse_model
 
 TEXT = """
@@ -37,7 +37,7 @@ def signal(text: str = TEXT) -> Lines:
 
 
 def test_the_wave_is_the_sum_the_file_says_started_centred() -> None:
-    wave = make_waveform(signal(), 1000.0)
+    wave = signal().waveform(1000.0)
     t = np.arange(2000) / 1000.0
     expected = (
         0.2 * np.cos(2 * np.pi * 0.5 * t)
@@ -55,7 +55,7 @@ def test_the_wave_is_the_sum_the_file_says_started_centred() -> None:
 def test_any_waveform_can_be_written_as_lines_and_read_back() -> None:
     protocol = library.load("lock-and-excite-multisine")
     part = protocol.steps[0].excite[0]
-    wave = make_waveform(part.signal, 1000.0)
+    wave = part.signal.waveform(1000.0)
     lines = chosen_lines(wave, 0.1)
     step = protocol.steps[0].model_copy(
         update={"excite": (part.model_copy(update={"signal": lines}),)}
@@ -64,7 +64,7 @@ def test_any_waveform_can_be_written_as_lines_and_read_back() -> None:
     text = protocol_text(changed, "Made by a test.")
     assert text.startswith("# Made by a test.\n")
     again = parse_model(Protocol, text, "again.yaml")
-    back = make_waveform(again.steps[0].excite[0].signal, 1000.0)
+    back = again.steps[0].excite[0].signal.waveform(1000.0)
     # Five digits are written of each amplitude and phase.
     assert back.samples == pytest.approx(wave.samples, abs=2e-4 * np.abs(wave.samples).max())
     assert back.lines == wave.lines
@@ -73,7 +73,7 @@ def test_any_waveform_can_be_written_as_lines_and_read_back() -> None:
 
 
 def test_amplitudes_scale_together() -> None:
-    twice = scaled(signal(), 2.0)
+    twice = signal().scaled(2.0)
     assert isinstance(twice, Lines)
     assert twice.amplitudes == pytest.approx((0.4, 0.2, 0.1))
     protocol = parse_model(Protocol, TEXT, "mine.yaml")

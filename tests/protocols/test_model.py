@@ -11,7 +11,9 @@ from hypothesis import strategies as st
 
 from protocols.files.library import load, shipped_names
 from protocols.files.plan import resolve
-from protocols.files.schema import Multisine, Protocol, Sine
+from protocols.files.schema import Protocol
+from protocols.signals.multisine import Multisine
+from protocols.signals.sine import Sine
 from rig.model.parse import InputError, parse_model
 from rig.runs.rigs import load_rig
 
@@ -52,14 +54,14 @@ REFUSED = [
     ("repeats: 3", "repeat: 3", "mine.yaml:12: steps.0.repeat: unknown key"),
     ("position_gain: 10 V/m", "position_gain: 10", "mine.yaml:3: .*has no unit"),
     ("position_gain: 10 V/m", "position_gain: 10 V", "mine.yaml:3: .*does not measure"),
-    ("amplitude: 500 mV", "amplitude: 500 mm", "mine.yaml:10: .*does not measure"),
+    ("amplitude: 500 mV", "amplitude: 500 kg", "mine.yaml:10: .*does not measure"),
     ("frequency: 2 Hz", "frequency: 0 Hz", "mine.yaml:10: .*greater than 0"),
     ("at: closed", "at: open", "mine.yaml:7: .*'end_min'"),
     ("at: closed", "at: end_min", "mine.yaml:7: .*piston belongs to a lock at 'closed'"),
     ("joint: 1", "joint: 2", "mine.yaml:5: .*joint 2 stands more than once"),
     ("joint: 1", "joint: 3", "joint 3 does not exist"),
     ("joints: 2", "joints: 3", "joint 3 is neither locked nor excited"),
-    ("kind: sine", "kind: chirp", "mine.yaml:10: .*'multisine'"),
+    ("kind: sine", "kind: square", "mine.yaml:10: .*'multisine'"),
     ("limit: 500 mV", "limit: 100 mV", "mine.yaml:3: .*push 0.4 V is above the limit 0.1 V"),
     ("repeats: 3", "repeats: 0", "mine.yaml:12: steps.0.repeats"),
     ("name: step1", "name: Step 1", "mine.yaml:5: steps.0.name"),

@@ -13,7 +13,7 @@ from protocols.engine.engine import run
 from protocols.engine.errors import LockFailed
 from protocols.files.library import load
 from protocols.files.plan import Overrides, resolve
-from protocols.files.waveforms import Array
+from protocols.language.waveforms import Array
 from rig.bench.session import Bench
 from rig.model.rig import Rig
 from rig.runs.recorder import Recorder

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from protocols.files import library
 from protocols.files.plan import Overrides, resolve
 from protocols.files.schema import Protocol
 from rig.bench.guard import JointRole
+from rig.bench.screens.commands import Judge
 from rig.model import channels as ch
 from rig.model.codes import decode_input, decode_output
 from rig.model.records import Record, Run
@@ -77,6 +78,28 @@ class DirectBench:
         self._blocks: list[Array] = []
         self._sequence = 0
         self._sensors = [rig.sensors.of(ch.kind_of(name)[0]) for name in rig.channels]
+
+    @property
+    def tick(self) -> int:
+        """The plant's next sample."""
+        return self.plant.tick
+
+    def zero_outputs(self) -> bool:
+        """Put the outputs to zero."""
+        self._laws = tuple(Law() for _ in self.rig.joints)
+        return True
+
+    def reconnect(self, wait: float) -> None:
+        """Nothing here can be lost."""
+
+    def listen(self, judge: Judge) -> None:
+        """Nobody commands this bench."""
+
+    def status(self, **changes: Any) -> None:
+        """Nobody watches this bench."""
+
+    def event(self, event: str, tick: int | None = None, **fields: Any) -> None:
+        """No log is kept."""
 
     def upload(self, joint: int, wave: Array) -> None:
         """Store one period of a joint's (0-based) waveform [V]."""

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from drivers.base import SampleBlock
 from rig.bench.guard import JointRole, piston_bounds
+from rig.bench.screens.commands import Command, Judge
 from rig.bench.screens.snapshot import BenchView, Progress, take_snapshot
-from rig.bench.screens.sockets import Command, Publisher
+from rig.bench.screens.sockets import Publisher
 from rig.model import channels as ch
 from rig.model.alarms.states import AlarmTable
 from rig.model.rig import Rig
@@ -45,9 +46,9 @@ class Display:
         self._lost = 0
         self._roles: Sequence[JointRole] = ()
 
-    def commands(self) -> list[Command]:
-        """Return what the screens asked for."""
-        return [] if self._publisher is None else self._publisher.commands()
+    def commands(self, judge: Judge | None = None) -> list[Command]:
+        """Return what the screens asked for and `judge` did not refuse."""
+        return [] if self._publisher is None else self._publisher.commands(judge) or []
 
     def show(self, block: SampleBlock, age: float, lost: int, roles: Sequence[JointRole]) -> None:
         """Take a block; publish if it is time."""

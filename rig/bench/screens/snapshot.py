@@ -36,7 +36,8 @@ class Snapshot:
 
     `state` is running, tripped, done or aborted; `device_time` and `wall_time` are in seconds
     (the latter since the epoch); `block_age` [s] is how late the newest block came.
-    `alarms` are those that stand (`rig.model.alarms.states.folded` orders them).
+    `alarms` are those that stand (`rig.model.alarms.states.folded` orders them). `engine` is the
+    state of the protocol's engine; `prompt` the open question, with its possible `answers`.
     """
 
     run: str
@@ -58,6 +59,9 @@ class Snapshot:
     message: str
     channels: dict[str, ChannelView]
     alarms: tuple[Alarm, ...] = ()
+    engine: str = ""
+    prompt: str = ""
+    answers: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -71,6 +75,9 @@ class Progress:
     done_s: float = 0.0
     total_s: float = 0.0
     message: str = ""
+    engine: str = ""
+    prompt: str = ""
+    answers: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)

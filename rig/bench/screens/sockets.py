@@ -1,8 +1,10 @@
 """The local sockets through which a screen watches a run and stops it; only their owner may.
 
 Two ZeroMQ sockets per session in a folder of mode 0700: `<rig>-<pid>.pub` (PUB: snapshots) and
-`<rig>-<pid>.cmd` (REP: "stop", "acknowledge"). The run never waits for a screen:
-snapshots that nobody takes are dropped, commands are polled.
+`<rig>-<pid>.cmd` (REP: commands). The run never waits for a screen: snapshots that nobody
+takes are dropped, commands are polled. Requests and answers are JSON
+(`rig.bench.screens.commands`): {"command", "value", "holder", "pid"}, then {"ok"} with "error" in
+one line where the command was refused.
 """
 
 from __future__ import annotations
@@ -20,6 +22,15 @@ from pathlib import Path
 
 import zmq
 
+from rig.bench.screens.commands import (
+    COMMANDS,
+    Command,
+    Holder,
+    Judge,
+    from_bytes,
+    own_command,
+    to_bytes,
+)
 from rig.bench.screens.snapshot import ChannelView, Snapshot, from_json, to_json
 from rig.runs.runstate import process_alive
 
@@ -27,7 +38,6 @@ __all__ = ["AttachError", "Attachment", "ChannelView", "Endpoint", "Publisher", 
 
 log = logging.getLogger(__name__)
 
-COMMANDS = ("stop", "acknowledge")
 _MAX_PATH = 100  # a Unix socket's address holds 107 bytes
 _MAX_NAME = 32
 _FILE = re.compile(r"^(?P<rig>.+)-(?P<pid>\d+)\.(?:pub|cmd)$")
@@ -36,14 +46,6 @@ _COMMANDS_AT_ONCE = 16
 
 class AttachError(Exception):
     """The local sockets cannot be made or trusted; the message says why."""
-
-
-@dataclass(frozen=True)
-class Command:
-    """What a screen asks for: a word of `COMMANDS`; `alarm` is the key of one, None for all."""
-
-    word: str
-    alarm: str | None = None
 
 
 @dataclass(frozen=True)
@@ -126,6 +128,7 @@ class Publisher:
         )
         self._context = zmq.Context(1)
         self._closed = False
+        self._holder = Holder()
         try:
             self._pub = self._bind(zmq.PUB, self.endpoint.pub)
             self._cmd = self._bind(zmq.REP, self.endpoint.cmd)
@@ -150,20 +153,26 @@ class Publisher:
         with suppress(zmq.ZMQError):
             self._pub.send(to_json(snapshot), zmq.NOBLOCK)
 
-    def commands(self) -> list[Command]:
-        """Return the commands that came since the last call, each answered; never waits."""
+    def commands(self, judge: Judge | None = None) -> list[Command]:
+        """Return the commands taken since the last call, each answered; never waits.
+
+        `judge` says of every command but "stop" why it is refused, None where it is taken.
+        """
         found: list[Command] = []
         for _ in range(_COMMANDS_AT_ONCE):
             try:
                 raw = self._cmd.recv_multipart(zmq.NOBLOCK)[0]
             except zmq.ZMQError:
                 break
-            command = _command(raw)
-            answer: dict[str, object] = {"ok": command is not None}
-            if command is None:
-                answer["error"] = f"expected one of: {', '.join(COMMANDS)}"
-            else:
+            command = from_bytes(raw)
+            refusal: str | None = f"expected one of: {', '.join(COMMANDS)}"
+            if command is not None:
+                refusal = self._holder.judge(command, judge)
+            answer: dict[str, object] = {"ok": refusal is None}
+            if refusal is None and command is not None:
                 found.append(command)
+            else:
+                answer["error"] = refusal
             with suppress(zmq.ZMQError):
                 self._cmd.send(json.dumps(answer).encode(), zmq.NOBLOCK)
         return found
@@ -180,17 +189,6 @@ class Publisher:
         for path in (self.endpoint.pub, self.endpoint.cmd):
             with suppress(OSError):
                 path.unlink(missing_ok=True)
-
-
-def _command(raw: bytes) -> Command | None:
-    try:
-        said = json.loads(raw)
-        word, alarm = said["command"], said.get("alarm")
-    except (ValueError, TypeError, KeyError, AttributeError):
-        return None
-    if word not in COMMANDS or not isinstance(alarm, str | None):
-        return None
-    return Command(word, alarm)
 
 
 class Attachment:
@@ -221,21 +219,23 @@ class Attachment:
             log.debug("no snapshot: %s", error)
             return None
 
-    def send(self, command: str, timeout: float = 2.0, *, alarm: str | None = None) -> bool:
-        """Send a command, for one alarm by its key or for all.
+    def send(self, command: str, timeout: float = 2.0) -> bool:
+        """Send a command; True when the run has taken it, False without an answer in `timeout`."""
+        return self.ask(own_command(command), timeout) is None
 
-        True when the run has taken it, False without an answer in `timeout` [s].
-        """
+    def ask(self, command: Command, timeout: float = 2.0) -> str | None:
+        """Send a command; None when the run has taken it, else in one line why not."""
         asking = self._context.socket(zmq.REQ)  # a new one: an unanswered one is of no use again
         asking.setsockopt(zmq.LINGER, 0)
         try:
             asking.connect(_address(self.endpoint.cmd))
-            asking.send(json.dumps({"command": command, "alarm": alarm}).encode(), zmq.NOBLOCK)
+            asking.send(to_bytes(command), zmq.NOBLOCK)
             if not asking.poll(round(timeout * 1000)):
-                return False
-            return bool(json.loads(asking.recv(zmq.NOBLOCK)).get("ok"))
-        except (zmq.ZMQError, ValueError, AttributeError):
-            return False
+                return f"no answer within {timeout:g} s"
+            answer = json.loads(asking.recv(zmq.NOBLOCK))
+            return None if answer.get("ok") else str(answer.get("error", "refused"))
+        except (zmq.ZMQError, ValueError, AttributeError) as error:
+            return f"no answer: {error}"
         finally:
             asking.close()
 

@@ -1,0 +1,379 @@
+"""What steps do at the bench: implements `protocols.steps.base.Actions` on a session."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from protocols.engine.desk import Desk
+from protocols.engine.errors import ProtocolAborted, RunEnded
+from protocols.engine.excitation import ExcitationRun
+from protocols.engine.locking import Hold, lock
+from protocols.engine.placing import LOOK, look, move
+from protocols.engine.session import BenchSession, Session
+from protocols.engine.states import Machine, State
+from protocols.files.plan import Plan
+from protocols.language.conditions import ELAPSED, Condition
+from protocols.steps.base import PlannedStep, Question
+from protocols.steps.excite import Step
+from protocols.steps.plans import LockPlan
+from rig.bench.guard import FREE
+from rig.model.rig import Rig
+from rig.model.trips import OperatorStop
+from rig.runs.recorder import RecordMeta
+
+log = logging.getLogger(__name__)
+
+SPARE = 5.0  # [s] of samples remembered beyond a record and the two periods before it
+ESTIMATED = 20.0  # [s] of wall time that the estimator may need for the last record
+SETTLE = 1.0  # [s] at rest before a place is believed, where a step states no time
+
+OnPhase = Callable[[str, str, int, int, str], None]
+
+
+class Conductor:
+    """One run of a plan: its session, its state, what is done and what is left."""
+
+    def __init__(
+        self, plan: Plan, rig: Rig, bench: BenchSession, on_phase: OnPhase, desk: Desk
+    ) -> None:
+        self.bench = bench
+        self.desk = desk
+        self.records = 0  # complete ones
+        keep = max((s.record + 2 * s.period for s in plan.excitations), default=0)
+        keep += round(SPARE * rig.sample_rate)
+        self.session = Session(bench, rig, keep, desk.machine, self._heed)
+        self._place = plan.place
+        self._on_phase = on_phase
+        self._taken: dict[str, int] = {}  # complete records by step
+        self._begun: dict[str, int] = {}  # the same, when the step was begun
+        self._last_record = ""
+        self._part: PlannedStep | None = None
+        self._part_began = 0.0
+        self._left = 0.0
+        self._origin: int | None = None  # tick of the run's first block
+        self._before = 0.0  # [s] until a lost device was connected anew
+
+    # Where it stands
+
+    @property
+    def machine(self) -> Machine:
+        """The state of the run."""
+        return self.desk.machine
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether a person asked for a pause, or to skip the step."""
+        return self.desk.control.wishes.pause or self.desk.control.wishes.skip
+
+    @property
+    def elapsed(self) -> float:
+        """Device time [s] since the run's first block."""
+        if self._origin is None:
+            self._origin = self.session.now or None
+        return self._before + (self.session.now - (self._origin or 0)) / self.session.rate
+
+    def begin(self, part: PlannedStep, rest: Sequence[PlannedStep]) -> None:
+        """Begin a step of the plan's sequence; `rest` are those after it."""
+        self._part, self._part_began = part, self.elapsed
+        self._left = sum(after.seconds for after in rest)
+
+    def left(self) -> float:
+        """Return the expected time [s] to the end; conditions count as little as they may."""
+        if self._part is None:
+            return self._left
+        own = self._part.seconds - (self.elapsed - self._part_began)
+        return self._left + max(0.0, own)
+
+    def tell(self, step: str, phase: str, repeat: int, repeats: int, message: str) -> None:
+        """Report a phase, and when the run is expected to end."""
+        self.bench.status(total_s=self.elapsed + self.left())
+        self._on_phase(step, phase, repeat, repeats, message)
+
+    def note_state(self, before: State, after: State, why: str) -> None:
+        """Write a change of state to the run's log and show it."""
+        self.bench.event("state", self.bench.tick, before=str(before), state=str(after), why=why)
+        self.bench.status(engine=str(after))
+
+    # What steps ask for
+
+    def do(self, planned: PlannedStep) -> None:
+        """Run one step, unless a person wants a pause before it."""
+        self._safe_point()
+        if self._skipped(planned.name):
+            return
+        if not planned.excitations:
+            self.tell(planned.name, planned.step.key.replace("_", " "), 0, 0, planned.title)
+        planned.step.run(planned, self)
+        self._skipped(planned.name)
+
+    def excite(self, planned: PlannedStep) -> None:
+        """Take the records of an excitation, from its place on after every pause."""
+        (step,) = planned.excitations
+        before = self._begun.setdefault(step.name, self._taken.get(step.name, 0))
+        swept = planned.step.parameters if isinstance(planned.step, Step) else {}
+        running = ExcitationRun(self.session, self._place, step, self, before + 1, swept)
+        running.taken = self._taken.get(step.name, 0) - before  # after a lost device
+        complete = running.taken >= step.repeats
+        while not complete:
+            try:
+                complete = running.run()
+            finally:
+                self.records += before + running.taken - self._taken.get(step.name, 0)
+                self._taken[step.name] = before + running.taken
+                if running.taken:
+                    self._last_record = f"{step.name}_r{before + running.taken}"
+            if complete or self._skipped(step.name):
+                break
+            self._safe_point()
+            if self._skipped(step.name):
+                break
+        self._begun.pop(step.name, None)
+
+    def excite_until(self, planned: PlannedStep, condition: Condition | None, most: float) -> bool:
+        """Excite without records until a condition holds; False after `most` seconds."""
+        (step,) = planned.excitations
+        done = self._judge(condition)
+        self.session.wait(LOOK)
+        left = most
+        while not done():
+            began = self.elapsed
+            if left <= 0.0:
+                return False
+            good = ExcitationRun(self.session, self._place, step, self).move_until(done, left)
+            left -= self.elapsed - began
+            if good or self._skipped(step.name):
+                return True
+            if self.interrupted:
+                self._safe_point()
+        return True
+
+    def hold(self, planned: PlannedStep, locks: Sequence[LockPlan], seconds: float) -> None:
+        """Bring joints to their places, close every valve, and record the time."""
+        self.machine.to(State.HOMING, planned.title)
+        self.session.bench.guard([FREE] * self.session.joints)
+        self.session.wait(LOOK)
+        if locks:
+            targets = {part.joint: part.piston for part in locks}
+            self.tell(planned.name, "place", 0, 0, planned.title)
+            move(
+                self.session, targets, self._place, self._place.tolerance, SETTLE, planned.name
+            )  # fmt: skip
+        self.machine.to(State.LOCKED, "valves closed")
+        self.session.off()
+        if planned.step.name is None:
+            self._pass(seconds)
+        else:
+            self._record_at_rest(planned, seconds)
+        self.rest_now(f"{planned.name} is over")
+
+    def _record_at_rest(self, planned: PlannedStep, seconds: float) -> None:
+        name = planned.name
+        repeat = self._taken.get(name, 0) + 1
+        joints = tuple(range(1, self.session.joints + 1))
+        ticks = round(seconds * self.session.rate)
+        meta = RecordMeta(step=name, repeat=repeat, locked=joints, attributes={"excited": ""})
+        self.tell(name, "record", repeat, repeat, f"{seconds:g} s with every valve closed")
+        first = self.session.now
+        with self.bench.record(meta, start_tick=first, ticks=ticks) as record:
+            self.session.until(first + ticks)
+            span = min(round(LOOK * self.session.rate), ticks // 2)
+            for j in range(self.session.joints):
+                began = look(self.session, j, first, first + span).piston
+                ended = look(self.session, j, first + ticks - span, first + ticks).piston
+                record.note(**{f"creep_m_{j + 1}": ended - began})
+        self._taken[name] = repeat
+        self.records += 1
+
+    def lock(self, planned: PlannedStep, locks: Sequence[LockPlan]) -> None:
+        """Prove that joints can be locked; the steps that follow lock them again."""
+        self.machine.to(State.HOMING, planned.title)
+        self.session.bench.guard([FREE] * self.session.joints)
+        self.session.wait(LOOK)
+        hold = Hold(planned.name, SETTLE, 1.0)
+        for part in locks:
+            self.tell(planned.name, "lock", 0, 0, f"joint {part.joint + 1} {part.at}")
+            lock(self.session, part, self._place, hold)
+            self.machine.to(State.LOCKED, f"joint {part.joint + 1} {part.at}")
+        self.rest_now("locks are proved")
+
+    def rest(self, seconds: float, why: str) -> None:
+        """Let time pass with all outputs at zero."""
+        self.rest_now(why)
+        self._pass(seconds)
+
+    def wait(self, condition: Condition, most: float) -> bool:
+        """Rest until a condition holds; False after `most` seconds."""
+        self.rest_now(f"waiting for {condition.text}")
+        return self._pass(most, self._judge(condition))
+
+    def ask(self, question: Question) -> str:
+        """Ask a person, outputs at zero; returns the answer, or the default where nobody attends.
+
+        Raises RunEnded where there is neither.
+        """
+        self.rest_now("a question")
+        control = self.desk.control
+        control.answers, control.wishes.answer = question.answers, None
+        self.machine.to(State.PROMPTING, question.text)
+        self.bench.status(prompt=question.text, answers=list(question.answers))
+        choice = f"{question.text} [{'/'.join(question.answers)}]"
+        self.tell("prompt", "prompt", 0, 0, choice)
+        try:
+            answer, source = self._answer(question)
+        finally:
+            control.answers = ()
+            self.bench.status(prompt="", answers=[])
+        self.bench.event("answer", self.bench.tick, prompt=question.text, answer=answer, by=source)
+        self.machine.to(State.IDLE, f"answered {answer!r} ({source})")
+        return answer
+
+    def _answer(self, question: Question) -> tuple[str, str]:
+        limit = self.desk.longest_pause if self.desk.attended else question.timeout
+        began = self.elapsed
+        while self.elapsed - began < limit:
+            self.session.wait(LOOK)
+            wish = self.desk.control.wishes.answer
+            if wish is not None:
+                return wish, "from the screen"
+            typed = None if self.desk.terminal is None else self.desk.terminal()
+            if typed is not None:
+                if typed.strip() in question.answers:
+                    return typed.strip(), "at the terminal"
+                expected = ", ".join(question.answers)
+                self.tell("prompt", "prompt", 0, 0, f"{typed.strip()!r} is no answer: {expected}")
+        if question.default is None or self.desk.attended:
+            raise RunEnded(f"{question.text!r} was not answered within {limit:g} s")
+        return question.default, f"the default, after {limit:g} s"
+
+    def repeat(self, planned: PlannedStep, condition: Condition, rounds: int) -> bool:
+        """Run the nested steps until a condition holds; False after `rounds`."""
+        for number in range(1, rounds + 1):
+            for part in planned.nested:
+                self.do(part)
+            if condition.estimates:
+                self._await_estimates()
+            good = self._judge(condition)()
+            seen = ", ".join(
+                f"{name} {value:.4g}"
+                for name, value in self.desk.estimates.values().items()
+                if name in condition.names
+            )
+            verdict = "holds" if good else "does not hold"
+            text = f"{condition.text} {verdict} after round {number}" + (
+                f" ({seen})" if seen else ""
+            )
+            self.mark(text)
+            self.tell(planned.name, "repeat", number, rounds, text)
+            if good:
+                return True
+        return False
+
+    def _await_estimates(self) -> None:
+        """Let the estimator take in the last record; wall time, because it runs beside the run."""
+        until = time.monotonic() + ESTIMATED
+        while not self.desk.estimates.complete(self._last_record):
+            if time.monotonic() > until:
+                log.warning("the estimator does not keep up; its last estimates count")
+                return
+            self.session.wait(LOOK)
+
+    def mark(self, text: str) -> None:
+        """Write a line into the run's log."""
+        self.bench.event("mark", self.bench.tick, text=text)
+
+    def fail(self, why: str) -> None:
+        """Fail the step with a reason."""
+        raise ProtocolAborted(why)
+
+    def end(self, why: str) -> None:
+        """End the run with a reason."""
+        raise RunEnded(why)
+
+    # Rest and safe points
+
+    def rest_now(self, why: str, *, confirmed: bool = True) -> None:
+        """Put every output to zero and the state to idle; unconfirmed where the device is lost."""
+        if confirmed:
+            self.session.off()
+        if self.machine.state not in (State.TRIPPED, State.SAFE):
+            self.machine.to(State.IDLE, why)
+
+    def reconnect(self, wait: float) -> None:
+        """Connect anew to a lost device and forget what was read of it."""
+        self._before = self.elapsed
+        self.bench.reconnect(wait)
+        self.session.forget()
+        self._origin = None
+
+    def _heed(self) -> None:
+        if self.desk.control.wishes.abort:
+            self.bench.zero_outputs()
+            raise OperatorStop(self.desk.control.wishes.abort)
+
+    def _safe_point(self) -> None:
+        """Pause here if a person asked for it; raises RunEnded when nobody resumes."""
+        wishes = self.desk.control.wishes
+        if not wishes.pause:
+            return
+        self.rest_now("a pause was asked for")
+        wishes.pause = wishes.resume = False
+        self.machine.to(State.PAUSED, "until someone resumes")
+        self.tell("pause", "paused", 0, 0, "outputs at zero until someone resumes")
+        began = self.elapsed
+        while not wishes.resume and not wishes.skip:
+            if self.elapsed - began > self.desk.longest_pause:
+                raise RunEnded(
+                    f"paused for longer than {self.desk.longest_pause:g} s; the run is over"
+                )
+            self.session.wait(LOOK)
+        wishes.resume = False
+        self.machine.to(State.IDLE, "resumed; places and locks are made anew")
+
+    def _skipped(self, name: str) -> bool:
+        wishes = self.desk.control.wishes
+        if not wishes.skip:
+            return False
+        wishes.skip = False
+        self.rest_now(f"{name} is skipped")
+        self.mark(f"{name} was skipped by a person")
+        self.tell(name, "skip", 0, 0, "skipped by a person")
+        return True
+
+    def _pass(self, seconds: float, done: Callable[[], bool] | None = None) -> bool:
+        """Let time pass at rest; True when `done`, or a person wants to go on; else False."""
+        began = self.elapsed
+        self.session.wait(min(LOOK, seconds))
+        while done is None or not done():
+            if self.desk.control.wishes.skip:
+                return True
+            if self.desk.control.wishes.pause and self.machine.state is State.IDLE:
+                self._safe_point()
+            left = seconds - (self.elapsed - began)
+            if left <= 0.5 / self.session.rate:
+                return False
+            self.session.wait(min(LOOK, left))
+        return True
+
+    def _judge(self, condition: Condition | None) -> Callable[[], bool]:
+        """Return what says whether a condition holds now; `elapsed` counts from here."""
+        began = self.elapsed
+
+        def holds() -> bool:
+            return condition is None or condition.holds(self._values(condition, began))
+
+        return holds
+
+    def _values(self, condition: Condition, began: float) -> Mapping[str, float]:
+        found: dict[str, float] = {**self.desk.estimates.values(), ELAPSED: self.elapsed - began}
+        first = max(0, self.session.now - round(LOOK * self.session.rate))
+        for name in condition.names:
+            if name in self.session.rig.recorded:
+                seen = self.session.channel(name, first, self.session.now)
+                known = seen[np.isfinite(seen)]
+                found[name] = float(np.mean(known)) if len(known) else math.nan
+        return found

@@ -1,0 +1,250 @@
+"""One step's excitation: place, lock, warm up, centre, record, and stop at a safe point."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from typing import Protocol
+
+from protocols.engine.errors import ProtocolAborted
+from protocols.engine.excited_joint import Driven
+from protocols.engine.locking import Hold, JointLock, give, lock
+from protocols.engine.placing import LOOK, look, move
+from protocols.engine.playback import Playback
+from protocols.engine.session import Session
+from protocols.engine.states import Machine, State
+from protocols.steps.parts import CLOSED, Place
+from protocols.steps.plans import LockPlan, StepPlan
+from rig.bench.guard import EXCITED, FREE, JointRole
+from rig.runs.recorder import RecordMeta
+
+log = logging.getLogger(__name__)
+
+GUARD_SHARE = 2.0  # the bench trips at twice the tolerance at which the engine gives up a lock
+RELOCK_SHARE = 0.5  # of the tolerance; a closed valve that gave more is closed anew
+
+
+class ExcitationDesk(Protocol):
+    """What an excitation needs of the engine that runs it."""
+
+    @property
+    def machine(self) -> Machine:
+        """The state of the run."""
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether a person asked for a pause, or to skip the step."""
+
+    def tell(self, step: str, phase: str, repeat: int, repeats: int, message: str) -> None:
+        """Hear where the step stands."""
+
+
+class ExcitationRun:
+    """The excitation of one step, from rest to rest as often as it is interrupted."""
+
+    def __init__(
+        self,
+        session: Session,
+        place: Place,
+        step: StepPlan,
+        desk: ExcitationDesk,
+        first: int = 1,
+        attributes: Mapping[str, str] | None = None,
+    ) -> None:
+        """Number the records from `first`; `attributes` are kept with each."""
+        self.session = session
+        self.place = place
+        self.step = step
+        self.taken = 0  # complete records
+        self._desk = desk
+        self._first = first
+        self._more = dict(attributes or {})
+        self.locks: list[JointLock] = []
+
+    def tell(self, phase: str, message: str, repeat: int = 0) -> None:
+        """Report a phase."""
+        log.info("%s: %s %s", self.step.name, phase, message)
+        self._desk.tell(self.step.name, phase, repeat, self.step.repeats, message)
+
+    def run(self) -> bool:
+        """Take the records that are not taken yet; False where a person asked to stop earlier."""
+        excitation = self._start()
+        self.tell("centre", "open loop; biases are trimmed")
+        excitation.settle_bias()
+        complete = self._records(excitation)
+        self._stop(excitation)
+        return complete
+
+    def move_until(self, done: Callable[[], bool], most: float) -> bool:
+        """Excite without records until `done`; False after `most` seconds or where interrupted."""
+        excitation = self._start()
+        excitation.hold()
+        began, good = self.session.now, done()
+        while not good and not self._desk.interrupted:
+            if self.session.now - began >= most * self.session.rate:
+                break
+            excitation.keep_on(LOOK)
+            good = done()
+        self._stop(excitation)
+        return good
+
+    def _start(self) -> Playback:
+        """Place, lock and let the waveforms grow."""
+        self._desk.machine.to(State.HOMING, self.step.name)
+        self.session.bench.guard(self._roles(moving=True))
+        nulls = self._place()
+        self.locks = self._lock()
+        self.session.bench.guard(self._roles())
+        self._desk.machine.to(State.EXCITING, self.step.name)
+        excitation = Playback(self.session, self.step, self.place, self.locks)
+        self.tell("warm-up", "waveforms grow under the position loop")
+        excitation.warm_up(nulls)
+        return excitation
+
+    def _stop(self, excitation: Playback) -> None:
+        self.tell("stop", "waveforms shrink, valves close")
+        excitation.stop()
+        self._desk.machine.to(State.IDLE, f"{self.step.name}: valves closed")
+        self.locks = []
+        self.session.bench.guard(self._roles(moving=True))
+
+    def _roles(self, moving: bool = False) -> list[JointRole]:
+        """Return what each joint does; a joint on its way may touch the ends of its stroke."""
+        roles = [FREE] * self.session.joints
+        if moving:
+            return roles
+        for part in self.step.excite:
+            roles[part.joint] = EXCITED
+        for held in self.locks:
+            tolerance = GUARD_SHARE * held.tolerance
+            roles[held.joint] = JointRole(locked_at=held.piston, tolerance=tolerance)
+        return roles
+
+    def _place(self) -> dict[int, float]:
+        targets = {e.joint: e.centre for e in self.step.excite}
+        where = ", ".join(f"joint {j + 1} to {1e3 * s:g} mm" for j, s in targets.items())
+        self.tell("place", where)
+        self.session.wait(0.01)  # so that the session knows the device's time
+        # They are centred again when they move: here half of what that allows is near enough.
+        near = 0.5 * min(e.settings.centring.offset for e in self.step.excite)
+        tolerance = max(self.place.tolerance, near)
+        settle, name = self.step.settle, self.step.name
+        return move(self.session, targets, self.place, tolerance, settle, name)
+
+    def _lock(self) -> list[JointLock]:
+        """Lock the joints: end stops first, because the push shakes what is merely closed."""
+        hold = Hold(self.step.name, self.step.settle, self.step.record / self.session.rate)
+        locks = []
+        for part in sorted(self.step.locks, key=lambda p: p.at == CLOSED):
+            self.tell("lock", f"joint {part.joint + 1} {_lock_text(part)}")
+            locks.append(lock(self.session, part, self.place, hold))
+            self._desk.machine.to(State.LOCKED, f"joint {part.joint + 1} {part.at}")
+        return locks
+
+    def _records(self, excitation: Playback) -> bool:
+        """Take records until all are there, or a person interrupts between two of them."""
+        disturbed = 0
+        while self.taken < self.step.repeats:
+            repeat = self._first + self.taken
+            if self._record(excitation, repeat):
+                self.taken += 1
+                if self.taken < self.step.repeats:
+                    if self._desk.interrupted:
+                        return False
+                    if self._relock(excitation):
+                        excitation.settle_bias()
+                continue
+            disturbed += 1
+            if disturbed > self.step.tries:
+                raise ProtocolAborted(
+                    f"{self.step.name}: record {repeat} was about to leave the piston limits "
+                    f"{disturbed} times; lower the amplitude, or find out what makes it drift"
+                )
+            if self._desk.interrupted:
+                return False
+            self.tell("centre", f"record {repeat} was disturbed and is taken again", repeat)
+            excitation.settle_bias()
+        return True
+
+    def _record(self, excitation: Playback, repeat: int) -> bool:
+        """Take one record; False if it was disturbed, and so is none."""
+        self.tell("record", f"record {repeat} of {self._first - 1 + self.step.repeats}", repeat)
+        first, driven = excitation.at, excitation.joints
+        meta = self._meta(repeat)
+        with self.session.bench.record(meta, start_tick=first, ticks=self.step.record) as record:
+            if not excitation.record():
+                record.discard("a bias had to be corrected within it")
+                return False
+            record.note(**self._attributes(first, driven, excitation))
+        return True
+
+    def _meta(self, repeat: int) -> RecordMeta:
+        attributes: dict[str, str | float | int] = {
+            **{f"parameter_{name}": value for name, value in self._more.items()},
+            "excited": " ".join(str(e.joint + 1) for e in self.step.excite),
+        }
+        for e in self.step.excite:
+            if e.wave.detection_lines:
+                lines = " ".join(str(k) for k in e.wave.detection_lines)
+                attributes[f"detection_lines_{e.joint + 1}"] = lines
+        return RecordMeta(
+            step=self.step.name,
+            repeat=repeat,
+            locked=tuple(held.joint + 1 for held in self.locks),
+            period=self.step.period,
+            lines=self.step.lines,
+            attributes=attributes,
+        )
+
+    def _attributes(
+        self, first: int, driven: Sequence[Driven], excitation: Playback
+    ) -> dict[str, str | float | int]:
+        """Return what is known of a record only when it has been taken."""
+        found: dict[str, str | float | int] = {}
+        last = first + self.step.record
+        for held in self.locks:
+            j = held.joint + 1
+            found[f"lock_{j}"] = held.at
+            found[f"lock_piston_m_{j}"] = held.piston
+            found[f"lock_gain_v_per_m_{j}"] = held.law.position_gain
+            found[f"lock_give_m_{j}"] = give(self.session, held, first, last)
+        for before, after in zip(driven, excitation.joints, strict=True):
+            j = before.joint + 1
+            found[f"bias_v_{j}"] = before.bias
+            found[f"position_gain_v_per_m_{j}"] = before.loop
+            found[f"drift_m_{j}"] = after.moved.drift * self.step.record / self.session.rate
+            found[f"centre_m_{j}"] = after.moved.mean
+        return found
+
+    def _relock(self, excitation: Playback) -> bool:
+        """Close a valve anew that let its piston creep; says whether one had to be."""
+        changed = False
+        for n, held in enumerate(self.locks):
+            if held.at != CLOSED:
+                continue
+            first = self.session.now - self.step.period
+            off = look(self.session, held.joint, first, self.session.now).piston - held.piston
+            if abs(off) <= RELOCK_SHARE * held.tolerance:
+                continue
+            self.tell("lock", f"joint {held.joint + 1} crept {1e3 * off:.2f} mm; closed anew")
+            plan = next(part for part in self.step.locks if part.joint == held.joint)
+            excitation.hold()
+            self.session.bench.guard(self._roles_without(held.joint))
+            hold = Hold(self.step.name, self.step.settle, self.step.record / self.session.rate)
+            self.locks[n] = lock(self.session, plan, self.place, hold)
+            changed = True
+        if changed:
+            excitation.resume(self.locks)
+            self.session.bench.guard(self._roles())
+        return changed
+
+    def _roles_without(self, joint: int) -> list[JointRole]:
+        roles = self._roles()
+        roles[joint] = FREE
+        return roles
+
+
+def _lock_text(part: LockPlan) -> str:
+    if part.at == CLOSED:
+        return f"to {1e3 * part.piston:g} mm, valve closed there"
+    return f"to its end stop ({part.at}), held there"

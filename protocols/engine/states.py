@@ -1,0 +1,95 @@
+"""The states of a run, and the only ways from one to the next.
+
+    idle        outputs at zero; between two steps
+    checking    the plan is proved on the twin; no device is connected
+    homing      pistons are brought to their places and locks
+    locked      joints are held; none is excited
+    exciting    waveforms are played
+    paused      outputs at zero until a person resumes
+    prompting   outputs at zero until a person answers
+    tripped     a safety limit was passed; outputs at zero, the trip latched
+    safe        outputs confirmed at zero; the run is over
+
+Only `homing` leads from rest to motion, and only from `idle`: whatever was interrupted begins again
+with its places and locks. A session refuses every output law in a state that is at rest, so a
+pause that someone forgot cannot move anything.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from enum import StrEnum
+from typing import Final
+
+log = logging.getLogger(__name__)
+
+
+class State(StrEnum):
+    """A state of the engine."""
+
+    IDLE = "idle"
+    CHECKING = "checking"
+    HOMING = "homing"
+    LOCKED = "locked"
+    EXCITING = "exciting"
+    PAUSED = "paused"
+    PROMPTING = "prompting"
+    TRIPPED = "tripped"
+    SAFE = "safe"
+
+
+_ENDS = frozenset({State.TRIPPED, State.SAFE})
+WAYS: Final[Mapping[State, frozenset[State]]] = {
+    State.IDLE: frozenset({State.CHECKING, State.HOMING, State.PAUSED, State.PROMPTING}) | _ENDS,
+    State.CHECKING: frozenset({State.IDLE, State.SAFE}),
+    State.HOMING: frozenset({State.LOCKED, State.EXCITING, State.IDLE}) | _ENDS,
+    State.LOCKED: frozenset({State.HOMING, State.EXCITING, State.IDLE}) | _ENDS,
+    State.EXCITING: frozenset({State.IDLE}) | _ENDS,
+    State.PAUSED: frozenset({State.IDLE}) | _ENDS,
+    State.PROMPTING: frozenset({State.IDLE}) | _ENDS,
+    State.TRIPPED: frozenset({State.SAFE}),
+    State.SAFE: frozenset(),
+}
+ENERGISED: Final = frozenset({State.HOMING, State.LOCKED, State.EXCITING})
+
+OnChange = Callable[[State, State, str], None]
+
+
+class Machine:
+    """Holds the state of one run; every change is passed on, those before a listener are kept."""
+
+    def __init__(self) -> None:
+        self._state = State.IDLE
+        self._listener: OnChange | None = None
+        self._early: list[tuple[State, State, str]] = []
+
+    @property
+    def state(self) -> State:
+        """The state now."""
+        return self._state
+
+    @property
+    def energised(self) -> bool:
+        """Whether outputs other than zero are allowed now."""
+        return self._state in ENERGISED
+
+    def to(self, state: State, why: str = "") -> None:
+        """Change the state; raises RuntimeError for a way that does not exist."""
+        if state is self._state:
+            return
+        if state not in WAYS[self._state]:
+            raise RuntimeError(f"no way from state {self._state} to {state} ({why})")
+        before, self._state = self._state, state
+        log.info("%s -> %s: %s", before, state, why)
+        if self._listener is None:
+            self._early.append((before, state, why))
+        else:
+            self._listener(before, state, why)
+
+    def listen(self, listener: OnChange) -> None:
+        """Pass every change to `listener`, beginning with those that came before it."""
+        self._listener = listener
+        early, self._early = self._early, []
+        for before, after, why in early:
+            listener(before, after, why)

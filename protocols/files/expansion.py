@@ -1,0 +1,247 @@
+"""Replacing what is written once by what is meant: parameters, sweeps, includes.
+
+Works on the plain data of a file, so that a parameter may stand for any value. Every step that
+results keeps the lines of the file it came from, so that what is wrong in it is named there.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from protocols.steps import STEPS, kind_of_step
+from protocols.steps.base import Macro
+from rig.model.parse import InputError, Path
+
+MOST_STEPS = 1000
+_REFERENCE = re.compile(r"\$(?P<name>[a-z][a-z0-9_]*)|\$\$")
+Lines = Mapping[Path, int]
+
+
+@dataclass(frozen=True)
+class RawStep:
+    """A step as plain data, the line of each of its keys, and whether another file defined it."""
+
+    data: Any
+    lines: Lines
+    included: bool = False
+
+
+@dataclass(frozen=True)
+class Scope:
+    """The parameters in force, and those that a sweep varies (by name, as text)."""
+
+    values: Mapping[str, Any]
+    swept: Mapping[str, str] = field(default_factory=dict)
+
+    def changed(self, values: Mapping[str, Any], swept: bool = False) -> Scope:
+        """Return the scope with other values."""
+        more = {name: str(value) for name, value in values.items()} if swept else {}
+        return Scope({**self.values, **values}, {**self.swept, **more})
+
+
+Include = Callable[[str, Mapping[str, Any], int], Sequence[Any]]
+
+
+@dataclass(frozen=True)
+class Expander:
+    """Expands the steps of one file, `source`; `include` reads the raw steps of another."""
+
+    source: str
+    lines: Lines
+    include: Include
+
+    def steps(self, data: Any, path: Path, scope: Scope) -> list[RawStep]:
+        """Return the steps of a list, expanded; raises InputError naming file, line and key."""
+        if not isinstance(data, list):
+            self._refuse(path, f"expected a list of steps, found {type(data).__name__}")
+        found: list[RawStep] = []
+        for index, item in enumerate(data):
+            where: Path = (*path, index)
+            kind = kind_of_step(item)
+            if kind == "set":
+                values = self._values(item, "set", where, scope)
+                scope = scope.changed(substituted(values, scope, self._at(where)))
+            elif kind == "sweep":
+                found += self._sweep(item, where, scope)
+            elif kind == "include":
+                found += self._included(item, where, scope)
+            else:
+                found.append(self._plain(item, kind, where, scope))
+            if len(found) > MOST_STEPS:
+                self._too_many(where, len(found))
+        return found
+
+    def _plain(self, item: Any, kind: str | None, where: Path, scope: Scope) -> RawStep:
+        lines = {(): self._line(where), **self._below(where)}
+        nested = isinstance(item, dict) and kind is not None and STEPS[kind].nests
+        own = {k: v for k, v in item.items() if k != "steps"} if nested else item
+        data = substituted(own, scope, self._at(where))
+        if nested and "steps" in item:
+            inner = self.steps(item["steps"], (*where, "steps"), scope)
+            data["steps"] = [part.data for part in inner]
+            lines = {p: n for p, n in lines.items() if p[:1] != ("steps",) or len(p) == 1}
+            for number, part in enumerate(inner):
+                lines |= {("steps", number, *p): n for p, n in part.lines.items()}
+        if kind == "excite" and scope.swept:
+            data = {**data, "parameters": dict(scope.swept)}
+        return RawStep(data, lines)
+
+    def _sweep(self, item: Any, where: Path, scope: Scope) -> list[RawStep]:
+        self._keys(item, "sweep", where)
+        rows = self._rows(item["sweep"], where, scope)
+        if "steps" not in item:
+            self._refuse(where, "sweep: steps is missing here")
+        found: list[RawStep] = []
+        for number, row in enumerate(rows, start=1):
+            inner = self.steps(item["steps"], (*where, "steps"), scope.changed(row, swept=True))
+            total = len(rows) * len(inner)
+            if total > MOST_STEPS:
+                self._too_many(where, total)
+            found += [_numbered(step, number) for step in inner]
+        return found
+
+    def _rows(self, over: Any, where: Path, scope: Scope) -> list[dict[str, Any]]:
+        """Return the value of each parameter, run by run."""
+        place: Path = (*where, "sweep")
+        if isinstance(over, dict) and over and all(isinstance(v, list) for v in over.values()):
+            self._known(over, place, scope)
+            count = 1
+            for name, values in over.items():
+                if not values:
+                    self._refuse((*place, name), f"sweep {name}: an empty list")
+                count *= len(values)
+            if count > MOST_STEPS:
+                self._too_many(where, count)
+            return [dict(zip(over, row, strict=True)) for row in itertools.product(*over.values())]
+        if isinstance(over, list) and over and all(isinstance(row, dict) for row in over):
+            for row in over:
+                self._known(row, place, scope)
+                if set(row) != set(over[0]):
+                    self._refuse(place, "sweep: every row must state the same parameters")
+            return over
+        self._refuse(
+            place, "sweep: expected lists of values by parameter, or a list of rows of values"
+        )
+        raise AssertionError
+
+    def _included(self, item: Any, where: Path, scope: Scope) -> list[RawStep]:
+        self._keys(item, "include", where)
+        data = substituted(item, scope, self._at(where))
+        values = data.get("parameters", {})
+        if not isinstance(data["include"], str) or not isinstance(values, dict):
+            self._refuse(where, "include: expected a name or path, and parameters by name")
+        line = self._line(where)
+        steps = self.include(data["include"], values, line)
+        return [RawStep(step, {(): line}, included=True) for step in steps]
+
+    def _values(self, item: Any, key: str, where: Path, scope: Scope) -> Mapping[str, Any]:
+        self._keys(item, key, where)
+        values = item[key]
+        if not isinstance(values, dict) or not values:
+            self._refuse(where, f"{key}: expected values by parameter")
+        self._known(values, (*where, key), scope)
+        return dict(values)
+
+    def _keys(self, item: Mapping[str, Any], key: str, where: Path) -> None:
+        kind = STEPS[key]
+        assert issubclass(kind, Macro)
+        for name in item:
+            if name not in kind.model_fields:
+                text = f"{key}.{name}: unknown key; remove it or correct its spelling"
+                self._refuse((*where, name), text)
+
+    def _known(self, values: Mapping[str, Any], where: Path, scope: Scope) -> None:
+        for name in values:
+            if name not in scope.values:
+                self._refuse((*where, name), unknown_parameter(name, scope.values))
+
+    def _below(self, where: Path) -> dict[Path, int]:
+        depth = len(where)
+        return {p[depth:]: n for p, n in self.lines.items() if p[:depth] == where}
+
+    def _line(self, where: Path) -> int:
+        while where and where not in self.lines:
+            where = where[:-1]
+        return self.lines.get(where, 1)
+
+    def _at(self, where: Path) -> str:
+        return f"{self.source}:{self._line(where)}"
+
+    def _too_many(self, where: Path, count: int) -> None:
+        text = f"{count} steps; expected at most {MOST_STEPS} in one protocol"
+        self._refuse(where, text)
+
+    def _refuse(self, where: Path, text: str) -> None:
+        raise InputError(f"{self._at(where)}: {text}")
+
+
+def unknown_parameter(name: str, known: Mapping[str, Any]) -> str:
+    """Return the refusal of a parameter that the file does not declare."""
+    has = " ".join(known) if known else "none; declare them under 'parameters'"
+    return f"no parameter {name!r}; the file has: {has}"
+
+
+def substituted(data: Any, scope: Scope, where: str) -> Any:
+    """Return plain data with every `$name` replaced; InputError for a name that is not known.
+
+    A text that is nothing but a reference becomes the value itself; within a text the value is
+    written out, and `$$` is a dollar.
+    """
+    if isinstance(data, dict):
+        return {key: substituted(value, scope, where) for key, value in data.items()}
+    if isinstance(data, list):
+        return [substituted(value, scope, where) for value in data]
+    if not isinstance(data, str) or "$" not in data:
+        return data
+
+    def value_of(match: re.Match[str]) -> Any:
+        name = match["name"]
+        if name is None:
+            return "$"
+        if name not in scope.values:
+            raise InputError(f"{where}: ${name}: {unknown_parameter(name, scope.values)}")
+        return scope.values[name]
+
+    whole = _REFERENCE.fullmatch(data)
+    if whole is not None:
+        return value_of(whole)
+    return _REFERENCE.sub(lambda match: str(value_of(match)), data)
+
+
+def _numbered(step: RawStep, number: int) -> RawStep:
+    """Return a step with a number behind its name, and behind those nested in it."""
+    return RawStep(_renamed(step.data, f"_{number}"), step.lines, step.included)
+
+
+def _renamed(data: Any, ending: str) -> Any:
+    if not isinstance(data, dict):
+        return data
+    changed = dict(data)
+    if isinstance(data.get("name"), str):
+        changed["name"] = data["name"] + ending
+    elif kind_of_step(data) == "warm_up":
+        changed["name"] = "warm_up" + ending
+    if isinstance(data.get("steps"), list):
+        changed["steps"] = [_renamed(step, ending) for step in data["steps"]]
+    return changed
+
+
+def made_unique(steps: Sequence[RawStep]) -> list[RawStep]:
+    """Return the steps, with a number behind names that an included file uses once more."""
+    taken = {s.data.get("name") for s in steps if not s.included and isinstance(s.data, dict)}
+    found = []
+    for step in steps:
+        data = step.data
+        if step.included and isinstance(data, dict) and data.get("name") is not None:
+            number, ending = 1, ""
+            while data["name"] + ending in taken:
+                number += 1
+                ending = f"_{number}"
+            data = _renamed(data, ending) if ending else data
+            taken.add(data["name"])
+        found.append(RawStep(data, step.lines, step.included))
+    return found

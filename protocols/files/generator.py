@@ -1,0 +1,76 @@
+"""Python protocols: a function that yields the same steps, for what a file should not do.
+
+The module states what the head of a file states, as a dictionary `PROTOCOL`, and defines
+`steps(parameters)`, which yields steps as objects or as the dictionaries that a file would hold:
+
+    PROTOCOL = {"name": "falling", "joints": 2, "parameters": {"amplitude": "0.4 V"}}
+
+    def steps(parameters):
+        for n in range(3):
+            yield {"name": f"size_{n}", "excite": [...]}
+
+All steps are drawn before anything is resolved, so that a Python protocol passes the same checks.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import itertools
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from protocols.files.expansion import MOST_STEPS, unknown_parameter
+from protocols.files.schema import Protocol
+from protocols.steps.base import StepKind
+from rig.model.parse import InputError, validate_model
+
+
+def load_generator(path: Path, values: Mapping[str, Any]) -> Protocol:
+    """Run a Python protocol's generator to its end; raises InputError naming what is wrong in it.
+
+    `values` replace those of its `PROTOCOL["parameters"]`.
+    """
+    module = _module(path)
+    head, steps = getattr(module, "PROTOCOL", None), getattr(module, "steps", None)
+    if not isinstance(head, dict) or not callable(steps):
+        raise InputError(
+            f"{path}: expected a dictionary PROTOCOL and a function steps(parameters) that yields "
+            "steps"
+        )
+    declared = dict(head.get("parameters", {}))
+    for name in values:
+        if name not in declared:
+            raise InputError(f"{path}: {unknown_parameter(name, declared)}")
+    parameters = {**declared, **values}
+    try:
+        drawn = list(itertools.islice(steps(parameters), MOST_STEPS + 1))
+    except Exception as error:
+        raise InputError(f"{path}: steps() raised {type(error).__name__}: {error}") from error
+    if len(drawn) > MOST_STEPS:
+        raise InputError(f"{path}: steps() yields more than {MOST_STEPS} steps, the most allowed")
+    plain = [step for step in drawn if not isinstance(step, StepKind)]
+    if len(plain) == len(drawn):
+        data = {**head, "parameters": parameters, "steps": drawn}
+        return validate_model(Protocol, data, {}, str(path), {"folder": path.parent})
+    if plain:
+        raise InputError(f"{path}: steps() yields objects and dictionaries; expected one of them")
+    first = {**head, "parameters": parameters, "steps": [{"mark": "to be replaced"}]}
+    made = validate_model(Protocol, first, {}, str(path), {"folder": path.parent})
+    try:
+        return Protocol(**{**dict(made), "steps": tuple(drawn)})
+    except ValueError as error:
+        reason = str(error).splitlines()
+        raise InputError(f"{path}: {reason[2].strip() if len(reason) > 2 else error}") from error
+
+
+def _module(path: Path) -> object:
+    spec = importlib.util.spec_from_file_location("bramah_python_protocol", path)
+    if spec is None or spec.loader is None or not path.is_file():
+        raise InputError(f"{path}: cannot be read as a Python file")
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except (Exception, SystemExit) as error:
+        raise InputError(f"{path}: {type(error).__name__}: {error}") from error
+    return module

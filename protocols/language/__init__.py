@@ -1,0 +1,1 @@
+"""The vocabulary of protocol files: quantities, waveforms, conditions, plug-in discovery."""

@@ -1,0 +1,180 @@
+"""What every kind of step is: data of the file, its plan on a rig, and what it does at the bench.
+
+Adding one: a subclass of `StepKind` in a module of `protocols.steps`, with the key by which the
+file names it. The registry, the JSON schema, `check` and the engine then know it.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol
+
+from pydantic import Field
+
+from protocols.language.conditions import Condition
+from protocols.language.part import ProtocolPart
+from protocols.steps.parts import Place
+from protocols.steps.plans import ExcitePlan, LockPlan, StepPlan
+from rig.model.rig import Rig
+
+NAME = r"^[a-z0-9]+(?:_[a-z0-9]+)*$"
+
+
+class Planner(Protocol):
+    """What a step may ask while it is resolved on a rig."""
+
+    @property
+    def rig(self) -> Rig:
+        """The rig."""
+
+    def condition(self, text: str) -> Condition:
+        """Read a condition; InputError where the rig cannot judge it."""
+
+    def nested(self, steps: Sequence[StepKind]) -> tuple[PlannedStep, ...]:
+        """Resolve the steps within a step."""
+
+    def locked(self, locks: Sequence[Any]) -> None:
+        """Remember locks (of `protocols.steps.parts`) for the steps that follow."""
+
+    def locks(self, step: StepKind, locks: Sequence[Any]) -> tuple[LockPlan, ...]:
+        """Resolve locks; InputError naming step, joint and limit."""
+
+    def excitation(self, step: StepKind) -> StepPlan:
+        """Resolve a step that locks some joints and excites the others."""
+
+
+@dataclass(frozen=True)
+class PlannedStep:
+    """A step resolved on a rig: in words, its expected time [s], what it excites, what it nests.
+
+    `least` and `most` [s] bound the time where only the bench decides it.
+    """
+
+    step: StepKind
+    title: str
+    seconds: float
+    excitations: tuple[StepPlan, ...] = ()
+    nested: tuple[PlannedStep, ...] = ()
+    locks: tuple[LockPlan, ...] = ()
+    condition: Condition | None = None
+    records: tuple[str, ...] = ()
+    most: float | None = None
+
+    @property
+    def name(self) -> str:
+        """The step's name, or its kind where it has none."""
+        return self.step.name or self.step.key
+
+    @property
+    def longest(self) -> float:
+        """The time [s] it may take at most."""
+        return self.seconds if self.most is None else self.most
+
+    @property
+    def all_excitations(self) -> tuple[StepPlan, ...]:
+        """Its excitations and those of nested steps, in order."""
+        inner = (plan for part in self.nested for plan in part.all_excitations)
+        return (*self.excitations, *inner)
+
+
+class Actions(Protocol):
+    """What a step may do at the bench; the engine implements it.
+
+    Every one of these leaves the state machine in `idle` with the outputs at zero, unless it says
+    otherwise; raises what ends the run.
+    """
+
+    def excite(self, planned: PlannedStep) -> None:
+        """Place, lock, centre and take the records of the step's excitation."""
+
+    def excite_until(self, planned: PlannedStep, condition: Condition | None, most: float) -> bool:
+        """Excite without taking records until a condition holds; False after `most` seconds."""
+
+    def hold(self, planned: PlannedStep, locks: Sequence[LockPlan], seconds: float) -> None:
+        """Lock joints, stand still and take one record where the step has a name."""
+
+    def lock(self, planned: PlannedStep, locks: Sequence[LockPlan]) -> None:
+        """Prove that joints can be locked."""
+
+    def rest(self, seconds: float, why: str) -> None:
+        """Let time pass with all outputs at zero."""
+
+    def wait(self, condition: Condition, most: float) -> bool:
+        """Rest until a condition holds; False after `most` seconds."""
+
+    def ask(self, question: Question) -> str:
+        """Ask a person, outputs at zero; returns the answer."""
+
+    def repeat(self, planned: PlannedStep, condition: Condition, rounds: int) -> bool:
+        """Run the nested steps until a condition holds; False after `rounds`."""
+
+    def mark(self, text: str) -> None:
+        """Write a line into the run's log."""
+
+    def fail(self, why: str) -> None:
+        """Fail the step with a reason; the protocol's `on_error` says what follows."""
+
+    def end(self, why: str) -> None:
+        """End the run with a reason, whatever `on_error` says."""
+
+
+@dataclass(frozen=True)
+class Question:
+    """A question to the operator; `default` counts after `timeout` [s] where nobody attends."""
+
+    text: str
+    answers: tuple[str, ...]
+    default: str | None
+    timeout: float
+
+
+class StepKind(ProtocolPart):
+    """A step of a protocol; `key` is the key by which a file names the kind."""
+
+    key: ClassVar[str]
+    rank: ClassVar[int] = 1  # kinds of lower rank are recognised first
+    nests: ClassVar[bool] = False  # its key `steps` holds steps
+
+    name: str | None = Field(default=None, pattern=NAME, description="of its records and log lines")
+
+    @abstractmethod
+    def plan(self, planner: Planner) -> PlannedStep:
+        """Resolve the step on a rig; raises InputError naming what does not fit."""
+
+    @abstractmethod
+    def run(self, planned: PlannedStep, actions: Actions) -> None:
+        """Do it at the bench."""
+
+
+class Macro(StepKind):
+    """A step that the reader replaces by others before anything is resolved."""
+
+    def plan(self, planner: Planner) -> PlannedStep:
+        """Refuse: nothing of it is left when a protocol is resolved."""
+        raise TypeError(f"{self.key} is replaced when a protocol file is read")
+
+    def run(self, planned: PlannedStep, actions: Actions) -> None:
+        """Refuse: it is never planned."""
+        raise TypeError(f"{self.key} is replaced when a protocol file is read")
+
+
+def by_rank(kind: type[StepKind]) -> tuple[int, str]:
+    """Return the order in which kinds are recognised."""
+    return kind.rank, kind.key
+
+
+def choose_kind(data: Any, kinds: Mapping[str, type[StepKind]]) -> str | None:
+    """Return the key of the first kind whose key a step's data has; None for no kind."""
+    if isinstance(data, StepKind):
+        return data.key
+    if not isinstance(data, dict):
+        return None
+    return next((key for key in kinds if key in data), None)
+
+
+__all__ = [
+    "Actions", "Condition", "ExcitePlan", "LockPlan", "Macro", "Place", "PlannedStep", "Planner",
+    "Question", "StepKind", "StepPlan", "by_rank", "choose_kind",
+]  # fmt: skip

@@ -1,0 +1,60 @@
+"""Asking a person."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Self
+
+from pydantic import Field, field_validator, model_validator
+
+from protocols.steps.base import Actions, PlannedStep, Planner, Question, StepKind
+from rig.model.quantity import Time
+
+
+def _word(value: Any) -> Any:
+    """Return YAML's true and false as the yes and no that were written."""
+    return {True: "yes", False: "no"}.get(value, value) if isinstance(value, bool) else value
+
+
+class PromptStep(StepKind):
+    """Ask, outputs at zero, and wait for an answer.
+
+    At a terminal or from a screen a person answers; where nobody attends, `default` counts after
+    `timeout`, and without a default the run ends there.
+    """
+
+    key: ClassVar[str] = "prompt"
+
+    prompt: str = Field(min_length=1, max_length=500)
+    answers: tuple[str, ...] = Field(default=("yes", "no"), min_length=1)
+    default: str | None = Field(default=None, description="counts after the time-out, unattended")
+    timeout: Time = Field(gt=0, description="for an answer where nobody attends")
+    abort_on: tuple[str, ...] = Field(default=("no",), description="answers that end the run")
+
+    @field_validator("answers", "abort_on", mode="before")
+    @classmethod
+    def _words(cls, value: Any) -> Any:
+        return [_word(item) for item in value] if isinstance(value, list | tuple) else _word(value)
+
+    @field_validator("default", mode="before")
+    @classmethod
+    def _default_word(cls, value: Any) -> Any:
+        return _word(value)
+
+    @model_validator(mode="after")
+    def _default_is_an_answer(self) -> Self:
+        if self.default is not None and self.default not in self.answers:
+            raise ValueError(f"default {self.default!r} is none of: {', '.join(self.answers)}")
+        return self
+
+    def plan(self, planner: Planner) -> PlannedStep:
+        """Describe the question."""
+        default = f"{self.default!r}" if self.default else "the run ends"
+        title = f"ask {self.prompt!r}; unanswered for {self.timeout:g} s: {default}"
+        return PlannedStep(self, title, 0.0, most=self.timeout)
+
+    def run(self, planned: PlannedStep, actions: Actions) -> None:
+        """Ask."""
+        question = Question(self.prompt, self.answers, self.default, self.timeout)
+        answer = actions.ask(question)
+        if answer in self.abort_on:
+            actions.end(f"{self.prompt!r} was answered {answer!r}")

@@ -1,0 +1,41 @@
+"""Moving the machine until its oil is warm."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from pydantic import Field
+
+from protocols.steps.base import NAME, Actions, PlannedStep, Planner, StepKind
+from protocols.steps.excite import MOVE_SECONDS
+from protocols.steps.parts import Excite, Lock
+from rig.model.quantity import Time
+
+
+class WarmUpStep(StepKind):
+    """Excite joints, without records, until a condition holds."""
+
+    key: ClassVar[str] = "warm_up"
+
+    name: str = Field(default="warm_up", pattern=NAME)
+    warm_up: str = Field(description="condition, like 'oil_temperature > 40 degC'")
+    timeout: Time = Field(gt=0, description="after which the step has failed")
+    move: tuple[Excite, ...] = Field(min_length=1, description="what moves the oil")
+    lock: tuple[Lock, ...] = ()
+    ramp: Time = Field(default=2.0, gt=0, description="the waveform grows to full size in [s]")
+    settle: Time = Field(default=1.0, gt=0, description="at rest before a lock is believed [s]")
+
+    def plan(self, planner: Planner) -> PlannedStep:
+        """Resolve the motion and the condition."""
+        condition = planner.condition(self.warm_up)
+        step = planner.excitation(self)
+        rate = planner.rig.sample_rate
+        before = MOVE_SECONDS * (1 + len(step.locks)) + step.samples(rate) / rate
+        title = f"move until {condition.text}, at most {self.timeout:g} s"
+        most = before + self.timeout
+        return PlannedStep(self, title, before, (step,), condition=condition, most=most)
+
+    def run(self, planned: PlannedStep, actions: Actions) -> None:
+        """Move until it is warm."""
+        if not actions.excite_until(planned, planned.condition, self.timeout):
+            actions.fail(f"{self.warm_up} did not come within {self.timeout:g} s of moving")
