@@ -10,14 +10,16 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
 
-from protocols.design.check_report import CheckReport, MotionPrediction, StepCheck
+from protocols.design.check_report import CheckReport, Moment, MotionPrediction, StepCheck
 from protocols.engine.centring import Array, follow, under_loop
 from protocols.files.plan import Plan
+from protocols.steps.base import PlannedStep
 from protocols.steps.plans import ExcitePlan, StepPlan
 from rig.model.parse import InputError
 from rig.model.rig import Rig
@@ -52,8 +54,34 @@ def check(plan: Plan, rig: Rig, twin: Twin) -> CheckReport:
     Raises InputError where the twin cannot follow the commands at all; whether limits are kept
     is in the report.
     """
-    steps = tuple(check_step(step, rig, twin) for step in plan.excitations)
-    return CheckReport(plan.protocol.name, rig.name, plan.seconds, steps)
+    seen: dict[Hashable, StepCheck] = {}
+    steps = []
+    for step in plan.excitations:
+        same = _content(step)  # steps of a sweep or a repetition are often alike
+        if same not in seen:
+            seen[same] = check_step(step, rig, twin)
+        steps.append(replace(seen[same], step=step.name))
+    return CheckReport(plan.protocol.name, rig.name, plan.seconds, tuple(steps), _timeline(plan))
+
+
+def _content(step: StepPlan) -> Hashable:
+    """Return what the prediction of a step depends on."""
+    waves = tuple((e.joint, e.wave.samples.tobytes(), e.settings) for e in step.excite)
+    return waves, step.locks, step.period, step.record
+
+
+def _timeline(plan: Plan) -> tuple[Moment, ...]:
+    """Return when each step begins if every condition comes at once."""
+    found: list[Moment] = []
+
+    def lay(parts: Sequence[PlannedStep], begins: float) -> None:
+        for part in parts:
+            found.append(Moment(part.name, part.title, begins, part.seconds, part.longest))
+            lay(part.nested, begins)
+            begins += part.seconds
+
+    lay(plan.sequence, 0.0)
+    return tuple(found)
 
 
 def check_step(step: StepPlan, rig: Rig, twin: Twin) -> StepCheck:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Self
 
 from rig.model.parse import InputError
 
@@ -45,6 +45,22 @@ class StepCheck:
     predictions: tuple[MotionPrediction, ...]
     biases: Mapping[int, float]
 
+    @property
+    def ok(self) -> bool:
+        """Whether every limit is kept."""
+        return all(line.ok for line in self.predictions if line.binding)
+
+
+@dataclass(frozen=True)
+class Moment:
+    """A step in the run's course: when it begins, its expected and its longest time [s]."""
+
+    name: str
+    title: str
+    begins: float
+    seconds: float
+    longest: float
+
 
 @dataclass(frozen=True)
 class CheckReport:
@@ -54,12 +70,47 @@ class CheckReport:
     rig: str
     seconds: float
     steps: tuple[StepCheck, ...] = field(default=())
+    timeline: tuple[Moment, ...] = ()
+    scales: Mapping[str, float | None] = field(default_factory=dict)
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Self:
+        """Return the report that `as_dict` wrote; KeyError or TypeError for anything else."""
+        steps = tuple(
+            StepCheck(
+                entry["step"],
+                tuple(_line(line) for line in entry["predictions"]),
+                {int(joint): bias for joint, bias in entry["biases"].items()},
+            )
+            for entry in data["steps"]
+        )
+        timeline = tuple(Moment(**entry) for entry in data["timeline"])
+        return cls(
+            data["protocol"], data["rig"], data["seconds"], steps, timeline, data["scales"]
+        )  # fmt: skip
+
+    def with_remedies(self, scales: Mapping[str, float | None]) -> Self:
+        """Return the report with the factor by which each refused step's amplitudes would pass."""
+        return replace(self, scales=dict(scales))
+
+    def _begins(self, step: str) -> str:
+        """Say when a step begins, for the reader of a refusal."""
+        moments = [moment for moment in self.timeline if moment.name == step]
+        return f", about {moments[0].begins:.0f} s into the run" if moments else ""
+
+    def _remedy(self, step: str) -> str:
+        if step not in self.scales:
+            return ""
+        scale = self.scales[step]
+        if scale is None:
+            return "; no smaller amplitude was found to pass"
+        return f"; {scale:.2g} times its amplitude would pass"
 
     @property
     def refused(self) -> tuple[str, ...]:
         """One line per limit that would be passed."""
         return tuple(
-            _text(check.step, line)
+            _text(check.step, line) + self._begins(check.step) + self._remedy(check.step)
             for check in self.steps
             for line in check.predictions
             if line.binding and not line.ok
@@ -93,6 +144,8 @@ class CheckReport:
             "rig": self.rig,
             "seconds": self.seconds,
             "ok": self.ok,
+            "timeline": [asdict(moment) for moment in self.timeline],
+            "scales": dict(self.scales),
             "steps": [
                 {
                     "step": check.step,
@@ -126,6 +179,14 @@ def _text(step: str, line: MotionPrediction) -> str:
     return (
         f"{step}, {who}: {line.quantity} {low:.4g} to {high:.4g} {unit} on the twin, allowed "
         f"{scale * line.allowed_low:.4g} to {scale * line.allowed_high:.4g} {unit}"
+    )
+
+
+def _line(data: Mapping[str, Any]) -> MotionPrediction:
+    low, high = data["predicted"]
+    least, most = data["allowed"]
+    return MotionPrediction(
+        data["quantity"], data["joint"], low, high, least, most, data["unit"], data["binding"]
     )
 
 

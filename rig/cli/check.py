@@ -13,8 +13,10 @@ from rig.cli.options import (
     RepeatsOption,
     RigOption,
     ScaleOption,
+    SetOption,
     StepOption,
     WaveSeedOption,
+    overridden,
 )
 from rig.cli.output import write_json
 
@@ -27,23 +29,28 @@ def check(
     amplitude_scale: ScaleOption = 1.0,
     wave_seed: WaveSeedOption = None,
     step: StepOption = None,
+    set_: SetOption = None,
     json: JsonOption = None,
 ) -> None:
     """Prove a protocol against the limits on the twin and predict its errors; nothing moves.
 
     Example: bramah check lock-and-excite --rig shinshu-2dof
     """
-    from protocols.files.plan import Overrides
-    from rig.cli.predicted_errors import as_dict, foresee, prediction_text
+    from protocols.files import library
+    from protocols.files.plan import resolve
+    from rig.cli.proofs import proved
     from rig.cli.sheets import check_text
+    from rig.runs.rigs import load_bench
 
-    steps = tuple(step) if step else None
-    changes = Overrides(repeats, duration, amplitude_scale, wave_seed, steps)
-    found = foresee(protocol, rig, changes)
-    write_json(json, as_dict(found))
+    changes = overridden(repeats, duration, amplitude_scale, wave_seed, step, set_)
+    bench = load_bench(rig)
+    plan = resolve(library.load(protocol, changes.parameters), bench, changes)
+    proof = proved(plan, bench, predict=True)
+    write_json(json, {**proof.report.as_dict(), "identification": proof.prediction})
     if json != Path("-"):
-        typer.echo(f"{check_text(found.limits)}\n\n{prediction_text(found)}")
-    found.limits.require()
+        known = "\n\nunchanged since it was proved; the kept proof stands" if proof.reused else ""
+        typer.echo(f"{check_text(proof.report)}\n\n{proof.text}{known}")
+    proof.report.require()
 
 
 def register(app: typer.Typer) -> None:

@@ -44,6 +44,7 @@ VERBS: Final = {
     "loop": "rig.cli.loop",
     "conformance": "rig.cli.conformance",
     "dbc": "rig.cli.dbc",
+    "schema": "rig.cli.schema",
     "bench": "rig.cli.bench.command",
 }
 GUIDE: Final = """Run a hydraulic robot's test bench, identify it, say what the model lacks.

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from protocols.files.plan import Overrides
 
 RigOption = Annotated[
     str, typer.Option("--rig", help="A shipped rig's name, or the path of a rig file.")
@@ -19,6 +23,10 @@ WaveSeedOption = Annotated[
     int | None, typer.Option("--wave-seed", min=0, help="Of the multisines' phases.")
 ]
 StepOption = Annotated[list[str] | None, typer.Option("--step", help="Only this step; repeatable.")]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="NAME=VALUE of a parameter of the file; repeatable."),
+]
 EndpointOption = Annotated[
     str | None, typer.Option(help="KIND://..., such as modbus-tcp://HOST:PORT, not the rig's wire.")
 ]
@@ -27,3 +35,20 @@ JsonOption = Annotated[
     typer.Option("--json", help="Write the machine-readable result here; - is standard output."),
 ]
 RunsArgument = Annotated[list[Path], typer.Argument(help="Run folders.")]
+
+
+def overridden(
+    repeats: int | None,
+    duration: float | None,
+    amplitude_scale: float,
+    seed: int | None,
+    steps: Sequence[str] | None,
+    settings: Sequence[str] | None = None,
+) -> Overrides:
+    """Return what a person changed of a protocol on the command line."""
+    from protocols.files import library
+    from protocols.files.plan import Overrides
+
+    kept = tuple(steps) if steps else None
+    values = library.parsed_values(settings or ())
+    return Overrides(repeats, duration, amplitude_scale, seed, kept, values)

@@ -36,10 +36,25 @@ class Foresight:
     why: str = ""
 
 
+@dataclass(frozen=True)
+class ForeseenText:
+    """A foresight as plain data and as a person reads it."""
+
+    limits: CheckReport
+    plain: Mapping[str, Any]
+    text: str
+
+
+def foreseen(plan: Plan, rig: Rig) -> ForeseenText:
+    """Check and predict a plan; InputError where the twin cannot follow it."""
+    found = of_plan(plan, rig)
+    return ForeseenText(found.limits, as_dict(found)["identification"], prediction_text(found))
+
+
 def foresee(protocol: str, rig: str, overrides: Overrides) -> Foresight:
     """Check a protocol's limits and predict its errors; raises InputError for bad files."""
     bench = load_bench(rig)
-    plan = resolve(library.load(protocol), bench, overrides)
+    plan = resolve(library.load(protocol, overrides.parameters), bench, overrides)
     return of_plan(plan, bench)
 
 
@@ -47,6 +62,8 @@ def of_plan(plan: Plan, rig: Rig) -> Foresight:
     """Check and predict a plan; what cannot be predicted is said, the limits stand without it."""
     limits = check(plan, rig, simulate_commands)
     biases = {step.step: step.biases for step in limits.steps}
+    if not plan.steps:
+        return Foresight(limits, None, "it takes no records of excited joints")
     try:
         return Foresight(limits, predict(rig, planned_steps(plan, biases)))
     except InputError as error:

@@ -5,19 +5,24 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drivers import make_driver, wire_at
-from protocols.design.check import check
 from protocols.engine import engine
+from protocols.engine.desk import Desk
+from protocols.engine.states import Machine, State
 from protocols.files import library
 from protocols.files.plan import Overrides, Plan, resolve
 from rig.bench.latch import reset_bench
 from rig.bench.screens.sockets import AttachError, Publisher
 from rig.bench.session import Bench
+from rig.cli.attended import TrackedEstimates, terminal_lines
+from rig.cli.proofs import proved
 from rig.cli.provenance import provenance_of
+from rig.cli.sheets import plan_text
+from rig.cli.space import require_space
 from rig.model.rig import Rig
 from rig.runs.recorder import Recorder
 from rig.runs.rigs import load_bench
@@ -40,11 +45,12 @@ class ProtocolJob:
     operator: str | None = None
     track: bool = False
     memory: float = math.inf
+    attended: bool | None = False
 
 
 def _plan(protocol: str, rig: str, overrides: Overrides) -> tuple[Rig, Plan]:
     bench = load_bench(rig)
-    return bench, resolve(library.load(protocol), bench, overrides)
+    return bench, resolve(library.load(protocol, overrides.parameters), bench, overrides)
 
 
 class _Story:
@@ -69,7 +75,6 @@ class _Story:
             repeat=repeat,
             repeats=repeats,
             message=message,
-            total_s=self._plan.seconds,
         )
 
     def tracked(self, estimate: str) -> None:
@@ -90,8 +95,10 @@ def _publisher(rig: Rig, say: Say) -> Publisher | None:
         return None
 
 
-def _tracking(job: ProtocolJob, rig: Rig, say: Say, stack: ExitStack) -> Tracking | None:
-    if not job.track:
+def _tracking(
+    job: ProtocolJob, plan: Plan, rig: Rig, say: Say, stack: ExitStack
+) -> Tracking | None:
+    if not job.track and not plan.estimates:
         return None
     from rig.cli.tracking import Tracking
 
@@ -103,12 +110,14 @@ def run_protocol(job: ProtocolJob, say: Say) -> Path:
     rig, plan = _plan(job.protocol, job.rig, job.overrides)
     wire = rig.wire if job.endpoint is None else wire_at(job.endpoint, rig.wire)
     rig = rig.model_copy(update={"wire": wire})
+    desk_machine = Machine()
+    desk_machine.to(State.CHECKING, plan.protocol.name)
+    say(plan_text(plan))
+    require_space(plan, rig, job.out)
     say(f"checking {plan.protocol.name} on the twin of {rig.name}")
-    from analysis.simulation.twin import simulate_commands
-
-    report = check(plan, rig, simulate_commands)
-    report.require()
-    for note in report.notes:
+    proof = proved(plan, rig)
+    proof.report.require()
+    for note in proof.report.notes:
         say(f"note: {note}")
     say(f"running {len(plan.records)} records, about {plan.seconds:.0f} s of the device's time")
     recorder = Recorder(
@@ -119,14 +128,18 @@ def run_protocol(job: ProtocolJob, say: Say) -> Path:
         provenance=provenance_of(job.protocol, job.rig, job.overrides, plan),
     )
     with ExitStack() as stack:
-        tracking = _tracking(job, rig, say, stack)
+        tracking = _tracking(job, plan, rig, say, stack)
         publisher = _publisher(rig, say)
         bench = stack.enter_context(Bench(rig, make_driver(wire, rig), recorder, publisher))
+        bench.recorded_after = plan.protocol.on_trip.record
+        proof.keep(job.out)
         story = _Story(bench, plan, say)
+        desk = Desk(machine=desk_machine, terminal=terminal_lines(job.attended))
         if tracking is not None:
             tracking.tell(story.note, story.tracked)
             bench.observers.add(tracking)
-        engine.run(plan, rig, bench, story.phase)
+            desk = replace(desk, estimates=TrackedEstimates(tracking))
+        engine.run(plan, rig, bench, story.phase, desk)
     return job.out
 
 

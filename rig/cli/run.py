@@ -13,8 +13,10 @@ from rig.cli.options import (
     RepeatsOption,
     RigOption,
     ScaleOption,
+    SetOption,
     StepOption,
     WaveSeedOption,
+    overridden,
 )
 from rig.cli.output import progress
 
@@ -29,6 +31,7 @@ def run(
     amplitude_scale: ScaleOption = 1.0,
     wave_seed: WaveSeedOption = None,
     step: StepOption = None,
+    set_: SetOption = None,
     operator: Annotated[
         str | None, typer.Option(help="Written into the run.  [default: you]")
     ] = None,
@@ -38,17 +41,22 @@ def run(
     memory: Annotated[
         float, typer.Option(help="Of --track: forget with this time constant [s].")
     ] = float("inf"),
+    attended: Annotated[
+        bool | None,
+        typer.Option(
+            "--attended/--unattended",
+            help="Whether a person answers prompts here.  [default: at a terminal]",
+        ),
+    ] = None,
 ) -> None:
     """Run a protocol unattended into a run folder; Ctrl-C zeroes the outputs and keeps the data.
 
     Example: bramah run lock-and-excite-multisine --rig shinshu-2dof --out runs/monday
     """
-    from protocols.files.plan import Overrides
     from rig.cli.protocol_run import ProtocolJob, run_protocol
 
-    steps = tuple(step) if step else None
-    changes = Overrides(repeats, duration, amplitude_scale, wave_seed, steps)
-    job = ProtocolJob(protocol, rig, out, endpoint, changes, operator, track, memory)
+    changes = overridden(repeats, duration, amplitude_scale, wave_seed, step, set_)
+    job = ProtocolJob(protocol, rig, out, endpoint, changes, operator, track, memory, attended)
     folder = run_protocol(job, progress)
     typer.echo(str(folder))
 

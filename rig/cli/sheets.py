@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from protocols.design.check_report import CheckReport, MotionPrediction
+from collections.abc import Sequence
+
+from protocols.design.check_report import CheckReport, Moment, MotionPrediction
 from protocols.design.proof import Proof, Verdicts
+from protocols.files.plan import Plan
 from rig.cli.output import table
 from rig.model.quantity import unit_map
 
+_BAR = 40  # characters of the timeline
+_PICTURE = 30  # characters between the two limits
 _SHOWN = {"m": "mm", "Pa": "MPa", "Pa/s": "GPa/s", "m^3/s": "L/min"}
 
 
@@ -34,7 +39,88 @@ def check_text(report: CheckReport) -> str:
     rows = [_cells(step.step, line) for step in report.steps for line in step.predictions]
     header = ["step, place, quantity", "predicted", "allowed", "margin", "unit", ""]
     minutes = report.seconds / 60.0
-    return f"{table(header, rows)}\n\nabout {minutes:.1f} min of the device's time"
+    parts = [timeline_text(report.timeline)] if report.timeline else []
+    if rows:
+        parts += [table(header, rows), envelope_text(report)]
+    parts.append(f"about {minutes:.1f} min of the device's time")
+    return "\n\n".join(parts)
+
+
+def plan_text(plan: Plan) -> str:
+    """Return the steps of a plan in order, with their times, before anything runs."""
+    lines = [f"plan of {plan.protocol.name} on {plan.rig}:"]
+    for number, part in enumerate(plan.sequence, start=1):
+        lines.append(f"  {number:3d}. {part.name}: {part.title} (about {part.seconds:.0f} s)")
+        lines += [f"         {inner.name}: {inner.title}" for inner in part.nested]
+    longest = "" if plan.longest <= plan.seconds else f", at most {_clock(plan.longest)}"
+    lines.append(f"  {len(plan.records)} records, about {_clock(plan.seconds)}{longest}")
+    return "\n".join(lines)
+
+
+def timeline_text(moments: Sequence[Moment]) -> str:
+    """Return the run's course: when each step begins, how long it takes, a bar of its place."""
+    end = max((m.begins + m.seconds for m in moments), default=0.0) or 1.0
+    rows = []
+    for moment in moments:
+        first = min(_BAR - 1, int(_BAR * moment.begins / end))
+        last = max(first + 1, round(_BAR * (moment.begins + moment.seconds) / end))
+        bar = " " * first + "#" * (last - first)
+        most = f" (at most {moment.longest:.0f} s)" if moment.longest > moment.seconds else ""
+        text = f"{moment.name}: {moment.title}"
+        rows.append(
+            f"{_clock(moment.begins):>8}  {moment.seconds:6.0f} s  |{bar:<{_BAR}}|  {text}{most}"
+        )
+    return "\n".join(["  begins      time", *rows])
+
+
+def envelope_text(report: CheckReport) -> str:
+    """Return each predicted range as a picture within its limits, and its margin in words."""
+    lines = ["limits  [  predicted range ===  ]"]
+    for step in report.steps:
+        lines.append(f"{step.step}:")
+        lines += [
+            f"  {_place(line):9} {line.quantity:34} {_picture(line)}  {margin_words(line)}"
+            for line in step.predictions
+        ]
+    return "\n".join(lines)
+
+
+def margin_words(line: MotionPrediction) -> str:
+    """Say how far a prediction stays from its nearer limit, and on which side."""
+    unit = _SHOWN.get(line.unit, line.unit)
+    scale = 1.0 / unit_map(unit, line.unit)[0]
+    below, above = line.low - line.allowed_low, line.allowed_high - line.high
+    upper = line.joint is None or above <= below
+    room = above if upper else below
+    limit = scale * (line.allowed_high if upper else line.allowed_low)
+    side = "upper" if upper else "lower"
+    amount = f"{scale * abs(room):.3g} {unit}"
+    where = f"the {side} limit, {limit:.3g} {unit}"
+    if room >= 0.0:
+        return f"stays {amount} inside {where}"
+    kind = "PASSES" if line.binding else "would pass"
+    return f"{kind} {where}, by {amount}"
+
+
+def _picture(line: MotionPrediction) -> str:
+    """Return the predicted range between the limits; `<` and `>` where it leaves them."""
+    span = line.allowed_high - line.allowed_low
+    ends = [(value - line.allowed_low) / span for value in (line.low, line.high)]
+    first, last = (min(_PICTURE - 1, max(0, int(_PICTURE * end))) for end in ends)
+    bar = "." * first + "=" * (last - first + 1) + "." * (_PICTURE - 1 - last)
+    left = "<" if ends[0] < 0.0 else "["
+    right = ">" if ends[1] > 1.0 else "]"
+    return f"{left}{bar}{right}"
+
+
+def _place(line: MotionPrediction) -> str:
+    return "bench" if line.joint is None else f"joint {line.joint}"
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
 def proof_text(proof: Proof) -> str:

@@ -125,6 +125,16 @@ class Tracking:
             self._process.close()
             self._folder.cleanup()
 
+    @property
+    def alive(self) -> bool:
+        """Whether the tracker still works."""
+        return self._process.is_alive()
+
+    @property
+    def recorded(self) -> frozenset[str]:
+        """The records that are in the estimates."""
+        return frozenset(str(entry["record"]) for entry in self._history)
+
     def _finish(self) -> None:
         """Wait for the last estimates and write everything beside the records."""
         noted = len(self._history)

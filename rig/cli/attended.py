@@ -1,0 +1,53 @@
+"""What stands between a run and people: the terminal's answers, the tracker's estimates."""
+
+from __future__ import annotations
+
+import math
+import select
+import sys
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rig.cli.tracking import Tracking
+
+
+def terminal_lines(attended: bool | None) -> Callable[[], str | None] | None:
+    """Return what reads a typed line without waiting; None where nobody attends.
+
+    Attended is, by default, a run whose standard input and error are terminals.
+    """
+    if attended is None:
+        attended = sys.stdin.isatty() and sys.stderr.isatty()
+    return _typed if attended else None
+
+
+def _typed() -> str | None:
+    ready, _, _ = select.select([sys.stdin], [], [], 0.0)
+    if not ready:
+        return None
+    line = sys.stdin.readline()
+    return line.rstrip("\n") if line else None
+
+
+class TrackedEstimates:
+    """The tracker's estimates as conditions see them (`protocols.engine.desk.Estimates`)."""
+
+    def __init__(self, tracking: Tracking) -> None:
+        self._tracking = tracking
+
+    def values(self) -> Mapping[str, float]:
+        """Return each estimate [SI] and, as NAME.rsd, its standard deviation over its value."""
+        found: dict[str, float] = {}
+        for name, estimate in self._tracking.parameters.items():
+            value, std = estimate["value"], estimate["std"]
+            if value is None:
+                continue
+            found[name] = float(value)
+            if std is not None and value:
+                found[f"{name}.rsd"] = abs(float(std) / float(value))
+        return {name: value for name, value in found.items() if math.isfinite(value)}
+
+    def complete(self, record: str) -> bool:
+        """Say whether the tracker has taken in a record; True where it is gone."""
+        return not self._tracking.alive or record in self._tracking.recorded

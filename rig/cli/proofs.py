@@ -1,0 +1,145 @@
+"""Proofs of plans on the twin, kept so that what did not change is not proved again.
+
+A proof is known by the hash of everything that it depends on: the resolved protocol, the rig, and
+the source of the twin and of the check. It is kept in the user's cache folder and with each run.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from protocols.design.check_report import CheckReport
+from protocols.files.plan import Plan
+from rig.cli.output import write_json
+from rig.model.rig import Rig
+
+log = logging.getLogger(__name__)
+
+NAME = "proof.json"
+CACHE_VARIABLE = "BRAMAH_CACHE"
+KEPT = 200  # proofs in the cache; the oldest go
+_SOURCES = (
+    "analysis.simulation", "analysis.terms", "analysis.regression", "analysis.design",
+    "protocols.design", "protocols.files", "protocols.language", "protocols.signals",
+    "protocols.steps", "rig.model",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class PlanProof:
+    """What the twin said of a plan; `prediction` and its `text` are those of the analysis."""
+
+    key: str
+    report: CheckReport
+    prediction: Mapping[str, Any] | None = None
+    text: str = ""
+    reused: bool = False
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as plain data."""
+        return {
+            "key": self.key,
+            "report": self.report.as_dict(),
+            "prediction": self.prediction,
+            "text": self.text,
+        }
+
+    def keep(self, folder: Path) -> None:
+        """Write the proof into a run's folder."""
+        write_json(folder / NAME, self.as_dict())
+
+
+def proved(plan: Plan, rig: Rig, *, predict: bool = False) -> PlanProof:
+    """Return the proof of a plan, from the cache where nothing changed.
+
+    With `predict` also the standard errors to expect. Raises InputError where the twin cannot
+    follow; whether limits are kept is in the report.
+    """
+    key = proof_key(plan, rig)
+    kept = _from_cache(key)
+    if kept is not None and (kept.text or not predict):
+        return kept
+    from protocols.design.check import check
+    from protocols.design.remedy import passing_scale
+    from rig.cli.predicted_errors import foreseen
+
+    if predict:
+        made = foreseen(plan, rig)
+        report, prediction, text = made.limits, made.plain, made.text
+    else:
+        from analysis.simulation.twin import simulate_commands
+
+        report, prediction, text = check(plan, rig, simulate_commands), None, ""
+    if not report.ok:
+        from analysis.simulation.twin import simulate_commands
+
+        bad = {check.step for check in report.steps if not check.ok}
+        scales = {
+            step.name: passing_scale(step, rig, simulate_commands)
+            for step in plan.excitations
+            if step.name in bad
+        }
+        report = report.with_remedies(scales)
+    proof = PlanProof(key, report, prediction, text)
+    _to_cache(proof)
+    return proof
+
+
+def proof_key(plan: Plan, rig: Rig) -> str:
+    """Return the hash of what a proof depends on."""
+    parts = (
+        plan.protocol.model_dump_json(),
+        rig.model_dump_json(exclude={"wire"}),
+        _source_digest(),
+    )
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()
+
+
+@cache
+def _source_digest() -> str:
+    digest = hashlib.sha256()
+    for package in _SOURCES:
+        folder = Path(str(resources.files(package)))
+        for path in sorted(folder.rglob("*.py")):
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def cache_folder() -> Path:
+    """Return the folder of kept proofs: $BRAMAH_CACHE, or the user's cache."""
+    stated = os.environ.get(CACHE_VARIABLE)
+    if stated:
+        return Path(stated) / "proofs"
+    base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    return Path(base) / "bramah" / "proofs"
+
+
+def _from_cache(key: str) -> PlanProof | None:
+    path = cache_folder() / f"{key}.json"
+    try:
+        data = json.loads(path.read_text("utf-8"))
+        report = CheckReport.from_dict(data["report"])
+        if data["key"] != key:
+            return None
+        return PlanProof(key, report, data["prediction"], data["text"], reused=True)
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _to_cache(proof: PlanProof) -> None:
+    folder = cache_folder()
+    with suppress(OSError):  # a cache that cannot be written costs time, nothing else
+        write_json(folder / f"{proof.key}.json", proof.as_dict())
+        kept = sorted(folder.glob("*.json"), key=lambda path: path.stat().st_mtime)
+        for old in kept[:-KEPT]:
+            old.unlink(missing_ok=True)

@@ -1,0 +1,26 @@
+"""The `schema` verb: the JSON schema of protocol files, for editors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def schema(
+    out: Annotated[Path | None, typer.Option(help="Write it here.  [default: stdout]")] = None,
+) -> None:
+    """Print the JSON schema of protocol files, with which editors complete and check them.
+
+    Example: bramah schema --out protocol.schema.json
+    """
+    from protocols.files.json_schema import protocol_schema
+    from rig.cli.output import write_json
+
+    write_json(Path("-") if out is None else out, protocol_schema())
+
+
+def register(app: typer.Typer) -> None:
+    """Add this verb to the command line."""
+    app.command()(schema)
