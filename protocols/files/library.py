@@ -110,7 +110,7 @@ def _protocol(
         ) | {k: v for k, v in head.items() if k in ("name", "description")}
         data["parameters"] = dict(scope.values)
         data["steps"] = [step.data for step in steps]
-        lines = {path: line for path, line in lines.items() if path[:1] != ("steps",)}
+        lines = {p: line for p, line in lines.items() if p[:1] != ("steps",) or len(p) == 1}
         for number, step in enumerate(steps):
             lines |= {("steps", number, *path): line for path, line in step.lines.items()}
     made = validate_model(Protocol, data, lines, source, {"folder": folder})

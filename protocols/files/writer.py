@@ -69,11 +69,13 @@ def protocol_text(protocol: Protocol, comment: str = "") -> str:
 
 def _quantities(value: Any, key: str = "") -> Any:
     if isinstance(value, dict):
+        if key == "parameters":
+            return value  # as the person wrote them
         return {name: _quantities(item, name) for name, item in value.items()}
     if isinstance(value, list):
         items = [_quantities(item, key) for item in value]
         return items if any(isinstance(item, dict) for item in items) else _Row(items)
-    if key in _UNITS and value is not None:
+    if key in _UNITS and isinstance(value, int | float):
         unit, scale = _UNITS[key]
         digits = _DIGITS.get(key, 12)
         return f"{float(f'{value * scale:.{digits}g}'):.{digits}g} {unit}"

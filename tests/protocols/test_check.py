@@ -84,7 +84,7 @@ def test_a_limit_that_would_be_passed_refuses_the_protocol(rig: Rig) -> None:
         report.require()
     message = str(caught.value)
     assert message.startswith("protocol 'lock-and-excite' refused: step1, joint 2: piston -38.")
-    assert "allowed -36 to 36 mm (and 2 more)" in message
+    assert "allowed -36 to 36 mm, about 0 s into the run (and 2 more)" in message
 
 
 def test_a_supply_that_will_sag_is_a_note_and_no_refusal(rig: Rig) -> None:
