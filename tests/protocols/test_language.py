@@ -259,3 +259,12 @@ def test_the_schema_knows_every_kind() -> None:
     assert all(f'"{key}"' in text for key in STEPS)
     assert all(f'"#/$defs/{signal.__name__}"' in text for signal in SIGNALS)
     assert protocol_schema()["properties"]["version"]["maximum"] == VERSION
+
+
+def test_the_lab_sheet_of_the_documentation_resolves_on_the_seed_bench(rig: Rig) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "protocols.md").read_text("utf-8")
+    (example,) = [part.split("```")[0] for part in page.split("```yaml\n") if "evening" in part]
+    plan = resolve(read_protocol(example, "docs", {"amplitude": "9 mm"}), rig)
+    assert plan.records.count("sine_4_r3") == 1
+    assert plan.records[-1] == "rest_r1"
+    assert plan.estimates == ("b",)
