@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from hil_sim.scenario.file import Scenario
 from protocols.design.generate import generate
 from protocols.design.validation_steps import validation
 from protocols.files import library
-from protocols.files.plan import Plan, resolve
+from protocols.files.plan import resolve
 from protocols.files.schema import Protocol
 from protocols.files.writer import protocol_text
 from protocols.steps.plans import StepPlan
@@ -56,10 +56,10 @@ def laws(step: StepPlan, rig: Rig) -> list[Law]:
     return out
 
 
-def recorded(rig: Rig, plan: Plan, seed: int, repeats: int, seconds: float) -> Run:
-    """Records of a plan straight from the plant, without a wire; every step from rest."""
+def recorded(rig: Rig, steps: Sequence[StepPlan], seed: int, repeats: int, seconds: float) -> Run:
+    """Records of steps straight from the plant, without a wire; every step from rest."""
     records = []
-    for number, step in enumerate(plan.steps):
+    for number, step in enumerate(steps):
         plant = Plant(rig, Scenario(), 10 * seed + number)
         told = laws(step, rig)
         # The waveform starts when the locked joints have reached their ends.
@@ -95,7 +95,7 @@ def planned(digger: Rig) -> Protocol:
 
 @pytest.fixture(scope="module")
 def three(digger: Rig, planned: Protocol) -> Run:
-    return recorded(digger, resolve(planned, digger), 3, 2, 10.0)
+    return recorded(digger, resolve(planned, digger).steps, 3, 2, 10.0)
 
 
 def test_three_joints_are_identified_with_the_planned_steps(three: Run, digger: Rig) -> None:
@@ -113,8 +113,8 @@ def test_three_joints_are_identified_with_the_planned_steps(three: Run, digger: 
 
 def test_a_model_of_three_joints_follows_all_of_them_at_once(three: Run, digger: Rig) -> None:
     plan = resolve(validation(digger, predictor().twin, "judge"), digger)
-    both = tuple(step for step in plan.steps if step.name.startswith("all"))
-    judged = recorded(digger, Plan(plan.protocol, plan.rig, plan.sample_rate, both, 0.0), 4, 1, 4.0)
+    together = tuple(step for step in plan.steps if step.name.startswith("all"))
+    judged = recorded(digger, together, 4, 1, 4.0)
     results = validate(identify([three]).model, [judged])
     assert len(results) == 2
     for result in results:

@@ -20,6 +20,7 @@ import pytest
 
 from drivers import make_driver, registry, wire_at
 from drivers.base import OFF, DeviceError, DeviceLost, OutputLaw
+from drivers.bench_protocol import DeviceSilent
 from drivers.modbus_map import MapSettings, ModbusMapDriver, UnitConnection, register_map, spans
 from rig.bench.session import Bench
 from rig.model.parse import InputError, parse_model
@@ -306,7 +307,7 @@ def test_an_answer_with_another_transaction_number_is_not_taken() -> None:
 
     assert fetched(late_and_right) == bytes.fromhex("0005 0006")
     for number in (0, 2, 0xFFFF):  # the request has number 1
-        with pytest.raises(DeviceError, match="are no Modbus answer to the request"):
+        with pytest.raises(DeviceSilent, match=r"does not answer \(0.5 s\)"):
             fetched(lambda _, number=number: words(number, [111, 111]))
 
 
