@@ -82,7 +82,7 @@ def readable(path: Path) -> Iterator[None]:
 def open_archive(path: Path) -> h5py.File:
     """Open an archive for reading; raises InputError if the file is none."""
     with readable(path):
-        file = h5py.File(path, "r")
+        file = h5py.File(path, "r", locking=False)  # a finished archive is never changed in place
         if int(file.attrs.get("format", 0)) != FORMAT:
             file.close()
             raise InputError(f"{path}: not an archive of this version's format {FORMAT}")

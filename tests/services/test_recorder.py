@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import fcntl
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -227,6 +229,22 @@ def test_a_damaged_run_is_refused_in_one_line(tmp_path: Path, spoil, said: str) 
     assert "\n" not in str(error.value)
     with pytest.raises(InputError, match="no such run folder"):
         load_run(tmp_path / "nowhere")
+
+
+def test_a_lock_that_a_child_process_still_holds_does_not_keep_the_records_from_the_disk(
+    tmp_path: Path,
+) -> None:
+    # A process started while the archive is open shares its lock until it runs its own program.
+    with (
+        ExitStack() as child,
+        Bench(RIG, FakeDriver(RIG), Recorder(tmp_path / "run", RIG)) as bench,
+    ):
+        held = child.enter_context((tmp_path / "run" / "records.h5.tmp").open("wb"))
+        fcntl.flock(held, fcntl.LOCK_EX)
+        bench.exchange()
+        with bench.record(step="s"):
+            bench.run_for(0.1)
+    assert [record.name for record in load_run(tmp_path / "run").records] == ["s_r1"]
 
 
 @pytest.mark.parametrize("fault", ["a sample", "a section", "a count"])
