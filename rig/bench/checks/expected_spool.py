@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import cont2discrete, lfilter
 
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
+_SQUARINGS, _TERMS = 10, 8  # of the series for the matrix exponential: exact to rounding below w dt
 
 
 class ExpectedSpool:
@@ -22,29 +22,46 @@ class ExpectedSpool:
 
     def __init__(self, rig: Rig) -> None:
         self._valves = [joint.valve for joint in rig.joints]
-        self._filters = []
+        self._steps = []
         for valve in self._valves:
             w = 2.0 * math.pi * valve.natural_frequency
-            system = ([w * w], [1.0, 2.0 * valve.damping_ratio * w, w * w])
-            b, a, _ = cont2discrete(system, 1.0 / rig.sample_rate)
-            self._filters.append((b.ravel(), a))
-        self._state: list[Array] | None = None
+            damping = 2.0 * valve.damping_ratio * w
+            system = np.array([[0.0, 1.0, 0.0], [-w * w, -damping, w * w], [0.0, 0.0, 0.0]])
+            self._steps.append(_exponential(system / rig.sample_rate)[:2].tolist())
+        self._state: list[tuple[float, float]] | None = None
 
     def forget(self) -> None:
         """Begin anew with the spools at rest under the next command."""
         self._state = None
 
     def follow(self, commands: Array) -> Array:
-        """Return the expected spools [V] under commands [V], both of shape (n, joints)."""
+        """Return the expected spools [V] under commands [V], both of shape (n, joints).
+
+        The spool at a sample follows from the commands up to the sample before.
+        """
         out = np.empty_like(commands)
-        fresh = self._state is None
-        state = self._state or [np.zeros(2)] * len(self._filters)
-        for j, ((b, a), valve) in enumerate(zip(self._filters, self._valves, strict=True)):
+        after = []
+        for j, (step, valve) in enumerate(zip(self._steps, self._valves, strict=True)):
             stroke = valve.spool_stroke
-            wanted = np.clip(valve.spool_gain * commands[:, j], -stroke, stroke)
-            if fresh:  # at rest under the first command: z of a filter of unit gain
-                z2 = (b[2] - a[2]) * wanted[0]
-                state[j] = np.array([(b[1] - a[1]) * wanted[0] + z2, z2])
-            out[:, j], state[j] = lfilter(b, a, wanted, zi=state[j])
-        self._state = state
+            wanted = np.clip(valve.spool_gain * commands[:, j], -stroke, stroke).tolist()
+            # At rest under the first command.
+            place, speed = self._state[j] if self._state else (wanted[0], 0.0)
+            (pp, ps, pu), (sp, ss, su) = step
+            for k, u in enumerate(wanted):
+                out[k, j] = place
+                place, speed = pp * place + ps * speed + pu * u, sp * place + ss * speed + su * u
+            after.append((place, speed))
+        self._state = after
         return out
+
+
+def _exponential(matrix: Array) -> Array:
+    """Return exp(matrix) by scaling and squaring; scipy has it too and loads slowly."""
+    small = matrix / 2.0**_SQUARINGS
+    term = total = np.eye(len(matrix))
+    for n in range(1, _TERMS):
+        term = term @ small / n
+        total = total + term
+    for _ in range(_SQUARINGS):
+        total = total @ total
+    return total
