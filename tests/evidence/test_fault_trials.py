@@ -12,6 +12,7 @@ from hil_sim.faults.base import Fault
 from rig.cli.bench.fault_bench import FaultBench, fault_bench
 from rig.cli.bench.fault_figures import RIG, counted, jobs
 from rig.cli.bench.fault_trials import Naming, Outcome, example, kinds, naming, try_fault, wires
+from rig.model.alarms.states import Alarm
 from rig.model.rig import Rig
 from rig.model.trips import SafetyTrip, Violation
 from rig.runs.rigs import load_rig
@@ -119,6 +120,22 @@ def test_a_message_is_judged_by_what_was_done(
     fault: str, error: Exception | None, expected: Naming
 ) -> None:
     assert naming(example(fault), Outcome(fault, "serial", error=error)) == expected
+
+
+@pytest.mark.parametrize(
+    ("channel", "joint", "expected"),
+    [("cap_pressure_1", 1, Naming.NAMED), ("cap_pressure_2", 2, Naming.WRONG)],
+)
+def test_a_warning_counts_as_noticing_and_is_judged_like_a_trip(
+    channel: str, joint: int, expected: Naming
+) -> None:
+    alarm = Alarm(
+        check="noisy sensor", channel=channel, joint=joint, value=2.0, limit=(None, 1.0),
+        unit="Pa", tick=5, time=1.5, sentence="A sensor is noisy.", remedy="", trips=False,
+    )  # fmt: skip
+    outcome = Outcome("sensor_noise", "serial", alarm=alarm)
+    assert naming(example("sensor_noise"), outcome) == expected
+    assert outcome.says == "warning: A sensor is noisy."
 
 
 def test_a_missed_number_shows_in_the_figures() -> None:

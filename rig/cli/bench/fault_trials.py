@@ -29,6 +29,7 @@ from rig.bench.latch import BenchState
 from rig.bench.session import Bench
 from rig.cli.bench.fault_bench import SILENCE, FaultBench
 from rig.model import channels as ch
+from rig.model.alarms.states import Alarm
 from rig.model.rig import Rig
 from rig.model.trips import DEVICE, SafetyTrip
 from rig.runs.archive import NAME
@@ -89,11 +90,14 @@ class Outcome:
     zeroed: bool = True
     naming: Naming = Naming.UNKNOWN
     warned: list[str] = field(default_factory=list)
+    alarm: Alarm | None = None  # the first warning of the guard after the fault's begin
 
     @property
     def says(self) -> str:
         """What the operator reads, '' where nothing is said."""
-        return "" if self.error is None else " ".join(str(self.error).split())
+        if self.error is not None:
+            return " ".join(str(self.error).split())
+        return "" if self.alarm is None else f"warning: {self.alarm.sentence}"
 
 
 def kinds() -> dict[str, type[Fault]]:
@@ -226,6 +230,10 @@ def _session(
             outcome.seconds = error.device_time - began[1]
         else:
             outcome.seconds = max(0.0, ended - began[0])
+    if outcome.error is None and not isinstance(fault, WireFault):
+        raised = [alarm for alarm in session.alarms.alarms if alarm.time >= fault.at]
+        outcome.alarm = min(raised, key=lambda alarm: alarm.time, default=None)
+        outcome.seconds = outcome.alarm.time - fault.at if outcome.alarm else None
     outcome.blocks = len(collector.blocks)
     outcome.missing = session.lost_samples
     outcome.lost_blocks = _not_in(folder / "run" / NAME, rig, collector.blocks)
@@ -273,17 +281,21 @@ def naming(fault: Fault, outcome: Outcome) -> Naming:
     """
     error = outcome.error
     if error is None:
-        if outcome.missing:
-            return Naming.COUNTED
-        if isinstance(fault, WireFault | ClockDrift):
-            return Naming.HARMLESS
-        return Naming.UNNOTICED
+        return _without_end(fault, outcome)
     trip = error if isinstance(error, SafetyTrip) else None
     if isinstance(fault, WireFault | DeviceFault):
         return _of_wire(fault, error, trip)
-    if trip is None:
-        return Naming.WRONG
-    return _of_machine(fault, trip)
+    return Naming.WRONG if trip is None else _of_machine(fault, trip)
+
+
+def _without_end(fault: Fault, outcome: Outcome) -> Naming:
+    if outcome.missing:
+        return Naming.COUNTED
+    if isinstance(fault, WireFault | ClockDrift):
+        return Naming.HARMLESS
+    if outcome.alarm is None or isinstance(fault, DeviceFault):
+        return Naming.UNNOTICED
+    return _of_machine(fault, outcome.alarm)
 
 
 def _of_wire(fault: Fault, error: Exception, trip: SafetyTrip | None) -> Naming:
@@ -300,7 +312,7 @@ def _of_wire(fault: Fault, error: Exception, trip: SafetyTrip | None) -> Naming:
     return Naming.UNKNOWN
 
 
-def _of_machine(fault: Fault, trip: SafetyTrip) -> Naming:
+def _of_machine(fault: Fault, trip: SafetyTrip | Alarm) -> Naming:
     own = {getattr(fault, key, None) for key in ("channel", "other")} - {None}
     if own:
         return Naming.NAMED if trip.channel in own else Naming.WRONG

@@ -81,6 +81,8 @@ def _what_notices(outcome: Outcome) -> str:
         return f"guard: {error.limit}"
     if error is not None:
         return "driver: device lost" if isinstance(error, DeviceLost) else "driver: refuses it"
+    if outcome.alarm is not None:
+        return f"guard warns: {outcome.alarm.check}"
     if outcome.missing:
         return "driver: counts what is missing"
     again = [line for line in outcome.warned if "again" in line or "dropped" in line]
