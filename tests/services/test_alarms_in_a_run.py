@@ -11,6 +11,7 @@ import pytest
 
 from drivers.base import OutputLaw, SampleBlock
 from rig.bench.guard import EXCITED, FREE
+from rig.bench.screens.commands import Judge
 from rig.bench.screens.snapshot import Snapshot, from_json, to_json
 from rig.bench.screens.sockets import Command
 from rig.bench.session import Bench
@@ -38,7 +39,7 @@ class Screen:
     def publish(self, snapshot: Snapshot) -> None:
         self.seen.append(from_json(to_json(snapshot)))
 
-    def commands(self) -> list[Command]:
+    def commands(self, judge: Judge | None = None) -> list[Command]:
         asked, self.asks = self.asks, []
         return asked
 
