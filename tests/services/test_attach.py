@@ -259,7 +259,7 @@ class Wall:
     def __init__(self) -> None:
         self.seen: list[Snapshot] = []
         self.publish = self.seen.append
-        self.commands = list
+        self.commands = lambda judge: []
         self.close = dict
 
 
