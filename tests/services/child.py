@@ -13,6 +13,7 @@ import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from drivers.base import OutputLaw
@@ -42,6 +43,15 @@ def dying(module: Any, name: str, when: int = 0, *, after: bool = False) -> None
         return result
 
     setattr(module, name, wrapped)
+
+
+def its_own(module: Any, name: str) -> Any:
+    """Give a module a copy of a module it imports, so that a change there meets nobody else."""
+    shared = getattr(module, name)
+    copy = ModuleType(shared.__name__)
+    vars(copy).update(vars(shared))
+    setattr(module, name, copy)
+    return copy
 
 
 def torn_write(*_: Any, **__: Any) -> None:
@@ -76,9 +86,9 @@ def prepare(mode: str, number: int) -> dict[str, Any]:
             lambda: dying(store, "replace_text", after=True),
             lambda: dying(journal.Journal, "create"),
             lambda: dying(journal.Journal, "create", after=True),
-            lambda: dying(journal.sqlite3, "connect", after=True),
-            lambda: dying(journal.json, "dumps"),
-            lambda: dying(journal.sqlite3, "connect", 1),
+            lambda: dying(its_own(journal, "sqlite3"), "connect", after=True),
+            lambda: dying(its_own(journal, "json"), "dumps"),
+            lambda: dying(its_own(journal, "sqlite3"), "connect", 1),
         ]
         starts[number]()
     elif mode in ("file limit", "disk full"):
