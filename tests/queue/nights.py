@@ -16,6 +16,7 @@ from rig.queue.items import Item, Job
 from rig.queue.runner import Report, Runner, Settings
 from rig.queue.store import QueueStore
 from rig.runs.rigs import load_rig
+from rig.runs.runstate import read_events
 
 ROOT = Path(__file__).parents[2]
 PROGRAM = (sys.executable, "-m", "tests.queue.program")
@@ -70,6 +71,11 @@ class Night:
             for path in self.folder.glob("*.starts")
             if path.stem.partition("-")[0] == f"run{number}"
         )
+
+    def recorded(self, number: int) -> bool:
+        """Whether an item's run has a complete record on the disk."""
+        run = Path(self.item(number).run)
+        return any(event["event"] == "record complete" for event in read_events(run))
 
     def process(self) -> subprocess.Popen[bytes]:
         """Start a runner as a process, without the runs' progress."""

@@ -26,7 +26,7 @@ def test_an_item_killed_together_with_its_runner_is_interrupted_and_recovered(
     night.add("endless")
     night.add("done")
     runner = night.process()
-    until(lambda: night.starts(1) == 1 and night.item(1).pid is not None, "the item runs")
+    until(lambda: night.recorded(1) and night.item(1).pid is not None, "the item has recorded")
     runner.kill()
     runner.wait(LONG)
     pid = night.item(1).pid
