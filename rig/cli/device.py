@@ -21,7 +21,7 @@ def device_of(rig: str, endpoint: str | None) -> tuple[Rig, Driver]:
     return described, make_driver(wire, described)
 
 
-def print_pressure(places: list[str]) -> None:
-    """Print what is still under pressure, if anything is."""
+def print_pressure(places: list[str], *, aside: bool = False) -> None:
+    """Print what is still under pressure, if anything is; `aside`: to standard error."""
     if places:
-        typer.echo(f"still under pressure: {', '.join(places)}")
+        typer.echo(f"still under pressure: {', '.join(places)}", err=aside)

@@ -30,7 +30,7 @@ def probe(rig: RigOption, endpoint: EndpointOption = None, json: JsonOption = No
     if json != Path("-"):
         header = ("channel", "mean", "least", "most", "unit", "codes", "")
         typer.echo(table(header, [_row(one) for one in found]))
-    print_pressure(bench.pressurised(found))
+    print_pressure(bench.pressurised(found), aside=json == Path("-"))
     odd = [one.channel for one in found if one.mark != bench.GOOD]
     if odd:
         raise WorkError(f"not plausible: {', '.join(odd)}; look at the last column")

@@ -225,7 +225,9 @@ class Runner:
             words = ["probe", "--rig", job.rig, *place, "--json", "-"]
             answer = self._call(words, self._settings.probe_seconds)
             found = answer.as_json()
-            means: dict[str, float] | str = answer.reason or "no answer"
+            means: dict[str, float] | str = answer.reason or (
+                f"`bramah probe` wrote {answer.output[:60]!r}, not a JSON list of channels"
+            )
             if isinstance(found, list):  # also with an implausible channel, which is no reason
                 means = {
                     one["channel"]: float(one["mean"]) for one in found if one["mean"] is not None

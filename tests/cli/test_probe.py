@@ -41,6 +41,13 @@ def test_probe_shows_every_channel_with_its_codes_and_moves_nothing(
     assert "still under pressure: joint 1 cap" in shown.stdout
 
 
+def test_a_program_reads_json_alone_while_chambers_are_under_pressure(endpoint: str) -> None:
+    shown = bramah("probe", "--rig", RIG, "--endpoint", endpoint, "--json", "-")
+    assert shown.returncode == 0, shown.stderr
+    assert {one["channel"] for one in json.loads(shown.stdout)} == set(load_rig(RIG).channels)
+    assert "still under pressure: joint 1 cap" in shown.stderr
+
+
 def test_stop_zeroes_what_another_host_has_put_out(endpoint: str) -> None:
     rig = load_rig(RIG)
     other = make_driver(wire_at(endpoint, rig.wire), rig)
