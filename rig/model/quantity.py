@@ -14,7 +14,7 @@ from typing import Annotated, Any, cast
 
 from pydantic import BeforeValidator, ValidationInfo, WithJsonSchema
 
-from rig.model.units import linear_map
+from rig.model.units import differs, linear_map
 
 FROM_FILE: dict[str, bool] = {"from_file": True}
 
@@ -41,7 +41,17 @@ def _linear_map(unit: str, si: str) -> tuple[float, float]:
 
     Raises UnitError for an unknown unit or one of another dimension.
     """
-    return linear_map(unit, si) or map_by_pint(unit, si)
+    known = linear_map(unit, si)
+    if known is None and differs(unit, si):
+        raise _other_dimension(unit, si)
+    return known or map_by_pint(unit, si)
+
+
+def _other_dimension(unit: str, si: str) -> UnitError:
+    return UnitError(
+        f"unit {unit or 'dimensionless'!r} does not measure what is wanted here; "
+        f"expected one like {si or 'dimensionless'!r}"
+    )
 
 
 def map_by_pint(unit: str, si: str) -> tuple[float, float]:
@@ -57,9 +67,7 @@ def map_by_pint(unit: str, si: str) -> tuple[float, float]:
         zero = registry.Quantity(0.0, parsed).to(target).magnitude
         one = registry.Quantity(1.0, parsed).to(target).magnitude
     except Exception as error:  # of another dimension, or one that no conversion exists for
-        raise UnitError(
-            f"unit {text!r} does not measure what is wanted here; expected one like {target!r}"
-        ) from error
+        raise _other_dimension(unit, si) from error
     return float(one - zero), float(zero)
 
 

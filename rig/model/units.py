@@ -86,6 +86,12 @@ def linear_map(unit: str, si: str) -> tuple[float, float] | None:
     return found.size / target.size, 0.0
 
 
+def differs(unit: str, si: str) -> bool:
+    """Whether a unit is known here to measure something else than `si`."""
+    found, target = measure(unit.strip()), measure(si.strip())
+    return found is not None and target is not None and found.powers != target.powers
+
+
 def measure(text: str) -> Measure | None:
     """Return what a unit's text means; None for a unit or a form that is not known here."""
     if text in _NAMES:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from rig.model import units
 from rig.model.quantity import UnitError, map_by_pint, parse_quantity, to_si, unit_map
-from rig.model.units import linear_map, measure
+from rig.model.units import differs, linear_map, measure
 
 SHIPPED = ("boom-1dof", "digger-3dof", "electric-2dof", "emps", "shinshu-2dof", "uia-crane")
 
@@ -118,6 +118,12 @@ def test_a_made_up_unit_is_what_pint_makes_of_it(unit: str, si: str) -> None:
     assert_as_pint(unit, si)
 
 
+@given(unit_text, st.sampled_from(WANTED))
+def test_a_unit_known_to_be_of_another_dimension_is_refused_by_pint_too(unit: str, si: str) -> None:
+    if differs(unit, si):
+        assert by_pint(unit, si) is None
+
+
 @given(unit_text)
 def test_a_made_up_unit_has_pints_size_in_its_own_si_units(unit: str) -> None:
     known = measure(unit)
@@ -136,6 +142,16 @@ def test_the_shipped_rigs_are_read_without_pint() -> None:
     code = (
         "import sys; from rig.runs.rigs import load_rig\n"
         f"for name in {SHIPPED!r}: load_rig(name)\n"
+        "assert 'pint' not in sys.modules"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_shipped_protocols_are_read_without_pint() -> None:
+    code = (
+        "import sys; from protocols.files import library\n"
+        "for name in library.shipped_names(): library.load(name)\n"
         "assert 'pint' not in sys.modules"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
