@@ -34,6 +34,14 @@ DRIFT_LEFT = 0.2  # of the drift that the protocol allows
 WIDER = 1.05  # swing under the centring loop over the free one: told from there on
 
 
+class NotCentred(InputError):
+    """A step whose pistons cannot be kept centred on the twin."""
+
+    def __init__(self, message: str, step: StepPlan) -> None:
+        super().__init__(message)
+        self.step = step
+
+
 class Twin(Protocol):
     """Simulates commands (n, joints) [V] from pistons at `start` (joints,) [m].
 
@@ -105,7 +113,7 @@ def centred(
 ) -> tuple[dict[int, float], Mapping[str, Array]]:  # fmt: skip
     """Seek biases that keep the pistons centred; returns them and the last period's motion.
 
-    Raises InputError where the twin cannot follow.
+    Raises InputError where the twin cannot follow, NotCentred where another amplitude may help.
     """
     rate, joints = rig.sample_rate, len(rig.joints)
     locked = {part.joint: part.piston for part in step.locks}
@@ -125,10 +133,11 @@ def centred(
         if steady and samples == whole:
             return biases, {name: values[-step.period :] for name, values in moved.items()}
     which = ", ".join(str(part.joint + 1) for part in step.excite)
-    raise InputError(
+    raise NotCentred(
         f"{step.name}: on the twin joint {which} cannot be centred: after {BIAS_TRIES} biases it "
         "still drifts, or its state ceases to exist (end of the linkage, vacuum); "
-        "lower the amplitude, or allow more drift"
+        "lower the amplitude, or allow more drift",
+        step,
     )
 
 

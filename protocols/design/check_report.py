@@ -99,12 +99,7 @@ class CheckReport:
         return f", about {moments[0].begins:.0f} s into the run" if moments else ""
 
     def _remedy(self, step: str) -> str:
-        if step not in self.scales:
-            return ""
-        scale = self.scales[step]
-        if scale is None:
-            return "; no smaller amplitude was found to pass"
-        return f"; {scale:.2g} times its amplitude would pass"
+        return f"; {remedy_text(self.scales[step])}" if step in self.scales else ""
 
     @property
     def refused(self) -> tuple[str, ...]:
@@ -188,6 +183,13 @@ def _line(data: Mapping[str, Any]) -> MotionPrediction:
     return MotionPrediction(
         data["quantity"], data["joint"], low, high, least, most, data["unit"], data["binding"]
     )
+
+
+def remedy_text(scale: float | None) -> str:
+    """Say with which factor of its amplitudes a refused step passes; None: with none found."""
+    if scale is None:
+        return "no smaller amplitude was found to pass"
+    return f"{scale:g} times this amplitude would pass"
 
 
 def worst(report: CheckReport) -> Sequence[tuple[str, MotionPrediction]]:

@@ -10,7 +10,7 @@ from protocols.steps.plans import StepPlan
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 
-SMALLER, TRIES = 0.9, 20
+PERCENT = 100  # factors are tried in hundredths, so that the one that is written is the one tried
 
 
 def resized(step: StepPlan, factor: float) -> StepPlan:
@@ -28,17 +28,23 @@ def resized(step: StepPlan, factor: float) -> StepPlan:
 
 
 def passing_scale(step: StepPlan, rig: Rig, twin: Twin) -> float | None:
-    """Return the largest factor tried by which a step's amplitudes keep every limit; None if none.
+    """Return the largest factor found by which a step's amplitudes keep every limit; None if none.
 
-    Factors are 0.9, 0.81, ...: each is proved on the twin, nothing is extrapolated.
+    Sought by bisection in hundredths below 1: the factor returned was proved on the twin itself.
     """
-    factor = 1.0
-    for _ in range(TRIES):
-        factor *= SMALLER
-        try:
-            found = check_step(resized(step, factor), rig, twin)
-        except InputError:
-            continue
-        if all(line.ok for line in found.predictions if line.binding):
-            return factor
-    return None
+    passes, fails = 0, PERCENT
+    while fails - passes > 1:
+        trial = (passes + fails) // 2
+        if _passes(resized(step, trial / PERCENT), rig, twin):
+            passes = trial
+        else:
+            fails = trial
+    return passes / PERCENT if passes else None
+
+
+def _passes(step: StepPlan, rig: Rig, twin: Twin) -> bool:
+    try:
+        found = check_step(step, rig, twin)
+    except InputError:
+        return False
+    return all(line.ok for line in found.predictions if line.binding)

@@ -1,7 +1,8 @@
 """Proofs of plans on the twin, kept so that what did not change is not proved again.
 
-A proof is known by the hash of everything that it depends on: the resolved protocol, the rig, and
-the source of the twin and of the check. It is kept in the user's cache folder and with each run.
+A proof is known by the hash of everything that it depends on: the resolved protocol, the rig, the
+source of the twin and of the check, and the versions of the libraries that compute them. It is kept
+in the user's cache folder and with each run.
 """
 
 from __future__ import annotations
@@ -14,13 +15,15 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
-from importlib import resources
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from protocols.design.check_report import CheckReport
 from protocols.files.plan import Plan
+from protocols.steps.plans import StepPlan
 from rig.cli.output import write_json
+from rig.model.parse import InputError
 from rig.model.rig import Rig
 
 log = logging.getLogger(__name__)
@@ -28,11 +31,14 @@ log = logging.getLogger(__name__)
 NAME = "proof.json"
 CACHE_VARIABLE = "BRAMAH_CACHE"
 KEPT = 200  # proofs in the cache; the oldest go
+_ROOT = Path(__file__).parents[2]
 _SOURCES = (
-    "analysis.simulation", "analysis.terms", "analysis.regression", "analysis.design",
-    "protocols.design", "protocols.files", "protocols.language", "protocols.signals",
-    "protocols.steps", "rig.model",
+    "analysis/signals", "analysis/simulation", "analysis/terms", "analysis/regression",
+    "analysis/identify", "analysis/design", "protocols/design", "protocols/files",
+    "protocols/language", "protocols/signals", "protocols/steps", "protocols/engine/centring.py",
+    "rig/model", "rig/cli/predicted_errors.py", "rig/cli/planned.py",
 )  # fmt: skip
+_LIBRARIES = ("numpy", "scipy", "numba")
 
 
 @dataclass(frozen=True)
@@ -69,30 +75,44 @@ def proved(plan: Plan, rig: Rig, *, predict: bool = False) -> PlanProof:
     kept = _from_cache(key)
     if kept is not None and (kept.text or not predict):
         return kept
-    from protocols.design.check import check
-    from protocols.design.remedy import passing_scale
-    from rig.cli.predicted_errors import foreseen
+    from protocols.design.check import NotCentred
+    from protocols.design.check_report import remedy_text
 
-    if predict:
-        made = foreseen(plan, rig)
-        report, prediction, text = made.limits, made.plain, made.text
-    else:
-        from analysis.simulation.twin import simulate_commands
-
-        report, prediction, text = check(plan, rig, simulate_commands), None, ""
+    try:
+        report, prediction, text = _checked(plan, rig, predict=predict)
+    except NotCentred as refused:
+        scale = _passing_scale(refused.step, rig)
+        raise InputError(f"{refused}; {remedy_text(scale)}") from refused
     if not report.ok:
-        from analysis.simulation.twin import simulate_commands
-
         bad = {check.step for check in report.steps if not check.ok}
         scales = {
-            step.name: passing_scale(step, rig, simulate_commands)
-            for step in plan.excitations
-            if step.name in bad
+            step.name: _passing_scale(step, rig) for step in plan.excitations if step.name in bad
         }
         report = report.with_remedies(scales)
     proof = PlanProof(key, report, prediction, text)
     _to_cache(proof)
     return proof
+
+
+def _checked(
+    plan: Plan, rig: Rig, *, predict: bool
+) -> tuple[CheckReport, Mapping[str, Any] | None, str]:
+    if predict:
+        from rig.cli.predicted_errors import foreseen
+
+        made = foreseen(plan, rig)
+        return made.limits, made.plain, made.text
+    from analysis.simulation.twin import simulate_commands
+    from protocols.design.check import check
+
+    return check(plan, rig, simulate_commands), None, ""
+
+
+def _passing_scale(step: StepPlan, rig: Rig) -> float | None:
+    from analysis.simulation.twin import simulate_commands
+    from protocols.design.remedy import passing_scale
+
+    return passing_scale(step, rig, simulate_commands)
 
 
 def proof_key(plan: Plan, rig: Rig) -> str:
@@ -108,10 +128,11 @@ def proof_key(plan: Plan, rig: Rig) -> str:
 @cache
 def _source_digest() -> str:
     digest = hashlib.sha256()
-    for package in _SOURCES:
-        folder = Path(str(resources.files(package)))
-        for path in sorted(folder.rglob("*.py")):
+    for source in _SOURCES:
+        for path in sorted((_ROOT / source).rglob("*.py")) or [_ROOT / source]:
             digest.update(path.read_bytes())
+    for library in _LIBRARIES:
+        digest.update(f"{library} {metadata.version(library)}".encode())
     return digest.hexdigest()
 
 
