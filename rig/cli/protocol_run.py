@@ -56,19 +56,16 @@ def _plan(protocol: str, rig: str, overrides: Overrides) -> tuple[Rig, Plan]:
 class _Story:
     """Tells the phases of a run to the person, to the run's log and to any screen."""
 
-    def __init__(self, bench: Bench, plan: Plan, say: Say) -> None:
-        self._bench, self._plan, self._say = bench, plan, say
-        self._began: int | None = None  # the device's tick, known with its first block
+    def __init__(self, bench: Bench, say: Say) -> None:
+        self._bench, self._say = bench, say
         self._message = ""
 
     def phase(self, step: str, phase: str, repeat: int, repeats: int, message: str) -> None:
-        tick = self._bench.tick
-        if self._began is None and tick:
-            self._began = tick
-        at = (tick - (self._began or tick)) / self._plan.sample_rate
+        recorder = self._bench.recorder
+        at = 0.0 if recorder is None else recorder.elapsed
         self._say(f"{at:8.1f} s  {step:10s} {phase:8s}  {message}")
         self._message = message
-        self._bench.event("phase", tick, step=step, phase=phase, message=message)
+        self._bench.event("phase", self._bench.tick, step=step, phase=phase, message=message)
         self._bench.status(
             step=step,
             phase=phase,
@@ -133,7 +130,7 @@ def run_protocol(job: ProtocolJob, say: Say) -> Path:
         bench = stack.enter_context(Bench(rig, make_driver(wire, rig), recorder, publisher))
         bench.recorded_after = plan.protocol.on_trip.record
         proof.keep(job.out)
-        story = _Story(bench, plan, say)
+        story = _Story(bench, say)
         desk = Desk(machine=desk_machine, terminal=terminal_lines(job.attended))
         if tracking is not None:
             tracking.tell(story.note, story.tracked)

@@ -113,6 +113,11 @@ class Recorder:
         """Whether blocks can be kept."""
         return self._journal is not None
 
+    @property
+    def elapsed(self) -> float:
+        """Time [s] since the run began of the newest sample, across restarts of the device."""
+        return self._newest
+
     def open(self, info: DeviceInfo) -> None:
         """Make the folder and its journal; the run is `running` from here on."""
         about: Any = self._about
