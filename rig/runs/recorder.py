@@ -102,6 +102,7 @@ class Recorder:
         self._journal: Journal | None = None
         self._events: EventLog | None = None
         self._names: set[str] = set()
+        self._unfinished: tuple[int, RecordMeta, int] | None = None  # the record left last
         self._stream = 0
         self._clock: StreamClock | None = None  # of the present stream, from its first block on
         self._newest = 0.0  # [s] since the run began, of the newest sample
@@ -147,7 +148,14 @@ class Recorder:
         return self._journal
 
     def begin_stream(self) -> None:
-        """Note that the device counts its ticks anew from the next block on."""
+        """Note that the device counts its ticks anew from the next block on.
+
+        A record that the end of the stream before left unfinished is none: it can be taken again.
+        """
+        if self._unfinished is not None:
+            number, meta, ticks = self._unfinished
+            why: dict[str, Attribute] = {"discarded": "the stream ended in it"}
+            self.end_record(number, meta, ticks, "discarded", why)
         self._stream += 1
         self._clock = None
 
@@ -201,6 +209,7 @@ class Recorder:
     ) -> None:
         """Close a record after `ticks` samples: `state` is complete, partial or discarded."""
         self._open_journal().end_mark(number, ticks, state, meta.as_dict(more))
+        self._unfinished = (number, meta, ticks) if state == "partial" else None
         if state == "discarded":
             self._names.discard(meta.name)
         self.event(f"record {state}", record=meta.name, ticks=ticks)
