@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import BeforeValidator, Field, WithJsonSchema, model_validator
 
 from protocols.steps.base import Actions, PlannedStep, Planner, Question, StepKind
 from rig.model.quantity import Time
@@ -12,7 +12,11 @@ from rig.model.quantity import Time
 
 def _word(value: Any) -> Any:
     """Return YAML's true and false as the yes and no that were written."""
-    return {True: "yes", False: "no"}.get(value, value) if isinstance(value, bool) else value
+    return {True: "yes", False: "no"}[value] if isinstance(value, bool) else value
+
+
+_WORD_OR_YES = WithJsonSchema({"anyOf": [{"type": "string"}, {"type": "boolean"}]})
+Word = Annotated[str, BeforeValidator(_word), _WORD_OR_YES]
 
 
 class PromptStep(StepKind):
@@ -25,20 +29,10 @@ class PromptStep(StepKind):
     key: ClassVar[str] = "prompt"
 
     prompt: str = Field(min_length=1, max_length=500)
-    answers: tuple[str, ...] = Field(default=("yes", "no"), min_length=1)
-    default: str | None = Field(default=None, description="counts after the time-out, unattended")
+    answers: tuple[Word, ...] = Field(default=("yes", "no"), min_length=1)
+    default: Word | None = Field(default=None, description="counts after the time-out, unattended")
     timeout: Time = Field(gt=0, description="for an answer where nobody attends")
-    abort_on: tuple[str, ...] = Field(default=("no",), description="answers that end the run")
-
-    @field_validator("answers", "abort_on", mode="before")
-    @classmethod
-    def _words(cls, value: Any) -> Any:
-        return [_word(item) for item in value] if isinstance(value, list | tuple) else _word(value)
-
-    @field_validator("default", mode="before")
-    @classmethod
-    def _default_word(cls, value: Any) -> Any:
-        return _word(value)
+    abort_on: tuple[Word, ...] = Field(default=("no",), description="answers that end the run")
 
     @model_validator(mode="after")
     def _default_is_an_answer(self) -> Self:

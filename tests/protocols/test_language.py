@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import json
+from importlib import resources
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from jsonschema import Draft202012Validator
 
 from protocols.files.json_schema import protocol_schema
-from protocols.files.library import load, parsed_values, read_protocol
+from protocols.files.library import load, parsed_values, read_protocol, shipped_names
 from protocols.files.plan import piston_gain, resolve
 from protocols.files.schema import VERSION, Protocol
 from protocols.language.conditions import parse_condition
 from protocols.signals import SIGNALS
 from protocols.steps import STEPS
 from protocols.steps.prompt import PromptStep
-from rig.model.parse import InputError
+from rig.model.parse import InputError, load_yaml
 from rig.model.rig import Rig
 from rig.runs.rigs import load_rig
 
@@ -261,10 +263,53 @@ def test_the_schema_knows_every_kind() -> None:
     assert protocol_schema()["properties"]["version"]["maximum"] == VERSION
 
 
-def test_the_lab_sheet_of_the_documentation_resolves_on_the_seed_bench(rig: Rig) -> None:
+def documented_sheet() -> str:
+    """The lab sheet that the documentation shows."""
     page = (Path(__file__).parents[2] / "docs" / "protocols.md").read_text("utf-8")
     (example,) = [part.split("```")[0] for part in page.split("```yaml\n") if "evening" in part]
-    plan = resolve(read_protocol(example, "docs", {"amplitude": "9 mm"}), rig)
+    return example
+
+
+def test_the_lab_sheet_of_the_documentation_resolves_on_the_seed_bench(rig: Rig) -> None:
+    plan = resolve(read_protocol(documented_sheet(), "docs", {"amplitude": "9 mm"}), rig)
     assert plan.records.count("sine_4_r3") == 1
     assert plan.records[-1] == "rest_r1"
     assert plan.estimates == ("b",)
+
+
+def test_editors_accept_every_shipped_protocol_and_the_documentations_lab_sheet() -> None:
+    judge = Draft202012Validator(protocol_schema())
+    judge.check_schema(protocol_schema())
+    for name in shipped_names():
+        text = (resources.files("protocols") / "shipped" / f"{name}.yaml").read_text("utf-8")
+        judge.validate(load_yaml(text, name)[0])
+    judge.validate(load_yaml(documented_sheet(), "protocols.md")[0])
+
+
+@pytest.mark.parametrize(
+    ("found", "wrong"),
+    [
+        ("frequency: 1 Hz", "frequenzy: 1 Hz"),
+        ("kind: sine", "kind: sign"),
+        ("- mark: x", "- marc: x"),
+        ("timeout: 30 s", "timeout: 30"),
+        ("default: yes", "default: 3"),
+        ("joints: 2", "joints: two"),
+        ("version: 2", "version: 3"),
+        ("amplitude: 0.2 V", "amplitude: 0.2"),
+        ("at: closed", "at: open"),
+    ],
+)
+def test_editors_mark_what_the_reader_refuses(found: str, wrong: str) -> None:
+    text = (
+        f"version: 2\n{HEAD}steps:\n{SINE.replace('$amplitude', '0.2 V')}"
+        "  - {prompt: Is it warm, answers: [yes, no], default: yes, timeout: 30 s}\n  - mark: x\n"
+    )
+    judge = Draft202012Validator(protocol_schema())
+    judge.validate(load_yaml(text, "sheet.yaml")[0])
+    read_protocol(text, "sheet.yaml")
+    spoilt = text.replace(found, wrong)
+    assert spoilt != text
+    with pytest.raises(InputError):
+        read_protocol(spoilt, "sheet.yaml")
+    assert not judge.is_valid(load_yaml(spoilt, "sheet.yaml")[0])
