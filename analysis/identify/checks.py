@@ -174,6 +174,37 @@ def repeats(strata: Mapping[tuple[int, str], int]) -> Check:
     return Check("repeats", True, f"{min(strata.values())} or more repeats of every step")
 
 
+def is_hold(rig: Rig, head: Record | RecordHead) -> bool:
+    """Whether a record was taken with every valve closed: it has no equations of motion."""
+    return set(range(1, len(rig.joints) + 1)) <= set(head.locked)
+
+
+def leak_down(rig: Rig, records: Sequence[Record | RecordHead]) -> list[Check]:
+    """State how far pistons crept in the records of a hold, with every valve closed."""
+    found = [
+        (abs(float(creep)) * head.sample_rate / head.samples, abs(float(creep)), i, head)
+        for head in records
+        if is_hold(rig, head) and head.samples
+        for i in range(1, len(rig.joints) + 1)
+        if isinstance(creep := head.attributes.get(f"creep_m_{i}"), int | float)
+    ]
+    if not found:
+        return []
+    speed, creep, joint, head = max(found, key=lambda one: one[0])
+    seconds = head.samples / head.sample_rate
+    ok = speed < IDENTIFY.most_creep
+    why = "" if ok else "; oil passes the piston, leaves the joint, or passes a valve at rest"
+    return [
+        Check(
+            "leak-down",
+            ok,
+            f"record {head.name!r}: with every valve closed joint {joint} crept {1e3 * creep:.2g} "
+            f"mm in {seconds:g} s, {1e3 * speed:.2g} mm/s (below {1e3 * IDENTIFY.most_creep:g} "
+            f"wanted){why}",
+        )
+    ]
+
+
 def joints_excited(rig: Rig, records: Sequence[Record | RecordHead]) -> Check:
     """State joints that no record excites: their parameters cannot be identified."""
     still = [

@@ -114,9 +114,12 @@ def _statements(
     masked: int,
 ) -> tuple[Check, ...]:
     return (
-        ck.repeats(repeats_of((one.run, one.head) for one in reductions)),
+        ck.repeats(
+            repeats_of((one.run, one.head) for one in reductions if not ck.is_hold(rig, one.head))
+        ),
         ck.joints_excited(rig, [one.head for one in reductions]),
         *ck.clipping(rig, [(one.head, one.clipped) for one in reductions]),
+        *ck.leak_down(rig, [one.head for one in reductions]),
         ck.lost_samples([(one.head, one.lost) for one in reductions]),
         ck.masked(sum(rows.values()), masked),
         *ck.identifiability(found.solutions),

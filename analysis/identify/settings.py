@@ -17,6 +17,7 @@ class IdentifySettings:
     least_travel: float = 50.0  # of an excited piston, times its sensor's noise
     clipped_share: float = 0.01  # of a channel's samples
     lost_share: float = 0.01  # of a run's samples
+    most_creep: float = 2e-4  # [m/s] valves closed; the drift that a record of 10 s may have
     masked_share: float = 0.2  # of an equation's rows
     condition_limit: float = 200.0  # scaled columns; the paper's are 10 to 27
     noise_bias: float = 0.01  # relative, of the worst parameter

@@ -62,9 +62,12 @@ def sequential(
     heads = [one.head for one in reductions]
     statements = (
         _uniqueness(shown),
-        ck.repeats(repeats_of((one.run, one.head) for one in reductions)),
+        ck.repeats(
+            repeats_of((one.run, one.head) for one in reductions if not ck.is_hold(rig, one.head))
+        ),
         ck.joints_excited(rig, heads),
         *ck.clipping(rig, [(one.head, one.clipped) for one in reductions]),
+        *ck.leak_down(rig, [one.head for one in reductions]),
         ck.lost_samples([(one.head, one.lost) for one in reductions]),
         ck.masked(sum(rows.values()), masked),
         *consistency(rig, estimates),
