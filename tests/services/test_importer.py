@@ -20,6 +20,7 @@ from tests.services.fake_driver import samples
 RIG = load_rig("shinshu-2dof")
 NAMES = RIG.channels
 DATA = samples(RIG, np.arange(50))[:, : len(NAMES)]
+DATA[:, [NAMES.index("spool_1"), NAMES.index("spool_2")]] = 0.1 * np.sin(np.arange(50))[:, None]
 HEAD = "rig: shinshu-2dof\nsample_rate: 1 kHz\n"
 ONE = HEAD + "records:\n  - {file: a.csv, step: s, locked: [1], repeat: 1}\n"
 
@@ -261,3 +262,119 @@ def test_a_mat_file_that_does_not_fit_is_refused(tmp_path: Path, content, said: 
     with pytest.raises(InputError) as error:
         bring(tmp_path, ONE.replace("a.csv", "a.mat"))
     assert said in str(error.value)
+
+
+SWEEP = np.arange(4000) / 1000.0
+WAVE = np.sin(2 * np.pi * 1.3 * SWEEP) + 0.3 * np.sin(2 * np.pi * 4.1 * SWEEP + 1.0)
+
+
+def moving(**changed: np.ndarray) -> np.ndarray:
+    """Records (4000, channels) of a bench in motion, some channels replaced."""
+    size = {"spool": 0.5, "piston": 0.01, "cap_pressure": 1e6, "rod_pressure": 1e6}
+    mean = {"cap_pressure": 4e6, "rod_pressure": 4e6, "supply_pressure": 7e6}
+    columns = []
+    for k, name in enumerate(NAMES):
+        kind = name.rsplit("_", 1)[0] if name[-1].isdigit() else name
+        wave = np.roll(WAVE, 37 * k)
+        made = mean.get(kind, 40.0 if kind == "oil_temperature" else 0.0) + wave * size.get(
+            kind, 1e-3 * mean.get(kind, 1.0)
+        )
+        columns.append(changed.get(name, made))
+    return np.column_stack(columns)
+
+
+@pytest.mark.parametrize("delay", [0.003, 0.0025, -0.0041])
+def test_a_delay_of_a_column_is_taken_out_and_every_column_kept_as_long(
+    tmp_path: Path, delay: float
+) -> None:
+    def motion(t: np.ndarray) -> np.ndarray:
+        return 0.01 * np.sin(2 * np.pi * 3.0 * t)
+
+    data = moving(piston_1=motion(SWEEP - delay), piston_2=motion(SWEEP))
+    manifest = ONE.replace("locked: [1], ", "") + f"columns: {{piston_1: {{delay: {delay} s}}}}\n"
+    report = bring(tmp_path, manifest, a__csv=csv(data=data))
+    assert report.warnings == ()
+    (record,) = load_run(tmp_path / "run").records
+    # The two pistons moved alike, and do so again; what one of them lacks is in neither.
+    np.testing.assert_allclose(record.channels["piston_1"], record.channels["piston_2"], atol=2e-8)
+    cut = int(np.ceil(abs(delay) * 1000.0 - 1e-9))
+    assert record.samples == len(SWEEP) - cut
+    first = cut if delay < 0 else 0
+    assert record.start == pytest.approx(first / 1000.0)
+    np.testing.assert_array_equal(
+        record.channels["piston_2"], motion(SWEEP)[first : first + record.samples]
+    )
+
+
+def test_begin_and_end_count_from_the_files_first_sample_with_a_delay_too(tmp_path: Path) -> None:
+    records = "records:\n  - {file: a.csv, step: s, begin: 1 s, end: 2 s}\n"
+    delayed = f"{HEAD}{records}columns: {{spool_1: {{delay: 2 ms}}}}\n"
+    data = moving()
+    bring(tmp_path, delayed, a__csv=csv(data=data))
+    (record,) = load_run(tmp_path / "run").records
+    np.testing.assert_array_equal(record.channels["piston_1"], data[1000:2000, 1])
+    np.testing.assert_array_equal(record.channels["spool_1"], data[1002:2002, 0])
+    other = tmp_path / "other"
+    other.mkdir()
+    with pytest.raises(InputError, match=r"a\.csv: has 3\.998 s of samples; .* 1 s to 4 s"):
+        bring(other, delayed.replace("end: 2 s", "end: 4 s"), a__csv=csv(data=data))
+    assert not (other / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("columns", "said"),
+    [
+        ("time: {column: t, delay: 1 ms}", "columns.time.delay: the time itself has no delay"),
+        ("spool_1: {delay: 1 mm}", "columns.spool_1.delay: unit 'mm'"),
+        ("spool_1: {delay: 5 s}", "'spool_1' with a delay of 5 s leaves none"),
+    ],
+)
+def test_a_delay_that_makes_no_sense_is_refused(tmp_path: Path, columns: str, said: str) -> None:
+    with pytest.raises(InputError) as caught:
+        bring(tmp_path, f"{ONE}columns:\n  {columns}\n", a__csv=csv(data=moving()))
+    assert said in str(caught.value)
+
+
+PRESSURE = 4e6 + 1e6 * WAVE
+
+
+@pytest.mark.parametrize(
+    ("channel", "values", "said"),
+    [
+        ("cap_pressure_2", np.full(4000, 3.1e6), "every sample is 3.1e+06 Pa; is the sensor"),
+        ("cap_pressure_2", np.minimum(PRESSURE, 4.8e6), "its top; is the sensor or its converter"),
+        ("cap_pressure_2", np.maximum(PRESSURE, 3.1e6), "its bottom; is the sensor"),
+        ("cap_pressure_2", 3 * PRESSURE, "to an end of the range -100000 to 1e+07 of the rig's"),
+        ("supply_pressure", np.full(4000, 7e6), "every sample is 7e+06 Pa"),
+        ("cap_pressure_2", np.round(np.minimum(PRESSURE, 4.8e6) / 200) * 200, "its top"),
+    ],
+)
+def test_a_dead_or_clipped_sensor_is_noticed_with_a_sentence(
+    tmp_path: Path, channel: str, values: np.ndarray, said: str
+) -> None:
+    report = bring(tmp_path, ONE, a__csv=csv(data=moving(**{channel: values})))
+    (warning,) = report.warnings
+    assert warning.startswith(f"a.csv, {channel}: ")
+    assert said in warning
+    assert load_run(tmp_path / "run").records[0].samples == 4000
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        PRESSURE,
+        np.round(PRESSURE / 200) * 200,  # a converter of 14 bits
+        np.round(PRESSURE / 20e3) * 20e3,  # so coarse that every peak is flat
+        PRESSURE + np.random.default_rng(1).normal(0, 5e3, 4000),
+        4e6 + 1e6 * np.sin(2 * np.pi * 0.25 * SWEEP),  # one slow peak
+    ],
+)
+def test_a_healthy_sensor_is_not_spoken_of(tmp_path: Path, values: np.ndarray) -> None:
+    report = bring(tmp_path, ONE, a__csv=csv(data=moving(cap_pressure_2=values)))
+    assert report.warnings == ()
+
+
+def test_channels_of_a_locked_joint_may_stand_still(tmp_path: Path) -> None:
+    still = np.zeros(4000)
+    data = moving(spool_1=still, piston_1=still, oil_temperature=np.full(4000, 40.0))
+    assert bring(tmp_path, ONE, a__csv=csv(data=data)).warnings == ()

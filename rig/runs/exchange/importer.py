@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from rig.model.rig import Rig
 from rig.model.trips import RecordingFailed
 from rig.runs import archive, store
 from rig.runs.exchange.columns import read_table
+from rig.runs.exchange.dead_sensors import silent_sensors
 from rig.runs.exchange.manifest import (
     TIME,
     Manifest,
@@ -30,6 +32,7 @@ from rig.runs.runstate import DONE, EventLog, give_up_ownership, write_state
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
+_WHOLE = 1e-6  # of a sample: a delay so near to whole samples is one
 _UNEVEN = 0.1  # of the mean step: what rounded time stamps may differ from it
 
 
@@ -102,21 +105,57 @@ def _read(source: _Source, entry: ManifestRecord) -> _Imported:
         scale, offset = source.maps.get(name, (1.0, 0.0))
         found[name] = raw * scale + offset if (scale, offset) != (1.0, 0.0) else raw
     rate, start = _time_base(source, file, found.pop(TIME, None))
-    part = _part(entry, file, rate, len(next(iter(found.values()))))
+    samples = len(next(iter(found.values())))
+    delays = {n: c.delay * rate for n, c in source.manifest.columns.items() if n in found}
+    first, last = _common(file, rate, samples, delays)
+    for name, delay in delays.items():
+        found[name] = _advanced(found[name], delay, first, last)
+    part = _part(entry, file, rate, first, last)
     channels = {n: found[n][part] for n in every if n in found}
     return _Imported(entry, rate, start + part.start / rate, channels)
 
 
-def _part(entry: ManifestRecord, file: Path, rate: float, samples: int) -> slice:
-    """Return the samples between the entry's `begin` and `end`; raises InputError if none are."""
-    first = round(entry.begin * rate)
-    last = samples if entry.end is None else round(entry.end * rate)
-    if first >= samples - 1 or last > samples:
-        wanted = f"{entry.begin:g} s to {'the end' if entry.end is None else f'{entry.end:g} s'}"
+def _common(
+    file: Path, rate: float, samples: int, delays: Mapping[str, float]
+) -> tuple[int, int]:  # fmt: skip
+    """Return the samples [first, last) that every column has once its delay [samples] is out."""
+    least, most = min((0.0, *delays.values())), max((0.0, *delays.values()))
+    first, last = math.ceil(-least - _WHOLE), samples - math.ceil(most - _WHOLE)
+    if last - first < 2:
+        name = max(delays, key=lambda n: abs(delays[n]))
         raise InputError(
-            f"{file}: has {samples / rate:g} s of samples; the record asks for {wanted}"
+            f"{file}: has {samples / rate:g} s of samples; column of {name!r} with a delay of "
+            f"{delays[name] / rate:g} s leaves none that all columns have"
         )
-    return slice(first, last)
+    return first, last
+
+
+def _advanced(values: Array, delay: float, first: int, last: int) -> Array:
+    """Return a column (n,) without its delay [samples]; what lies outside [first, last) is 0."""
+    whole = round(delay)
+    out = np.zeros_like(values)
+    if abs(delay - whole) < _WHOLE:
+        out[first:last] = values[first + whole : last + whole]
+        return out
+    from scipy.interpolate import make_interp_spline  # noqa: PLC0415 - loads slowly
+
+    spline = make_interp_spline(np.arange(len(values)), values, k=3)
+    out[first:last] = spline(np.arange(first, last) + delay)
+    return out
+
+
+def _part(entry: ManifestRecord, file: Path, rate: float, first: int, last: int) -> slice:
+    """Return the samples between the entry's `begin` and `end`; raises InputError if none are.
+
+    Both count from the file's first sample; [first, last) are those that every column has.
+    """
+    begin = max(first, round(entry.begin * rate))
+    end = last if entry.end is None else round(entry.end * rate)
+    if begin >= last - 1 or end > last:
+        wanted = f"{entry.begin:g} s to {'the end' if entry.end is None else f'{entry.end:g} s'}"
+        has = f"{last / rate:g} s of samples" + ("" if not first else f" from {first / rate:g} s")
+        raise InputError(f"{file}: has {has}; the record asks for {wanted}")
+    return slice(begin, end)
 
 
 def _read_columns(
@@ -190,6 +229,9 @@ def _warnings(source: _Source, records: list[_Imported]) -> tuple[str, ...]:
     for rate in sorted({r.sample_rate for r in records}):
         if abs(rate - rig.sample_rate) > 1e-6 * rig.sample_rate:
             found.append(f"sampled at {rate:g} Hz, the rig samples at {rig.sample_rate:g} Hz")
+    for r in records:
+        silent = silent_sensors(rig, r.entry.locked, r.channels)
+        found += [f"{r.entry.file}, {sentence}" for sentence in silent]
     lengths: dict[str, set[int]] = {}
     for r in records:
         lengths.setdefault(r.entry.step, set()).add(len(next(iter(r.channels.values()))))

@@ -25,13 +25,15 @@ class _Part(BaseModel):
 class Column(_Part):
     """Where a channel stands: value = to_SI(raw * scale + offset).
 
-    `scale` and `offset` apply to the raw number, their result is in `unit` (default: SI).
+    `scale` and `offset` apply to the raw number, their result is in `unit` (default: SI). `delay`
+    [s] is by how much the column lags behind the others: what it shows at t was so at t - delay.
     """
 
     column: str | None = Field(default=None, min_length=1)
     unit: str | None = None
     scale: float = 1.0
     offset: float = 0.0
+    delay: Time = Field(default=0.0, description="behind the other columns [s], taken out")
 
     @model_validator(mode="after")
     def _scale_is_a_scale(self) -> Self:
@@ -136,6 +138,11 @@ def check_against_rig(
         except UnitError as error:
             at = lines.get(("columns", name, "unit"), line)
             raise InputError(f"{path}:{at}: columns.{name}.unit: {error}") from error
+        if name == TIME and column.delay:
+            raise InputError(
+                f"{path}:{line}: columns.{name}.delay: the time itself has no delay; state that of "
+                "the columns that lag"
+            )
         maps[name] = (factor * column.scale, factor * column.offset + shift)
     return maps
 

@@ -1,0 +1,75 @@
+"""Sensors that say nothing in a foreign record: dead, at the end of their range, or cut flat.
+
+A foreign record does not say where its converter ends, so a flat top is known by its shape: near
+the peak of any smooth motion the samples thin out towards the peak by the square root, so that few
+of those within two percent of the range share its exact value; of a clipped one most do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.model import channels as ch
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+
+_DRIVEN = (ch.SPOOL, ch.DRIVE)  # what a waveform or its limit may hold at one value
+_LEVELS = 500  # of resolution within the range; a coarser channel has flat tops anyway
+_NEAR = 0.02  # of the channel's range, counted from its extreme
+_SHARE = 0.5  # of the samples near an extreme that have its exact value: a parabola has a third
+_LEAST = 10  # samples at one value before it is spoken of
+_END = 1e-3  # of a sensor's range, from its end
+
+
+def silent_sensors(rig: Rig, locked: tuple[int, ...], channels: Mapping[str, Array]) -> list[str]:
+    """Return a sentence for each channel (n,) that is dead or clipped; [] where all are well.
+
+    Channels of `locked` joints (1-based) may stand still, and so may the oil's temperature.
+    """
+    said = []
+    for name, values in channels.items():
+        kind, joint = ch.kind_of(name)
+        if kind in (ch.COMMAND, ch.TEMPERATURE) or joint in locked:
+            continue
+        low, high = float(values.min()), float(values.max())
+        unit = rig.unit_of(name)
+        if low == high:
+            said.append(f"{name}: every sample is {low:g} {unit}; is the sensor connected?")
+            continue
+        beyond = _beyond(rig, kind, name, low, high)
+        flat = [] if beyond or kind in _DRIVEN else _flat(name, values, unit)
+        said += beyond + flat
+    return said
+
+
+def _beyond(rig: Rig, kind: str, name: str, low: float, high: float) -> list[str]:
+    ends = rig.sensors.of(kind).range
+    margin = _END * (ends[1] - ends[0])
+    if low > ends[0] + margin and high < ends[1] - margin:
+        return []
+    return [
+        f"{name}: goes from {low:g} to {high:g} {rig.unit_of(name)}, to an end of the range "
+        f"{ends[0]:g} to {ends[1]:g} of the rig's sensor; is it clipped, or is the unit another?"
+    ]
+
+
+def _flat(name: str, values: Array, unit: str) -> list[str]:
+    span = float(np.ptp(values))
+    resolution = float(np.diff(np.unique(values)).min())
+    if resolution > span / _LEVELS:
+        return []
+    found = []
+    for end, distance in (("top", values.max() - values), ("bottom", values - values.min())):
+        at = int(np.count_nonzero(distance < 0.5 * resolution))
+        near = int(np.count_nonzero(distance <= _NEAR * span))
+        if at >= _LEAST and at > _SHARE * near:
+            level = values.max() if end == "top" else values.min()
+            found.append(
+                f"{name}: {at} of {len(values)} samples are exactly {level:g} {unit}, its {end}; "
+                "is the sensor or its converter clipped?"
+            )
+    return found
