@@ -1,4 +1,4 @@
-"""Exit codes and the one line a person reads when something went wrong (CONTRACT, "Commands")."""
+"""Exit codes and what a person reads when something went wrong: a line for each problem."""
 
 from __future__ import annotations
 
@@ -47,8 +47,9 @@ class LogFormatter(logging.Formatter):
 def _say(message: str) -> None:
     from rig.bench.outputs import UNSURE
 
-    line = "bramah: " + " ".join(message.split())
-    print(alarm(line) if UNSURE in line else line, file=sys.stderr)
+    for part in message.strip().splitlines() or [""]:
+        line = "bramah: " + " ".join(part.split())
+        print(alarm(line) if UNSURE in line else line, file=sys.stderr)
 
 
 def _os_error(error: OSError) -> str:

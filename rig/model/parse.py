@@ -1,4 +1,4 @@
-"""YAML text to models: every refusal names the file, the line, the key and what was expected."""
+"""YAML text to models: a refusal lists every problem with file, line, key and what is expected."""
 
 from __future__ import annotations
 
@@ -8,15 +8,17 @@ from typing import Any, TypeVar
 
 import yaml
 from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
 
 from rig.model.quantity import FROM_FILE, UnitError, parse_quantity
 
+_MOST = 30  # problems of one file that are listed; beyond, it is another kind of file
 Model = TypeVar("Model", bound=BaseModel)
 Path = tuple[str | int, ...]
 
 
 class InputError(ValueError):
-    """Bad input by the user: the message is one line that says what to do (exit code 2)."""
+    """Bad input by the user: the message says what to do, a line for each problem (exit code 2)."""
 
 
 # YAML 1.1 needs a dot in 7e-4 to see a number; people do not.
@@ -80,35 +82,59 @@ def load_yaml(text: str, source: str) -> tuple[Any, dict[Path, int]]:
         loader.dispose()
 
 
-def _first_problem(
+def _problems(
     error: ValidationError, lines: dict[Path, int], source: str, model: type[BaseModel]
 ) -> str:
-    # An unknown key is often the misspelt form of the missing one: say the unknown one first.
-    problems = sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
-    problem = problems[0]
-    path: Path = tuple(problem["loc"])
-    # A tagged union puts its tag into the path; drop parts that the file does not have.
-    known: Path = ()
-    for part in path:
-        if (*known, part) in lines:
-            known = (*known, part)
-    if lines:
-        path = (*known, path[-1]) if problem["type"] == "missing" else known
-    line = lines.get(known, 1)
-    where = ".".join(str(part) for part in path) or model.__name__.lower()
+    """Return one line per problem, in the order of the file; at most `_MOST` of them."""
+    found: list[tuple[int, str]] = []
+    said: set[tuple[str | int, str]] = set()
+    for problem in _causes(error):
+        path, text = tuple(problem["loc"]), _problem_text(problem)
+        # A tagged union puts its tag into the path; drop parts that the file does not have.
+        known: Path = ()
+        for part in path:
+            if (*known, part) in lines:
+                known = (*known, part)
+        # What a YAML alias repeats is one mistake.
+        mistake = (path[-1] if path else "", f"{text} {problem['input']!r}")
+        repeated = bool(lines) and known[-1:] != path[-1:] and problem["type"] != "missing"
+        if repeated and mistake in said:
+            continue
+        said.add(mistake)
+        if lines:
+            path = (*known, path[-1]) if problem["type"] == "missing" else known
+        line = lines.get(known, 1)
+        where = ".".join(str(part) for part in path) or model.__name__.lower()
+        found.append((line, f"{source}:{line}: {where}: {text}"))
+    shown = [text for _, text in sorted(found, key=lambda one: one[0])]
+    if len(shown) > _MOST:
+        shown[_MOST:] = [f"{source}: and {len(shown) - _MOST} more"]
+    return "\n".join(shown)
+
+
+def _causes(error: ValidationError) -> list[ErrorDetails]:
+    """Return the problems without those that follow from others: a list is short of its members."""
+    problems = error.errors()
+    places = [tuple(problem["loc"]) for problem in problems]
+    return [
+        problem
+        for problem, at in zip(problems, places, strict=True)
+        if problem["type"] not in ("too_short", "too_long")
+        or not any(len(other) > len(at) and other[: len(at)] == at for other in places)
+    ]
+
+
+def _problem_text(problem: ErrorDetails) -> str:
     text = problem["msg"].removeprefix("Value error, ")
     if problem["type"] == "extra_forbidden":
-        text = "unknown key; remove it or correct its spelling"
-    elif problem["type"] == "missing":
-        text = "is missing here"
-    elif problem["type"] not in ("value_error",):
-        text = f"{text}, found {problem['input']!r}"
-    more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-    return f"{source}:{line}: {where}: {text}{more}"
+        return "unknown key; remove it or correct its spelling"
+    if problem["type"] == "missing":
+        return "is missing here"
+    return text if problem["type"] == "value_error" else f"{text}, found {problem['input']!r}"
 
 
 def parse_model(model: type[Model], text: str, source: str) -> Model:
-    """Read YAML text as `model`, units required beside numbers; raises InputError with the line."""
+    """Read YAML text as `model`, units required beside numbers; raises as `validate_model`."""
     data, lines = load_yaml(text, source)
     return validate_model(model, data, lines, source)
 
@@ -120,7 +146,9 @@ def validate_model(
     source: str,
     context: Mapping[str, Any] | None = None,
 ) -> Model:
-    """Validate loaded YAML as `model`; raises InputError naming file, line, key and expectation.
+    """Validate loaded YAML as `model`; raises InputError: a line for each of its problems.
+
+    Each line names file, line, key, what was found and what was expected.
 
     `context` is passed to the model's validators beside `FROM_FILE`.
     """
@@ -129,7 +157,7 @@ def validate_model(
     try:
         return model.model_validate(data, context={**FROM_FILE, **(context or {})})
     except ValidationError as error:
-        raise InputError(_first_problem(error, lines, source, model)) from error
+        raise InputError(_problems(error, lines, source, model)) from error
     except RecursionError as error:
         raise InputError(f"{source}:1: refers to itself (a YAML alias?)") from error
 

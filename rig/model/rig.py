@@ -69,8 +69,10 @@ class Rig(Part):
     @field_validator("nominal", mode="before")
     @classmethod
     def _nominal_units(cls, value: object, info: ValidationInfo) -> object:
-        if not isinstance(value, dict) or "joints" not in info.data:
+        if not isinstance(value, dict):
             return value
+        if "joints" not in info.data:
+            return {}  # the joints are refused; which parameters there are is known with them
         joints = len(info.data["joints"])
         known = parameter_names(joints)
         for name in value:
@@ -245,8 +247,10 @@ class ElectricRig(Rig):
     @classmethod
     def _sensor_units(cls, value: Any, info: ValidationInfo) -> Any:
         joints = info.data.get("joints")
-        if not isinstance(value, dict) or not joints:
+        if not isinstance(value, dict):
             return value
+        if not joints:
+            raise ValueError("judged once the joints are right: they say which units these have")
         units = {"position": joints[0].position_unit, "drive": joints[0].drive.unit}
         out = dict(value)
         for key, si in units.items():
@@ -263,8 +267,10 @@ class ElectricRig(Rig):
     @classmethod
     def _nominal_units(cls, value: object, info: ValidationInfo) -> object:
         joints = info.data.get("joints")
-        if not isinstance(value, dict) or not joints:
+        if not isinstance(value, dict):
             return value
+        if not joints:
+            return {}  # refused; which parameters there are is known with them
         known = {name: electric_unit(name, joints) for name in electric_names(joints)}
         for name in value:
             if name not in known:

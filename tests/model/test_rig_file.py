@@ -27,7 +27,7 @@ def refused(old: str, new: str) -> str:
     with pytest.raises(InputError) as caught:
         parse_model(Rig, text, "bench.yaml")
     message = str(caught.value)
-    assert "\n" not in message
+    assert all(line.startswith("bench.yaml:") for line in message.splitlines())
     return message
 
 
@@ -102,6 +102,42 @@ def test_a_bench_that_cannot_be_built_is_refused_with_its_line(
     assert expected in message
     line = int(message.split(":")[1])
     assert abs(line - line_of(fragment)) <= 1, message
+
+
+def test_every_error_of_a_file_is_listed_with_line_key_found_and_expected() -> None:
+    text = TEXT
+    wrong = {
+        "gravity: 9.8 m/s^2": "gravitas: 9.8 m/s^2",
+        "stroke: 75 mm": "stroke: 75 kg",
+        "bits: 16, noise: 0.2 mV": "bits: 64, noise: 0.2 mV",
+        "watchdog: 0.5 s": "watchdog: soon",
+        "flow: 11.7 L/min": "flow: 11.7",
+    }
+    for old, new in wrong.items():
+        text = text.replace(old, new, 1)
+    with pytest.raises(InputError) as caught:
+        parse_model(Rig, text, "bench.yaml")
+    lines = str(caught.value).splitlines()
+    said = [
+        ("gravitas", "gravitas: unknown key"),
+        ("flow: 11.7", "supply.flow: 11.7 has no unit; write one beside the number"),
+        ("stroke: 75 kg", "cylinder.stroke: unit 'kg' does not measure"),
+        ("bits: 64", "sensors.spool.bits: Input should be less than or equal to 16, found 64"),
+        ("watchdog: soon", "'soon' is not a number with a unit"),
+    ]
+    assert len(lines) == len(said), lines  # a cylinder that two joints share is wrong once
+    for line, (fragment, says) in zip(lines, said, strict=True):
+        assert line.startswith(f"bench.yaml:{line_of(fragment, text)}: ")
+        assert says in line
+
+
+def test_a_file_of_another_kind_is_refused_with_a_bounded_list() -> None:
+    text = "\n".join(f"key{k}: {k}" for k in range(500))
+    with pytest.raises(InputError) as caught:
+        parse_model(Rig, text, "bench.yaml")
+    lines = str(caught.value).splitlines()
+    assert len(lines) < 40
+    assert lines[-1].startswith("bench.yaml: and ")
 
 
 def test_a_key_written_twice_is_refused() -> None:

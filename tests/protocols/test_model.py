@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -135,9 +136,9 @@ plain = st.recursive(
 
 @settings(max_examples=150, deadline=None)
 @given(plain)
-def test_whatever_a_file_holds_it_is_refused_in_one_line(content: object) -> None:
+def test_whatever_a_file_holds_every_problem_is_a_line_that_names_it(content: object) -> None:
     # None of these is a whole protocol: the leaves lack what every one must have.
-    with pytest.raises(InputError, match=r"\Amine\.yaml:\d+: [^\n]*\Z"):
+    with pytest.raises(InputError, match=r"\A(mine\.yaml:\d+: [^\n]*(\n|\Z))+\Z"):
         read(yaml.safe_dump(content))
 
 
@@ -146,3 +147,23 @@ def test_the_example_in_the_documentation_is_a_protocol_of_the_seed_bench() -> N
     example = page.split("```yaml\n")[1].split("```")[0]
     plan = resolve(parse_model(Protocol, example, "docs"), load_rig("shinshu-2dof"))
     assert plan.records[-1] == "step2_r4"
+
+
+def test_all_that_is_wrong_is_listed_at_once() -> None:
+    text = GOOD
+    wrong = {
+        "frequency: 2 Hz": "frequency: 0 Hz",
+        "at: closed": "at: open",
+        "repeats: 3": "repeats: 0",
+    }
+    for old, new in wrong.items():
+        text = text.replace(old, new)
+    with pytest.raises(InputError) as caught:
+        read(text)
+    lines = str(caught.value).splitlines()
+    assert all(re.match(r"mine\.yaml:\d+: ", line) for line in lines)
+    numbers = [int(line.split(":")[1]) for line in lines]
+    assert numbers == sorted(numbers)
+    for says in ("steps.0.repeats", "steps.0.lock.0.at", "frequency"):
+        assert sum(says in line for line in lines) == 1, lines
+    assert "at least 1 item" not in str(caught.value)  # a list is not short for what is in it
