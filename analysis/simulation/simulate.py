@@ -6,7 +6,7 @@ import enum
 import functools
 import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -301,21 +301,6 @@ def _cylinders(geometry, inputs, locked, q, qd, cap, rod, filled, piston, speed)
                     beyond = beyond or p < 0.0 or p > inputs[k, 0]
         count += beyond and k < filled
     return count
-
-
-def rates_of(ready: Compiled, drive: DrivingInput) -> Callable[[float, Array], Array]:
-    """Return dy/dt(t, y) of a compiled model under a drive, for other integrators to use."""
-    inputs, work = drive.inputs, ready.work()
-
-    def rates(t: float, y: Array) -> Array:
-        dy = np.zeros_like(y)
-        eq.evaluate(
-            ready.address, t, np.ascontiguousarray(y), dy, inputs, drive.rate, drive.locked,
-            ready.geometry, ready.par, ready.context, work,
-        )  # fmt: skip
-        return dy
-
-    return rates
 
 
 def state_at(signals: Signals, sample: int) -> State:

@@ -49,11 +49,6 @@ class Report:
         """Return the results of one verdict."""
         return tuple(result for result in self.results if result.verdict == verdict)
 
-    @property
-    def conforms(self) -> bool:
-        """Whether no check failed and at least one passed."""
-        return bool(self.of(Verdict.PASSED)) and not self.of(Verdict.FAILED)
-
 
 def random_calls(trial: Trial) -> None:
     """Random sequences of every call, losses and faults among them: ticks rise, samples follow

@@ -28,11 +28,6 @@ AMPLITUDE = 0.4  # [V] rms to begin with; every step is sized on the twin
 REPEATS = 4
 
 
-def steps_needed(joints: int) -> int:
-    """Return the least number of steps with one excited joint that can determine all inertia."""
-    return joints * (joints + 1) // 2
-
-
 def candidates(rig: Rig) -> tuple[Step, ...]:
     """Return all candidate steps, outermost joint first, with their first amplitude."""
     N = len(rig.joints)

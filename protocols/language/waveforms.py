@@ -33,11 +33,6 @@ class Waveform:
         """Samples until the waveform starts again."""
         return len(self.samples)
 
-    @property
-    def crest_factor(self) -> float:
-        """Peak over rms."""
-        return float(np.max(np.abs(self.samples)) / np.sqrt(np.mean(self.samples**2)))
-
     def travel(self, rate: float) -> float:
         """Return the peak of the integral about its mean [V s] at `rate` samples a second."""
         moved = integral(self.samples, np.array(self.lines)) * (self.period / rate)

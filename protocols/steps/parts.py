@@ -21,7 +21,6 @@ CLOSED: Final = "closed"
 END_MIN: Final = "end_min"
 END_MAX: Final = "end_max"
 OPEN_LOOP: Final = "open-loop"
-POSITION_LOOP: Final = "position-loop"
 
 
 class Place(ProtocolPart):

@@ -55,12 +55,6 @@ class RecordHandle:
         """Add attributes: text, numbers."""
         self._more.update(attributes)
 
-    def fix(self, start_tick: int, ticks: int) -> None:
-        """Fix the range afterwards, exactly; before `open` for the start."""
-        if self._number is not None and start_tick != self.start_tick:
-            raise ValueError("the start of a record that was begun cannot be moved")
-        self.start_tick, self._ticks = start_tick, ticks
-
     def open(self) -> Self:
         """Begin the record."""
         recorder = self._bench.recorder

@@ -18,7 +18,7 @@ from analysis.simulation.twin import simulate_commands
 from protocols.design.check import check
 from protocols.design.check_report import CheckReport
 from protocols.files import library
-from protocols.files.plan import Overrides, Plan, resolve
+from protocols.files.plan import Plan, resolve
 from protocols.files.writer import protocol_text
 from rig.cli.output import progress, table
 from rig.cli.planned import designed_protocol, designed_step, empty_lines, planned_steps
@@ -49,13 +49,6 @@ def foreseen(plan: Plan, rig: Rig) -> ForeseenText:
     """Check and predict a plan; InputError where the twin cannot follow it."""
     found = of_plan(plan, rig)
     return ForeseenText(found.limits, as_dict(found)["identification"], prediction_text(found))
-
-
-def foresee(protocol: str, rig: str, overrides: Overrides) -> Foresight:
-    """Check a protocol's limits and predict its errors; raises InputError for bad files."""
-    bench = load_bench(rig)
-    plan = resolve(library.load(protocol, overrides.parameters), bench, overrides)
-    return of_plan(plan, bench)
 
 
 def of_plan(plan: Plan, rig: Rig) -> Foresight:

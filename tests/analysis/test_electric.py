@@ -15,7 +15,7 @@ from analysis.identify.stacked_rows import build_rows
 from analysis.signals.conditioning import condition
 from analysis.signals.filters import butterworth, channel_filter
 from analysis.simulation.model import Estimate, Model, load_model, save_model
-from analysis.simulation.simulate import DrivingInput, State, compiled, rates_of, simulate
+from analysis.simulation.simulate import DrivingInput, State, compiled, simulate
 from analysis.simulation.validate import validate
 from analysis.terms import with_effects
 from analysis.terms.base import Used
@@ -23,6 +23,7 @@ from rig.model.parse import InputError
 from rig.model.records import Record, Run
 from rig.model.rig import ElectricRig, Rig
 from rig.runs.rigs import load_rig
+from tests.analysis.right_hand_side import rates_of
 from tests.studies.machines import electric_plant as plant
 
 FRICTION = ("coulomb_friction",)

@@ -15,13 +15,14 @@ from analysis.regression.rows import right_sides
 from analysis.signals.conditioning import Signals, condition
 from analysis.simulation.integrator import integrate
 from analysis.simulation.model import Model, nominal_model
-from analysis.simulation.simulate import compiled, drive_of, rates_of, simulate, state_at
+from analysis.simulation.simulate import compiled, drive_of, simulate, state_at
 from analysis.terms import base, baseline
 from analysis.terms.base import Coefficient, Columns, Kernel, Term, Used, kernel
 from rig.model.parse import InputError
 from rig.model.records import Run
 from rig.model.rig import Rig
 from tests.analysis import small_bench as bench
+from tests.analysis.right_hand_side import rates_of
 from tests.analysis.small_bench import TRUTH
 
 BASELINE = tuple(Used(term) for term in baseline())

@@ -24,7 +24,6 @@ from drivers.can_port import BusPlace, CanPort
 from drivers.can_stream import CanSettings, CanStreamDriver
 from drivers.registry import make_driver, wire_at
 from hil_sim.device.can.adapters import SocketcandServer
-from hil_sim.device.can.bus_node import BusNode
 from hil_sim.device.can.server import layout_of, run_device
 from hil_sim.device.device import Device
 from rig.cli.main import run as command
@@ -34,6 +33,7 @@ from rig.model.registers import TripCause
 from rig.model.rig import Rig
 from rig.model.wire.can_frames import CanFrame, zero_frame
 from rig.model.wire.can_layout import CanLayout, read_layout
+from tests.drivers.bus_node import BusNode
 from tests.drivers.test_can_frames import own_database
 from tests.drivers.wires import ROOT, device_at
 from tests.hil_sim.integrator import IntegratorPlant, expected_outputs, seed_rig

@@ -115,7 +115,8 @@ def test_without_outputs_nothing_that_drives_is_asked_for() -> None:
     report = run(memory_subject(), outputs=False)
     drives = {check.name for check in all_checks() if check.moves}
     assert {result.check for result in report.of(Verdict.SKIPPED)} == drives
-    assert report.conforms
+    assert not report.of(Verdict.FAILED)
+    assert report.of(Verdict.PASSED)
 
 
 def test_an_unknown_check_is_refused() -> None:

@@ -13,7 +13,7 @@ import pytest
 
 from rig.model.parse import InputError
 from rig.model.trips import RecordingFailed
-from rig.runs.listing.summary import list_runs
+from rig.runs.listing.index import indexed_runs
 from rig.runs.recover import recover
 from rig.runs.runstate import read_events
 from rig.runs.store import load_run
@@ -28,7 +28,7 @@ def test_killed_while_recording_every_acknowledged_sample_is_recovered(
     run = tmp_path / "run"
     code, _ = finish(run, "kill at block", block)
     assert code == -signal.SIGKILL
-    (summary,) = list_runs(tmp_path)
+    (summary,) = indexed_runs(tmp_path)
     assert summary.state == "interrupted"
     with pytest.raises(InputError, match=r"interrupted, .*bramah recover"):
         load_run(run)
@@ -70,13 +70,13 @@ def test_killed_while_the_folder_is_made_it_is_an_empty_run_or_none(
     code, _ = finish(run, "kill at start", place)
     assert code == -signal.SIGKILL
     if place < 2:
-        assert list_runs(tmp_path) == []
+        assert indexed_runs(tmp_path) == []
         with pytest.raises(InputError, match="not a run folder"):
             recover(run)
     else:
         report = recover(run)
         assert (report.state, report.records) == ("interrupted", 0)
-        assert [s.state for s in list_runs(tmp_path)] == ["interrupted"]
+        assert [s.state for s in indexed_runs(tmp_path)] == ["interrupted"]
         with pytest.raises(InputError):
             load_run(run)
 

@@ -18,7 +18,7 @@ from rig.runs.exchange import export
 from rig.runs.exchange.export import export_run, library_missing
 from rig.runs.exchange.fixtures import write_run
 from rig.runs.exchange.importer import import_records
-from rig.runs.listing.summary import list_runs
+from rig.runs.listing.index import indexed_runs
 from rig.runs.rigs import load_rig
 from rig.runs.store import load_run
 from tests.services.fake_driver import samples
@@ -54,7 +54,7 @@ def test_what_import_takes_comes_back_to_the_last_bit(run: Path, tmp_path: Path,
 
 def test_a_folder_of_exported_files_is_not_taken_for_a_run(run: Path, tmp_path: Path) -> None:
     export_run(run, tmp_path / "out", "csv")
-    assert [s.path for s in list_runs(tmp_path)] == [run]
+    assert [s.path for s in indexed_runs(tmp_path)] == [run]
 
 
 def test_matlab_finds_vectors_with_their_units_beside_them(run: Path, tmp_path: Path) -> None:

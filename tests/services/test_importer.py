@@ -12,7 +12,7 @@ from scipy.io import savemat
 
 from rig.model.parse import InputError
 from rig.runs.exchange.importer import import_records
-from rig.runs.listing.summary import list_runs
+from rig.runs.listing.index import indexed_runs
 from rig.runs.rigs import load_rig
 from rig.runs.store import load_run
 from tests.services.fake_driver import samples
@@ -64,7 +64,7 @@ columns:
     ]
     for index, name in enumerate(NAMES):
         np.testing.assert_allclose(run.records[0].channels[name], DATA[:, index], rtol=1e-14)
-    (summary,) = list_runs(tmp_path / "run")
+    (summary,) = indexed_runs(tmp_path / "run")
     assert (summary.state, summary.records) == ("done", 2)
     assert sorted(p.name for p in (tmp_path / "run").iterdir()) == [
         "events.jsonl", "records.h5", "run.yaml", "state",

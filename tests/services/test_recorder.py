@@ -18,7 +18,7 @@ from rig.model.channels import unit_of
 from rig.model.parse import InputError
 from rig.model.trips import RecordingFailed
 from rig.runs import archive
-from rig.runs.listing.summary import list_runs
+from rig.runs.listing.index import indexed_runs
 from rig.runs.recorder import Recorder, RecordMeta
 from rig.runs.recover import recover
 from rig.runs.rigs import load_rig
@@ -198,7 +198,7 @@ def test_runs_are_listed_with_their_state_and_records(tmp_path: Path) -> None:
     broken = tmp_path / "b"
     broken.mkdir()
     (broken / "run.yaml").write_text("format: 99\n")
-    summaries = {s.path.name: s for s in list_runs(tmp_path)}
+    summaries = {s.path.name: s for s in indexed_runs(tmp_path)}
     assert set(summaries) == {"a", "b"}
     found = summaries["a"]
     assert (found.state, found.rig, found.protocol, found.records) == (
@@ -268,7 +268,7 @@ def test_an_archive_that_differs_from_the_journal_is_never_put_in_its_place(
     left = {p.name for p in (tmp_path / "run").iterdir()}
     assert "journal.sqlite" in left
     assert not {"records.h5", "records.h5.tmp"} & left
-    assert list_runs(tmp_path)[0].state == "aborted"
+    assert indexed_runs(tmp_path)[0].state == "aborted"
     assert recover(tmp_path / "run").state == "done"
     assert len(load_run(tmp_path / "run").records) == 2
 

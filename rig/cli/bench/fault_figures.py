@@ -89,28 +89,6 @@ def counted(outcomes: Sequence[Outcome]) -> list[Figure]:
     ]
 
 
-def by_fault(outcomes: Sequence[Outcome]) -> list[list[str]]:
-    """Return a row for each fault and wire: how often each naming came, and the slowest end."""
-    rows = []
-    for name in dict.fromkeys(outcome.fault for outcome in outcomes):
-        for wire in wires():
-            own = [o for o in outcomes if o.fault == name and o.wire == wire]
-            if not own:
-                continue
-            of = Counter(str(o.naming) for o in own)
-            ends = [o.seconds for o in own if o.seconds is not None]
-            rows.append(
-                [
-                    name,
-                    wire,
-                    str(len(own)),
-                    ", ".join(f"{count} {word}" for word, count in of.most_common()),
-                    f"{max(ends):.2f} s" if ends else "",
-                ]
-            )
-    return rows
-
-
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Keep hundreds of provoked warnings off the terminal; they are in the outcomes."""

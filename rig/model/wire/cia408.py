@@ -20,7 +20,6 @@ DEVICE_MODE: Final = 0x6042
 CONTROL_MODE: Final = 0x6043
 SET_POINT: Final = 0x6300
 ACTUAL_VALUE: Final = 0x6301
-SENSORS: Final = 0x2100
 
 BY_BUS: Final = 1  # device mode: the set point comes by the bus
 POSITION_OPEN_LOOP: Final = 1  # control mode: the spool follows the set point

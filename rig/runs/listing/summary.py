@@ -122,11 +122,6 @@ def _count_journal(path: Path) -> Written:
     return Written(len(marks), partial, inside, lost, 0, total - inside)
 
 
-def list_runs(folder: str | Path) -> list[RunSummary]:
-    """List the runs in a folder (or the one it is), oldest first; raises InputError."""
-    return in_order([summarise(child) for child in run_folders(folder)])
-
-
 def run_folders(folder: str | Path) -> list[Path]:
     """Return the run folders in a folder, or itself if it is one; raises InputError."""
     root = Path(folder)

@@ -21,7 +21,6 @@ from analysis.simulation.simulate import (
     Simulation,
     State,
     compiled,
-    rates_of,
     simulate,
 )
 from analysis.terms import baseline_of, make
@@ -29,6 +28,7 @@ from analysis.terms.base import Used
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 from rig.runs.rigs import load_rig
+from tests.analysis.right_hand_side import rates_of
 
 pytest.importorskip("fmpy")
 if compiler_missing() or platform.machine() != "x86_64" or platform.system() != "Linux":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,7 +14,7 @@ from hil_sim.device.server import TCP
 from hil_sim.faults.device import DeviceFault
 from hil_sim.faults.wire import WireFault
 from rig.cli.bench.fault_bench import fault_bench
-from rig.cli.bench.fault_figures import RIG, by_fault, counted
+from rig.cli.bench.fault_figures import RIG, counted
 from rig.cli.bench.fault_trials import Outcome, kinds, try_fault, wires
 from rig.cli.bench.figures import text
 from rig.model.trips import SafetyTrip
@@ -67,10 +68,29 @@ def noticed(outcomes: Sequence[Outcome]) -> str:
     return "\n".join("| " + " | ".join(cells) + " |" for cells in rows)
 
 
+def _by_fault(outcomes: Sequence[Outcome]) -> list[tuple[str, ...]]:
+    """Return a row for each fault and wire: how often each naming came, and the slowest end."""
+    groups: dict[tuple[str, str], list[Outcome]] = {}
+    for fault in dict.fromkeys(outcome.fault for outcome in outcomes):
+        for wire in wires():
+            group = [o for o in outcomes if o.fault == fault and o.wire == wire]
+            if group:
+                groups[fault, wire] = group
+    rows: list[tuple[str, ...]] = []
+    for (fault, wire), group in groups.items():
+        namings = Counter(str(o.naming) for o in group).most_common()
+        ends = [o.seconds for o in group if o.seconds is not None]
+        rows.append((
+            fault, wire, str(len(group)), ", ".join(f"{count} {name}" for name, count in namings),
+            f"{max(ends):.2f} s" if ends else "",
+        ))  # fmt: skip
+    return rows
+
+
 def counts(outcomes: Sequence[Outcome]) -> str:
     """Return the counts of many sessions as Markdown: the figures, then a row a fault and wire."""
     head = ("fault", "wire", "sessions", "ended as", "slowest end")
-    rows = [head, tuple("---" for _ in head), *by_fault(outcomes)]
+    rows = [head, tuple("---" for _ in head), *_by_fault(outcomes)]
     table = "\n".join("| " + " | ".join(cells) + " |" for cells in rows)
     return f"```text\n{text(counted(outcomes))}\n```\n\n{table}"
 

@@ -1,4 +1,4 @@
-"""The simulated bench as a node on a bus of python-can.
+"""The simulated bench as a node on a bus of python-can, as no program of Bramah runs it.
 
 `virtual` is a bus inside one process, `socketcan` a real or a virtual one of Linux.
 """
