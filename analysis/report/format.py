@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import PurePosixPath
 
+from rig.model import units
 from rig.model.parameters import GAIN_SIGNS
+from rig.model.units import DisplayUnit, typeset
 
 DASH = "—"
 MINUS = "−"
@@ -19,30 +21,10 @@ _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 MAX_DIGITS = 6  # no measurement here is worth more
 
 
-@dataclass(frozen=True)
-class DisplayUnit:
-    """How an SI quantity is shown: shown number = scale * SI number, then `text`."""
-
-    scale: float
-    text: str
-
-
-_UNITS = {
-    "Pa": DisplayUnit(1e-6, "MPa"),
-    "m^3/(s*V*Pa^0.5)": DisplayUnit(1e7, "10⁻⁷ m³/(s·V·√Pa)"),
-    "kg*m^2": DisplayUnit(1.0, "kg·m²"),
-    "kg*m": DisplayUnit(1.0, "kg·m"),
-    "N*m*s/rad": DisplayUnit(1.0, "N·m·s/rad"),
-    "N*m": DisplayUnit(1.0, "N·m"),
-    "m^3/s": DisplayUnit(1e6, "mL/s"),
-    "m": DisplayUnit(1e3, "mm"),
-    "V": DisplayUnit(1.0, "V"),
-}
-
-
 def display_unit(si: str) -> DisplayUnit:
     """Return the display unit of an SI unit as pint writes it; an unknown one is shown as it is."""
-    return _UNITS.get(si) or DisplayUnit(1.0, si.replace("*", "·"))
+    shown = units.display_unit(si, units.RESULTS)
+    return replace(shown, text=typeset(shown.text))
 
 
 def _tidy(text: str) -> str:

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Self
 
 from rig.model.parse import InputError
+from rig.model.units import LIMITS, display_unit
 
 
 @dataclass(frozen=True)
@@ -164,11 +165,9 @@ class CheckReport:
         }
 
 
-_SHOWN = {"m": (1e3, "mm"), "Pa": (1e-6, "MPa"), "Pa/s": (1e-9, "GPa/s"), "m^3/s": (6e4, "L/min")}
-
-
 def _text(step: str, line: MotionPrediction) -> str:
-    scale, unit = _SHOWN.get(line.unit, (1.0, line.unit))
+    shown = display_unit(line.unit, LIMITS)
+    scale, unit = shown.scale, shown.text
     who = "the bench" if line.joint is None else f"joint {line.joint}"
     low, high = scale * line.low, scale * line.high
     return (

@@ -11,19 +11,14 @@ from analysis.identify.result import Identification
 from analysis.simulation.model import Estimate
 from analysis.simulation.validate import RecordValidation
 from rig.cli.output import table
-from rig.model.quantity import unit_map
-
-# SI unit of a parameter -> the unit it is shown in
-_SHOWN = {"Pa": "MPa"}
-_RESIDUAL = {"m": (1e3, "mm"), "rad": (1e3, "mrad"), "Pa": (1e-3, "kPa")}
+from rig.model.units import RESIDUALS, RESULTS, DisplayUnit, typeset
 
 
 def _shown(estimate: Estimate) -> tuple[float, str]:
-    unit = _SHOWN.get(estimate.unit, estimate.unit)
-    scale, _ = unit_map(estimate.unit, unit) if unit != estimate.unit else (1.0, 0.0)
-    return scale, unit.replace("*", "·").replace("^2", "²").replace("^3", "³").replace(
-        "Pa^0.5", "√Pa"
-    )
+    unit = DisplayUnit(1.0, estimate.unit)
+    if estimate.unit == "Pa":
+        unit = RESULTS[estimate.unit]
+    return unit.scale, typeset(unit.text)
 
 
 def _percent(value: float, digits: int = 2) -> str:
@@ -87,14 +82,14 @@ def validation_text(results: Sequence[RecordValidation]) -> str:
     for result in results:
         for name, fit in result.fit.items():
             si = result.units.get(name, "m" if name.startswith("piston") else "Pa")
-            scale, unit = _RESIDUAL[si]
+            unit = RESIDUALS[si]
             rows.append(
                 [
                     f"{result.record} {name}",
                     _percent(fit, 1),
-                    f"{scale * result.rmse[name]:.3g}",
-                    f"{scale * result.window_rmse[name]:.3g}",
-                    unit,
+                    f"{unit.scale * result.rmse[name]:.3g}",
+                    f"{unit.scale * result.window_rmse[name]:.3g}",
+                    unit.text,
                 ]
             )
     lines = [table(["record and channel", "FIT", "RMSE", "0.25 s RMSE", "unit"], rows)]

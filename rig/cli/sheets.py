@@ -8,16 +8,15 @@ from protocols.design.check_report import CheckReport, Moment, MotionPrediction
 from protocols.design.proof import Proof, Verdicts
 from protocols.files.plan import Plan
 from rig.cli.output import table
-from rig.model.quantity import unit_map
+from rig.model.units import LIMITS, display_unit
 
 _BAR = 40  # characters of the timeline
 _PICTURE = 30  # characters between the two limits
-_SHOWN = {"m": "mm", "Pa": "MPa", "Pa/s": "GPa/s", "m^3/s": "L/min"}
 
 
 def _cells(step: str, line: MotionPrediction) -> list[str]:
-    unit = _SHOWN.get(line.unit, line.unit)
-    scale = 1.0 / unit_map(unit, line.unit)[0]
+    shown = display_unit(line.unit, LIMITS)
+    scale, unit = shown.scale, shown.text
     place = "bench" if line.joint is None else f"joint {line.joint}"
     low, high, least, most, margin = (
         f"{scale * value:.3g}"
@@ -87,8 +86,8 @@ def envelope_text(report: CheckReport) -> str:
 
 def margin_words(line: MotionPrediction) -> str:
     """Say how far a prediction stays from its nearer limit, and on which side."""
-    unit = _SHOWN.get(line.unit, line.unit)
-    scale = 1.0 / unit_map(unit, line.unit)[0]
+    shown = display_unit(line.unit, LIMITS)
+    scale, unit = shown.scale, shown.text
     below, above = line.low - line.allowed_low, line.allowed_high - line.high
     upper = line.joint is None or above <= below
     room = above if upper else below

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from rig.model.rig import Rig
+from rig.model.units import LIMITS, display_unit
 
 FINITE: Final = "finite samples"
 SATURATED: Final = "saturated sensor"
@@ -23,8 +24,6 @@ DRIFTS: Final = "drift at rest"
 NOISY: Final = "noisy sensor"
 
 _LARGEST = 1e300  # an end beyond is none
-# People read bar-sized and millimetre-sized numbers better than exponents.
-_SHOWN = {"Pa": (1e-6, "MPa"), "Pa/s": (1e-9, "GPa/s"), "m": (1e3, "mm")}
 
 
 @dataclass(frozen=True)
@@ -42,8 +41,8 @@ class Violation:
 
 def show(value: float, unit: str) -> str:
     """Write a value for a person: '9.31 MPa'."""
-    factor, shown = _SHOWN.get(unit, (1.0, unit))
-    return f"{value * factor:.4g} {shown}"
+    shown = display_unit(unit, LIMITS)
+    return f"{value * shown.scale:.4g} {shown.text}"
 
 
 def _open(end: float) -> bool:
@@ -66,8 +65,8 @@ def _allowed(violation: Violation) -> str:
         return f"at least {show(low, violation.unit)}"
     if _open(low):
         return f"at most {show(high, violation.unit)}"
-    factor, shown = _SHOWN.get(violation.unit, (1.0, violation.unit))
-    return f"{low * factor:.4g} to {high * factor:.4g} {shown}"
+    shown = display_unit(violation.unit, LIMITS)
+    return f"{low * shown.scale:.4g} to {high * shown.scale:.4g} {shown.text}"
 
 
 def describe(violation: Violation, rig: Rig) -> str:

@@ -1,14 +1,15 @@
-"""The units that files usually name, in a table of our own: pint takes a third of a second to load.
+"""The units that files name and people read, in tables: pint takes a third of a second to load.
 
 Products, quotients and powers of them with SI prefixes are understood; whatever else is left to
-pint (`rig.model.quantity`). What is answered here is what pint answers.
+pint (`rig.model.quantity`). What is answered here is what pint answers. The tables at the end say
+in which unit an SI quantity is shown: on the screen, as a limit, as a result, as a residual.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -131,3 +132,51 @@ def _product(tokens: Iterator[str], end: str) -> Measure:
         if token not in ("*", "/"):
             raise ValueError(token)
         sign = 1.0 if token == "*" else -1.0
+
+
+@dataclass(frozen=True)
+class DisplayUnit:
+    """How an SI quantity is shown: shown number = scale * SI number, its unit, fixed decimals."""
+
+    scale: float
+    text: str
+    decimals: int = 3
+
+
+_MPA: Final = DisplayUnit(1e-6, "MPa", 2)
+_MM: Final = DisplayUnit(1e3, "mm", 1)
+READINGS: Final = {  # of a channel, on the operator's screen
+    "Pa": _MPA,
+    "m": _MM,
+    "degC": DisplayUnit(1.0, "°C", 1),
+    "rad": DisplayUnit(180.0 / math.pi, "°", 1),
+}
+LIMITS: Final = {
+    "Pa": _MPA,
+    "Pa/s": DisplayUnit(1e-9, "GPa/s"),
+    "m": _MM,
+    "m^3/s": DisplayUnit(6e4, "L/min"),
+}
+RESULTS: Final = {  # parameters and the errors of equations
+    "Pa": _MPA,
+    "m": _MM,
+    "m^3/s": DisplayUnit(1e6, "mL/s"),
+    "m^3/(s*V*Pa^0.5)": DisplayUnit(1e7, "10⁻⁷ m³/(s·V·√Pa)"),
+}
+RESIDUALS: Final = {
+    "Pa": DisplayUnit(1e-3, "kPa"),
+    "m": _MM,
+    "rad": DisplayUnit(1e3, "mrad"),
+}
+
+
+def display_unit(si: str, table: Mapping[str, DisplayUnit]) -> DisplayUnit:
+    """Return how an SI unit is shown; one that the table does not hold is shown in SI."""
+    return table.get(si) or DisplayUnit(1.0, si)
+
+
+def typeset(unit: str) -> str:
+    """Return a unit as pint writes it with raised powers, dots and roots: N·m, m²."""
+    for plain, set_ in (("*", "·"), ("^2", "²"), ("^3", "³"), ("Pa^0.5", "√Pa")):
+        unit = unit.replace(plain, set_)
+    return unit

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Final
+
+from rig.model.units import READINGS, display_unit
 
 
 @dataclass(frozen=True)
@@ -33,18 +34,10 @@ class Shown:
         return text.replace("-", "−")
 
 
-SHOWN: Final[dict[str, Shown]] = {
-    "Pa": Shown("MPa", 1e-6, 2),
-    "m": Shown("mm", 1e3, 1),
-    "V": Shown("V", 1.0, 3),
-    "degC": Shown("°C", 1.0, 1),
-    "rad": Shown("°", 180.0 / math.pi, 1),
-}
-
-
 def shown(unit: str) -> Shown:
     """Return how an SI unit is shown; one not listed keeps its own name."""
-    return SHOWN.get(unit, Shown(unit, 1.0, 3))
+    known = display_unit(unit, READINGS)
+    return Shown(known.text, known.scale, known.decimals)
 
 
 class Band(IntEnum):

@@ -12,7 +12,16 @@ from hypothesis import strategies as st
 
 from rig.model import units
 from rig.model.quantity import UnitError, map_by_pint, parse_quantity, to_si, unit_map
-from rig.model.units import differs, linear_map, measure
+from rig.model.units import (
+    LIMITS,
+    READINGS,
+    RESIDUALS,
+    RESULTS,
+    DisplayUnit,
+    differs,
+    linear_map,
+    measure,
+)
 
 SHIPPED = ("boom-1dof", "digger-3dof", "electric-2dof", "emps", "shinshu-2dof", "uia-crane")
 
@@ -156,3 +165,11 @@ def test_the_shipped_protocols_are_read_without_pint() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("table", [READINGS, LIMITS, RESIDUALS, RESULTS])
+def test_a_display_unit_scales_as_pint_does(table: dict[str, DisplayUnit]) -> None:
+    for si, shown in table.items():
+        if "√" not in shown.text:
+            unit = {"°": "deg", "°C": "degC"}.get(shown.text, shown.text)
+            assert shown.scale * map_by_pint(unit, si)[0] == pytest.approx(1.0, rel=1e-12), si
