@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from hil_sim.device.laws import DeviceLaw, LawTable, Refused
 from hil_sim.device.queue import BlockQueue
 from hil_sim.faults.device import ClockDrift, ClockJump, DeviceFault, QueueOverrun, Reboots
+from hil_sim.plant.prefetch import Prefetch, Rewindable
 from rig.model import registers as reg
 from rig.model.parts import WATCHDOG_RANGE
 from rig.model.registers import BlockHeader, Refusal, Status, TripCause
@@ -74,7 +75,10 @@ class Device:
         self.on_restart: Callable[[], None] = lambda: None
         self._faults = sorted(faults, key=lambda fault: fault.at)
         self._virtual_silence = virtual_silence
-        self._plant = plant
+        # In real time the plant is never ahead of the clock; faults may change it between blocks.
+        ahead = not realtime and not faults and isinstance(plant, Rewindable)
+        self._prefetch = Prefetch(plant) if ahead and isinstance(plant, Rewindable) else None
+        self._plant: Plant = plant if self._prefetch is None else self._prefetch
         self._clock = clock
         self._heard = self._polled = self._origin = clock()
         self._drift = 0.0  # by which share the sample clock runs fast
@@ -204,6 +208,14 @@ class Device:
         self.catch_up()
         if not self.realtime and self.streaming and not len(self.queue):
             self._run(self.layout.samples)
+
+    def prefetch(self) -> None:
+        """Compute, while nobody waits, what the host will most likely read next.
+
+        Nothing of it shows before it is read, and a change of laws makes it void.
+        """
+        if self._prefetch is not None and self.streaming and not self._broken:
+            self._prefetch.prefetch(self.layout.samples, self.laws.active)
 
     # -- what happens by itself -------------------------------------------------------------
 

@@ -6,7 +6,6 @@ import struct
 from typing import Protocol
 
 from pymodbus.constants import ExcCodes
-from pymodbus.datastore import ModbusServerContext
 from pymodbus.pdu import ExceptionResponse, ModbusPDU
 
 from hil_sim.device.laws import Refused
@@ -58,8 +57,8 @@ class Request(ModbusPDU):
         """Carry the request out; returns what follows the function code of the answer."""
         raise NotImplementedError
 
-    async def datastore_update(self, context: ModbusServerContext, device_id: int) -> ModbusPDU:
-        """Answer, or say why not in the terms of Modbus."""
+    def answered(self) -> ModbusPDU:
+        """Return the answer, or why there is none in the terms of Modbus."""
         try:
             return Answer(self.function_code, self.answer())
         except Refused as refused:

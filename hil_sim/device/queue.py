@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,7 +67,9 @@ class BlockQueue:
         self._filled += len(measured)
         if self._filled < self._layout.samples:
             return
-        rows = [np.concatenate(part) for part in zip(*self._parts, strict=True)]
+        rows: Sequence[Codes] = self._parts[0]
+        if len(self._parts) > 1:
+            rows = [np.concatenate(part) for part in zip(*self._parts, strict=True)]
         self._parts.clear()
         self._filled = 0
         if self._to_lose:

@@ -74,12 +74,15 @@ class RtuLine:
         self._received += data
         while (length := frame_length(self._received)) is not None:
             if len(self._received) < length:
-                return
+                break
             frame, self._received = self._received[:length], self._received[length:]
-            answer = asyncio.ensure_future(self._answer(frame))
-            answer.add_done_callback(_raised)
+            try:
+                self._answer(frame)
+            except OSError as error:
+                logger.error("a request failed: %s", error)
+        self._device.prefetch()
 
-    async def _answer(self, frame: bytes) -> None:
+    def _answer(self, frame: bytes) -> None:
         if self._device.boots:
             return
         if not sound(frame):
@@ -96,7 +99,7 @@ class RtuLine:
             assert isinstance(request, Request)
             request.session = self._session
             request.decode(frame[2:-2])
-            answer = await request.datastore_update(None, ADDRESS)  # type: ignore[arg-type]
+            answer = request.answered()
         if self._device.boots:  # since it has begun to answer
             return
         body = bytes([ADDRESS, answer.function_code]) + answer.encode()
@@ -124,11 +127,6 @@ def checksum(data: bytes) -> bytes:
 def sound(frame: bytes) -> bool:
     """Tell whether a frame's checksum is right."""
     return frame[-2:] == checksum(frame[:-2])
-
-
-def _raised(answer: asyncio.Future[None]) -> None:
-    if not answer.cancelled() and (error := answer.exception()) is not None:
-        logger.error("a request failed: %s", error)
 
 
 async def serve_line(

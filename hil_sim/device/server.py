@@ -11,7 +11,8 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
 from pymodbus.constants import ExcCodes
-from pymodbus.pdu import ModbusPDU
+from pymodbus.exceptions import ModbusIOException
+from pymodbus.pdu import ExceptionResponse
 from pymodbus.server import ModbusTcpServer
 from pymodbus.server.requesthandler import ServerRequestHandler
 from pymodbus.simulator import DataType, SimData, SimDevice
@@ -58,35 +59,67 @@ WIRES: Final = (TCP, RTU, SERIAL, CAN, SLCAN, VALVES)
 BITRATE: Final = 1_000_000  # of the simulated bus, where nothing else is said
 
 
-class _Session:
-    """What one connection is to the device: an identity, and the news of its end."""
+class _Connection(ServerRequestHandler):
+    """One connection, which answers requests as they arrive, in order, several at once or not.
 
-    def __init__(self, device: Device, registers: RegisterMap) -> None:
+    The library hands every request to another turn of the event loop, by a write to a pipe of its
+    own: more work than the answer, and a second request of the same segment would be lost by it.
+    """
+
+    def __init__(self, server: BenchServer, device: Device, registers: RegisterMap) -> None:
+        super().__init__(server, None, None, self._connection)  # type: ignore[no-untyped-call]
         self._device = device
         self.registers = registers
-        self.handler: ServerRequestHandler | None = None
 
-    def tag(self, sending: bool, pdu: ModbusPDU) -> ModbusPDU:
-        """Tell an incoming request which connection it came by."""
-        if not sending and isinstance(pdu, Request):
-            pdu.session = self
-        return pdu
+    def data_received(self, data: bytes) -> None:
+        """Answer every whole request that has arrived; keep what is not whole yet."""
+        waiting = self.recv_buffer + data
+        used = 1
+        while waiting and used:
+            used = self._answer_first(waiting)
+            waiting = waiting[used:]
+        self.recv_buffer = waiting if len(waiting) <= self.max_buffer_size else b""
+        self._device.prefetch()
 
-    def connection(self, connected: bool) -> None:
+    def _answer_first(self, data: bytes) -> int:
+        """Answer the request that begins `data`; returns its bytes, 0 while it is not whole."""
+        try:
+            used, request = self.framer.handleFrame(data, 0, 0)
+        except ModbusIOException as error:
+            bad = ExceptionResponse(
+                error.fcode or 0,
+                ExcCodes.ILLEGAL_FUNCTION,
+                device_id=error.dev_id,
+                transaction=error.transaction_id,
+            )
+            self.pdu_send(bad)
+            return len(data)
+        if request is None:
+            return used
+        if isinstance(request, Request):
+            request.session = self
+            answer = request.answered()
+        else:
+            answer = ExceptionResponse(request.function_code, ExcCodes.ILLEGAL_FUNCTION)
+        answer.transaction_id, answer.dev_id = request.transaction_id, request.dev_id
+        if self.transport:  # the device may have restarted meanwhile
+            self.pdu_send(answer)
+        return used
+
+    def _connection(self, connected: bool) -> None:
         """Pass the end of the connection on; a device that boots takes none."""
         if not connected:
             self._device.disconnected(self)
-        elif self._device.boots and self.handler is not None:
-            _abort(self.handler)
+        elif self._device.boots:
+            _abort(self)
 
 
 class BenchServer(ModbusTcpServer):
     """A Modbus TCP server whose registers are one device's."""
 
     def __init__(self, device: Device, host: str, port: int) -> None:
-        # The library wants a store; ours answers every function that the map does not know.
-        nothing = SimData(0, count=1, values=0, datatype=DataType.REGISTERS)
-        store = SimDevice(0, simdata=nothing, action=_no_such_function)
+        # The library wants a store; none of its registers is ever read.
+        store = SimDevice(0, simdata=SimData(0, values=0, datatype=DataType.REGISTERS))
         super().__init__(store, address=(host, port), custom_pdu=REQUESTS)
         self._address = (host, port)
         self._device = device
@@ -110,11 +143,7 @@ class BenchServer(ModbusTcpServer):
 
     def callback_new_connection(self) -> ServerRequestHandler:
         """Make the handler of one connection."""
-        session = _Session(self._device, self._registers)
-        session.handler = ServerRequestHandler(  # type: ignore[no-untyped-call]
-            self, None, session.tag, session.connection
-        )
-        return session.handler
+        return _Connection(self, self._device, self._registers)
 
     def abort_connections(self) -> None:
         """End every connection without a goodbye, as a restart does."""
@@ -248,7 +277,3 @@ async def _end_with(parent: int, stop: asyncio.Event) -> None:
 def _abort(connection: ModbusProtocol) -> None:
     if isinstance(connection.transport, asyncio.WriteTransport):
         connection.transport.abort()
-
-
-async def _no_such_function(*_args: object) -> ExcCodes:
-    return ExcCodes.ILLEGAL_FUNCTION

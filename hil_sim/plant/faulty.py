@@ -52,6 +52,8 @@ class FaultyPlant:
 
     def advance(self, ticks: int, laws: Sequence[Law]) -> tuple[Codes, Codes]:
         """Run `ticks` ticks as `Plant.advance` does, faults beginning and ending in between."""
+        if not self._faults:
+            return self.plant.advance(ticks, laws)
         parts = [self.plant.advance(0, laws)]
         while ticks > 0:
             self._switch()
@@ -60,6 +62,14 @@ class FaultyPlant:
             ticks -= count
         measured, outputs = zip(*parts, strict=True)
         return np.concatenate(measured), np.concatenate(outputs)
+
+    def mark(self) -> object | None:
+        """Return what `rewind` needs to come back to now; None with faults, which do not undo."""
+        return None if self._faults else self.plant.mark()
+
+    def rewind(self, mark: object) -> None:
+        """Be as at the mark."""
+        self.plant.rewind(mark)
 
     def _until_next(self) -> int:
         edges = [edge for one in self._faults for edge in (one.first, one.end) if edge > self.tick]

@@ -60,7 +60,7 @@ BENCH: Final = _records(
     "tank_pressure tank_resistance tank_lag "
     "temperature band period_1 phase_1 period_2 phase_2 bulk_temperature viscosity_temperature",
 )
-CHANNEL: Final = _records("kind joint", "noise gain offset lag low step top")
+CHANNEL: Final = _records("kind joint", "noise gain offset lag low step scale top")
 LAW: Final = _records("start first period", "gain bias position_gain setpoint limit")
 
 

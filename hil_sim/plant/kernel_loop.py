@@ -223,8 +223,9 @@ def run(
 ) -> None:
     """Run len(measured) ticks: measure, evaluate the laws, hold the outputs for one period.
 
-    In place: state y, spool, rings values and slopes (ring, channels). Out: measured SI values
-    before coding (ticks, channels), DA codes (ticks, joints). `noise` is standard normal.
+    In place: state y, spool, rings values and slopes (ring, channels). Out: AD codes (ticks,
+    channels) as `rig.model.codes.encode_input` defines them, DA codes (ticks, joints). `noise` is
+    standard normal, (ticks, channels).
     """
     n, bench = len(joints), bench_table[0]
     w, k, ends = np.zeros((n + 4, n)), np.zeros((5, len(y))), np.zeros((2, 3, n))
@@ -239,9 +240,9 @@ def run(
             h = channels[c]
             true = delayed(tick, c, h.lag / period, values, slopes)
             read = h.gain * true + h.offset + h.noise * noise[row, c]
-            measured[row, c] = read
+            code = min(max(np.rint((read - h.low) * h.scale), 0.0), h.top)
+            measured[row, c] = int(code)
             if h.kind == _PISTON:
-                code = min(max(np.rint((read - h.low) / h.step), 0.0), h.top)
                 position[h.joint] = h.low + code * h.step
         for i in range(n):
             codes[row, i] = output(laws[i], waves, tick, position[i], joints[i])

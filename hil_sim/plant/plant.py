@@ -6,8 +6,10 @@ Deterministic for (rig, scenario, seed); how the ticks are divided into calls ch
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +17,7 @@ from numpy.typing import NDArray
 from hil_sim.effects.base import Tables
 from hil_sim.plant import kernel, kernel_loop
 from hil_sim.plant.kernel_data import ATMOSPHERE, LAW, record
-from hil_sim.plant.sensors import converters, encode, ring_length
+from hil_sim.plant.sensors import ring_length
 from hil_sim.plant.tables import build
 from hil_sim.scenario.file import Scenario
 from hil_sim.scenario.truth import load_machine
@@ -25,6 +27,7 @@ from rig.model.rig import Rig
 # Longest integration step [s]. plant_bench.accuracy gives 3e-7 of the pressures' range with it
 # (1e-7 at 1/6 ms, 8e-7 at 1/4 ms); the stiffest edge, wide open at an end stop, allows 1/4 ms.
 STEP = 2e-4
+DRAWN: Final = 256  # ticks of noise drawn at once, and kept for going back
 
 
 @dataclass(frozen=True)
@@ -61,10 +64,11 @@ class Plant:
         self._period = 1.0 / rig.sample_rate
         self._substeps = math.ceil(self._period / STEP * (1.0 - 1e-9))
         self._state, self._spool = rest(self._tables)
-        self._converters = converters(rig)
+        self._joints, self._width = len(rig.joints), len(rig.channels)
+        self._draws, self._used = np.empty((0, self._width)), 0
         self._laws: tuple[Law, ...] = ()
-        channels, ring = len(rig.channels), ring_length(self._tables.channels, self._period)
-        self._values, self._slopes = np.zeros((ring, channels)), np.zeros((ring, channels))
+        ring = ring_length(self._tables.channels, self._period)
+        self._values, self._slopes = np.zeros((ring, self._width)), np.zeros((ring, self._width))
         self._fill_history()
         # Compile (or load) the tick loop now: the first block asked for should not wait for it.
         self.advance(0, [Law()] * len(rig.joints))
@@ -77,15 +81,13 @@ class Plant:
         keeps the wave it had: give a new Law for a new wave. Raises ValueError for a wrong
         number of laws.
         """
-        joints, channels = len(self._rig.joints), len(self._rig.channels)
+        joints = self._joints
         if len(laws) != joints:
             raise ValueError(f"{len(laws)} laws for {joints} joint(s)")
-        if len(self._laws) != joints or any(
-            a is not b for a, b in zip(laws, self._laws, strict=True)
-        ):
+        if len(self._laws) != joints or not all(map(operator.is_, laws, self._laws)):
             self._laws, self._law_table = tuple(laws), _law_table(laws)
         table, waves = self._law_table
-        measured = np.empty((ticks, channels))
+        measured = np.empty((ticks, self._width), dtype=np.int64)
         outputs = np.empty((ticks, joints), dtype=np.int64)
         t = self._tables
         kernel_loop.run(
@@ -102,12 +104,40 @@ class Plant:
             t.channels,
             table,
             waves,
-            self._noise.standard_normal((ticks, channels)),
+            self._drawn(ticks),
             measured,
             outputs,
         )
         self.tick += ticks
-        return encode(measured, self._converters), outputs
+        return measured, outputs
+
+    def mark(self) -> object:
+        """Return what `rewind` needs to come back to now."""
+        state = (self._state, self._spool, self._values, self._slopes)
+        return self.tick, [array.copy() for array in state]
+
+    def rewind(self, mark: Any) -> None:
+        """Be as at the mark, as if nothing had been computed since; the same noise comes again."""
+        tick, before = mark
+        self._used -= self.tick - tick
+        self.tick = tick
+        state = (self._state, self._spool, self._values, self._slopes)
+        for array, values in zip(state, before, strict=True):
+            array[:] = values
+
+    def _drawn(self, ticks: int) -> Array:
+        """Return the noise of the next `ticks` ticks, (ticks, channels).
+
+        What was drawn last is kept for as long as `rewind` may want it again.
+        """
+        first, last = self._used, self._used + ticks
+        if last > len(self._draws):
+            fresh = self._noise.standard_normal((max(DRAWN, last - len(self._draws)), self._width))
+            keep = max(first - DRAWN, 0)
+            self._draws = np.concatenate([self._draws[keep:], fresh])
+            first, last = first - keep, last - keep
+        self._used = last
+        return self._draws[first:last]
 
     @property
     def tables(self) -> Tables:

@@ -8,13 +8,10 @@ tick: along the tangent of the true signal), and shows the world as it was `dela
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from hil_sim.plant.kernel_data import CHANNEL, KIND, Table
-from rig.model import codes
 from rig.model.channels import kind_of
 from rig.model.rig import Rig
 
@@ -35,6 +32,7 @@ def channel_table(rig: Rig, noise: float) -> Table:
             "lag": sensor.delay - k * rig.sensors.skew,
             "low": low,
             "step": (high - low) / top,
+            "scale": top / (high - low),
             "top": top,
         }
         for field, value in row.items():
@@ -46,31 +44,3 @@ def ring_length(table: Table, period: float) -> int:
     """Return how many ticks of history the longest lag needs."""
     longest = float(np.max(table["lag"], initial=0.0))
     return max(math.ceil(longest / period), 0) + 3
-
-
-@dataclass(frozen=True)
-class Converter:
-    """Channels that share one range and width: their columns, then low, high and bits."""
-
-    columns: tuple[int, ...]
-    low: float
-    high: float
-    bits: int
-
-
-def converters(rig: Rig) -> tuple[Converter, ...]:
-    """Return the AD converters of `rig`; together they cover every channel once."""
-    shared: dict[tuple[float, float, int], list[int]] = {}
-    for k, name in enumerate(rig.channels):
-        sensor = rig.sensors.of(kind_of(name)[0])
-        shared.setdefault((*sensor.range, sensor.bits), []).append(k)
-    return tuple(Converter(tuple(columns), *key) for key, columns in shared.items())
-
-
-def encode(measured: codes.Array, parts: Sequence[Converter]) -> codes.Codes:
-    """Return the AD codes of measured SI values, both (ticks, channels)."""
-    out = np.empty(measured.shape, dtype=np.int64)
-    for part in parts:
-        columns = list(part.columns)
-        out[:, columns] = codes.encode_input(measured[:, columns], part.low, part.high, part.bits)
-    return out

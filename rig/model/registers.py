@@ -208,8 +208,11 @@ def unpack_header(data: bytes) -> BlockHeader:
 
 def pack_samples(measured: ArrayLike, commands: ArrayLike) -> bytes:
     """Return the bytes of AD codes (n, channels) and signed DA codes (n, joints), row by row."""
-    rows = np.hstack([np.asarray(measured, np.int64), np.asarray(commands, np.int64) & 0xFFFF])
-    return rows.astype(">u2").tobytes()
+    codes, outputs = np.asarray(measured), np.asarray(commands)
+    rows = np.empty((len(codes), codes.shape[1] + outputs.shape[1]), ">u2")
+    rows[:, : codes.shape[1]] = codes
+    rows[:, codes.shape[1] :] = outputs  # two's complement, as the cast wraps
+    return rows.tobytes()
 
 
 def unpack_samples(

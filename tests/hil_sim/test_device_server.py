@@ -169,3 +169,20 @@ def test_noise_on_one_connection_does_not_disturb_another(port: int, server: soc
     with ModbusTcpClient("127.0.0.1", port=port, timeout=PATIENCE) as client:
         answer = client.read_holding_registers(reg.IDENTITY_MAGIC.address, count=2)
         assert answer.registers == [0x4252, 0x414D]
+
+
+def test_requests_that_arrive_together_or_in_pieces_are_answered_in_order(
+    server: socket.socket,
+) -> None:
+    body = b"\x01" + bytes.fromhex("03 0000 0002")
+    frames = [struct.pack(">HHH", number, 0, len(body)) + body for number in range(1, 6)]
+    stream = b"".join(frames)
+    for piece in (stream[:5], stream[5:30], stream[30:]):
+        server.sendall(piece)
+        time.sleep(0.02)
+    answers = b""
+    while len(answers) < 5 * 13:
+        answers += server.recv(300)
+    found = [answers[at : at + 13] for at in range(0, len(answers), 13)]
+    assert [struct.unpack_from(">H", answer)[0] for answer in found] == [1, 2, 3, 4, 5]
+    assert {answer[9:] for answer in found} == {bytes.fromhex("42524 14D".replace(" ", ""))}

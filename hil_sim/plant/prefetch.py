@@ -1,0 +1,71 @@
+"""A plant that is run ahead of its clock while nobody asks, and set back where that was wrong.
+
+In virtual time the next block is all but certain: the laws stay as they are. So it is computed
+while the host works on the block before it. It is used only if it is what would be
+computed then; otherwise the plant is set back, and nothing shows that it ever went ahead.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Sequence
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+Codes = NDArray[np.int64]
+
+
+@runtime_checkable
+class Rewindable(Protocol):
+    """A plant that can be set back to where it was."""
+
+    @property
+    def tick(self) -> int:
+        """Samples measured so far."""
+
+    def advance(self, ticks: int, laws: Sequence[Any]) -> tuple[Codes, Codes]:
+        """Run `ticks` samples; return AD codes (ticks, channels), DA codes (ticks, joints)."""
+
+    def mark(self) -> object | None:
+        """Return what `rewind` needs to come back to now; None where it cannot."""
+
+    def rewind(self, mark: object) -> None:
+        """Be as at the mark, as if nothing had been computed since."""
+
+
+class Prefetch:
+    """A plant with the block that will be asked for next, as far as anybody knows."""
+
+    def __init__(self, plant: Rewindable) -> None:
+        self._plant = plant
+        self._mark: object | None = None
+        self._laws: tuple[Any, ...] = ()
+        self._block: tuple[Codes, Codes] | None = None
+
+    @property
+    def tick(self) -> int:
+        """Samples measured so far; those computed ahead are not."""
+        return self._plant.tick - (0 if self._block is None else len(self._block[0]))
+
+    def prefetch(self, ticks: int, laws: Sequence[Any]) -> None:
+        """Compute the next `ticks` samples under `laws`, unless that is done or impossible."""
+        if self._block is not None or (mark := self._plant.mark()) is None:
+            return
+        try:
+            ahead = self._plant.advance(ticks, laws)
+        except Exception:  # raised again when the samples are asked for
+            self._plant.rewind(mark)
+            return
+        self._mark, self._laws, self._block = mark, tuple(laws), ahead
+
+    def advance(self, ticks: int, laws: Sequence[Any]) -> tuple[Codes, Codes]:
+        """Run `ticks` samples as the plant does."""
+        ahead, self._block = self._block, None
+        if ahead is not None:
+            same = len(laws) == len(self._laws) and all(map(operator.is_, laws, self._laws))
+            if same and len(ahead[0]) == ticks:
+                return ahead
+            self._plant.rewind(self._mark)
+        return self._plant.advance(ticks, laws)
