@@ -48,6 +48,7 @@ class Conductor:
         keep += round(SPARE * rig.sample_rate)
         self.session = Session(bench, rig, keep, desk.machine, self._heed)
         self._place = plan.place
+        self._parts = len(plan.sequence)
         self._on_phase = on_phase
         self._taken: dict[str, int] = {}  # complete records by step
         self._begun: dict[str, int] = {}  # the same, when the step was begun
@@ -81,6 +82,7 @@ class Conductor:
         """Begin a step of the plan's sequence; `rest` are those after it."""
         self._part, self._part_began = part, self.elapsed
         self._left = sum(after.seconds for after in rest)
+        self.bench.status(part=self._parts - len(rest))
 
     def left(self) -> float:
         """Return the expected time [s] to the end; conditions count as little as they may."""

@@ -36,8 +36,9 @@ from rig.bench.latch import BenchState
 from rig.bench.lateness import ArrivalClock, HostTiming
 from rig.bench.observers import Observers
 from rig.bench.outputs import UNSURE, Outputs
-from rig.bench.screens.commands import ACKNOWLEDGE, STOP, Judge
-from rig.bench.screens.display import Display
+from rig.bench.screens.commands import ACKNOWLEDGE, RELEASE, STOP, TAKE, Judge
+from rig.bench.screens.display import LOST, Display
+from rig.bench.screens.past import PlanLine
 from rig.bench.screens.sockets import Publisher
 from rig.bench.stops import StopFlag
 from rig.model.alarms.states import AlarmTable
@@ -55,6 +56,7 @@ from rig.runs.recorder import Recorder, RecordMeta
 
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
+_CONTROLS = {TAKE: "taken", RELEASE: "released"}
 
 
 class Bench:
@@ -94,7 +96,7 @@ class Bench:
         self._alarms = AlarmLog(rig, lambda event, tick, about: self.event(event, tick, **about))
         self._stop = StopFlag()
         self._signals = signals
-        self._display = Display(rig, publisher, str(recorder.folder) if recorder else "", clock)
+        self._display = Display(rig, publisher, _place(recorder), clock)
         self._arrival: ArrivalClock | None = None
         self._timing = HostTiming(rig.sample_rate)
         self._expected: int | None = None
@@ -150,13 +152,16 @@ class Bench:
         """
         self._outputs.close()
         until = self._clock() + wait
+        self.status(device=LOST)
         while self._clock() < until:
             self._heed()
+            self._display.repeat()
             time.sleep(min(0.1, max(0.0, until - self._clock())))
         self.info = self._connect()
         cause = self._outputs.safely(self._driver.trip_cause)
         if cause is not None:
             raise Latched(f"the device tripped meanwhile and stays so: {cause}", self.rig)
+        self.status(device="")
         self.restart()
 
     def __exit__(
@@ -182,7 +187,8 @@ class Bench:
         try:
             sure = not self._outputs.connected or self._outputs.zero()
             # A screen waits for this, and what follows can take seconds.
-            self._display.ended(state, message if sure else unsure)
+            lost = isinstance(error, DeviceLost)
+            self._display.ended(state, message if sure else unsure, lost=lost)
             if sure and not self._ends_at_zero(error):
                 log.error("%s: it still reports a command", UNSURE, extra={"alarm": True})
                 sure = False
@@ -353,6 +359,9 @@ class Bench:
                 self._stop.request("stopped by operator (from the screen)")
             elif command.word == ACKNOWLEDGE:
                 self.acknowledge(command.value or None)
+            elif command.word in (TAKE, RELEASE):
+                with suppress(RecordingFailed):  # the next block says so, with the outputs at zero
+                    self.event(f"controls {_CONTROLS[command.word]}", self.tick, by=command.holder)
         if self._stop.reason is not None:
             self.zero_outputs()
             with suppress(RecordingFailed):
@@ -401,8 +410,12 @@ class Bench:
         """Let `judge` take or refuse the commands of screens, all but the stop."""
         self._judge = judge
 
+    def describe(self, plan: Sequence[PlanLine]) -> None:
+        """Say which steps there will be."""
+        self._display.describe(plan)
+
     def status(self, **changes: Any) -> None:
-        """Say where the protocol stands: step phase repeat repeats total_s message engine."""
+        """Say where the protocol stands: the fields of `rig.bench.screens.snapshot.Progress`."""
         self._display.progress = replace(self._display.progress, **changes)
 
     def event(self, event: str, tick: int | None = None, **fields: Any) -> None:
@@ -430,6 +443,11 @@ class Bench:
                 raise ValueError("exchange a block first, or give start_tick: no tick is known yet")
             start_tick = self._expected
         return RecordHandle(self, what, start_tick, ticks)
+
+
+def _place(recorder: Recorder | None) -> str:
+    """Return the run's folder, absolute: a screen may have been started elsewhere."""
+    return "" if recorder is None else str(recorder.folder.absolute())
 
 
 def _outcome(error: BaseException | None) -> tuple[str, str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,6 +16,7 @@ from protocols.engine.states import Machine, State
 from protocols.files import library
 from protocols.files.plan import Overrides, Plan, resolve
 from rig.bench.latch import reset_bench
+from rig.bench.screens.past import PlanLine
 from rig.bench.screens.sockets import AttachError, Publisher
 from rig.bench.session import Bench
 from rig.cli.attended import TrackedEstimates, terminal_lines
@@ -74,9 +75,10 @@ class _Story:
             message=message,
         )
 
-    def tracked(self, estimate: str) -> None:
-        """Show an estimate beside what the run does."""
-        self._bench.status(message=f"{self._message}; {estimate}")
+    def tracked(self, estimate: str, parameters: Mapping[str, Any]) -> None:
+        """Show an estimate beside what the run does, and all of them with their intervals."""
+        known = {name: [found["value"], *found["ci95"]] for name, found in parameters.items()}
+        self._bench.status(message=f"{self._message}; {estimate}", estimates=known)
 
     def note(self, entry: dict[str, Any]) -> None:
         """Keep the estimates at a record's end in the run's log."""
@@ -131,9 +133,11 @@ def run_protocol(job: ProtocolJob, say: Say) -> Path:
         bench.recorded_after = plan.protocol.on_trip.record
         proof.keep(job.out)
         story = _Story(bench, say)
+        bench.describe([PlanLine(part.name, part.title, part.seconds) for part in plan.sequence])
         desk = Desk(machine=desk_machine, terminal=terminal_lines(job.attended))
         if tracking is not None:
-            tracking.tell(story.note, story.tracked)
+            followed = tracking  # for the closure: it is not None
+            tracking.tell(story.note, lambda text: story.tracked(text, followed.parameters))
             bench.observers.add(tracking)
             desk = replace(desk, estimates=TrackedEstimates(tracking))
         engine.run(plan, rig, bench, story.phase, desk)

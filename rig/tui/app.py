@@ -10,53 +10,64 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import ClassVar, Final
 
-from rich.text import Text
+from textual import events
 from textual.app import App, ComposeResult
 from textual.binding import Binding, BindingType
-from textual.widgets import ContentSwitcher, Footer, OptionList, RichLog
 
+from rig.bench.screens.commands import own_command
+from rig.bench.screens.sockets import Endpoint
+from rig.model.alarms.states import AlarmTable
+from rig.tui.acts import Acts
+from rig.tui.canvas import Canvas
 from rig.tui.link import FRAME, Frame, Link, LinkStage, LocalSessions, Sessions
-from rig.tui.panels import BenchPanel, HeaderPanel, Notices, PanelLook
-from rig.tui.screens import Chooser, Help, Waiting
-from rig.tui.units import age_text
-from rig.tui.words import OLD, KeyAnswer, Stop, is_live, notices
+from rig.tui.look import PAGES, Dialog, Look, View
+from rig.tui.pages.operation import in_order
+from rig.tui.pages.parts import joints_in
+from rig.tui.pages.whole import compose
+from rig.tui.story import KINDS
+from rig.tui.words import LINGER, KeyAnswer, Stop
 
-SPANS: Final = (5.0, 10.0, 30.0, 60.0, 120.0, 300.0, 600.0)  # of the plots [s of device time]
+SPANS: Final = (2.0, 5.0, 10.0, 30.0, 60.0)  # of the plots [s of device time]
+LONG_SPANS: Final = (*SPANS, 120.0, 300.0, 600.0)
 CROSSING: Final = 5.0  # least wall time in which a curve crosses its plot [s]
-SLOW: Final = 0.2  # ages and notices are redrawn this often even when nothing arrives [s]
+SLOW: Final = 0.2  # ages are redrawn this often where nothing arrives [s]
+BLINK: Final = 0.5  # half a period of what nobody has acknowledged [s]
+TWICE: Final = 0.7  # two presses of Escape within this time stop [s]
+ALARM_WINDOW: Final = 60.0  # of samples held while the alarms are looked at [s]
+
+HELP: Final = (
+    "SPACE, s or Esc-Esc   STOP: all outputs to zero, at once, on every page",
+    "1 … 9, 0              pages: overview, joint, channel, diagnostics, alarms,",
+    "                      protocol, log, estimates, manual, runs",
+    "t                     take the controls, or release them",
+    "p  n  x  a            pause or resume, skip the step, abort, answer",
+    "k  r                  acknowledge an alarm; reset a latched one, with a reason",
+    "← → ↑ ↓  PgUp PgDn    joint, channel, marked line, scroll",
+    "+  −  =               plots: longer, shorter, automatic;  z zooms to the data",
+    "h                     hold the picture; the run goes on",
+    "c                     choose another run",
+    "q                     quit this screen; the run goes on",
+    "",
+    "● normal  ? asks you  ▲ warning  ■ alarm  □ ended",
+    "◌ stale   ⊘ disconnected   ✕ invalid   ‖ held",
+)
 
 
 def automatic_span(speed: float) -> float:
     """Return the shortest span that a curve does not cross too fast to be read."""
     # A run in real time jitters around speed 1 and must not flip between two spans.
-    return next((s for s in SPANS[1:] if s / speed > CROSSING), SPANS[-1])
+    return next((s for s in LONG_SPANS[2:] if s / speed > CROSSING), LONG_SPANS[-1])
 
 
-class Monitor(App[int]):
-    """Attach, watch, stop."""
+class Monitor(Acts, App[int]):
+    """Attach, watch, stop, command."""
 
     TITLE = "bramah monitor"
     ENABLE_COMMAND_PALETTE = False
-    CSS = """
-    Screen { layout: vertical; }
-    #main { height: 1fr; }
-    #log { height: 3; padding: 0 1; scrollbar-size: 0 0; background: $background; }
-    .tall #log { height: 6; }
-    """
-    # Priority: no widget that has the focus, and no page on top, may swallow a stop.
+    CSS = "Screen { background: $background; }"
     BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("s,space", "stop", "STOP outputs", key_display="s/space", priority=True),
-        Binding("p", "pause", "pause"),
-        Binding("z", "zoom", "zoom"),
-        Binding("plus,equals_sign", "span(1)", "longer", show=False),
-        Binding("minus", "span(-1)", "shorter", show=False),
-        Binding("0", "span(0)", "automatic span", show=False),
-        Binding("up", "scroll(-1)", "scroll", show=False),
-        Binding("down", "scroll(1)", "scroll", show=False),
-        Binding("c", "choose", "runs"),
-        Binding("question_mark", "help", "help", key_display="?"),
-        Binding("q", "leave(0)", "quit, run goes on", priority=True),
         Binding("ctrl+c", "leave(130)", "quit", show=False, priority=True),
+        Binding("ctrl+q", "leave(0)", "quit", show=False, priority=True),
     ]
 
     def __init__(
@@ -67,31 +78,29 @@ class Monitor(App[int]):
         *,
         threaded: bool = True,
     ) -> None:
-        super().__init__()
-        self._rig, self._clock, self._threaded = rig, clock, threaded
+        App.__init__(self)
+        self.rig, self.clock, self._threaded = rig, clock, threaded
         self.link = Link(sessions or LocalSessions(rig), clock)
+        self.me = own_command("take").holder
+        self.look = Look()
+        self.dialog: Dialog | None = None
+        self.accept: Callable[[str], None] | None = None  # what the open question's answer does
+        self.remark = ""
+        self.stop_asked: Stop | None = None  # the newest stop and what became of it
+        self.seen_alarms: frozenset[tuple[int, str]] = frozenset()  # acknowledged after the end
+        self.reset_alarms: frozenset[tuple[int, str]] = frozenset()
+        self.marked_session: Endpoint | None = None
         self._span: float | None = None  # None: automatic
-        self._look = PanelLook()
-        self._held: Frame | None = None  # what a paused display shows
+        self._held: Frame | None = None  # what a held picture shows
         self._drawn: object = None
         self._slow = -float("inf")
-        self.stop_asked: Stop | None = None  # the newest stop and what became of it
-        self._told = 0
-        self._header, self._notices = HeaderPanel(id="header"), Notices(id="notices")
-        self._chooser, self._bench = Chooser(id="chooser"), BenchPanel(id="bench")
-        self._events = RichLog(id="log", markup=False, wrap=True, min_width=20, max_lines=500)
-        self._events.can_focus = False
+        self._escaped = -float("inf")
+        self.canvas = Canvas()
+        self.pictures = 0  # drawn since the start; an idle screen draws none
 
     def compose(self) -> ComposeResult:
-        """Lay the screen out: header, notices, bench (or what stands in for it), log, keys."""
-        yield self._header
-        yield self._notices
-        with ContentSwitcher(initial="waiting", id="main"):
-            yield Waiting(self._rig, id="waiting")
-            yield self._chooser
-            yield self._bench
-        yield self._events
-        yield Footer()
+        """The whole screen is one widget."""
+        yield self.canvas
 
     def on_mount(self) -> None:
         """Start the link and the clock of the screen."""
@@ -105,120 +114,244 @@ class Monitor(App[int]):
         self.link.close()
 
     def on_resize(self) -> None:
-        """Give a tall terminal a taller log."""
-        self.screen.set_class(self.size.height >= 36, "tall")
+        """Draw for the new size."""
         self.call_after_refresh(self.draw, force=True)
 
+    # The picture
+
+    def view(self) -> View:
+        """Return everything the picture is drawn from."""
+        newest = self.link.frame
+        if newest.stage is LinkStage.CHOOSING and self.marked_session not in newest.sessions:
+            self.marked_session = newest.sessions[0] if newest.sessions else None
+        span = self._span or automatic_span(newest.speed)
+        self.link.window_seconds = max(span, ALARM_WINDOW) if self.look.page == "alarms" else span
+        if self.look.seconds != span:
+            self.look = replace(self.look, seconds=span)
+        return View(
+            frame=self._held or newest,
+            newest=newest,
+            now=self.clock(),
+            look=self.look,
+            alarms=self.alarms_of(newest),
+            stop=self.stop_asked,
+            dialog=self.dialog,
+            remark=self.remark,
+            me=self.me,
+            rig=self.rig,
+            browsed=self.browsed,
+            marked_session=self.marked_session,
+        )
+
     def draw(self, *, force: bool = False) -> None:
-        """Draw the newest frame if it has changed, and what depends on time every so often."""
-        if not self._bench.is_attached:
-            return  # the screen is being taken down around a last tick of its timer
-        frame, now = self.link.frame, self._clock()
-        if frame is self._drawn and now - self._slow < SLOW and not force:
+        """Draw what has changed, and what depends on time as long as something is going on."""
+        frame, now = self.link.frame, self.clock()
+        blink = int(now / BLINK) % 2 == 0 if self.alarms_of(frame).unacknowledged else True
+        if blink != self.look.blink:
+            self.look = replace(self.look, blink=blink)
+            force = True
+        same = self._drawn is frame and not force
+        waits = self.stop_asked is not None and now - self.stop_asked.at < LINGER
+        idle = (frame.over or frame.endpoint is None) and not waits
+        if same and (idle or now - self._slow < SLOW):
             return
         self._drawn, self._slow = frame, now
-        self._header.show(frame, now)
-        paused = self._held is not None
-        self._notices.show(notices(frame, self.stop_asked, now, paused=paused))
-        self._draw_log(frame)
-        self._draw_main(frame, now)
+        size = self.size
+        self.canvas.show(compose(self.view(), size.width, size.height))
+        self.pictures += 1
 
-    def _draw_log(self, frame: Frame) -> None:
-        fresh = min(frame.told - self._told, len(frame.story))
-        self._told = frame.told
-        for line in frame.story[len(frame.story) - fresh :]:
-            time = (f"{line.device_time:9.2f} s  ", OLD)
-            self._events.write(Text.assemble(time, (line.text, line.style)))
+    def alarms_of(self, frame: Frame) -> AlarmTable:
+        """Return the alarms of a frame, with what was acknowledged and reset after its end."""
+        snapshot = frame.snapshot
+        if snapshot is None:
+            return AlarmTable()
+        found = []
+        for alarm in snapshot.alarms:
+            name = (snapshot.pid, alarm.key)
+            if name not in self.reset_alarms:
+                found.append(
+                    replace(alarm, acknowledged=True) if name in self.seen_alarms else alarm
+                )
+        return AlarmTable(tuple(found))
 
-    def _draw_main(self, frame: Frame, now: float) -> None:
-        main = self.query_one(ContentSwitcher)
-        if frame.stage is LinkStage.CHOOSING:
-            self._chooser.show(frame.sessions, appearing=main.current != "chooser")
-            main.current = "chooser"
-        elif frame.snapshot is None:
-            main.current = "waiting"
+    # Keys
+
+    def on_key(self, event: events.Key) -> None:
+        """Do what a key asks for; the stop comes before everything else."""
+        event.stop()
+        event.prevent_default()
+        key = event.key
+        typing = self.dialog is not None and self.dialog.text is not None
+        lives = self.link.frame.endpoint is not None and not self.link.frame.over
+        choosing = self.link.frame.stage is LinkStage.CHOOSING
+        if key == "space" and (lives or choosing or not typing):
+            self.act_stop()
+        elif key == "escape":
+            self._escape()
+        elif self.dialog is not None:
+            self._answer(self.dialog, key, event.character)
+        elif key == "s":
+            self.act_stop()
         else:
-            main.current = "bench"
-            self._draw_bench(self._held or frame, frame, now)
-
-    def _draw_bench(self, shown: Frame, newest: Frame, now: float) -> None:
-        if shown.snapshot is None:
-            return
-        self.link.window_seconds = seconds = self._span or automatic_span(newest.speed)
-        live = self._held is None and is_live(newest, now)
-        self._look = replace(self._look, seconds=seconds, live=live)
-        if live:
-            remark = ""
-        elif newest.over:
-            remark = " · last picture"
-        elif self._held is not None:
-            remark = f" · paused at {shown.snapshot.device_time:.1f} s"
-        else:
-            remark = f" · OLD, {age_text(newest.age(now))}"
-        if not self._bench.show(shown, self._look, remark):
-            self.call_after_refresh(self.draw, force=True)
-
-    def action_stop(self) -> None:
-        """Zero the outputs of the run on the screen, or of the one marked in the chooser."""
-        frame = self.link.frame
-        choosing = frame.stage is LinkStage.CHOOSING
-        endpoint = self._chooser.marked if choosing else frame.endpoint
-        if endpoint is None:
-            self.stop_asked = Stop(self._clock(), None, KeyAnswer.NOWHERE)
-        else:
-            self.stop_asked = stop = Stop(self._clock(), endpoint)
-            self.link.stop(endpoint, lambda answered: self._answered(stop, answered))
-            if choosing:
-                self.link.choose(endpoint)
+            self._page_key(key, event.character or "")
         self.draw(force=True)
 
-    def _answered(self, stop: Stop, answered: bool) -> None:
-        # Called by the sending thread; replacing one attribute needs no lock.
-        if self.stop_asked is stop:
-            self.stop_asked = replace(stop, answer=KeyAnswer.TAKEN if answered else KeyAnswer.NONE)
-            self._slow = -float("inf")
+    def _escape(self) -> None:
+        now = self.clock()
+        if now - self._escaped <= TWICE:
+            self._escaped = -float("inf")
+            self.act_stop()
+        else:
+            self._escaped = now
+        self.dialog, self.accept = None, None
 
-    def action_pause(self) -> None:
+    def ask(self, dialog: Dialog, accept: Callable[[str], None] | None = None) -> None:
+        """Open a question above the page; `accept` takes its answer."""
+        self.dialog, self.accept = dialog, accept
+
+    def _answer(self, dialog: Dialog, key: str, character: str | None) -> None:
+        """Take a key for the open question: type, mark, accept."""
+        if key == "enter" or (dialog.text is None and not dialog.choices):
+            accept, self.dialog, self.accept = self.accept, None, None
+            if accept is not None and key == "enter":
+                chosen = dialog.choices[dialog.marked] if dialog.choices else ""
+                accept(chosen if dialog.text is None else dialog.text)
+        elif dialog.choices and key in ("up", "down"):
+            marked = dialog.marked + (1 if key == "down" else -1)
+            self.dialog = replace(dialog, marked=marked % len(dialog.choices))
+        elif dialog.text is not None and key == "backspace":
+            self.dialog = replace(dialog, text=dialog.text[:-1])
+        elif dialog.text is not None and character and character.isprintable():
+            self.dialog = replace(dialog, text=(dialog.text + character)[:400])
+
+    def _page_key(self, key: str, character: str) -> None:
+        page = next((name for number, name, _ in PAGES if number == character), None)
+        self.remark = ""
+        if page is not None:
+            self.open_page(page)
+        elif self.link.frame.stage is LinkStage.CHOOSING and key in ("up", "down", "enter"):
+            self._choose(key)
+        elif key in ("up", "down", "left", "right", "pageup", "pagedown", "home", "end"):
+            self._move(key)
+        elif character in self.ACTS:
+            getattr(self, f"act_{self.ACTS[character]}")()
+        elif key == "enter":
+            self.act_enter()
+
+    def open_page(self, page: str) -> None:
+        """Show a page from its beginning."""
+        self.look = replace(self.look, page=page, marked=0, offset=0)
+        if page == "runs":
+            self.look_around()
+
+    def _choose(self, key: str) -> None:
+        sessions = self.link.frame.sessions
+        if key == "enter":
+            self.link.choose(self.marked_session)
+        elif sessions:
+            at = sessions.index(self.marked_session) if self.marked_session in sessions else 0
+            self.marked_session = sessions[(at + (1 if key == "down" else -1)) % len(sessions)]
+
+    def _move(self, key: str) -> None:
+        look, snapshot = self.look, self.link.frame.snapshot
+        down = {"up": -1, "down": 1, "pageup": -10, "pagedown": 10, "home": -9999, "end": 9999}
+        step = down.get(key, 0)
+        joints = len(joints_in(snapshot.channels)) if snapshot else 0
+        if look.page == "log":
+            self.look = replace(look, offset=max(look.offset - step, 0))
+        elif look.page == "overview":
+            self.look = replace(look, offset=min(max(look.offset + step, 0), max(joints - 1, 0)))
+        elif look.page == "channel":
+            last = len(snapshot.channels) - 1 if snapshot else 0
+            self.look = replace(look, channel=min(max(look.channel + step, 0), max(last, 0)))
+        elif look.page in ("joint", "manual") and key in ("left", "right"):
+            joint = look.joint + (1 if key == "right" else -1)
+            self.look = replace(look, joint=min(max(joint, 1), max(joints, 1)))
+        elif look.page == "manual":
+            self.act_jog(key)
+        else:
+            self.look = replace(look, marked=min(max(look.marked + step, 0), self.last_marked()))
+
+    def last_marked(self) -> int:
+        """Return the number of the last line that can be marked on this page."""
+        if self.look.page == "alarms":
+            return max(len(in_order(self.view())) - 1, 0)
+        return max(len(self.browsed_lines()) - 1, 0)
+
+    # How it is shown
+
+    def act_help(self) -> None:
+        """Show the keys."""
+        self.ask(Dialog("keys", HELP, keys="any key closes; SPACE stops"))
+
+    def act_hold(self) -> None:
         """Hold the picture, or let it live again."""
         self._held = None if self._held is not None else self.link.frame
-        self.draw(force=True)
 
-    def action_zoom(self) -> None:
+    def act_zoom(self) -> None:
         """Scale the plots to the data or to the limits."""
-        self._look = replace(self._look, zoomed=not self._look.zoomed)
-        self.draw(force=True)
+        self.look = replace(self.look, zoomed=not self.look.zoomed)
 
-    def action_span(self, step: int) -> None:
-        """Show more or less of the past; 0 leaves it to the screen."""
-        if step == 0:
-            self._span = None
-        else:
-            at = SPANS.index(self._look.seconds) + step
-            self._span = SPANS[min(max(at, 0), len(SPANS) - 1)]
-        self.draw(force=True)
+    def _step_span(self, step: int) -> None:
+        spans = LONG_SPANS
+        at = spans.index(self.look.seconds) + step
+        self._span = spans[min(max(at, 0), len(spans) - 1)]
 
-    def action_scroll(self, rows: int) -> None:
-        """Scroll a bench of more joints than fit."""
-        self._bench.scroll_relative(y=5 * rows, animate=False)
+    def act_longer(self) -> None:
+        """Show more of the past."""
+        self._step_span(1)
 
-    def action_choose(self) -> None:
+    def act_shorter(self) -> None:
+        """Show less of the past."""
+        self._step_span(-1)
+
+    def act_automatic(self) -> None:
+        """Leave the span to the screen."""
+        self._span = None
+
+    def act_filter(self) -> None:
+        """Keep one kind of line in the log, or all."""
+        at = (KINDS.index(self.look.only) + 1) % len(KINDS)
+        self.look = replace(self.look, only=KINDS[at], offset=0)
+
+    def act_search(self) -> None:
+        """Ask what to look for in the log."""
+
+        def found(text: str) -> None:
+            self.look = replace(self.look, search=text.strip(), page="log", offset=0)
+
+        lines = ("Lines that contain the text are kept; an empty text keeps all.",)
+        self.ask(Dialog("search", lines, text="", keys="Enter keeps, Esc closes"), found)
+
+    def act_end(self) -> None:
+        """Go to the newest line."""
+        self.look = replace(self.look, offset=0)
+
+    def act_choose(self) -> None:
         """Go back to the list of runs; with a single one there is nothing to choose."""
         if len(self.link.frame.sessions) < 2:
-            self.notify("No other run to choose.")
+            self.remark = "No other run to choose."
         else:
             self.link.choose(None)
 
-    def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
-        """Attach to the chosen run."""
-        self.link.choose(self._chooser.at(event.option_index))
-
-    def action_help(self) -> None:
-        """Show the page of help."""
-        self.push_screen(Help())
+    def act_quit(self) -> None:
+        """Close the screen; the run goes on."""
+        self.action_leave(0)
 
     def action_leave(self, code: int) -> None:
         """Close the screen and say what becomes of the run."""
         self.exit(code, message=farewell(self.link.frame))
+
+    def stop_answered(self, stop: Stop, answered: bool) -> None:
+        """Note what became of a stop; called by the sending thread."""
+        # Replacing one attribute needs no lock.
+        if self.stop_asked is stop:
+            self.stop_asked = replace(stop, answer=KeyAnswer.TAKEN if answered else KeyAnswer.NONE)
+            self.redraw()
+
+    def redraw(self) -> None:
+        """Draw at the next tick, whether or not anything arrived; any thread may ask."""
+        self._drawn = None
 
 
 def farewell(frame: Frame) -> str:

@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.bench.screens.past import PastMinute
 from rig.bench.screens.sockets import ChannelView, Snapshot
 from rig.tui.units import limit
 
@@ -104,6 +105,17 @@ class History:
         ends = start + (snapshot.device_time - start) * np.arange(1, buckets + 1) / buckets
         self._write(ends, _stack([snapshot.channels[name] for name in names], buckets))
         self._last = snapshot.device_time
+
+    def begin_with(self, past: PastMinute) -> bool:
+        """Begin anew with what the run itself kept; False where it has other channels."""
+        if set(past.names) != set(self._columns) or not len(past.time):
+            return False
+        reach = self._reach
+        self._clear(tuple(past.names))
+        self._reach, self._key = reach, (*self._key[:2], tuple(past.names))
+        self._write(past.time, np.array((past.low, past.high)))
+        self._last = float(past.time[-1])
+        return True
 
     def _write(self, ends: Array, values: Array) -> None:
         at = (self._count + np.arange(len(ends))) % self._capacity

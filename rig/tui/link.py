@@ -9,21 +9,27 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
+from pathlib import Path
 from typing import Final, Protocol
 
+from rig.bench.screens.commands import Command, own_command
+from rig.bench.screens.past import PastMinute, PlanLine
 from rig.bench.screens.sockets import Attachment, Endpoint, Snapshot
+from rig.runs.runstate import read_events
 from rig.tui.history import EMPTY, History, HistoryWindow
-from rig.tui.story import Line, tell
+from rig.tui.story import Line, from_events, tell
 
 log = logging.getLogger(__name__)
 
-FRAME: Final = 1 / 12  # shortest time between two frames [s]
-POLL: Final = 0.1  # longest wait for a snapshot, and between looks for a session [s]
-QUIET: Final = 1.0  # a run silent for this long is stale, and it is asked whether it still is [s]
-STORY: Final = 100
+FRAME: Final = 1 / 10  # shortest time between two frames [s]
+POLL: Final = 0.1  # longest wait for a snapshot [s]
+LOOK: Final = 0.5  # between looks for a session while none is attached [s]
+QUIET: Final = 0.5  # a run silent for this long is stale, and it is asked whether it still is [s]
+STORY: Final = 2000  # lines kept
+ANSWERED: Final = 1.0  # time for a run to say what it did lately [s]
 ENDED_STATES: Final = frozenset({"done", "aborted", "tripped", "interrupted"})
 
 
@@ -36,6 +42,14 @@ class SnapshotSource(Protocol):
 
     def send(self, command: str) -> bool:
         """Send a command; False when the run did not answer."""
+        ...
+
+    def ask(self, command: Command) -> str | None:
+        """Send a command with a value; None when it was taken, else in one line why not."""
+        ...
+
+    def past(self, timeout: float) -> PastMinute | None:
+        """Return what the run did lately and its plan; None where it does not say."""
         ...
 
     def close(self) -> None:
@@ -95,12 +109,21 @@ class Frame:
     speed: float = 1.0  # device seconds per wall second
     story: tuple[Line, ...] = ()  # what happened, oldest first, the newest STORY lines of it
     told: int = 0  # how many lines there have ever been
+    plan: tuple[PlanLine, ...] = ()
+    estimates: tuple[tuple[float, Mapping[str, Sequence[float | None]]], ...] = ()  # by run time
+    interval: float = 0.0  # between two snapshots, smoothed [s of wall time]
+    worst_age: float = 0.0  # of a block since the screen attached [s]
     trouble: str = ""  # why sessions cannot be looked for
 
     def age(self, now: float) -> float:
         """Return how old the newest sample is [s]: its age when published plus the time since."""
         block = self.snapshot.block_age if self.snapshot else 0.0
         return max(block, 0.0) + now - self.received
+
+    @property
+    def device_time(self) -> float:
+        """The device's time at the newest sample [s]."""
+        return float(self.window.time[-1]) if len(self.window.time) else 0.0
 
     @property
     def over(self) -> bool:
@@ -122,6 +145,7 @@ class Link:
         self._looked = -float("inf")
         self._framed = -float("inf")
         self._dirty = False
+        self._asked_past = -float("inf")
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
         self.window_seconds = 10.0  # set by the screen: how much of the past a frame carries
@@ -156,6 +180,25 @@ class Link:
 
         threading.Thread(target=send, name="bramah-stop", daemon=True).start()
 
+    def ask(
+        self, endpoint: Endpoint, word: str, value: str, answered: Callable[[str | None], None]
+    ) -> None:
+        """Send a command on a thread of its own; `answered` hears why not, or None."""
+
+        def send() -> None:
+            try:
+                source = self._sessions.open(endpoint)
+                try:
+                    refusal = source.ask(own_command(word, value))
+                finally:
+                    source.close()
+            except Exception as error:  # the operator must read it, whatever it was
+                log.exception("asking %r of %s failed", word, endpoint)
+                refusal = str(error) or repr(error)
+            answered(refusal)
+
+        threading.Thread(target=send, name="bramah-ask", daemon=True).start()
+
     def _send(self, endpoint: Endpoint, command: str) -> bool:
         try:
             source = self._sessions.open(endpoint)
@@ -182,12 +225,13 @@ class Link:
         """Look for sessions if it is time, wait `timeout` [s] for a snapshot, make a frame."""
         self._follow_sessions()
         if self._source is None:
-            self._closing.wait(timeout)
+            self._closing.wait(5 * timeout)
             return
         snapshot = self._source.receive(timeout)
         now = self._clock()
         if snapshot is not None:
             self._take(snapshot, now)
+            self._fetch_past(now)
         if self._dirty and (snapshot is None or snapshot.trip or now - self._framed >= FRAME):
             window = self._history.window(self.window_seconds)
             self._frame = replace(self._frame, window=window)
@@ -199,20 +243,46 @@ class Link:
         snapshot = _carried(before.snapshot, snapshot)
         self._history.add(snapshot, after_gap=quiet)
         lines = tell(before.snapshot, snapshot)
+        estimates = before.estimates
+        if snapshot.estimates and (not estimates or estimates[-1][1] != snapshot.estimates):
+            estimates = (*estimates, (snapshot.done_s, snapshot.estimates))[-STORY:]
         # The window follows at the frame rate; what is said in words follows every snapshot.
         self._frame = replace(
             before,
             snapshot=snapshot,
             received=now if _has_news(before.snapshot, snapshot) else before.received,
             speed=_speed(before, snapshot),
-            story=(*before.story, *lines)[-STORY:],
+            story=(*before.story, *lines)[-STORY:] if lines else before.story,
             told=before.told + len(lines),
+            estimates=estimates,
+            interval=_interval(before, snapshot),
+            worst_age=max(before.worst_age, snapshot.block_age),
         )
         self._dirty = True
 
+    def _fetch_past(self, now: float) -> None:
+        """Ask a run for its plan and its last minute, once, and again when its plan has changed."""
+        frame = self._frame
+        if frame.snapshot is None or self._source is None or frame.over:
+            return
+        known = len(frame.plan) == frame.snapshot.parts
+        first = self._asked_past == -float("inf")
+        if now - self._asked_past < ANSWERED or (known and not first):
+            return
+        self._asked_past = now
+        past = self._source.past(ANSWERED)
+        if past is None:
+            return
+        story = frame.story
+        if first and self._history.begin_with(past) and frame.snapshot.run:
+            earlier = from_events(read_events(Path(frame.snapshot.run)), frame.snapshot)
+            story = (*earlier, *story)[-STORY:]
+        told = frame.told + len(story) - len(frame.story)
+        self._frame = replace(self._frame, plan=past.plan, story=story, told=told)
+
     def _follow_sessions(self) -> None:
         now = self._clock()
-        due = QUIET if self._source is not None else POLL
+        due = 2 * LOOK if self._source is not None else LOOK
         if now - self._looked < due and self._chosen is None and not self._choosing:
             return
         self._looked = now
@@ -260,6 +330,7 @@ class Link:
         self._detach()
         self._source = source
         self._history = History()
+        self._asked_past = -float("inf")
         self._frame = self._blank(LinkStage.ATTACHED, endpoint)
 
     def _detach(self) -> None:
@@ -282,6 +353,14 @@ def _carried(last: Snapshot | None, snapshot: Snapshot) -> Snapshot:
         for name, view in snapshot.channels.items()
     }
     return replace(snapshot, channels=channels)
+
+
+def _interval(before: Frame, snapshot: Snapshot) -> float:
+    """Return the time between two snapshots [s of wall time], smoothed over about 20."""
+    if before.snapshot is None or before.snapshot.run != snapshot.run:
+        return 0.0
+    latest = snapshot.wall_time - before.snapshot.wall_time
+    return before.interval + 0.05 * (latest - before.interval) if before.interval else latest
 
 
 def _speed(before: Frame, snapshot: Snapshot) -> float:

@@ -1,40 +1,79 @@
-"""What happened, as lines for the log: turns of the protocol, messages, losses, trips."""
+"""What happened, as lines for the log: turns of the protocol, messages, alarms, losses, trips."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any, Final
 
+from rig.bench.screens.display import LOST
 from rig.bench.screens.sockets import Snapshot
+from rig.tui.drawing.styles import ALARM_TEXT, DIM, PLAIN, STRONG, WARN_TEXT
+
+KINDS: Final = ("all", "alarms", "protocol", "people")  # what the log can be filtered by
 
 
 @dataclass(frozen=True)
 class Line:
-    """One thing that happened, at a device time [s]; `style` is a rich style."""
+    """One thing that happened, at a time [s] since the run began; `kind` is one of KINDS."""
 
-    device_time: float
+    time: float
     text: str
-    style: str = ""
+    style: str = PLAIN
+    kind: str = "protocol"
+
+
+Said = tuple[str, str, str]  # text, style, kind
 
 
 def tell(last: Snapshot | None, snapshot: Snapshot) -> list[Line]:
     """Return what is new in a snapshot after the one before it (None: it is a run's first)."""
-    said: list[tuple[str, str]] = []
+    said: list[Said] = []
     if last is not None and (last.run, last.pid) != (snapshot.run, snapshot.pid):
         last = None
     if last is None:
-        said.append((f"attached to run {snapshot.run} on {snapshot.rig}", "bold"))
+        said.append((f"attached to run {snapshot.run} on {snapshot.rig}", STRONG, "people"))
     if last is None or _turn(snapshot) != _turn(last):
-        said.append((_turn(snapshot), "cyan"))
+        said.append((_turn(snapshot), STRONG, "protocol"))
     if snapshot.message and (last is None or snapshot.message != last.message):
-        said.append((snapshot.message, ""))
+        said.append((snapshot.message, PLAIN, "protocol"))
     more = snapshot.lost_samples - (last.lost_samples if last else 0)
     if more > 0:
-        said.append((f"{more} samples lost ({snapshot.lost_samples} in all)", "bold red"))
+        text = f"{more} samples lost ({snapshot.lost_samples} in all)"
+        said.append((text, ALARM_TEXT, "alarms"))
+    said += _alarms(last, snapshot)
+    said += _people(last, snapshot)
+    if snapshot.device == LOST and (last is None or last.device != LOST):
+        said.append(("DEVICE LOST", ALARM_TEXT, "alarms"))
     if snapshot.trip is not None and (last is None or last.trip != snapshot.trip):
-        said.append((f"TRIP  {trip_text(snapshot.trip)}", "bold red"))
+        said.append((f"TRIP  {trip_text(snapshot.trip)}", ALARM_TEXT, "alarms"))
     if last is not None and snapshot.state != last.state:
-        said.append((f"state: {last.state} → {snapshot.state}", "bold"))
-    return [Line(snapshot.device_time, text, style) for text, style in said if text]
+        said.append((f"state: {last.state} → {snapshot.state}", STRONG, "protocol"))
+    return [Line(snapshot.done_s, *parts) for parts in said if parts[0]]
+
+
+def _alarms(last: Snapshot | None, snapshot: Snapshot) -> list[Said]:
+    before = {alarm.key: alarm for alarm in last.alarms} if last is not None else {}
+    now = {alarm.key: alarm for alarm in snapshot.alarms}
+    said: list[Said] = []
+    for key, alarm in now.items():
+        old = before.get(key)
+        if old is None and not alarm.trips:
+            said.append((f"WARNING  {alarm.sentence}", WARN_TEXT, "alarms"))
+        elif old is not None and old.state is not alarm.state:
+            said.append((f"{key}: {old.state} → {alarm.state}", PLAIN, "alarms"))
+    said += [(f"{key}: normal again", PLAIN, "alarms") for key in before if key not in now]
+    return said
+
+
+def _people(last: Snapshot | None, snapshot: Snapshot) -> list[Said]:
+    said: list[Said] = []
+    if snapshot.prompt and (last is None or last.prompt != snapshot.prompt):
+        said.append((f"asked: {snapshot.prompt}", STRONG, "people"))
+    if last is not None and snapshot.holder != last.holder:
+        text = f"in command: {snapshot.holder}" if snapshot.holder else "nobody is in command"
+        said.append((text, PLAIN, "people"))
+    return said
 
 
 def _turn(snapshot: Snapshot) -> str:
@@ -45,3 +84,45 @@ def _turn(snapshot: Snapshot) -> str:
 def trip_text(trip: str) -> str:
     """Return a trip's message without its opening words, which the screen says larger."""
     return trip.removeprefix("safety trip: ")
+
+
+def from_events(events: Iterable[Mapping[str, Any]], snapshot: Snapshot) -> list[Line]:
+    """Return the lines of a run's event log, for a screen that attached late.
+
+    Times come from the events' ticks: `snapshot` says how they relate to the run's beginning.
+    """
+    if not snapshot.device_time > 0 or not snapshot.tick:
+        return []
+    rate = snapshot.tick / snapshot.device_time
+    found = []
+    for event in events:
+        tick = event.get("tick")
+        said = _of_event(event)
+        if said is None or not isinstance(tick, int):
+            continue
+        at = max(snapshot.done_s - (snapshot.tick - tick) / rate, 0.0)
+        found.append(Line(at, *said))
+    return found
+
+
+def _of_event(event: Mapping[str, Any]) -> Said | None:
+    def get(key: str) -> str:
+        return str(event.get(key, ""))
+
+    texts: dict[str, Said] = {
+        "phase": (f"{get('step')} {get('phase')}  {get('message')}", PLAIN, "protocol"),
+        "state": (f"{get('before')} → {get('state')}: {get('why')}", DIM, "protocol"),
+        "mark": (f"mark: {get('text')}", PLAIN, "protocol"),
+        "alarm": (f"WARNING  {get('sentence')}", WARN_TEXT, "alarms"),
+        "alarm returned": (f"{get('alarm')}: back within its band", PLAIN, "alarms"),
+        "alarm acknowledged": (f"{get('alarm')}: acknowledged", PLAIN, "alarms"),
+        "trip": (f"TRIP  {trip_text(get('message'))}", ALARM_TEXT, "alarms"),
+        "samples lost": (f"{get('lost')} samples lost", ALARM_TEXT, "alarms"),
+        "device lost": (f"DEVICE LOST  {get('message')}", ALARM_TEXT, "alarms"),
+        "device back": ("the device is back", PLAIN, "alarms"),
+        "answer": (f"answered {get('answer')!r} {get('by')}", PLAIN, "people"),
+        "controls taken": (f"in command: {get('by')}", PLAIN, "people"),
+        "controls released": (f"controls released by {get('by')}", PLAIN, "people"),
+        "stop": (f"stop: {get('reason')}", STRONG, "people"),
+    }
+    return texts.get(get("event"))

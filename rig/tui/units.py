@@ -5,17 +5,27 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Final
 
 from rig.model.units import READINGS, display_unit
 
 
 @dataclass(frozen=True)
 class Shown:
-    """How a channel's SI unit is shown: its name, SI to shown factor, decimals."""
+    """How a channel's SI unit is shown: its name, SI to shown factor, decimals.
+
+    `least` is the smallest height [SI] of a plot without limits: noise must not look like motion.
+    """
 
     unit: str
     factor: float
     decimals: int
+    least: float = 0.0
+
+    @property
+    def signed(self) -> bool:
+        """Whether its sign is shown always: what moves to both sides of zero."""
+        return self.unit not in ("MPa", "°C")
 
     def number(self, value: float | None, *, sign: bool = False) -> str:
         """Return the value's digits in the shown unit; an absent or NaN value is a dash."""
@@ -34,10 +44,14 @@ class Shown:
         return text.replace("-", "−")
 
 
+# Smallest height [SI] of a plot without limits: noise must not look like motion.
+_LEAST: Final = {"Pa": 0.2e6, "m": 2e-3, "V": 0.02, "degC": 2.0}
+
+
 def shown(unit: str) -> Shown:
     """Return how an SI unit is shown; one not listed keeps its own name."""
     known = display_unit(unit, READINGS)
-    return Shown(known.text, known.scale, known.decimals)
+    return Shown(known.text, known.scale, known.decimals, _LEAST.get(unit, 0.0))
 
 
 class Band(IntEnum):

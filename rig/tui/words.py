@@ -1,41 +1,51 @@
-"""What the screen says in words: header lines, the notices above the bench, gauges."""
+"""What the screen says in words: the state of the bench, what must not be missed, values."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
-from rich.text import Text
-
 from rig.bench.outputs import UNSURE
+from rig.bench.screens.display import LOST
 from rig.bench.screens.sockets import ChannelView, Endpoint, Snapshot
 from rig.model import channels as ch
 from rig.model.alarms.states import AlarmState, AlarmTable, folded
+from rig.tui.drawing.rows import Row
+from rig.tui.drawing.styles import ALARM, ALARM_TEXT, DIM, STALE, STRONG, SYMBOLS, WARN_TEXT
 from rig.tui.link import ENDED_STATES, QUIET, Frame, LinkStage
 from rig.tui.story import trip_text
-from rig.tui.units import Band, age_text, band, clock_text, limit, shown
+from rig.tui.units import Band, age_text, band, limit, shown
 
 VERY_OLD: Final = 3.0  # from here on old data is red instead of yellow [s]
 CONFIRM: Final = 2.0  # a stop is confirmed within this time, or the screen says that it was not [s]
-
-STATES: Final = {
-    "running": "bold black on green",
-    "done": "bold white on blue",
-    "aborted": "bold black on yellow",
-    "interrupted": "bold black on yellow",
-    "tripped": "bold white on red",
-}
-BANDS: Final = {
-    Band.INSIDE: "bold",
-    Band.NEAR: "bold yellow",
-    Band.BEYOND: "bold white on red",
-}
-OLD: Final = "grey50"
-
-
 LINGER: Final = 10.0  # what became of a stop of another run than the one shown stays this long [s]
+RECENT: Final = 1.0  # the nearest margin is that of the last second [s of device time]
 EMERGENCY: Final = "Use the emergency stop of the bench."
+
+
+class Freshness(Enum):
+    """What a number on the screen is; each looks different and has a word."""
+
+    LIVE = "live"
+    HELD = "held"  # the operator has paused the display
+    STALE = "stale"  # nothing new for longer than QUIET
+    DISCONNECTED = "disconnected"  # the device or the run's process is gone
+    ENDED = "ended"  # the run is over; this is its last picture
+
+
+@dataclass(frozen=True)
+class Headline:
+    """The state of the bench in a word; `level` is normal, ended, ask, warn or alarm."""
+
+    word: str
+    level: str
+
+    @property
+    def symbol(self) -> str:
+        """The level as a shape."""
+        return SYMBOLS[self.level]
 
 
 class KeyAnswer(Enum):
@@ -58,29 +68,122 @@ class Stop:
 
 @dataclass(frozen=True)
 class Notice:
-    """One line above the bench; `level` is good, info, warn or alarm."""
+    """One line above the page; `level` is normal, ask, warn or alarm."""
 
     level: str
     text: str
 
 
-def is_live(frame: Frame, now: float) -> bool:
-    """Whether the numbers are fresh enough to be shown as what is so now."""
-    return frame.snapshot is not None and not frame.over and frame.age(now) <= QUIET
+@dataclass(frozen=True)
+class Margin:
+    """How far a channel is from a limit, as a share of the width of its band, and in SI."""
+
+    channel: str
+    share: float
+    distance: float
+    value: float
+    limit: float
+    unit: str
+
+
+def freshness(frame: Frame, now: float, *, held: bool = False) -> Freshness:
+    """Return what the numbers of a frame are."""
+    snapshot = frame.snapshot
+    if snapshot is not None and (snapshot.device == LOST or _gone(frame, snapshot)):
+        return Freshness.DISCONNECTED
+    if frame.over:
+        return Freshness.ENDED
+    if snapshot is None or frame.age(now) > QUIET:
+        return Freshness.STALE
+    return Freshness.HELD if held else Freshness.LIVE
+
+
+def _gone(frame: Frame, snapshot: Snapshot) -> bool:
+    return frame.stage is LinkStage.ENDED and snapshot.state not in ENDED_STATES
+
+
+def headline(frame: Frame, now: float) -> Headline:
+    """Return the state of the bench in a word, the worst that is true."""
+    snapshot = frame.snapshot
+    if snapshot is None:
+        return Headline("NO RUN" if frame.endpoint is None else "NO DATA", "ended")
+    state = snapshot.state
+    cases = (
+        (UNSURE in snapshot.message, Headline("OUTPUTS NOT CONFIRMED", "alarm")),
+        (snapshot.device == LOST, Headline("DEVICE LOST", "alarm")),
+        (state == "tripped" or snapshot.trip is not None, Headline("TRIPPED", "alarm")),
+        (_gone(frame, snapshot), Headline("RUN GONE", "alarm")),
+        (state == "done", Headline("RUN ENDED", "ended")),
+        (frame.over, Headline("STOPPED" if _zeroed(snapshot) else state.upper(), "warn")),
+        (frame.age(now) > VERY_OLD, Headline("NO DATA", "alarm")),
+        (frame.age(now) > QUIET, Headline("NO DATA", "warn")),
+        (snapshot.engine in ("prompting", "paused"), Headline(snapshot.engine.upper(), "ask")),
+    )
+    word = snapshot.engine or state
+    return next((found for so, found in cases if so), Headline(word.upper(), "normal"))
+
+
+def nearest_margin(frame: Frame) -> Margin | None:
+    """Return the channel closest to a limit in the last second, by share of its band.
+
+    The piston of a joint that moves freely may touch its ends and does not count.
+    """
+    snapshot = frame.snapshot
+    best: Margin | None = None
+    for name, view in snapshot.channels.items() if snapshot is not None else ():
+        low, high = limit(view.low), limit(view.high)
+        kind, joint = place_of(name)
+        free = snapshot is not None and joint is not None and _role(snapshot, joint) == "free"
+        if low is None or high is None or not high > low or (kind == ch.PISTON and free):
+            continue
+        seen = frame.window.span(name, frame.device_time - RECENT) or (view.last, view.last)
+        if math.isnan(seen[0]):
+            continue
+        below, above = seen[0] - low, high - seen[1]
+        value, edge = (seen[0], low) if below < above else (seen[1], high)
+        margin = Margin(name, min(below, above) / (high - low), min(below, above), value, edge,
+                        view.unit)  # fmt: skip
+        if best is None or margin.share < best.share:
+            best = margin
+    return best
+
+
+def place_of(name: str) -> tuple[str, int | None]:
+    """Return (kind, joint or None) of a channel; one of a kind not known stands for itself."""
+    try:
+        return ch.kind_of(name)
+    except ValueError:
+        return name, None
+
+
+def _role(snapshot: Snapshot, joint: int) -> str:
+    return snapshot.roles[joint - 1] if joint <= len(snapshot.roles) else ""
+
+
+def run_time(frame: Frame, device_time: float | None = None) -> float:
+    """Return the time [s] since the run began, of a device time (default: the newest)."""
+    snapshot = frame.snapshot
+    if snapshot is None:
+        return 0.0
+    began = snapshot.device_time - snapshot.done_s
+    return (snapshot.device_time if device_time is None else device_time) - began
 
 
 def notices(frame: Frame, stop: Stop | None, now: float, *, paused: bool) -> list[Notice]:
     """Return what the operator must not miss, the worst first."""
     found: list[Notice] = []
-    if frame.trouble:
-        found.append(Notice("alarm", f"CANNOT REACH RUNS: {frame.trouble}"))
     snapshot = frame.snapshot
     if snapshot is not None and UNSURE in snapshot.message:
         found.append(Notice("alarm", f"{UNSURE.upper()}: keep away from the machine. {EMERGENCY}"))
+    if snapshot is not None and snapshot.device == LOST:
+        became = (
+            snapshot.message if frame.over else "looking for it; outputs zeroed by its watchdog"
+        )
+        found.append(Notice("alarm", f"DEVICE LOST: {became}"))
     if snapshot is not None and snapshot.trip is not None:
-        found.append(Notice("alarm", f"TRIP  {trip_text(snapshot.trip)}"))
-    if snapshot is not None and not frame.over:
-        found += alarm_notices(snapshot)
+        found.append(Notice("alarm", f"TRIPPED  {trip_text(snapshot.trip)}"))
+    if frame.trouble:
+        found.append(Notice("alarm", f"CANNOT REACH RUNS: {frame.trouble}"))
     if stop is not None and (stop.endpoint == frame.endpoint or now - stop.at < LINGER):
         found.append(stop_notice(frame, stop, now))
     if frame.over:
@@ -89,8 +192,14 @@ def notices(frame: Frame, stop: Stop | None, now: float, *, paused: bool) -> lis
         level = "alarm" if age > VERY_OLD else "warn"
         what = "what is shown is old" if snapshot else "nothing received yet"
         found.append(Notice(level, f"NO DATA for {age_text(age)}: {what}"))
+    if snapshot is not None and not frame.over and snapshot.prompt:
+        found.append(Notice("ask", f"ANSWER: {snapshot.prompt}  (a answers)"))
+    elif snapshot is not None and not frame.over and snapshot.engine == "paused":
+        found.append(Notice("ask", "PAUSED: outputs at zero until someone resumes (p)"))
+    if snapshot is not None and not frame.over:
+        found += alarm_notices(snapshot)
     if paused:
-        found.append(Notice("warn", "DISPLAY PAUSED, the run goes on: p shows it live again"))
+        found.append(Notice("warn", "DISPLAY HELD, the run goes on: h shows it live again"))
     return found
 
 
@@ -123,7 +232,7 @@ def stop_notice(frame: Frame, stop: Stop, now: float) -> Notice:
 
 def _stop_of_the_shown(frame: Frame, stop: Stop, now: float) -> Notice:
     if frame.snapshot is not None and _zeroed(frame.snapshot):
-        return Notice("good", "STOP SENT, OUTPUTS ZEROED: the run confirmed it")
+        return Notice("normal", "STOP SENT, OUTPUTS ZEROED: the run confirmed it")
     if stop.answer is KeyAnswer.SENDING:
         return Notice("warn", "STOP: sending ...")
     if frame.over:
@@ -151,70 +260,39 @@ def _ended(frame: Frame) -> Notice:
     tail = "below is its last picture; waiting for the next run"
     if snapshot is None:
         return Notice("warn", "RUN GONE before it sent anything; waiting for the next run")
-    if not frame.over or snapshot.state == "running":
+    if not frame.over or snapshot.state not in ENDED_STATES:
         pid = snapshot.pid
         return Notice("alarm", f"RUN GONE (process {pid} ended without a word): {tail}")
-    level = "good" if snapshot.state == "done" else "warn"
+    level = "ended" if snapshot.state == "done" else "warn"
     return Notice(level, f"RUN ENDED, {snapshot.state}: {tail}")
 
 
-def header(frame: Frame, now: float, width: int) -> list[Text]:
-    """Return the three lines on top: who and what state, where in the protocol, how fresh."""
-    snapshot = frame.snapshot
-    if snapshot is None:
-        who = frame.endpoint
-        about = f"{who.rig} (process {who.pid})" if who else "no run attached"
-        return [Text.assemble((" bramah ", "bold reverse"), f" {about}"), Text(), Text()]
-    return [_who(snapshot, frame, width), _where(snapshot, width), _fresh(frame, snapshot, now)]
+BANDS: Final = {Band.INSIDE: STRONG, Band.NEAR: WARN_TEXT, Band.BEYOND: ALARM}
+NEARNESS: Final = {Band.INSIDE: "", Band.NEAR: "▲", Band.BEYOND: "■"}
 
 
-def _who(snapshot: Snapshot, frame: Frame, width: int) -> Text:
-    gone = frame.stage is LinkStage.ENDED and snapshot.state == "running"
-    state = "GONE" if gone else snapshot.state.upper()
-    badge = (f" {state} ", STATES["tripped"] if gone else STATES.get(snapshot.state, "reverse"))
-    rig = f" {snapshot.rig}"
-    room = max(width - len(rig) - len(state) - 18, 8)
-    run = snapshot.run if len(snapshot.run) <= room else "…" + snapshot.run[-(room - 1) :]
-    line = Text.assemble((" bramah ", "bold reverse"), (rig, "bold"), "  run ", run)
-    line.append(" " * max(width - line.cell_len - len(badge[0]), 1))
-    return line.append_text(Text(*badge))
+def band_of(view: ChannelView) -> Band:
+    """Return where a channel's newest value stands: within, where it warns, or beyond a limit."""
+    where = band(view.last, limit(view.low), limit(view.high))
+    near = band(view.last, limit(view.warn_low), limit(view.warn_high), margin=0.0)
+    return Band.NEAR if where is Band.INSIDE and near is Band.BEYOND else where
 
 
-def _where(snapshot: Snapshot, width: int) -> Text:
-    line = Text.assemble(" ", (snapshot.step or "–", "bold"))
-    if snapshot.phase:
-        line.append(f"  {snapshot.phase}")
-    if snapshot.repeats > 0:
-        line.append(f"  repeat {snapshot.repeat} of {snapshot.repeats}")
-    if snapshot.total_s > 0:
-        share = min(max(snapshot.done_s / snapshot.total_s, 0.0), 1.0)
-        times = f" {share:4.0%}  {clock_text(snapshot.done_s)} of {clock_text(snapshot.total_s)} "
-        room = min(max(width - line.cell_len - len(times) - 2, 0), 40)
-        full = round(share * room)
-        line.append("  ").append("━" * full, "green").append("━" * (room - full), "grey30")
-        line.append(times)
-    return line
+def value(view: ChannelView, fresh: Freshness, *, sign: bool = False) -> Row:
+    """Return a channel's newest value with its unit; its form says whether it can be believed.
 
-
-def _fresh(frame: Frame, snapshot: Snapshot, now: float) -> Text:
-    age = frame.age(now)
-    style = "" if age <= QUIET else "yellow" if age <= VERY_OLD else "bold red"
-    line = Text.assemble(f" device {snapshot.device_time:.1f} s")
-    if frame.speed > 1.5:
-        line.append(f" ({frame.speed:.0f}×)")
-    line.append("   age ").append("–" if frame.over else age_text(age), style)
-    lost = snapshot.lost_samples
-    line.append("   lost ").append(str(lost), "bold red" if lost else "green")
-    live = is_live(frame, now)
-    for name, label in ((ch.SUPPLY, "supply"), (ch.TEMPERATURE, "oil")):
-        view = snapshot.channels.get(name)
-        if view is not None:
-            line.append(f"   {label} ").append_text(value(view, live=live))
-    return line
-
-
-def value(view: ChannelView, *, live: bool, sign: bool = False) -> Text:
-    """Return a channel's newest value with its unit, coloured by its limits; grey when old."""
+    ▲ close to a limit, ■ beyond it, ✕ not a number, ◌ stale, ⊘ disconnected, ‖ held.
+    """
     how = shown(view.unit)
-    style = BANDS[band(view.last, limit(view.low), limit(view.high))] if live else OLD
-    return Text.assemble((how.number(view.last, sign=sign), style), (f" {how.unit}", OLD))
+    unit = (f" {how.unit}", DIM)
+    if fresh is Freshness.DISCONNECTED:
+        return (("⊘", ALARM_TEXT), (how.number(view.last, sign=sign), STALE), unit)
+    if math.isnan(view.last):
+        return (("✕ invalid", ALARM_TEXT),)
+    number = how.number(view.last, sign=sign)
+    if fresh is Freshness.STALE:
+        return (("◌", WARN_TEXT), (number, STALE), unit)
+    if fresh is not Freshness.LIVE:
+        return (("‖" if fresh is Freshness.HELD else "", DIM), (number, DIM), unit)
+    where = band_of(view)
+    return ((NEARNESS[where], BANDS[where]), (number, BANDS[where]), unit)

@@ -9,6 +9,8 @@ from pathlib import Path
 
 from textual.pilot import Pilot
 
+from rig.bench.screens.commands import Command
+from rig.bench.screens.past import PastMinute
 from rig.bench.screens.sockets import Endpoint, Snapshot
 from rig.tui.app import Monitor
 from rig.tui.link import SnapshotSource
@@ -27,6 +29,16 @@ class Recorded:
         self.waiting = deque(snapshots)
         self.answers = answers
         self.commands: list[str] = []
+        self.asked: list[tuple[str, str]] = []
+        self.refusal: str | None = None
+        self.lately: PastMinute | None = None
+
+    def ask(self, command: Command) -> str | None:
+        self.asked.append((command.word, command.value))
+        return self.refusal
+
+    def past(self, timeout: float) -> PastMinute | None:
+        return self.lately
 
     def receive(self, timeout: float) -> Snapshot | None:
         return self.waiting.popleft() if self.waiting else None
@@ -77,9 +89,8 @@ class Glass:
         while before is not self.app.link.frame:
             before = self.app.link.frame
             self.app.link.step(0.0)
-        for _ in range(2):  # a new bench is mounted first and drawn then
-            self.app.draw(force=True)
-            await self.pilot.pause()
+        self.app.draw(force=True)
+        await self.pilot.pause()
 
     async def press(self, key: str) -> None:
         await self.pilot.press(key)
@@ -88,6 +99,12 @@ class Glass:
     async def answered(self) -> None:
         """Wait until the stop that was pressed has an answer, and draw."""
         while self.app.stop_asked is None or self.app.stop_asked.answer is KeyAnswer.SENDING:
+            await self.pilot.pause(0.005)
+        await self.watch()
+
+    async def said(self, start: str) -> None:
+        """Wait until an act's answer stands in the line of remarks, and draw."""
+        while not self.app.remark.startswith(start) or self.app.remark.endswith("..."):
             await self.pilot.pause(0.005)
         await self.watch()
 

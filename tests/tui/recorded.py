@@ -12,7 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rig.bench.screens.past import PastMinute, PlanLine
 from rig.bench.screens.sockets import ChannelView, Snapshot
+from rig.model.alarms.states import Alarm, AlarmState
 
 RATE = 1000.0  # samples a second
 LIMITS = {
@@ -115,13 +117,84 @@ def run(bench: Bench, seconds: float, step: float = 0.05) -> Iterator[Snapshot]:
     return (snapshot(bench, k, step) for k in range(1, round(seconds / step) + 1))
 
 
+PLAN = (
+    PlanLine("lock", "joint 1 to its retracted end", 4.0),
+    PlanLine("step1", "joint 2 excited, joint 1 locked, 4 records of 6 s", 30.0),
+    PlanLine("step2", "joint 1 excited, joint 2 locked, 1 record", 6.0),
+)
+
+
+def followed(view: Snapshot) -> Snapshot:
+    """Return a snapshot as a run of today says it: roles, engine, plan, warnings, a warning."""
+    channels = {
+        name: replace(channel, warn_low=0.1e6, warn_high=8.1e6) if "_pressure_" in name
+        else replace(channel, warn_low=5.6e6, warn_high=8e6) if name == "supply_pressure"
+        else replace(channel, warn_low=20.0, warn_high=60.0) if name == "oil_temperature"
+        else channel
+        for name, channel in view.channels.items()
+    }  # fmt: skip
+    roles = ["locked" if joint == 1 else "excited" for joint in range(1, len(_joints(view)) + 1)]
+    return replace(
+        view, channels=channels, roles=roles, engine="exciting", part=2, parts=len(PLAN),
+        wire="modbus-tcp://127.0.0.1:5020", sample_rate=RATE,
+        alarms=(warning(),) if view.device_time > 6 else (),
+    )  # fmt: skip
+
+
+def _joints(view: Snapshot) -> list[str]:
+    return [name for name in view.channels if name.startswith("piston")]
+
+
+def warning() -> Alarm:
+    """Return a warning of the supply that began after 6 s."""
+    return Alarm(
+        "supply pressure", "supply_pressure", None, 5.5e6, (5.6e6, 8e6), "Pa", 6000, 6.0,
+        "The supply pressure is outside its band. supply_pressure: 5.5 MPa at 6.0000 s, "
+        "expected 5.6 to 8 MPa",
+        "Check pump and relief valve.",
+    )  # fmt: skip
+
+
+def trip_alarms(time: float) -> tuple[Alarm, ...]:
+    """Return the alarms of a trip: its cause, latched, and one that follows from it."""
+    cause = Alarm(
+        "pressure", "cap_pressure_2", 2, 9.31e6, (-0.2e6, 9e6), "Pa", round(time * RATE), time,
+        "A chamber pressure is outside its limits. cap_pressure_2 of joint 2 (arm): 9.31 MPa",
+        "Check what the load pushes against, then the relief valve.",
+        trips=True, state=AlarmState.LATCHED,
+    )  # fmt: skip
+    follows = Alarm(
+        "spool does not follow", "spool_2", 2, 0.4, (-0.1, 0.1), "V", round(time * RATE) + 2,
+        time + 0.002, "The spool of joint 2 does not follow its command.",
+        "Check the valve's connector.", cause=cause.key,
+    )  # fmt: skip
+    return (cause, follows)
+
+
+def past(bench: Bench, seconds: float, step: float = 0.05) -> PastMinute:
+    """Return what a run of so many seconds kept of itself: one bucket per snapshot."""
+    names = tuple(samples(bench, np.zeros(1)))
+    table = []
+    for k in range(1, round(seconds / step) + 1):
+        time = np.arange(round((k - 1) * step * RATE), round(k * step * RATE)) / RATE
+        values = samples(bench, time)
+        table.append([k * step, *(values[n].min() for n in names),
+                      *(values[n].max() for n in names)])  # fmt: skip
+    raw = np.array(table)
+    cut = 1 + len(names)
+    return PastMinute(names, raw[:, 0], raw[:, 1:cut], raw[:, cut:], PLAN)
+
+
 def tripped(last: Snapshot) -> Snapshot:
     """Return what a run says last when joint 2 passed its pressure limit."""
     trip = (
         "safety trip: limit 'pressure', cap_pressure_2 of joint 2 (arm): 9.31 MPa at "
         f"{last.device_time - 0.003:.4f} s, allowed -0.2 to 9 MPa"
     )
-    return replace(last, state="tripped", trip=trip, message="outputs zeroed")
+    alarms = (*last.alarms, *trip_alarms(last.device_time - 0.003))
+    return replace(
+        last, state="tripped", trip=trip, message="outputs zeroed", alarms=alarms, engine="tripped"
+    )
 
 
 def stopped(last: Snapshot) -> Snapshot:

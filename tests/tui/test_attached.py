@@ -52,7 +52,7 @@ async def until(pilot: Pilot[int], so: Callable[[], bool]) -> None:
 
 def told(app: Monitor) -> str:
     return " ".join(
-        n.text for n in notices(app.link.frame, app.stop_asked, app._clock(), paused=False)
+        n.text for n in notices(app.link.frame, app.stop_asked, app.clock(), paused=False)
     )
 
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from rig.tui.braille import (
+from rig.tui.drawing.braille import (
     DASH,
     Scale,
     curve_dots,

@@ -2,19 +2,34 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 
-from tests.tui.capture import capture
+from tests.tui.capture import arguments_of, capture
 
 PAGE = Path(__file__).parents[2] / "docs" / "screen.md"
+PICTURE = re.compile(
+    r"<!-- python -m tests\.tui\.capture (?P<words>.+?) -->\n```\n(?P<text>.*?)\n```\n", re.DOTALL
+)
+PICTURES = [
+    pytest.param(found["words"], found["text"], id=found["words"])
+    for found in PICTURE.finditer(PAGE.read_text(encoding="utf-8"))
+]
 
 
-@pytest.mark.parametrize("trip", [False, True])
-async def test_the_pictures_in_the_page_are_what_the_command_above_them_makes(trip: bool) -> None:
-    command = f"python -m tests.tui.capture 80 24{' --trip' if trip else ''}"
-    made = await capture(80, 24, trip=trip)
-    assert f"<!-- {command} -->\n```\n{made}\n```\n" in PAGE.read_text(encoding="utf-8"), (
-        f"docs/screen.md is not up to date: put in what {command} writes"
+def test_the_page_has_a_picture_of_each_level_and_of_a_trip() -> None:
+    names = " ".join(str(picture.id) for picture in PICTURES)
+    for word in ("overview", "joint", "channel", "diagnostics", "alarms", "protocol", "--trip"):
+        assert word in names
+
+
+@pytest.mark.parametrize(("words", "text"), PICTURES)
+async def test_the_pictures_in_the_page_are_what_the_command_above_them_makes(
+    words: str, text: str
+) -> None:
+    made = await capture(*arguments_of(words.split()))
+    assert made == text, (
+        "docs/screen.md is not up to date: `python -m tests.tui.capture --docs` writes its pictures"
     )

@@ -11,11 +11,22 @@ from hypothesis import strategies as st
 from rig.bench.screens.sockets import ChannelView
 from rig.model.alarms.states import Alarm, AlarmTable, raised, returned
 from rig.tui.app import farewell
-from rig.tui.gauge import bar, gauge
+from rig.tui.drawing.bar import bar
+from rig.tui.drawing.rows import text_of, width_of
+from rig.tui.history import History
 from rig.tui.link import Frame, LinkStage
+from rig.tui.pages.gauge import gauge
 from rig.tui.story import tell
 from rig.tui.units import Band, age_text, band, clock_text, limit, shown
-from rig.tui.words import KeyAnswer, Stop, notices
+from rig.tui.words import (
+    Freshness,
+    Headline,
+    KeyAnswer,
+    Stop,
+    headline,
+    nearest_margin,
+    notices,
+)
 from tests.tui.glass import endpoint
 from tests.tui.recorded import Bench, snapshot, stopped, tripped
 
@@ -30,6 +41,54 @@ def said(frame: Frame, stop: Stop | None = None, now: float = 100.0) -> list[tup
 
 def test_a_healthy_run_needs_no_notice() -> None:
     assert said(LIVE) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "word", "level"),
+    [
+        ({}, "EXCITING", "normal"),
+        ({"engine": ""}, "RUNNING", "normal"),
+        ({"engine": "prompting"}, "PROMPTING", "ask"),
+        ({"engine": "paused"}, "PAUSED", "ask"),
+        ({"state": "done"}, "RUN ENDED", "ended"),
+        ({"state": "aborted", "message": "stopped by operator"}, "STOPPED", "warn"),
+        ({"state": "aborted", "message": "step1 failed"}, "ABORTED", "warn"),
+        ({"state": "tripped", "trip": "safety trip: x"}, "TRIPPED", "alarm"),
+        ({"state": "aborted", "device": "lost", "message": "no answer"}, "DEVICE LOST", "alarm"),
+        (
+            {"state": "tripped", "trip": "x", "message": "outputs not confirmed at zero"},
+            "OUTPUTS NOT CONFIRMED",
+            "alarm",
+        ),
+    ],
+)
+def test_the_state_is_one_word_and_the_worst_that_is_true(
+    changes: dict[str, str], word: str, level: str
+) -> None:
+    view = replace(VIEW, **{"engine": "exciting", **changes})
+    found = headline(replace(LIVE, snapshot=view), 100.0)
+    assert (found.word, found.level) == (word, level)
+
+
+def test_old_data_and_a_dead_process_change_the_word() -> None:
+    assert headline(LIVE, 100.6) == Headline("NO DATA", "warn")
+    assert headline(LIVE, 104.0) == Headline("NO DATA", "alarm")
+    assert headline(replace(LIVE, stage=LinkStage.ENDED), 100.0) == Headline("RUN GONE", "alarm")
+
+
+def test_the_nearest_margin_counts_peaks_and_not_what_may_touch_its_end() -> None:
+    history = History()
+    for k in range(1, 81):
+        history.add(snapshot(Bench(), k))
+    frame = replace(LIVE, window=history.window(10.0))
+    locked = replace(VIEW, roles=["free", "excited"])
+    margin = nearest_margin(replace(frame, snapshot=locked))
+    assert margin is not None
+    assert margin.channel == "piston_2", "joint 1 rests at its end and may"
+    low, high = -0.036, 0.036
+    peak = 0.022
+    assert margin.share == pytest.approx((high - peak) / (high - low), rel=0.02)
+    assert nearest_margin(Frame()) is None
 
 
 def test_warnings_that_stand_are_one_line_with_the_first_cause() -> None:
@@ -64,7 +123,7 @@ def test_the_age_includes_how_late_the_block_already_was() -> None:
         (KeyAnswer.SENDING, "running", 0.1, "warn", "sending"),
         (KeyAnswer.TAKEN, "running", 0.1, "warn", "waiting for the run to confirm"),
         (KeyAnswer.TAKEN, "running", 2.5, "alarm", "NOT CONFIRMED for 2.5 s"),
-        (KeyAnswer.TAKEN, "tripped", 0.1, "good", "OUTPUTS ZEROED"),
+        (KeyAnswer.TAKEN, "tripped", 0.1, "normal", "OUTPUTS ZEROED"),
         (KeyAnswer.TAKEN, "done", 0.1, "alarm", "NOT CONFIRMED: the run ended"),
         (KeyAnswer.NONE, "running", 0.1, "alarm", "NO ANSWER"),
         (KeyAnswer.NONE, "done", 0.1, "warn", "the run had ended (done)"),
@@ -85,7 +144,7 @@ def test_a_stop_is_called_what_it_is(
 @pytest.mark.parametrize(
     ("message", "level"),
     [
-        ("stopped by operator (from the screen)", "good"),
+        ("stopped by operator (from the screen)", "normal"),
         ("the device does not answer", "alarm"),
         ("stopped by operator; outputs not confirmed at zero", "alarm"),
     ],
@@ -194,7 +253,7 @@ def test_a_bar_is_as_wide_as_asked_and_the_marker_keeps_its_side(
 @pytest.mark.parametrize("width", [36, 40, 76])
 def test_a_gauge_fills_its_line(width: int) -> None:
     view = ChannelView("m", -0.0375, 0.0375, 0.01, [], [])
-    line = gauge("piston", view, (0.0, 0.02), (-0.0375, 0.0375), width, live=True)
-    assert line.cell_len == width
-    assert "+10.0 mm −37.5 " in line.plain
-    assert line.plain.endswith(" 37.5")
+    line = gauge("piston", view, (0.0, 0.02), (-0.0375, 0.0375), width, Freshness.LIVE)
+    assert width_of(line) == width
+    assert "+10.0 mm −37.5 " in text_of(line)
+    assert text_of(line).endswith(" 37.5")

@@ -16,9 +16,11 @@ log = logging.getLogger(__name__)
 
 STOP: Final = "stop"  # anyone may, always
 ACKNOWLEDGE: Final = "acknowledge"  # an alarm by its key, without a value all; anyone may
+TAKE: Final = "take"  # the controls, from whoever holds them
 RELEASE: Final = "release"
+PAST: Final = "past"  # the last minute and the plan, for a screen that attaches late; anyone may
 CONTROLS: Final = ("pause", "resume", "skip", "abort", "answer")
-COMMANDS: Final = (STOP, ACKNOWLEDGE, *CONTROLS, RELEASE)
+COMMANDS: Final = (STOP, ACKNOWLEDGE, *CONTROLS, TAKE, RELEASE, PAST)
 
 _LONGEST = 500  # characters of a value or a holder's name
 
@@ -62,28 +64,40 @@ def from_bytes(raw: bytes) -> Command | None:
 
 
 class Holder:
-    """Lets one screen at a time command a run: the first to do so, until it releases or is gone."""
+    """Lets one screen at a time command a run.
+
+    The first to do so holds the controls until it releases them, is gone, or another takes them.
+    """
 
     def __init__(self) -> None:
         self._held: Command | None = None
 
+    @property
+    def held(self) -> Command | None:
+        """The newest command of the screen that holds the controls; None where they are free."""
+        if self._held is not None and self._held.pid and not process_alive(self._held.pid):
+            self._held = None
+        return self._held
+
     def judge(self, command: Command, judge: Judge | None) -> str | None:
         """Return None where the command is taken, else in one line why it is refused."""
-        if command.word in (STOP, ACKNOWLEDGE):
+        if command.word in (STOP, ACKNOWLEDGE, PAST):
             return None
-        held = self._held
-        if held is not None and held.pid and not process_alive(held.pid):
-            held = self._held = None
-        if held is not None and held.holder != command.holder:
-            return f"the controls are held by {held.holder}; it must release them first"
-        if command.word == RELEASE:
-            self._held = None
-            return None
+        refusal = self._refusal(command, judge)
+        if refusal is None:
+            self._held = None if command.word == RELEASE else command
+        return refusal
+
+    def _refusal(self, command: Command, judge: Judge | None) -> str | None:
+        held = self.held
         if not command.holder:
             return f"{command.word}: say who asks ('holder'), so that one screen has the controls"
+        if command.word == TAKE:
+            return None
+        if held is not None and held.holder != command.holder:
+            return f"the controls are held by {held.holder}; take them, or wait for their release"
+        if command.word == RELEASE:
+            return None
         if judge is None:
             return f"{command.word}: this run takes no commands but stop"
-        refusal = judge(command)
-        if refusal is None:
-            self._held = command
-        return refusal
+        return judge(command)

@@ -5,14 +5,17 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.base import SampleBlock
-from rig.bench.guard import JointRole, piston_bounds
+from rig.bench.checks import bands
+from rig.bench.guard import GuardSettings, JointRole, piston_bounds
 from rig.bench.screens.commands import Command, Judge
-from rig.bench.screens.snapshot import BenchView, Progress, take_snapshot
+from rig.bench.screens.past import PastKeeper, PlanLine
+from rig.bench.screens.snapshot import Band, BenchView, Progress, take_snapshot
 from rig.bench.screens.sockets import Publisher
 from rig.model import channels as ch
 from rig.model.alarms.states import AlarmTable
@@ -20,8 +23,9 @@ from rig.model.rig import Rig
 from rig.runs import runstate
 
 Array = NDArray[np.float64]
-Limits = dict[str, tuple[float | None, float | None]]
+Limits = dict[str, Band]
 
+LOST: Final = "lost"  # what a snapshot says of a device that does not answer
 _INTERVAL = 0.05  # [s] of wall time between snapshots
 
 
@@ -45,6 +49,21 @@ class Display:
         self._first: int | None = None
         self._lost = 0
         self._roles: Sequence[JointRole] = ()
+        self._bands: tuple[Sequence[JointRole], Limits, Limits] | None = None
+        self._past = PastKeeper(rig.recorded)
+        if publisher is not None:
+            publisher.past = self._past.answer
+
+    def describe(self, plan: Sequence[PlanLine]) -> None:
+        """Say which steps there will be; a screen lists them."""
+        self._past.plan = tuple(plan)
+        self.progress = replace(self.progress, parts=len(self._past.plan))
+
+    def repeat(self) -> None:
+        """Publish, if it is time, that nothing new was measured: the device is being looked for."""
+        if self._publisher is not None and self._clock() >= self._next:
+            self._publish(runstate.RUNNING, 0.0)
+            self._next = self._clock() + _INTERVAL
 
     def commands(self, judge: Judge | None = None) -> list[Command]:
         """Return what the screens asked for and `judge` did not refuse."""
@@ -71,20 +90,37 @@ class Display:
         columns = len(self._units)
         samples = np.concatenate(self._waiting) if self._waiting else np.empty((0, columns))
         self._waiting = []
+        device_time = self._tick / self._rig.sample_rate
+        self._past.add(device_time, samples)
+        limits, warnings = self._both_bands()
         view = BenchView(
             run=self._run,
             rig=self._rig.name,
             state=state,
             tick=self._tick,
-            device_time=self._tick / self._rig.sample_rate,
+            device_time=device_time,
             wall_time=time.time(),
             block_age=age,
             lost_samples=self._lost,
             trip=self.trip,
             alarms=self.alarms.alarms,
+            holder=getattr(self._publisher, "holder", ""),
+            roles=[_role(role) for role in self._roles],
+            wire=self._rig.wire.endpoint,
+            sample_rate=self._rig.sample_rate,
         )
-        snapshot = take_snapshot(view, self.progress, samples, self._units, self._limits())
+        snapshot = take_snapshot(view, self.progress, samples, self._units, limits, warnings)
         self._publisher.publish(snapshot)
+
+    def _both_bands(self) -> tuple[Limits, Limits]:
+        """Return what trips and what warns on every channel; they change with the roles only."""
+        if self._bands is None or self._bands[0] is not self._roles:
+            warn: Limits = {}
+            if self._roles:
+                near = bands.warning_bounds(self._rig, tuple(self._roles), GuardSettings())
+                warn = {name: near.of(k) for k, name in enumerate(self._rig.recorded)}
+            self._bands = (self._roles, self._limits(), warn)
+        return self._bands[1], self._bands[2]
 
     def _limits(self) -> Limits:
         found: Limits = {}
@@ -106,8 +142,10 @@ class Display:
                 found[name] = (ends[0], ends[1])
         return found
 
-    def ended(self, state: str, message: str) -> None:
-        """Publish how the run ended, as soon as the outputs are at zero."""
+    def ended(self, state: str, message: str, *, lost: bool = False) -> None:
+        """Publish how the run ended, as soon as the outputs are at zero; `lost` is the device."""
+        if lost:
+            self.progress = replace(self.progress, device=LOST)
         if message:
             self.progress = replace(self.progress, message=message)
         self._publish(state, 0.0)
@@ -117,3 +155,7 @@ class Display:
         if self._publisher is not None:
             self._publisher.close()
             self._publisher = None
+
+
+def _role(role: JointRole) -> str:
+    return "excited" if role.excited else "locked" if role.locked else "free"

@@ -14,13 +14,17 @@ from numpy.typing import NDArray
 from rig.model.alarms.states import Alarm, AlarmState
 
 Array = NDArray[np.float64]
+Band = tuple[float | None, float | None]
 
 BUCKETS = 25  # of new samples per snapshot: at 20 snapshots a second, 500 columns for a plot
 
 
 @dataclass(frozen=True)
 class ChannelView:
-    """One channel since the previous snapshot, in SI; `low` and `high` are its limits."""
+    """One channel since the previous snapshot, in SI; `low` and `high` are its limits.
+
+    Beyond `warn_low` and `warn_high` a warning begins.
+    """
 
     unit: str
     low: float | None
@@ -28,6 +32,8 @@ class ChannelView:
     last: float
     minimum: list[float] = field(default_factory=list)
     maximum: list[float] = field(default_factory=list)
+    warn_low: float | None = None
+    warn_high: float | None = None
 
 
 @dataclass(frozen=True)
@@ -37,7 +43,11 @@ class Snapshot:
     `state` is running, tripped, done or aborted; `device_time` and `wall_time` are in seconds
     (the latter since the epoch); `block_age` [s] is how late the newest block came.
     `alarms` are those that stand (`rig.model.alarms.states.folded` orders them). `engine` is the
-    state of the protocol's engine; `prompt` the open question, with its possible `answers`.
+    state of the protocol's engine; `prompt` the open question, with its possible `answers`. `part`
+    of `parts` (from 1) is the step of the plan; `estimates` holds [value, low, high] in SI by
+    parameter, low to high being its 95 % interval. `device` is empty, or "lost"; `wire` is its
+    endpoint. `holder` is the screen that has the controls, `roles` what each joint does (excited,
+    free, locked).
     """
 
     run: str
@@ -59,9 +69,18 @@ class Snapshot:
     message: str
     channels: dict[str, ChannelView]
     alarms: tuple[Alarm, ...] = ()
+    holder: str = ""
+    roles: list[str] = field(default_factory=list)
+    wire: str = ""
+    sample_rate: float = 0.0
     engine: str = ""
     prompt: str = ""
     answers: list[str] = field(default_factory=list)
+    kind: str = "protocol"
+    part: int = 0
+    parts: int = 0
+    device: str = ""
+    estimates: dict[str, list[float | None]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -78,6 +97,11 @@ class Progress:
     engine: str = ""
     prompt: str = ""
     answers: list[str] = field(default_factory=list)
+    kind: str = "protocol"
+    part: int = 0
+    parts: int = 0
+    device: str = ""
+    estimates: dict[str, list[float | None]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -94,6 +118,10 @@ class BenchView:
     lost_samples: int
     trip: str | None
     alarms: tuple[Alarm, ...] = ()
+    holder: str = ""
+    roles: list[str] = field(default_factory=list)
+    wire: str = ""
+    sample_rate: float = 0.0
 
 
 def decimate(samples: Array, buckets: int = BUCKETS) -> tuple[Array, Array]:
@@ -110,15 +138,20 @@ def take_snapshot(
     progress: Progress,
     samples: Array,
     units: Mapping[str, str],
-    limits: Mapping[str, tuple[float | None, float | None]],
+    limits: Mapping[str, Band],
+    warnings: Mapping[str, Band] | None = None,
 ) -> Snapshot:
-    """Make a snapshot of the samples (n, channels) since the previous one; n may be 0."""
+    """Make a snapshot of the samples (n, channels) since the previous one; n may be 0.
+
+    `limits` and, if known, `warnings` have every channel's band.
+    """
     low, high = decimate(samples)
     channels = {}
     for column, (name, unit) in enumerate(units.items()):
         last = float(samples[-1, column]) if len(samples) else float("nan")
+        near = (None, None) if warnings is None else warnings.get(name, (None, None))
         channels[name] = ChannelView(
-            unit, *limits[name], last, low[:, column].tolist(), high[:, column].tolist()
+            unit, *limits[name], last, low[:, column].tolist(), high[:, column].tolist(), *near
         )
     shown = {name: getattr(view, name) for name in view.__dataclass_fields__}
     return Snapshot(pid=os.getpid(), channels=channels, **shown, **asdict(progress))

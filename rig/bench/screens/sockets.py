@@ -4,7 +4,8 @@ Two ZeroMQ sockets per session in a folder of mode 0700: `<rig>-<pid>.pub` (PUB:
 `<rig>-<pid>.cmd` (REP: commands). The run never waits for a screen: snapshots that nobody
 takes are dropped, commands are polled. Requests and answers are JSON
 (`rig.bench.screens.commands`): {"command", "value", "holder", "pid"}, then {"ok"} with "error" in
-one line where the command was refused.
+one line where the command was refused. The answer to "past" has a second frame
+(`rig.bench.screens.past`).
 """
 
 from __future__ import annotations
@@ -16,14 +17,17 @@ import os
 import re
 import socket
 import stat
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import zmq
 
 from rig.bench.screens.commands import (
     COMMANDS,
+    PAST,
     Command,
     Holder,
     Judge,
@@ -31,6 +35,7 @@ from rig.bench.screens.commands import (
     own_command,
     to_bytes,
 )
+from rig.bench.screens.past import PastMinute, past_from
 from rig.bench.screens.snapshot import ChannelView, Snapshot, from_json, to_json
 from rig.runs.runstate import process_alive
 
@@ -129,6 +134,7 @@ class Publisher:
         self._context = zmq.Context(1)
         self._closed = False
         self._holder = Holder()
+        self.past: Callable[[], tuple[dict[str, Any], bytes]] | None = None
         try:
             self._pub = self._bind(zmq.PUB, self.endpoint.pub)
             self._cmd = self._bind(zmq.REP, self.endpoint.cmd)
@@ -169,13 +175,24 @@ class Publisher:
             if command is not None:
                 refusal = self._holder.judge(command, judge)
             answer: dict[str, object] = {"ok": refusal is None}
-            if refusal is None and command is not None:
-                found.append(command)
-            else:
+            frames: list[bytes] = []
+            if refusal is not None or command is None:
                 answer["error"] = refusal
+            elif command.word != PAST:
+                found.append(command)
+            elif self.past is not None:
+                header, raw_past = self.past()
+                answer.update(header)
+                frames.append(raw_past)
             with suppress(zmq.ZMQError):
-                self._cmd.send(json.dumps(answer).encode(), zmq.NOBLOCK)
+                self._cmd.send_multipart([json.dumps(answer).encode(), *frames], zmq.NOBLOCK)
         return found
+
+    @property
+    def holder(self) -> str:
+        """The screen that holds the controls, empty where they are free."""
+        held = self._holder.held
+        return "" if held is None else held.holder
 
     def close(self) -> None:
         """Close and remove the sockets; never raises."""
@@ -225,6 +242,22 @@ class Attachment:
 
     def ask(self, command: Command, timeout: float = 2.0) -> str | None:
         """Send a command; None when the run has taken it, else in one line why not."""
+        answer = self._exchange(command, timeout)
+        return answer if isinstance(answer, str) else None
+
+    def past(self, timeout: float = 2.0) -> PastMinute | None:
+        """Return what the run did lately and its plan; None where it does not say."""
+        answer = self._exchange(own_command(PAST), timeout)
+        if isinstance(answer, str) or len(answer) != 2:  # header and array
+            return None
+        try:
+            return past_from(json.loads(answer[0]), answer[1])
+        except ValueError as error:
+            log.debug("no past: %s", error)
+            return None
+
+    def _exchange(self, command: Command, timeout: float) -> list[bytes] | str:
+        """Return the frames of the answer, or in one line why the command was not taken."""
         asking = self._context.socket(zmq.REQ)  # a new one: an unanswered one is of no use again
         asking.setsockopt(zmq.LINGER, 0)
         try:
@@ -232,8 +265,9 @@ class Attachment:
             asking.send(to_bytes(command), zmq.NOBLOCK)
             if not asking.poll(round(timeout * 1000)):
                 return f"no answer within {timeout:g} s"
-            answer = json.loads(asking.recv(zmq.NOBLOCK))
-            return None if answer.get("ok") else str(answer.get("error", "refused"))
+            frames = asking.recv_multipart(zmq.NOBLOCK)
+            answer = json.loads(frames[0])
+            return frames if answer.get("ok") else str(answer.get("error", "refused"))
         except (zmq.ZMQError, ValueError, AttributeError) as error:
             return f"no answer: {error}"
         finally:

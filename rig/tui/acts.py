@@ -1,0 +1,226 @@
+"""What the operator can do to a run: stop, command, acknowledge, reset."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import ClassVar, Final
+
+from rig.bench.screens.sockets import Endpoint
+from rig.model.alarms.states import Alarm, AlarmState, AlarmTable
+from rig.model.trips import RecordingFailed
+from rig.runs.runstate import EventLog
+from rig.tui.browse import Browsed
+from rig.tui.jobs import Job, begin, rig_of_run
+from rig.tui.link import Frame, Link, LinkStage
+from rig.tui.look import Dialog, Look, View
+from rig.tui.pages.operation import in_order
+from rig.tui.words import KeyAnswer, Stop
+
+MOVING: Final = ("homing", "locked", "exciting")  # states in which an abort does not ask first
+
+
+class Acts:
+    """The part of the screen that acts; each act leaves one line on what became of it."""
+
+    ACTS: ClassVar = {
+        "?": "help", "h": "hold", "z": "zoom", "+": "longer", "-": "shorter", "=": "automatic",
+        "f": "filter", "/": "search", "e": "end", "c": "choose", "q": "quit",
+        "t": "command", "p": "pause", "n": "skip", "x": "abort", "a": "answer",
+        "k": "acknowledge", "r": "reset",
+    }  # fmt: skip
+
+    link: Link
+    look: Look
+    me: str
+    remark: str
+    clock: Callable[[], float]
+    stop_asked: Stop | None
+    marked_session: Endpoint | None
+    seen_alarms: frozenset[tuple[int, str]]
+    reset_alarms: frozenset[tuple[int, str]]
+    ask: Callable[..., None]
+    view: Callable[[], View]
+    redraw: Callable[[], None]
+    stop_answered: Callable[[Stop, bool], None]
+    alarms_of: Callable[[Frame], AlarmTable]
+    browsed = Browsed()
+
+    def act_stop(self) -> None:
+        """Zero the outputs of the run on the screen, or of the one marked in the list."""
+        frame = self.link.frame
+        choosing = frame.stage is LinkStage.CHOOSING
+        endpoint = self.marked_session if choosing else frame.endpoint
+        if endpoint is None:
+            self.stop_asked = Stop(self.clock(), None, KeyAnswer.NOWHERE)
+            return
+        self.stop_asked = stop = Stop(self.clock(), endpoint)
+        self.link.stop(endpoint, lambda answered: self.stop_answered(stop, answered))
+        if choosing:
+            self.link.choose(endpoint)
+
+    # Commands
+
+    def command(self, word: str, value: str = "", done: str = "") -> None:
+        """Send a command to the run; asks before it takes the controls from another screen."""
+        frame = self.link.frame
+        if frame.endpoint is None or frame.snapshot is None:
+            self.remark = f"{word}: no run is attached."
+        elif frame.over:
+            self.remark = f"{word}: the run is over ({frame.snapshot.state})."
+        elif frame.snapshot.holder not in ("", self.me) and word not in ("take", "acknowledge"):
+            self.remark = f"{word}: read-only, {frame.snapshot.holder} is in command; t takes over."
+        else:
+            self.remark = f"{word}: asking ..."
+            self.link.ask(frame.endpoint, word, value, lambda no: self._heard(word, done, no))
+
+    def _heard(self, word: str, done: str, refusal: str | None) -> None:
+        self.remark = f"{word}: {done or 'taken'}" if refusal is None else f"{word}: {refusal}"
+        self.redraw()
+
+    def confirmed(self, title: str, text: str, act: Callable[[], None]) -> None:
+        """Do something after a yes."""
+
+        def chosen(answer: str) -> None:
+            if answer == "yes":
+                act()
+
+        keys = "↑ ↓ and Enter choose, Esc closes, SPACE stops"
+        self.ask(Dialog(title, (text,), choices=("no", "yes"), keys=keys), chosen)
+
+    def act_command(self) -> None:
+        """Take the controls, or release them; from another screen only after a yes."""
+        snapshot = self.link.frame.snapshot
+        holder = snapshot.holder if snapshot is not None else ""
+        if holder == self.me:
+            self.command("release", done="this screen is read-only now")
+        elif holder:
+            text = f"{holder} is in command. Take the controls? It will see that you did."
+            self.confirmed("take the controls", text, self._take)
+        else:
+            self._take()
+
+    def _take(self) -> None:
+        self.command("take", done="this screen is in command")
+
+    def act_pause(self) -> None:
+        """Pause at the next safe point, or resume after a yes: the bench will move."""
+        snapshot = self.link.frame.snapshot
+        if snapshot is not None and snapshot.engine == "paused":
+            text = "The bench will move: places and locks are made anew. Resume?"
+            self.confirmed("resume", text, lambda: self.command("resume"))
+        else:
+            self.command("pause", done="taken; it comes at the end of the record")
+
+    def act_skip(self) -> None:
+        """Skip the present step after a yes."""
+        snapshot = self.link.frame.snapshot
+        step = snapshot.step if snapshot is not None else ""
+        text = f"Leave step {step!r} and go on with the next one?"
+        self.confirmed("skip", text, lambda: self.command("skip"))
+
+    def act_abort(self) -> None:
+        """End the run: at once where the bench moves, after a yes where it is at rest."""
+        snapshot = self.link.frame.snapshot
+        if snapshot is None or snapshot.engine in MOVING:
+            self.command("abort")
+        else:
+            text = "Outputs are at zero. End the run for good? What was measured is kept."
+            self.confirmed("abort", text, lambda: self.command("abort"))
+
+    def act_answer(self) -> None:
+        """Answer what the protocol asks."""
+        snapshot = self.link.frame.snapshot
+        if snapshot is None or not snapshot.prompt or self.link.frame.over:
+            self.remark = "answer: nothing is asked now."
+            return
+        keys = "↑ ↓ and Enter choose, Esc closes, SPACE stops"
+        dialog = Dialog("answer", (snapshot.prompt,), choices=tuple(snapshot.answers), keys=keys)
+        self.ask(dialog, lambda answer: self.command("answer", answer, f"{answer!r} taken"))
+
+    # Alarms
+
+    def _marked_alarm(self) -> Alarm | None:
+        """Return the alarm marked on its page; elsewhere the most urgent one."""
+        listed = [alarm for alarm, _ in in_order(self.view())]
+        if not listed:
+            return None
+        at = self.look.marked if self.look.page == "alarms" else 0
+        return listed[min(at, len(listed) - 1)]
+
+    def act_acknowledge(self) -> None:
+        """Say that a person has seen an alarm."""
+        alarm, frame = self._marked_alarm(), self.link.frame
+        if alarm is None or frame.snapshot is None:
+            self.remark = "acknowledge: no alarm stands."
+        elif alarm.acknowledged:
+            self.remark = f"acknowledge: {alarm.key} is acknowledged already."
+        elif not frame.over:
+            self.command("acknowledge", alarm.key, alarm.key)
+        else:
+            # The run has no ear any more: this screen keeps it, and the run's log.
+            self.seen_alarms |= {(frame.snapshot.pid, alarm.key)}
+            self._note("alarm acknowledged", alarm)
+            self.remark = f"acknowledge: {alarm.key}"
+
+    def _note(self, event: str, alarm: Alarm) -> None:
+        snapshot = self.link.frame.snapshot
+        folder = Path(snapshot.run) if snapshot is not None and snapshot.run else None
+        if folder is None or not folder.is_dir():
+            return
+        with suppress(RecordingFailed):
+            log = EventLog(folder)
+            log.append(event, alarm.tick, {"alarm": alarm.key, "by": self.me})
+            log.close()
+
+    def act_reset(self) -> None:
+        """Reset a latched alarm: another act than acknowledging it, and it needs a reason."""
+        alarm, frame = self._marked_alarm(), self.link.frame
+        if alarm is None or alarm.state is not AlarmState.LATCHED:
+            self.remark = "reset: the marked alarm is not latched; it ends by itself."
+        elif not alarm.acknowledged:
+            self.remark = f"reset: acknowledge {alarm.key} first (k); to reset is another act."
+        elif not frame.over:
+            self.remark = "reset: the run still holds the bench; wait for its end."
+        else:
+            body = (alarm.sentence, "", "What was found and done? It is kept with the trip.")
+            keys = "Enter resets device and bench, Esc closes"
+            self.ask(Dialog("reset", body, text="", keys=keys), lambda why: self._reset(alarm, why))
+
+    def _reset(self, alarm: Alarm, reason: str) -> None:
+        snapshot = self.link.frame.snapshot
+        if snapshot is None or not reason.strip():
+            self.remark = "reset: a reset needs a reason; nothing was reset."
+            return
+        rig, pid = rig_of_run(snapshot.run, snapshot.rig), snapshot.pid
+        self.remark = "reset: asking the device ..."
+
+        def changed(job: Job) -> None:
+            if job.code == 0:
+                self.reset_alarms |= {(pid, alarm.key)}
+                self.remark = f"reset: {job.output.strip()}"
+            elif job.code is not None:
+                self.remark = f"reset: {job.ended}"
+            self.redraw()
+
+        self.start(("reset", "--rig", rig, "--reason", reason.strip()), changed)
+
+    def start(self, words: tuple[str, ...], changed: Callable[[Job], None]) -> None:
+        """Start a verb as a process of its own."""
+        begin(words, changed)
+
+    # Elsewhere
+
+    def act_enter(self) -> None:
+        """Open what is marked."""
+
+    def act_jog(self, key: str) -> None:
+        """Move a joint while a key is held."""
+
+    def look_around(self) -> None:
+        """Read what stands on the disk."""
+
+    def browsed_lines(self) -> tuple[str, ...]:
+        """Return the lines that can be marked."""
+        return ()

@@ -1,0 +1,45 @@
+"""The one widget of the screen: shows rows, and draws again only those that changed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import groupby
+
+from textual.geometry import Region
+from textual.strip import Strip
+from textual.widget import Widget
+
+from rig.tui.drawing.rows import BLANK, Row, to_strip
+
+
+class Canvas(Widget):
+    """Rows of the whole terminal."""
+
+    DEFAULT_CSS = "Canvas { width: 100%; height: 100%; }"
+    can_focus = True
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.rows: tuple[Row, ...] = ()
+
+    def show(self, rows: Sequence[Row]) -> int:
+        """Show these rows; returns how many had changed."""
+        before, self.rows = self.rows, tuple(rows)
+        padded = [*before, *[BLANK] * (len(rows) - len(before))]
+        changed = [y for y, line in enumerate(self.rows) if line != padded[y]]
+        if len(before) != len(rows):
+            self.refresh()
+        elif changed:
+            # Neighbouring rows make one region: each has its cost in the compositor.
+            runs = groupby(enumerate(changed), key=lambda pair: pair[1] - pair[0])
+            regions = []
+            for _, members in runs:
+                lines = [y for _, y in members]
+                regions.append(Region(0, lines[0], self.size.width, len(lines)))
+            self.refresh(*regions)
+        return len(changed)
+
+    def render_line(self, y: int) -> Strip:
+        """Return one line of the terminal."""
+        line = self.rows[y] if y < len(self.rows) else BLANK
+        return to_strip(line, self.size.width, self.rich_style)

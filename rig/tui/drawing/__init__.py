@@ -1,0 +1,1 @@
+"""Rows of styled text and what is drawn with them: plots, bars, boxes, large letters."""

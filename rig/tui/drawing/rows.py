@@ -1,0 +1,134 @@
+"""A row of the screen: pieces of text with their styles; immutable, so that rows compare quickly.
+
+Pages are plain functions that return rows. Only rows that changed are drawn again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from functools import lru_cache
+from textwrap import wrap
+
+from rich.cells import cell_len, set_cell_size
+from rich.segment import Segment
+from rich.style import Style
+from textual.strip import Strip
+
+from rig.tui.drawing.styles import DIM, PLAIN
+
+Part = tuple[str, str]
+Row = tuple[Part, ...]
+
+BLANK: Row = ()
+
+
+def row(*parts: str | Part) -> Row:
+    """Return a row of parts; a bare string is plain."""
+    return tuple((part, PLAIN) if isinstance(part, str) else part for part in parts)
+
+
+def text_of(line: Row) -> str:
+    """Return a row's characters."""
+    return "".join(text for text, _ in line)
+
+
+def width_of(line: Row) -> int:
+    """Return how many cells a row takes."""
+    return sum(cell_len(text) for text, _ in line)
+
+
+def fit(line: Row, width: int, style: str = PLAIN) -> Row:
+    """Return a row of exactly `width` cells: cut with an ellipsis, or filled up in a style."""
+    if width <= 0:
+        return BLANK
+    have = width_of(line)
+    if have <= width:
+        return line if have == width else (*line, (" " * (width - have), style))
+    found: list[Part] = []
+    left = width - 1
+    for text, part_style in line:
+        size = cell_len(text)
+        if size > left:
+            found.append((set_cell_size(text, left) + "…", part_style))
+            break
+        found.append((text, part_style))
+        left -= size
+    return tuple(found)
+
+
+def ends(left: Row, right: Row, width: int, style: str = PLAIN) -> Row:
+    """Return a row with one part at each end; the left one is cut where both do not fit."""
+    room = width - width_of(right)
+    if room <= 0:
+        return fit(right, width, style)
+    return (*fit(left, room, style), *right)
+
+
+def block(rows: Sequence[Row], width: int, height: int, style: str = PLAIN) -> list[Row]:
+    """Return exactly `height` rows of `width` cells."""
+    kept = [fit(line, width, style) for line in rows[: max(height, 0)]]
+    return kept + [fit(BLANK, width, style)] * (height - len(kept))
+
+
+def beside(blocks: Sequence[tuple[Sequence[Row], int]], height: int, gap: int = 1) -> list[Row]:
+    """Return blocks of given widths side by side, each filled up to `height` rows."""
+    filled = [block(rows, width, height) for rows, width in blocks]
+    space: Row = ((" " * gap, PLAIN),) if gap else ()
+    found = []
+    for parts in zip(*filled, strict=True):
+        line: Row = parts[0]
+        for part in parts[1:]:
+            line = (*line, *space, *part)
+        found.append(line)
+    return found
+
+
+def box(
+    title: str, body: Sequence[Row], width: int, height: int, style: str = DIM, note: str = ""
+) -> list[Row]:
+    """Return a frame of `width` x `height` around rows, its title above, a note below right."""
+    inner = width - 4
+    if inner < 1 or height < 2:
+        return block(body, width, height)
+    head = f"─ {title} " if title else ""
+    head = set_cell_size(head, min(cell_len(head), width - 3))
+    foot = f" {note} ─" if note else ""
+    foot = foot if cell_len(foot) <= width - 3 else ""
+    top = row((f"┌{head}{'─' * (width - 2 - cell_len(head))}┐", style))
+    bottom = row((f"└{'─' * (width - 2 - cell_len(foot))}{foot}┘", style))
+    left, right = ("│ ", style), (" │", style)
+    rows = block(body, inner, height - 2)
+    return [top, *((left, *line, right) for line in rows), bottom]
+
+
+def wrapped(text: str, width: int, style: str = PLAIN) -> list[Row]:
+    """Return a text as rows no wider than `width`; filled up where its style has a ground."""
+    lines = [part for line in text.splitlines() for part in wrap(line, max(width, 8)) or [""]]
+    rows = [row((line, style)) for line in lines]
+    return [fit(line, width, style) for line in rows] if " on " in style else rows
+
+
+def columns(rows: Iterable[Sequence[str | Part]], gap: int = 2) -> list[Row]:
+    """Return cells as aligned columns; each as wide as its widest cell."""
+    lines = [row(*cells) for cells in rows]
+    count = max((len(line) for line in lines), default=0)
+    widths = [
+        max((cell_len(line[k][0]) for line in lines if k < len(line)), default=0)
+        for k in range(count)
+    ]
+    return [
+        tuple((text + " " * ((widths[k] - cell_len(text) + gap) * (k + 1 < len(line))), style)
+              for k, (text, style) in enumerate(line))
+        for line in lines
+    ]  # fmt: skip
+
+
+@lru_cache(maxsize=256)
+def _style(text: str) -> Style:
+    return Style.parse(text) if text else Style.null()
+
+
+def to_strip(line: Row, width: int, ground: Style) -> Strip:
+    """Return a row as what the terminal's driver takes."""
+    segments = [Segment(text, ground + _style(style)) for text, style in fit(line, width)]
+    return Strip(segments, width)

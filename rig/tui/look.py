@@ -1,0 +1,90 @@
+"""What the operator has chosen to see, and everything a page is drawn from; immutable."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Final
+
+from rig.bench.screens.sockets import Endpoint
+from rig.model.alarms.states import AlarmTable
+from rig.tui.browse import Browsed
+from rig.tui.link import Frame
+from rig.tui.words import Freshness, Stop, freshness
+
+# The key of each page, its name, and the name where there is little room.
+PAGES: Final = (
+    ("1", "overview", "over"),
+    ("2", "joint", "joint"),
+    ("3", "channel", "chan"),
+    ("4", "diagnostics", "diag"),
+    ("5", "alarms", "alarm"),
+    ("6", "protocol", "prot"),
+    ("7", "log", "log"),
+    ("8", "estimates", "est"),
+    ("9", "manual", "man"),
+    ("0", "runs", "runs"),
+)
+
+
+@dataclass(frozen=True)
+class Look:
+    """What is chosen: page, joint, channel, the marked line, span of the plots, filters."""
+
+    page: str = "overview"
+    joint: int = 1
+    channel: int = 0
+    marked: int = 0
+    offset: int = 0  # lines scrolled away from the newest, or joints from the first
+    seconds: float = 10.0
+    zoomed: bool = False
+    search: str = ""
+    only: str = "all"
+    blink: bool = True
+
+
+@dataclass(frozen=True)
+class Dialog:
+    """A question above the page: a line of text, a choice, yes or no, or a page to read."""
+
+    title: str
+    body: tuple[str, ...] = ()
+    text: str | None = None  # None: no line to type in
+    choices: tuple[str, ...] = ()
+    marked: int = 0
+    keys: str = "Esc closes"
+
+
+@dataclass(frozen=True)
+class View:
+    """One picture: `frame` is shown, `newest` what the link has (they differ where held)."""
+
+    frame: Frame
+    newest: Frame
+    now: float
+    look: Look = field(default_factory=Look)
+    alarms: AlarmTable = field(default_factory=AlarmTable)
+    stop: Stop | None = None
+    dialog: Dialog | None = None
+    remark: str = ""  # what became of the operator's newest act
+    me: str = ""  # this screen, as a holder of the controls
+    rig: str | None = None
+    browsed: Browsed = field(default_factory=Browsed)
+    marked_session: Endpoint | None = None
+    tripped: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def held(self) -> bool:
+        """Whether the operator holds the picture."""
+        return self.frame is not self.newest
+
+    @property
+    def fresh(self) -> Freshness:
+        """What the numbers are."""
+        return freshness(self.newest, self.now, held=self.held)
+
+    @property
+    def in_command(self) -> bool:
+        """Whether this screen holds the controls."""
+        snapshot = self.newest.snapshot
+        return snapshot is not None and bool(self.me) and snapshot.holder == self.me

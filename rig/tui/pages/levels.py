@@ -1,0 +1,128 @@
+"""The levels below the overview: one joint, one channel, diagnostics."""
+
+from __future__ import annotations
+
+from rig.model import channels as ch
+from rig.tui.drawing.rows import Part, Row, beside, block, box, columns, fit, row
+from rig.tui.drawing.styles import ALARM_TEXT, DIM, STRONG, WARN_TEXT
+from rig.tui.look import View
+from rig.tui.pages.parts import (
+    CURVES,
+    GAUGES,
+    bar_of,
+    curve,
+    curves,
+    joint_title,
+    joints_in,
+    said_of,
+    short_name,
+)
+from rig.tui.units import age_text, clock_text, limit, shown
+from rig.tui.words import NEARNESS, band_of, run_time, value
+
+TWO = 110  # from this width on, curves stand in two columns
+LIST = 26  # width of the list of channels
+
+
+def joint_page(view: View, width: int, height: int) -> list[Row]:
+    """Return one joint: every channel as a curve where there is room, and as a bar."""
+    snapshot = view.frame.snapshot
+    assert snapshot is not None
+    joints = list(joints_in(snapshot.channels))
+    if not joints:
+        return block([row((" this run has no joints", DIM))], width, height)
+    joint = joints[min(max(view.look.joint, 1), len(joints)) - 1]
+    have = {kind: ch.channel(kind, joint) for kind in GAUGES}
+    have = {kind: name for kind, name in have.items() if name in snapshot.channels}
+    inner = width - 4
+    bars = [bar_of(view, name, short_name(kind), inner) for kind, name in have.items()]
+    names = {have[kind]: short_name(kind) for kind in CURVES if kind in have}
+    room = height - 2 - len(bars)
+    if width >= TWO:
+        pressures = {n: k for n, k in names.items() if ch.kind_of(n)[0] in (ch.CAP, ch.ROD)}
+        motion = {n: k for n, k in names.items() if n not in pressures}
+        half = (inner - 2) // 2
+        sides = [(curves(view, side, half, room), half) for side in (pressures, motion) if side]
+        above = beside(sides, room, gap=2)
+    else:
+        above = curves(view, names, inner, room)
+    title = f"{joint_title(view, joint)} of {len(joints)}  ← →"
+    remark = said_of(view)
+    note = f"last {view.look.seconds:g} s  + − ="
+    return box(
+        f"{title} · {remark}" if remark else title, [*above, *bars], width, height, DIM, note
+    )
+
+
+def channel_page(view: View, width: int, height: int) -> list[Row]:
+    """Return every channel in a list, the marked one as a plot with its bands in words."""
+    snapshot = view.frame.snapshot
+    assert snapshot is not None
+    names = list(snapshot.channels)
+    if not names:
+        return block([row((" this run measures nothing", DIM))], width, height)
+    at = min(max(view.look.channel, 0), len(names) - 1)
+    first = min(max(at - height // 2, 0), max(len(names) - height, 0))
+    listed = []
+    for k, name in list(enumerate(names))[first : first + height]:
+        near = NEARNESS[band_of(snapshot.channels[name])] or " "
+        mark = "▸" if k == at else " "
+        listed.append(row((f"{mark}{near} {name}", STRONG if k == at else "")))
+    name, room = names[at], width - LIST - 1
+    channel = snapshot.channels[name]
+    how = shown(channel.unit)
+    words = [
+        ("trips beyond", how.short(limit(channel.low)), how.short(limit(channel.high))),
+        ("warns beyond", how.short(limit(channel.warn_low)), how.short(limit(channel.warn_high))),
+    ]
+    text = [
+        fit(row((f"{what}  ", DIM), f"{low or '–'} … {high or '–'} {how.unit}"), room)
+        for what, low, high in words
+    ]
+    plot = curve(view, name, name, room, height - len(text), axis=True)
+    return beside([(listed, LIST), ([*plot, *text], room)], height)
+
+
+def diagnostics_page(view: View, width: int, height: int) -> list[Row]:
+    """Return the health of sampling and of the link, with the device's own time."""
+    frame = view.newest
+    snapshot = frame.snapshot
+    assert snapshot is not None
+    lost = (str(snapshot.lost_samples), ALARM_TEXT if snapshot.lost_samples else "")
+    age = frame.age(view.now)
+    cells: list[tuple[str, str | Part]] = [
+        ("time since the run began", f"{run_time(frame):.3f} s  ({clock_text(run_time(frame))})"),
+        ("time of the device", f"{snapshot.device_time:.3f} s, tick {snapshot.tick}"),
+        ("device against wall clock", f"{frame.speed:.2f} times"),
+        ("age of the newest sample", "–" if frame.over else age_text(age)),
+        ("worst age of a block", age_text(frame.worst_age)),
+        ("samples lost", lost),
+        ("samples a second", f"{snapshot.sample_rate:g}" if snapshot.sample_rate else "–"),
+        ("channels", str(len(snapshot.channels))),
+        ("pictures a second", f"{1 / frame.interval:.1f}" if frame.interval > 0 else "–"),
+        ("what the numbers are", (view.fresh.value, "" if not said_of(view) else WARN_TEXT)),
+        ("state of the run / engine", f"{snapshot.state} / {snapshot.engine or '–'}"),
+        ("in command", snapshot.holder or "nobody"),
+        ("wire", snapshot.wire or "–"),
+        ("process of the run", str(snapshot.pid)),
+        ("run folder", snapshot.run or "none"),
+        ("sockets", str(frame.endpoint.pub) if frame.endpoint else "–"),
+    ]
+    found = columns([[(f" {name}", DIM), *row(what)] for name, what in cells])
+    names = [
+        [
+            (f" {name}", ""),
+            ("".join(text for text, _ in value(channel, view.fresh)), ""),
+            (_state_of(view, channel.last), DIM),
+        ]
+        for name, channel in snapshot.channels.items()
+    ]
+    listed = columns(names)
+    if width >= TWO:
+        left = max(width // 2, 60)
+        return beside([(found, left), (listed, width - left - 1)], height)
+    return block([*found, row(), *listed][:height], width, height)
+
+
+def _state_of(view: View, last: float) -> str:
+    return "INVALID" if last != last else said_of(view) or "live"  # noqa: PLR0124 - NaN

@@ -1,0 +1,214 @@
+"""The pages of the run: alarms, protocol, log, estimates."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from rig.model.alarms.states import Alarm, folded
+from rig.tui.drawing.plot import PlotTrace, draw, time_axis
+from rig.tui.drawing.rows import Row, beside, block, box, columns, fit, row, wrapped
+from rig.tui.drawing.styles import ASK, ASK_TEXT, DIM, NORMAL, STRONG, WARN_TEXT
+from rig.tui.look import View
+from rig.tui.pages.overview import alarm_mark
+from rig.tui.pages.parts import said_of
+from rig.tui.story import Line
+from rig.tui.units import clock_text, limit, shown
+from rig.tui.words import Freshness, run_time
+
+BEFORE = 2.0  # of an alarm's channel shown before its first offending sample [s]
+AFTER = 0.5  # and after it [s]
+WIDE = 110  # from this width on, details stand beside the list
+
+
+def in_order(view: View) -> list[tuple[Alarm, bool]]:
+    """Return the alarms as listed, each with whether it is a consequence of one above."""
+    found = []
+    for first, rest in folded(view.alarms):
+        found.append((first, False))
+        found += [(alarm, True) for alarm in rest]
+    return found
+
+
+def alarms_page(view: View, width: int, height: int) -> list[Row]:
+    """Return the alarms, first causes on top, and the marked one in full."""
+    listed = in_order(view)
+    if not listed:
+        text = row(
+            (" No alarms. ", STRONG), ("Trips latch until they are reset with a reason.", DIM)
+        )
+        return block([text], width, height)
+    at = min(max(view.look.marked, 0), len(listed) - 1)
+    rows = []
+    for k, (alarm, follows) in enumerate(listed):
+        mark = ("▸", STRONG) if k == at else (" ", "")
+        indent = "   └ " if follows else " "
+        moment = f"{run_time(view.frame, alarm.time):9.2f} s  "
+        rows.append(row(mark, (moment, DIM), indent, *alarm_mark(view, alarm), f" {alarm.key}"))
+    if width >= WIDE:
+        left = width * 2 // 5
+        right = width - left - 1
+        detail = _detail(view, listed[at][0], right, height)
+        return beside([(_window(rows, at, height), left), (detail, right)], height)
+    above = min(len(rows), max(height // 3, 1))
+    return block(
+        [*_window(rows, at, above), *_detail(view, listed[at][0], width, height - above)],
+        width, height,
+    )  # fmt: skip
+
+
+def _window(rows: list[Row], at: int, height: int) -> list[Row]:
+    """Return `height` of the rows with the marked one among them."""
+    first = min(max(at - height // 2, 0), max(len(rows) - height, 0))
+    return rows[first : first + height]
+
+
+def _detail(view: View, alarm: Alarm, width: int, height: int) -> list[Row]:
+    how = shown(alarm.unit)
+    low, high = (limit(end) if math.isfinite(end) else None for end in alarm.limit)
+    allowed = " … ".join(how.short(end) or "any" for end in (low, high))
+    if alarm.state == "latched":
+        acts = "k acknowledges"
+        acts += ", r resets with a reason" if alarm.acknowledged else "; only then r resets it"
+    else:
+        acts = "acknowledged" if alarm.acknowledged else "k acknowledges"
+    where = f"joint {alarm.joint}" if alarm.joint else "the bench"
+    facts = [
+        ("cause", alarm.check),
+        ("where", f"{alarm.channel or '–'} of {where}"),
+        ("value", f"{how.number(alarm.value)} {how.unit}, allowed {allowed} {how.unit}"),
+        ("when", f"{run_time(view.frame, alarm.time):.3f} s since the run began"),
+        ("state", f"{alarm.state}, {'acknowledged' if alarm.acknowledged else 'UNACKNOWLEDGED'}"
+                  + (f", came {alarm.count} times" if alarm.count > 1 else "")),
+        ("acts", acts),
+    ]  # fmt: skip
+    inner = width - 4
+    body = columns([[(name, DIM), text] for name, text in facts])
+    body = [line for text in wrapped(alarm.sentence, inner, STRONG) for line in (text,)] + body
+    body += [row(("do    ", ASK_TEXT), *line) for line in wrapped(alarm.remedy, inner - 6)]
+    plot = _before(view, alarm, inner, height - 2 - len(body))
+    return box(alarm.key, [*body, *plot], width, height)
+
+
+def _before(view: View, alarm: Alarm, width: int, height: int) -> list[Row]:
+    """Return the 2 s before an alarm as a plot; nothing where they are not known."""
+    window = view.frame.window
+    if height < 4 or alarm.channel not in window.columns:
+        return []
+    start, stop = alarm.time - BEFORE, alarm.time + AFTER
+    inside = (window.time > start) & (window.time <= stop)
+    if not inside.any():
+        return [row((" the samples around it are no longer held", DIM))]
+    low, high = window.of(alarm.channel)
+    ends = (limit(alarm.limit[0]), limit(alarm.limit[1]))
+    trace = PlotTrace(window.time, low, high, start, stop, ends, shown(alarm.unit))
+    text = f"{BEFORE:g} s before it and {AFTER:g} s after"
+    return [row((text, DIM)), *draw(trace, width, height - 1)]
+
+
+def protocol_page(view: View, width: int, height: int) -> list[Row]:
+    """Return the steps with the present one, what is asked, and who is in command."""
+    snapshot = view.newest.snapshot
+    assert snapshot is not None
+    if view.in_command:
+        holder = "this screen is in command; t releases the controls"
+    elif snapshot.holder:
+        holder = f"read-only: {snapshot.holder} is in command; t takes the controls"
+    else:
+        holder = "nobody is in command; t takes the controls"
+    left = max(snapshot.total_s - snapshot.done_s, 0.0)
+    head = [
+        row((" command ", DIM), (holder, STRONG if view.in_command else "")),
+        row((" engine  ", DIM), (snapshot.engine or snapshot.state, STRONG),
+            (f"   {clock_text(snapshot.done_s)} of {clock_text(snapshot.total_s)}", ""),
+            (f"   {clock_text(left)} left", STRONG)),
+    ]  # fmt: skip
+    if snapshot.prompt and not view.newest.over:
+        answers = " / ".join(snapshot.answers)
+        head += wrapped(f" ? {snapshot.prompt}   [{answers}]   a answers", width, ASK)
+    at = snapshot.part
+    steps: list[Row] = []
+    for k, line in enumerate(view.newest.plan, 1):
+        mark, style = ("✓", DIM) if k < at else ("▸", STRONG) if k == at else (" ", "")
+        state = " now" if k == at and not view.newest.over else ""
+        steps.append(
+            row((f" {mark}{k:3d} {line.name:<14} ", style),
+                (f"{clock_text(line.seconds):>7}  ", DIM), (line.title, style), (state, NORMAL))
+        )  # fmt: skip
+    if not steps:
+        steps = [row((" the run has not said which steps it has", DIM))]
+    return block([*head, row(), *_window(steps, at - 1, height - len(head) - 1)], width, height)
+
+
+def filtered(view: View) -> list[Line]:
+    """Return the lines of the log that the operator's filter and search keep."""
+    wanted = view.look.search.lower()
+    return [
+        line
+        for line in view.newest.story
+        if view.look.only in ("all", line.kind) and wanted in line.text.lower()
+    ]
+
+
+def log_page(view: View, width: int, height: int) -> list[Row]:
+    """Return the log, the newest below; scrolled by whole lines."""
+    lines = filtered(view)
+    room = height - 1
+    offset = min(view.look.offset, max(len(lines) - room, 0))
+    shown_lines = lines[max(len(lines) - room - offset, 0) : len(lines) - offset]
+    search = f"  search: {view.look.search}" if view.look.search else ""
+    where = f"  {offset} lines back" if offset else ""
+    total = len(view.newest.story)
+    head = row((f" {view.look.only}{search}", STRONG), (f"  {len(lines)} of {total}{where}", DIM))
+    rows = [row((f"{line.time:10.2f} s  ", DIM), (line.text, line.style)) for line in shown_lines]
+    return block([head, *rows], width, height)
+
+
+def estimates_page(view: View, width: int, height: int) -> list[Row]:
+    """Return each parameter that is followed with its 95 % interval, over the run's time."""
+    series = view.newest.estimates
+    names = [name for name in (series[-1][1] if series else {}) if _known(view, name)]
+    if not names:
+        text = "Nothing is estimated yet: `bramah run --track` follows b and the flow gains."
+        return block(wrapped(f" {text}", width, DIM), width, height)
+    across = max(min(width // 38, len(names)), 1)
+    down = -(-len(names) // across)
+    each = (width - (across - 1)) // across
+    rows: list[Row] = []
+    for k in range(0, len(names), across):
+        share = max((height - len(rows)) // max(down - k // across, 1), 4)
+        boxes = [(_estimate(view, name, each, share), each) for name in names[k : k + across]]
+        rows += beside(boxes, share)
+    return block(rows, width, height)
+
+
+def _known(view: View, name: str) -> bool:
+    return view.newest.estimates[-1][1][name][0] is not None
+
+
+def _estimate(view: View, name: str, width: int, height: int) -> list[Row]:
+    nan = float("nan")
+    points = [
+        (at, [nan if v is None else float(v) for v in found[name]])
+        for at, found in view.newest.estimates
+        if name in found and found[name][0] is not None
+    ]
+    time = np.array([at for at, _ in points])
+    table = np.array([found for _, found in points])
+    low = np.where(np.isnan(table[:, 1]), table[:, 0], table[:, 1])
+    high = np.where(np.isnan(table[:, 2]), table[:, 0], table[:, 2])
+    value = table[-1, 0]
+    half = 0.5 * (table[-1, 2] - table[-1, 1])
+    share = abs(half / value) if value else nan
+    wide = ("▲ wide ", WARN_TEXT) if not share < 0.5 else ("", "")
+    line = fit(
+        row((f"{value:.4g}", STRONG), (f" ± {half:.2g} ({share:.0%}, 95 %)  ", DIM), wide),
+        width - 4,
+    )
+    span = max(time[-1], 1.0)
+    live = view.fresh is Freshness.LIVE
+    trace = PlotTrace(time, low, high, 0.0, span, (None, None), shown(""), live, True)
+    plot = draw(trace, width - 4, height - 4)
+    return box(name, [line, *plot, time_axis(0.0, span, width - 4)], width, height, DIM,
+               said_of(view))  # fmt: skip

@@ -1,0 +1,141 @@
+"""Overview: the state of the bench in one glance from two metres."""
+
+from __future__ import annotations
+
+from rig.bench.screens.sockets import Snapshot
+from rig.model.alarms.states import Alarm, folded
+from rig.tui.drawing.large import ROWS, large, large_width
+from rig.tui.drawing.rows import Row, beside, block, fit, row
+from rig.tui.drawing.styles import (
+    ALARM,
+    ALARM_TEXT,
+    DIM,
+    LEVELS,
+    STRONG,
+    WARN,
+    WARN_TEXT,
+)
+from rig.tui.look import View
+from rig.tui.pages.parts import WIDTH, bench_bars, joint_box, joints_in
+from rig.tui.units import clock_text, shown
+from rig.tui.words import Headline, Margin, headline, nearest_margin
+
+NEAR = 0.10  # a margin below this share of its band is yellow
+BIG = (150, 45)  # terminal of this size: letters twice as large
+GLANCE = 3  # alarms listed
+
+
+def overview(view: View, width: int, height: int) -> list[Row]:
+    """Return state, margin and time left in large letters, then alarms, then the joints."""
+    snapshot = view.frame.snapshot
+    assert snapshot is not None
+    margin = nearest_margin(view.newest)
+    scale = 2 if width >= BIG[0] and height >= BIG[1] else 1
+    rows = _band(headline(view.newest, view.now), margin, view, width, scale)
+    rows += [_step_line(view, snapshot, width), _margin_line(margin, width)]
+    rows += alarm_lines(view, width, GLANCE if height < 30 else 2 * GLANCE)
+    bars = bench_bars(view, width)
+    joints = list(joints_in(snapshot.channels))
+    return [*rows, *_joints(view, joints, width, height - len(rows) - len(bars)), *bars]
+
+
+def _band(found: Headline, margin: Margin | None, view: View, width: int, scale: int) -> list[Row]:
+    """Return the large letters; what is not normal fills the band with its colour."""
+    snapshot = view.newest.snapshot
+    assert snapshot is not None
+    ground = LEVELS[found.level] if found.level not in ("normal", "ended") else ""
+    tiles = []
+    if margin is not None and not view.newest.over:
+        near = ALARM_TEXT if margin.share < 0 else WARN_TEXT if margin.share < NEAR else STRONG
+        tiles.append((f"{max(margin.share, 0.0):.0%}", "to nearest limit", near))
+    if snapshot.total_s > 0 and not view.newest.over:
+        left = clock_text(max(snapshot.total_s - snapshot.done_s, 0.0))
+        tiles.append((left, "left", STRONG))
+    sizes = [max(large_width(text, scale), len(caption)) + 2 for text, caption, _ in tiles]
+    room = width - sum(sizes) - len(tiles)
+    if room < min(large_width(found.word), width) and found.level == "alarm":
+        tiles, sizes, room = [], [], width  # the word matters most
+    fits = next((s for s in (scale, 1) if large_width(found.word, s) + 4 <= room), 0)
+    high = ROWS * scale
+    style = ground or STRONG
+    if fits:
+        letters: list[Row] = large(found.word, style, fits)
+    else:
+        letters = [row(), row((" ".join(found.word) if 2 * len(found.word) < room else found.word,
+                               style))]  # fmt: skip
+    word = [fit((("  ", style), *line), room, ground) for line in letters]
+    caption = row((f" {found.symbol} {found.word} ", ground or DIM))
+    word = [*block(word, room, high, ground), fit(caption, room, ground)]
+    blocks: list[tuple[list[Row], int]] = [(word, room)]
+    for (text, below, tile_style), size in zip(tiles, sizes, strict=True):
+        blocks.append(([*large(text, tile_style, scale), row((below, DIM))], size))
+    return beside(blocks, high + 1)
+
+
+def _step_line(view: View, snapshot: Snapshot, width: int) -> Row:
+    part = f"{snapshot.part} of {snapshot.parts}: " if snapshot.parts else ""
+    now = row((" now   ", DIM), (f"{part}{snapshot.step or '–'} {snapshot.phase}", STRONG))
+    plan = view.newest.plan
+    after = plan[snapshot.part].title if snapshot.part < len(plan) else "the run is over"
+    return fit((*now, ("   next  ", DIM), (after, "")) if plan else now, width)
+
+
+def _margin_line(margin: Margin | None, width: int) -> Row:
+    if margin is None:
+        return fit(row((" limit ", DIM), ("no channel has limits", DIM)), width)
+    how = shown(margin.unit)
+    near = margin.share < NEAR
+    symbol = "■ " if margin.share < 0 else "▲ " if near else ""
+    style = ALARM_TEXT if margin.share < 0 else WARN_TEXT if near else ""
+    text = (
+        f"{symbol}{margin.channel} {how.number(margin.value)} {how.unit}, "
+        f"{how.number(margin.distance)} {how.unit} from its limit {how.short(margin.limit)}"
+    )
+    return fit(row((" limit ", DIM), (text, style)), width)
+
+
+def alarm_lines(view: View, width: int, most: int) -> list[Row]:
+    """Return the most urgent alarms, one line each; unacknowledged ones blink."""
+    groups = folded(view.alarms)
+    if not groups:
+        return [fit(row((" alarms none", DIM)), width)]
+    rows = []
+    for first, rest in groups[:most]:
+        more = f" (+{len(rest)} consequences)" if rest else ""
+        rows.append(
+            fit(row((" ", ""), *alarm_mark(view, first), f" {first.sentence}{more}"), width)
+        )
+    left = len(groups) - most
+    if left > 0:
+        rows.append(fit(row((f" … and {left} more: 5 shows them", DIM)), width))
+    return rows
+
+
+def alarm_mark(view: View, alarm: Alarm) -> Row:
+    """Return an alarm's shape and state; its colour blinks until somebody has acknowledged it."""
+    shape, style, text = ("■", ALARM, ALARM_TEXT) if alarm.trips else ("▲", WARN, WARN_TEXT)
+    bright = alarm.acknowledged or view.look.blink
+    word = f"{shape} {alarm.state.upper()}"
+    word += "" if alarm.acknowledged else " UNACK"
+    return row((f" {word} ", text if alarm.acknowledged else style if bright else text))
+
+
+def _joints(view: View, joints: list[int], width: int, height: int) -> list[Row]:
+    """Return the joints side by side; those that do not fit are reached by scrolling."""
+    if not joints or height < 3:
+        return block([], width, max(height, 0))
+    across = max(min(width // WIDTH, len(joints)), 1)
+    first = min(view.look.offset, max(len(joints) - across, 0))
+    chosen = joints[first:]
+    rows_of = [chosen[k : k + across] for k in range(0, len(chosen), across)]
+    fits = max(min(len(rows_of), height // 9), 1)
+    rows: list[Row] = []
+    for k, group in enumerate(rows_of[:fits]):
+        share = (height - len(rows)) // (fits - k)
+        each = (width - (across - 1)) // across
+        blocks = [(joint_box(view, joint, each, share), each) for joint in group]
+        rows += beside(blocks, share)
+    hidden = len(joints) - sum(map(len, rows_of[:fits]))
+    if hidden > 0:
+        rows[-1] = fit(row((f" {hidden} more joints: ↑ ↓ ", DIM)), width)
+    return block(rows, width, height)

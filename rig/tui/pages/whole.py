@@ -1,0 +1,208 @@
+"""The whole screen: header, what must not be missed, the page, the keys, a question above all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Final
+
+from rig.tui.drawing.rows import Row, beside, block, box, ends, fit, row, wrapped
+from rig.tui.drawing.styles import ASK, DIM, LEVELS, NORMAL, STRONG, SYMBOLS, WARN_TEXT
+from rig.tui.link import LinkStage
+from rig.tui.look import PAGES, View
+from rig.tui.pages import levels, operation, overview
+from rig.tui.units import age_text, clock_text
+from rig.tui.words import VERY_OLD, Freshness, headline, notices, run_time
+
+LEAST: Final = (60, 16)  # a smaller terminal shows the state and the stop, nothing else
+NOTICES: Final = 6  # rows they may take
+Page = Callable[[View, int, int], list[Row]]
+OF_A_RUN: Final[Mapping[str, Page]] = {
+    "overview": overview.overview,
+    "joint": levels.joint_page,
+    "channel": levels.channel_page,
+    "diagnostics": levels.diagnostics_page,
+    "alarms": operation.alarms_page,
+    "protocol": operation.protocol_page,
+    "log": operation.log_page,
+    "estimates": operation.estimates_page,
+}
+KEYS: Final = {
+    "overview": "t command  p pause/resume  a answer  k acknowledge  h hold",
+    "joint": "←→ joint  + − = span  z zoom  h hold",
+    "channel": "↑↓ channel  + − = span  z zoom  h hold",
+    "alarms": "↑↓ mark  k acknowledge  r reset",
+    "protocol": "t command  p pause/resume  n skip  x abort  a answer",
+    "log": "↑↓ scroll  / search  f filter  e end",
+    "estimates": "",
+    "manual": "",
+    "runs": "",
+    "diagnostics": "",
+}
+
+
+def compose(view: View, width: int, height: int) -> list[Row]:
+    """Return `height` rows of `width` cells: the picture of everything."""
+    if width <= 0 or height <= 0:
+        return []
+    if width < LEAST[0] or height < LEAST[1]:
+        return too_small(view, width, height)
+    head = [*header(view, width), *notice_rows(view, width)]
+    foot = [_keys(view, width)]
+    if view.remark:
+        foot.insert(0, fit(row((" ", ""), (view.remark, STRONG)), width))
+    room = max(height - len(head) - len(foot), 0)
+    rows = block([*head, *block(_page(view, width, room), width, room), *foot], width, height)
+    return _above(rows, view, width) if view.dialog is not None else rows
+
+
+def _page(view: View, width: int, height: int) -> list[Row]:
+    page = OF_A_RUN.get(view.look.page)
+    if view.newest.stage is LinkStage.CHOOSING:
+        return chooser(view, width, height)
+    if page is not None and view.frame.snapshot is None:
+        return waiting(view, width, height)
+    return page(view, width, height) if page is not None else []
+
+
+def too_small(view: View, width: int, height: int) -> list[Row]:
+    """Return what a terminal without room for a page still says: the state, and that keys stop."""
+    found = headline(view.newest, view.now)
+    style = LEVELS[found.level]
+    lines = [
+        row((f"{found.symbol} {found.word}", style)),
+        row(("SPACE STOPS", STRONG)),
+        row((f"{width}x{height}: too small, needs {LEAST[0]}x{LEAST[1]}", "")),
+    ]
+    return block(lines, width, height)
+
+
+def header(view: View, width: int) -> list[Row]:
+    """Return the lines on top: state, run, age and clock; the step; the pages."""
+    return [_who(view, width), _where(view, width), _tabs(view, width)]
+
+
+def _who(view: View, width: int) -> Row:
+    found = headline(view.newest, view.now)
+    badge = (f" {found.symbol} {found.word} ", LEVELS[found.level])
+    snapshot = view.newest.snapshot
+    if snapshot is None:
+        who = view.newest.endpoint
+        about = f"{who.rig} (process {who.pid})" if who else "no run attached"
+        return fit(row(badge, f" {about}"), width)
+    fresh = view.fresh
+    age = view.newest.age(view.now)
+    style = "" if fresh is Freshness.LIVE else WARN_TEXT if age <= VERY_OLD else LEVELS["alarm"]
+    word = "ended" if view.newest.over else f"age {age_text(age)}"
+    speed = f" ({view.newest.speed:.0f}×)" if view.newest.speed > 1.5 else ""
+    clock = f"  t {clock_text(run_time(view.newest))}{speed} "
+    command = "in command" if view.in_command else "held by another" if snapshot.holder else ""
+    command = f"{command}  " if command else "read-only  "
+    right = row((command, DIM), (word, style if not view.newest.over else DIM), (clock, STRONG))
+    name = snapshot.run.rstrip("/").rpartition("/")[2]
+    return ends(row(badge, (f" {snapshot.rig}", STRONG), (f"  {name}", DIM)), right, width)
+
+
+def _where(view: View, width: int) -> Row:
+    snapshot = view.newest.snapshot
+    if snapshot is None:
+        return fit(row(), width)
+    line = row(" ", (snapshot.step or "–", STRONG), f"  {snapshot.phase}")
+    if snapshot.repeats > 0:
+        line = (*line, (f"  repeat {snapshot.repeat} of {snapshot.repeats}", ""))
+    lost = (f"  {snapshot.lost_samples} lost", WARN_TEXT if snapshot.lost_samples else DIM)
+    if not snapshot.total_s > 0:
+        return ends(line, (lost,), width)
+    share = min(max(snapshot.done_s / snapshot.total_s, 0.0), 1.0)
+    room = max(min(width - 70, 40), 0)
+    full = round(share * room)
+    left = clock_text(max(snapshot.total_s - snapshot.done_s, 0.0))
+    progress = row(("━" * full, ""), ("─" * (room - full), DIM), f" {share:.0%}  left {left}", lost)
+    return ends(line, (*progress, (" ", "")), width)
+
+
+def _tabs(view: View, width: int) -> Row:
+    count = len(view.alarms.alarms)
+    fresh = len(view.alarms.unacknowledged)
+    line: Row = ()
+    for key, name, short in PAGES:
+        text = name if width >= 116 else short
+        if name == "alarms" and count:
+            text += f" {count}{'▲' if fresh else ''}"
+        style = NORMAL if name == view.look.page else WARN_TEXT if text[-1] == "▲" else DIM
+        line = (*line, (f" {key} {text}{' ' * (width >= 116)}", style))
+    return fit(line, width)
+
+
+def notice_rows(view: View, width: int) -> list[Row]:
+    """Return what the operator must not miss, each on its own colour over the whole width."""
+    rows: list[Row] = []
+    found = notices(view.newest, view.stop, view.now, paused=view.held)
+    if view.look.page == "overview":  # it lists the alarms itself
+        found = [notice for notice in found if not notice.text.startswith("WARNING")]
+    for notice in found:
+        style = LEVELS[notice.level]
+        lines = wrapped(notice.text, width - 4)
+        for k, line in enumerate(lines):
+            symbol = SYMBOLS[notice.level] if k == 0 else " "
+            text = "".join(part for part, _ in line)
+            rows.append(row((f" {symbol} {text:<{width - 3}}"[:width], style)))
+    return rows[:NOTICES]
+
+
+def _keys(view: View, width: int) -> Row:
+    stop = row((" SPACE STOP ", LEVELS["normal"]))
+    if width >= 116:
+        stop = (*stop, (" Esc-Esc too ", DIM))
+    keys = KEYS.get(view.look.page, "")
+    return ends((*stop, (f" {keys}", "")), row((" ? help  q quit ", DIM)), width)
+
+
+def waiting(view: View, width: int, height: int) -> list[Row]:
+    """Return what stands where there is no run: how to start one."""
+    rig = view.rig or "shinshu-2dof"
+    which = f" on rig {view.rig}" if view.rig else ""
+    lines = [
+        row((f" No protocol is running{which}.", STRONG)),
+        row(),
+        row(" Start one here: 0 lists protocols and runs; or in another terminal:"),
+        row((f"   bramah run lock-and-excite --rig {rig} --out RUN", "")),
+        row(),
+        row((" This screen attaches as soon as it runs.  q quits.", DIM)),
+    ]
+    if view.newest.endpoint is not None:
+        lines = [row((" Attached; nothing received yet.", STRONG))]
+    return block(lines, width, height)
+
+
+def chooser(view: View, width: int, height: int) -> list[Row]:
+    """Return the runs to choose from."""
+    lines = [
+        row((" Several runs. Which one?  Enter attaches; SPACE stops the marked one.", STRONG))
+    ]
+    for endpoint in view.newest.sessions:
+        mark = "▸" if endpoint == view.marked_session else " "
+        style = STRONG if endpoint == view.marked_session else ""
+        lines.append(row((f" {mark} {endpoint.rig}   process {endpoint.pid}", style)))
+    return block(lines, width, height)
+
+
+def _above(rows: list[Row], view: View, width: int) -> list[Row]:
+    """Return the rows with the open question over them."""
+    dialog = view.dialog
+    assert dialog is not None
+    wide = min(76, width)
+    inner = wide - 4
+    body = [line for text in dialog.body for line in (wrapped(text, inner) or [row()])]
+    for k, choice in enumerate(dialog.choices):
+        marked = k == dialog.marked
+        body.append(row((f" {'▸' if marked else ' '} {choice} ", ASK if marked else "")))
+    if dialog.text is not None:
+        body.append(fit(row(("> ", STRONG), dialog.text, ("█", "")), inner))
+    body += [row(), row((dialog.keys, DIM))]
+    high = min(len(body) + 2, len(rows))
+    drawn = box(dialog.title, body, wide, high, STRONG)
+    top, left = max((len(rows) - high) // 2, 0), (width - wide) // 2
+    # What stands beside the box is left out: the question is all there is to read on these rows.
+    blank = [row()] * high
+    middle = beside([(blank, left), (drawn, wide), (blank, width - wide - left)], high, gap=0)
+    return [*rows[:top], *middle, *rows[top + high :]]
