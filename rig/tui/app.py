@@ -5,6 +5,7 @@ The screen may come, go, hang or crash: the run is another process and does not 
 
 from __future__ import annotations
 
+import asyncio
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -78,7 +79,7 @@ class Monitor(Acts, App[int]):
         *,
         threaded: bool = True,
     ) -> None:
-        App.__init__(self)
+        App.__init__(self, ansi_color=True)  # the 16 colours of the terminal itself
         self.rig, self.clock, self._threaded = rig, clock, threaded
         self.link = Link(sessions or LocalSessions(rig), clock)
         self.me = own_command("take").holder
@@ -95,6 +96,7 @@ class Monitor(Acts, App[int]):
         self._drawn: object = None
         self._slow = -float("inf")
         self._escaped = -float("inf")
+        self._ticking: asyncio.Task[None] | None = None
         self.canvas = Canvas()
         self.pictures = 0  # drawn since the start; an idle screen draws none
 
@@ -106,11 +108,21 @@ class Monitor(Acts, App[int]):
         """Start the link and the clock of the screen."""
         if self._threaded:
             self.link.start()
-            self.set_interval(FRAME, self.draw)
+            self._ticking = asyncio.create_task(self._tick())
         self.draw()
+
+    async def _tick(self) -> None:
+        """Draw at the frame rate while a run lives; look less often while nothing can change."""
+        while True:
+            frame = self.link.frame
+            idle = self._drawn is frame and (frame.over or frame.endpoint is None)
+            await asyncio.sleep(BLINK if idle else FRAME)
+            self.draw()
 
     def on_unmount(self) -> None:
         """Let go of the run."""
+        if self._ticking is not None:
+            self._ticking.cancel()
         self.link.close()
 
     def on_resize(self) -> None:

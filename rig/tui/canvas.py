@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import groupby
 
+from rich.style import Style
 from textual.geometry import Region
 from textual.strip import Strip
 from textual.widget import Widget
@@ -21,10 +22,12 @@ class Canvas(Widget):
     def __init__(self) -> None:
         super().__init__()
         self.rows: tuple[Row, ...] = ()
+        self._ground = Style.null()
 
     def show(self, rows: Sequence[Row]) -> int:
         """Show these rows; returns how many had changed."""
         before, self.rows = self.rows, tuple(rows)
+        self._ground = self.rich_style
         padded = [*before, *[BLANK] * (len(rows) - len(before))]
         changed = [y for y, line in enumerate(self.rows) if line != padded[y]]
         if len(before) != len(rows):
@@ -42,4 +45,4 @@ class Canvas(Widget):
     def render_line(self, y: int) -> Strip:
         """Return one line of the terminal."""
         line = self.rows[y] if y < len(self.rows) else BLANK
-        return to_strip(line, self.size.width, self.rich_style)
+        return to_strip(line, self.size.width, self._ground)

@@ -43,9 +43,13 @@ class HistoryWindow:
 
     def span(self, channel: str, since: float) -> tuple[float, float] | None:
         """Return the channel's (smallest, largest) from device time `since`; None if none."""
-        low, high = self.of(channel)
-        recent = (self.time > since) & ~np.isnan(low)
-        return (float(low[recent].min()), float(high[recent].max())) if recent.any() else None
+        at = self.columns.get(channel)
+        first = int(np.searchsorted(self.time, since, side="right"))
+        if at is None or first == len(self.time):
+            return None
+        smallest = float(np.fmin.reduce(self.low[first:, at]))
+        largest = float(np.fmax.reduce(self.high[first:, at]))
+        return None if np.isnan(smallest) else (smallest, largest)
 
 
 EMPTY: Final = HistoryWindow(np.empty(0), np.empty((0, 0)), np.empty((0, 0)), {}, {})

@@ -21,7 +21,9 @@ def bench(
     ] = 10,
     only: Annotated[
         str | None,
-        typer.Option(help="One of: plant, analysis, stream, demo, acquisition, wires, faults."),
+        typer.Option(
+            help="One of: plant, analysis, stream, demo, acquisition, wires, faults, screen."
+        ),
     ] = None,
     docs: Annotated[Path | None, typer.Option(help="Also write the table as a page.")] = None,
 ) -> None:

@@ -19,6 +19,7 @@ from rig.cli.bench.acquisition import measure_acquisition
 from rig.cli.bench.analysis import identify_figures, simulation_figures
 from rig.cli.bench.fault_figures import fault_figures
 from rig.cli.bench.figure import Figure
+from rig.cli.bench.screen_figures import screen_figures
 from rig.cli.bench.stream_figures import stream_figures
 from rig.cli.bench.wire_figures import wire_figures
 from rig.cli.experiment import RIG, Experiment, experiment
@@ -30,7 +31,7 @@ from rig.runs.rigs import load_rig
 from rig.runs.store import load_run
 
 JUDGING_SEED = 100  # seeds below were used to tune; these and above judge
-LONG: Final = ("wires", "faults")  # measured only when asked for: half an hour each
+LONG: Final = ("wires", "faults", "screen")  # measured only when asked for
 Say = Callable[[str], None]
 
 
@@ -148,6 +149,7 @@ def measure(minutes: float, seeds: int, only: str | None, say: Say) -> list[Figu
         "acquisition": lambda folder, tell: acquisition_figures(folder, tell, minutes),
         "wires": lambda _, tell: wire_figures(tell, minutes),
         "faults": fault_figures,
+        "screen": lambda _, tell: screen_figures(tell, min(60.0 * minutes, 30.0)),
     }
     if only is not None and only not in groups:
         raise InputError(f"--only {only}: expected one of: {' '.join(groups)}")
@@ -183,7 +185,8 @@ tune.
   by the host's clock after the time of its last sample by the device's.
 
 `bramah bench --only wires --minutes 10` (each wire: losses, processor time, lateness, the bare
-library) and `--only faults` ([faults](faults.md)) are measured on their own.
+library), `--only faults` ([faults](faults.md)) and `--only screen` (the operator's screen, live and
+after the end of a run) are measured on their own.
 """
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 from typing import Final
 
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.tui.drawing import braille
-from rig.tui.drawing.rows import Part, Row, row
+from rig.tui.drawing.rows import Part, Row, fitted, row
 from rig.tui.drawing.styles import ALARM, DIM, PLAIN, TRIP_LINE, WARN_LINE
 from rig.tui.units import Shown
 
@@ -21,6 +22,7 @@ GUTTER: Final = 7  # characters left of the curve: a limit's number and the axis
 LEAST_ZOOM: Final = 0.04  # of the range between the limits
 TICK: Final = 20  # least characters between two numbers of the time axis
 _STEPS: Final = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 30.0, 60.0, 120.0, 300.0)
+_BEYOND: Final = 4  # the kind of a cell whose curve is beyond a limit
 _WIDE: Final = 5  # a warning's line is on for one dot column in so many characters
 
 
@@ -70,20 +72,20 @@ def draw(trace: PlotTrace, width: int, height: int) -> list[Row]:
         trace.time, trace.low, trace.high, trace.start, trace.stop, 2 * columns
     )
     curve = braille.curve_dots(low, high, 4 * height, scale)
-    trip = _lines(trace.limits, 2 * columns, height, scale)
-    warn = _lines(trace.warnings, 2 * columns, height, scale)
-    warn[:, np.arange(2 * columns) % (2 * _WIDE) != 0] = False
-    # 0 nothing, 1 line of a warning, 2 of a trip, 3 curve, 4 curve beyond a limit
-    kinds = braille.to_cells(warn).astype(np.int64)
-    kinds[braille.to_cells(trip)] = 2
+    lines, kinds = _lines(trace.limits, trace.warnings, columns, height, scale)
     cells = braille.to_cells(curve)
+    kinds = kinds.copy()
     kinds[cells] = (3 + np.broadcast_to(_beyond(low, high, trace.limits), cells.shape))[cells]
+    if columns:  # a blank takes the style before it: fewer pieces to send to the terminal
+        known = np.maximum.accumulate(np.where(kinds > 0, np.arange(columns), 0), axis=1)
+        spread = np.take_along_axis(kinds, known, axis=1)
+        kinds = np.where((kinds == 0) & (spread < _BEYOND), spread, kinds)
     # What is beyond a limit is marked also when old: a tripped run is looked at for it.
     styles = (DIM, WARN_LINE, TRIP_LINE, PLAIN if trace.live else DIM, ALARM)
-    axis = _axis(trace, scale, height)
+    axis = _axis(trace.limits, trace.warnings, trace.zoomed, trace.shown, scale, height)
     return [
-        (*axis[i], *_runs(text, kinds[i], styles))
-        for i, text in enumerate(braille.to_text(curve | trip | warn))
+        fitted((*axis[i], *_runs(text, kinds[i], styles)), GUTTER + columns)
+        for i, text in enumerate(braille.to_text(curve | lines))
     ]
 
 
@@ -104,12 +106,25 @@ def time_axis(start: float, stop: float, width: int) -> Row:
     return row(("".join(cells), DIM))
 
 
-def _lines(levels: Band, columns: int, height: int, scale: braille.Scale) -> braille.Dots:
-    dots = np.zeros((4 * height, columns), dtype=np.bool_)
-    for level in levels:
+@lru_cache(maxsize=64)
+def _lines(
+    limits: Band, warnings: Band, columns: int, height: int, scale: braille.Scale
+) -> tuple[braille.Dots, NDArray[np.int64]]:
+    """Return the dots of all lines, and of each character which kind of line it has.
+
+    0 nothing, 1 line of a warning, 2 of a trip; a curve is 3, and 4 beyond a limit.
+    """
+    dots = [np.zeros((4 * height, 2 * columns), dtype=np.bool_) for _ in range(2)]
+    for k, level in [*((0, w) for w in warnings), *((1, t) for t in limits)]:
         if level is not None:
-            dots |= braille.level_dots(level, columns, 4 * height, scale)
-    return dots
+            dots[k] |= braille.level_dots(level, 2 * columns, 4 * height, scale)
+    warn, trip = dots
+    warn[:, np.arange(2 * columns) % (2 * _WIDE) != 0] = False
+    kinds = braille.to_cells(warn).astype(np.int64)
+    kinds[braille.to_cells(trip)] = 2
+    both = warn | trip
+    both.flags.writeable = kinds.flags.writeable = False  # kept for the next pictures
+    return both, kinds
 
 
 def _beyond(low: Array, high: Array, limits: Band) -> NDArray[np.int_]:
@@ -120,24 +135,27 @@ def _beyond(low: Array, high: Array, limits: Band) -> NDArray[np.int_]:
     return np.asarray(columns.reshape(-1, 2).any(axis=1), dtype=np.int_)
 
 
-def _axis(trace: PlotTrace, scale: braille.Scale, height: int) -> list[tuple[Part, ...]]:
+@lru_cache(maxsize=64)
+def _axis(
+    limits: Band, warnings: Band, zoomed: bool, how: Shown, scale: braille.Scale, height: int
+) -> tuple[tuple[Part, ...], ...]:
     """Return the gutter, line by line: numbers of limits on the scale, else of the scale's ends."""
     labels: dict[int, Part] = {}
-    marks = (*trace.limits, *trace.warnings)
-    if trace.zoomed or not any(m is not None and scale.low <= m <= scale.high for m in marks):
-        labels[height - 1] = (trace.shown.short(scale.low), DIM)
-        labels[0] = (trace.shown.short(scale.high), DIM)
-    for levels, style in ((trace.warnings, WARN_LINE), (trace.limits, TRIP_LINE)):
+    marks = (*limits, *warnings)
+    if zoomed or not any(m is not None and scale.low <= m <= scale.high for m in marks):
+        labels[height - 1] = (how.short(scale.low), DIM)
+        labels[0] = (how.short(scale.high), DIM)
+    for levels, style in ((warnings, WARN_LINE), (limits, TRIP_LINE)):
         for level in levels:
             if level is not None and scale.low <= level <= scale.high:
                 at = int(scale.row(level, 4 * height)) // 4
-                labels[at] = (trace.shown.short(level), style)
+                labels[at] = (how.short(level), style)
     lines: list[tuple[Part, ...]] = []
     for k in range(height):
         text, style = labels.get(k, ("", DIM))
         tick = "┤" if text else "│"
         lines.append(((f"{text:>{GUTTER - 1}}"[: GUTTER - 1], style), (tick, DIM)))
-    return lines
+    return tuple(lines)
 
 
 def _runs(text: str, kinds: NDArray[np.int64], styles: tuple[str, ...]) -> tuple[Part, ...]:

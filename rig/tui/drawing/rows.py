@@ -5,11 +5,13 @@ Pages are plain functions that return rows. Only rows that changed are drawn aga
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from textwrap import wrap
 
-from rich.cells import cell_len, set_cell_size
+from rich.cells import cell_len as slow_cell_len
+from rich.cells import set_cell_size
 from rich.segment import Segment
 from rich.style import Style
 from textual.strip import Strip
@@ -20,6 +22,19 @@ Part = tuple[str, str]
 Row = tuple[Part, ...]
 
 BLANK: Row = ()
+
+# Characters of two cells, and of none. Only text that has one is measured character by character.
+_ODD = re.compile(
+    "[\u0300-\u036f\u1100-\u115f\u200b-\u200f\u2e80-\ua4cf\uac00-\ud7a3\uf900-\ufaff"
+    "\ufe00-\ufe6f\uff00-\uff60\uffe0-\uffe6\U0001f000-\U0003fffd]"
+)
+
+
+def cell_len(text: str) -> int:
+    """Return how many cells a text takes."""
+    if text.isascii() or _ODD.search(text) is None:
+        return len(text)
+    return slow_cell_len(text)
 
 
 def row(*parts: str | Part) -> Row:
@@ -32,9 +47,27 @@ def text_of(line: Row) -> str:
     return "".join(text for text, _ in line)
 
 
+class Fitted(tuple[Part, ...]):
+    """A row whose width is known: it is not measured again on its way to the terminal."""
+
+    cells: int
+
+
+def fitted(parts: Iterable[Part], cells: int) -> Row:
+    """Return parts that take `cells` cells as a row that knows it."""
+    made = Fitted(parts)
+    made.cells = cells
+    return made
+
+
 def width_of(line: Row) -> int:
     """Return how many cells a row takes."""
-    return sum(cell_len(text) for text, _ in line)
+    if isinstance(line, Fitted):
+        return line.cells
+    total = 0
+    for text, _ in line:
+        total += cell_len(text)
+    return total
 
 
 def fit(line: Row, width: int, style: str = PLAIN) -> Row:
@@ -43,7 +76,8 @@ def fit(line: Row, width: int, style: str = PLAIN) -> Row:
         return BLANK
     have = width_of(line)
     if have <= width:
-        return line if have == width else (*line, (" " * (width - have), style))
+        rest = ((" " * (width - have), style),) if have < width else ()
+        return line if isinstance(line, Fitted) and not rest else fitted((*line, *rest), width)
     found: list[Part] = []
     left = width - 1
     for text, part_style in line:
@@ -53,7 +87,7 @@ def fit(line: Row, width: int, style: str = PLAIN) -> Row:
             break
         found.append((text, part_style))
         left -= size
-    return tuple(found)
+    return fit(tuple(found), width, style)
 
 
 def ends(left: Row, right: Row, width: int, style: str = PLAIN) -> Row:
@@ -67,19 +101,22 @@ def ends(left: Row, right: Row, width: int, style: str = PLAIN) -> Row:
 def block(rows: Sequence[Row], width: int, height: int, style: str = PLAIN) -> list[Row]:
     """Return exactly `height` rows of `width` cells."""
     kept = [fit(line, width, style) for line in rows[: max(height, 0)]]
-    return kept + [fit(BLANK, width, style)] * (height - len(kept))
+    if len(kept) < height:
+        kept += [fit(BLANK, width, style)] * (height - len(kept))
+    return kept
 
 
 def beside(blocks: Sequence[tuple[Sequence[Row], int]], height: int, gap: int = 1) -> list[Row]:
     """Return blocks of given widths side by side, each filled up to `height` rows."""
     filled = [block(rows, width, height) for rows, width in blocks]
     space: Row = ((" " * gap, PLAIN),) if gap else ()
+    total = sum(width for _, width in blocks) + gap * (len(blocks) - 1)
     found = []
     for parts in zip(*filled, strict=True):
         line: Row = parts[0]
         for part in parts[1:]:
             line = (*line, *space, *part)
-        found.append(line)
+        found.append(fitted(line, total))
     return found
 
 
@@ -98,7 +135,7 @@ def box(
     bottom = row((f"└{'─' * (width - 2 - cell_len(foot))}{foot}┘", style))
     left, right = ("│ ", style), (" │", style)
     rows = block(body, inner, height - 2)
-    return [top, *((left, *line, right) for line in rows), bottom]
+    return [top, *(fitted((left, *line, right), width) for line in rows), bottom]
 
 
 def wrapped(text: str, width: int, style: str = PLAIN) -> list[Row]:
@@ -124,11 +161,11 @@ def columns(rows: Iterable[Sequence[str | Part]], gap: int = 2) -> list[Row]:
 
 
 @lru_cache(maxsize=256)
-def _style(text: str) -> Style:
-    return Style.parse(text) if text else Style.null()
+def _style(text: str, ground: Style) -> Style:
+    return ground + Style.parse(text) if text else ground
 
 
 def to_strip(line: Row, width: int, ground: Style) -> Strip:
     """Return a row as what the terminal's driver takes."""
-    segments = [Segment(text, ground + _style(style)) for text, style in fit(line, width)]
+    segments = [Segment(text, _style(style, ground)) for text, style in fit(line, width)]
     return Strip(segments, width)
