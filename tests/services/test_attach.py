@@ -20,8 +20,10 @@ import zmq
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.base import SampleBlock
+from drivers.base import DeviceLost, SampleBlock
 from rig.bench.guard import EXCITED, JointRole
+from rig.bench.screens.commands import Holder
+from rig.bench.screens.past import KEPT, PastKeeper, PastMinute, PlanLine, past_from
 from rig.bench.screens.snapshot import Snapshot, decimate, from_json, to_json
 from rig.bench.screens.sockets import AttachError, Attachment, Command, Endpoint, Publisher
 from rig.bench.session import Bench
@@ -285,3 +287,80 @@ def test_a_trip_is_shown_at_once_and_the_limits_follow_the_roles() -> None:
     assert last.channels["piston_2"].high == pytest.approx(0.0, abs=1e-12)
     assert last.channels["command_1"].high == 4.0
     assert (last.tick, last.device_time) == (20, 0.02)
+
+
+def test_a_screen_that_attaches_late_gets_the_last_minute_and_the_plan(folder: Path) -> None:
+    publisher = Publisher(RIG.name)
+    ticking = iter(range(1_000_000))
+    driver = FakeDriver(RIG)
+    with Bench(RIG, driver, None, publisher, clock=lambda: next(ticking)) as bench:  # type: ignore[arg-type]
+        bench.describe([PlanLine("step1", "joint 2 excited", 6.0)])
+        measured = bench.run_for(0.5)
+        late = Attachment(publisher.endpoint)
+        found: list[PastMinute | None] = []
+        asker = threading.Thread(target=lambda: found.append(late.past(20)))
+        asker.start()
+        wait_for(lambda: bench.exchange() is not None and bool(found))
+        asker.join(30)
+        late.close()
+    (past,) = found
+    assert past is not None
+    assert past.names == tuple(RIG.recorded)
+    assert [line.title for line in past.plan] == ["joint 2 excited"]
+    assert np.all(np.diff(past.time) > 0)
+    inside = past.time <= 0.5 + 1e-9
+    np.testing.assert_array_equal(past.low[inside].min(axis=0), measured.min(axis=0))
+    np.testing.assert_array_equal(past.high[inside].max(axis=0), measured.max(axis=0))
+
+
+def test_a_run_remembers_no_more_than_a_minute_of_snapshots() -> None:
+    keeper = PastKeeper(["a", "b"])
+    for k in range(KEPT + 10):
+        keeper.add(float(k), np.full((3, 2), float(k)))
+    keeper.add(1e6, np.empty((0, 2)))
+    past = past_from(*keeper.answer())
+    assert len(past.time) == KEPT
+    assert (past.time[0], past.time[-1]) == (10.0, KEPT + 9.0)
+    for header, raw in (({}, b""), ({"names": 3, "plan": []}, b""), ({"names": ["a"]}, b"12")):
+        with pytest.raises(ValueError):  # noqa: PT011
+            past_from(header, raw)
+
+
+def test_the_controls_are_taken_over_explicitly_and_every_screen_sees_whose_they_are(
+    tmp_path: Path,
+) -> None:
+    holder = Holder()
+    one, two = (Command("pause", holder=name) for name in ("one", "two"))
+    assert holder.judge(one, lambda _: None) is None
+    assert "held by one" in str(holder.judge(two, lambda _: None))
+    assert holder.judge(Command("take", holder="two"), None) is None
+    assert holder.held is not None
+    assert holder.held.holder == "two"
+    assert "held by two" in str(holder.judge(one, lambda _: None))
+    assert holder.judge(Command("stop"), None) is None
+    assert holder.judge(Command("release", holder="two"), None) is None
+    assert holder.held is None
+    assert "say who asks" in str(holder.judge(Command("take"), None))
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    assert holder.judge(Command("take", holder="three", pid=dead.pid), None) is None
+    assert holder.held is None, "a screen that is gone gives its controls up"
+
+
+def test_a_snapshot_says_roles_warning_bands_and_a_lost_device() -> None:
+    wall = Wall()
+    with (  # noqa: PT012
+        pytest.raises(DeviceLost),
+        Bench(RIG, FakeDriver(RIG), None, wall, clock=lambda: 0.0) as bench,
+    ):
+        bench.guard([EXCITED, JointRole(locked_at=-0.02, tolerance=0.02)])
+        bench.exchange()
+        raise DeviceLost("the device does not answer")
+    first, last = wall.seen[0], wall.seen[-1]
+    assert first.roles == ["excited", "locked"]
+    cap = first.channels["cap_pressure_1"]
+    assert cap.warn_high is not None
+    assert cap.high is not None
+    assert cap.warn_high < cap.high
+    assert (first.device, last.device) == ("", "lost")
+    assert first.wire == RIG.wire.endpoint
