@@ -9,11 +9,19 @@ import typer
 
 def monitor(
     rig: Annotated[str | None, typer.Option("--rig", help="Only runs of this rig.")] = None,
+    plain: Annotated[
+        bool, typer.Option("--plain", help="One line a second, for screen readers and logs.")
+    ] = False,
 ) -> None:
-    """Watch a running protocol: pressures, limits, pistons; s stops it, q leaves it running.
+    """Watch and command a running protocol; space stops it, q leaves it running.
 
     Example: bramah monitor --rig shinshu-2dof
     """
+    if plain:
+        from rig.tui.plain import read_aloud
+
+        read_aloud(rig, typer.echo)
+        return
     from rig.tui.app import main
 
     raise typer.Exit(main(rig))

@@ -105,9 +105,7 @@ def _load(pid: int, terminal: int, seconds: float) -> tuple[float, int]:
 def screen_figures(say: Callable[[str], None], seconds: float) -> list[Figure]:
     """Measure the screen on a live run of 17 channels at 1 kHz, and after its end."""
     columns, rows = SIZE
-    say(
-        f"screen: {columns} x {rows}, 17 channels at 1 kHz, {seconds:g} s live and idle"
-    )
+    say(f"screen: {columns} x {rows}, 17 channels at 1 kHz, {seconds:g} s live and idle")
     # A socket's address holds about 100 bytes: the folder's name must be short.
     with tempfile.TemporaryDirectory(prefix="b", dir="/tmp") as folder:
         script = f"from rig.cli.bench.screen_figures import publish; publish({WARM + seconds + 1})"

@@ -1,0 +1,98 @@
+"""`bramah monitor --plain`: one line a second, for screen readers, logs and pipes.
+
+Each line begins with the state in a word; what happened stands in lines of its own at once. After
+the end of a run it is silent until the next one.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Final
+
+from rig.tui.link import POLL, Frame, Link, LinkStage, LocalSessions, Sessions
+from rig.tui.units import age_text, clock_text, shown
+from rig.tui.words import headline, nearest_margin, notices, run_time
+
+EVERY: Final = 1.0  # [s]
+
+
+def status_line(frame: Frame, now: float) -> str:
+    """Return the state of the bench in one line."""
+    found = headline(frame, now)
+    snapshot = frame.snapshot
+    if snapshot is None:
+        return f"{found.word}: {_without(frame)}"
+    parts = [f"{found.word}: {run_time(frame):.1f} s", f"{snapshot.step} {snapshot.phase}".strip()]
+    if snapshot.repeats > 0:
+        parts.append(f"repeat {snapshot.repeat} of {snapshot.repeats}")
+    if snapshot.total_s > 0 and not frame.over:
+        parts.append(f"{clock_text(max(snapshot.total_s - snapshot.done_s, 0.0))} left")
+    margin = nearest_margin(frame)
+    if margin is not None:
+        how = shown(margin.unit)
+        parts.append(
+            f"nearest limit {margin.channel} {how.number(margin.value)} of "
+            f"{how.short(margin.limit)} {how.unit} ({margin.share:.0%})"
+        )
+    fresh = sum(not alarm.acknowledged for alarm in snapshot.alarms)
+    if snapshot.alarms:
+        parts.append(f"{len(snapshot.alarms)} alarms, {fresh} unacknowledged")
+    parts.append(f"{snapshot.lost_samples} lost")
+    if not frame.over:
+        parts.append(f"age {age_text(frame.age(now))}")
+    return ", ".join(part for part in parts if part)
+
+
+def _without(frame: Frame) -> str:
+    if frame.trouble:
+        return f"cannot reach runs: {frame.trouble}"
+    if frame.stage is LinkStage.CHOOSING:
+        names = ", ".join(f"{e.rig} (process {e.pid})" for e in frame.sessions)
+        return f"several runs, name one with --rig: {names}"
+    return "waiting for a run" if frame.endpoint is None else "attached, nothing received yet"
+
+
+class Reader:
+    """Says what changed: status lines every second, and what happened as it is received."""
+
+    def __init__(self, say: Callable[[str], None]) -> None:
+        self._say = say
+        self._told = 0
+        self._next = -float("inf")
+        self._last = ""
+
+    def read(self, frame: Frame, now: float) -> None:
+        """Say what is new in a frame."""
+        fresh = min(frame.told - self._told, len(frame.story))
+        self._told = frame.told
+        for what in frame.story[len(frame.story) - fresh :]:
+            self._say(f"  at {what.time:.2f} s: {what.text}")
+        quiet = frame.over or frame.snapshot is None
+        line = status_line(frame, now)
+        if quiet and line != self._last:
+            self._say(line)
+            for notice in notices(frame, None, now, paused=False):
+                self._say(f"  {notice.text}")
+        elif not quiet and now >= self._next:
+            self._next = now + EVERY
+            self._say(line)
+        self._last = line
+
+
+def read_aloud(
+    rig: str | None,
+    say: Callable[[str], None],
+    sessions: Sessions | None = None,
+    clock: Callable[[], float] = time.monotonic,
+) -> None:
+    """Say what a run does until interrupted; it is watched, never commanded."""
+    link = Link(sessions or LocalSessions(rig), clock)
+    reader = Reader(say)
+    link.start()
+    try:
+        while True:
+            reader.read(link.frame, clock())
+            time.sleep(POLL)
+    finally:
+        link.close()

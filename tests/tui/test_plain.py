@@ -1,0 +1,101 @@
+"""`bramah monitor --plain`: lines that a screen reader can read."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from rig.tui.link import Link
+from rig.tui.plain import Reader
+from tests.tui.glass import Clock, Machine, Recorded, endpoint
+from tests.tui.recorded import Bench, followed, run, snapshot, tripped
+
+HERE = endpoint()
+ROOT = Path(__file__).parents[2]
+
+
+class Listener:
+    """Someone who listens to the lines while time passes."""
+
+    def __init__(self, machine: Machine) -> None:
+        self.heard: list[str] = []
+        self.clock = Clock()
+        self.link = Link(machine, self.clock)
+        self.reader = Reader(self.heard.append)
+
+    def listen(self, seconds: float) -> list[str]:
+        del self.heard[:]
+        for _ in range(round(seconds / 0.1)):
+            before = None
+            while before is not self.link.frame:
+                before = self.link.frame
+                self.link.step(0.0)
+            self.reader.read(self.link.frame, self.clock())
+            self.clock.now += 0.1
+        return [line for line in self.heard if not line.startswith("  ")]
+
+
+def test_one_line_a_second_says_the_state_first() -> None:
+    record = Recorded(map(followed, run(Bench(), 4.0)))
+    listener = Listener(Machine({HERE: record}))
+    assert listener.listen(0.1)[0].startswith("EXCITING: 4.0 s, step1 excite, repeat 1 of 4")
+    assert any("attached to run" in line for line in listener.heard)
+    for k in range(81, 121):
+        record.waiting.append(followed(snapshot(Bench(), k)))
+        listener.listen(0.1)
+    record.waiting.append(followed(snapshot(Bench(), 121)))
+    (line,) = listener.listen(0.4)
+    assert "0:33 left" in line
+    assert "nearest limit piston_1 −37.4 of −39 mm (2%)" in line
+    lines = listener.listen(3.0)
+    assert all(line.startswith("NO DATA: ") for line in lines[1:])
+    assert 2 <= len(lines) <= 4
+
+
+def test_a_trip_is_said_at_once_and_then_it_is_silent() -> None:
+    record = Recorded(map(followed, run(Bench(), 4.0)))
+    listener = Listener(Machine({HERE: record}))
+    listener.listen(0.2)
+    record.waiting.append(tripped(replace(followed(snapshot(Bench(), 81)))))
+    (line,) = listener.listen(0.2)
+    assert line.startswith("TRIPPED: ")
+    assert any("TRIP  limit 'pressure'" in said for said in listener.heard)
+    assert listener.listen(30.0) == []
+
+
+def test_without_a_run_it_says_so_once() -> None:
+    assert Listener(Machine()).listen(20.0) == ["NO RUN: waiting for a run"]
+
+
+def test_several_runs_are_named() -> None:
+    machine = Machine({HERE: Recorded(), endpoint("press", 9): Recorded()})
+    said = " ".join(Listener(machine).listen(1.0))
+    assert "several runs, name one with --rig: shinshu-2dof (process 4711), press" in said
+
+
+@pytest.fixture
+def folder() -> Iterator[str]:
+    with tempfile.TemporaryDirectory(prefix="b", dir="/tmp") as found:
+        yield found
+
+
+def test_as_a_process_it_ends_with_an_interrupt(folder: str) -> None:
+    environment = {**os.environ, "XDG_RUNTIME_DIR": folder}
+    words = [sys.executable, "-c", "from rig.cli.main import run; run()", "monitor", "--plain"]
+    process = subprocess.Popen(
+        words, cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "NO RUN: waiting for a run\n"
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "Traceback" not in errors
