@@ -42,6 +42,7 @@ VERBS: Final = {
     "simulate": "rig.cli.simulate",
     "trace": "rig.cli.trace",
     "loop": "rig.cli.loop",
+    "manual": "rig.cli.manual",
     "conformance": "rig.cli.conformance",
     "dbc": "rig.cli.dbc",
     "schema": "rig.cli.schema",

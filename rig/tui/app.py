@@ -18,14 +18,15 @@ from textual.binding import Binding, BindingType
 from rig.bench.screens.commands import own_command
 from rig.bench.screens.sockets import Endpoint
 from rig.model.alarms.states import AlarmTable
-from rig.tui.acts import Acts
+from rig.tui.acting.manual import ByHand
+from rig.tui.browse import Browsed
 from rig.tui.canvas import Canvas
-from rig.tui.link import FRAME, Frame, Link, LinkStage, LocalSessions, Sessions
+from rig.tui.following.link import FRAME, Frame, Link, LinkStage, LocalSessions, Sessions
+from rig.tui.following.story import KINDS
 from rig.tui.look import PAGES, Dialog, Look, View
 from rig.tui.pages.operation import in_order
 from rig.tui.pages.parts import joints_in
 from rig.tui.pages.whole import compose
-from rig.tui.story import KINDS
 from rig.tui.words import LINGER, KeyAnswer, Stop
 
 SPANS: Final = (2.0, 5.0, 10.0, 30.0, 60.0)  # of the plots [s of device time]
@@ -60,7 +61,7 @@ def automatic_span(speed: float) -> float:
     return next((s for s in LONG_SPANS[2:] if s / speed > CROSSING), LONG_SPANS[-1])
 
 
-class Monitor(Acts, App[int]):
+class Monitor(ByHand, App[int]):
     """Attach, watch, stop, command."""
 
     TITLE = "bramah monitor"
@@ -78,12 +79,14 @@ class Monitor(Acts, App[int]):
         clock: Callable[[], float] = time.monotonic,
         *,
         threaded: bool = True,
+        browsed: Browsed | None = None,
     ) -> None:
         App.__init__(self, ansi_color=True)  # the 16 colours of the terminal itself
         self.rig, self.clock, self._threaded = rig, clock, threaded
         self.link = Link(sessions or LocalSessions(rig), clock)
         self.me = own_command("take").holder
         self.look = Look()
+        self.browsed = browsed or Browsed()
         self.dialog: Dialog | None = None
         self.accept: Callable[[str], None] | None = None  # what the open question's answer does
         self.remark = ""
@@ -281,6 +284,10 @@ class Monitor(Acts, App[int]):
             self.look = replace(look, joint=min(max(joint, 1), max(joints, 1)))
         elif look.page == "manual":
             self.act_jog(key)
+        elif look.page == "runs" and key in ("left", "right"):
+            self.act_tab(1 if key == "right" else -1)
+        elif look.page == "runs" and key in ("pageup", "pagedown"):
+            self.look = replace(look, offset=max(look.offset + step, 0))
         else:
             self.look = replace(look, marked=min(max(look.marked + step, 0), self.last_marked()))
 
@@ -288,7 +295,7 @@ class Monitor(Acts, App[int]):
         """Return the number of the last line that can be marked on this page."""
         if self.look.page == "alarms":
             return max(len(in_order(self.view())) - 1, 0)
-        return max(len(self.browsed_lines()) - 1, 0)
+        return max(self.browsed.lines - 1, 0)
 
     # How it is shown
 
@@ -378,7 +385,7 @@ def farewell(frame: Frame) -> str:
     )
 
 
-def main(rig: str | None) -> int:
+def main(rig: str | None, browsed: Browsed | None = None) -> int:
     """Show the screen until the operator leaves it; return the exit code (0, or 130 on Ctrl-C)."""
-    code = Monitor(rig).run()
+    code = Monitor(rig, browsed=browsed).run()
     return 0 if code is None else code

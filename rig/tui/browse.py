@@ -1,10 +1,78 @@
-"""What stands on the disk: runs, protocols and the queue, read beside the screen."""
+"""What stands on the disk: runs, protocols and the queue, as they are read for the screen."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import sqlite3
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+from protocols.files.library import shipped_names
+from rig.bench.latch import state_folder
+from rig.model.parse import InputError
+from rig.queue.items import Item
+from rig.queue.store import QueueStore
+from rig.runs.listing.index import indexed_runs
+from rig.runs.listing.summary import RunSummary
+from rig.tui.jobs import Job
+
+TABS: Final = ("protocols", "runs", "queue")
 
 
 @dataclass(frozen=True)
 class Browsed:
-    """What was found; empty until somebody looks."""
+    """What was found; `trouble` says in one line what could not be read.
+
+    `job` is the newest verb that was started here, `rig` and `endpoint` what it is started for.
+    """
+
+    folder: Path = Path()
+    tab: int = 0
+    protocols: tuple[str, ...] = ()
+    runs: tuple[RunSummary, ...] = ()
+    queue: tuple[Item, ...] = ()
+    paused: str = ""
+    trouble: str = ""
+    reading: bool = False
+    job: Job | None = None
+    rig: str = ""
+    endpoint: str | None = None
+
+    @property
+    def name(self) -> str:
+        """The tab that is open."""
+        return TABS[self.tab]
+
+    @property
+    def lines(self) -> int:
+        """How many lines the open tab has."""
+        return len((self.protocols, self.runs, self.queue)[self.tab])
+
+
+def read_disk(before: Browsed) -> Browsed:
+    """Read everything anew; never raises: what cannot be read is said in `trouble`."""
+    troubles: list[str] = []
+    runs: tuple[RunSummary, ...] = ()
+    queue: tuple[Item, ...] = ()
+    paused = ""
+    try:
+        runs = tuple(reversed(indexed_runs(before.folder)))  # the newest on top
+    except (InputError, OSError) as error:
+        troubles.append(str(error))
+    path = state_folder() / "queue.sqlite"
+    if path.is_file():
+        try:
+            with QueueStore(path, create=False) as store:
+                queue, paused = tuple(store.items()), store.paused
+        except (InputError, OSError, sqlite3.Error) as error:
+            troubles.append(str(error))
+    own = tuple(sorted(str(path) for path in before.folder.glob("*.protocol.yaml")))
+    return replace(
+        before,
+        protocols=(*shipped_names(), *own),
+        runs=runs,
+        queue=queue,
+        paused=paused,
+        trouble="; ".join(troubles),
+        reading=False,
+    )

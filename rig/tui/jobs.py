@@ -64,23 +64,22 @@ class Job:
             return None
 
 
-def begin(words: Sequence[str], changed: Callable[[Job], None]) -> Job:
-    """Start a verb; `changed` hears of its output and its end, on a thread of its own."""
+def begin(words: Sequence[str], changed: Callable[[Job], None]) -> None:
+    """Start a verb; `changed` hears of its start at once, then of its output and its end."""
     # Closed by the thread that watches the child.
     output, errors = tempfile.TemporaryFile(), tempfile.TemporaryFile()  # noqa: SIM115
     job = Job(tuple(words))
     try:
         process = start([*BRAMAH, *words], output, errors)
     except OSError as error:
-        job = replace(job, code=1, reason=f"cannot be started: {error.strerror}")
-        changed(job)
-        return job
+        changed(replace(job, code=1, reason=f"cannot be started: {error.strerror}"))
+        return
     job = replace(job, pid=process.pid)
+    changed(job)
     watcher = threading.Thread(
         target=_watch, args=(job, process, output, errors, changed), name="bramah-job", daemon=True
     )
     watcher.start()
-    return job
 
 
 def _watch(

@@ -9,7 +9,7 @@ from typing import Final
 from rig.bench.screens.sockets import Endpoint
 from rig.model.alarms.states import AlarmTable
 from rig.tui.browse import Browsed
-from rig.tui.link import Frame
+from rig.tui.following.link import Frame
 from rig.tui.words import Freshness, Stop, freshness
 
 # The key of each page, its name, and the name where there is little room.

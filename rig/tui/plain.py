@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from rig.tui.link import POLL, Frame, Link, LinkStage, LocalSessions, Sessions
+from rig.tui.following.link import POLL, Frame, Link, LinkStage, LocalSessions, Sessions
 from rig.tui.units import age_text, clock_text, shown
 from rig.tui.words import headline, nearest_margin, notices, run_time
 

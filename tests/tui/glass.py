@@ -13,7 +13,7 @@ from rig.bench.screens.commands import Command
 from rig.bench.screens.past import PastMinute
 from rig.bench.screens.sockets import Endpoint, Snapshot
 from rig.tui.app import Monitor
-from rig.tui.link import SnapshotSource
+from rig.tui.following.link import SnapshotSource
 from rig.tui.words import KeyAnswer
 
 

@@ -13,7 +13,7 @@ import pytest
 from textual.pilot import Pilot
 
 from rig.tui.app import Monitor
-from rig.tui.link import LinkStage
+from rig.tui.following.link import LinkStage
 from rig.tui.words import notices
 
 ROOT = Path(__file__).parents[2]

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from rig.tui.history import History, regroup
+from rig.tui.following.history import History, regroup
 from tests.tui.recorded import RATE, Bench, run, samples, snapshot
 
 BENCH = Bench()

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from rig.tui.link import Link
+from rig.tui.following.link import Link
 from rig.tui.plain import Reader
 from tests.tui.glass import Clock, Machine, Recorded, endpoint
 from tests.tui.recorded import Bench, followed, run, snapshot, tripped

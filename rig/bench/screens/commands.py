@@ -20,7 +20,8 @@ TAKE: Final = "take"  # the controls, from whoever holds them
 RELEASE: Final = "release"
 PAST: Final = "past"  # the last minute and the plan, for a screen that attaches late; anyone may
 CONTROLS: Final = ("pause", "resume", "skip", "abort", "answer")
-COMMANDS: Final = (STOP, ACKNOWLEDGE, *CONTROLS, TAKE, RELEASE, PAST)
+BY_HAND: Final = ("jog", "lock", "unlock")  # what a manual session takes
+COMMANDS: Final = (STOP, ACKNOWLEDGE, *CONTROLS, *BY_HAND, TAKE, RELEASE, PAST)
 
 _LONGEST = 500  # characters of a value or a holder's name
 

@@ -10,10 +10,10 @@ from rig.model.alarms.states import Alarm, folded
 from rig.tui.drawing.plot import PlotTrace, draw, time_axis
 from rig.tui.drawing.rows import Row, beside, block, box, columns, fit, row, wrapped
 from rig.tui.drawing.styles import ASK, ASK_TEXT, DIM, NORMAL, STRONG, WARN_TEXT
+from rig.tui.following.story import Line
 from rig.tui.look import View
 from rig.tui.pages.overview import alarm_mark
 from rig.tui.pages.parts import said_of
-from rig.tui.story import Line
 from rig.tui.units import clock_text, limit, shown
 from rig.tui.words import Freshness, run_time
 

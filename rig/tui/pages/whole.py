@@ -7,9 +7,9 @@ from typing import Final
 
 from rig.tui.drawing.rows import Row, beside, block, box, ends, fit, row, wrapped
 from rig.tui.drawing.styles import ASK, DIM, LEVELS, NORMAL, STRONG, SYMBOLS, WARN_TEXT
-from rig.tui.link import LinkStage
+from rig.tui.following.link import LinkStage
 from rig.tui.look import PAGES, View
-from rig.tui.pages import levels, operation, overview
+from rig.tui.pages import levels, manual, operation, overview, runs
 from rig.tui.units import age_text, clock_text
 from rig.tui.words import VERY_OLD, Freshness, headline, notices, run_time
 
@@ -34,8 +34,8 @@ KEYS: Final = {
     "protocol": "t command  p pause/resume  n skip  x abort  a answer",
     "log": "↑↓ scroll  / search  f filter  e end",
     "estimates": "",
-    "manual": "",
-    "runs": "",
+    "manual": "hold ↑ ↓ jog  ←→ joint  l lock  u unlock  x end",
+    "runs": "← → tabs  ↑ ↓ mark  Enter what can be done",
     "diagnostics": "",
 }
 
@@ -56,6 +56,10 @@ def compose(view: View, width: int, height: int) -> list[Row]:
 
 
 def _page(view: View, width: int, height: int) -> list[Row]:
+    if view.look.page == "runs":
+        return runs.runs_page(view, width, height)
+    if view.look.page == "manual":
+        return manual.manual_page(view, width, height)
     page = OF_A_RUN.get(view.look.page)
     if view.newest.stage is LinkStage.CHOOSING:
         return chooser(view, width, height)

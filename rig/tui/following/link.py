@@ -19,8 +19,8 @@ from rig.bench.screens.commands import Command, own_command
 from rig.bench.screens.past import PastMinute, PlanLine
 from rig.bench.screens.sockets import Attachment, Endpoint, Snapshot
 from rig.runs.runstate import read_events
-from rig.tui.history import EMPTY, History, HistoryWindow
-from rig.tui.story import Line, from_events, tell
+from rig.tui.following.history import EMPTY, History, HistoryWindow
+from rig.tui.following.story import Line, from_events, tell
 
 log = logging.getLogger(__name__)
 

@@ -11,9 +11,8 @@ from rig.bench.screens.sockets import Endpoint
 from rig.model.alarms.states import Alarm, AlarmState, AlarmTable
 from rig.model.trips import RecordingFailed
 from rig.runs.runstate import EventLog
-from rig.tui.browse import Browsed
+from rig.tui.following.link import Frame, Link, LinkStage
 from rig.tui.jobs import Job, begin, rig_of_run
-from rig.tui.link import Frame, Link, LinkStage
 from rig.tui.look import Dialog, Look, View
 from rig.tui.pages.operation import in_order
 from rig.tui.words import KeyAnswer, Stop
@@ -21,7 +20,7 @@ from rig.tui.words import KeyAnswer, Stop
 MOVING: Final = ("homing", "locked", "exciting")  # states in which an abort does not ask first
 
 
-class Acts:
+class Commands:
     """The part of the screen that acts; each act leaves one line on what became of it."""
 
     ACTS: ClassVar = {
@@ -45,7 +44,6 @@ class Acts:
     redraw: Callable[[], None]
     stop_answered: Callable[[Stop, bool], None]
     alarms_of: Callable[[Frame], AlarmTable]
-    browsed = Browsed()
 
     def act_stop(self) -> None:
         """Zero the outputs of the run on the screen, or of the one marked in the list."""
@@ -209,18 +207,3 @@ class Acts:
     def start(self, words: tuple[str, ...], changed: Callable[[Job], None]) -> None:
         """Start a verb as a process of its own."""
         begin(words, changed)
-
-    # Elsewhere
-
-    def act_enter(self) -> None:
-        """Open what is marked."""
-
-    def act_jog(self, key: str) -> None:
-        """Move a joint while a key is held."""
-
-    def look_around(self) -> None:
-        """Read what stands on the disk."""
-
-    def browsed_lines(self) -> tuple[str, ...]:
-        """Return the lines that can be marked."""
-        return ()

@@ -1,0 +1,55 @@
+"""The `manual` verb: a session in which a screen moves one joint at a time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rig.cli.options import EndpointOption, RigOption
+from rig.cli.output import progress
+
+
+def manual(
+    rig: RigOption,
+    endpoint: EndpointOption = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Record the session into this run folder.")
+    ] = None,
+    idle: Annotated[
+        float, typer.Option(min=1.0, help="End after so many seconds without a command.")
+    ] = 300.0,
+) -> None:
+    """Let a screen jog, lock and unlock joints within their limits; refused while a run goes on.
+
+    Example: bramah manual --rig shinshu-2dof
+    """
+    from drivers import make_driver
+    from protocols.engine.manual import Manual
+    from rig.bench.screens.sockets import AttachError, Publisher
+    from rig.bench.session import Bench
+    from rig.cli.device import device_of
+    from rig.cli.errors import WorkError
+    from rig.runs.recorder import Recorder
+
+    described, _ = device_of(rig, endpoint)
+    if endpoint is not None:
+        from drivers import wire_at
+
+        wire = wire_at(endpoint, described.wire)
+        described = described.model_copy(update={"wire": wire})
+    try:
+        publisher = Publisher(described.name)
+    except AttachError as error:
+        raise WorkError(f"manual: no screen could command this session: {error}") from error
+    recorder = None if out is None else Recorder(out, described)
+    with Bench(described, make_driver(described.wire, described), recorder, publisher) as bench:
+        progress("manual: page 9 of `bramah monitor` moves a joint; space stops")
+        Manual(bench, described, idle_after=idle).run()
+    typer.echo("manual session over; outputs at zero, confirmed by the device")
+
+
+def register(app: typer.Typer) -> None:
+    """Add this verb to the command line."""
+    app.command()(manual)

@@ -1,0 +1,160 @@
+"""Verbs that the operator starts from the page of runs: check, run, identify, trace, night page."""
+
+from __future__ import annotations
+
+import threading
+import webbrowser
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+from typing import Final
+
+from rig.runs.listing.summary import RunSummary
+from rig.tui.acting.commands import Commands
+from rig.tui.browse import TABS, Browsed, read_disk
+from rig.tui.jobs import Job, begin
+from rig.tui.look import Dialog
+
+KEYS: Final = "↑ ↓ and Enter choose, Esc closes, SPACE stops"
+
+
+class Starts(Commands):
+    """The part of the screen that starts verbs; each is a process that outlives the screen."""
+
+    browsed: Browsed
+    open_page: Callable[[str], None]
+
+    def look_around(self) -> None:
+        """Read what stands on the disk, beside the screen."""
+        if self.browsed.reading:
+            return
+        snapshot = self.link.frame.snapshot
+        rig = self.browsed.rig or (snapshot.rig if snapshot is not None else "")
+        self.browsed = replace(self.browsed, reading=True, rig=rig)
+
+        def read() -> None:
+            found = read_disk(self.browsed)
+            # What was started or opened meanwhile stays.
+            now = self.browsed
+            self.browsed = replace(found, tab=now.tab, job=now.job, rig=now.rig)
+            self.redraw()
+
+        threading.Thread(target=read, name="bramah-browse", daemon=True).start()
+
+    def act_tab(self, step: int) -> None:
+        """Open the next tab."""
+        self.browsed = replace(self.browsed, tab=(self.browsed.tab + step) % len(TABS))
+        self.look = replace(self.look, marked=0, offset=0)
+
+    def act_enter(self) -> None:
+        """Offer what can be done with the marked line."""
+        found = self.browsed
+        if self.look.page != "runs" or not found.lines:
+            return
+        at = min(self.look.marked, found.lines - 1)
+        if found.name == "protocols":
+            name = found.protocols[at]
+            self._offer(name, {
+                "check on the twin": lambda: self._check(name),
+                "start on the bench": lambda: self._start_run(name),
+            })  # fmt: skip
+        elif found.name == "runs":
+            self._offer_run(found.runs[at])
+        else:
+            item = found.queue[at]
+            page = found.folder / "night.html"
+            words = ("queue", "page", "--out", str(page))
+            self._offer(f"item {item.id} {item.job.name}: {item.state} {item.reason}", {
+                "write the page of the night": lambda: self._job(words),
+                "open the page of the night": lambda: self._open(page),
+            })  # fmt: skip
+
+    def _offer(self, title: str, acts: dict[str, Callable[[], None]]) -> None:
+        dialog = Dialog(title, choices=tuple(acts), keys=KEYS)
+        self.ask(dialog, lambda chosen: acts[chosen]())
+
+    def _offer_run(self, run: RunSummary) -> None:
+        path = str(run.path)
+        others = [one for one in self.browsed.runs if one.path != run.path and one.records > 0]
+        report = run.path / "trace.html"
+
+        def against() -> None:
+            acts: dict[str, Callable[[], None]] = {}
+            for one in others:
+                words = ("trace", path, "--holdout", str(one.path), "--report", str(report))
+                acts[one.path.name] = lambda words=words: self._job(words)  # type: ignore[misc]
+            if acts:
+                self._offer("trace: held-out records of", acts)
+            else:
+                self.remark = "trace: it needs a second run, of other records, to judge by."
+
+        acts: dict[str, Callable[[], None]] = {
+            "identify its parameters": lambda: self._job(("identify", path, "--json", "-")),
+            "trace what its model lacks": against,
+            "open its report": lambda: self._open(report),
+        }
+        if run.state == "interrupted":
+            acts = {"recover what was recorded": lambda: self._job(("recover", path)), **acts}
+        self._offer(run.path.name, acts)
+
+    def _open(self, page: Path) -> None:
+        if not page.is_file():
+            self.remark = f"{page}: there is no such page yet; it is written by the line above."
+            return
+        opened = webbrowser.open(page.absolute().as_uri())
+        self.remark = f"opened {page}" if opened else f"no browser here; open {page.absolute()}"
+
+    def _with_rig(self, act: Callable[[str], None]) -> None:
+        """Do something with the rig that is known, or ask for one."""
+        if self.browsed.rig:
+            act(self.browsed.rig)
+            return
+
+        def named(text: str) -> None:
+            self.browsed = replace(self.browsed, rig=text.strip())
+            if text.strip():
+                act(text.strip())
+
+        body = ("The rig's shipped name, or the path of its file.",)
+        self.ask(Dialog("rig", body, text="", keys="Enter takes it, Esc closes"), named)
+
+    def _check(self, protocol: str) -> None:
+        self._with_rig(lambda rig: self._job(("check", protocol, "--rig", rig)))
+
+    def _start_run(self, protocol: str) -> None:
+        frame = self.link.frame
+        if frame.endpoint is not None and frame.snapshot is not None and not frame.over:
+            self.remark = f"start: run {frame.snapshot.run} holds the bench; wait for its end."
+            return
+        self._with_rig(lambda rig: self._confirm_start(protocol, rig))
+
+    def _confirm_start(self, protocol: str, rig: str) -> None:
+        name = Path(protocol).name.removesuffix(".yaml").removesuffix(".protocol")
+        out = self.browsed.folder / f"{name}-{datetime.now():%Y-%m-%d-%H%M%S}"
+        words = ["run", protocol, "--rig", rig, "--out", str(out), "--unattended"]
+        if self.browsed.endpoint is not None:
+            words += ["--endpoint", self.browsed.endpoint]
+
+        def go() -> None:
+            self._job(tuple(words))
+            self.remark = "start: proved on the twin first; this screen attaches as soon as it runs"
+
+        text = f"THE BENCH MOVES, once {protocol} is proved on the twin of {rig}. Start?"
+        self.confirmed("start", text, go)
+
+    def _job(self, words: tuple[str, ...]) -> None:
+        job = self.browsed.job
+        if job is not None and job.code is None and words[0] != "run":
+            self.remark = f"{words[0]}: wait for the end of `{job.title}`."
+            return
+        self.look = replace(self.look, offset=0)
+
+        def changed(job: Job) -> None:
+            self.browsed = replace(self.browsed, job=job)
+            if job.code is not None:
+                self.remark = f"{job.words[0]}: {job.ended}"
+                self.look_around()
+            self.redraw()
+
+        begin(words, changed)

@@ -1,0 +1,1 @@
+"""Following a run: what it publishes becomes frames, a history and a log."""

@@ -1,0 +1,42 @@
+"""Manual: one joint moved while a key is held, joints locked and unlocked."""
+
+from __future__ import annotations
+
+from rig.tui.drawing.rows import Row, beside, block, fit, row, wrapped
+from rig.tui.drawing.styles import ASK, DIM, STRONG, WARN_TEXT
+from rig.tui.look import View
+from rig.tui.pages.parts import bench_bars, joint_box, joints_in
+
+MANUAL = "manual"  # the kind of session that takes jogs
+
+
+def manual_page(view: View, width: int, height: int) -> list[Row]:
+    """Return what can be done by hand now, and the joints."""
+    snapshot = view.newest.snapshot
+    if snapshot is None or view.newest.over:
+        lines = [
+            row((" Nothing is held by hand.", STRONG)),
+            row((" Enter starts a manual session: it takes the device; no protocol may run.", "")),
+            row((" d lets the pressure out, where the rig can.", "")),
+        ]
+        return block(lines, width, height)
+    if snapshot.kind != MANUAL:
+        text = (
+            f" Refused while a protocol runs ({snapshot.run or snapshot.step}): wait for its end."
+        )
+        return block(wrapped(text, width, WARN_TEXT), width, height)
+    joints = list(joints_in(snapshot.channels))
+    joint = joints[min(max(view.look.joint, 1), len(joints)) - 1] if joints else 1
+    held = "" if view.in_command else "   t takes the controls first"
+    head = [
+        fit(row((f" joint {joint} ", ASK), ("  hold ↑ to extend, ↓ to retract: it stops when you "
+                "let go", STRONG), (held, WARN_TEXT)), width),
+        fit(row((" ← → joint   l lock   u unlock   x end the session   ", ""),
+                (snapshot.message, DIM)), width),
+    ]  # fmt: skip
+    bars = bench_bars(view, width)
+    room = height - len(head) - len(bars)
+    others = [joint, *(other for other in joints if other != joint)][: max(width // 38, 1)]
+    each = (width - len(others) + 1) // len(others)
+    boxes = [(joint_box(view, one, each, room), each) for one in sorted(others)]
+    return [*head, *beside(boxes, room), *bars]
