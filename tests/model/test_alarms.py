@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from rig.model.alarms.states import (
@@ -112,6 +112,13 @@ ACTS = st.lists(
 )
 
 
+# A first cause that leaves and comes back after its consequence has consequences of its own.
+@example(
+    [
+        ("raise", "pressure", 2), ("return", "pressure", 2), ("raise", "piston", 2),
+        ("acknowledge", "pressure", 2), ("raise", "lock", 2), ("raise", "pressure", 2),
+    ]
+)  # fmt: skip
 @given(ACTS)
 def test_no_order_of_events_loses_a_latched_trip_or_shows_an_alarm_twice(
     acts: list[tuple[str, str, int]],

@@ -76,9 +76,16 @@ class AlarmTable:
 
 
 def _put(table: AlarmTable, alarm: Alarm) -> AlarmTable:
-    """Replace the alarm of the same key; one that is normal leaves the table."""
-    kept = [alarm if old.key == alarm.key else old for old in table.alarms]
-    return AlarmTable(tuple(one for one in kept if one.state is not AlarmState.NORMAL))
+    """Replace the alarm of the same key; one that is normal leaves the table.
+
+    Its consequences then stand for themselves: when it comes again it is no longer their cause.
+    """
+    if alarm.state is not AlarmState.NORMAL:
+        return AlarmTable(tuple(alarm if old.key == alarm.key else old for old in table.alarms))
+    kept = (old for old in table.alarms if old.key != alarm.key)
+    return AlarmTable(
+        tuple(replace(old, cause="") if old.cause == alarm.key else old for old in kept)
+    )
 
 
 def related(one: Alarm, other: Alarm) -> bool:
@@ -165,15 +172,13 @@ def folded(table: AlarmTable) -> tuple[tuple[Alarm, tuple[Alarm, ...]], ...]:
     """Return (first cause, its consequences) in the order of urgency.
 
     Above: what nobody has acknowledged, then what trips (or whose consequence does), then what is
-    older. A consequence whose first cause has left the table stands for itself.
+    older.
     """
-    standing = {alarm.key for alarm in table.alarms}
-    groups = []
-    for first in table.alarms:
-        if first.cause in standing:
-            continue
-        rest = tuple(one for one in table.alarms if one.cause == first.key)
-        groups.append((first, rest))
+    groups = [
+        (first, tuple(alarm for alarm in table.alarms if alarm.cause == first.key))
+        for first in table.alarms
+        if not first.cause
+    ]
 
     def urgency(group: tuple[Alarm, tuple[Alarm, ...]]) -> tuple[bool, bool, float]:
         every = (group[0], *group[1])
