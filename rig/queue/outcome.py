@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
+from rig.bench.outputs import UNSURE
 from rig.queue import items as it
 from rig.runs import runstate, store
 
@@ -68,6 +69,7 @@ def outcome_of_folder(folder: Path, said: str) -> Outcome:
 
 
 def _told(said: str) -> str:
+    said = said.removeprefix(f"{UNSURE}; ")
     if said.startswith(_DEVICE):
         return it.LOST
     return it.STOPPED if said.startswith("stopped") else it.FAILED
