@@ -53,6 +53,9 @@ class Transport(Protocol):
         """Close the port; never raises."""
 
 
+_WRITE_TIMEOUT = 1.0  # [s]
+
+
 class PortInUse(DeviceBusy):
     """Another program has the port."""
 
@@ -60,8 +63,8 @@ class PortInUse(DeviceBusy):
 class PySerialTransport:
     """`Transport` over pyserial: 8 data bits, no parity, 1 stop bit, no flow control."""
 
-    def __init__(self, device: str, baud: int, write_timeout: float = 1.0) -> None:
-        self._device, self._baud, self._write_timeout = device, baud, write_timeout
+    def __init__(self, device: str, baud: int) -> None:
+        self._device, self._baud = device, baud
         self._port: serial.Serial | None = None
 
     @property
@@ -82,7 +85,7 @@ class PySerialTransport:
                 self._device,
                 self._baud,
                 timeout=_SLICE_SECONDS,
-                write_timeout=self._write_timeout,
+                write_timeout=_WRITE_TIMEOUT,
                 exclusive=None if shared else True,
             )
         except _OPENING_ERRORS as error:

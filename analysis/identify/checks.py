@@ -344,11 +344,14 @@ def _bulk(estimates: Mapping[str, Estimate]) -> list[Check]:
     return [Check("bulk modulus", low < b < high, detail)]
 
 
-def workspace(rig: Rig, points: int = 9) -> list[Array]:
+_GRID = 9  # points of the stroke, a joint
+
+
+def workspace(rig: Rig) -> list[Array]:
     """Return joint angles (N,) spread over the stroke: a grid, or a fixed lattice."""
     N = len(rig.joints)
-    if points**N <= 4096:
-        axes = np.meshgrid(*([np.linspace(0, 1, points)] * N), indexing="ij")
+    if _GRID**N <= 4096:
+        axes = np.meshgrid(*([np.linspace(0, 1, _GRID)] * N), indexing="ij")
         unit = np.column_stack([axis.ravel() for axis in axes])
     else:
         # Additive recurrence with square roots of primes fills the cube evenly.

@@ -29,7 +29,6 @@ from rig.runs.stream import read_run_head
 
 def identify_folders(
     folders: Sequence[str],
-    terms: Sequence[Used] | None = None,
     filtering: Callable[[Record], Filtering] = default_filtering,
     reject_noise: bool = True,
     pool: Pool | None = None,
@@ -39,8 +38,8 @@ def identify_folders(
     """Identify from run folders, of which one record at a time is in memory.
 
     This is `identify` by the coupled method with the estimator "plain", for the other methods and
-    estimators go over all rows again and again. `terms` defaults to those of the model `like`, or
-    to the rig's baseline with `effects` (`analysis.terms.with_effects`). With a `pool` each record
+    estimators go over all rows again and again. The terms are those of the model `like`, or the
+    rig's baseline with `effects` (`analysis.terms.with_effects`). With a `pool` each record
     is reduced in one of its processes, where the folders are read; only triangles come back. Raises
     InputError as `identify` and `load_run` do, for a model of another rig, and for an effect whose
     shape is open.
@@ -48,11 +47,11 @@ def identify_folders(
     workers = pool or Serial()
     heads = list(workers.map(read_run_head, folders, reads=str))
     rig = ck.common_rig(heads)
-    if terms is None and like is not None:
+    used = tuple(map(Used, with_effects(rig, effects)))
+    if like is not None:
         for head in heads:
             refuse_other_rig(like, head.rig, head.source)
-        terms = like.terms
-    used = tuple(terms) if terms is not None else tuple(map(Used, with_effects(rig, effects)))
+        used = tuple(like.terms)
     _refuse_open(rig, used)
     steps = [
         (number, one)

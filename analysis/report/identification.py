@@ -18,9 +18,7 @@ from analysis.report import facts, figures, machine, paper, tables
 from analysis.report import format as fm
 from analysis.report.page import page, write
 from analysis.report.residuals import per_repeat, residuals
-from analysis.simulation.model import Model, rig_difference
 from analysis.simulation.validate import RecordValidation
-from rig.model.parse import InputError
 from rig.model.records import Run
 from rig.model.rig import Rig
 
@@ -57,7 +55,6 @@ def write_report(
     *,
     runs: Sequence[Run],
     identification: Identification,
-    model: Model | None = None,
     validation: Sequence[RecordValidation] = (),
     validation_runs: Sequence[Run] = (),
     truth: Mapping[str, float] | None = None,
@@ -69,7 +66,7 @@ def write_report(
     See `render_report` for the arguments; raises InputError where the file cannot be written.
     """
     text = render_report(
-        runs=runs, identification=identification, model=model, validation=validation,
+        runs=runs, identification=identification, validation=validation,
         validation_runs=validation_runs, truth=truth, title=title, provenance=provenance,
     )  # fmt: skip
     write(path, text)
@@ -80,7 +77,6 @@ def render_report(
     *,
     runs: Sequence[Run],
     identification: Identification,
-    model: Model | None = None,
     validation: Sequence[RecordValidation] = (),
     validation_runs: Sequence[Run] = (),
     truth: Mapping[str, float] | None = None,
@@ -89,15 +85,11 @@ def render_report(
 ) -> str:
     """Return the report as HTML text.
 
-    `runs` are those behind `identification`, `model` the one that was validated (default: the
-    identified one), `truth` the parameters of a simulated bench (SI, by name). Raises InputError
-    for records that cannot be used or a model of another rig.
+    `runs` are those behind `identification`, `truth` the parameters of a simulated bench (SI, by
+    name). Raises InputError for records that cannot be used.
     """
-    model = model or identification.model
-    rig = identification.model.rig
-    difference = rig_difference(model.rig, rig)
-    if difference:
-        raise InputError(f"the model and the identification are of different rigs: {difference}")
+    model = identification.model
+    rig = model.rig
     rows = identification.built or build_rows(rig, runs, identification.model.terms)
     context = {
         "title": title,

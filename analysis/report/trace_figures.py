@@ -226,10 +226,13 @@ def spectrum(one: Spectrum, unit: str, key: str, after: bool) -> Markup:
         return svg(made, key, "Lines of the residual, before and after")
 
 
-def binned(x: Array, y: Array, count: int = 24) -> dict[str, Array]:
+_BINS = 24
+
+
+def binned(x: Array, y: Array) -> dict[str, Array]:
     """Return mean and quartiles of y in bins of equally many x."""
     order = np.argsort(x)
-    parts = [p for p in np.array_split(order, min(count, max(1, len(x) // 5))) if len(p)]
+    parts = [p for p in np.array_split(order, min(_BINS, max(1, len(x) // 5))) if len(p)]
     return {
         "x": np.array([x[p].mean() for p in parts]),
         "mean": np.array([y[p].mean() for p in parts]),

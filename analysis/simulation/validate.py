@@ -7,7 +7,7 @@ the model's rates without the drift that a free run collects.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.effects.measurement import corrected_channels
-from analysis.regression.rows import Filtering, default_filtering
+from analysis.regression.rows import default_filtering
 from analysis.signals.conditioning import Mask, Signals, aligned_channels, condition, lost_samples
 from analysis.signals.filters import Smoother
 from analysis.signals.locks import moving_by_step
@@ -92,16 +92,14 @@ def validate(model: Model, runs: Sequence[Run]) -> list[RecordValidation]:
 
 
 def validate_record(
-    model: Model, rig: Rig, record: Record,
-    filtering: Callable[[Record], Filtering] = default_filtering,
-    moving: Mask | None = None,
-) -> RecordValidation:  # fmt: skip
+    model: Model, rig: Rig, record: Record, moving: Mask | None = None
+) -> RecordValidation:
     """Validate on one record (see `validate`).
 
     `moving` (N,) is the decision for all repeats of its step (`analysis.signals.locks`), by default
     of this record alone.
     """
-    smoother = filtering(record).channels
+    smoother = default_filtering(record).channels
     here = arrived(rig, record)
     signals = put_right(rig, model.terms, condition(rig, record, smoother, moving))
     # A sensor that the model says is wrong is put right before anything is compared with it.

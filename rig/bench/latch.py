@@ -205,7 +205,7 @@ def _note_in_run(found: LatchedTrip, entry: dict[str, Any]) -> None:
         log.warning("%s", error)
 
 
-def reset_bench(rig: Rig, driver: Driver, reason: str, state: BenchState | None = None) -> str:
+def reset_bench(rig: Rig, driver: Driver, reason: str) -> str:
     """Clear the trip of a bench, in its device and on this computer; returns what had tripped it.
 
     Raises InputError without a reason, DeviceError if the device does not obey: the trip then
@@ -216,7 +216,7 @@ def reset_bench(rig: Rig, driver: Driver, reason: str, state: BenchState | None 
             "reset: --reason TEXT is missing; look at the bench, then say what was found and done, "
             'for example --reason "cap sensor of joint 2 replaced"'
         )
-    bench = state or BenchState(rig.wire)
+    bench = BenchState(rig.wire)
     bench.prepare()
     try:
         driver.connect()

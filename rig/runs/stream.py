@@ -60,12 +60,12 @@ def open_record(path: str | Path, name: str) -> Iterator[RecordReader]:
         yield RecordReader(file_path, group, head)
 
 
-def iterate_records(path: str | Path, *, partial: bool = False) -> Iterator[Record]:
+def iterate_records(path: str | Path) -> Iterator[Record]:
     """Yield a run's records in the order they were taken, one in memory at a time.
 
     Raises InputError as `store.load_run` does.
     """
-    for head in read_run_head(path, partial=partial).records:
+    for head in read_run_head(path).records:
         with open_record(path, head.name) as reader:
             record = reader.read()
         yield record

@@ -13,7 +13,6 @@ from analysis.identify.checks import Check
 from analysis.identify.identify import identify
 from analysis.identify.result import Identification
 from analysis.report.identification import Provenance, render_report, write_report
-from analysis.simulation.model import Model
 from analysis.simulation.validate import RecordValidation, validate
 from rig.model.parse import InputError
 from rig.model.records import Run
@@ -308,9 +307,3 @@ def test_a_report_is_written_whole_and_one_that_cannot_be_says_where(
         write_report(tmp_path / "no" / "r.html", runs=[multisine_run], identification=found)
     assert path.read_text(encoding="utf-8").lstrip().startswith("<!DOCTYPE html>")
     assert [p.name for p in tmp_path.iterdir()] == ["r.html"]
-
-
-def test_a_model_of_another_rig_is_refused(multisine_run: Run, found: Identification) -> None:
-    other: Model = replace(found.model, rig=found.model.rig.model_copy(update={"name": "another"}))
-    with pytest.raises(InputError, match="different rigs"):
-        render_report(runs=[multisine_run], identification=found, model=other)

@@ -127,13 +127,12 @@ class ValveBench:
         rig: Rig,
         plant: Plant,
         adapter: Adapter,
-        clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._rig, self._plant, self._adapter, self._clock = rig, plant, adapter, clock
+        self._rig, self._plant, self._adapter, self._clock = rig, plant, adapter, time.monotonic
         self._network = AdapterNetwork(adapter)
         joints = range(1, len(rig.joints) + 1)
-        self.valves = [ValveNode(self._network, number, clock) for number in joints]
-        self._origin, self._first = clock(), plant.tick
+        self.valves = [ValveNode(self._network, number, self._clock) for number in joints]
+        self._origin, self._first = self._clock(), plant.tick
         self._codes = np.zeros(len(rig.channels), dtype=np.int64)
 
     @property
