@@ -87,7 +87,7 @@ def conclude(
     if found.bootstrap:
         estimates = with_ends(estimates, found.bootstrap)
     rows = {family: solution.rows for family, solution in solutions.items()}
-    masked = sum(one.masked for one in reductions)
+    masked = sum(reduction.masked for reduction in reductions)
     statements = (
         *_statements(rig, reductions, found, estimates, rows, masked),
         *found.checks,
@@ -96,7 +96,7 @@ def conclude(
         "method": "coupled",
         "estimator": found.estimator,
         "runs": list(sources),
-        "records": [one.head.name for one in reductions],
+        "records": [reduction.head.name for reduction in reductions],
         "rows": rows,
         "checks_failed": [c.name for c in statements if not c.ok],
     }
@@ -115,12 +115,16 @@ def _statements(
 ) -> tuple[Check, ...]:
     return (
         ck.repeats(
-            repeats_of((one.run, one.head) for one in reductions if not ck.is_hold(rig, one.head))
+            repeats_of(
+                (reduction.run, reduction.head)
+                for reduction in reductions
+                if not ck.is_hold(rig, reduction.head)
+            )
         ),
-        ck.joints_excited(rig, [one.head for one in reductions]),
-        *ck.clipping(rig, [(one.head, one.clipped) for one in reductions]),
-        *ck.leak_down(rig, [one.head for one in reductions]),
-        ck.lost_samples([(one.head, one.lost) for one in reductions]),
+        ck.joints_excited(rig, [reduction.head for reduction in reductions]),
+        *ck.clipping(rig, [(reduction.head, reduction.clipped) for reduction in reductions]),
+        *ck.leak_down(rig, [reduction.head for reduction in reductions]),
+        ck.lost_samples([(reduction.head, reduction.lost) for reduction in reductions]),
         ck.masked(sum(rows.values()), masked),
         *ck.identifiability(found.solutions),
         *base_statements(rig, found.solutions),

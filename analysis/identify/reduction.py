@@ -230,7 +230,7 @@ def _inspect(rig: Rig, source: Source, stretch: int) -> tuple[int, dict[str, int
 
 def clusters_of(reductions: Sequence[RecordReduction], family: str) -> list[RowCluster]:
     """Return one cluster per record, or one per part where its step has this record only."""
-    repeats = repeats_of((one.run, one.head) for one in reductions)
+    repeats = repeats_of((reduction.run, reduction.head) for reduction in reductions)
     out: list[RowCluster] = []
     for one in reductions:
         stratum = (one.run, one.head.step)
@@ -254,9 +254,9 @@ def noise_of(reductions: Sequence[RecordReduction], family: str) -> Array | None
         key = (one.run, one.head.step)
         counts[key] = counts.get(key, 0) + 1
     found = [
-        counts[one.run, one.head.step] * one.noise[family]
-        for one in reductions
-        if one.noise is not None and family in one.noise
+        counts[reduction.run, reduction.head.step] * reduction.noise[family]
+        for reduction in reductions
+        if reduction.noise is not None and family in reduction.noise
     ]
     return np.sum(found, axis=0) if found else None
 

@@ -182,13 +182,13 @@ def _solve_once(
     members: Sequence[RecordRows], family: str, names: Sequence[str]
 ) -> Mapping[str, float]:
     clusters = []
-    for one in members:
-        rows = one.family(family)
+    for member in members:
+        rows = member.family(family)
         if rows:
             matrix = np.concatenate([r.matrix for r in rows])
             rhs = np.concatenate([r.rhs for r in rows])
             clusters.append(
-                RowCluster(one.group, one.record.repeat, triangle(matrix, rhs), len(rhs))
+                RowCluster(member.group, member.record.repeat, triangle(matrix, rhs), len(rhs))
             )
     if not clusters or family not in FAMILIES:
         return {}

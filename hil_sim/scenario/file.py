@@ -96,17 +96,17 @@ def parse_scenario(text: str, source: str) -> Scenario:
 def check_fits(scenario: Scenario, rig: Rig) -> None:
     """Raise InputError where an effect or fault is at a joint or channel that the rig lacks."""
     members: tuple[AnyEffect | AnyFault, ...] = (*scenario.effects, *scenario.faults)
-    for one in members:
-        joint = getattr(one, "joint", None)
+    for member in members:
+        joint = getattr(member, "joint", None)
         if joint is not None and joint >= len(rig.joints):
             raise InputError(
-                f"scenario: {one.name} at {one.place}, but rig {rig.name!r} has "
+                f"scenario: {member.name} at {member.place}, but rig {rig.name!r} has "
                 f"{len(rig.joints)} joint(s)"
             )
         for key in ("channel", "other"):
-            channel = getattr(one, key, None)
+            channel = getattr(member, key, None)
             if channel is not None and channel not in rig.channels:
                 raise InputError(
-                    f"scenario: {one.name} at channel {channel!r}, but rig {rig.name!r} measures: "
-                    f"{' '.join(rig.channels)}"
+                    f"scenario: {member.name} at channel {channel!r}, but rig {rig.name!r} "
+                    f"measures: {' '.join(rig.channels)}"
                 )

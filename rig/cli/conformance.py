@@ -50,7 +50,7 @@ def conformance(
         raise InputError(f"--only: {error}") from error
     write_json(json, asdict(report))
     if json != Path("-"):
-        rows = [(one.check, one.verdict.value, one.reason) for one in report.results]
+        rows = [(result.check, result.verdict.value, result.reason) for result in report.results]
         typer.echo(table(("check", "verdict", "why"), rows))
     failed = [one.check for one in report.of(Verdict.FAILED)]
     if failed:

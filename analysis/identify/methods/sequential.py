@@ -48,7 +48,7 @@ def sequential(
     built = build_rows(rig, runs, terms, filtering)
     reductions = reduce_rows(rig, terms, built)
     stages = _stages(rig, terms, reductions)
-    masked = sum(one.masked for one in reductions)
+    masked = sum(reduction.masked for reduction in reductions)
     started = time.perf_counter()
     outcomes = {
         family: solve_stages(parameters_of(rig, terms, family), stages[family], reject_noise)
@@ -59,16 +59,20 @@ def sequential(
     estimates, covariance = estimates_of(rig, terms, solutions)
     rows = {family: outcome.rows for family, outcome in outcomes.items()}
     shown = {name: _shown(rig, terms, outcomes, name) for name in estimates}
-    heads = [one.head for one in reductions]
+    heads = [reduction.head for reduction in reductions]
     statements = (
         _uniqueness(shown),
         ck.repeats(
-            repeats_of((one.run, one.head) for one in reductions if not ck.is_hold(rig, one.head))
+            repeats_of(
+                (reduction.run, reduction.head)
+                for reduction in reductions
+                if not ck.is_hold(rig, reduction.head)
+            )
         ),
         ck.joints_excited(rig, heads),
-        *ck.clipping(rig, [(one.head, one.clipped) for one in reductions]),
-        *ck.leak_down(rig, [one.head for one in reductions]),
-        ck.lost_samples([(one.head, one.lost) for one in reductions]),
+        *ck.clipping(rig, [(reduction.head, reduction.clipped) for reduction in reductions]),
+        *ck.leak_down(rig, [reduction.head for reduction in reductions]),
+        ck.lost_samples([(reduction.head, reduction.lost) for reduction in reductions]),
         ck.masked(sum(rows.values()), masked),
         *consistency(rig, estimates),
     )
@@ -104,8 +108,8 @@ def _stages(
     for family in FAMILIES:
         width = len(parameters_of(rig, terms, family)) + 1
         out[family] = []
-        for step in dict.fromkeys(one.head.step for one in reductions):
-            part = [one for one in reductions if one.head.step == step]
+        for step in dict.fromkeys(reduction.head.step for reduction in reductions):
+            part = [reduction for reduction in reductions if reduction.head.step == step]
             noise = noise_of(part, family)
             clusters = tuple(clusters_of(part, family))
             if clusters:
