@@ -60,10 +60,10 @@ def check_identity(data: bytes, rig: Rig, where: str) -> DeviceInfo:
         ),
         ("samples per block", samples, layout.samples, samples == layout.samples),
     )
-    for what, found, expected, fits in checks:
+    for what, reported, expected, fits in checks:
         if not fits:
             raise DeviceError(
-                f"the device at {where} is not the rig described: {what} {found}, "
+                f"the device at {where} is not the rig described: {what} {reported}, "
                 f"expected {expected}"
             )
     if converters != reg.converter_checksum(rig):

@@ -69,15 +69,15 @@ class CanLine:
 
     def receive(self, patience: float) -> list[WireFrame]:
         """Return the messages that are whole; raises DeviceLost when the bus has gone."""
-        found = []
+        messages = []
         for key, data in self._port.receive(patience):
             if self._blocks.takes(key):
                 message = self._blocks.feed(key, data, *self._stream)
             else:
                 message = self._answers.feed(data)
             if message is not None:
-                found.append(message)
-        return found
+                messages.append(message)
+        return messages
 
     def complaint(self, heard: int) -> str:
         """Say what came that may explain a silence, or nothing."""

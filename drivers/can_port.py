@@ -193,9 +193,9 @@ class CanPort:
         place = self._place
         try:
             with socket.create_connection((place.host, place.port), _OPEN_SECONDS) as asked:
-                said = asked.recv(64)
+                greeting = asked.recv(64)
                 asked.sendall(f"< open {place.channel} >".encode())
-                opened = asked.recv(64) if said.startswith(_GREETING) else b""
+                opened = asked.recv(64) if greeting.startswith(_GREETING) else b""
         except ConnectionError as error:
             raise DeviceLost(
                 f"nobody listens at {place.host}:{place.port} ({error.strerror}); is socketcand "
@@ -205,9 +205,9 @@ class CanPort:
             raise DeviceLost(
                 f"no socketcand at {place.host}:{place.port}: {error.strerror or error}"
             ) from error
-        if not said.startswith(_GREETING):
+        if not greeting.startswith(_GREETING):
             raise DeviceError(
-                f"{place.host}:{place.port} is no socketcand: it said {said[:20]!r}, expected "
+                f"{place.host}:{place.port} is no socketcand: it said {greeting[:20]!r}, expected "
                 f"{_GREETING!r}"
             )
         if not opened.startswith(_OPENED):
@@ -270,12 +270,12 @@ class _SocketcandBus(SocketCanDaemonBus):
 
     def _expect_msg(self, msg: str) -> None:
         # The last answer of the greeting may come together with the first frames.
-        said = b""
-        while not said.endswith(b">") and (byte := self._end.recv(1)):
-            said += byte
-        if said.decode("ascii", "replace") != msg:
+        answer = b""
+        while not answer.endswith(b">") and (byte := self._end.recv(1)):
+            answer += byte
+        if answer.decode("ascii", "replace") != msg:
             self._end.close()
-            raise can.CanInitializationError(f"expected {msg!r}, got {said!r}")
+            raise can.CanInitializationError(f"expected {msg!r}, got {answer!r}")
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         message, filtered = super()._recv_internal(timeout)  # type: ignore[no-untyped-call]

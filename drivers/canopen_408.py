@@ -130,10 +130,10 @@ class CanOpenValves:
         end = time.monotonic() + self._wire.timeout
         with self._received:
             while self._waited:
-                left = end - time.monotonic()
-                if left <= 0.0 or self._port.fault is not None:
+                remaining = end - time.monotonic()
+                if remaining <= 0.0 or self._port.fault is not None:
                     break
-                self._received.wait(min(left, 0.05))
+                self._received.wait(min(remaining, 0.05))
             missing = sorted({1 + (cob - 1) % 0x80 for cob in self._waited})
         if missing:
             # A late answer would pass for the next one.

@@ -140,10 +140,10 @@ class InProcessDriver:
         if not name:
             raise DeviceError("wire: object: expected package.module:name, a callable of the rig")
         try:
-            found: Callable[[Rig], Advancing] = getattr(importlib.import_module(module), name)
+            factory: Callable[[Rig], Advancing] = getattr(importlib.import_module(module), name)
         except Exception as error:  # whatever the module does when it is imported
             raise DeviceError(f"wire: object: cannot import {self._path}: {error!r}") from error
-        return found
+        return factory
 
     def close(self) -> None:
         """Forget laws and object; never raises."""

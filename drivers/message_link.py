@@ -161,10 +161,10 @@ class MessageLink:
 
     def _awaited(self, end: float) -> WireFrame | None:
         while self._number not in self._answers:
-            left = end - self._clock()
-            if left <= 0.0:
+            remaining = end - self._clock()
+            if remaining <= 0.0:
                 return None
-            self.listen(left)
+            self.listen(remaining)
         return self._answers.pop(self._number)
 
     def _sort(self, frame: WireFrame) -> None:

@@ -205,8 +205,8 @@ class MessageStreamDriver:
         deadline = self._clock() + period + self._link.patience
         for asked in count(1):
             due = min(self._clock() + pause, deadline)
-            while not self._ready and (left := due - self._clock()) > 0.0:
-                self._link.listen(left)
+            while not self._ready and (remaining := due - self._clock()) > 0.0:
+                self._link.listen(remaining)
                 self._accept()
             if self._ready:
                 break

@@ -374,10 +374,10 @@ class MappedModule:
         with self._explained(where):
             self._link.store(entry.watchdog_register, [entry.milliseconds])
             data = self._link.fetch(HOLDING, entry.watchdog_register, 1)
-        found = int.from_bytes(data, "big")
-        if found != entry.milliseconds:
+        stored = int.from_bytes(data, "big")
+        if stored != entry.milliseconds:
             raise DeviceError(
-                f"{where} of the {self._who} holds {found} after {entry.milliseconds} was "
+                f"{where} of the {self._who} holds {stored} after {entry.milliseconds} was "
                 "written; it is no watchdog time in milliseconds"
             )
 
@@ -395,12 +395,12 @@ class ModbusMapDriver(PolledDriver):
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        found = MapSettings.of(wire)
+        settings = MapSettings.of(wire)
         super().__init__(
             wire,
             rig,
-            MappedModule(found, register_map(found, rig), wire.timeout),
-            accept_no_watchdog=found.accept_no_watchdog,
+            MappedModule(settings, register_map(settings, rig), wire.timeout),
+            accept_no_watchdog=settings.accept_no_watchdog,
             clock=clock,
             sleep=sleep,
         )

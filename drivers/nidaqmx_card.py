@@ -244,12 +244,12 @@ class NidaqmxDriver(PolledDriver):
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        found = CardSettings.of(wire)
+        settings = CardSettings.of(wire)
         super().__init__(
             wire,
             rig,
-            NidaqmxCard(wiring(found, rig), wire.timeout),
-            accept_no_watchdog=found.accept_no_watchdog,
+            NidaqmxCard(wiring(settings, rig), wire.timeout),
+            accept_no_watchdog=settings.accept_no_watchdog,
             clock=clock,
             sleep=sleep,
         )

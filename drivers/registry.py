@@ -16,15 +16,15 @@ GROUP: Final = "bramah.drivers"
 
 def wire_kinds() -> tuple[str, ...]:
     """Name the kinds of wire that an installed driver serves."""
-    return tuple(sorted({found.name for found in entry_points(group=GROUP)}))
+    return tuple(sorted({entry.name for entry in entry_points(group=GROUP)}))
 
 
 def driver_class(kind: str) -> type[Driver]:
     """Return the driver of a kind of wire; raises InputError for one that nothing serves."""
-    found: list[EntryPoint] = list(entry_points(group=GROUP, name=kind))
-    if not found:
+    entries: list[EntryPoint] = list(entry_points(group=GROUP, name=kind))
+    if not entries:
         raise InputError(f"wire: kind: {kind!r} has no driver; installed: {' '.join(wire_kinds())}")
-    loaded: type[Driver] = found[0].load()
+    loaded: type[Driver] = entries[0].load()
     return loaded
 
 
@@ -46,7 +46,7 @@ def wire_at(endpoint: str, wire: Wire) -> Wire:
         )
     settings = driver_class(url.scheme).settings
     try:
-        found = settings.of_endpoint(url)
+        values = settings.of_endpoint(url)
     except ValueError as error:
         raise InputError(f"--endpoint {endpoint}: expected one like {settings.example}") from error
-    return wire.reached_by(url.scheme, found)
+    return wire.reached_by(url.scheme, values)

@@ -186,8 +186,8 @@ class ReplayDriver:
             self._sleep(-late)
             return 0
         assert self._data is not None
-        left = len(self._data) - tick
-        return min(int(late * rate), left) // self._settings.block_samples
+        remaining = len(self._data) - tick
+        return min(int(late * rate), remaining) // self._settings.block_samples
 
     # -- the file ---------------------------------------------------------------------------
 
@@ -236,7 +236,11 @@ def _in_order(file: Any) -> Iterator[Any]:
     groups += list(file.get(BETWEEN, {}).values())
 
     def taken(group: Any) -> tuple[int, int, str]:
-        told = group.attrs
-        return int(told.get("stream", 0)), int(told.get("start_tick", 0)), str(group.name)
+        attributes = group.attrs
+        return (
+            int(attributes.get("stream", 0)),
+            int(attributes.get("start_tick", 0)),
+            str(group.name),
+        )
 
     yield from sorted(groups, key=taken)

@@ -157,8 +157,10 @@ class LimitForecast:
                 best, lowest = spectrum, float(shares[worst])
             level = DESIGN.peak_clip * shares[worst]
             clipped = np.clip(motion[worst], -level * self.low[worst], level * self.high[worst])
-            left = np.fft.rfft(clipped)[self.lines]
-            spectrum = size * np.exp(1j * np.angle(left / _nonzero(self.responses[worst])))
+            remaining_lines = np.fft.rfft(clipped)[self.lines]
+            spectrum = size * np.exp(
+                1j * np.angle(remaining_lines / _nonzero(self.responses[worst]))
+            )
         return best, lowest
 
 
@@ -175,9 +177,9 @@ def forecast_of(rig: Rig, played: Played, joint: int, lines: NDArray[np.int64]) 
     for bound in bounds(rig, played.step, played.motion):
         if bound.joint < 0 or not bound.low < bound.signal.mean() < bound.high:
             continue
-        found = np.fft.rfft(bound.signal[-n:])[strong] / command[strong]
+        response = np.fft.rfft(bound.signal[-n:])[strong] / command[strong]
         responses.append(
-            np.interp(lines, strong, found.real) + 1j * np.interp(lines, strong, found.imag)
+            np.interp(lines, strong, response.real) + 1j * np.interp(lines, strong, response.imag)
         )
         low.append(bound.signal.mean() - bound.low)
         high.append(bound.high - bound.signal.mean())

@@ -201,8 +201,8 @@ class _Search:
     def judged(self, step: PlannedStep, tones: Mapping[int, Tone]) -> Candidate:
         """Play a step; raises InputError where the twin cannot."""
         played = play(self.rig, step)
-        found = information(self.rig, played, self.terms)
-        return Candidate(tones, played, found, *used(self.rig, played))
+        step_information = information(self.rig, played, self.terms)
+        return Candidate(tones, played, step_information, *used(self.rig, played))
 
     def fitted(self, candidate: Candidate) -> tuple[Candidate, int]:
         """Make a step that passes a limit smaller until it keeps them all."""

@@ -57,20 +57,20 @@ def sensor_variance(sensor: AnySensor) -> float:
 
 def inputs_of(rig: Rig, moving: Mask) -> tuple[Input, ...]:
     """Return the inputs of the rows; a joint that does not move is held and lets no noise in."""
-    found = []
+    inputs = []
     for i in range(len(rig.joints)):
 
         def name(kind: str, joint: int = i + 1) -> str:
             return ch.channel(kind, joint)
 
         if moving[i]:
-            found += [Input(name(ch.PISTON), k, f, i) for k, f in enumerate(("s", "sd", "sdd"))]
-        found.append(Input(name(ch.SPOOL), 0, "u", i))
+            inputs += [Input(name(ch.PISTON), k, f, i) for k, f in enumerate(("s", "sd", "sdd"))]
+        inputs.append(Input(name(ch.SPOOL), 0, "u", i))
         for kind, fields in ((ch.CAP, ("p_cap", "pd_cap")), (ch.ROD, ("p_rod", "pd_rod"))):
-            found += [Input(name(kind), k, f, i) for k, f in enumerate(fields)]
-    found.append(Input(ch.SUPPLY, 0, "p_s", None))
-    found.append(Input(ch.TEMPERATURE, 0, "temperature", None))
-    return tuple(i for i in found if i.channel in rig.channels)
+            inputs += [Input(name(kind), k, f, i) for k, f in enumerate(fields)]
+    inputs.append(Input(ch.SUPPLY, 0, "p_s", None))
+    inputs.append(Input(ch.TEMPERATURE, 0, "temperature", None))
+    return tuple(i for i in inputs if i.channel in rig.channels)
 
 
 def moved(rig: Rig, signals: Signals, what: Input, by: float) -> Signals:

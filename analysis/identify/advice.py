@@ -32,13 +32,13 @@ def base_statements(rig: Rig, solutions: Mapping[str, Solution]) -> list[Check]:
             continue
         k = len(solution.names)
         noise = solution.noise[:k, :k] if len(solution.noise) else None
-        found = determined(solution.names, solution.triangle[:k, :k], noise)
-        combined = ", ".join(part.text for part in found.base) or "no combination of them"
-        helps = _help(rig, family, found)
+        base = determined(solution.names, solution.triangle[:k, :k], noise)
+        combined = ", ".join(part.text for part in base.base) or "no combination of them"
+        helps = _help(rig, family, base)
         out.append(
             Check(
                 f"base parameters {family}", False,
-                f"rank {found.rank} of {k}; of {' '.join(solution.unidentifiable)} these records "
+                f"rank {base.rank} of {k}; of {' '.join(solution.unidentifiable)} these records "
                 f"determine: {combined}. {_joined(helps)}",
             )
         )  # fmt: skip
@@ -73,15 +73,15 @@ def fluid_help(rig: Rig, found: Determined) -> list[str]:
 
 def mechanical_help(rig: Rig, found: Determined) -> list[str]:
     """Return the fewest steps found that show every null direction, in words."""
-    left = found.null
+    undetermined = found.null
     steps = list(_candidates(rig))
     rows = [_rows(rig, excited, places) for excited, places in steps]
     scale = np.maximum(np.linalg.norm(np.vstack(rows), axis=0), 1e-300)
     # Each candidate against itself: an outer joint's torques are small, and tell as much.
     rows = [X / np.linalg.norm(X / scale, 2) for X in rows]
     helps = []
-    while len(left):
-        basis = np.linalg.qr((left * scale).T)[0]
+    while len(undetermined):
+        basis = np.linalg.qr((undetermined * scale).T)[0]
         seen = [np.linalg.svd(X / scale @ basis, full_matrices=True) for X in rows]
         ranks = [int(np.sum(sigma > IDENTIFY.visible_direction)) for _, sigma, _ in seen]
         # As many directions as possible, then as clearly; a closed valve gives, a stop does not.
@@ -93,7 +93,7 @@ def mechanical_help(rig: Rig, found: Determined) -> list[str]:
         if not ranks[best]:
             break
         helps.append(_words(rig, *steps[best]))
-        left = (basis @ seen[best][2][ranks[best] :].T).T / scale
+        undetermined = (basis @ seen[best][2][ranks[best] :].T).T / scale
     return helps
 
 

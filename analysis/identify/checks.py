@@ -243,7 +243,7 @@ def noise_bias(solutions: Mapping[str, Solution], unbiased: bool = False) -> Che
 
     It is that of least squares; `unbiased` says that the values come from what it cannot bias.
     """
-    found = [
+    biases = [
         (abs(bias / value), name)
         for solution in solutions.values()
         for name, value, bias in zip(
@@ -251,9 +251,9 @@ def noise_bias(solutions: Mapping[str, Solution], unbiased: bool = False) -> Che
         )
         if np.isfinite(value) and np.isfinite(bias) and value != 0
     ]
-    if not found:
+    if not biases:
         return Check("noise bias", False, "nothing identified to judge")
-    worst, name = max(found)
+    worst, name = max(biases)
     return Check(
         "noise bias",
         bool(worst < IDENTIFY.noise_bias) or unbiased,

@@ -55,8 +55,8 @@ def coupled(
         if rig.electric:
             from analysis.identify.output_error.free_run import free_run_fit  # noqa: PLC0415 - compiles
 
-            found, check = free_run_fit(rig, runs, used, solutions)
-            return Refined(found, (check,), estimator)
+            fitted, check = free_run_fit(rig, runs, used, solutions)
+            return Refined(fitted, (check,), estimator)
         job = EstimationJob(rig, runs, used, built, estimator, bootstrap, rng)
         return refine(job, solutions)
 
@@ -81,20 +81,20 @@ def conclude(
     started = time.perf_counter()
     solutions = solve_reductions(rig, used, reductions, reject_noise)
     seconds = time.perf_counter() - started
-    found = Refined(solutions, (_UNREFINED,), PLAIN) if refined is None else refined(solutions)
-    solutions = found.solutions
+    refinement = Refined(solutions, (_UNREFINED,), PLAIN) if refined is None else refined(solutions)
+    solutions = refinement.solutions
     estimates, covariance = estimates_of(rig, used, solutions)
-    if found.bootstrap:
-        estimates = with_ends(estimates, found.bootstrap)
+    if refinement.bootstrap:
+        estimates = with_ends(estimates, refinement.bootstrap)
     rows = {family: solution.rows for family, solution in solutions.items()}
     masked = sum(reduction.masked for reduction in reductions)
     statements = (
-        *_statements(rig, reductions, found, estimates, rows, masked),
-        *found.checks,
+        *_statements(rig, reductions, refinement, estimates, rows, masked),
+        *refinement.checks,
     )
     provenance = {
         "method": "coupled",
-        "estimator": found.estimator,
+        "estimator": refinement.estimator,
         "runs": list(sources),
         "records": [reduction.head.name for reduction in reductions],
         "rows": rows,

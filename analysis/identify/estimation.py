@@ -179,10 +179,10 @@ def _prepare(
         for name in tuple(beside):
             fit = least_squares(prepared.blocks)
             # Anew each time: a nuisance that was left out has shifted the columns.
-            found = {b.name: b for b in nu.beliefs(prepared.names, fit.beta)}
-            if name not in found:
+            beliefs = {b.name: b for b in nu.beliefs(prepared.names, fit.beta)}
+            if name not in beliefs:
                 continue
-            belief = found[name]
+            belief = beliefs[name]
             error = spread([pieces(fit)], fit.inverse)
             wrong = nu.implausible(belief, fit.beta, error.covariance)
             checks.append(nuisance_statement(belief, prepared.names, fit.beta, error, wrong))
@@ -202,7 +202,7 @@ def _family(
 ) -> Prepared:
     names = (*mine, *beside)
     kept = [list(columns).index(n) for n in names]
-    records = {(one.conditioned.run, one.record.name): one.record for one in built}
+    records = {(rows.conditioned.run, rows.record.name): rows.record for rows in built}
     blocks = levelled(blocks_of(built, family, kept), records)
     return Prepared(family, names, len(mine), tuple(blocks))
 

@@ -58,8 +58,8 @@ def identify_folders(
         for number, (folder, head) in enumerate(zip(folders, heads, strict=True))
         for one in steps_of(rig, folder, head.records)
     ]
-    found = workers.map(moving_task, [one for _, one in steps], reads=path_of)
-    moving = {(n, one.step): moves for (n, one), moves in zip(steps, found, strict=True)}
+    decisions = workers.map(moving_task, [one for _, one in steps], reads=path_of)
+    moving = {(n, one.step): moves for (n, one), moves in zip(steps, decisions, strict=True)}
     tasks = [
         RecordTask(
             rig,

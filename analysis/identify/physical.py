@@ -172,9 +172,9 @@ def _level(result: Identification, name: str, rigid: bool) -> Level:
         k = len(solution.names)
         X, y = solution.triangle[:k, :k], solution.triangle[:k, k]
         # An estimator may have moved the free solution off the triangle's own: project that one.
-        found = minimise(X, X @ solution.value, feasible(rig, solution.names, rigid))
-        solutions[family] = _constrained(solution, X, found)
-        prices[family] = _price(rig, solution, X, y, found)
+        minimum = minimise(X, X @ solution.value, feasible(rig, solution.names, rigid))
+        solutions[family] = _constrained(solution, X, minimum)
+        prices[family] = _price(rig, solution, X, y, minimum)
     estimates, covariance = estimates_of(rig, result.model.terms, solutions)
     return Level(name, estimates, covariance, prices)
 

@@ -175,8 +175,8 @@ def reduce_record(
         part = source.read(0, count)
         signals = condition(rig, part, filters.channels, moving)
         rows = record_rows(rig, terms, signals, filters)
-        found = record_moments(rig, terms, ConditionedRecord(run, part, signals, filters), rows)
-        noise = {family: moment * (head.samples / count) for family, moment in found.items()}
+        moments = record_moments(rig, terms, ConditionedRecord(run, part, signals, filters), rows)
+        noise = {family: moment * (head.samples / count) for family, moment in moments.items()}
     return RecordReduction(run, head, parts, masked, lost, clipped, noise)
 
 
@@ -253,12 +253,12 @@ def noise_of(reductions: Sequence[RecordReduction], family: str) -> Array | None
     for one in reductions:
         key = (one.run, one.head.step)
         counts[key] = counts.get(key, 0) + 1
-    found = [
+    weighted = [
         counts[reduction.run, reduction.head.step] * reduction.noise[family]
         for reduction in reductions
         if reduction.noise is not None and family in reduction.noise
     ]
-    return np.sum(found, axis=0) if found else None
+    return np.sum(weighted, axis=0) if weighted else None
 
 
 def solve_reductions(

@@ -63,7 +63,7 @@ def estimates_of(
 ) -> tuple[dict[str, Estimate], Array]:
     """Turn the rows' coefficients into parameters (b = 1/coefficient) with intervals."""
     coefficients = {c.parameter: c for used in terms for c in used.term.parameters(rig)}
-    found: dict[str, Estimate] = {}
+    estimates: dict[str, Estimate] = {}
     blocks = []
     for solution in solutions.values():
         std = np.sqrt(np.diag(solution.covariance))
@@ -72,15 +72,15 @@ def estimates_of(
         for i, name in enumerate(solution.names):
             c = coefficients[name]
             note = solution.unidentifiable.get(name, "")
-            found[name], slopes[i] = _estimate(c, solution.value[i], std[i], half[i], note)
+            estimates[name], slopes[i] = _estimate(c, solution.value[i], std[i], half[i], note)
         blocks.append(solution.covariance * np.outer(slopes, slopes))
-    names = list(found)
+    names = list(estimates)
     covariance = np.zeros((len(names), len(names)))
     start = 0
     for block in blocks:
         covariance[start : start + len(block), start : start + len(block)] = block
         start += len(block)
-    return found, covariance
+    return estimates, covariance
 
 
 def _estimate(

@@ -99,8 +99,10 @@ def _noisy(Vt: Array, sigma: Array, scale: Array, noise: Array | None) -> Array:
         return np.zeros((0, len(scale)))
     white = Vt / sigma[:, None]
     share, turn = np.linalg.eigh(white @ (noise / np.outer(scale, scale)) @ white.T)
-    found = (turn.T @ white)[share > REGRESSION.noise_share]
-    return np.asarray(found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-300))
+    projected = (turn.T @ white)[share > REGRESSION.noise_share]
+    return np.asarray(
+        projected / np.maximum(np.linalg.norm(projected, axis=1, keepdims=True), 1e-300)
+    )
 
 
 def _combinations(

@@ -63,8 +63,8 @@ def _reduce(
     for _ in range(REGRESSION.rounds):
         change = _transform(reduction, places, others, p)
         stepped = solve(new, _transformed(whole, change), None, False)
-        found = np.where(np.isfinite(stepped.value), stepped.value, p)
-        step, p = np.abs(found - p).max(), found
+        stepped_value = np.where(np.isfinite(stepped.value), stepped.value, p)
+        step, p = np.abs(stepped_value - p).max(), stepped_value
         if step <= REGRESSION.tolerance * np.abs(p).max():
             break
     else:

@@ -62,18 +62,18 @@ def check_lines(checks: Sequence[Check]) -> list[CheckLine]:
 
 def truth_remark(rig: Rig, truth: Mapping[str, float] | None) -> str:
     """Say where a simulated bench's own truth is no rigid body's (R_ij = l_i W_j), '' otherwise."""
-    found = []
+    remarks = []
     for i, j in itertools.combinations(range(1, len(rig.joints) + 1), 2):
         R, W = (truth or {}).get(f"R{i}{j}"), (truth or {}).get(f"W{j}")
         length = rig.joints[i - 1].link_length
         if R is not None and W and abs(R / W / length - 1) >= IDENTIFY.length_tolerance:
-            found.append(
+            remarks.append(
                 f"R{i}{j}/W{j} = {fm.significant(R / W)} m for a link of {fm.significant(length)} m"
             )
-    if not found:
+    if not remarks:
         return ""
     return (
-        f"The simulated bench's own truth has {'; '.join(found)}: there the check on link length "
+        f"The simulated bench's own truth has {'; '.join(remarks)}: there the check on link length "
         "speaks of the bench, not of the identification."
     )
 
@@ -141,14 +141,14 @@ def sentences(
     joints = len(rig.joints)
     expected = tuple(identification.estimates) if rig.electric else parameter_names(joints)
     kind = "electric joint" if rig.electric else "hydraulic joint"
-    found = [e for n, e in identification.estimates.items() if e.identified and n in expected]
+    identified = [e for n, e in identification.estimates.items() if e.identified and n in expected]
     steps = len({(i, r.step) for i, run in enumerate(runs) for r in run.records})
     bench = "the simulated bench" if simulated else "the rig"
     first = (
         f"On {bench} {rig.name} ({fm.count(joints, kind)}), "
         f"{fm.count(len(records), 'record')} of {fm.count(steps, 'step')} were taken, "
         f"{minutes(duration(records))} of data; one {identification.method} least-squares solve "
-        f"gives {len(found)} of the {len(expected)} parameters of the model."
+        f"gives {len(identified)} of the {len(expected)} parameters of the model."
     )
     if not validation:
         return [first, "The model has not been validated: no validation records were given."]
@@ -179,21 +179,21 @@ def tiles(
 ) -> list[Tile]:
     """Return the headline's figures."""
     estimates = identification.estimates
-    found = {n: e for n, e in estimates.items() if e.identified}
+    known = {n: e for n, e in estimates.items() if e.identified}
     out = [
-        Tile(f"{len(found)} of {len(estimates)}", "parameters identified",
-             "all of the model's" if len(found) == len(estimates) else "the rest is noted below",
-             len(found) < len(estimates))
+        Tile(f"{len(known)} of {len(estimates)}", "parameters identified",
+             "all of the model's" if len(known) == len(estimates) else "the rest is noted below",
+             len(known) < len(estimates))
     ]  # fmt: skip
-    widths = {n: w for n, e in found.items() if not math.isnan(w := relative_half_width(e))}
+    widths = {n: w for n, e in known.items() if not math.isnan(w := relative_half_width(e))}
     if widths:
         name = max(widths, key=lambda n: widths[n])
         out.append(Tile(f"±{fm.percent(widths[name])} %", "widest 95 % interval", name))
     if truth:
-        errors = {n: 100 * (e.value / truth[n] - 1) for n, e in found.items() if truth.get(n)}
+        errors = {n: 100 * (e.value / truth[n] - 1) for n, e in known.items() if truth.get(n)}
         if errors:
             name = max(errors, key=lambda n: abs(errors[n]))
-            inside = sum(covers(found[n], truth[n]) for n in errors)
+            inside = sum(covers(known[n], truth[n]) for n in errors)
             out.append(
                 Tile(f"{fm.percent(errors[name], signed=True)} %", "largest error against truth",
                      f"{name}; {inside} of {len(errors)} intervals hold the truth")

@@ -44,22 +44,22 @@ def parameters(
 ) -> Gallery:
     """Return the dots with whiskers: against truth or nominal where there is one, and widths."""
     estimates = identification.estimates
-    found = []
+    figures = []
     reference, kind = (truth, "truth") if truth else (rig.nominal, "nominal")
     if reference and any(name in reference for name in estimates):
         text = (
             "Zero is the value the simulated bench was built with." if truth
             else "Zero is the rig file's nominal value: a design figure, not the truth."
         )  # fmt: skip
-        found.append(
+        figures.append(
             ReportFigure(interval_plots.against_reference(estimates, reference, kind),
                   f"Parameters against the {kind}", text)
         )  # fmt: skip
-    found.append(
+    figures.append(
         ReportFigure(interval_plots.interval_widths(estimates), "Width of the intervals",
               "Scatter is not accuracy: a narrow interval says nothing of what the model lacks.")
     )  # fmt: skip
-    return Gallery(tuple(found))
+    return Gallery(tuple(figures))
 
 
 def arm(rig: Rig) -> ReportFigure | None:

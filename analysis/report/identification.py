@@ -129,7 +129,7 @@ def _headline(
 
 
 def _regression(identification: Identification, rows: Sequence[RecordRows]) -> dict[str, Any]:
-    left = residuals(identification, rows)
+    residual_sets = residuals(identification, rows)
     scatter = per_repeat(identification, rows)
     rig = identification.model.rig
     return {
@@ -146,10 +146,10 @@ def _regression(identification: Identification, rows: Sequence[RecordRows]) -> d
         "masked_rows": identification.masked_rows,
         "solve": fm.significant(1e3 * identification.solve_seconds),
         "paper": paper if rig.name == paper.RIG else None,
-        "residual_rows": figures.residual_rows(left),
-        "residual_figures": figures.residuals(left),
-        "largest_share": figures.largest_share(left),
-        "single": any(one.repeats < 2 for one in left),
+        "residual_rows": figures.residual_rows(residual_sets),
+        "residual_figures": figures.residuals(residual_sets),
+        "largest_share": figures.largest_share(residual_sets),
+        "single": any(one.repeats < 2 for one in residual_sets),
         "table3": tables.table_iii(rig.name, identification, scatter),
         "repeats": max((s.repeats for s in scatter.values()), default=0),
     }

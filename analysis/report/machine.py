@@ -203,8 +203,8 @@ def _largest(attributes: Attributes, key: str) -> float | None:
 
 
 def _total(attributes: Attributes, key: str) -> str:
-    found = _numbers(attributes, key)
-    return f"{sum(found):.0f}" if found else fm.DASH
+    counts = _numbers(attributes, key)
+    return f"{sum(counts):.0f}" if counts else fm.DASH
 
 
 def _per_joint(step: StepSummary, kind: str, scale: float, figure: object) -> str:

@@ -89,7 +89,10 @@ def render(night: Night) -> str:
         "tiles": _tiles(night, counts),
         "timeline": _timeline(ended),
         "rows": [_row(item) for item in night.items],
-        "drifts": [_drift(rig, found) for rig, found in _identified(night.items).items()],
+        "drifts": [
+            _drift(rig, identifications)
+            for rig, identifications in _identified(night.items).items()
+        ],
         "unidentified": [
             (item.number, item.name, item.unidentified) for item in night.items if item.unidentified
         ],
@@ -171,11 +174,11 @@ def _timeline(items: Sequence[NightItem]) -> Markup | None:
         axes = made.add_subplot(1, 1, 1)
         for k, item in enumerate(shown):
             assert item.started is not None
-            left = (item.started - begin).total_seconds() / 60.0
+            start_minute = (item.started - begin).total_seconds() / 60.0
             width = max(_seconds(item) / 60.0, 1e-3)
             colour = _BAR_COLOURS.get(item.state, GREY)
-            axes.barh(k, width, left=left, height=0.62, color=colour)
-            axes.plot([left + width] * 2, [k - 0.31, k + 0.31], color=INK, lw=0.8)
+            axes.barh(k, width, left=start_minute, height=0.62, color=colour)
+            axes.plot([start_minute + width] * 2, [k - 0.31, k + 0.31], color=INK, lw=0.8)
         axes.set_yticks(range(len(shown)), [str(item.number) for item in shown])
         axes.set_ylim(len(shown) - 0.4, -0.6)
         axes.set_xlabel(f"minutes since {_clock(begin)}")
@@ -187,13 +190,13 @@ def _timeline(items: Sequence[NightItem]) -> Markup | None:
 
 def _identified(items: Sequence[NightItem]) -> dict[str, list[NightItem]]:
     """Group what has parameters by rig, in the order of time."""
-    found: dict[str, list[NightItem]] = {}
+    by_rig: dict[str, list[NightItem]] = {}
     for item in items:
         if item.parameters and item.ended is not None:
-            found.setdefault(item.rig, []).append(item)
-    for group in found.values():
+            by_rig.setdefault(item.rig, []).append(item)
+    for group in by_rig.values():
         group.sort(key=lambda item: item.ended or item.started or datetime.min)
-    return found
+    return by_rig
 
 
 def _drift(rig: str, items: Sequence[NightItem]) -> dict[str, Any]:

@@ -87,9 +87,9 @@ def residuals(identification: Identification, per_record: Sequence[RecordRows]) 
         names = sorted(members[0].rows, key=_order)
         for name in names:
             rows = [m.rows[name] for m in members if name in m.rows]
-            found = _residual(run, step, name, rows, beta[family_of(name)])
-            if found is not None:
-                out.append(found)
+            residual = _residual(run, step, name, rows, beta[family_of(name)])
+            if residual is not None:
+                out.append(residual)
     return out
 
 
@@ -106,22 +106,22 @@ def _residual(run: int, step: str, name: str, rows: Sequence[Rows], beta: Array)
         return None
     picked = [np.isin(r.time, common) for r in rows]
     side = np.array([r.rhs[p] for r, p in zip(rows, picked, strict=True)])
-    left = np.array([(r.rhs - r.matrix @ beta)[p] for r, p in zip(rows, picked, strict=True)])
+    each = np.array([(r.rhs - r.matrix @ beta)[p] for r, p in zip(rows, picked, strict=True)])
     n = len(rows)
-    band = left.std(axis=0, ddof=1) if n > 1 else np.full(len(common), np.nan)
+    band = each.std(axis=0, ddof=1) if n > 1 else np.full(len(common), np.nan)
     scatter = float(np.sqrt(np.mean(band**2)))
-    mean = left.mean(axis=0)
-    excess = float(np.mean(mean**2)) - (scatter**2 / n if n > 1 else 0.0)
+    mean = each.mean(axis=0)
+    systematic = float(np.mean(mean**2)) - (scatter**2 / n if n > 1 else 0.0)
     frequency, whole = _density(common, mean)
     noise = (
-        np.sqrt(np.mean([_density(common, r - mean)[1] ** 2 for r in left], axis=0) * n / (n - 1))
+        np.sqrt(np.mean([_density(common, r - mean)[1] ** 2 for r in each], axis=0) * n / (n - 1))
         if n > 1 else np.full(len(frequency), np.nan)
     )  # fmt: skip
     kind, joint = name.rsplit("_", 1)
     return Residual(
         run, step, name, int(joint), "N*m" if kind == "torque" else "m^3/s", n,
         sum(len(r.rhs) for r in rows), sum(r.masked for r in rows), common, side.mean(axis=0),
-        mean, band, _rms(side), _rms(left), float(np.sqrt(max(excess, 0.0))), scatter,
+        mean, band, _rms(side), _rms(each), float(np.sqrt(max(systematic, 0.0))), scatter,
         frequency, whole, noise,
     )  # fmt: skip
 
@@ -169,13 +169,13 @@ def per_repeat(
     if len(whole) < 2:
         return {}
     model = identification.model
-    found: dict[str, list[float]] = {}
+    by_equation: dict[str, list[float]] = {}
     for members in whole:
         for family, solution in identification.solutions.items():
             alone = _solve_once(members, family, solution.names)
             for name, value in inverted(model.rig, model.terms, alone).items():
-                found.setdefault(name, []).append(value)
-    return {name: _scatter(np.array(values)) for name, values in found.items()}
+                by_equation.setdefault(name, []).append(value)
+    return {name: _scatter(np.array(values)) for name, values in by_equation.items()}
 
 
 def _solve_once(

@@ -125,8 +125,8 @@ def table_iv(rig_name: str, validation: Sequence[RecordValidation]) -> FitTable:
         cells = []
         for i, kind in enumerate(KINDS):
             name = ch.channel(kind, column.joint)
-            found = [r.fit[name] for r in results if name in r.fit]
-            ours = float(np.mean(found)) if found else float("nan")
+            fits = [r.fit[name] for r in results if name in r.fit]
+            ours = float(np.mean(fits)) if fits else float("nan")
             theirs = column.fit[i] if column.fit else None
             mark = "" if theirs is None or math.isnan(ours) else mark_of(ours, theirs)
             compared += bool(theirs is not None)

@@ -166,7 +166,7 @@ def condition(
 
 def clipped_samples(rig: Rig, record: Record) -> dict[str, Mask]:
     """Return, per channel that touches an end of its sensor's range, where it does (n,)."""
-    found = {}
+    clipped = {}
     for name in rig.channels:
         if name in record.channels:
             sensor = rig.sensors.of(ch.kind_of(name)[0])
@@ -175,8 +175,8 @@ def clipped_samples(rig: Rig, record: Record) -> dict[str, Mask]:
             x = np.asarray(record.channels[name])
             mask = (x <= low + 0.5 * step) | (x >= high - 0.5 * step)
             if mask.any():
-                found[name] = mask
-    return found
+                clipped[name] = mask
+    return clipped
 
 
 def _refuse_missing(rig: Rig, record: Record, excited: Mask) -> None:

@@ -43,21 +43,21 @@ def moving_joints(rig: Rig, repeats: Sequence[Record]) -> Mask:
     A joint without a position channel in any repeat counts as moving.
     """
     rate, noise = repeats[0].sample_rate, rig.sensors.of(rig.position_kind).noise
-    found = []
+    moving = []
     for i in range(1, len(rig.joints) + 1):
         name = ch.channel(rig.position_kind, i)
         locked = [r for r in repeats if i in r.locked and name in r.channels]
         if len(locked) < len(repeats):
-            found.append(True)
+            moving.append(True)
             continue
         length = min(SIGNALS.deciding_samples, *(r.samples for r in locked))
         every = np.array([bridged(np.asarray(r.channels[name])[:length]) for r in locked])
         # Repeats that were not synchronised after all would cancel in the mean.
-        found.append(
+        moving.append(
             gives(every.mean(axis=0), rate, noise / np.sqrt(len(locked)))
             or any(gives(one, rate, noise) for one in every)
         )
-    return np.array(found)
+    return np.array(moving)
 
 
 def gives(position: Array, rate: float, noise: float) -> bool:

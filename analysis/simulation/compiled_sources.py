@@ -81,7 +81,7 @@ def compiled_now(source: str, subject: str) -> Any:
         building = Path(tempfile.mkdtemp(prefix="bramah-rates-"))
     try:
         (building / _SOURCE).write_text(source, encoding="utf-8")
-        found = _run(source, building / _SOURCE)
+        compiled = _run(source, building / _SOURCE)
         sums = {str(p.relative_to(building)): _checksum(p) for p in _files(building)}
         (building / _CHECKSUMS).write_text(json.dumps(sums), encoding="utf-8")
         if building.parent == root:
@@ -92,7 +92,7 @@ def compiled_now(source: str, subject: str) -> Any:
     finally:
         shutil.rmtree(building, ignore_errors=True)
     log.warning("compiled in %.1f s", time.perf_counter() - began)
-    return found
+    return compiled
 
 
 def _run(source: str, path: Path) -> Any:
@@ -115,10 +115,10 @@ def _checksum(path: Path) -> str:
 def _unharmed(folder: Path, source: str) -> bool:
     try:
         expected = json.loads((folder / _CHECKSUMS).read_text(encoding="utf-8"))
-        found = {str(p.relative_to(folder)): _checksum(p) for p in _files(folder)}
+        checksums = {str(p.relative_to(folder)): _checksum(p) for p in _files(folder)}
         return bool(
-            found == expected
-            and len(found) > 1
+            checksums == expected
+            and len(checksums) > 1
             and (folder / _SOURCE).read_text(encoding="utf-8") == source
         )
     except (OSError, ValueError):

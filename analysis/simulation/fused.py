@@ -127,12 +127,12 @@ def _generated(
                 "M": ScalarArray("M", (N, N)),
                 "dz": ScalarArray("dy", (hidden[m],), int(z_first[m])),
             }
-            found = specialised(
+            kernel = specialised(
                 used.term.kernel.function, {"phase": phase}, arrays, f"t{m}_{phase}_", helpers
             )
-            read |= found.read
-            places |= {int(name[1:]): place for name, place in found.places.items()}
-            phases.append([f"# {used.term.name} at {used.term.where}", *found.lines])
+            read |= kernel.read
+            places |= {int(name[1:]): place for name, place in kernel.places.items()}
+            phases.append([f"# {used.term.name} at {used.term.where}", *kernel.lines])
     for k in sorted(int(name[1:]) for name in read if name[0] == "p" and name[1:].isdecimal()):
         body.add(f"p{k} = par[{k}]")
     for k in range(4 * N, 4 * N + sum(hidden)):

@@ -191,12 +191,12 @@ def _fused(
     except NotSpecialisable as reason:
         log.info("the equations stay term by term: %s", reason)
         return None
-    found = compiled_sources.stored(source)
+    compiled_source = compiled_sources.stored(source)
     own = {u.term.name for u in model.terms} <= {t.name for t in baseline_of(model.rig)}
-    if found is None and (own or effort is Effort.FIT):
+    if compiled_source is None and (own or effort is Effort.FIT):
         names = " ".join(dict.fromkeys(u.term.name for u in model.terms))
         return compiled_sources.compiled_now(source, f"{len(electric)} joint(s): {names}")
-    return found
+    return compiled_source
 
 
 @functools.lru_cache(maxsize=16)

@@ -70,9 +70,9 @@ def holding_state(rig: Rig, model: Model, piston: Array) -> State:
         area_cap, area_rod = joint.cylinder.cap_area, joint.cylinder.rod_area
         # The chambers' mean is half the supply, their difference carries the load.
         half = 0.5 * rig.supply.pressure
-        excess = (force - half * (area_cap - area_rod)) / (area_cap + area_rod)
-        cap[i] = np.clip(half + excess, 0.0, rig.supply.pressure)
-        rod[i] = np.clip(half - excess, 0.0, rig.supply.pressure)
+        pressure_excess = (force - half * (area_cap - area_rod)) / (area_cap + area_rod)
+        cap[i] = np.clip(half + pressure_excess, 0.0, rig.supply.pressure)
+        rod[i] = np.clip(half - pressure_excess, 0.0, rig.supply.pressure)
     return State(q, np.zeros(N), cap, rod)
 
 

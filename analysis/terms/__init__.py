@@ -22,13 +22,13 @@ BASELINE: Final = ("inertia", "viscous_friction", "gravity", "compressibility", 
 @functools.cache
 def known() -> dict[str, type[Term]]:
     """Return every term class by its name, from all modules of `PACKAGES`."""
-    found: dict[str, type[Term]] = {}
+    terms: dict[str, type[Term]] = {}
     for package_name in PACKAGES:
         package = importlib.import_module(package_name)
         for info in pkgutil.iter_modules(package.__path__):
             module = importlib.import_module(f"{package_name}.{info.name}")
-            found.update({term.name: term for term in getattr(module, "TERMS", ())})
-    return found
+            terms.update({term.name: term for term in getattr(module, "TERMS", ())})
+    return terms
 
 
 def make(name: str, where: str = "bench") -> Term:

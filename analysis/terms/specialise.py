@@ -131,10 +131,10 @@ def _definition(function: Callable[..., Any]) -> ast.FunctionDef:
         tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
     except (OSError, TypeError, SyntaxError) as error:
         raise NotSpecialisable(f"the source of {function!r} cannot be read: {error}") from error
-    found = tree.body[0]
-    if not isinstance(found, ast.FunctionDef):
+    definition = tree.body[0]
+    if not isinstance(definition, ast.FunctionDef):
         raise NotSpecialisable(f"{function!r} is not a plain function")
-    return found
+    return definition
 
 
 def _unparse(statements: Sequence[ast.stmt]) -> str:
@@ -299,9 +299,9 @@ class _Body(ast.NodeTransformer):
                 parts = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
                 index = [_whole(self.visit(part)) for part in parts]
                 if all(k is not None for k in index):
-                    found = self.arrays[name].variable(tuple(k for k in index if k is not None))
-                    (self.read if isinstance(node.ctx, ast.Load) else self.written).add(found)
-                    return ast.Name(found, node.ctx)
+                    variable = self.arrays[name].variable(tuple(k for k in index if k is not None))
+                    (self.read if isinstance(node.ctx, ast.Load) else self.written).add(variable)
+                    return ast.Name(variable, node.ctx)
             case ast.Call() if isinstance(_constant(node.slice), int):  # one of several results
                 return ast.Subscript(self.visit(node.value), node.slice, node.ctx)
         raise NotSpecialisable(f"line {node.lineno}: {ast.unparse(node)} has no fixed place")

@@ -47,13 +47,13 @@ def commands(block: SampleBlock, rig: Rig) -> Array:
 def require_law(block: SampleBlock, playing: Playing, rig: Rig) -> None:
     """Require that every row of a block follows the law, to 1.1 steps of the converter."""
     ticks = block.tick + np.arange(len(block.data))
-    wanted, found = playing.volts(rig, ticks, block.data), commands(block, rig)
-    near = np.abs(found - wanted) <= 1.1 * steps(rig) + 1e-9  # NaN is never near
+    wanted, measured = playing.volts(rig, ticks, block.data), commands(block, rig)
+    near = np.abs(measured - wanted) <= 1.1 * steps(rig) + 1e-9  # NaN is never near
     wrong = np.flatnonzero(~near.all(axis=1))
     if len(wrong):
         row = int(wrong[0])
         raise NotConforming(
-            f"at tick {ticks[row]} the commands are {in_volts(found[row])}, "
+            f"at tick {ticks[row]} the commands are {in_volts(measured[row])}, "
             f"the law makes {in_volts(wanted[row])}"
         )
 

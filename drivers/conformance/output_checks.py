@@ -93,9 +93,9 @@ def joints_are_separate(trial: Trial) -> None:
     tick = driver.apply(laws, restart=True)
     trial.until_law(driver, trial.playing(laws, waves, tick), tick, 4)
     for joint in range(trial.joints):
-        one = trial.law(joint, gain=0.5, bias=0.1 * trial.volts)
-        tick = driver.apply(one, restart=True)
-        trial.until_law(driver, trial.playing(one, waves, tick), tick, 2)
+        law = trial.law(joint, gain=0.5, bias=0.1 * trial.volts)
+        tick = driver.apply(law, restart=True)
+        trial.until_law(driver, trial.playing(law, waves, tick), tick, 2)
 
 
 @check()
@@ -114,8 +114,8 @@ def limit_bounds_the_sum(trial: Trial) -> None:
         most = values["limit"] + steps(trial.rig)[0] + 1e-9
         for block in driver.read(3):
             rows = block.data[max(0, tick - block.tick) :, len(trial.rig.channels)]
-            found = float(np.abs(rows).max(initial=0.0))
-            require(found <= most, f"{found:.3f} V under a limit of {values['limit']:.3f} V")
+            peak = float(np.abs(rows).max(initial=0.0))
+            require(peak <= most, f"{peak:.3f} V under a limit of {values['limit']:.3f} V")
         if "position_gain" not in values:
             trial.until_law(driver, trial.playing(laws, {0: wave}, tick), tick, 1)
 
@@ -132,10 +132,10 @@ def position_law_pulls_to_setpoint(trial: Trial) -> None:
         block = driver.read_block()
         while block.tick + len(block.data) <= tick:
             block = driver.read_block()
-        found = float(block.data[max(0, tick - block.tick), len(rig.channels)])
+        command = float(block.data[max(0, tick - block.tick), len(rig.channels)])
         wanted = 0.5 * trial.volts * np.sign(away)
-        fits = abs(found - wanted) < 0.3 * trial.volts
-        require(fits, f"{found:.3f} V at {away:+g} m to the setpoint, expected {wanted:.3f} V")
+        fits = abs(command - wanted) < 0.3 * trial.volts
+        require(fits, f"{command:.3f} V at {away:+g} m to the setpoint, expected {wanted:.3f} V")
         at = float(block.data[-1, column])
 
 
@@ -267,10 +267,10 @@ def probe_agrees_with_samples(trial: Trial) -> None:
     driver.apply(laws)
     driver.read(3)
     assert trial.bench.outputs is not None
-    found = np.asarray(trial.bench.outputs(), dtype=np.float64)
+    probed = np.asarray(trial.bench.outputs(), dtype=np.float64)
     wanted = np.array([law.bias for law in laws])
-    fits = np.abs(found - wanted) <= 1.1 * steps(trial.rig) + 1e-9
-    require(fits.all(), f"the device puts out {found} V, the samples show {wanted} V")
+    fits = np.abs(probed - wanted) <= 1.1 * steps(trial.rig) + 1e-9
+    require(fits.all(), f"the device puts out {probed} V, the samples show {wanted} V")
 
 
 @check(SATURATION, moves=False)

@@ -16,18 +16,18 @@ from rig.model.rig import Rig
 @check(moves=False)
 def identity(trial: Trial) -> None:
     """`connect` returns the rig's joints, channels and rate, and the kind of time declared."""
-    found = trial.connected().info
-    assert found is not None
+    info = trial.connected().info
+    assert info is not None
     rig = trial.rig
     for what, is_so, wanted in (
-        ("joints", found.joints, len(rig.joints)),
-        ("channels", found.channels, len(rig.channels)),
-        ("sample rate [Hz]", found.sample_rate, rig.sample_rate),
-        ("virtual time", found.virtual_time, trial.claims.virtual_time),
+        ("joints", info.joints, len(rig.joints)),
+        ("channels", info.channels, len(rig.channels)),
+        ("sample rate [Hz]", info.sample_rate, rig.sample_rate),
+        ("virtual time", info.virtual_time, trial.claims.virtual_time),
     ):
         require(is_so == wanted, f"{what} {is_so}, expected {wanted}")
-    require(found.identity, "the device has no name")
-    require(found.block_samples > 0, f"{found.block_samples} samples in a block")
+    require(info.identity, "the device has no name")
+    require(info.block_samples > 0, f"{info.block_samples} samples in a block")
 
 
 def _others(rig: Rig) -> Iterator[tuple[str, Rig]]:
@@ -232,8 +232,8 @@ def cut_link_is_lost(trial: Trial) -> None:
     driver = trial.ready()
     driver.read(2)
     _cut(trial)
-    said = lost(driver.read_block)
-    require(said, "three calls of read_block after the end of the link raised no DeviceLost")
+    message = lost(driver.read_block)
+    require(message, "three calls of read_block after the end of the link raised no DeviceLost")
 
 
 @check(LOSS, moves=False)
@@ -244,8 +244,8 @@ def silent_device_is_lost(trial: Trial) -> None:
         driver.read(2)
         trial.spoil(fault)
         trial.refused(f"read_block with the wire at fault ({fault})", driver.read_block)
-        said = lost(driver.read_block)
-        require(said, f"read_block with the wire at fault ({fault}) raised no DeviceLost")
+        message = lost(driver.read_block)
+        require(message, f"read_block with the wire at fault ({fault}) raised no DeviceLost")
         trial.spoil(HEALTHY)
         driver.close()
 

@@ -40,17 +40,17 @@ class Trial:
 
     def connected(self, driver: Watched | None = None) -> Watched:
         """Return a connected driver; waits while the device still serves the session before."""
-        found = self.driver() if driver is None else driver
-        patiently(found.connect)
-        return found
+        device = self.driver() if driver is None else driver
+        patiently(device.connect)
+        return device
 
     def ready(self) -> Watched:
         """Return a connected driver of a device that is not tripped and streams."""
-        found = self.connected()
-        if found.trip_cause() is not None:
-            found.reset()
-        found.start()
-        return found
+        driver = self.connected()
+        if driver.trip_cause() is not None:
+            driver.reset()
+        driver.start()
+        return driver
 
     def spoil(self, fault: str) -> None:
         """Make the wire do `fault` from now on."""
@@ -107,8 +107,8 @@ class Trial:
         """Require that the device's outputs are zero, where there is a probe."""
         if self.bench.outputs is None:
             return
-        found = np.asarray(self.bench.outputs(), dtype=np.float64)
-        require(not found.any(), f"{when} the device puts out {in_volts(found)}")
+        outputs = np.asarray(self.bench.outputs(), dtype=np.float64)
+        require(not outputs.any(), f"{when} the device puts out {in_volts(outputs)}")
 
     def zero_in_stream(self, driver: Watched, when: str, *, soon: bool = False) -> None:
         """Require a block of zero commands; `soon` lets older blocks come before it."""
@@ -118,10 +118,10 @@ class Trial:
             if not commands(block, self.rig).any():
                 return
             block = driver.read_block()
-        found = commands(block, self.rig)
-        wrong = np.flatnonzero(found.any(axis=1))
+        outputs = commands(block, self.rig)
+        wrong = np.flatnonzero(outputs.any(axis=1))
         if len(wrong):
-            shown = in_volts(found[wrong[-1]])
+            shown = in_volts(outputs[wrong[-1]])
             raise NotConforming(f"{when} the samples show commands of {shown}")
 
     def zero_somehow(self, driver: Watched, when: str) -> None:

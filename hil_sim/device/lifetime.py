@@ -42,10 +42,10 @@ def _exists(pid: int) -> bool:
 @contextmanager
 def told_to_end() -> Iterator[list[int]]:
     """Collect SIGTERM and SIGINT in the list given, instead of dying of them."""
-    told: list[int] = []
+    signals: list[int] = []
 
     def note(number: int, _frame: FrameType | None) -> None:
-        told.append(number)
+        signals.append(number)
 
     before = {}
     # Only a main thread has signals; elsewhere the caller ends its process.
@@ -53,7 +53,7 @@ def told_to_end() -> Iterator[list[int]]:
         for number in (signal.SIGTERM, signal.SIGINT):
             before[number] = signal.signal(number, note)
     try:
-        yield told
+        yield signals
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -129,11 +129,11 @@ class TcpLink(FaultyLink):
             self._forget(side)
 
     def _forget(self, side: _Side) -> None:
-        for one in (side, side.other):
-            self._sides.pop(one.end, None)
+        for end in (side, side.other):
+            self._sides.pop(end.end, None)
             with suppress(OSError):
-                one.end.shutdown(socket.SHUT_RDWR)
-            one.end.close()
+                end.end.shutdown(socket.SHUT_RDWR)
+            end.end.close()
 
     def _hang_up(self) -> None:
         for side in list(self._sides.values()):

@@ -113,10 +113,10 @@ class Way:
             self._queue([Piece(whole)], now)
         while self._before and self._before[0].at <= now:
             self._queue([replace(self._before.pop(0).piece, wait=0.0)], now)
-        found = []
+        chunks = []
         while self._ready and self._ready[0].at <= now:
-            found.append(self._ready.popleft().piece)
-        return found
+            chunks.append(self._ready.popleft().piece)
+        return chunks
 
     def next_time(self) -> float:
         """Return the earliest time [s] at which `due` may have something, inf if none is known."""

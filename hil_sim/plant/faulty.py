@@ -72,23 +72,25 @@ class FaultyPlant:
         self.plant.rewind(mark)
 
     def _until_next(self) -> int:
-        edges = [edge for one in self._faults for edge in (one.first, one.end) if edge > self.tick]
+        edges = [
+            edge for fault in self._faults for edge in (fault.first, fault.end) if edge > self.tick
+        ]
         return int(min(edges) - self.tick) if edges and min(edges) < math.inf else 1 << 62
 
     def _switch(self) -> None:
-        for one in self._faults:
-            if one.first == self.tick:
-                one.last = self._last.copy()
-                one.mend = one.fault.begin(self.plant.tables)
-            elif one.end == self.tick and one.mend is not None:
-                one.mend()
+        for fault in self._faults:
+            if fault.first == self.tick:
+                fault.last = self._last.copy()
+                fault.mend = fault.fault.begin(self.plant.tables)
+            elif fault.end == self.tick and fault.mend is not None:
+                fault.mend()
 
     def _distorted(self, codes: Codes, outputs: Codes) -> tuple[Codes, Codes]:
         first = self.tick - len(codes)
-        for one in self._faults:
-            if one.first <= first < one.end:
-                seconds = (first - one.first + np.arange(len(codes))) / self._rig.sample_rate
-                one.fault.distort(codes, one.last, seconds, self._rig, self._rng)
+        for fault in self._faults:
+            if fault.first <= first < fault.end:
+                seconds = (first - fault.first + np.arange(len(codes))) / self._rig.sample_rate
+                fault.fault.distort(codes, fault.last, seconds, self._rig, self._rng)
         if len(codes):
             self._last = codes[-1].copy()
         return codes, outputs

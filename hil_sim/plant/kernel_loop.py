@@ -100,9 +100,9 @@ def step(
     """
     size = len(y)
     half, end, trial = ends[0], ends[1], k[4]
-    left = h
-    while left > 0.0:
-        d = left
+    remaining = h
+    while remaining > 0.0:
+        d = remaining
         move_spool(spool, target, 0.5 * d, joints, half)
         move_spool(half, target, 0.5 * d, joints, end)
         at = crossing(spool, end, d, joints)
@@ -123,7 +123,7 @@ def step(
         for n in range(size):
             y[n] += d / 6.0 * (k[0, n] + 2.0 * (k[1, n] + k[2, n]) + k[3, n])
         spool[:] = end
-        left = left - d if at < 1.0 else 0.0
+        remaining = remaining - d if at < 1.0 else 0.0
 
 
 @jit

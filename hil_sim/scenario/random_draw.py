@@ -44,7 +44,7 @@ def draw(rig: Rig, seed: int) -> Scenario:
     elif kind != NONE:
         count = 1 if kind == ONE else 2
         chosen = [CLASSES[int(i)] for i in rng.choice(len(CLASSES), size=count, replace=False)]
-        effects = [_effect(one, one.sizes, rig, rng) for one in chosen]
+        effects = [_effect(effect, effect.sizes, rig, rng) for effect in chosen]
     scenario = Scenario.model_validate({"description": f"drawn: {kind}", "effects": effects})
     check_fits(scenario, rig)
     return scenario

@@ -67,10 +67,10 @@ class AlarmLog:
 
     def _raise(self, alarm: Alarm) -> str:
         self.table = states.raised(self.table, alarm)
-        found = self.table.get(alarm.key) or alarm
+        known = self.table.get(alarm.key) or alarm
         if not alarm.trips:
             log.warning("warning: %s", alarm.sentence)
-        about = {k: v for k, v in asdict(found).items() if k != "tick"}
+        about = {k: v for k, v in asdict(known).items() if k != "tick"}
         self._on_event("alarm", alarm.tick, {"alarm": alarm.key, **about})
         return alarm.key
 

@@ -169,8 +169,8 @@ class Guard:
         self._band_warnings(block, last)
         self._standing.expire(last)
         self._tail = joined[-self._keep :]
-        found = [violation for violation in trips if violation is not None]
-        return min(found, key=lambda violation: violation.tick, default=None)
+        violations = [violation for violation in trips if violation is not None]
+        return min(violations, key=lambda violation: violation.tick, default=None)
 
     def _act(self, found: Sequence[Violation], last: int) -> list[Violation]:
         """Do with each finding what the rig file wants; returns those that trip."""

@@ -107,8 +107,8 @@ class BenchState:
         """Return the latched trip, None if there is none; a damaged file is a trip as well."""
         path = self.folder / _TRIP
         try:
-            found = json.loads(path.read_text(encoding="utf-8"))
-            return LatchedTrip(**{key: str(found[key]) for key in LatchedTrip.__annotations__})
+            stored = json.loads(path.read_text(encoding="utf-8"))
+            return LatchedTrip(**{key: str(stored[key]) for key in LatchedTrip.__annotations__})
         except (FileNotFoundError, NotADirectoryError):
             return None
         except (OSError, ValueError, KeyError, TypeError) as error:
@@ -131,12 +131,12 @@ class BenchState:
 
     def refuse_if_tripped(self, rig: Rig) -> None:
         """Raise Latched if an earlier trip was not cleared."""
-        found = self.read_trip()
-        if found is None:
+        trip = self.read_trip()
+        if trip is None:
             return
-        run = f" in run {found.run}" if found.run else ""
+        run = f" in run {trip.run}" if trip.run else ""
         raise Latched(
-            f"the bench at {self.endpoint} tripped at {found.time}{run} and stays so: {found.trip}",
+            f"the bench at {self.endpoint} tripped at {trip.time}{run} and stays so: {trip.trip}",
             rig,
         )
 
@@ -145,24 +145,24 @@ class BenchState:
 
         The reason goes into `resets.jsonl` first, then into the events of the tripped run.
         """
-        found = self.read_trip()
+        trip = self.read_trip()
         entry = {
             "time": runstate.now(),
             "who": _user(),
             "host": runstate.here(),
             "reason": reason,
-            "trip": None if found is None else asdict(found),
+            "trip": None if trip is None else asdict(trip),
             "device": device_cause,
         }
         with (self.folder / _RESETS).open("a", encoding="utf-8") as stream:
             stream.write(json.dumps(entry) + "\n")
             stream.flush()
             os.fsync(stream.fileno())
-        if found is not None:
-            _note_in_run(found, entry)
+        if trip is not None:
+            _note_in_run(trip, entry)
         (self.folder / _TRIP).unlink(missing_ok=True)
         sync_folder(self.folder)
-        return found
+        return trip
 
     # The session
 
@@ -224,7 +224,7 @@ def reset_bench(rig: Rig, driver: Driver, reason: str) -> str:
         driver.reset()
     finally:
         driver.close()
-    found = bench.clear(reason.strip(), cause)
-    parts = [] if found is None else [found.trip]
+    cleared = bench.clear(reason.strip(), cause)
+    parts = [] if cleared is None else [cleared.trip]
     parts += [] if cause is None else [f"device: {cause}"]
     return "; ".join(parts) or "nothing was latched"

@@ -217,8 +217,8 @@ class Bench:
             self._keep(block, None, self._continue(block))
 
         seconds = self.recorded_after
-        found = record_zero(self.rig, self._driver.read_block, keep, self._clock, seconds)
-        return found is not False
+        after_zero = record_zero(self.rig, self._driver.read_block, keep, self._clock, seconds)
+        return after_zero is not False
 
     def _flush(self, state: str, message: str, error: BaseException | None) -> None:
         if self.recorder is None:
@@ -318,12 +318,12 @@ class Bench:
 
     def _inspect(self, block: SampleBlock, lost: int, late: float | None) -> Violation | None:
         blind = self._guard.gap(lost, block.tick) if lost else None
-        found = blind or self._guard.check(block)
-        if found is None and late is not None:
-            found = self._guard.stale(late, block.tick)
-        if found is None and block.tripped:
-            found = self._guard.device_tripped(block.tick)
-        return found
+        violation = blind or self._guard.check(block)
+        if violation is None and late is not None:
+            violation = self._guard.stale(late, block.tick)
+        if violation is None and block.tripped:
+            violation = self._guard.device_tripped(block.tick)
+        return violation
 
     def _keep(self, block: SampleBlock, late: float | None, lost: int) -> None:
         if self.recorder is None:

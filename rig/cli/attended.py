@@ -38,15 +38,15 @@ class TrackedEstimates:
 
     def values(self) -> Mapping[str, float]:
         """Return each estimate [SI] and, as NAME.rsd, its standard deviation over its value."""
-        found: dict[str, float] = {}
+        entered: dict[str, float] = {}
         for name, estimate in self._tracking.parameters.items():
             value, std = estimate["value"], estimate["std"]
             if value is None:
                 continue
-            found[name] = float(value)
+            entered[name] = float(value)
             if std is not None and value:
-                found[f"{name}.rsd"] = abs(float(std) / float(value))
-        return {name: value for name, value in found.items() if math.isfinite(value)}
+                entered[f"{name}.rsd"] = abs(float(std) / float(value))
+        return {name: value for name, value in entered.items() if math.isfinite(value)}
 
     def complete(self, record: str) -> bool:
         """Say whether the tracker has taken in a record; True where it is gone."""

@@ -19,11 +19,11 @@ def depressurise(rig: RigOption, endpoint: EndpointOption = None) -> None:
 
     stop(rig, endpoint)
     described, driver = device_of(rig, endpoint)
-    left = bench.pressurised(bench.probe(driver, described))
-    if left:
+    pressurised = bench.pressurised(bench.probe(driver, described))
+    if pressurised:
         raise WorkError(
             f"rig {described.name!r} describes no way to let the pressure out: stop the pump and "
-            f"open the relief by hand; still under pressure: {', '.join(left)}"
+            f"open the relief by hand; still under pressure: {', '.join(pressurised)}"
         )
 
 

@@ -30,14 +30,14 @@ def design(
     from rig.cli.output import write_json
     from rig.cli.predicted_errors import design_json, design_protocol, design_text
 
-    found = design_protocol(protocol, rig, criterion, budget, seed)
+    designed = design_protocol(protocol, rig, criterion, budget, seed)
     out.parent.mkdir(parents=True, exist_ok=True)
     part = out.with_name(out.name + ".part")
-    part.write_text(found.text, encoding="utf-8")
+    part.write_text(designed.text, encoding="utf-8")
     part.replace(out)
-    write_json(json, design_json(found))
+    write_json(json, design_json(designed))
     if json != Path("-"):
-        typer.echo(design_text(found, out))
+        typer.echo(design_text(designed, out))
 
 
 def register(app: typer.Typer) -> None:

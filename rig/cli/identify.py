@@ -175,17 +175,17 @@ def identify(
             search=SearchOptions(evaluations=evaluations),
         )
     shapes = shapes_in(result.model.rig, result.model.terms)
-    told, more = to_json(result), shapes_text(shapes) + method_text(result)
+    document, more = to_json(result), shapes_text(shapes) + method_text(result)
     if shapes:
-        told["shapes"] = {n: {"value": v, "unit": s.unit} for n, (v, s) in shapes.items()}
+        document["shapes"] = {n: {"value": v, "unit": s.unit} for n, (v, s) in shapes.items()}
     if physical:
         from rig.cli.physical import make_physical
 
-        result, told, consistent = make_physical(result)
+        result, document, consistent = make_physical(result)
         more += consistent
     if model is not None:
         save_model(result.model, model)
-    write_json(json, told)
+    write_json(json, document)
     if report is not None:
         from rig.cli.reports import write_identification
 

@@ -100,9 +100,9 @@ def _tell(going: Any, json: Path | None, report: Path) -> None:
 
     if not going.rounds and not going.wanted.out.is_dir():
         return  # ended before anything was taken
-    told = rounds_json(going.rounds, going.stopped)
-    write_json(going.wanted.out / "loop.json", told)
-    write_json(json, told)
+    document = rounds_json(going.rounds, going.stopped)
+    write_json(going.wanted.out / "loop.json", document)
+    write_json(json, document)
     if going.rounds:
         report.parent.mkdir(parents=True, exist_ok=True)
         write_loop(report, going.train, going.judge, going.rounds, going.stopped)

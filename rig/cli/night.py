@@ -44,21 +44,21 @@ def _time(text: str) -> datetime | None:
 
 def _shown(item: Item) -> NightItem:
     folder = Path(item.run) if item.run else None
-    found = summarise(folder) if folder is not None and is_run(folder) else None
+    summary = summarise(folder) if folder is not None and is_run(folder) else None
     parameters = item.found.get("parameters") or {}
     return NightItem(
         number=item.id,
         name=item.job.name,
         state=item.state,
         reason=item.reason,
-        rig=found.rig if found is not None and found.rig else item.job.rig,
+        rig=summary.rig if summary is not None and summary.rig else item.job.rig,
         run=item.run,
         started=_time(item.started),
         ended=_time(item.ended),
         attempts=item.attempt,
-        records=-1 if found is None else found.records,
-        samples=-1 if found is None else found.samples,
-        lost_samples=-1 if found is None else found.lost_samples,
+        records=-1 if summary is None else summary.records,
+        samples=-1 if summary is None else summary.samples,
+        lost_samples=-1 if summary is None else summary.lost_samples,
         parameters={
             name: Estimate(float(p["value"]), _number(p.get("std")), str(p.get("unit", "")))
             for name, p in parameters.items()

@@ -16,10 +16,10 @@ def make_physical(result: Identification) -> tuple[Identification, dict[str, Any
 
     Raises InputError where a parameter is not identified.
     """
-    found = physical(result)
-    given = with_physics(result, found)
-    told = {**identification_json(given), "physical": physical_json(found)}
-    return given, told, "\n\n" + physical_text(found)
+    projection = physical(result)
+    given = with_physics(result, projection)
+    document = {**identification_json(given), "physical": physical_json(projection)}
+    return given, document, "\n\n" + physical_text(projection)
 
 
 def physical_text(found: Physical) -> str:

@@ -47,8 +47,10 @@ class ForeseenText:
 
 def foreseen(plan: Plan, rig: Rig) -> ForeseenText:
     """Check and predict a plan; InputError where the twin cannot follow it."""
-    found = of_plan(plan, rig)
-    return ForeseenText(found.limits, as_dict(found)["identification"], prediction_text(found))
+    forecast = of_plan(plan, rig)
+    return ForeseenText(
+        forecast.limits, as_dict(forecast)["identification"], prediction_text(forecast)
+    )
 
 
 def of_plan(plan: Plan, rig: Rig) -> Foresight:
@@ -65,10 +67,10 @@ def of_plan(plan: Plan, rig: Rig) -> Foresight:
 
 def as_dict(found: Foresight) -> dict[str, Any]:
     """Return the check as plain data, with the prediction, or why there is none."""
-    told: dict[str, Any] = {"impossible": found.why}
+    document: dict[str, Any] = {"impossible": found.why}
     if found.prediction is not None:
-        told = to_json(found.prediction)
-    return {**found.limits.as_dict(), "identification": told}
+        document = to_json(found.prediction)
+    return {**found.limits.as_dict(), "identification": document}
 
 
 def percent(value: float) -> str:

@@ -25,13 +25,13 @@ def probe(rig: RigOption, endpoint: EndpointOption = None, json: JsonOption = No
     from rig.cli.errors import WorkError
 
     described, driver = device_of(rig, endpoint)
-    found = bench.probe(driver, described)
-    write_json(json, [asdict(one) for one in found])
+    readings = bench.probe(driver, described)
+    write_json(json, [asdict(one) for one in readings])
     if json != Path("-"):
         header = ("channel", "mean", "least", "most", "unit", "codes", "")
-        typer.echo(table(header, [_row(one) for one in found]))
-    print_pressure(bench.pressurised(found), aside=json == Path("-"))
-    odd = [one.channel for one in found if one.mark != bench.GOOD]
+        typer.echo(table(header, [_row(one) for one in readings]))
+    print_pressure(bench.pressurised(readings), aside=json == Path("-"))
+    odd = [one.channel for one in readings if one.mark != bench.GOOD]
     if odd:
         raise WorkError(f"not plausible: {', '.join(odd)}; look at the last column")
 

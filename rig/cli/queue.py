@@ -219,8 +219,8 @@ def list_items(
         paused, items = store.paused, store.items()
     shown = [item for item in items if not state or item.state in state]
     pid = runner_of(_path(queue))
-    told = {"paused": paused, "runner": pid, "items": [item.as_dict() for item in shown]}
-    write_json(json, told)
+    document = {"paused": paused, "runner": pid, "items": [item.as_dict() for item in shown]}
+    write_json(json, document)
     if json == Path("-"):
         return
     if shown:
@@ -232,11 +232,12 @@ def list_items(
                 left=("name", "state", "reason or condition"),
             )
         )
-    left = [item for item in items if not item.over]
-    minutes = sum(item.proof.get("seconds") or 0.0 for item in left) / 60.0
+    pending = [item for item in items if not item.over]
+    minutes = sum(item.proof.get("seconds") or 0.0 for item in pending) / 60.0
+    runner = f"run by process {pid}" if pid else "nobody runs the queue"
     typer.echo(
-        f"{len(left)} of {len(items)} items are not over, about {minutes:.0f} min of the device's "
-        f"time; {paused or ('run by process ' + str(pid) if pid else 'nobody runs the queue')}"
+        f"{len(pending)} of {len(items)} items are not over, about {minutes:.0f} min of the "
+        f"device's time; {paused or runner}"
     )
 
 
@@ -252,9 +253,9 @@ def show(item: ItemArgument, queue: QueueOption = None, json: JsonOption = None)
     with _opened(queue) as store:
         found, lines = store.item(item), store.history(item)
     log = log_of(_path(queue), found)
-    told: dict[str, Any] = found.as_dict()
-    told |= {"history": [asdict(line) for line in lines], "log": str(log)}
-    write_json(json, told)
+    document: dict[str, Any] = found.as_dict()
+    document |= {"history": [asdict(line) for line in lines], "log": str(log)}
+    write_json(json, document)
     if json == Path("-"):
         return
     job = found.job
@@ -316,12 +317,12 @@ def run(
             from rig.cli.night import write_page
 
             write_page(page, store, began)
-    told = {
+    document = {
         "code": report.code,
         "reason": report.reason,
         "ended": [item.as_dict() for item in report.ended],
     }
-    write_json(json, told)
+    write_json(json, document)
     if json != Path("-"):
         done = sum(item.state == "done" for item in report.ended)
         typer.echo(f"{done} of {len(report.ended)} items done; {report.reason}")
@@ -379,11 +380,11 @@ def cancel(item: ItemArgument, queue: QueueOption = None, json: JsonOption = Non
     from rig.queue.runner import end_orphan, runner_of
 
     with _opened(queue) as store:
-        found = store.cancel(item, _who())
-        if not found.over and runner_of(store.path) is None:
-            end_orphan(store.path, found)
-    said = "cancelled" if found.over else "asked to end; `bramah queue show` says how it ends"
-    _show(found, json, said)
+        cancelled = store.cancel(item, _who())
+        if not cancelled.over and runner_of(store.path) is None:
+            end_orphan(store.path, cancelled)
+    result = "cancelled" if cancelled.over else "asked to end; `bramah queue show` says how it ends"
+    _show(cancelled, json, result)
 
 
 def move(
@@ -415,8 +416,8 @@ def retry(item: ItemArgument, queue: QueueOption = None, json: JsonOption = None
     Example: bramah queue retry 3
     """
     with _opened(queue) as store:
-        found = store.retry(item, _who())
-    _show(found, json, f"queued again; it will run into {found.next_folder()}")
+        retried = store.retry(item, _who())
+    _show(retried, json, f"queued again; it will run into {retried.next_folder()}")
 
 
 def register(app: typer.Typer) -> None:

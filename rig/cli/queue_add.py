@@ -20,5 +20,5 @@ def prove(job: Job) -> dict[str, Any]:
         raise InputError(f"not queued: {answer.reason}")
     if answer.code != 0:
         raise WorkError(f"not queued: {answer.reason}")
-    found = answer.as_json()
-    return {key: found[key] for key in _KEPT if isinstance(found, dict) and key in found}
+    proof = answer.as_json()
+    return {key: proof[key] for key in _KEPT if isinstance(proof, dict) and key in proof}

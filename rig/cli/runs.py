@@ -58,7 +58,7 @@ def runs(
     if rebuild:
         progress(f"{rebuild_index(folder)} runs in the index of {folder}")
     listed = indexed_runs(folder)
-    found = [
+    selected = [
         one
         for one in listed
         if (not state or one.state in state)
@@ -66,15 +66,15 @@ def runs(
         and _named(one.rig, rig)
         and _named(one.protocol, protocol)
     ]
-    write_json(json, [{**asdict(one), "path": str(one.path)} for one in found])
+    write_json(json, [{**asdict(one), "path": str(one.path)} for one in selected])
     if json == Path("-"):
         return
-    if not found:
+    if not selected:
         progress(f"no runs in {folder}" + (f" that fit, of {len(listed)}" if listed else ""))
         return
     header = ("run", "state", "rig", "protocol", "created", "records", "samples", "lost", "min")
-    typer.echo(table(header, [_row(one) for one in found], left=("state", "rig", "protocol")))
-    for summary in found:
+    typer.echo(table(header, [_row(one) for one in selected], left=("state", "rig", "protocol")))
+    for summary in selected:
         if summary.message:
             typer.echo(f"{summary.path.name}: {summary.message}")
 

@@ -107,9 +107,9 @@ def _picture(line: MotionPrediction) -> str:
     ends = [(value - line.allowed_low) / span for value in (line.low, line.high)]
     first, last = (min(_PICTURE - 1, max(0, int(_PICTURE * end))) for end in ends)
     bar = "." * first + "=" * (last - first + 1) + "." * (_PICTURE - 1 - last)
-    left = "<" if ends[0] < 0.0 else "["
+    low_end = "<" if ends[0] < 0.0 else "["
     right = ">" if ends[1] > 1.0 else "]"
-    return f"{left}{bar}{right}"
+    return f"{low_end}{bar}{right}"
 
 
 def _place(line: MotionPrediction) -> str:

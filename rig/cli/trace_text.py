@@ -137,9 +137,9 @@ def story_text(rounds: Sequence[Round], stopped: str) -> str:
 
 def named(result: Trace) -> str:
     """Return the effects of a trace in a few words, the tied ones too."""
-    found = [f"{e.name} at {e.where}" for e in result.effects]
+    names = [f"{e.name} at {e.where}" for e in result.effects]
     tied = ", ".join(f"{name} at {where}" for name, where in result.tied)
-    return (", ".join(found) or "nothing") + (f" (or {tied})" if tied else "")
+    return (", ".join(names) or "nothing") + (f" (or {tied})" if tied else "")
 
 
 def _figure(value: float | None) -> str:

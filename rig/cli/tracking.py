@@ -272,8 +272,8 @@ def _head(data: dict[str, Any]) -> RecordHead:
 
 
 def _reply(socket: zmq.Socket[bytes], kind: str, tracker: Tracker, **more: str) -> None:
-    found: dict[str, Estimate] = tracker.estimates()
-    known = {name: estimate_json(e) for name, e in found.items()}
+    estimates: dict[str, Estimate] = tracker.estimates()
+    known = {name: estimate_json(e) for name, e in estimates.items()}
     if all(e["value"] is None for e in known.values()):
         known = {}
     try:

@@ -21,8 +21,8 @@ def write_truth(path: Path | None, parameters: Mapping[str, float], scenario: An
 def read_truth(path: Path) -> dict[str, float]:
     """Read the parameters that `bramah sim --truth` wrote; raises InputError for another file."""
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        return {str(name): float(value) for name, value in found.items() if name != SCENARIO}
+        truth = json.loads(path.read_text(encoding="utf-8"))
+        return {str(name): float(value) for name, value in truth.items() if name != SCENARIO}
     except (OSError, ValueError, TypeError, AttributeError) as error:
         raise InputError(
             f"{path} cannot be read as true parameters ({error}); expected the JSON file that "

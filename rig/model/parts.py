@@ -261,7 +261,7 @@ class Sensors(Part):
 
     def of(self, kind: str) -> AnySensor:
         """Return the sensor of a channel kind; raises KeyError where the rig has none."""
-        found = {
+        sensors = {
             ch.SPOOL: self.spool,
             ch.PISTON: self.piston,
             ch.CAP: self.chamber_pressure,
@@ -269,9 +269,9 @@ class Sensors(Part):
             ch.SUPPLY: self.supply_pressure,
             ch.TEMPERATURE: self.oil_temperature,
         }[kind]
-        if found is None:
+        if sensors is None:
             raise KeyError(f"this rig has no sensor for {kind!r}")
-        return found
+        return sensors
 
 
 class Supply(Part):

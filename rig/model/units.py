@@ -81,10 +81,10 @@ def linear_map(unit: str, si: str) -> tuple[float, float] | None:
     unit, si = unit.strip(), si.strip()
     if si == "degC":
         return {"degC": (1.0, 0.0), "K": (1.0, -_ZERO_CELSIUS)}.get(unit)
-    found, target = measure(unit), measure(si)
-    if found is None or target is None or found.powers != target.powers:
+    source, target = measure(unit), measure(si)
+    if source is None or target is None or source.powers != target.powers:
         return None
-    return found.size / target.size, 0.0
+    return source.size / target.size, 0.0
 
 
 def differs(unit: str, si: str) -> bool:

@@ -94,9 +94,9 @@ def _attributes(
     meta = section.meta
     device = section.start / sample_rate
     start = device if clock is None else clock.at(section.start, sample_rate)
-    found: dict[str, Any]
+    attributes: dict[str, Any]
     if meta:
-        found = record_attributes(
+        attributes = record_attributes(
             meta["step"],
             meta["repeat"],
             meta["locked"],
@@ -107,10 +107,10 @@ def _attributes(
             section.complete,
         )
     else:
-        found = {"kind": BETWEEN, "sample_rate": sample_rate, "start_s": start}
+        attributes = {"kind": BETWEEN, "sample_rate": sample_rate, "start_s": start}
     return {
         **meta.get("attributes", {}),
-        **found,
+        **attributes,
         "stream": section.stream,
         "start_tick": section.start,
         "device_s": device,
@@ -161,12 +161,12 @@ def write_from_journal(journal: Journal, folder: Path, rig_name: str) -> Written
             raise OSError(f"{needed / 1e6:.1f} MB are needed and not free")
         with create(fresh, rig_name) as file:
             for section in sections:
-                found = assemble(journal, spans, section)
-                attributes = _attributes(section, rate, found, clocks.get(section.stream))
-                each = {name: found.data[:, i] for i, name in enumerate(columns)}
+                assembled = assemble(journal, spans, section)
+                attributes = _attributes(section, rate, assembled, clocks.get(section.stream))
+                each = {name: assembled.data[:, i] for i, name in enumerate(columns)}
                 write_group(file, section.group, each, attributes)
-                _note_saturation(file[section.group], columns, found)
-                lost += found.lost if section.meta else 0
+                _note_saturation(file[section.group], columns, assembled)
+                lost += assembled.lost if section.meta else 0
         damaged = verify(journal, fresh, sections)
         put_in_place(fresh, folder / NAME)
     except (OSError, RuntimeError) as error:  # h5py reports a failed flush as RuntimeError

@@ -55,17 +55,17 @@ def samples_of(
 ) -> Record:
     """Read the samples [first, last) of a record's group; InputError where they were changed."""
     part = slice(first, last)
-    found = {}
+    columns = {}
     for name in head.channels:
         try:
-            found[name] = np.asarray(group[name][part], dtype=np.float64)
+            columns[name] = np.asarray(group[name][part], dtype=np.float64)
         except OSError as error:
             raise InputError(
                 f"{group.file.filename}: record {head.name}, channel {name}: samples were changed "
                 "or damaged since they were written (their checksum does not match); take the "
                 f"file from a backup, or do without this run ({error})"
             ) from error
-    return head.record(found)
+    return head.record(columns)
 
 
 @contextmanager
@@ -97,8 +97,8 @@ def _python(value: Any) -> Any:
 
 def read_heads(file: h5py.File, path: Path) -> list[RecordHead]:
     """Return the heads of every record in the order it was taken."""
-    found = [head_of(name, group, path) for name, group in file.items() if name != BETWEEN]
-    return sorted(found, key=_taken)
+    heads = [head_of(name, group, path) for name, group in file.items() if name != BETWEEN]
+    return sorted(heads, key=_taken)
 
 
 def count(path: Path) -> Written:

@@ -140,13 +140,13 @@ class Journal:
             raise InputError(f"{path}: no such journal")
         try:
             db = sqlite3.connect(path, isolation_level=None)
-            found = cls(db, path)
-            if found.meta("format") != _FORMAT:
+            journal = cls(db, path)
+            if journal.meta("format") != _FORMAT:
                 db.close()
                 raise InputError(f"{path}: no journal of this format")
         except sqlite3.Error as error:
             raise InputError(f"{path}: not a readable journal: {error}") from error
-        return found
+        return journal
 
     def _write(self, sql: str, values: tuple[Any, ...]) -> None:
         try:
@@ -203,13 +203,13 @@ class Journal:
 
     def spans(self) -> Spans:
         """Return where every readable block lies, in the order of arrival."""
-        found: list[tuple[int, int, int, int]] = []
+        out: list[tuple[int, int, int, int]] = []
         rows = self._db.execute("SELECT id, stream, tick, samples FROM block ORDER BY id")
         try:
-            found.extend(rows)
+            out.extend(rows)
         except sqlite3.DatabaseError as error:  # a damaged page: keep what stands before it
-            log.warning("%s: unreadable after %d blocks: %s", self.path, len(found), error)
-        table = np.array(found, dtype=np.int64).reshape(len(found), 4)
+            log.warning("%s: unreadable after %d blocks: %s", self.path, len(out), error)
+        table = np.array(out, dtype=np.int64).reshape(len(out), 4)
         return Spans(*table.T)
 
     def blocks(self, first: int = 0, last: int = _LAST) -> Iterator[tuple[int, Block | None]]:

@@ -108,9 +108,9 @@ def _from_damaged(folder: Path, rig: Rig, stood: str, damage: str) -> RecoverRep
     """Finalise what a damaged journal still holds; the journal itself is kept beside."""
     path = folder / runstate.JOURNAL
     state = _outcome(path) or stood
-    journal, found = rebuild(path, rig, damage)
+    journal, rebuilt = rebuild(path, rig, damage)
     try:
-        if not found.blocks:
+        if not rebuilt.blocks:
             journal.delete()
             raise RecordingFailed(
                 f"{path}: not a readable journal: {damage}; no block of samples in it can be read. "
@@ -120,21 +120,21 @@ def _from_damaged(folder: Path, rig: Rig, stood: str, damage: str) -> RecoverRep
     finally:
         journal.close()
     kept = set_aside(path)
-    seconds = found.lost / rig.sample_rate
-    loss = f"lost: {found.lost} samples ({seconds:.3f} s)" if found.lost else "no loss is known"
+    seconds = rebuilt.lost / rig.sample_rate
+    loss = f"lost: {rebuilt.lost} samples ({seconds:.3f} s)" if rebuilt.lost else "no loss is known"
     message = (
-        f"the journal is damaged: {damage}; read from it: {found.samples} samples; {loss}; what "
+        f"the journal is damaged: {damage}; read from it: {rebuilt.samples} samples; {loss}; what "
         f"came after its last readable sample cannot be counted; {_counts(written)}; the damaged "
         f"journal is kept as {kept.name}"
     )
-    if found.nameless:
+    if rebuilt.nameless:
         message += (
             f"; what these records were cannot be read, their samples stand under "
-            f"{runstate.BETWEEN}: {', '.join(found.nameless)}"
+            f"{runstate.BETWEEN}: {', '.join(rebuilt.nameless)}"
         )
     _note(folder, state, message)
     report = _report(folder, state, written, message)
-    return replace(report, damaged_blocks=found.lost_blocks, damaged=kept, missing=found.lost)
+    return replace(report, damaged_blocks=rebuilt.lost_blocks, damaged=kept, missing=rebuilt.lost)
 
 
 def _outcome(path: Path) -> str | None:

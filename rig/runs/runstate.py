@@ -186,13 +186,13 @@ STREAM: Final = "stream begins"
 
 def stream_clocks(events: Iterable[Mapping[str, Any]]) -> dict[int, StreamClock]:
     """Return the clocks of every stream that a run's events tell of."""
-    found: dict[int, StreamClock] = {}
+    clocks: dict[int, StreamClock] = {}
     for event in events:
         if event.get("event") == STREAM:
             with suppress(KeyError, TypeError, ValueError):
                 began, host = float(event["t"]), str(event["time"])
-                found[int(event["stream"])] = StreamClock(int(event["tick"]), began, host)
-    return found
+                clocks[int(event["stream"])] = StreamClock(int(event["tick"]), began, host)
+    return clocks
 
 
 def read_events(folder: Path) -> list[dict[str, Any]]:
@@ -201,12 +201,12 @@ def read_events(folder: Path) -> list[dict[str, Any]]:
         raw = (folder / EVENTS).read_bytes()
     except OSError:
         return []
-    found = []
+    events = []
     for line in raw.splitlines():
         try:
             entry = json.loads(line)
         except ValueError:
             continue
         if isinstance(entry, dict):
-            found.append(entry)
-    return found
+            events.append(entry)
+    return events

@@ -89,11 +89,11 @@ def _runs(spans: Spans) -> list[_Run]:
 
 def _extent(runs: Sequence[_Run]) -> dict[int, tuple[int, int]]:
     """Return the first and one past the last tick of every stream."""
-    found: dict[int, tuple[int, int]] = {}
+    extents: dict[int, tuple[int, int]] = {}
     for run in runs:
-        low, high = found.get(run.stream, (run.start, run.end))
-        found[run.stream] = (min(low, run.start), max(high, run.end))
-    return found
+        low, high = extents.get(run.stream, (run.start, run.end))
+        extents[run.stream] = (min(low, run.start), max(high, run.end))
+    return extents
 
 
 def _record(mark: Mark, extent: dict[int, tuple[int, int]]) -> Section | None:
@@ -112,7 +112,7 @@ def _record(mark: Mark, extent: dict[int, tuple[int, int]]) -> Section | None:
 
 def _unmarked(runs: Sequence[_Run], records: Sequence[Section]) -> list[Section]:
     """Cover what was measured outside of every record; a gap begins another section."""
-    found: list[Section] = []
+    unmarked: list[Section] = []
     for run in runs:
         pieces = [(run.start, run.end)]
         for record in (r for r in records if r.stream == run.stream):
@@ -123,9 +123,9 @@ def _unmarked(runs: Sequence[_Run], records: Sequence[Section]) -> list[Section]
                 if piece[0] < piece[1]
             ]
         for a, b in pieces:
-            group = f"{BETWEEN}/{len(found) + 1:04d}"
-            found.append(Section(group, run.stream, a, b - a, True))
-    return found
+            group = f"{BETWEEN}/{len(unmarked) + 1:04d}"
+            unmarked.append(Section(group, run.stream, a, b - a, True))
+    return unmarked
 
 
 def plan(journal: Journal, spans: Spans) -> list[Section]:

@@ -46,11 +46,11 @@ def _version(name: str) -> str | None:
 
 def versions() -> dict[str, str]:
     """Return what a reader needs to take the same run again: software and where it ran."""
-    found = {
+    out = {
         "bramah": _version("bramah") or "unknown",
         "python": platform.python_version(),
         "platform": platform.platform(),
         **{name: version for name in _LIBRARIES if (version := _version(name)) is not None},
     }
     source = commit()
-    return found if source is None else {**found, "commit": source}
+    return out if source is None else {**out, "commit": source}

@@ -55,11 +55,11 @@ def _units(blocks: Sequence[RepeatBlock]) -> dict[tuple[int, str], list[tuple[in
     for b in blocks:
         repeats.setdefault(b.stratum, set()).add(b.repeat)
     out: dict[tuple[int, str], list[tuple[int, int]]] = {}
-    for stratum, found in repeats.items():
-        if len(found) > 1:
-            out[stratum] = [(r, -1) for r in sorted(found)]
+    for stratum, repeat_blocks in repeats.items():
+        if len(repeat_blocks) > 1:
+            out[stratum] = [(r, -1) for r in sorted(repeat_blocks)]
         else:
-            (only,) = found
+            (only,) = repeat_blocks
             parts = {int(s) for b in blocks if b.stratum == stratum for s in np.unique(b.segment)}
             out[stratum] = [(only, s) for s in sorted(parts)]
     return out

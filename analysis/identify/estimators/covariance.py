@@ -62,8 +62,8 @@ def spread(groupings: Sequence[Pieces], inverse: Array) -> CovarianceParts:
 def by_repeats(pieces: Pieces, inverse: Array) -> CovarianceParts | None:
     """Return the scatter between repeats within their steps; None where a step has only one."""
     stratum, score, _ = pieces.grouped(pieces.repeat)
-    found = stratified(stratum, score @ inverse.T)
-    return None if found is None else CovarianceParts(*found, np.zeros(len(inverse)))
+    sandwich = stratified(stratum, score @ inverse.T)
+    return None if sandwich is None else CovarianceParts(*sandwich, np.zeros(len(inverse)))
 
 
 def lack_of_fit(pieces: Pieces, inverse: Array) -> Array:
@@ -74,14 +74,14 @@ def lack_of_fit(pieces: Pieces, inverse: Array) -> Array:
     k = len(inverse)
     if noise is None:
         return np.zeros((k, k))
-    found = u.T @ u
-    size, floor = np.diag(found), np.diag(noise[0])
+    scatter = u.T @ u
+    size, floor = np.diag(scatter), np.diag(noise[0])
     with np.errstate(divide="ignore", invalid="ignore"):
         dof = np.where(size > 0, size**2 / np.sum(u**4, axis=0), 1.0)
         p = fdtrc(np.maximum(dof, 1.0), np.maximum(noise[1], 1.0), size / floor)
-    excess = np.where(p < IDENTIFY.lack_of_fit_level, np.maximum(size - floor, 0.0), 0.0)
-    scale = np.sqrt(excess / np.where(size > 0, size, 1.0))
-    return np.asarray(found * np.outer(scale, scale))
+    excess_energy = np.where(p < IDENTIFY.lack_of_fit_level, np.maximum(size - floor, 0.0), 0.0)
+    scale = np.sqrt(excess_energy / np.where(size > 0, size, 1.0))
+    return np.asarray(scatter * np.outer(scale, scale))
 
 
 def by_parts(pieces: Pieces, inverse: Array) -> CovarianceParts:

@@ -89,11 +89,11 @@ def segments(
 
 def blocks_of(built: Sequence[RecordRows], family: str, kept: Sequence[int]) -> list[RepeatBlock]:
     """Return the blocks of one family with the columns `kept`."""
-    found = []
+    blocks = []
     for one in built:
         record = one.record
         for rows in one.family(family):
-            found.append(
+            blocks.append(
                 RepeatBlock(
                     *one.group, record.repeat, record.name, rows.equation,
                     rows.matrix[:, list(kept)], rows.rhs, rows.time,
@@ -101,7 +101,7 @@ def blocks_of(built: Sequence[RecordRows], family: str, kept: Sequence[int]) -> 
                     np.zeros(len(rows.rhs), dtype=np.int64),
                 )
             )  # fmt: skip
-    return found
+    return blocks
 
 
 def solve(blocks: Sequence[RepeatBlock], Z: Sequence[Array], w: Sequence[Array]) -> EquationFit:
@@ -150,7 +150,7 @@ class Pieces:
 def pieces(fit: EquationFit, by: str = "segment") -> Pieces:
     """Return scores and information of a fit by stratum, repeat and `segment` or `level`."""
     strata = {s: i for i, s in enumerate(sorted({b.stratum for b in fit.blocks}))}
-    found: dict[tuple[int, int, int], tuple[Array, Array]] = {}
+    sums: dict[tuple[int, int, int], tuple[Array, Array]] = {}
     for b, z, weight, e in zip(fit.blocks, fit.Z, fit.w, fit.residuals(), strict=True):
         weighted = z * weight[:, None]
         labels = b.segment if by == "segment" else b.level
@@ -158,13 +158,13 @@ def pieces(fit: EquationFit, by: str = "segment") -> Pieces:
             here = labels == part
             score, information = weighted[here].T @ e[here], weighted[here].T @ b.X[here]
             key = (strata[b.stratum], b.repeat, int(part))
-            if key in found:
-                score, information = score + found[key][0], information + found[key][1]
-            found[key] = (score, information)
-    keys = np.array(list(found), dtype=np.int64)
+            if key in sums:
+                score, information = score + sums[key][0], information + sums[key][1]
+            sums[key] = (score, information)
+    keys = np.array(list(sums), dtype=np.int64)
     return Pieces(
         keys[:, 0], keys[:, 1], keys[:, 2],
-        np.array([g for g, _ in found.values()]), np.array([a for _, a in found.values()]),
+        np.array([g for g, _ in sums.values()]), np.array([a for _, a in sums.values()]),
     )  # fmt: skip
 
 
@@ -201,15 +201,15 @@ def levelled(
     """
     states: dict[tuple[int, str, str], dict[float, list[float]]] = {}
     for b in blocks:
-        found = states.setdefault((*b.stratum, b.equation), {})
+        state = states.setdefault((*b.stratum, b.equation), {})
         for t, x in zip(np.round(b.time, 9), _state(b, records[b.run, b.record]), strict=True):
-            found.setdefault(float(t), []).append(float(x))
+            state.setdefault(float(t), []).append(float(x))
     bins = {}
-    for number, (key, found) in enumerate(sorted(states.items())):
-        mean = np.array([np.mean(v) for v in found.values()])
+    for number, (key, state) in enumerate(sorted(states.items())):
+        mean = np.array([np.mean(v) for v in state.values()])
         rank = np.argsort(np.argsort(mean))
         label = number * IDENTIFY.state_levels + rank * IDENTIFY.state_levels // len(rank)
-        bins[key] = dict(zip(found, label.tolist(), strict=True))
+        bins[key] = dict(zip(state, label.tolist(), strict=True))
     return [
         replace(
             b,

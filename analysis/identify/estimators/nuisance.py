@@ -117,14 +117,14 @@ def nuisance_terms(
     from them what is theirs.
     """
     names = {used.term.name for used in terms}
-    found: list[Used] = []
+    nuisances: list[Used] = []
     measured = all(ch.TEMPERATURE in r.channels for run in runs for r in run.records)
     if "compressibility" in names and measured and np.isfinite(values.get("b", np.nan)):
-        found.append(Used(BulkTemperature()))
+        nuisances.append(Used(BulkTemperature()))
     gains = {n: v for n, v in values.items() if n.startswith("C_") and np.isfinite(v)}
     if "orifice" in names and gains:
-        found.append(Used(LaminarTransition(gains=tuple(gains.items()))))
-    return tuple(found)
+        nuisances.append(Used(LaminarTransition(gains=tuple(gains.items()))))
+    return tuple(nuisances)
 
 
 def beliefs(names: Sequence[str], value: Array) -> list[Belief]:

@@ -59,12 +59,12 @@ def _tukey(r: Array) -> Array:
 def _scales(
     blocks: Sequence[RepeatBlock], residuals: Sequence[Array], weights: Sequence[Array]
 ) -> list[float]:
-    found: dict[tuple[int, str, str], list[Array]] = {}
+    deviations: dict[tuple[int, str, str], list[Array]] = {}
     for b, e, w in zip(blocks, residuals, weights, strict=True):
-        found.setdefault((*b.stratum, b.equation), []).append(np.abs(e[w > 0.5]))
+        deviations.setdefault((*b.stratum, b.equation), []).append(np.abs(e[w > 0.5]))
     scale = {
         k: max(IDENTIFY.mad_to_std * float(np.median(np.concatenate(v))), 1e-300)
-        for k, v in found.items()
+        for k, v in deviations.items()
     }
     return [scale[*b.stratum, b.equation] for b in blocks]
 

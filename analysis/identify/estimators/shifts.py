@@ -59,7 +59,7 @@ def shifts_of(
     reference: Mapping[str, tuple[Array, CovarianceParts, EquationFit]],
 ) -> list[Shift]:
     """Return the shift of every parameter; `reference` is least squares, by family."""
-    found = []
+    shifts = []
     for p in prepared:
         test, (_, error, _) = tests[p.family], reference[p.family]
         half = half_width(np.sqrt(np.diag(error.covariance)), error.dof)
@@ -67,7 +67,7 @@ def shifts_of(
             size = abs(float(test.difference[i]))
             # The rows hold 1/b: what makes 1/b larger makes b smaller.
             sign = -1.0 if name == "b" else 1.0
-            found.append(
+            shifts.append(
                 Shift(
                     name,
                     sign * float(test.relative[i]),
@@ -76,7 +76,7 @@ def shifts_of(
                     bool(test.certain[i]),
                 )
             )
-    return found
+    return shifts
 
 
 def certain_shift(test: Hausman, p: Prepared) -> Array:

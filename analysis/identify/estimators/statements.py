@@ -29,26 +29,26 @@ def nuisance_statement(
     if belief.name == nu.KAPPA:
         compliance = float(beta[list(names).index("b")])
         alpha, spread_ = -100 * value / compliance, 100 * std / abs(compliance)
-        said = f"b changes by {alpha:.2f} +- {2 * spread_:.2f} % per kelvin by these records"
+        statement = f"b changes by {alpha:.2f} +- {2 * spread_:.2f} % per kelvin by these records"
         if spread_ > 100 * IDENTIFY.bulk_slope_std:
-            said = (
+            statement = (
                 "the oil's temperature hardly varied: its effect on b is taken as "
                 f"{100 * IDENTIFY.bulk_slope:.1f} +- {200 * IDENTIFY.bulk_slope_std:.1f} % per "
                 "kelvin"
             )
         if wrong:
-            said += ", which no oil does: b is that of the records' mean temperature"
+            statement += ", which no oil does: b is that of the records' mean temperature"
         else:
-            said += "; b is that of the rig's nominal oil temperature"
-        return Check("oil temperature", not wrong, said)
+            statement += "; b is that of the rig's nominal oil temperature"
+        return Check("oil temperature", not wrong, statement)
     size = np.sqrt(max(value, 0.0) + 2 * std)
-    said = f"laminar below a drop of {size / 1e6:.2g} MPa at most by these records"
+    statement = f"laminar below a drop of {size / 1e6:.2g} MPa at most by these records"
     if wrong:
-        said = (
+        statement = (
             "the flow depends on the pressure drop in a way no orifice does (a tank pressure, a "
             "sensor's offset, a leak?); the gains are those of the plain square root"
         )
-    return Check("laminar transition", not wrong, said)
+    return Check("laminar transition", not wrong, statement)
 
 
 def noise_statement(shifts: Sequence[Shift]) -> Check:

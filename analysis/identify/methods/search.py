@@ -206,14 +206,14 @@ def score(task: SearchTask, values: Mapping[str, float]) -> Score:
         if fate == DIVERGED:
             lost += window.samples
             continue
-        found = simulate(ready, task.drive, window.start, window.first, window.samples)
-        lost += found.outside + window.samples - found.filled
-        if found.failure:
+        simulated = simulate(ready, task.drive, window.start, window.first, window.samples)
+        lost += simulated.outside + window.samples - simulated.filled
+        if simulated.failure:
             fate = DIVERGED
-        elif found.outside:
+        elif simulated.outside:
             fate = fate or COMPLEX
         elif not fate:
-            channels = found.channels()
+            channels = simulated.channels()
             for name, y in window.measured.items():
                 off = (y - channels[name])[window.here]
                 total += float(np.sum(off**2)) / window.spread[name]

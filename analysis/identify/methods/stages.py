@@ -170,8 +170,8 @@ def as_solution(outcome: Outcome, values: Mapping[str, Value]) -> Solution:
     value, std, dof = (np.full(k, np.nan) for _ in range(3))
     for i, name in enumerate(outcome.names):
         if name in values:
-            found = values[name]
-            value[i], std[i], dof[i] = found.value, found.std, found.dof
+            estimate = values[name]
+            value[i], std[i], dof[i] = estimate.value, estimate.std, estimate.dof
     R = outcome.everything
     there = np.nan_to_num(value)
     squares = float(np.sum((R[:k, k] - R[:k, :k] @ there) ** 2)) + float(R[k, k] ** 2)

@@ -193,10 +193,10 @@ def _identification(
 
 def _as_solution(method: str, task: SearchTask, trail: Trail, family: str) -> Solution:
     """Return a family's values as a solution of no rows: no interval, no condition number."""
-    found = inverted(task.model.rig, task.model.terms, trail.values)
+    best_values = inverted(task.model.rig, task.model.terms, trail.values)
     names = parameters_of(task.model.rig, task.model.terms, family)
     nan = np.full(len(names), np.nan)
-    value = np.array([found.get(name, np.nan) for name in names])
+    value = np.array([best_values.get(name, np.nan) for name in names])
     lost = {n: f"{method} searches STEP1's parameters only" for n in names if n not in trail.values}
     return Solution(names, value, np.diag(nan), nan, np.nan, 0, np.nan, nan, lost)
 

@@ -99,23 +99,23 @@ def free_run_fit(
         return np.concatenate([part.ravel() for part in left])
 
     first = solution.value / scale
-    found = least_squares(
+    optimum = least_squares(
         stacked, first, diff_step=IDENTIFY.free_run_step, max_nfev=IDENTIFY.free_run_simulations
     )
     before = float(np.sqrt(np.mean(stacked(first) ** 2)))
-    after = float(np.sqrt(np.mean(found.fun**2)))
-    jacobian = found.jac / scale
+    after = float(np.sqrt(np.mean(optimum.fun**2)))
+    jacobian = optimum.jac / scale
     inverse = scaled_inverse(jacobian.T @ jacobian)
-    error = spread([_pieces(ready.records, found, jacobian)], inverse)
+    error = spread([_pieces(ready.records, optimum, jacobian)], inverse)
     unit = rig.unit_of(ready.records[0].names[0])
     check = Check(
         "output error",
-        bool(found.success),
+        bool(optimum.success),
         f"free runs of {len(ready.records)} whole record(s) from their measured first state: "
         f"{before:.3g} {unit} rms with least squares, {after:.3g} {unit} with these parameters"
-        + ("" if found.success else f"; not settled after {found.nfev} steps"),
+        + ("" if optimum.success else f"; not settled after {optimum.nfev} steps"),
     )
-    new = replace(solution, value=found.x * scale, covariance=error.covariance, dof=error.dof)
+    new = replace(solution, value=optimum.x * scale, covariance=error.covariance, dof=error.dof)
     return dict.fromkeys(solutions, new), check
 
 

@@ -191,14 +191,14 @@ class Windows:
 
         # A record's first window shows which parameters move nothing in it; once that is known,
         # windows need not wait for one another.
-        found = {}
+        reductions = {}
         for k, stretch in enumerate(self.stretches):
             if stretch.record not in self._idle:
-                found[k] = one(k)
-        rest = [k for k in range(len(self.stretches)) if k not in found]
+                reductions[k] = one(k)
+        rest = [k for k in range(len(self.stretches)) if k not in reductions]
         with ThreadPoolExecutor(IDENTIFY.window_workers) as pool:
-            found |= zip(rest, pool.map(one, rest), strict=True)
-        return [found[k] for k in range(len(self.stretches))]
+            reductions |= zip(rest, pool.map(one, rest), strict=True)
+        return [reductions[k] for k in range(len(self.stretches))]
 
     def _window(
         self, stretch: Stretch, start: Array, sigma: Array, nudged: Nudged

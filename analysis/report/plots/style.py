@@ -139,10 +139,10 @@ def svg(made: Figure, key: str, label: str) -> Markup:
 
 
 def _view_box(text: str) -> str:
-    found = _OPENING.search(text)
-    if found is None:
+    match = _OPENING.search(text)
+    if match is None:
         raise ValueError("matplotlib wrote an SVG without a viewBox")
-    return found[1]
+    return match[1]
 
 
 def _short(number: re.Match[str]) -> str:

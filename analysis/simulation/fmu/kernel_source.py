@@ -180,20 +180,20 @@ class _Translation:
         if value is None:
             self._line("return;")
             return
-        found = self._tuple(value) if isinstance(value, ast.Tuple) else self._value(value)
-        kind = (DOUBLE if not found.size else "tuple", found.size)
+        returned = self._tuple(value) if isinstance(value, ast.Tuple) else self._value(value)
+        kind = (DOUBLE if not returned.size else "tuple", returned.size)
         if self.result not in (None, kind):
             raise self._refusal(value, "results of different kinds")
         self.result = kind
-        self._line(f"return {found.text};")
+        self._line(f"return {returned.text};")
 
     def _assign_all(self, targets: Sequence[ast.expr], value: ast.expr) -> None:
         if len(targets) == 1 and isinstance(targets[0], ast.Tuple):
             self._unpack(targets[0].elts, value)
             return
-        found = self._value(value)
+        assigned = self._value(value)
         for target in reversed(targets):
-            self._store(target, found)
+            self._store(target, assigned)
 
     def _unpack(self, targets: Sequence[ast.expr], value: ast.expr) -> None:
         """Assign a tuple to targets: every value is computed before the first is stored."""

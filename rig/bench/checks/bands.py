@@ -150,13 +150,13 @@ def towards_zero(limits: Range, share: float) -> Range:
 
 def delays(rig: Rig, settings: GuardSettings) -> tuple[Counts, Counts]:
     """Return the (warning, trip) delays of all recorded channels [samples]."""
-    found = []
+    out = []
     for name in rig.recorded:
         band = rig.alarms.channels.get(name, _NO_BAND)
         warning = settings.warning_delay if band.warning_delay is None else band.warning_delay
         trip = band.trip_delay or 0.0
-        found.append((round(warning * rig.sample_rate), round(trip * rig.sample_rate)))
-    warnings, trips = np.array(found, dtype=np.int64).T
+        out.append((round(warning * rig.sample_rate), round(trip * rig.sample_rate)))
+    warnings, trips = np.array(out, dtype=np.int64).T
     return warnings, trips
 
 

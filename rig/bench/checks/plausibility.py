@@ -96,10 +96,10 @@ class Plausibility:
         if len(data) < self._window:
             return None
         tick = block.tick + len(block.data) - 1
-        found = {key_of(v): v for v in self._findings(data, expected, roles, tick)}
-        self._pending = {key: self._pending.get(key, found[key]) for key in found}
+        violations = {key_of(v): v for v in self._findings(data, expected, roles, tick)}
+        self._pending = {key: self._pending.get(key, violations[key]) for key in violations}
         return [
-            found[key]
+            violations[key]
             for key, first in self._pending.items()
             if tick - first.tick >= self._confirm
         ]  # fmt: skip

@@ -73,7 +73,7 @@ class Rate:
 
 def rates(rig: Rig) -> tuple[Rate, ...]:
     """Return the bounds on rates of a rig, one per kind and window."""
-    found: dict[tuple[str, int], list[tuple[int, float]]] = {}
+    limits_by_window: dict[tuple[str, int], list[tuple[int, float]]] = {}
     for column, name in enumerate(rig.channels):
         kind, joint = ch.kind_of(name)
         if joint is None or kind not in (ch.PISTON, ch.CAP, ch.ROD):
@@ -82,7 +82,7 @@ def rates(rig: Rig) -> tuple[Rate, ...]:
         limit = limits.speed if kind == ch.PISTON else limits.pressure_rate
         window = rate_window(rig.sensors.of(kind).noise, limit, rig.sample_rate)
         what = "piston speed" if kind == ch.PISTON else "pressure rate"
-        found.setdefault((what, window), []).append((column, limit))
+        limits_by_window.setdefault((what, window), []).append((column, limit))
     return tuple(
         Rate(
             what,
@@ -90,5 +90,5 @@ def rates(rig: Rig) -> tuple[Rate, ...]:
             window,
             np.array([limit for _, limit in entries]) * (window / rig.sample_rate),
         )
-        for (what, window), entries in found.items()
+        for (what, window), entries in limits_by_window.items()
     )

@@ -68,7 +68,7 @@ def simulation_figures(rig: Rig, repeats: int = 5) -> dict[str, Any]:
     """
     model, drive, start = _both_moving(rig)
     ready = compiled(model)
-    found = simulate(ready, drive, start)
+    simulated = simulate(ready, drive, start)
     own = _spent(lambda: simulate(ready, drive, start), repeats)
     p = hand_fused.constants(rig, model.values)
     y0 = np.concatenate((start.q, start.qd, start.p_cap, start.p_rod))
@@ -90,7 +90,7 @@ def simulation_figures(rig: Rig, repeats: int = 5) -> dict[str, Any]:
     def error(q: Array) -> float:
         return float(np.abs(q - true[:, :2]).max())
 
-    exact = error(found.q)
+    exact = error(simulated.q)
     rtol = next(
         r for r in (1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10) if error(odeint(r)[:, :2]) <= exact
     )
@@ -103,8 +103,8 @@ def simulation_figures(rig: Rig, repeats: int = 5) -> dict[str, Any]:
         "odeint": other,
         "odeint_rtol": rtol,
         "angle_error": exact,
-        "difference_to_hand": float(np.abs(out[:, :2] - found.q).max()),
-        "failure": found.failure,
+        "difference_to_hand": float(np.abs(out[:, :2] - simulated.q).max()),
+        "failure": simulated.failure,
     }
 
 

@@ -49,8 +49,8 @@ class FaultBench:
 
     def state(self) -> BenchState:
         """Return what the device says of itself."""
-        found: BenchState = self._ask("state")
-        return found
+        answer: BenchState = self._ask("state")
+        return answer
 
     def end(self) -> None:
         """End the bench; another one may begin."""

@@ -43,8 +43,8 @@ def jobs(wire: str, least: int) -> Iterator[tuple[int, str]]:
 def fault_trials(folder: Path, least: int, say: Say) -> list[Outcome]:
     """Run at least `least` trials in virtual time, each with a fault of its own."""
     with _quiet(), ThreadPoolExecutor(len(wires())) as pool:  # they wait more than they work
-        found = pool.map(lambda wire: _on_wire(folder, wire, least, say), wires())
-        return [outcome for part in found for outcome in part]
+        outcomes = pool.map(lambda wire: _on_wire(folder, wire, least, say), wires())
+        return [outcome for part in outcomes for outcome in part]
 
 
 def _on_wire(folder: Path, wire: str, least: int, say: Say) -> list[Outcome]:

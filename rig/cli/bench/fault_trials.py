@@ -159,12 +159,12 @@ def try_fault(
     outcome, warned = Outcome(name, wire), _Warnings()
     logging.getLogger().addHandler(warned)
     try:
-        for left in reversed(range(_TRIES)):
+        for tries_left in reversed(range(_TRIES)):
             try:
-                _session(bench, reached, fault, folder / f"{left}", outcome, seed, realtime)
+                _session(bench, reached, fault, folder / f"{tries_left}", outcome, seed, realtime)
                 break
             except (DeviceError, SafetyTrip):  # before the fault: a computer too busy
-                if not left:
+                if not tries_left:
                     raise
                 rig = _more_patient(rig)
                 endpoint = bench.begin(rig, wire, early, seed, realtime=realtime)
@@ -216,9 +216,9 @@ def _session(
                     bench.strike([fault])
                     session.run_for(STRIKING + 0.5)
                 else:
-                    left = max(fault.at - session.tick / rig.sample_rate, 0.01)
-                    began = time.monotonic() + left * realtime, fault.at
-                    session.run_for(left)
+                    seconds_left = max(fault.at - session.tick / rig.sample_rate, 0.01)
+                    began = time.monotonic() + seconds_left * realtime, fault.at
+                    session.run_for(seconds_left)
                     session.run_for(WATCHED)
             finally:
                 ended = time.monotonic()

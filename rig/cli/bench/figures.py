@@ -54,13 +54,13 @@ def analysis_figures(folder: Path, say: Say) -> list[Figure]:
     started = time.perf_counter()
     run = load_run(folder / "thirty" / "identify")
     loading = time.perf_counter() - started
-    found = identify_figures(run)
+    measured = identify_figures(run)
     speed = simulation_figures(load_rig(RIG))
     own, hand, odeint = (speed[name] for name in ("own", "hand", "odeint"))
     return [
-        Figure("analysis", "records of 10 s", found["records"]),
-        Figure("analysis", "load and identify", loading + found["identify_seconds"], "s", 5.0),
-        Figure("analysis", "of it the solve", 1e3 * found["solve_seconds"], "ms", 50.0),
+        Figure("analysis", "records of 10 s", measured["records"]),
+        Figure("analysis", "load and identify", loading + measured["identify_seconds"], "s", 5.0),
+        Figure("analysis", "of it the solve", 1e3 * measured["solve_seconds"], "ms", 50.0),
         Figure("analysis", "free run of 10 s, both joints", 1e3 * own[0], "ms"),
         Figure("analysis", "the same, median", 1e3 * own[1], "ms"),
         Figure("analysis", "free run", speed["times_real_time"], "x real time", 500, True),
@@ -122,16 +122,16 @@ def acquisition_figures(_: Path, say: Say, minutes: float) -> list[Figure]:
     with simulated_bench(RIG, seed=JUDGING_SEED, real_time=True) as endpoint:
         driver = make_driver(wire_at(endpoint, rig.wire), rig)
         try:
-            found = measure_acquisition(driver, driver.connect(), 60.0 * minutes)
+            measured = measure_acquisition(driver, driver.connect(), 60.0 * minutes)
         finally:
             driver.close()
     return [
-        Figure("acquisition", "samples of every channel", found["samples"]),
-        Figure("acquisition", "samples lost", found["lost_samples"], "", 0.0),
-        Figure("acquisition", "blocks out of order", found["out_of_order_blocks"], "", 0.0),
-        Figure("acquisition", "lateness, mean", 1e3 * found["lateness_mean_s"], "ms"),
-        Figure("acquisition", "lateness, 99 %", 1e3 * found["lateness_p99_s"], "ms"),
-        Figure("acquisition", "lateness, worst", 1e3 * found["lateness_max_s"], "ms"),
+        Figure("acquisition", "samples of every channel", measured["samples"]),
+        Figure("acquisition", "samples lost", measured["lost_samples"], "", 0.0),
+        Figure("acquisition", "blocks out of order", measured["out_of_order_blocks"], "", 0.0),
+        Figure("acquisition", "lateness, mean", 1e3 * measured["lateness_mean_s"], "ms"),
+        Figure("acquisition", "lateness, 99 %", 1e3 * measured["lateness_p99_s"], "ms"),
+        Figure("acquisition", "lateness, worst", 1e3 * measured["lateness_max_s"], "ms"),
     ]
 
 

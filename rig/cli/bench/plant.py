@@ -171,9 +171,9 @@ def accuracy(seconds: float = 1.0) -> dict[str, float]:
     Keys: angle_error, pressure_error (relative to each signal's range), step [s], seconds.
     """
     rig = _shipped()
-    found, targets = plant_run(rig, round(seconds * rig.sample_rate))
+    simulated, targets = plant_run(rig, round(seconds * rig.sample_rate))
     true, _ = reference_run(rig, targets, method="DOP853", rtol=1e-10)
-    return {**errors(found, true, len(rig.joints)), "step": STEP, "seconds": seconds}
+    return {**errors(simulated, true, len(rig.joints)), "step": STEP, "seconds": seconds}
 
 
 def speed(seconds: float = 5.0, rig: Rig | None = None) -> dict[str, float]:
@@ -192,9 +192,9 @@ def speed(seconds: float = 5.0, rig: Rig | None = None) -> dict[str, float]:
         plant.advance(ticks, laws)
         taken = min(taken, (time.process_time() - began) / seconds)
     part = 0.3
-    found, targets = plant_run(rig, round(part * rig.sample_rate))
+    simulated, targets = plant_run(rig, round(part * rig.sample_rate))
     true, _ = reference_run(rig, targets, method="DOP853", rtol=1e-11)
-    own = max(errors(found, true, len(rig.joints)).values())
+    own = max(errors(simulated, true, len(rig.joints)).values())
     for rtol in (1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10):
         rough, lsoda = reference_run(rig, targets, method="LSODA", rtol=rtol)
         other = max(errors(rough, true, len(rig.joints)).values())

@@ -50,16 +50,18 @@ def _cluster(folder: Path, say: Say) -> list[Figure]:
     say("stream: an archive on one and on two Dask workers")
     run = bench_run(load_rig(RIG), repeats=6, seconds=RECORD_SECONDS)
     folders = [str(write_run(folder / f"run-{number}", run)) for number in range(RUNS)]
-    found = cluster_figures(folders)
+    measured = cluster_figures(folders)
     plain = spin_figures()
     return [
         Figure(GROUP, f"archive: records of {RECORD_SECONDS:g} s", RUNS * len(run.records)),
-        Figure(GROUP, "one Dask worker", found["one_seconds"], "s"),
-        Figure(GROUP, "two Dask workers", found["two_seconds"], "s"),
-        Figure(GROUP, "two workers over one", found["speedup"], "x", 1.6, True),
+        Figure(GROUP, "one Dask worker", measured["one_seconds"], "s"),
+        Figure(GROUP, "two Dask workers", measured["two_seconds"], "s"),
+        Figure(GROUP, "two workers over one", measured["speedup"], "x", 1.6, True),
         Figure(GROUP, "two processes over one, bare arithmetic", plain, "x"),
-        Figure(GROUP, "one's processor time over the busier of two", found["processor_ratio"], "x"),
-        Figure(GROUP, "archive: largest relative difference", found["difference"], "", 1e-10),
+        Figure(
+            GROUP, "one's processor time over the busier of two", measured["processor_ratio"], "x"
+        ),
+        Figure(GROUP, "archive: largest relative difference", measured["difference"], "", 1e-10),
     ]
 
 

@@ -79,15 +79,15 @@ def acquisition_of(wire: str, seconds: float) -> list[Figure]:
                 disordered += block.tick < before
             share = (time.process_time() - busy) / (time.perf_counter() - began)
             lost = bench.lost_samples - lost
-    found = timing(np.array(ends), np.array(arrivals))
+    measured = timing(np.array(ends), np.array(arrivals))
     values = len(rig.recorded)
     return [
         Figure(GROUP, f"{wire}: samples of {values} values", samples),
         Figure(GROUP, f"{wire}: samples lost", lost, "", 0.0),
         Figure(GROUP, f"{wire}: blocks out of order", disordered, "", 0.0),
         Figure(GROUP, f"{wire}: of one core, driver + guard + recorder", 1e2 * share, "%", 25.0),
-        Figure(GROUP, f"{wire}: lateness, 99 %", 1e3 * found["lateness_p99_s"], "ms"),
-        Figure(GROUP, f"{wire}: lateness, worst", 1e3 * found["lateness_max_s"], "ms", 50.0),
+        Figure(GROUP, f"{wire}: lateness, 99 %", 1e3 * measured["lateness_p99_s"], "ms"),
+        Figure(GROUP, f"{wire}: lateness, worst", 1e3 * measured["lateness_max_s"], "ms", 50.0),
     ]
 
 

@@ -132,15 +132,15 @@ def read_alive(layout: CanLayout, data: bytes, session: int) -> WireFrame | None
     """Return the `ALIVE_NOTE` of a frame's bytes, None if it is not of session `session`."""
     if len(data) < layout.alive.size:
         return None
-    found = layout.alive.unpack(data)
-    if found["alive_session"] & SESSION_MASK != session & SESSION_MASK:
+    signals = layout.alive.unpack(data)
+    if signals["alive_session"] & SESSION_MASK != session & SESSION_MASK:
         return None
     alive = msg.Alive(
-        found["alive_acknowledge"] & 0xFFFF,
-        found["alive_heartbeat"] & 0xFFFF,
-        bool(found["alive_resend"]),
+        signals["alive_acknowledge"] & 0xFFFF,
+        signals["alive_heartbeat"] & 0xFFFF,
+        bool(signals["alive_resend"]),
     )
-    number = found["alive_stream"] & 0xFFFF
+    number = signals["alive_stream"] & 0xFFFF
     return WireFrame(Message.ALIVE_NOTE, number, session, msg.pack_alive(alive))
 
 

@@ -166,14 +166,14 @@ def read_layout(text: str, source: str, rig: Rig) -> CanLayout:
 
 def _parsed(text: str, source: str) -> Database:
     try:
-        found = load_string(text, "dbc")
+        database = load_string(text, "dbc")
     # The parser raises whatever a damaged text makes of it.
     except (Error, ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
         reason = " ".join(str(error).split())
         raise InputError(f"{source}: not a DBC file: {reason[:200]}") from error
-    if not isinstance(found, Database):
+    if not isinstance(database, Database):
         raise InputError(f"{source}: not a DBC file of a CAN bus")
-    return found
+    return database
 
 
 class _Reader:

@@ -51,9 +51,9 @@ def find_damage(path: Path, rig: Rig) -> str | None:
     log_file = path.with_name(path.name + "-wal")
     try:
         with closing(_open(path)) as db:
-            (said,) = db.execute("PRAGMA integrity_check(1)").fetchone()
-            if said != "ok":
-                return f"its pages are damaged ({' '.join(str(said).split())})"
+            (report,) = db.execute("PRAGMA integrity_check(1)").fetchone()
+            if report != "ok":
+                return f"its pages are damaged ({' '.join(str(report).split())})"
             newest = _check_rows(Journal(db, path), db, rig)
     except _UNREADABLE as error:
         return f"SQLite cannot read it ({error})"
@@ -204,8 +204,8 @@ def _account(
     if numbers and places[keys[0]][1] > 1:
         lost += (places[keys[0]][1] - 1) * usual
     # A record may be announced before its first sample is taken.
-    told = [e for e in events if e.get("event") != "record begins"]
-    known = [int(e["tick"]) for e in told if isinstance(e.get("tick"), int)]
+    other_events = [e for e in events if e.get("event") != "record begins"]
+    known = [int(e["tick"]) for e in other_events if isinstance(e.get("tick"), int)]
     known += [m.start + m.ticks for m in chosen if m.state == "complete" and m.ticks is not None]
     lost += max(0, max(known, default=0) - int(ends[-1]))
     return Salvage(

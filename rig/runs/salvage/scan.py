@@ -90,9 +90,9 @@ def _rows(raw: Bytes, columns: int, short: int, like: Like) -> Iterator[FoundRow
             continue
         types = [part[places + 1 + k] for k in range(short)]
         for place in places[like(types)].tolist():
-            found = _row(part, place, columns)
-            if found is not None:
-                yield FoundRow(begin + place, *found)
+            row = _row(part, place, columns)
+            if row is not None:
+                yield FoundRow(begin + place, *row)
 
 
 def _row(part: Bytes, place: int, columns: int) -> tuple[int | None, tuple[Any, ...]] | None:
