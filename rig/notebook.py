@@ -1,0 +1,223 @@
+"""What a notebook or a script works with, under one name: `from rig import notebook as bench`.
+
+Reading, identifying, judging and tracing are the functions that the command line calls, named here
+so that nobody has to look for them. Own to this module is what a file and a terminal do elsewhere:
+tables, plots, a protocol with a step changed, and taking its records. Nothing here prints.
+
+Glossary: a *run* is a folder's content, a *record* one repeat of one step (`rig.model.records`).
+"""
+
+from __future__ import annotations
+
+import io
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pydantic import ValidationError
+
+from analysis.identify.identify import identify
+from analysis.report.plots.style import figure, style, thin
+from analysis.simulation.model import load_model, save_model
+from analysis.simulation.validate import RecordValidation, validate
+from analysis.trace.engine import trace
+from protocols.files.library import load as load_protocol
+from protocols.files.plan import Overrides, mapped, resolve
+from protocols.files.schema import Protocol, every_step
+from protocols.files.writer import protocol_text
+from protocols.steps.base import StepKind
+from rig.cli.proofs import PlanProof, proved
+from rig.cli.protocol_run import ProtocolJob, run_protocol
+from rig.cli.simulated_bench import simulated_bench
+from rig.model.parse import InputError
+from rig.model.records import Record, Run
+from rig.runs.rigs import load_bench, load_rig
+from rig.runs.store import load_run
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pandas import DataFrame  # type: ignore[import-untyped]
+
+__all__ = [
+    "Overrides", "Plot", "changed", "check", "frame", "identify", "load_model", "load_protocol",
+    "load_rig", "load_run", "plot", "plot_validation", "record", "save_model", "simulated_bench",
+    "take", "trace", "units", "validate",
+]  # fmt: skip
+
+log = logging.getLogger(__name__)
+_PANEL = 1.1  # [in] of height for one channel
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A figure that a notebook shows as it stands; `figure` is Matplotlib's, to change further."""
+
+    figure: Figure
+
+    def _repr_svg_(self) -> str:
+        text = io.StringIO()
+        self.figure.savefig(text, format="svg")
+        return text.getvalue()
+
+    def save(self, path: str | Path) -> Path:
+        """Write it as the format that the path's ending names; returns the path."""
+        self.figure.savefig(path)
+        return Path(path)
+
+
+def record(run: Run, name: str) -> Record:
+    """Return the record of a run by its name, as `step1_r2`; raises InputError naming those."""
+    for one in run.records:
+        if one.name == name:
+            return one
+    known = " ".join(one.name for one in run.records)
+    raise InputError(f"{run.source or 'the run'}: has no record {name!r}; it has: {known}")
+
+
+def units(run: Run) -> dict[str, str]:
+    """Return the SI unit of every channel of a run, by name."""
+    names = dict.fromkeys(name for one in run.records for name in one.channels)
+    return {name: run.rig.unit_of(name) for name in names}
+
+
+def frame(run: Run, name: str) -> DataFrame:
+    """Return a record as a table: a row a sample, indexed by the time [s] since the run began.
+
+    Columns are channels in SI; `attrs` holds `units` and the record's attributes. Raises InputError
+    for an unknown record, or where pandas (`pip install 'bramah[export]'`) is missing.
+    """
+    try:
+        import pandas  # noqa: PLC0415 - wanted on request alone
+    except ImportError as error:
+        raise InputError("a table needs pandas: pip install 'bramah[export]'") from error
+    one = record(run, name)
+    index = pandas.Index(one.start + one.time, name="time")
+    made = pandas.DataFrame(dict(one.channels), index=index)
+    made.attrs = {"units": units(run), **one.attributes}
+    return made
+
+
+def plot(run: Run, name: str, channels: Sequence[str] | None = None) -> Plot:
+    """Draw channels of a record over its time, a panel each; all of them by default."""
+    one = record(run, name)
+    chosen = list(channels or one.channels)
+    unknown = [channel for channel in chosen if channel not in one.channels]
+    if unknown:
+        known = " ".join(one.channels)
+        raise InputError(f"record {name!r} has no channel {unknown[0]!r}; it has: {known}")
+    series = {
+        f"{channel} [{run.rig.unit_of(channel)}]": [one.channels[channel]] for channel in chosen
+    }
+    return _panels(one.time, series, name)
+
+
+def plot_validation(result: RecordValidation) -> Plot:
+    """Draw what was measured in a record, and over it the model's free run."""
+    simulated = result.simulation.channels()
+    series = {
+        f"{channel} [{result.units.get(channel, 'SI')}], FIT {fit:.1f} %": [
+            result.measured[channel], simulated[channel][: len(result.time)]
+        ]
+        for channel, fit in result.fit.items()
+    }  # fmt: skip
+    return _panels(result.time, series, f"{result.record}: measured, and the model over it")
+
+
+def _panels(time: Any, series: Mapping[str, Sequence[Any]], title: str) -> Plot:
+    with style():
+        made = figure(_PANEL * len(series) + 0.6)
+        grid = made.subplots(len(series), 1, sharex=True, squeeze=False)[:, 0]
+        for axes, (label, lines) in zip(grid, series.items(), strict=True):
+            for number, values in enumerate(lines):
+                axes.plot(*thin(time[: len(values)], values), linewidth=1.6 if not number else 0.8)
+            axes.set_title(label, loc="left", fontsize="small")
+        grid[-1].set_xlabel("time [s]")
+        made.suptitle(title)
+        made.tight_layout()
+    return Plot(made)
+
+
+def changed(protocol: Protocol, step: str, changes: Mapping[str, Any]) -> Protocol:
+    """Return a protocol with one step changed and checked again as its file would be.
+
+    `changes` maps keys of the step, as error messages write them, to values with units:
+    ``{"repeats": 2, "excite.0.signal.amplitude": "0.6 V"}``. Raises InputError naming step and key.
+    """
+    names = [one.name for one in every_step(protocol.steps) if one.name]
+    if step not in names:
+        raise InputError(
+            f"protocol {protocol.name!r} has no step {step!r}; it has: {' '.join(names)}"
+        )
+
+    def change(one: StepKind) -> StepKind:
+        if one.name != step:
+            return one
+        data = one.model_dump()
+        for path, value in changes.items():
+            _put(data, path, value, step)
+        try:
+            return type(one).model_validate(data)
+        except ValidationError as error:
+            problem = error.errors()[0]
+            where = ".".join(map(str, problem["loc"]))
+            text = problem["msg"].removeprefix("Value error, ")
+            raise InputError(f"step {step!r}: {where}: {text}") from error
+
+    return protocol.model_copy(update={"steps": mapped(protocol.steps, change)})
+
+
+def _put(data: Any, path: str, value: Any, step: str) -> None:
+    """Set one key of nested plain data; raises InputError for one that is not there."""
+    *way, last = path.split(".")
+    for key in way:
+        data = _at(data, key, path, step)
+    _at(data, last, path, step)
+    data[int(last) if isinstance(data, list | tuple) else last] = value
+
+
+def _at(data: Any, key: str, path: str, step: str) -> Any:
+    try:
+        return data[int(key)] if isinstance(data, list | tuple) else data[key]
+    except (KeyError, IndexError, ValueError, TypeError) as error:
+        known = list(data) if isinstance(data, dict) else f"0 to {len(data) - 1}"
+        raise InputError(
+            f"step {step!r}: {path}: no key {key!r} here; expected one of: {known}"
+        ) from error
+
+
+def check(protocol: str | Protocol, rig: str, overrides: Overrides | None = None) -> PlanProof:
+    """Prove a protocol on the twin and predict its standard errors; nothing moves.
+
+    `report.ok` says whether every limit is kept, `report.refused` which are not, `text` what the
+    records would tell. Raises InputError for what does not fit together.
+    """
+    how = overrides or Overrides()
+    made = load_protocol(protocol, how.parameters) if isinstance(protocol, str) else protocol
+    bench = load_bench(rig)
+    return proved(resolve(made, bench, how), bench, predict=True)
+
+
+def take(
+    protocol: str | Protocol,
+    rig: str,
+    out: str | Path,
+    endpoint: str | None = None,
+    overrides: Overrides | None = None,
+) -> Run:
+    """Run a protocol on a bench into the folder `out`, unattended, and return what was recorded.
+
+    As `bramah run`: proved first, every sample guarded, the outputs at zero at its end, however it
+    ends. A protocol that was changed is written beside the run, as OUT.yaml, so that it can be run
+    again. Progress goes to this module's logger. Raises what `bramah run` ends with: InputError,
+    SafetyTrip, DeviceError, OperatorStop.
+    """
+    folder = Path(out)
+    if isinstance(protocol, Protocol):
+        file = folder.with_name(f"{folder.name}.yaml")
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(protocol_text(protocol, "Made in a notebook."), encoding="utf-8")
+        protocol = str(file)
+    job = ProtocolJob(protocol, rig, folder, endpoint, overrides or Overrides())
+    return load_run(run_protocol(job, log.info))
