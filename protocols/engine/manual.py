@@ -30,6 +30,7 @@ log = logging.getLogger(__name__)
 
 HOLD: Final = 0.25  # of wall time that one press of a key counts [s]
 INSIDE: Final = 0.05  # of the width of a joint's limits that a jog keeps from either of them
+VOLTS: Final = 0.15  # of a jog at most: some 25 mm/s on the seed bench [V]
 TOLERANCE: Final = 2e-3  # by which a locked joint may leave its place [m]
 IDLE: Final = 300.0  # without a command the session ends [s]
 KIND: Final = "manual"  # of the session, as screens see it
@@ -48,11 +49,12 @@ class Manual:
         rig: Rig,
         clock: Callable[[], float] = time.monotonic,
         *,
-        place: Place | None = None,
+        volts: float = VOLTS,
         idle_after: float = IDLE,
     ) -> None:
         self._bench, self._rig, self._clock = bench, rig, clock
-        self._place = place or Place()
+        self._place = Place()
+        self._jogging = Place().model_copy(update={"limit": volts})
         self._idle_after = idle_after
         self._locked: dict[int, float] = {}  # joint (0-based): where [m]
         self._jog: tuple[int, float] | None = None  # joint (0-based) and where to [m]
@@ -147,7 +149,7 @@ class Manual:
                 roles.append(JointRole(locked_at=at, tolerance=TOLERANCE))
                 continue
             moving = self._jog is not None and self._jog[0] == joint
-            law = position_law(self._place, self._jog[1], 0.0) if moving and self._jog else OFF
+            law = position_law(self._jogging, self._jog[1], 0.0) if moving and self._jog else OFF
             laws.append(law)
             roles.append(FREE)
         if tuple(laws) == self._laws:

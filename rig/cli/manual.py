@@ -17,6 +17,9 @@ def manual(
     out: Annotated[
         Path | None, typer.Option(help="Record the session into this run folder.")
     ] = None,
+    volts: Annotated[
+        float, typer.Option(min=0.01, help="Of a jog at most [V]; more where the valve overlaps.")
+    ] = 0.15,
     idle: Annotated[
         float, typer.Option(min=1.0, help="End after so many seconds without a command.")
     ] = 300.0,
@@ -46,7 +49,7 @@ def manual(
     recorder = None if out is None else Recorder(out, described)
     with Bench(described, make_driver(described.wire, described), recorder, publisher) as bench:
         progress("manual: page 9 of `bramah monitor` moves a joint; space stops")
-        Manual(bench, described, idle_after=idle).run()
+        Manual(bench, described, volts=volts, idle_after=idle).run()
     typer.echo("manual session over; outputs at zero, confirmed by the device")
 
 

@@ -241,7 +241,8 @@ class Monitor(ByHand, App[int]):
 
     def _page_key(self, key: str, character: str) -> None:
         page = next((name for number, name, _ in PAGES if number == character), None)
-        self.remark = ""
+        if key not in ("up", "down"):  # a held key must not wipe out the answer to itself
+            self.remark = ""
         if page is not None:
             self.open_page(page)
         elif self.link.frame.stage is LinkStage.CHOOSING and key in ("up", "down", "enter"):

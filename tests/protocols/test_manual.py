@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from protocols.engine.manual import HOLD, INSIDE, TOLERANCE, Manual
+from protocols.engine.manual import HOLD, INSIDE, TOLERANCE, VOLTS, Manual
 from rig.bench.screens.commands import Command
 from rig.runs.rigs import load_rig
 from tests.protocols.little_bench import LittleBench, default_cylinders
@@ -52,6 +52,7 @@ def test_a_joint_moves_while_the_key_is_held_and_stops_when_it_is_let_go() -> No
     moved, volts = hand.piston(1), hand.command(1)
     assert not volts[: round(0.5 * RATE)].any()
     assert (volts[round(0.6 * RATE) : round(1.4 * RATE)] > 0).all()
+    assert volts.max() <= VOLTS
     let_go = round((1.5 + HOLD + 0.05) * RATE)
     assert not volts[let_go:].any(), "no key, no voltage"
     assert moved[let_go] > moved[0] + 1e-3
@@ -73,8 +74,9 @@ def test_a_single_press_is_a_nudge() -> None:
 
 def test_a_key_held_for_long_ends_inside_the_limits() -> None:
     hand = Hand()
-    hand.hold(0.2, 20.0, "1 +")
-    hand.press(20.5, "abort")
+    hand.manual = Manual(hand.bench, RIG, lambda: hand.bench.tick / RATE, volts=0.6)
+    hand.hold(0.2, 9.0, "1 +")
+    hand.press(9.5, "abort")
     hand.manual.run()
     low, high = RIG.joints[0].limits.piston
     end = high - INSIDE * (high - low)

@@ -220,3 +220,65 @@ async def test_a_reset_that_fails_says_why_and_the_alarm_stays(
         await keys(shown, "5", "k", "r", "x", "enter")
         await shown.said("reset: DEVICE LOST: the device does not answer")
         assert "LATCHED" in shown.text
+
+
+def by_hand(**changes: object) -> Recorded:
+    """A manual session, with this screen's view of it."""
+    return running(engine="manual", kind="manual", step="manual", part=0, parts=0, **changes)
+
+
+async def test_a_joint_is_jogged_while_a_key_is_held_and_locked() -> None:
+    record = by_hand()
+    async with glass(Machine({HERE: record}), size=(120, 40)) as shown:
+        await keys(shown, "9", "right")
+        assert "joint 2 " in shown.text
+        assert "stops when you let go" in shown.text
+        for _ in range(30):  # a terminal repeats a held key about 30 times a second
+            await shown.press("up")
+            shown.clock.now += 0.033
+        await shown.said("jog")
+        while len(record.asked) < 2:
+            await shown.pilot.pause(0.01)
+        assert set(record.asked) == {("jog", "2 +")}
+        assert len(record.asked) <= 13, "a held key is not sent more often than it has to be"
+        del record.asked[:]
+        await shown.press("l")
+        await shown.said("lock")
+        await shown.press("u")
+        await shown.said("unlock")
+        assert record.asked == [("lock", "2"), ("unlock", "2")]
+        record.refusal = "jog: joint 2 is locked; unlock it first"
+        shown.clock.now += 1.0
+        await shown.press("down")
+        await shown.said("jog: joint 2 is locked")
+        await shown.press("space")
+        await shown.answered()
+        assert record.commands == ["stop"]
+
+
+async def test_by_hand_is_refused_while_a_protocol_runs() -> None:
+    record = running()
+    async with glass(Machine({HERE: record})) as shown:
+        await shown.press("9")
+        assert "Refused while a protocol runs" in shown.text
+        for key in ("up", "down", "l", "u", "d", "enter"):
+            await shown.press(key)
+            assert shown.app.dialog is None
+        assert record.asked == []
+
+
+async def test_a_manual_session_is_started_after_a_yes(
+    bramah: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with glass(Machine(), size=(120, 40)) as shown:
+        shown.app.browsed = replace(
+            shown.app.browsed, rig="shinshu-2dof", endpoint="modbus-tcp://127.0.0.1:1"
+        )
+        await keys(shown, "9", "enter")
+        assert "Nothing moves until a key is held" in shown.text
+        await keys(shown, "down", "enter")
+        while not bramah.exists() or not bramah.read_text().endswith("]"):
+            await shown.pilot.pause(0.01)
+        asked = json.loads(bramah.read_text())
+        expected = ["manual", "--rig", "shinshu-2dof", "--endpoint", "modbus-tcp://127.0.0.1:1"]
+        assert asked == expected

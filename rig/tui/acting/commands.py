@@ -74,7 +74,8 @@ class Commands:
             self.link.ask(frame.endpoint, word, value, lambda no: self._heard(word, done, no))
 
     def _heard(self, word: str, done: str, refusal: str | None) -> None:
-        self.remark = f"{word}: {done or 'taken'}" if refusal is None else f"{word}: {refusal}"
+        said = done or "taken" if refusal is None else refusal.removeprefix(f"{word}: ")
+        self.remark = f"{word}: {said}"
         self.redraw()
 
     def confirmed(self, title: str, text: str, act: Callable[[], None]) -> None:

@@ -56,8 +56,8 @@ class ByHand(Starts):
             self._with_rig(self._start_manual)
 
     def _start_manual(self, rig: str) -> None:
-        text = f"A session of its own takes the device of {rig}. Nothing moves until a key is held."
-        self.confirmed("manual", f"{text} Start?", lambda: self._job(self._words("manual", rig)))
+        text = f"Nothing moves until a key is held. Take the device of {rig} for manual operation?"
+        self.confirmed("manual", text, lambda: self._job(self._words("manual", rig)))
 
     def act_depressurise(self) -> None:
         """Let the pressure out where the rig can, after a yes; not while a session holds it."""
