@@ -130,10 +130,10 @@ class Session:
         while self.now < tick:
             self._heed()
             block = self.bench.exchange()
-            ticks = np.arange(block.tick, block.tick + len(block.data))
-            places = ticks % len(self._stamps)
-            self._ring[places], self._stamps[places] = block.data, ticks
             self.now = block.tick + len(block.data)
+            ticks = np.arange(block.tick, self.now)
+            places = self._places(block.tick, self.now)
+            self._ring[places], self._stamps[places] = block.data, ticks
             if watch is not None:
                 watch()
 
@@ -150,9 +150,19 @@ class Session:
     def channel(self, name: str, first: int, last: int) -> Array:
         """Return a channel by its name over ticks [first, last), NaN where lost."""
         ticks = np.arange(first, last)
-        places = ticks % len(self._stamps)
+        places = self._places(first, last)
         values = self._ring[places, self._columns[name]]
-        return np.where(self._stamps[places] == ticks, values, np.nan)
+        known = self._stamps[places] == ticks
+        # Nothing is lost most often; a copy either way, for the ring goes on.
+        return values.copy() if known.all() else np.where(known, values, np.nan)
+
+    def _places(self, first: int, last: int) -> slice | NDArray[np.int64]:
+        """Return where ticks [first, last) stand in the ring: a slice unless its end is between."""
+        size = len(self._stamps)
+        begin = first % size
+        if begin + last - first <= size:
+            return slice(begin, begin + max(0, last - first))
+        return np.arange(first, last) % size
 
     def piston(self, joint: int, first: int, last: int) -> Array:
         """Return the piston [m] of joint `joint` (0-based) over ticks [first, last)."""

@@ -108,6 +108,11 @@ class Guard:
         self._trip = bands.trip_bounds(self.rig, self.roles)
         self._warn = bands.warning_bounds(self.rig, self.roles, self.settings)
         self._inner = bands.inner_bounds(self.rig, self._warn, self.settings)
+        self._tightest = self._trip.within(self._warn)
+        excited = [
+            frozen.judged for r, frozen in zip(roles, self._frozen, strict=True) if r.excited
+        ]
+        self._may_freeze = np.any(excited or [np.zeros(len(self.rig.recorded), bool)], axis=0)
         self._plausibility.restart()
 
     def gap(self, lost: int, tick: int) -> Violation | None:
@@ -152,21 +157,23 @@ class Guard:
         """
         data = block.data
         last = block.tick + len(data) - 1
-        trips = [self._band_trip(block)]
+        least, most = np.minimum.reduce(data, axis=0), np.maximum.reduce(data, axis=0)
+        calm = self._tightest.contain(least, most)  # as almost every block is
+        trips = [self._band_trip(block, calm)]
         joined = np.concatenate((self._tail, data))
         self._unbroken = min(self._unbroken, len(self._tail)) + len(data)
-        for rate in self._rates:
-            rows = joined[-self._unbroken :]
-            first = last + 1 - self._unbroken
-            share = self.rig.alarms.warning_share
-            trip, near = rate.find(self.rig, rows, first, len(data), share)
-            trips.append(trip)
-            self._standing.see(near, last)
+        rows, first = joined[-self._unbroken :], last + 1 - self._unbroken
+        share = self.rig.alarms.warning_share
+        with np.errstate(invalid="ignore"):  # inf - inf: the check of bands names it
+            for rate in self._rates:
+                trip, near = rate.find(self.rig, rows, first, len(data), share)
+                trips.append(trip)
+                self._standing.see(near, last)
         measured = data[:, : block.saturated.shape[1]]
         trips.append(self._saturation.find(block.saturated, measured, block.tick))
         trips += self._act(self._frozen_sensors(joined[-self._window :], last), last)
         trips += self._act(self._plausibility.look(block, self.roles) or (), last)
-        self._band_warnings(block, last)
+        self._band_warnings(block, last, calm)
         self._standing.expire(last)
         self._tail = joined[-self._keep :]
         violations = [violation for violation in trips if violation is not None]
@@ -174,18 +181,20 @@ class Guard:
 
     def _act(self, found: Sequence[Violation], last: int) -> list[Violation]:
         """Do with each finding what the rig file wants; returns those that trip."""
+        if not found:
+            return []
         self._standing.see([v for v in found if self._actions[v.limit] == "warn"], last)
         return [v for v in found if self._actions[v.limit] == "trip"]
 
-    def _band_trip(self, block: SampleBlock) -> Violation | None:
-        over = self._outside_trip.over(self._trip.outside(block.data))
+    def _band_trip(self, block: SampleBlock, calm: bool) -> Violation | None:
+        over = self._outside_trip.over(None if calm else self._trip.outside(block.data))
         if over is None:
             return None
         row, column = bands.first_of(over)
         return self._of_band(block, row, column, self._trip)
 
-    def _band_warnings(self, block: SampleBlock, last: int) -> None:
-        over = self._outside_warning.over(self._warn.outside(block.data))
+    def _band_warnings(self, block: SampleBlock, last: int, calm: bool) -> None:
+        over = self._outside_warning.over(None if calm else self._warn.outside(block.data))
         if over is not None:
             columns = np.flatnonzero(over.any(axis=0)).tolist()
             rows = [int(np.argmax(over[:, column])) for column in columns]
@@ -219,6 +228,8 @@ class Guard:
         """Return the violation of an excited joint's channel that kept one value all the window."""
         if len(window) < self._window:
             return []
+        if not np.count_nonzero((window[0] == window[-1]) & self._may_freeze):
+            return []  # most often: the ends differ, and the rest need not be looked at
         for joint, (role, frozen) in enumerate(zip(self.roles, self._frozen, strict=True), 1):
             column = frozen.find(window) if role.excited else None
             if column is None:

@@ -89,6 +89,7 @@ class Bench:
         self.trip: SafetyTrip | None = None
         self.lost_samples = 0
         self.tick = 0
+        self._columns = len(rig.recorded)
         self._outputs = Outputs(rig, driver)
         self._driver = driver
         self._clock = clock
@@ -303,9 +304,9 @@ class Bench:
 
     def _continue(self, block: SampleBlock) -> int:
         """Return how many samples are missing before a block; raises DeviceError if it is odd."""
-        shape = (len(block.data), len(self.rig.recorded))
-        if block.data.shape != shape or len(block.data) == 0:
-            raise DeviceError(f"a block of shape {block.data.shape} came; expected (n, {shape[1]})")
+        columns = self._columns
+        if block.data.ndim != 2 or block.data.shape[1] != columns or len(block.data) == 0:
+            raise DeviceError(f"a block of shape {block.data.shape} came; expected (n, {columns})")
         lost = 0 if self._expected is None else block.tick - self._expected
         if lost < 0:
             raise DeviceError(

@@ -36,6 +36,8 @@ class Screen:
         self.seen: list[Snapshot] = []
         self.asks: list[Command] = []
 
+    watched = True
+
     def publish(self, snapshot: Snapshot) -> None:
         self.seen.append(from_json(to_json(snapshot)))
 

@@ -11,6 +11,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -130,6 +131,19 @@ def test_screens_that_come_go_hang_or_die_leave_the_run_untouched(
     assert record.samples >= 1000
     assert record.attributes["lost_samples"] == 0
     assert_all_there(run)
+
+
+def test_snapshots_are_made_only_while_a_screen_is_attached(folder: Path) -> None:
+    with closing(Publisher(RIG.name)) as publisher:
+        assert not publisher.watched
+        for _ in range(2):  # a screen that comes again is seen again
+            screens = [Attachment(publisher.endpoint) for _ in range(2)]
+            wait_for(lambda: publisher.watched)
+            screens[0].close()
+            time.sleep(0.1)
+            assert publisher.watched
+            screens[1].close()
+            wait_for(lambda: not publisher.watched)
 
 
 def test_a_killed_runs_sockets_are_swept_away(folder: Path, tmp_path: Path) -> None:
@@ -261,6 +275,7 @@ class Wall:
     def __init__(self) -> None:
         self.seen: list[Snapshot] = []
         self.publish = self.seen.append
+        self.watched = True
         self.commands = lambda judge: []
         self.close = dict
 

@@ -49,6 +49,18 @@ class Bounds:
         inside = (data >= self.low) & (data <= self.high)
         return ~inside
 
+    def contain(self, least: Array, most: Array) -> bool:
+        """Say whether all values from `least` to `most`, (channels,) each, are inside; NaN is not.
+
+        Most blocks are: this takes a third of the time of looking at each of their samples.
+        """
+        held = np.count_nonzero(least >= self.low) + np.count_nonzero(most <= self.high)
+        return bool(held == 2 * len(self.low))
+
+    def within(self, other: Bounds) -> Bounds:
+        """Return the bands where both hold."""
+        return Bounds(np.maximum(self.low, other.low), np.minimum(self.high, other.high))
+
     def of(self, column: int) -> Range:
         """Return the band of one channel."""
         return float(self.low[column]), float(self.high[column])
@@ -65,9 +77,12 @@ class Delayed:
         """Begin anew: what comes next does not continue what came before."""
         self._runs: Counts = np.zeros(len(self._delay), dtype=np.int64)
 
-    def over(self, outside: Flags) -> Flags | None:
-        """Mark the samples whose run outside is longer than the delay; None where none is."""
-        if not outside.any():
+    def over(self, outside: Flags | None) -> Flags | None:
+        """Mark the samples whose run outside is longer than the delay; None where none is.
+
+        `outside` may be None for a block that is inside as a whole.
+        """
+        if outside is None or not outside.any():
             self._runs[:] = 0
             return None
         runs = run_lengths(outside, self._runs)

@@ -35,6 +35,8 @@ class Frozen:
         codes = np.array([np.ptp(s.range) / ((1 << s.bits) - 1) for _, s in parts])
         noise = np.array([s.noise for _, s in parts])
         self._judged = noise >= codes
+        self.judged = np.zeros(len(rig.recorded), dtype=bool)  # of all that is recorded
+        self.judged[self._columns[self._judged]] = True
         self._moved = _MOVED * np.maximum(noise, codes)
         self._low = np.array([s.range[0] for _, s in parts]) + codes
         self._high = np.array([s.range[1] for _, s in parts]) - codes
@@ -43,9 +45,6 @@ class Frozen:
 
     def find(self, window: Array) -> int | None:
         """Return the column that kept one value over a window of samples, None if none did."""
-        edges = window[[0, -1]][:, self._columns]
-        if not ((edges[0] == edges[1]) & self._judged).any():
-            return None  # most often: the ends differ, and the rest need not be looked at
         values = window[:, self._columns]
         still = (values == values[0]).all(axis=0) & self._judged
         still &= (values[0] > self._low) & (values[0] < self._high)

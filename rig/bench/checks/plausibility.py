@@ -68,15 +68,18 @@ class Plausibility:
 
     def forget(self) -> None:
         """Begin anew: what comes next does not continue what came before."""
+        self._new: list[Array] = []  # blocks whose spools are not followed yet
         self._expected.forget()
         self.restart()
 
     def skip(self) -> None:
         """Go on after a few lost samples: the spools are where their next command holds them."""
+        self._follow()
         self._expected.forget()
 
     def restart(self) -> None:
         """Begin a new window: the joints do something else from the next block on."""
+        self._follow()
         self._parts: list[Array] = []
         self._parts_expected: list[Array] = []
         self._since_look = 0
@@ -84,12 +87,12 @@ class Plausibility:
 
     def look(self, block: SampleBlock, roles: Roles) -> list[Violation] | None:
         """Take a block; return what has lasted long enough, None between two looks."""
-        self._parts.append(block.data)
-        self._parts_expected.append(self._expected.follow(block.data[:, self._command]))
+        self._new.append(block.data)
         self._since_look += len(block.data)
         if self._since_look < self._hop:
             return None
         self._since_look = 0
+        self._follow()
         data = np.concatenate(self._parts)[-self._window :]
         expected = np.concatenate(self._parts_expected)[-self._window :]
         self._parts, self._parts_expected = [data], [expected]
@@ -103,6 +106,14 @@ class Plausibility:
             for key, first in self._pending.items()
             if tick - first.tick >= self._confirm
         ]  # fmt: skip
+
+    def _follow(self) -> None:
+        """Let the expected spools follow the blocks since the last look, all at once."""
+        if self._new:
+            data = np.concatenate(self._new)
+            self._new = []
+            self._parts.append(data)
+            self._parts_expected.append(self._expected.follow(data[:, self._command]))
 
     def _findings(
         self, data: Array, expected: Array, roles: Roles, tick: int
@@ -124,9 +135,9 @@ class Plausibility:
     ]:  # fmt: skip
         settings = self._settings
         off = data[:, self._spool] - expected
-        constant = off.mean(axis=0)
-        moving = np.abs(off - constant).mean(axis=0)
-        commanded = np.abs(expected - expected.mean(axis=0)).mean(axis=0)
+        constant = _mean(off)
+        moving = _mean(np.abs(off - constant))
+        commanded = _mean(np.abs(expected - _mean(expected)))
         for j, joint in enumerate(self._rig.joints):
             stroke = joint.valve.spool_stroke
             least = max(settings.spool_floor * stroke, 5.0 * self._noise[self._spool[j]])
@@ -144,8 +155,8 @@ class Plausibility:
         half = len(data) // 2
         piston, spool = data[:, self._piston], data[:, self._spool]
         swing = np.ptp(piston, axis=0)
-        opening = np.abs(spool).mean(axis=0)
-        step = piston[half:].mean(axis=0) - piston[:half].mean(axis=0)
+        opening = _mean(np.abs(spool))
+        step = _mean(piston[half:]) - _mean(piston[:half])
         speed = step * self._rig.sample_rate / (len(data) - half)
         at_rest = (data[:, self._command] == 0.0).all(axis=0)
         for j, (joint, role) in enumerate(zip(self._rig.joints, roles, strict=True)):
@@ -169,18 +180,19 @@ class Plausibility:
         Violation
     ]:  # fmt: skip
         settings, nominal = self._settings, self._rig.supply.pressure
-        supply = nominal if self._supply is None else float(data[:, self._supply].mean())
+        means, peaks = _mean(data).tolist(), np.maximum.reduce(data, axis=0).tolist()
+        supply = nominal if self._supply is None else means[self._supply]
         top = settings.above_supply * max(supply, nominal)
         least = settings.empty_chamber * nominal
         lost = settings.supply_lost * nominal
         excited = any(role.excited for role in roles)
-        if excited and self._supply is not None and data[:, self._supply].max() < lost:
+        if excited and self._supply is not None and peaks[self._supply] < lost:
             yield say(SUPPLY_LOST, self._supply, supply, (lost, math.inf))
         swing = np.ptp(data[:, self._command], axis=0)
         for j, (joint, role) in enumerate(zip(self._rig.joints, roles, strict=True)):
             driven = role.excited and swing[j] > SWING * joint.limits.command
             for column in (self._cap[j], self._rod[j]):
-                mean, peak = float(data[:, column].mean()), float(data[:, column].max())
+                mean, peak = means[column], peaks[column]
                 if mean > top:
                     yield say(ABOVE_SUPPLY, column, mean, (-math.inf, top))
                 if driven and peak < least:
@@ -193,9 +205,21 @@ class Plausibility:
         """
         if self._rig.sample_rate < _SLOWEST_RATE:
             return
-        third = np.diff(data[:, : len(self._noise)], 3, axis=0)
-        seen = np.median(np.abs(third), axis=0) / (_NORMAL_MEDIAN * _THIRD_DIFFERENCE)
-        allowed = self._settings.noise * self._noise
+        x = data[:, : len(self._noise)]
+        size = np.abs(x[3:] - x[:-3] + 3.0 * (x[1:-2] - x[2:-1]))
+        allowed, scale = self._settings.noise * self._noise, _NORMAL_MEDIAN * _THIRD_DIFFERENCE
+        # A median above a bound has half of its samples there: mostly none has, and need not be
+        # sorted. A NaN counts as above.
+        above = len(size) - np.count_nonzero(size <= allowed * scale * (1.0 - 1e-9), axis=0)
+        if not np.count_nonzero(2 * above >= len(size)):
+            return
+        seen = np.median(size, axis=0) / scale
         for column in np.flatnonzero(seen > allowed).tolist():
             bound = float(allowed[column])
             yield say(NOISY, column, float(seen[column]), (-math.inf, bound))
+
+
+def _mean(values: Array) -> Array:
+    """Return the mean over the rows, in a third of the time that numpy's own takes for so few."""
+    total: Array = np.add.reduce(values, axis=0)
+    return total / len(values)

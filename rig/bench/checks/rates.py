@@ -28,10 +28,9 @@ def rate_window(noise: float, limit: float, sample_rate: float) -> int:
 
 @dataclass(frozen=True)
 class Rate:
-    """A bound on |x[k] - x[k-window]| of some columns; a share of it warns."""
+    """A bound on |x[k] - x[k-window]|, (recorded,), infinite where none is set; a share warns."""
 
     limit: str
-    columns: NDArray[np.intp]
     window: int
     bounds: Array
 
@@ -40,16 +39,17 @@ class Rate:
     ) -> tuple[Violation | None, list[Violation]]:
         """Return the first violation of the limit and one per channel past `share` of it.
 
-        `joined` (n, recorded) begins at tick `first`; only its last `new` samples are judged.
+        `joined` (n, recorded) begins at tick `first`; only its last `new` samples are judged. It
+        may hold infinite samples: the caller silences the warning of their difference.
         """
-        values = joined[-(new + self.window) :, self.columns]
+        values = joined[-(new + self.window) :]
         start = first + len(joined) - len(values) + self.window
-        with np.errstate(invalid="ignore"):  # inf - inf: the check of bands names it
-            steps = values[self.window :] - values[: -self.window]
-        near = np.abs(steps) > share * self.bounds
-        if not near.any():
+        steps = values[self.window :] - values[: -self.window]
+        size = np.abs(steps)
+        near = size > share * self.bounds
+        if not np.count_nonzero(near):
             return None, []
-        over = np.abs(steps) > self.bounds
+        over = size > self.bounds
         trip = None
         if over.any():
             trip = self._violation(rig, steps, start, *first_of(over), 1.0)
@@ -62,7 +62,7 @@ class Rate:
     def _violation(
         self, rig: Rig, steps: Array, start: int, row: int, column: int, share: float
     ) -> Violation:
-        name = rig.recorded[self.columns[column]]
+        name = rig.recorded[column]
         per_second = rig.sample_rate / self.window
         bound = share * float(self.bounds[column]) * per_second
         value = float(steps[row, column]) * per_second
@@ -83,12 +83,10 @@ def rates(rig: Rig) -> tuple[Rate, ...]:
         window = rate_window(rig.sensors.of(kind).noise, limit, rig.sample_rate)
         what = "piston speed" if kind == ch.PISTON else "pressure rate"
         limits_by_window.setdefault((what, window), []).append((column, limit))
-    return tuple(
-        Rate(
-            what,
-            np.array([column for column, _ in entries]),
-            window,
-            np.array([limit for _, limit in entries]) * (window / rig.sample_rate),
-        )
-        for (what, window), entries in limits_by_window.items()
-    )
+    made = []
+    for (what, window), entries in limits_by_window.items():
+        bounds = np.full(len(rig.recorded), math.inf)
+        for column, limit in entries:
+            bounds[column] = limit * (window / rig.sample_rate)
+        made.append(Rate(what, window, bounds))
+    return tuple(made)

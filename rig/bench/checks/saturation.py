@@ -39,7 +39,7 @@ class Saturation:
         self, marks: NDArray[np.bool_], measured: NDArray[np.float64], tick: int
     ) -> Violation | None:
         """Return the first channel too long at an end; marks and measured are (n, channels)."""
-        if not marks.any():
+        if not np.count_nonzero(marks):
             self._runs[:] = 0
             return None
         runs = run_lengths(marks, self._runs)

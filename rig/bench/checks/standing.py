@@ -38,6 +38,8 @@ class Standing:
 
     def expire(self, now: int) -> None:
         """Let go of the warnings whose cause has been away for the patience."""
+        if not self._last:
+            return
         for key, last in list(self._last.items()):
             if now - last >= self._patience:
                 del self._last[key], self.warnings[key]

@@ -76,13 +76,11 @@ class Display:
         self._waiting.append(block.data)
         if self._first is None:
             self._first = block.tick
-        done = (block.tick - self._first) / self._rig.sample_rate
-        self.progress = replace(self.progress, done_s=done)
         self._tick = block.tick + len(block.data)
         self._lost, self._roles = lost, roles
         if self.trip is not None or self._clock() >= self._next:
-            self._publish(runstate.RUNNING if self.trip is None else runstate.TRIPPED, age)
             self._next = self._clock() + _INTERVAL
+            self._publish(runstate.RUNNING if self.trip is None else runstate.TRIPPED, age)
 
     def _publish(self, state: str, age: float) -> None:
         if self._publisher is None:
@@ -92,6 +90,11 @@ class Display:
         self._waiting = []
         device_time = self._tick / self._rig.sample_rate
         self._past.add(device_time, samples)
+        if state == runstate.RUNNING and not self._publisher.watched:
+            return  # nobody looks: whoever comes gets the past and what is new then
+        if self._first is not None:
+            done = (self._tick - self._first) / self._rig.sample_rate
+            self.progress = replace(self.progress, done_s=done)
         limits, warnings = self._both_bands()
         view = BenchView(
             run=self._run,

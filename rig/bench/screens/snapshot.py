@@ -154,7 +154,7 @@ def take_snapshot(
             unit, *limits[name], last, low[:, column].tolist(), high[:, column].tolist(), *near
         )
     shown = {name: getattr(view, name) for name in view.__dataclass_fields__}
-    return Snapshot(pid=os.getpid(), channels=channels, **shown, **asdict(progress))
+    return Snapshot(pid=os.getpid(), channels=channels, **shown, **vars(progress))
 
 
 def _alarm(view: dict[str, Any]) -> Alarm:
@@ -164,7 +164,11 @@ def _alarm(view: dict[str, Any]) -> Alarm:
 
 def to_json(snapshot: Snapshot) -> bytes:
     """Write a snapshot as JSON."""
-    return json.dumps(asdict(snapshot)).encode()
+    # Without `asdict` for all of it, whose copies of every number cost three times the rest.
+    data = dict(vars(snapshot))
+    data["channels"] = {name: vars(view) for name, view in snapshot.channels.items()}
+    data["alarms"] = [asdict(alarm) for alarm in snapshot.alarms]
+    return json.dumps(data).encode()
 
 
 def from_json(raw: bytes) -> Snapshot:

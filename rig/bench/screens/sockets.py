@@ -121,6 +121,11 @@ def _sessions(folder: Path) -> list[Endpoint]:
     return found
 
 
+def _pending(socket: zmq.Socket[bytes]) -> bool:
+    """Whether a message has come."""
+    return bool(int(socket.get(zmq.EVENTS)) & zmq.POLLIN)
+
+
 class Publisher:
     """The run's side; raises AttachError if its sockets cannot be made."""
 
@@ -135,8 +140,9 @@ class Publisher:
         self._closed = False
         self._holder = Holder()
         self.past: Callable[[], tuple[dict[str, Any], bytes]] | None = None
+        self._watched = False
         try:
-            self._pub = self._bind(zmq.PUB, self.endpoint.pub)
+            self._pub = self._bind(zmq.XPUB, self.endpoint.pub)  # it hears who subscribes
             self._cmd = self._bind(zmq.REP, self.endpoint.cmd)
         except zmq.ZMQError as error:
             self._context.destroy(linger=0)
@@ -154,6 +160,14 @@ class Publisher:
         made.bind(_address(path))
         return made
 
+    @property
+    def watched(self) -> bool:
+        """Whether any screen is attached: else a snapshot need not be made."""
+        with suppress(zmq.ZMQError):
+            while _pending(self._pub):  # the first to come, the last to go
+                self._watched = self._pub.recv(zmq.NOBLOCK)[:1] == b"\1"
+        return self._watched
+
     def publish(self, snapshot: Snapshot) -> None:
         """Offer a snapshot to whoever watches; never waits."""
         with suppress(zmq.ZMQError):
@@ -167,6 +181,8 @@ class Publisher:
         found: list[Command] = []
         for _ in range(_COMMANDS_AT_ONCE):
             try:
+                if not _pending(self._cmd):  # cheaper than an exception
+                    break
                 raw = self._cmd.recv_multipart(zmq.NOBLOCK)[0]
             except zmq.ZMQError:
                 break

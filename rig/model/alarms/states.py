@@ -172,12 +172,13 @@ def folded(table: AlarmTable) -> tuple[tuple[Alarm, tuple[Alarm, ...]], ...]:
     """Return (first cause, its consequences) in the order of urgency.
 
     Above: what nobody has acknowledged, then what trips (or whose consequence does), then what is
-    older.
+    older. A consequence whose first cause is not in the table stands for itself.
     """
+    standing = {alarm.key for alarm in table.alarms}
     groups = [
         (first, tuple(alarm for alarm in table.alarms if alarm.cause == first.key))
         for first in table.alarms
-        if not first.cause
+        if first.cause not in standing
     ]
 
     def urgency(group: tuple[Alarm, tuple[Alarm, ...]]) -> tuple[bool, bool, float]:
