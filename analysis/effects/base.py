@@ -7,7 +7,7 @@ squares; at most two shape parameters are searched within physical bounds.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -33,6 +33,7 @@ class Shape:
     `resolution` the low bound is only what data resolve: to lie there contradicts nothing. A
     `detail` of the form stands last, and a shape may do without it: it is searched only where the
     records ask for it, makes no explanation less simple than another, and at a bound refuses none.
+    What is `fixed`, a knot of a curve, is placed by the data beforehand and never searched.
     """
 
     parameter: str
@@ -43,6 +44,7 @@ class Shape:
     neutral: float | None = None
     resolution: bool = False
     detail: bool = False
+    fixed: bool = False
 
     def given(self, value: float) -> bool:
         """Whether a form has this parameter; at 0 below its bounds it does without."""
@@ -52,6 +54,23 @@ class Shape:
     def middle(self) -> float:
         """The middle point of first look."""
         return self.grid[len(self.grid) // 2]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the records offer an effect that chooses its points of first look by the data.
+
+    `signals` are those of each averaged record that a joint moves in, as the model sees them;
+    `left` holds its residual by equation: instants (m,) [s] and whitened residual (m,).
+    """
+
+    signals: Sequence[Signals]
+    left: Sequence[Mapping[str, tuple[Array, Array]]]
+
+    def of_joint(self, joint: int, values: Callable[[Signals], Array]) -> Array:
+        """Return values (n,) of all records in which a joint moves."""
+        found = [values(s) for s in self.signals if s.moving is None or s.moving[joint]]
+        return np.concatenate(found) if found else np.zeros(0)
 
 
 @dataclass(frozen=True)
@@ -66,10 +85,16 @@ class Effect(Term):
     `prepare` changes: rows of others need not be built again for another shape. `hydraulic` marks
     what acts on oil, valve or cylinder, and is not for electric joints. `least` and `least_shape`
     are the coefficients and shapes [SI] of the smallest size that a person would want to know of on
-    a bench of some kW at some MPa.
+    a bench of some kW at some MPa. `mechanism` is where in the physics it acts; `free` marks a
+    mechanism without a name for its form, whose curve the data draw (see `curve`): no candidate as
+    long as a named effect explains the records. `by_data` says that its points of first look follow
+    from the records (`points`).
     """
 
     family: ClassVar[str] = ""
+    mechanism: ClassVar[str] = ""
+    free: ClassVar[bool] = False
+    by_data: ClassVar[bool] = False
     least: ClassVar[tuple[float, ...]] = ()
     least_shape: ClassVar[tuple[float, ...]] = ()
     variable: ClassVar[str] = ""
@@ -129,6 +154,10 @@ class Effect(Term):
         """Name the shape parameters; their number does not depend on the rig."""
         return ()
 
+    def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
+        """Return the shapes of first look of an effect that takes them from the data."""
+        raise NotImplementedError
+
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Say why sign or size of the fitted parameters is not physical ('' if it is).
 
@@ -176,7 +205,7 @@ class Effect(Term):
         A detail of the form is not asked: it says nothing of whether the effect is there.
         """
         for s, value in zip(self.shapes(rig)[: len(shape)], shape, strict=True):
-            if s.detail or not s.given(value):
+            if s.detail or s.fixed or not s.given(value):
                 continue
             margin = 1e-3 * (s.high - s.low)
             allowed = s.resolution or s.neutral == s.low

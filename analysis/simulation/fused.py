@@ -171,14 +171,14 @@ class _Lines:
 def _observe(body: _Lines, electric: Sequence[bool]) -> None:
     """Write what all terms see: inputs at t, the joints' geometry, chambers, volumes."""
     N = len(electric)
-    width = 2 + 4 * N
+    width = 3 + 4 * N
     body.add(
         "place = min(max(t * rate, 0.0), n - 1.0)",
         "low = min(int(place), n - 2)",
         "w = place - low",
         f"a = low * {width}",
         f"b = a + {width}",
-        f"bench{TIME} = t",
+        f"bench{TIME} = inputs[{width - 1}] + t",
         f"bench{P_S} = inputs[a] + w * (inputs[b] - inputs[a])",
         f"bench{P_TANK} = 0.0",
         f"bench{TEMPERATURE} = inputs[a + 1] + w * (inputs[b + 1] - inputs[a + 1])",

@@ -72,7 +72,7 @@ def _observe(t, y, inputs, rate, locked, geometry, bench, x, q_dd):  # type: ign
     place = min(max(t * rate, 0.0), inputs.shape[0] - 1.0)
     low = min(int(place), inputs.shape[0] - 2)
     w = place - low
-    bench[TIME] = t
+    bench[TIME] = inputs[0, 2 + 4 * N] + t  # since the record began
     bench[P_S] = inputs[low, 0] + w * (inputs[low + 1, 0] - inputs[low, 0])
     bench[P_TANK] = 0.0
     bench[TEMPERATURE] = inputs[low, 1] + w * (inputs[low + 1, 1] - inputs[low, 1])
@@ -179,7 +179,7 @@ def _rates(t, y_at, dy_at, inputs_at, n, rate, locked_at, geometry_at, par_at, c
     prepares, addresses = layout[2 * terms + 2 : 3 * terms + 2], layout[3 * terms + 2 :]
     size = 4 * N + hidden_ends[terms]
     y, dy, par = carray(y_at, (size,)), carray(dy_at, (size,)), carray(par_at, (ends[terms],))
-    inputs = carray(inputs_at, (n, 2 + 4 * N))
+    inputs = carray(inputs_at, (n, 3 + 4 * N))
     locked, geometry = carray(locked_at, (N,)), carray(geometry_at, (N, COLUMNS))
     scratch = carray(work, (4 + 17 * N + N * N,))
     bench = scratch[:4]

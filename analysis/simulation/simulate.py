@@ -57,8 +57,9 @@ class DrivingInput:
 
     @functools.cached_property
     def inputs(self) -> Array:
-        """Everything as the right-hand side reads it: (n, 2 + 4 N)."""
-        parts = (self.p_s, self.temperature, self.u, self.q, self.qd, self.qdd)
+        """Everything as the right-hand side reads it: (n, 3 + 4 N)."""
+        time = np.arange(len(self.u)) / self.rate
+        parts = (self.p_s, self.temperature, self.u, self.q, self.qd, self.qdd, time)
         return np.ascontiguousarray(np.column_stack(parts))
 
 

@@ -18,7 +18,7 @@ from analysis.regression.conditioned import ConditionedRecord
 from analysis.simulation.model import Model
 from analysis.terms import baseline_of
 from analysis.terms.base import FAMILIES, Used
-from analysis.trace.data.candidates import catalogue, variants
+from analysis.trace.data.candidates import catalogue
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.noise_floor import STATED
 from analysis.trace.data.regression_data import RegressionData, regression_data
@@ -90,7 +90,7 @@ def trace(
     _refuse_short(train_data, train)
     holdout_data = regression_data(rig, terms, judged, train_data.beta)
     candidates = _unknown(catalogue(rig) if effects is None else effects, known)
-    hypotheses = HypothesisSet(train_data, variants(rig, candidates))
+    hypotheses = HypothesisSet(train_data, candidates)
     before = stripped(identify(runs, terms=terms, estimator=PLAIN).model)
     notes = _notes(train_data, holdout_data)
     quiet = within(hypotheses.empty.excess_energy, hypotheses.limits)
@@ -248,6 +248,8 @@ def _named(
         found, winner, rest = wider, more, later
     if any(r.veto for r in rest):
         return (*found, *refused), winner, UNEXPLAINED, rest
+    if not winner.effects:  # what is left is too little for any effect to be needed
+        return refused, winner, CLEAN, rest
     return found, winner, CONFOUNDED if _tied(found) else EXPLAINED, rest
 
 

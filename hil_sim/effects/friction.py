@@ -1,4 +1,4 @@
-"""Dry friction of the cylinders' seals: levels by cause, in one of four forms."""
+"""Friction of the cylinders' seals: dry, levels by cause in one of four forms; viscous, by way."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 from hil_sim.effects.base import PlantEffect, Tables, in_unit
 from rig.model.quantity import Length, Speed
 
+Drag = Annotated[float, in_unit("N*s/m")]
 Force = Annotated[float, in_unit("N")]
 ForcePerPressure = Annotated[float, in_unit("N/Pa")]
 PerLength = Annotated[float, in_unit("m^-1")]
@@ -116,3 +117,37 @@ class PressureDependentFriction(_Friction):
         """Put the effect into the plant's tables."""
         t.joints["friction_pressure"][self.joint] += self.coefficient
         self.seal(t, self.coefficient * t.rig.supply.pressure)
+
+
+class AsymmetricViscousFriction(PlantEffect):
+    """Viscous friction beyond the joint's that differs with direction.
+
+    ``seal`` drags at the piston, ``bearing`` at the joint (by the same slopes at mid-stroke),
+    ``thinning`` at the piston with a film that thins as it is sheared: c v / (1 + |v| / 0.5 m/s).
+    """
+
+    drawn_at = "joint"
+    sizes: ClassVar = {"extending": (150.0, 500.0), "retracting": (20.0, 60.0)}
+    forms = ("seal", "bearing", "thinning")
+    name: Literal["asymmetric_viscous_friction"]
+    where: str
+    extending: Drag = Field(ge=0)
+    retracting: Drag = Field(ge=0)
+    form: Literal["seal", "bearing", "thinning"] = "seal"
+
+    @model_validator(mode="after")
+    def _differ(self) -> Self:
+        if self.extending == self.retracting:
+            raise ValueError("extending and retracting are equal: that is the joint's own Fv")
+        return self
+
+    def apply(self, t: Tables) -> None:
+        """Put the effect into the plant's tables."""
+        t.joints["drag_plus"][self.joint] += self.extending
+        t.joints["drag_minus"][self.joint] += self.retracting
+        t.joints["drag_thinning"][self.joint] = 2.0 if self.form == "thinning" else 0.0
+        if self.form == "bearing":
+            lever = t.rig.joints[self.joint or 0].linkage.jacobian(
+                t.rig.joints[self.joint or 0].linkage.angle(0.0)
+            )
+            t.joints["drag_lever"][self.joint] = abs(float(lever))

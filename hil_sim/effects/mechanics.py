@@ -1,4 +1,4 @@
-"""Effects on the arm: an inclined base, a payload, a spring, a constant torque."""
+"""Effects on the arm: an inclined base, a payload, a spring, a constant or a periodic torque."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from hil_sim.effects.base import PlantEffect, Tables, in_unit
-from rig.model.quantity import Angle
+from rig.model.quantity import Angle, Frequency
 
 Torque = Annotated[float, in_unit("N*m")]
 Mass = Annotated[float, in_unit("kg")]
@@ -88,3 +88,25 @@ class TorqueOffset(PlantEffect):
     def apply(self, t: Tables) -> None:
         """Put the effect into the plant's tables."""
         t.joints["torque_offset"][self.joint] += self.torque
+
+
+class PeriodicDisturbance(PlantEffect):
+    """A torque of one frequency that begins with the joint's excitation.
+
+    ``sine``, ``triangle``, or ``pulses``: a sine raised to its fifth power.
+    """
+
+    drawn_at = "joint"
+    sizes: ClassVar = {"torque": (1.0, 6.0), "frequency": (2.0, 12.0)}
+    forms = ("sine", "triangle", "pulses")
+    name: Literal["periodic_disturbance"]
+    where: str
+    torque: Torque = Field(gt=0)
+    frequency: Frequency = Field(gt=0, le=200)
+    form: Literal["sine", "triangle", "pulses"] = "sine"
+
+    def apply(self, t: Tables) -> None:
+        """Put the effect into the plant's tables."""
+        t.joints["wave_torque"][self.joint] = self.torque
+        t.joints["wave_rate"][self.joint] = self.frequency
+        t.joints["wave_form"][self.joint] = float(self.forms.index(self.form))

@@ -9,7 +9,7 @@ q, q rate, z cap, z rod, bristle (N each), z supply, z manifold, tank pressure. 
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import copysign, cos, exp, sin, sqrt, tanh
+from math import asin, copysign, cos, exp, pi, sin, sqrt, tanh
 from typing import Any, ParamSpec, TypeVar
 
 import numba
@@ -126,6 +126,29 @@ def bristle(deflection: float, s: float, v: float, p_cap: float, p_rod: float, j
     relax = abs(v) * joint.bristle_stiffness / level(s, v, p_cap, p_rod, joint)
     rate = (v - relax * deflection) / (1.0 + relax / joint.bristle_limit)
     return joint.bristle_stiffness * deflection + joint.bristle_damping * rate, rate
+
+
+@jit
+def drag(v: float, lever: float, joint: Any) -> float:
+    """Return viscous friction beyond the joint's against extension [N], by direction.
+
+    At the piston, its film thinning with the shear where `drag_thinning` [s/m] is set; or at the
+    joint, where `drag_lever` [m] is the lever at which the slopes are those of the piston.
+    """
+    slope = joint.drag_plus if v > 0.0 else joint.drag_minus
+    if joint.drag_lever > 0.0:
+        ratio = joint.drag_lever / lever
+        return float(slope * v * ratio * ratio)
+    return float(slope * v / (1.0 + joint.drag_thinning * abs(v)))
+
+
+@jit
+def wave(cycles: float, form: float) -> float:
+    """Return a periodic torque's share of its amplitude after so many cycles."""
+    turn = sin(2.0 * pi * cycles)
+    if form == 1.0:
+        return 2.0 / pi * asin(turn)
+    return turn**5 if form == 2.0 else turn
 
 
 @jit
@@ -265,9 +288,11 @@ def rates(
         elif j.bristle_stiffness > 0.0:
             friction, dy[4 * n + i] = bristle(y[4 * n + i], s, v, p_cap, p_rod, j)
             force -= friction
+        if j.drag_plus != j.drag_minus:
+            force -= drag(v, lever, j)
         twist = y[i] - j.spring_rest
         spring = j.spring * twist * (1.0 + j.spring_hardening * twist * twist)
-        torque[i] = lever * force - j.viscous * y[n + i] - spring + j.torque_offset
+        torque[i] = lever * force - j.viscous * y[n + i] - spring + j.torque_offset + j.wave_now
 
         dy[i] = y[n + i]
         sin_q = sin_b * j.cos_offset - cos_b * j.sin_offset

@@ -49,7 +49,8 @@ JOINT: Final = _records(
     "contact_stiffness contact_damping "
     "friction_plus friction_minus stribeck stribeck_speed friction_pressure friction_scale "
     "friction_taper friction_width friction_corner bristle_stiffness bristle_damping "
-    "bristle_limit "
+    "bristle_limit drag_plus drag_minus drag_thinning drag_lever "
+    "wave_torque wave_rate wave_form wave_now "
     "output_top output_range",
 )
 BENCH: Final = _records(

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from hil_sim.plant.kernel import jit, pressure, rates
+from hil_sim.plant.kernel import jit, pressure, rates, wave
 from hil_sim.plant.kernel_data import ATMOSPHERE, KIND
 
 _PISTON = KIND["piston"]
@@ -251,6 +251,13 @@ def run(
                 max(target[i] * joints[i].spool_gain, -joints[i].spool_stroke),
                 joints[i].spool_stroke,
             )
-        for _ in range(substeps):
-            step(y, spool, target, period / substeps, warmth, joints, bench, inertia, w, k, ends)
+        h = period / substeps
+        for part in range(substeps):
+            for i in range(n):
+                # Held over a step at its middle: the step is short beside any such wave.
+                if joints[i].wave_torque > 0.0:
+                    time = (tick - laws[i].start) * period + (part + 0.5) * h
+                    turned = wave(joints[i].wave_rate * time, joints[i].wave_form)
+                    joints[i].wave_now = joints[i].wave_torque * turned
+            step(y, spool, target, h, warmth, joints, bench, inertia, w, k, ends)
         tick += 1

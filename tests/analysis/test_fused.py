@@ -93,7 +93,7 @@ class Evaluated:
         y = np.concatenate(
             (q, rng.normal(0, 0.5, N), pressures, rng.normal(0, 1e-5, sum(self.hidden)))
         )
-        inputs = rng.normal(0, 0.05, (5, 2 + 4 * N))
+        inputs = rng.normal(0, 0.05, (5, 3 + 4 * N))
         inputs[:, 0], inputs[:, 1] = rng.uniform(6e6, 8e6, 5), rng.uniform(20, 60, 5)
         inputs[:, 2 + N : 2 + 2 * N] += q
         return {

@@ -94,7 +94,10 @@ def test_every_form_runs_and_moves_the_bench_otherwise(kind) -> None:
     more = ", speed: 20 mm/s" if kind.effect_name() == "stribeck_friction" else ""
     more = ", retracting: 10 N" if kind.effect_name() == "asymmetric_friction" else more
     unit = {"force": "N", "extending": "N", "coefficient": "N/Pa", "width": "V",
-            "line_drop": "Pa", "fraction": ""}[key]  # fmt: skip
+            "line_drop": "Pa", "fraction": "", "torque": "N*m"}[key]  # fmt: skip
+    if kind.effect_name() == "asymmetric_viscous_friction":
+        unit, more = "N*s/m", ", retracting: 10 N*s/m"
+    more = ", frequency: 7 Hz" if kind.effect_name() == "periodic_disturbance" else more
     where = "" if kind.drawn_at == "bench" else "where: joint 2, "
     runs = []
     for form in kind.forms:

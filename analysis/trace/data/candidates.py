@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from analysis.effects.base import Effect, shapes_of
+from analysis.effects.base import Effect, Evidence, shapes_of
 from analysis.terms import known
 from analysis.terms.base import Used
 from rig.model.rig import Rig
@@ -35,17 +35,28 @@ class Variant:
 
 
 def catalogue(rig: Rig, names: Sequence[str] | None = None) -> list[Effect]:
-    """Return every effect of the catalogue, or those named, at every place it can be at."""
+    """Return every named effect of the catalogue, or those `names`, at every place it can be at."""
     return [
         kind(where)
         for name, kind in sorted(known().items())
-        if issubclass(kind, Effect) and (names is None or name in names)
+        if issubclass(kind, Effect) and (not kind.free if names is None else name in names)
         for where in kind.places(rig)
     ]
 
 
-def points(effect: Effect, rig: Rig) -> list[tuple[float, ...]]:
-    """Return the shape grid of an effect, thinned where it has too many points."""
+def free_mechanisms(rig: Rig) -> list[Effect]:
+    """Return every mechanism whose form the data draw, at every place it can be at."""
+    kinds = [kind for _, kind in sorted(known().items()) if issubclass(kind, Effect) and kind.free]
+    return [kind(where) for kind in kinds for where in kind.places(rig)]
+
+
+def points(effect: Effect, rig: Rig, evidence: Evidence | None = None) -> list[tuple[float, ...]]:
+    """Return the shape grid of an effect, thinned where it has too many points.
+
+    Of an effect that takes its points from the data, those; none without `evidence`.
+    """
+    if effect.by_data:
+        return list(effect.points(rig, evidence)) if evidence is not None else []
     axes = [shape.grid for shape in effect.shapes(rig) if not shape.detail]
     grid = list(itertools.product(*axes))
     if len(grid) > MOST_POINTS:
@@ -60,9 +71,11 @@ def points(effect: Effect, rig: Rig) -> list[tuple[float, ...]]:
     return grid
 
 
-def variants(rig: Rig, effects: Sequence[Effect]) -> list[Variant]:
+def variants(
+    rig: Rig, effects: Sequence[Effect], evidence: Evidence | None = None
+) -> list[Variant]:
     """Return every candidate at every point of its grid."""
-    return [Variant(effect, shape) for effect in effects for shape in points(effect, rig)]
+    return [Variant(effect, shape) for effect in effects for shape in points(effect, rig, evidence)]
 
 
 def complexity(rig: Rig, used: Sequence[Used]) -> tuple[int, int]:
@@ -71,7 +84,8 @@ def complexity(rig: Rig, used: Sequence[Used]) -> tuple[int, int]:
     Details of a form do not count.
     """
     free = sum(
-        len(u.term.coefficients(rig)) + sum(not shape.detail for shape in shapes_of(rig, u))
+        len(u.term.coefficients(rig))
+        + sum(not (shape.detail or shape.fixed) for shape in shapes_of(rig, u))
         for u in used
     )
     return len(used), free

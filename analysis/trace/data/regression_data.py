@@ -17,6 +17,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.effects.base import Evidence
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.rows import Rows
 from analysis.signals.conditioning import Signals, condition
@@ -191,6 +192,19 @@ class VariantColumns:
     names: tuple[str, ...]
     columns: Array
     touched: frozenset[str]
+
+
+def evidence(data: RegressionData, residual: Array) -> Evidence:
+    """Return what the board's records offer effects that look at the data first.
+
+    `residual` (M,) is what a model leaves on the board.
+    """
+    left: list[dict[str, tuple[Array, Array]]] = []
+    for conditioned, rows in zip(data.records, data.rows, strict=True):
+        own = [s for s in data.segments if s.group == conditioned.group]
+        left.append({s.equation: (rows[s.equation].time, residual[s.where]) for s in own})
+    signals = [prepared(data.rig, data.terms, conditioned) for conditioned in data.records]
+    return Evidence(signals, left)
 
 
 def variant_columns(data: RegressionData, chosen: Sequence[Variant]) -> list[VariantColumns]:

@@ -216,7 +216,7 @@ class Ground:
             found += [c[:, None] for c in self.columns(used).values()]
             for j, shape in enumerate(shapes_of(self.stage.rig, used)):
                 value = used.shape[j]
-                if not shape.given(value):
+                if shape.fixed or not shape.given(value):
                     continue
                 step = SHAPE_STEP * (abs(value) or shape.high - shape.low)
                 near = value + step if value + step <= shape.high else value - step

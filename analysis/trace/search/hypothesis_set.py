@@ -16,8 +16,13 @@ from numpy.typing import NDArray
 from analysis.effects.base import Effect
 from analysis.terms import make
 from analysis.terms.base import Used
-from analysis.trace.data.candidates import Variant, complexity
-from analysis.trace.data.regression_data import RegressionData, VariantColumns, variant_columns
+from analysis.trace.data.candidates import Variant, complexity, variants
+from analysis.trace.data.regression_data import (
+    RegressionData,
+    VariantColumns,
+    evidence,
+    variant_columns,
+)
 from analysis.trace.search import linear_fit
 from analysis.trace.search.hypothesis import (
     Hypothesis,
@@ -42,10 +47,10 @@ DEEPEST = 3  # effects in a set found by extension
 class HypothesisSet:
     """Sets of effects on one stage, fitted exactly once each."""
 
-    def __init__(self, data: RegressionData, effects: Sequence[Variant]) -> None:
+    def __init__(self, data: RegressionData, effects: Sequence[Effect]) -> None:
         self.stage = data
         self.base = tuple(data.terms)
-        self.variants = tuple(effects)
+        self.effects = tuple(effects)
         self.limits = limits(data)
         self.listed: dict[frozenset[Key], Hypothesis] = {}
         self.empty = self._listed((), fit(data, self.base))
@@ -55,6 +60,11 @@ class HypothesisSet:
         return Hypothesis(
             effects, found, excess_of(self.stage, found.residual), complexity(rig, effects)
         )
+
+    def _variants(self, data: RegressionData, residual: Array) -> list[Variant]:
+        """Return the candidates' points of first look on a board that leaves a residual (M,)."""
+        seen = evidence(data, residual) if any(e.by_data for e in self.effects) else None
+        return variants(data.rig, self.effects, seen)
 
     def physical(self, one: Hypothesis) -> str:
         """Say why a set is not physical ('' if it is)."""
@@ -117,7 +127,7 @@ class HypothesisSet:
 
     def run(self) -> Hypothesis:
         """Search: singles and pairs from the first board, then extensions; returns the winner."""
-        found = variant_columns(self.stage, self.variants)
+        found = variant_columns(self.stage, self._variants(self.stage, self.stage.mean))
         field = self._field(self.stage, found)
         r = self.stage.mean
         r = r - field.basis @ (field.basis.T @ r)
@@ -208,7 +218,8 @@ class HypothesisSet:
         """
         data = rebased(self.stage, now.fit)
         taken = now.keys
-        found = variant_columns(data, [v for v in self.variants if v.key not in taken])
+        looks = self._variants(data, now.fit.residual)
+        found = variant_columns(data, [v for v in looks if v.key not in taken])
         mask = np.ones(len(now.fit.residual))
         for s in data.segments:
             mask[s.where] = not equations or s.equation in equations

@@ -186,7 +186,7 @@ def _free(data: RegressionData, terms: Sequence[Used]) -> list[tuple[int, int, S
         for k, u in enumerate(terms)
         if u not in data.terms
         for j, s in enumerate(shapes_of(data.rig, u))
-        if s.given(u.shape[j])
+        if s.given(u.shape[j]) and not s.fixed
     ]
 
 
@@ -240,7 +240,7 @@ def jacobian(data: RegressionData, model: ExactFit, used: Used) -> tuple[tuple[s
     own = [c.parameter for c in used.term.coefficients(data.rig)]
     names, columns = list(own), [rows.matrix[:, rows.names.index(n)] for n in own]
     for j, shape in enumerate(shapes_of(data.rig, used)):
-        if not shape.given(used.shape[j]):
+        if shape.fixed or not shape.given(used.shape[j]):
             continue
         step = 1e-3 * (shape.high - shape.low)
         if _logarithmic(shape):

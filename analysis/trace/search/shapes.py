@@ -10,7 +10,7 @@ from analysis.identify import checks as ck
 from analysis.terms.base import Used
 from analysis.trace.data.candidates import points
 from analysis.trace.data.conditioned_record import conditioned_records
-from analysis.trace.data.regression_data import regression_data
+from analysis.trace.data.regression_data import evidence, regression_data
 from analysis.trace.data.temperature_nuisance import temperature_terms
 from analysis.trace.search.refinement import fit, refine
 from rig.model.records import Run
@@ -34,9 +34,11 @@ def with_shapes(runs: Sequence[Run], terms: Sequence[Used]) -> tuple[Used, ...]:
         rig, (*known, *temperature_terms(known, runs)), conditioned_records(rig, runs)
     )
     found: tuple[Used, ...] = ()
+    seen = evidence(data, data.mean)
     for used in wanted:
         assert isinstance(used.term, Effect)
-        trials = [(*data.terms, *found, Used(used.term, p)) for p in points(used.term, rig)]
+        looks = points(used.term, rig, seen)
+        trials = [(*data.terms, *found, Used(used.term, p)) for p in looks]
         # The least before the search need not be it afterwards: edges that no spool reaches leave
         # little, and nothing to search along.
         near = sorted(trials, key=lambda trial: fit(data, trial).energy)[:STARTS]

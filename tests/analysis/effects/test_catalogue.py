@@ -31,6 +31,7 @@ CONTRACT = {
     "valve_deadband", "spool_offset", "underlap_leakage", "spool_lag",
     "internal_leakage", "external_leakage", "supply_sag", "tank_pressure", "entrained_air",
     "dead_volume", "channel_delay", "sensor_gain", "sensor_offset",
+    "asymmetric_viscous_friction", "periodic_disturbance",
 }  # fmt: skip
 
 
@@ -130,7 +131,7 @@ def observed(signals: Signals, k: int) -> tuple[np.ndarray, np.ndarray]:
     """The simulation's view of one sample: `x` and `bench`."""
     fields = ("q", "qd", "theta", "G", "s", "sd", "u", "p_cap", "p_rod", "V_cap", "V_rod")
     x = np.array([getattr(signals, field)[k] for field in fields])
-    return x, np.array([0.0, signals.p_s[k], signals.p_tank[k], 40.0])
+    return x, np.array([signals.t[k], signals.p_s[k], signals.p_tank[k], 40.0])
 
 
 def hidden_state(e: Effect, rig: Rig, signals: Signals, shape: tuple[float, ...]) -> np.ndarray:
@@ -270,6 +271,10 @@ REFUSED = [
     ("asymmetric_friction", "joint 1", {"F_ext_1": 80.0, "F_ret_1": -30.0}, (4e-5,)),
     ("asymmetric_friction", "joint 1", {"F_ext_1": 80.0, "F_ret_1": 79.0}, (4e-5,)),
     ("pressure_dependent_friction", "joint 1", {"k_friction_1": -1e-5}, (4e-5,)),
+    ("asymmetric_viscous_friction", "joint 2", {"c_ext_2": 40.0, "c_ret_2": -3000.0}, ()),
+    ("asymmetric_viscous_friction", "joint 2", {"c_ext_2": 40.0, "c_ret_2": 39.0}, ()),
+    ("periodic_disturbance", "joint 2", {"T_sin_2": 1e4, "T_cos_2": 0.0}, (7.0,)),
+    ("periodic_disturbance", "joint 2", {"T_sin_2": 1.0, "T_cos_2": 0.0}, (60.0,)),
     ("base_inclination", "bench", {}, (0.35,)),
     ("payload", "bench", {"m_payload": -1.0}, ()),
     ("joint_spring", "joint 2", {"k_spring_2": -30.0}, (-1.44,)),

@@ -2,19 +2,23 @@
 
 Dry friction is a function of the velocity at the same instant (a hyperbolic tangent, an algebraic
 sigmoid, or Karnopp's band of standstill), never of the path; the supply sags in proportion to the
-flow drawn; a leak is laminar. The equations of motion are those of `docs`' NOTES with joint 1
-standing at mid-stroke, typed in again, integrated by a Runge-Kutta of fixed step. Sensors are
-sampled at their own instants and get white noise.
+flow drawn, at once or behind a lag; a leak is laminar or goes by the root of the pressure. Viscous
+friction may have slopes by direction or a cube; a spring may harden; a spool may have play and its
+edges a taper; the return may stand under the pressure of a laminar line; oil may stiffen with
+pressure. The equations of motion are those of `docs`' NOTES with joint 1 standing at mid-stroke,
+typed in again, integrated by a Runge-Kutta of fixed step. Sensors are sampled at their own
+instants, may lag, be late or see each other, and get white noise.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from rig.model.records import Run
 from rig.model.rig import Rig
@@ -29,6 +33,12 @@ CENTRING = 0.3  # [V/m] that keep the piston about mid-stroke
 PUMP = 11.7e-3 / 60  # [m^3/s]
 RMS = 0.03  # [V] of the spool in training records; held-out ones have seven tenths
 TANH, SIGMOID, KARNOPP = range(3)
+(
+    AHEAD, ASTERN, WIDTH, FORM, BREAKAWAY, STRIBECK, LEAK, SAG, DRAG_AHEAD, DRAG_ASTERN, DRAG_CUBED,
+    SPRING, HARDENING, HUM, HUM_FREQUENCY, HUM_POWER, LEAK_ROOT, TAPER, PLAY, BACK, SAG_LAG,
+    STIFFER, BACK_POWER,
+) = range(23)  # fmt: skip
+MIDDLE = -1.44  # [rad] where springs are at rest
 
 
 @dataclass(frozen=True)
@@ -38,7 +48,15 @@ class Hidden:
     `ahead`, `astern` [N] are the levels of dry friction extending and retracting, `width` [m/s]
     the speed of its transition in the given `form`, `breakaway` [N] what it holds more near
     standstill, gone above `stribeck` [m/s]; `leak` [m^3/(s Pa)] is past the piston; `sag` [Pa] is
-    the drop of the supply at the pump's whole flow.
+    the drop of the supply at the pump's whole flow, behind a lag of `sag_lag` [s].
+
+    `drag_ahead`, `drag_astern` [N s/m] are slopes of viscous friction by direction, `drag_cubed`
+    [N s^3/m^3] goes with the cube of the speed; `spring` [N m/rad] and `hardening` [N m/rad^3] pull
+    at the joint about -1.44 rad; `hum` [N m] is a torque of `hum_frequency` [Hz] that begins with
+    the record, its sine raised to `hum_power`; `leak_root` [m^3/(s Pa^0.5)]; `taper` [1/V]: an
+    opening of x + taper x |x|; `play` [V] of the spool behind its sensor, half of it either way;
+    `back` [Pa] is the return's pressure at the pump's flow, which rises with the flow to the
+    `back_power`; `stiffer` [1/Pa] is the relative growth of the bulk modulus with pressure.
     """
 
     ahead: float = 0.0
@@ -49,27 +67,47 @@ class Hidden:
     stribeck: float = 0.02
     leak: float = 0.0
     sag: float = 0.0
+    drag_ahead: float = 0.0
+    drag_astern: float = 0.0
+    drag_cubed: float = 0.0
+    spring: float = 0.0
+    hardening: float = 0.0
+    hum: float = 0.0
+    hum_frequency: float = 7.0
+    hum_power: float = 1.0
+    leak_root: float = 0.0
+    taper: float = 0.0
+    play: float = 0.0
+    back: float = 0.0
+    sag_lag: float = 0.0
+    stiffer: float = 0.0
+    back_power: float = 1.0
 
     @property
     def array(self) -> Array:
         """Its numbers, in the order of the fields."""
-        return np.array([
-            self.ahead, self.astern, self.width, self.form, self.breakaway, self.stribeck,
-            self.leak, self.sag,
-        ])  # fmt: skip
+        return np.array(astuple(self))
 
 
 @njit(cache=True)
 def _dry(v, force, hidden):
     """Friction [N] at the speed v under the other forces' sum; Karnopp's holds within its band."""
-    level = hidden[0] if v > 0.0 else hidden[1]
-    level += hidden[4] / (1.0 + (v / hidden[5]) ** 2)
-    if hidden[3] == KARNOPP:
-        if abs(v) < hidden[2]:
-            return min(max(force, -hidden[1]), hidden[0])
+    level = hidden[AHEAD] if v > 0.0 else hidden[ASTERN]
+    level += hidden[BREAKAWAY] / (1.0 + (v / hidden[STRIBECK]) ** 2)
+    if hidden[FORM] == KARNOPP:
+        if abs(v) < hidden[WIDTH]:
+            return min(max(force, -hidden[ASTERN]), hidden[AHEAD])
         return level if v > 0.0 else -level
-    x = v / hidden[2]
-    return level * (x / math.sqrt(1.0 + x * x) if hidden[3] == SIGMOID else math.tanh(x))
+    x = v / hidden[WIDTH]
+    return level * (x / math.sqrt(1.0 + x * x) if hidden[FORM] == SIGMOID else math.tanh(x))
+
+
+@njit(cache=True)
+def _drag(v, hidden):
+    """Viscous friction [N] by direction and cube, smooth within 0.1 mm/s."""
+    much = math.hypot(v, 1e-4)
+    ahead, astern = 0.5 * (v + much), 0.5 * (v - much)
+    return hidden[DRAG_AHEAD] * ahead + hidden[DRAG_ASTERN] * astern + hidden[DRAG_CUBED] * v**3
 
 
 @njit(cache=True)
@@ -80,6 +118,34 @@ def _supply(cap, rod, u, par, sag):
     head = max(7e6 - held, 0.0)
     flow = 0.5 * (math.sqrt((square * slope) ** 2 + 4.0 * square * head) - square * slope)
     return 7e6 - slope * flow
+
+
+@njit(cache=True)
+def _return(cap, rod, u, par, hidden):
+    """Return pressure at the valve [Pa], by bisection on the flow given back."""
+    gain, held = (par[6], rod) if u > 0.0 else (par[5], cap)
+    low, high = 0.0, 2e-3
+    for _ in range(45):
+        flow = 0.5 * (low + high)
+        p = hidden[BACK] * (flow / PUMP) ** hidden[BACK_POWER]
+        if gain * abs(u) * math.sqrt(max(held - p, 0.0)) > flow:
+            low = flow
+        else:
+            high = flow
+    return hidden[BACK] * (low / PUMP) ** hidden[BACK_POWER]
+
+
+@njit(cache=True)
+def _root(x):
+    return math.sqrt(x) if x > 0.0 else 0.0
+
+
+@njit(cache=True)
+def _opening(u, held, hidden):
+    """Opening behind play (half of it either way) and taper."""
+    half = 0.5 * hidden[PLAY]
+    x = min(max(held, u - half), u + half) if half > 0.0 else u
+    return x + hidden[TAPER] * x * abs(x), x
 
 
 @njit(cache=True)
@@ -97,39 +163,62 @@ def _command(t, s, wave, bias):
 
 
 @njit(cache=True)
-def _rates(y, t, q1, par, hidden, wave, bias, out):
-    q, w, cap, rod = y
+def _rates(y, t, q1, par, hidden, wave, bias, held, out):
+    q, w, cap, rod = y[0], y[1], y[2], y[3]
     s, G = _linkage(q)
     v = G * w
-    u = _command(t, s, wave, bias)
-    p_s = _supply(cap, rod, u, par, hidden[7])
-    leak = hidden[6] * (cap - rod)
+    u = _opening(_command(t, s, wave, bias), held, hidden)[0]
+    p_s = _supply(cap, rod, u, par, hidden[SAG])
+    out[4] = 0.0
+    if hidden[SAG_LAG] > 0.0:
+        # The drop follows the flow that is drawn at the pressure of now.
+        p_s = 7e6 - y[4]
+        gain, side = (par[4], cap) if u > 0.0 else (par[7], rod)
+        flow = gain * abs(u) * _root(p_s - side)
+        out[4] = (hidden[SAG] * flow / PUMP - y[4]) / hidden[SAG_LAG]
+    p_t = _return(cap, rod, u, par, hidden) if hidden[BACK] > 0.0 else 0.0
+    across = cap - rod
+    leak = hidden[LEAK] * across
+    if hidden[LEAK_ROOT] > 0.0:
+        leak += hidden[LEAK_ROOT] * across / math.sqrt(abs(across) + 1e3)
     if u > 0.0:
-        into_cap = par[4] * u * math.sqrt(max(p_s - cap, 0.0)) - leak
-        into_rod = leak - par[6] * u * math.sqrt(max(rod, 0.0))
+        into_cap = par[4] * u * _root(p_s - cap) - leak
+        into_rod = leak - par[6] * u * _root(rod - p_t)
     else:
-        into_cap = par[5] * u * math.sqrt(max(cap, 0.0)) - leak
-        into_rod = leak - par[7] * u * math.sqrt(max(p_s - rod, 0.0))
+        into_cap = par[5] * u * _root(cap - p_t) - leak
+        into_rod = leak - par[7] * u * _root(p_s - rod)
     torque = G * (7.0e-4 * cap - 5.4e-4 * rod) - par[1] * w - par[2] * 9.8 * math.sin(q1 + q)
+    turn = q - MIDDLE
+    torque -= hidden[SPRING] * turn + hidden[HARDENING] * turn**3
+    if hidden[HUM] > 0.0:
+        wave_now = math.sin(2.0 * math.pi * hidden[HUM_FREQUENCY] * (t - SETTLE))
+        sign = 1.0 if wave_now > 0.0 else -1.0
+        torque += hidden[HUM] * sign * abs(wave_now) ** hidden[HUM_POWER]
+    torque -= G * _drag(v, hidden)
     friction = _dry(v, torque / G, hidden)
     out[0], out[1] = w, (torque - G * friction) / par[0]
-    out[2] = par[3] * (into_cap - 7.0e-4 * v) / (6.3e-5 + (0.0375 + s) * 7.0e-4)
-    out[3] = par[3] * (into_rod + 5.4e-4 * v) / (6.3e-5 + (0.0375 - s) * 5.4e-4)
+    stiff_cap = par[3] * (1.0 + hidden[STIFFER] * cap)
+    stiff_rod = par[3] * (1.0 + hidden[STIFFER] * rod)
+    out[2] = stiff_cap * (into_cap - 7.0e-4 * v) / (6.3e-5 + (0.0375 + s) * 7.0e-4)
+    out[3] = stiff_rod * (into_rod + 5.4e-4 * v) / (6.3e-5 + (0.0375 - s) * 5.4e-4)
 
 
 @njit(cache=True)
 def _integrated(start, steps, q1, par, hidden, wave, bias):
-    """States (steps + 1, 4): angle [rad], speed [rad/s], cap and rod pressure [Pa]."""
-    y, out = start.copy(), np.zeros((steps + 1, 4))
+    """States (steps + 1, 5): angle [rad], speed [rad/s], cap and rod pressure, sag [Pa]."""
+    y, out = start.copy(), np.zeros((steps + 1, 5))
     out[0] = y
-    a, b, c, d = np.zeros(4), np.zeros(4), np.zeros(4), np.zeros(4)
+    a, b, c, d = np.zeros(5), np.zeros(5), np.zeros(5), np.zeros(5)
+    held = _command(0.0, _linkage(y[0])[0], wave, bias)
     for k in range(steps):
         t = k * STEP
-        _rates(y, t, q1, par, hidden, wave, bias, a)
-        _rates(y + 0.5 * STEP * a, t + 0.5 * STEP, q1, par, hidden, wave, bias, b)
-        _rates(y + 0.5 * STEP * b, t + 0.5 * STEP, q1, par, hidden, wave, bias, c)
-        _rates(y + STEP * c, t + STEP, q1, par, hidden, wave, bias, d)
+        _rates(y, t, q1, par, hidden, wave, bias, held, a)
+        _rates(y + 0.5 * STEP * a, t + 0.5 * STEP, q1, par, hidden, wave, bias, held, b)
+        _rates(y + 0.5 * STEP * b, t + 0.5 * STEP, q1, par, hidden, wave, bias, held, c)
+        _rates(y + STEP * c, t + STEP, q1, par, hidden, wave, bias, held, d)
         y += STEP / 6.0 * (a + 2.0 * b + 2.0 * c + d)
+        u = _command(t + STEP, _linkage(y[0])[0], wave, bias)
+        held = _opening(u, held, hidden)[1]
         out[k + 1] = y
     return out
 
@@ -138,7 +227,7 @@ def _states(hidden: Hidden, wave: Array, bias: float, seconds: float) -> Array:
     q1, q2 = angle(0.0, 0), angle(0.0, 1)
     par = np.array([TRUTH[name] for name in NAMES_1])
     hold = TRUTH["W2"] * 9.8 * math.sin(q1 + q2) / _linkage(q2)[1]
-    start = np.array([q2, 0.0, (hold + 5.4e-4 * 3.5e6) / 7.0e-4, 3.5e6])
+    start = np.array([q2, 0.0, (hold + 5.4e-4 * 3.5e6) / 7.0e-4, 3.5e6, 0.0])
     steps = round((SETTLE + seconds) / STEP)
     return np.asarray(_integrated(start, steps, q1, par, hidden.array, wave, bias))
 
@@ -148,7 +237,35 @@ def _pistons(q: Array) -> Array:
     return np.asarray(length - 0.30)
 
 
-def channels(rig: Rig, hidden: Hidden, wave: Array, seconds: float) -> dict[str, Array]:
+@dataclass(frozen=True)
+class Sensors:
+    """What is wrong with the sensors of some `kinds`; nothing by default.
+
+    `late` [s] is a delay, `lag` [s] the time constant of a chain of `stages` equal lags together;
+    `seen` is the share of the rod's pressure in the cap's reading.
+    """
+
+    kinds: tuple[str, ...] = ()
+    late: float = 0.0
+    lag: float = 0.0
+    stages: int = 1
+    seen: float = 0.0
+
+    def behind(self, x: Array) -> Array:
+        """Return the fine signal behind its lags."""
+        share = STEP * self.stages / self.lag
+        for _ in range(self.stages):
+            x = lfilter([share], [1.0, share - 1.0], x, zi=[(1.0 - share) * x[0]])[0]
+        return x
+
+
+def channels(
+    rig: Rig,
+    hidden: Hidden,
+    wave: Array,
+    seconds: float,
+    sensors: Sensors = Sensors(),
+) -> dict[str, Array]:
     """Return noise-free channels, each at its own instants; the mean stroke is at the middle."""
     bias = 0.0
     for _ in range(2):
@@ -164,22 +281,27 @@ def channels(rig: Rig, hidden: Hidden, wave: Array, seconds: float) -> dict[str,
     }  # fmt: skip
     for kind in CHANNELS:
         at = tick + rig.sensors.skew * rig.channels.index(f"{kind}_2")
-        at = np.minimum(at, time[-1])
+        at = np.minimum(at, time[-1]) - (sensors.late if kind in sensors.kinds else 0.0)
         q, _, cap, rod = (np.interp(at, time, y[:, k]) for k in range(4))
         spool = [_command(t, s, wave, bias) for t, s in zip(at, _pistons(q), strict=True)]
         out[f"{kind}_2"] = {
             "spool": np.array(spool), "piston": _pistons(q),
             "cap_pressure": cap, "rod_pressure": rod,
         }[kind]  # fmt: skip
+        if kind in sensors.kinds and sensors.lag > 0.0:
+            fine = {"piston": _pistons(y[:, 0]), "cap_pressure": y[:, 2], "rod_pressure": y[:, 3]}
+            out[f"{kind}_2"] = np.interp(at, time, sensors.behind(fine[kind]))
+    if sensors.seen:
+        out["cap_pressure_2"] = out["cap_pressure_2"] + sensors.seen * out["rod_pressure_2"]
     return out
 
 
 def experiment(
     rig: Rig, hidden: Hidden, *, repeats: int, seed: int, rms: float = RMS, noise: float = 1.0,
-    seconds: float = 8.0,
+    seconds: float = 8.0, sensors: Sensors = Sensors(),
 ) -> Run:  # fmt: skip
     """Return a run of `repeats` repeats with `noise` times the rig's stated sensor noise."""
-    clean = channels(rig, hidden, excitation(rms, seed), seconds)
+    clean = channels(rig, hidden, excitation(rms, seed), seconds, sensors)
     records = tuple(
         replace(
             record(rig, clean, f"step1_r{k}", 1000 * seed + k, noise),
@@ -193,11 +315,12 @@ def experiment(
 
 def pair_of_runs(
     rig: Rig, hidden: Hidden, *, repeats: int = 4, noise: float = 1.0, seconds: float = 8.0,
-    seed: int = 1,
+    seed: int = 1, sensors: Sensors = Sensors(),
 ) -> tuple[Run, Run]:  # fmt: skip
     """Return training run and held-out run (another excitation at seven tenths) of one bench."""
     return (
-        experiment(rig, hidden, repeats=repeats, seed=seed, noise=noise, seconds=seconds),
+        experiment(rig, hidden, repeats=repeats, seed=seed, noise=noise, seconds=seconds,
+                   sensors=sensors),
         experiment(rig, hidden, repeats=min(repeats, 2), seed=seed + 1, rms=0.7 * RMS, noise=noise,
-                   seconds=seconds),
+                   seconds=seconds, sensors=sensors),
     )  # fmt: skip

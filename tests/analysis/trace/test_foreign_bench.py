@@ -88,6 +88,31 @@ def test_what_vetoes_no_leak_is_clean_without_one(rig: Rig) -> None:
     assert traced(rig, Hidden(2.0, 2.0)).verdict == "clean"
 
 
+@pytest.mark.parametrize(("ahead", "astern"), [(300.0, 100.0), (60.0, 0.0), (20.0, 90.0)])
+def test_slopes_by_direction_are_asymmetric_viscous_friction(
+    rig: Rig, ahead: float, astern: float
+) -> None:
+    result = traced(rig, Hidden(drag_ahead=ahead, drag_astern=astern))
+    assert result.verdict == "explained"
+    assert [e.name for e in result.effects] == ["asymmetric_viscous_friction"]
+    found = result.effects[0].parameters
+    slopes = [found[name].value for name in ("c_ext_2", "c_ret_2")]
+    assert slopes[0] - slopes[1] == pytest.approx(ahead - astern, rel=0.05)
+    assert result.model_after.values["Fv2"] == pytest.approx(4.43, rel=0.02)
+
+
+@pytest.mark.parametrize("frequency", [3.14, 7.3])
+def test_a_hum_that_begins_with_the_record_is_a_periodic_disturbance(
+    rig: Rig, frequency: float
+) -> None:
+    result = traced(rig, Hidden(hum=1.0, hum_frequency=frequency))
+    assert result.verdict == "explained"
+    assert [(e.name, e.where) for e in result.effects] == [("periodic_disturbance", "joint 2")]
+    found = result.effects[0].parameters
+    assert found["frequency_2"].value == pytest.approx(frequency, rel=1e-3)
+    assert found["T_sin_2"].value == pytest.approx(1.0, rel=0.03)
+
+
 @pytest.mark.parametrize("drop", [1e6, 2e6])
 def test_a_supply_that_sags_in_proportion_to_the_flow_is_named(rig: Rig, drop: float) -> None:
     """Laminar share and drop lie on a ridge: what counts is the drop at the flows that were."""

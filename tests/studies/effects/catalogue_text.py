@@ -14,8 +14,8 @@ from rig.model.rig import Rig
 from tests.studies.pages import markdown_table
 
 FAMILIES: Final[Mapping[str, str]] = {
-    "friction": "Dry friction of a cylinder's seals. All four act as a force at the piston, so "
-    "their torque goes with the cylinder's Jacobian G.",
+    "friction": "Friction of a cylinder's seals: a force at the piston, so that its torque goes "
+    "with the cylinder's Jacobian G.",
     "mechanics": "Effects on the arm and what it carries.",
     "valve": "What stands between the spool's LVDT and the metering edges.",
     "fluid": "Leaks, port pressures and the oil's stiffness.",

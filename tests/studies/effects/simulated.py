@@ -49,6 +49,15 @@ EXAMPLES: Final[tuple[Example, ...]] = (
         "pressure_dependent_friction", "joint 2", "where: joint 2, coefficient: 1e-5 N/Pa",
         {"k_friction_2": 1e-5},
     ),
+    (
+        "asymmetric_viscous_friction", "joint 2",
+        "where: joint 2, extending: 300 N*s/m, retracting: 50 N*s/m",
+        {"c_ext_2": 300.0, "c_ret_2": 50.0},
+    ),
+    (
+        "periodic_disturbance", "joint 2", "where: joint 2, torque: 3 N*m, frequency: 7 Hz",
+        {"frequency_2": 7.0},
+    ),
     ("base_inclination", "bench", "angle: 3 deg", {"inclination": np.deg2rad(3.0)}),
     ("joint_spring", "joint 2", "where: joint 2, stiffness: 30 N*m/rad", {"k_spring_2": 30.0}),
     ("torque_offset", "joint 2", "where: joint 2, torque: 5 N*m", {"T_offset_2": 5.0}),

@@ -29,6 +29,14 @@ SINGLES: Final[tuple[Sizes, ...]] = (
         "pressure_dependent_friction", "joint {j}", "coefficient",
         ("5e-6 N/Pa", "1e-5 N/Pa", "3e-5 N/Pa"), "",
     ),
+    (
+        "asymmetric_viscous_friction", "joint {j}", "extending",
+        ("80 N*s/m", "200 N*s/m", "500 N*s/m"), "retracting: 20 N*s/m",
+    ),
+    (
+        "periodic_disturbance", "joint {j}", "torque", ("0.5 N*m", "2 N*m", "6 N*m"),
+        "frequency: 7 Hz",
+    ),
     ("base_inclination", "bench", "angle", ("1 deg", "2 deg", "4 deg"), ""),
     ("joint_spring", "joint {j}", "stiffness", ("20 N*m/rad", "60 N*m/rad", "150 N*m/rad"), ""),
     ("torque_offset", "joint {j}", "torque", ("2 N*m", "6 N*m", "15 N*m"), ""),
@@ -130,7 +138,8 @@ def si_size(text: str) -> float:
     number, _, unit = text.partition(" ")
     base = {
         "N": "N", "N/Pa": "N/Pa", "deg": "rad", "N*m/rad": "N*m/rad", "N*m": "N*m", "mV": "V",
-        "ms": "s", "m^3/(s*Pa)": "m^3/(s*Pa)", "MPa": "Pa", "%": "", "cm^3": "m^3", "": "",
+        "N*s/m": "N*s/m", "ms": "s", "m^3/(s*Pa)": "m^3/(s*Pa)", "MPa": "Pa", "%": "",
+        "cm^3": "m^3", "": "",
     }[unit]  # fmt: skip
     if unit == "%":
         return float(number) / 100

@@ -1,0 +1,123 @@
+"""A torque that repeats at one frequency, whatever the joint does."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Final
+
+import numpy as np
+
+from analysis.effects.base import Array, Effect, Evidence, Shape
+from analysis.effects.mechanics import torque_limit
+from analysis.signals.conditioning import Signals
+from analysis.terms.base import (
+    CONTRIBUTE,
+    TIME,
+    TORQUE,
+    Coefficient,
+    Columns,
+    Kernel,
+    equation,
+    kernel,
+)
+from rig.model.rig import Rig
+
+FREQUENCY: Final = (0.5, 60.0)  # [Hz] slower is drift, faster does not pass the rows' filter
+PEAKS: Final = 3  # of the residual's spectrum that a search begins at
+BAND: Final = 0.4  # of the rows' rate: what stands above is their filter's edge
+FINE: Final = 4  # frequencies looked at within one over the record's length
+
+
+@dataclass(frozen=True)
+class PeriodicDisturbance(Effect):
+    """Torque T_sin sin(2 pi f t) + T_cos cos(2 pi f t) on the joint, t since the record began.
+
+    An eccentric, a hum, a controller's dither that begins with the record (Fourier; one line). What
+    has another phase in every repeat does not repeat: to the trace it is noise.
+    """
+
+    name: ClassVar[str] = "periodic_disturbance"
+    least: ClassVar[tuple[float, ...]] = (1.0, 0.0)  # [N m]
+    family: ClassVar[str] = "mechanics"
+    variable: ClassVar[str] = "time, at one frequency"
+    confounders: ClassVar[tuple[str, ...]] = ("torque_offset", "joint_spring")
+    separated_by: ClassVar[str] = (
+        "another excitation: what the joint's own motion causes goes with it, this does not"
+    )
+    per_joint: ClassVar[bool] = True
+    by_data: ClassVar[bool] = True
+    where: str = "joint 1"
+
+    @property
+    def kernel(self) -> Kernel:
+        """The compiled contribution."""
+        return _wave
+
+    def _names(self) -> tuple[str, str]:
+        return f"T_sin_{self.joint + 1}", f"T_cos_{self.joint + 1}"
+
+    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
+        """Return T_sin, T_cos [N m] (electric: N or N m)."""
+        unit = str(getattr(rig.joints[self.joint], "force_unit", "N*m"))
+        return tuple(Coefficient(name, unit, "mechanical") for name in self._names())
+
+    def shape_names(self) -> tuple[str, ...]:
+        """Name the frequency."""
+        return (f"frequency_{self.joint + 1}",)
+
+    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
+        """Return the frequency [Hz]."""
+        return (Shape(self.shape_names()[0], "Hz", *FREQUENCY, (7.0,)),)
+
+    def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
+        """Return the frequencies at which the joint's torque rows keep most."""
+        name = equation("torque", self.joint)
+        parts = [record[name] for record in evidence.left if name in record]
+        if not parts:
+            return ()
+        step = float(np.median(np.diff(parts[0][0])))
+        length = max(float(time[-1] - time[0]) for time, _ in parts)
+        high = min(FREQUENCY[1], BAND / step)
+        f = np.arange(max(FREQUENCY[0], 2.0 / length), high, 1.0 / (FINE * length))
+        total = np.zeros(len(f), dtype=complex)
+        for time, left in parts:
+            total += np.exp(-2j * np.pi * f[:, None] * time) @ left
+        power = np.abs(total)
+        inner = (power[1:-1] >= power[:-2]) & (power[1:-1] >= power[2:])
+        at = 1 + np.flatnonzero(inner)
+        return tuple((float(f[k]),) for k in at[np.argsort(-power[at])][:PEAKS])
+
+    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
+        """Return -sin and -cos: the disturbance stands with the drive."""
+        angle = 2 * np.pi * self.shape_of(rig, shape)[0] * signals.t
+        waves = (-np.sin(angle), -np.cos(angle))
+        return {equation("torque", self.joint): dict(zip(self._names(), waves, strict=True))}
+
+    def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
+        """Return joint, T_sin, T_cos, 2 pi f."""
+        linear = [values[name] for name in self._names()]
+        return np.array([self.joint, *linear, 2 * np.pi * self.shape_of(rig, shape)[0]])
+
+    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
+        """Refuse more than half of what the joint's drive can do, and a frequency at its bounds."""
+        amplitude = math.hypot(*(values[name] for name in self._names()))
+        limit = torque_limit(rig, self.joint)
+        if not amplitude < limit:
+            return f"an amplitude of {amplitude:.4g} N*m is not below {limit:.4g}"
+        return self.outside(rig, shape)
+
+    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
+        """Return time [s]."""
+        return {equation("torque", self.joint): signals.t}
+
+
+@kernel
+def _wave(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == CONTRIBUTE:
+        angle = par[3] * bench[TIME]
+        out[TORQUE, int(par[0])] += par[1] * math.sin(angle) + par[2] * math.cos(angle)
+
+
+TERMS = (PeriodicDisturbance,)

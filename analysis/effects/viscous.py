@@ -1,0 +1,114 @@
+"""Viscous friction whose slope depends on the direction of motion."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Final
+
+import numpy as np
+
+from analysis.effects.base import Array, Effect
+from analysis.signals.conditioning import Signals
+from analysis.terms.base import (
+    CONTRIBUTE,
+    SD,
+    TORQUE,
+    Coefficient,
+    Columns,
+    G,
+    Kernel,
+    equation,
+    kernel,
+)
+from rig.model.rig import Rig
+
+DRIVING: Final = 0.1  # of the larger slope that the other may lie below zero: its uncertainty
+DIFFERENCE: Final = 0.1  # of the mean slope: with less between directions they do not differ
+
+
+@dataclass(frozen=True)
+class AsymmetricViscousFriction(Effect):
+    """F = c_ext s' extending, c_ret s' retracting, beside the joint's Fv q': slopes by direction.
+
+    Wipers and lip seals drag less oil one way than the other (Jelali and Kroll 2003). The slope of
+    a direction is its own and Fv G^-2 together; what the records tell well is the difference. On an
+    electric joint G is 1, Fv is the mean slope, and one coefficient dFv, the column |q'|, says the
+    rest.
+    """
+
+    name: ClassVar[str] = "asymmetric_viscous_friction"
+    least: ClassVar[tuple[float, ...]] = (50.0, 0.0)  # [N s/m]
+    family: ClassVar[str] = "friction"
+    variable: ClassVar[str] = "the amount of the piston's velocity"
+    confounders: ClassVar[tuple[str, ...]] = (
+        "torque_offset",
+        "asymmetric_friction",
+        "coulomb_friction",
+    )
+    separated_by: ClassVar[str] = (
+        "two speeds of the same motion: an offset and a difference of levels stay, this doubles"
+    )
+    per_joint: ClassVar[bool] = True
+    where: str = "joint 1"
+
+    @property
+    def kernel(self) -> Kernel:
+        """The compiled contribution."""
+        return _by_direction
+
+    def _names(self, rig: Rig) -> tuple[str, ...]:
+        if rig.electric:
+            return (f"dFv{self.joint + 1}",)
+        return f"c_ext_{self.joint + 1}", f"c_ret_{self.joint + 1}"
+
+    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
+        """Return c_ext, c_ret [N s/m] (electric: dFv, half the difference of slopes)."""
+        unit = rig.unit_of_parameter(f"Fv{self.joint + 1}") if rig.electric else "N*s/m"
+        return tuple(Coefficient(name, unit, "mechanical") for name in self._names(rig))
+
+    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
+        """Return G times the part of s' that goes either way (electric: |q'|)."""
+        i = self.joint
+        G, v = signals.G[:, i], signals.sd[:, i]
+        parts = (np.abs(v),) if rig.electric else (np.maximum(v, 0.0), np.minimum(v, 0.0))
+        columns = {name: G * part for name, part in zip(self._names(rig), parts, strict=True)}
+        return {equation("torque", i): columns}
+
+    def slopes(self, rig: Rig, values: Mapping[str, float]) -> tuple[float, float]:
+        """Return the whole slopes extending and retracting at mid-stroke [N s/m]."""
+        lever = float(rig.joints[self.joint].geometry(0.0)[1])
+        mean = values.get(f"Fv{self.joint + 1}", np.nan) / lever**2
+        own = [values[name] for name in self._names(rig)]
+        ahead, back = own if len(own) == 2 else (own[0], -own[0])
+        return mean + ahead, mean + back
+
+    def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
+        """Return joint, slopes extending and retracting."""
+        own = [values[name] for name in self._names(rig)]
+        return np.array([self.joint, own[0], own[1] if len(own) == 2 else -own[0]])
+
+    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
+        """Refuse a direction that drives the joint, and directions that do not differ."""
+        slopes = self.slopes(rig, values)
+        for way, slope in zip(("extending", "retracting"), slopes, strict=True):
+            if slope < -DRIVING * max(slopes):
+                return f"a slope of {slope:.3g} N s/m {way} would drive the joint"
+        if abs(slopes[0] - slopes[1]) < DIFFERENCE * 0.5 * sum(slopes):
+            return "the slopes of the two directions differ by less than a tenth"
+        return ""
+
+    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
+        """Return the piston's velocity [m/s]."""
+        return {equation("torque", self.joint): signals.sd[:, self.joint]}
+
+
+@kernel
+def _by_direction(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == CONTRIBUTE:
+        i = int(par[0])
+        v = x[SD, i]
+        out[TORQUE, i] -= x[G, i] * v * (par[1] if v > 0.0 else par[2])
+
+
+TERMS = (AsymmetricViscousFriction,)
