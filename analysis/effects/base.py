@@ -57,6 +57,17 @@ class Shape:
 
 
 @dataclass(frozen=True)
+class Branch:
+    """One line of an effect's curve: y(x) = sum of weights (m,) times parameters, by name."""
+
+    label: str
+    x: Array
+    weights: Mapping[str, Array]
+    unit_x: str
+    unit_y: str
+
+
+@dataclass(frozen=True)
 class Evidence:
     """What the records offer an effect that chooses its points of first look by the data.
 
@@ -157,6 +168,10 @@ class Effect(Term):
     def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
         """Return the shapes of first look of an effect that takes them from the data."""
         raise NotImplementedError
+
+    def branches(self, rig: Rig, shape: Sequence[float]) -> tuple[Branch, ...]:
+        """Return the lines of the effect's curve, none by default."""
+        return ()
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Say why sign or size of the fitted parameters is not physical ('' if it is).

@@ -42,6 +42,7 @@ class EntrainedAir(Effect):
     millimetre keep the oil's temperature). Linear in alpha.
     """
 
+    mechanism: ClassVar[str] = "bulk_modulus_curve"
     name: ClassVar[str] = "entrained_air"
     least: ClassVar[tuple[float, ...]] = (3e-3,)  # of the volume, at one atmosphere
     hydraulic: ClassVar[bool] = True
@@ -101,6 +102,7 @@ class DeadVolume(Effect):
     smaller b by the others; the same in all chambers is not, but for V's change with the piston.
     """
 
+    mechanism: ClassVar[str] = "chamber_volume"
     name: ClassVar[str] = "dead_volume"
     least_shape: ClassVar[tuple[float, ...]] = (20e-6,)  # [m^3]
     prepares: ClassVar[bool] = True

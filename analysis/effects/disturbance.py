@@ -38,6 +38,7 @@ class PeriodicDisturbance(Effect):
     has another phase in every repeat does not repeat: to the trace it is noise.
     """
 
+    mechanism: ClassVar[str] = "disturbance"
     name: ClassVar[str] = "periodic_disturbance"
     least: ClassVar[tuple[float, ...]] = (1.0, 0.0)  # [N m]
     family: ClassVar[str] = "mechanics"

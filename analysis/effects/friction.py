@@ -65,6 +65,7 @@ class Friction(Effect):
     stiffening. `before` counts the shape parameters that stand before the contact's own.
     """
 
+    mechanism: ClassVar[str] = "friction_curve"
     family: ClassVar[str] = "friction"
     per_joint: ClassVar[bool] = True
     stiffens: ClassVar[bool] = False

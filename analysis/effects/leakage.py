@@ -34,6 +34,7 @@ UNIT = "m^3/(s*Pa)"
 
 @dataclass(frozen=True)
 class _Leakage(Effect):
+    mechanism: ClassVar[str] = "leakage_curve"
     family: ClassVar[str] = "fluid"
     hydraulic: ClassVar[bool] = True
     per_joint: ClassVar[bool] = True

@@ -33,6 +33,7 @@ MARGIN: Final = 16  # [samples] that the interpolation of a shift reaches
 class Sensor(Effect):
     """What the three share: the channel, and the way from one channel to all that follows."""
 
+    mechanism: ClassVar[str] = "sensor"
     hydraulic: ClassVar[bool] = True
     family: ClassVar[str] = "measurement"
     stage: ClassVar[int] = SENSOR

@@ -41,6 +41,7 @@ class BaseInclination(Effect):
     shape and not N linear unknowns.
     """
 
+    mechanism: ClassVar[str] = "gravity"
     name: ClassVar[str] = "base_inclination"
     least_shape: ClassVar[tuple[float, ...]] = (0.017,)  # [rad]
     prepares: ClassVar[bool] = True
@@ -106,6 +107,7 @@ class JointSpring(Effect):
     The rest angle is a shape; where the records cannot fix it, mid-stroke is as good.
     """
 
+    mechanism: ClassVar[str] = "position_force"
     name: ClassVar[str] = "joint_spring"
     least: ClassVar[tuple[float, ...]] = (20.0,)  # [N m/rad]
     family: ClassVar[str] = "mechanics"
@@ -182,6 +184,7 @@ class TorqueOffset(Effect):
     Of an electric joint the benchmark's sign and name are kept: M q'' + ... + offset = torque.
     """
 
+    mechanism: ClassVar[str] = "position_force"
     name: ClassVar[str] = "torque_offset"
     least: ClassVar[tuple[float, ...]] = (2.0,)  # [N m]
     family: ClassVar[str] = "mechanics"

@@ -39,6 +39,7 @@ class Payload(Effect):
     identified without it, M, R and W held there.
     """
 
+    mechanism: ClassVar[str] = "gravity"
     name: ClassVar[str] = "payload"
     family: ClassVar[str] = "mechanics"
     variable: ClassVar[str] = "gravity and inertia alike"

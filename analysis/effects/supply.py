@@ -92,6 +92,7 @@ class SupplySag(_PortEffect):
     simulation leaves that out. dp, r_t and V_supply are shapes.
     """
 
+    mechanism: ClassVar[str] = "supply_curve"
     name: ClassVar[str] = "supply_sag"
     least_shape: ClassVar[tuple[float, ...]] = (0.2e6, 0.0, 0.0)  # [Pa] at the rated flow
     variable: ClassVar[str] = "the flow drawn from the supply"
@@ -144,6 +145,7 @@ class TankPressure(_PortEffect):
     The line's part is turbulent; Q is the flow that the valves give back.
     """
 
+    mechanism: ClassVar[str] = "return_line"
     name: ClassVar[str] = "tank_pressure"
     least_shape: ClassVar[tuple[float, ...]] = (0.1e6, 0.0)  # [Pa]
     variable: ClassVar[str] = "the pressure left across the edge to the tank"

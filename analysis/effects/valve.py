@@ -33,6 +33,7 @@ from rig.model.rig import Rig
 class ValveEffect(Effect):
     """What the valve's effects share: one hydraulic joint, no linear unknown, spool as abscissa."""
 
+    mechanism: ClassVar[str] = "metering_curve"
     hydraulic: ClassVar[bool] = True
     family: ClassVar[str] = "valve"
     alters: ClassVar[tuple[str, ...]] = ("fluid",)
@@ -171,6 +172,7 @@ class SpoolLag(ValveEffect):
     straight lines between samples.
     """
 
+    mechanism: ClassVar[str] = "spool_dynamics"
     name: ClassVar[str] = "spool_lag"
     least_shape: ClassVar[tuple[float, ...]] = (1e-3,)  # [s]
     stage: ClassVar[int] = LAG

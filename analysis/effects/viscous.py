@@ -37,6 +37,7 @@ class AsymmetricViscousFriction(Effect):
     rest.
     """
 
+    mechanism: ClassVar[str] = "friction_curve"
     name: ClassVar[str] = "asymmetric_viscous_friction"
     least: ClassVar[tuple[float, ...]] = (50.0, 0.0)  # [N s/m]
     family: ClassVar[str] = "friction"

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from analysis.effects.base import shapes_of
 from analysis.terms import make
 from analysis.terms.base import Used
 from rig.model.parse import InputError
@@ -109,7 +110,15 @@ def model_json(model: Model) -> dict[str, Any]:
         "version": VERSION,
         "rig": model.rig.model_dump(mode="json"),
         "terms": [
-            {"name": u.term.name, "where": u.term.where, "shape": list(u.shape)}
+            {
+                "name": u.term.name,
+                "where": u.term.where,
+                "shape": list(u.shape),
+                "shape_parameters": {
+                    s.parameter: {"value": v, "unit": s.unit}
+                    for s, v in zip(shapes_of(model.rig, u), u.shape, strict=True)
+                },
+            }
             for u in model.terms
         ],
         "parameters": {name: estimate_json(p) for name, p in model.parameters.items()},

@@ -18,12 +18,13 @@ from analysis.regression.conditioned import ConditionedRecord
 from analysis.simulation.model import Model
 from analysis.terms import baseline_of
 from analysis.terms.base import FAMILIES, Used
-from analysis.trace.data.candidates import catalogue
+from analysis.trace.data.candidates import catalogue, free_mechanisms
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.noise_floor import STATED
 from analysis.trace.data.regression_data import RegressionData, regression_data
 from analysis.trace.data.spectral_lines import lines
 from analysis.trace.data.temperature_nuisance import stripped, temperature_terms
+from analysis.trace.free_forms import drawn_by_data
 from analysis.trace.judge import gates, held_out
 from analysis.trace.judge.shooting import reshaped, told
 from analysis.trace.next_experiment.proposal import propose
@@ -68,6 +69,7 @@ def trace(
     families: Sequence[str] = tuple(FAMILIES),
     look_ahead: bool = True,
     terms: Sequence[Used] | None = None,
+    free_forms: bool = True,
 ) -> Trace:
     """Say what the baseline lacks on `runs`, name it or refuse to, and judge it on `holdout`.
 
@@ -75,8 +77,9 @@ def trace(
     half-samples and sign flips; `families` are the equations looked at, mechanical or fluid (they
     share no parameter, so that what stays unexplained in one need not hide the other); `look_ahead`
     designs the next experiment; `terms` take the baseline's place: a model's with its effects,
-    whose shapes stay as they are. Raises InputError for records of different rigs, without held-out
-    records, with held-out records that are training records, or too short to tell anything.
+    whose shapes stay as they are; with `free_forms` a mechanism whose curve the data draw may
+    explain what no named effect does. Raises InputError for records of different rigs, without
+    held-out records, with held-out ones that are training records, or too short to tell anything.
     """
     started = time.perf_counter()
     rig = ck.common_rig([*runs, *holdout])
@@ -101,15 +104,15 @@ def trace(
     else:
         winner = hypotheses.run()
         found, winner, verdict, rest = _named(hypotheses, winner, holdout_data, rng)
+        if verdict == UNEXPLAINED and free_forms:
+            free = _unknown(free_mechanisms(rig), known)
+            drawn = drawn_by_data(hypotheses, free, winner, holdout_data, rng)
+            if drawn is not None:
+                hypotheses, found, winner, rest = drawn
+                verdict = CONFOUNDED if _tied(found) else EXPLAINED
         refused = tuple(f for f in found if not gates.stands(f))
         found = tuple(f for f in found if gates.stands(f))
-        if quiet and verdict == UNEXPLAINED:
-            notes.append(ELSEWHERE)
-        if verdict == UNEXPLAINED and (found or quiet):
-            notes += [f"{r.equation}: {r.words}" for r in rest if r.veto]
-        notes += [
-            f"{r.equation}: {r.words}; too little to speak against" for r in rest if not r.veto
-        ]
+        notes += _rest_notes(verdict, rest, quiet, bool(found))
     split = lines(train_data, winner.fit.residual)
     moves: tuple[Dependence, ...] = ()
     formulas: tuple[Formula, ...] = ()
@@ -202,6 +205,15 @@ def _notes(train_data: RegressionData, holdout_data: RegressionData) -> list[str
     if all(f.source == STATED for f in holdout_data.floors):
         out.append("the held-out noise floor is the rig file's stated sensor noise")
     return out
+
+
+def _rest_notes(verdict: str, rest: Sequence[Rest], quiet: bool, found: bool) -> list[str]:
+    """State what stays, and whether it speaks against what was found."""
+    out = [ELSEWHERE] if quiet and verdict == UNEXPLAINED else []
+    if verdict == UNEXPLAINED and (found or quiet):
+        out += [f"{r.equation}: {r.words}" for r in rest if r.veto]
+    few = [f"{r.equation}: {r.words}; too little to speak against" for r in rest if not r.veto]
+    return out + few
 
 
 def _named(

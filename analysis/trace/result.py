@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from analysis.identify.output_error.hidden_states import Shot
 from analysis.simulation.model import Estimate, Model, estimate_json, finite
@@ -15,10 +16,14 @@ from analysis.trace.data.noise_floor import Floor
 from analysis.trace.data.spectral_lines import SpectralLines
 from analysis.trace.search.refinement import ExactFit
 
+Array = NDArray[np.float64]
+
 CLEAN: Final = "clean"
 EXPLAINED: Final = "explained"
 CONFOUNDED: Final = "confounded"
 UNEXPLAINED: Final = "unexplained"
+NAMED: Final = "named"
+FREE: Final = "free"
 SURE: Final = 0.9  # share from which a formula goes before free curves
 FEW: Final = 2  # monomials of such a one: three bend to much
 _NAME: Final = re.compile(r"[a-z]+(?:_[a-z]+)*(?:_[0-9]+)?")
@@ -81,12 +86,26 @@ class Gate:
 
 
 @dataclass(frozen=True)
+class Curve:
+    """One line y(x) of an effect's curve with the 95 % band of it; arrays (m,)."""
+
+    label: str
+    x: Array
+    y: Array
+    lo: Array
+    hi: Array
+    unit_x: str
+    unit_y: str
+
+
+@dataclass(frozen=True)
 class Found:
     """An effect with its parameters, evidence and the gates it passed or not.
 
     `removed_fraction` is the share of the repeatable energy on held-out records, in the equations
     that the effect touches, which goes with it, the other effects kept. `shot` is what multiple
-    shooting makes of an effect with a hidden state.
+    shooting makes of an effect with a hidden state. `mechanism` is where it acts; a `free` one has
+    no name of its own and is what its `curves` say.
     """
 
     name: str
@@ -98,6 +117,9 @@ class Found:
     gates: tuple[Gate, ...]
     variable: str = ""
     shot: Shot | None = None
+    mechanism: str = ""
+    free: bool = False
+    curves: tuple[Curve, ...] = ()
 
     @property
     def named(self) -> bool:
@@ -237,6 +259,10 @@ def _effect(found: Found) -> dict[str, Any]:
     return {
         "name": found.name,
         "where": found.where,
+        "mechanism": found.mechanism,
+        "form": FREE if found.free else NAMED,
+        "curve": _curve(found.curves[0]) if found.curves else None,
+        "curves": [_curve(one) for one in found.curves],
         "parameters": {n: estimate_json(e) for n, e in found.parameters.items()},
         "p_value": finite(found.p_value),
         "removed_fraction": finite(found.removed_fraction),
@@ -250,6 +276,11 @@ def _effect(found: Found) -> dict[str, Any]:
         "gates": [{"name": g.name, "ok": g.ok, "detail": g.detail} for g in found.gates],
         "shooting": _shot(found.shot) if found.shot else None,
     }  # fmt: skip
+
+
+def _curve(one: Curve) -> dict[str, Any]:
+    numbers = {n: [float(v) for v in getattr(one, n)] for n in ("x", "y", "lo", "hi")}
+    return {"label": one.label, **numbers, "unit_x": one.unit_x, "unit_y": one.unit_y}
 
 
 def _shot(one: Shot) -> dict[str, Any]:

@@ -55,7 +55,10 @@ def hidden_effects(model: Model) -> list[Effect]:
     return [
         u.term
         for u in model.terms
-        if isinstance(u.term, Effect) and u.term.hidden(model.rig) and u.term.remembers(u.shape)
+        if isinstance(u.term, Effect)
+        and u.term.hidden(model.rig)
+        and u.term.remembers(u.shape)
+        and not u.term.free
     ]
 
 

@@ -18,6 +18,7 @@ from analysis.simulation.model import Estimate
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge import inference
+from analysis.trace.judge.curves import curves_of
 from analysis.trace.judge.held_out import residual as held_left
 from analysis.trace.judge.invariance import invariance
 from analysis.trace.result import Found, Gate, Rival
@@ -95,6 +96,9 @@ def judge(
                 (*twins, *rivals),
                 gates,
                 used.term.variable,
+                mechanism=used.term.mechanism,
+                free=used.term.free,
+                curves=curves_of(train_data, winner.fit, used),
             )
         )
     return tuple(out)

@@ -107,6 +107,8 @@ def invariance(
     """Return where a parameter disagrees with itself: (subset, parameter, value there, error)."""
     names, J = jacobian(train_data, model, used)
     base = others(train_data, model, names)
+    if isinstance(used.term, Effect) and used.term.free:
+        return _of_curve(train_data, model, used, (J, base), joint)
     residual = model.residual
     # A shape such as the presliding distance is the form's, not the effect's size.
     sizes = {c.parameter for c in used.term.coefficients(train_data.rig)}
@@ -148,3 +150,42 @@ def invariance(
             if abs(shift) > spill + DEVIATIONS * np.hypot(error, TOLERANCE / DEVIATIONS * full):
                 out.append((label, name, float(value.value[k]) + shift, error))
     return out
+
+
+def _of_curve(
+    train_data: RegressionData, model: ExactFit, used: Used, tangent: tuple[Array, Array],
+    joint: int | None,
+) -> list[tuple[str, str, float, float]]:  # fmt: skip
+    """Return where a free curve disagrees with itself: the factor by which it would be larger.
+
+    Its single values trade places between knots; what must be the same everywhere is the curve.
+    """
+    J, base = tangent
+    whole = J @ _amounts(train_data, model, used)
+    start = float(np.sum((whole - base @ (base.T @ whole)) ** 2))
+    clusters, out = _unmeasured(train_data), []
+    for label, mask in subsets(train_data, joint).items():
+        if not mask.any():
+            continue
+        B = orthonormal(base[mask])
+        own = whole[mask] - B @ (B.T @ whole[mask])
+        size = float(own @ own)
+        if size <= TELLS * start or size < 0.01 * float(whole[mask] @ whole[mask]):
+            continue
+        shift = float(own @ model.residual[mask]) / size
+        error = 1.0 / np.sqrt(size)
+        if clusters is not None:
+            rest = model.residual[mask] - B @ (B.T @ model.residual[mask]) - own * shift
+            error = max(error, _clustered(own, rest, clusters[mask]) / size)
+        if error <= POWER and abs(shift) > DEVIATIONS * np.hypot(error, TOLERANCE / DEVIATIONS):
+            out.append((label, "the curve's size", 1.0 + shift, error))
+    return out
+
+
+def _amounts(train_data: RegressionData, model: ExactFit, used: Used) -> Array:
+    """Return by how much each column of an effect's tangent (M, p) makes it what it is (p,)."""
+    found = [model.beta.get(c.parameter, 0.0) for c in used.term.coefficients(train_data.rig)]
+    for shape, value in zip(shapes_of(train_data.rig, used), used.shape, strict=True):
+        if not shape.fixed and shape.given(value):
+            found.append(value if shape.neutral is not None else 0.0)
+    return np.array(found)

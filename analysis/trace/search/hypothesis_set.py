@@ -7,6 +7,7 @@ on the list: the rivals of the winner come from it.
 
 from __future__ import annotations
 
+import copy
 import logging
 from collections.abc import Collection, Sequence
 
@@ -60,6 +61,16 @@ class HypothesisSet:
         return Hypothesis(
             effects, found, excess_of(self.stage, found.residual), complexity(rig, effects)
         )
+
+    def widened(self, effects: Sequence[Effect]) -> HypothesisSet:
+        """Return the sets with more candidates beside those that were searched already."""
+        wide = copy.copy(self)
+        wide.effects = tuple(effects)
+        more = variant_columns(self.stage, wide._variants(self.stage, self.stage.mean))
+        wide.found = [*self.found, *more]
+        wide.field = self._field(self.stage, wide.found)
+        wide.effects = (*self.effects, *effects)
+        return wide
 
     def _variants(self, data: RegressionData, residual: Array) -> list[Variant]:
         """Return the candidates' points of first look on a board that leaves a residual (M,)."""
@@ -127,11 +138,10 @@ class HypothesisSet:
 
     def run(self) -> Hypothesis:
         """Search: singles and pairs from the first board, then extensions; returns the winner."""
-        found = variant_columns(self.stage, self._variants(self.stage, self.stage.mean))
-        field = self._field(self.stage, found)
+        self.found = variant_columns(self.stage, self._variants(self.stage, self.stage.mean))
+        field = self.field = self._field(self.stage, self.found)
         r = self.stage.mean
         r = r - field.basis @ (field.basis.T @ r)
-        self.field, self.projected = field, r
         singles = self.tried(self._singles(field, r))
         now = self.prune(self.best([self.empty, *singles]))
         if within(now.excess_energy, self.limits):
@@ -211,15 +221,18 @@ class HypothesisSet:
         ]
         return [effects for effects in out if len(effects) > 1]
 
-    def extensions(self, now: Hypothesis, equations: Collection[str] = ()) -> list[Hypothesis]:
+    def extensions(
+        self, now: Hypothesis, equations: Collection[str] = (), free: bool = False
+    ) -> list[Hypothesis]:
         """Return sets with one more effect, found on a board that has the set in its model.
 
-        With `equations` the search looks at these alone.
+        With `equations` the search looks at these alone, with `free` at free mechanisms alone.
         """
         data = rebased(self.stage, now.fit)
         taken = now.keys
         looks = self._variants(data, now.fit.residual)
-        found = variant_columns(data, [v for v in looks if v.key not in taken])
+        looks = [v for v in looks if v.key not in taken and (v.effect.free or not free)]
+        found = variant_columns(data, looks)
         mask = np.ones(len(now.fit.residual))
         for s in data.segments:
             mask[s.where] = not equations or s.equation in equations

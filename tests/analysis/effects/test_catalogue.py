@@ -31,7 +31,7 @@ CONTRACT = {
     "valve_deadband", "spool_offset", "underlap_leakage", "spool_lag",
     "internal_leakage", "external_leakage", "supply_sag", "tank_pressure", "entrained_air",
     "dead_volume", "channel_delay", "sensor_gain", "sensor_offset",
-    "asymmetric_viscous_friction", "periodic_disturbance",
+    "asymmetric_viscous_friction", "periodic_disturbance", "friction_curve", "position_force",
 }  # fmt: skip
 
 
@@ -71,7 +71,9 @@ def test_places_are_those_of_the_contract_and_every_candidate_has_its_own_parame
     for e in every:
         own = [c.parameter for c in e.coefficients(rig) if c.parameter not in shared]
         own += [n for n in e.shape_names() if not n.startswith(("presliding", *DETAILS))]
-        assert len([n for n in e.shape_names() if not n.startswith(DETAILS)]) <= 2
+        placed = [s.parameter for s in e.shapes(rig) if s.fixed]
+        searched = [n for n in e.shape_names() if not n.startswith(DETAILS) and n not in placed]
+        assert len(searched) <= 2
         for name in own:
             assert owners.setdefault(name, (e.name, e.where)) == (e.name, e.where)
 
@@ -149,8 +151,9 @@ def hidden_state(e: Effect, rig: Rig, signals: Signals, shape: tuple[float, ...]
         level = np.exp(-((signals.sd[:, e.joint] / shape[0]) ** 2))
         return np.asarray(contact_under_load(s, level, 1.0 / shape[-1]) * shape[-1])
     if e.family == "friction":
-        path = worked(s, signals.sd[:, e.joint], sum(shape[1:]))
-        return np.asarray(shape[0] * contact_state(path, shape[0]))
+        distance, *stiffening = shape[4:] if e.name == "friction_curve" else shape
+        path = worked(s, signals.sd[:, e.joint], sum(stiffening))
+        return np.asarray(distance * contact_state(path, distance))
     if e.name == "spool_lag":
         return e.prepare(rig, signals, shape).u[:, e.joint]
     return np.zeros(len(signals.t))
@@ -275,6 +278,18 @@ REFUSED = [
     ("asymmetric_viscous_friction", "joint 2", {"c_ext_2": 40.0, "c_ret_2": 39.0}, ()),
     ("periodic_disturbance", "joint 2", {"T_sin_2": 1e4, "T_cos_2": 0.0}, (7.0,)),
     ("periodic_disturbance", "joint 2", {"T_sin_2": 1.0, "T_cos_2": 0.0}, (60.0,)),
+    (
+        "friction_curve",
+        "joint 2",
+        {f"friction_2_{part}_{k}": -30.0 for part in ("shared", "extending") for k in range(1, 5)},
+        (0.0, 0.05, 0.1, 0.2, 4e-5),
+    ),
+    (
+        "position_force",
+        "joint 2",
+        {f"F_position_2_{k}": 1e5 for k in range(1, 6)},
+        (-0.03, -0.02, -0.01, 0.01, 0.02, 0.03, 0.1, -0.5, 0.7, -0.7, 0.5, -0.1),
+    ),
     ("base_inclination", "bench", {}, (0.35,)),
     ("payload", "bench", {"m_payload": -1.0}, ()),
     ("joint_spring", "joint 2", {"k_spring_2": -30.0}, (-1.44,)),

@@ -5,10 +5,15 @@ The bench is `foreign_bench`, none of whose forms is the catalogue's.
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
+import numpy as np
 import pytest
 
+from analysis.simulation.model import load_model, save_model
 from analysis.trace.engine import trace
-from analysis.trace.result import Trace
+from analysis.trace.result import Trace, to_json
 from rig.model.rig import Rig
 from tests.analysis.trace.foreign_bench import (
     KARNOPP,
@@ -21,9 +26,9 @@ from tests.analysis.trace.foreign_bench import (
 LEAK = 2e-12  # [m^3/(s Pa)]
 
 
-def traced(rig: Rig, hidden: Hidden, **measured: float) -> Trace:
+def traced(rig: Rig, hidden: Hidden, free_forms: bool = True, **measured: float) -> Trace:
     train, held_out = pair_of_runs(rig, hidden, **measured)  # type: ignore[arg-type]
-    return trace([train], [held_out], look_ahead=False)
+    return trace([train], [held_out], look_ahead=False, free_forms=free_forms)
 
 
 @pytest.mark.parametrize(
@@ -111,6 +116,52 @@ def test_a_hum_that_begins_with_the_record_is_a_periodic_disturbance(
     found = result.effects[0].parameters
     assert found["frequency_2"].value == pytest.approx(frequency, rel=1e-3)
     assert found["T_sin_2"].value == pytest.approx(1.0, rel=0.03)
+
+
+def test_friction_with_a_cube_of_the_speed_is_a_curve_without_a_name(
+    rig: Rig, tmp_path: Path
+) -> None:
+    """It is not dry friction, nor any other name, but the curve that was there."""
+    result = traced(rig, Hidden(60.0, 60.0, drag_cubed=50_000.0))
+    assert result.verdict == "explained"
+    found = to_json(result)["effects"]
+    assert [(e["name"], e["form"], e["mechanism"]) for e in found] == [
+        ("friction_curve", "free", "friction_curve")
+    ]
+    curve = {n: np.array(v) if isinstance(v, list) else v for n, v in found[0]["curve"].items()}
+    assert (curve["unit_x"], curve["unit_y"]) == ("m/s", "N")
+    v, slope = curve["x"], 4.43 / abs(rig.joints[1].geometry(0.0)[1]) ** 2
+    there = 60.0 * np.sign(v) + 50_000.0 * v**3 + slope * v
+    fast = np.abs(v) > 5e-3
+    assert np.abs(curve["y"] - there)[fast].max() < 0.03 * np.abs(there).max()
+    assert (curve["lo"] <= curve["y"]).all()
+    assert (curve["y"] <= curve["hi"]).all()
+    assert result.model_after.values["Fv2"] == pytest.approx(4.43, rel=0.05)
+    save_model(result.model_after, tmp_path / "model.json")
+    again = load_model(tmp_path / "model.json")
+    assert again.terms == result.model_after.terms
+    knots = json.loads((tmp_path / "model.json").read_text())["terms"][-1]["shape_parameters"]
+    assert {k["unit"] for n, k in knots.items() if "knot" in n} == {"m/s"}
+
+
+def test_a_spring_that_hardens_is_a_force_over_position(rig: Rig) -> None:
+    result = traced(rig, Hidden(spring=20.0, hardening=150.0))
+    assert result.verdict == "explained"
+    assert [(e.name, e.free) for e in result.effects] == [("position_force", True)]
+    (line,) = result.effects[0].curves
+    q = np.array([float(rig.joints[1].geometry(s)[0]) for s in line.x])
+    lever = np.array([float(rig.joints[1].geometry(s)[1]) for s in line.x])
+    # The weight of one pose is a force over position too: what is told is the sum.
+    weight = 9.8 * (result.model_after.values["W2"] - 3.30) * np.sin(q + rig_angle(rig))
+    pull = (20.0 * (q + 1.44) + 150.0 * (q + 1.44) ** 3) / lever
+    assert line.y + weight / lever == pytest.approx(pull, abs=0.03 * np.abs(pull).max())
+    without = traced(rig, Hidden(spring=20.0, hardening=150.0), free_forms=False)
+    assert without.verdict == "unexplained"
+
+
+def rig_angle(rig: Rig) -> float:
+    """Angle of joint 1 at mid-stroke [rad], where it stands."""
+    return float(rig.joints[0].geometry(0.0)[0])
 
 
 @pytest.mark.parametrize("drop", [1e6, 2e6])

@@ -47,6 +47,8 @@ def parameter_rows(rig: Rig) -> list[tuple[str, str, str, str, str]]:
                 kept = "the orifice's own" if c.parameter in gain_names(1) else "coefficient"
                 rows.append((name, effect.place, c.parameter, c.unit or "-", kept))
             for s in effect.shapes(rig):
+                if s.fixed:  # a knot of a curve, where the data are
+                    continue
                 text = f"shape, {s.low:.3g} to {s.high:.3g}"
                 rows.append((name, effect.place, s.parameter, s.unit or "-", text))
     return rows
@@ -72,7 +74,9 @@ def overview(rig: Rig) -> str:
         "    python -m tests.studies effects --docs docs/\n",
         f"Parameters of joint 1 and of the bench, bounds of the rig `{rig.name}`. A *coefficient* "
         "is found by least squares, a *shape* by a search within its bounds, at most two per "
-        "effect. Bounds of spools, forces and volumes scale with the rig.\n",
+        "effect. Bounds of spools, forces and volumes scale with the rig. What has no name for its "
+        "form is a curve by its values at knots, tried where no named effect explains the records."
+        "\n",
         table(rig),
         "\n## Families\n",
         *(f"- [{family}](effects-{family}.md): {text}" for family, text in FAMILIES.items()),

@@ -1,0 +1,143 @@
+"""A curve that the data draw: a cubic spline, straight beyond the data, by values at a few knots.
+
+Between knots it is a cubic with continuous slope and curvature, the first and the last two pieces
+being one cubic each (de Boor 1978, chapter IV: not-a-knot); beyond the first and the last knot it
+is a straight line. It is linear in its values y at the knots t, and they carry its unit:
+
+    f(x) = a y_j + b y_j+1 + ((a^3 - a) m_j + (b^3 - b) m_j+1) h^2 / 6,
+    b = (x - t_j) / h, a = 1 - b, h = t_j+1 - t_j, m = S y (second derivatives, `bending`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from numba import njit
+
+from analysis.effects.base import Array, Shape
+
+APART: Final = 0.02  # of their range: knots nearer to each other are moved apart
+POINTS: Final = 61  # of a curve that is shown
+LAST: Final = 0.999  # quantile of the outermost knots: beyond, the curve is straight
+
+
+def bending(knots: Array) -> Array:
+    """Return S (K, K): the second derivatives at the knots per unit of the values there."""
+    K, h = len(knots), np.diff(knots)
+    left, right = np.zeros((K, K)), np.zeros((K, K))
+    left[0, :3] = -1.0 / h[0], 1.0 / h[0] + 1.0 / h[1], -1.0 / h[1]
+    left[-1, -3:] = -1.0 / h[-2], 1.0 / h[-2] + 1.0 / h[-1], -1.0 / h[-1]
+    for i in range(1, K - 1):
+        left[i, i - 1 : i + 2] = h[i - 1] / 6.0, (h[i - 1] + h[i]) / 3.0, h[i] / 6.0
+        right[i, i - 1 : i + 2] = 1.0 / h[i - 1], -1.0 / h[i - 1] - 1.0 / h[i], 1.0 / h[i]
+    return np.asarray(np.linalg.solve(left, right))
+
+
+def spline(knots: Sequence[float], x: Array) -> Array:
+    """Return the basis (n, K) of the curve at x (n,): its value per unit value at every knot."""
+    t = np.asarray(knots, dtype=np.float64)
+    S, K = bending(t), len(t)
+    j = np.clip(np.searchsorted(t, x, side="right") - 1, 0, K - 2)
+    h = t[j + 1] - t[j]
+    inner = np.clip(x, t[0], t[-1])
+    b = (inner - t[j]) / h
+    a = 1.0 - b
+    unit = np.eye(K)
+    out = a[:, None] * unit[j] + b[:, None] * unit[j + 1]
+    out += ((a**3 - a) * h**2 / 6.0)[:, None] * S[j]
+    out += ((b**3 - b) * h**2 / 6.0)[:, None] * S[j + 1]
+    first = (unit[1] - unit[0]) / (t[1] - t[0]) - (t[1] - t[0]) / 6.0 * (2.0 * S[0] + S[1])
+    last = (unit[-1] - unit[-2]) / (t[-1] - t[-2])
+    last = last + (t[-1] - t[-2]) / 6.0 * (S[-2] + 2.0 * S[-1])
+    slope = np.where((x < t[0])[:, None], first, last)
+    return np.asarray(out + (x - inner)[:, None] * slope)
+
+
+def packed(knots: Sequence[float], values: Array) -> Array:
+    """Return knots, values and second derivatives (3 K,), as `curve_at` reads them."""
+    t = np.asarray(knots, dtype=np.float64)
+    return np.concatenate((t, values, bending(t) @ values))
+
+
+@njit(cache=True, error_model="numpy")
+def curve_at(x, par, first, K):  # type: ignore[no-untyped-def]
+    """Return the curve at x, its K knots, values and second derivatives in par from `first` on."""
+    j = 0
+    while j < K - 2 and x >= par[first + j + 1]:
+        j += 1
+    t, u = par[first + j], par[first + j + 1]
+    y, z = par[first + K + j], par[first + K + j + 1]
+    m, n = par[first + 2 * K + j], par[first + 2 * K + j + 1]
+    h = u - t
+    if x < par[first]:
+        return y + (x - t) * ((z - y) / h - h / 6.0 * (2.0 * m + n))
+    if x > par[first + K - 1]:
+        return z + (x - u) * ((z - y) / h + h / 6.0 * (m + 2.0 * n))
+    b = (x - t) / h
+    a = 1.0 - b
+    return a * y + b * z + ((a**3 - a) * m + (b**3 - b) * n) * h * h / 6.0
+
+
+def freed(gauge: Array) -> Array:
+    """Return the values at the knots (K, K - 1) by all of them but the one of the largest weight.
+
+    That one follows from gauge (K,) times the values being zero.
+    """
+    K, last = len(gauge), int(np.argmax(np.abs(gauge)))
+    others = [k for k in range(K) if k != last]
+    out = np.zeros((K, K - 1))
+    out[others, range(K - 1)] = 1.0
+    out[last] = -gauge[others] / gauge[last]
+    return out
+
+
+def shortest_wave(knots: Array) -> Array:
+    """Return the gauge (K,) of a curve without its shortest wave: the highest divided difference.
+
+    sum of y_k / prod (t_k - t_j) = 0: the values lie on a polynomial of one degree less.
+    """
+    t = np.asarray(knots, dtype=np.float64)
+    apart = t[:, None] - t[None, :]
+    np.fill_diagonal(apart, 1.0)
+    gauge = 1.0 / np.prod(apart / (t[-1] - t[0]), axis=1)
+    return np.asarray(gauge / np.linalg.norm(gauge))
+
+
+def spread_knots(values: Array, shares: Sequence[float], low: float | None = None) -> Array:
+    """Return knots (K,) at quantiles of values (n,), apart from each other; the first may be given.
+
+    Empty where the values do not spread.
+    """
+    if not len(values):
+        return np.zeros(0)
+    knots = np.quantile(values, shares)
+    if low is not None:
+        knots[0] = low
+    least = APART * (knots[-1] - knots[0])
+    if not least > 0.0:
+        return np.zeros(0)
+    for k in range(1, len(knots)):
+        knots[k] = max(knots[k], knots[k - 1] + least)
+    return np.asarray(knots)
+
+
+def knot_shapes(names: Sequence[str], unit: str, low: float, high: float) -> tuple[Shape, ...]:
+    """Return the knots as shapes that the data place beforehand, evenly spread without data."""
+    even = np.linspace(low, high, len(names))
+    return tuple(
+        Shape(name, unit, min(low, -abs(high)), abs(high) + abs(low), (float(at),), fixed=True)
+        for name, at in zip(names, even, strict=True)
+    )
+
+
+def shown(knots: Sequence[float]) -> Array:
+    """Return the abscissae (m,) at which a curve between its outer knots is shown."""
+    return np.linspace(knots[0], knots[-1], POINTS)
+
+
+def refuse_large(y: Array, limit: float, what: str) -> str:
+    """Say that a curve (m,) exceeds a limit ('' if it does not)."""
+    most = float(np.max(np.abs(y))) if len(y) else 0.0
+    return "" if most < limit else f"{what} reaches {most:.4g}, more than {limit:.4g}"

@@ -1,0 +1,282 @@
+"""Forces at the piston whose form the data draw: over speed by direction, over position.
+
+Named effects are restrictions of these; what none of them is, is the curve itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Final
+
+import numpy as np
+
+from analysis.effects.base import Array, Branch, Effect, Evidence, Shape
+from analysis.effects.contact import PRESLIDING, slide
+from analysis.effects.curve import (
+    LAST,
+    curve_at,
+    freed,
+    knot_shapes,
+    packed,
+    refuse_large,
+    shortest_wave,
+    shown,
+    spline,
+    spread_knots,
+)
+from analysis.effects.friction import Friction, force_limit, force_unit
+from analysis.signals.conditioning import Signals
+from analysis.terms.base import (
+    CONTRIBUTE,
+    SD,
+    TORQUE,
+    Coefficient,
+    Columns,
+    G,
+    Kernel,
+    S,
+    equation,
+    kernel,
+)
+from rig.model.rig import Rig
+
+SPEEDS: Final = 4  # knots of |s'|, the first at rest
+PLACES: Final = 6  # knots of s
+ALIKE: Final = 0.03  # of gravity that a curve of s leaves: less, and the records show one pose
+DRIVES: Final = 0.1  # of the largest friction that it may drive by: the curve's uncertainty
+# Values at the knots of the part that both directions share, by its coefficients, where G is 1: a
+# slope from the first to the last knot is the baseline's viscous friction there. Elsewhere that
+# slope goes with G^2, and the values stand for themselves.
+LEVEL: Final = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0, 0]], dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class FrictionCurve(Friction):
+    """F_f = z f(|s'|) + |z| g(|s'|): friction over speed, f shared by both directions.
+
+    z is the contact's state (`contact`), f and g are curves (`curve`); g is what extending holds
+    more than retracting. On an electric joint the slope of f over the records' speeds is Fv.
+    """
+
+    name: ClassVar[str] = "friction_curve"
+    mechanism: ClassVar[str] = "friction_curve"
+    free: ClassVar[bool] = True
+    by_data: ClassVar[bool] = True
+    variable: ClassVar[str] = "the piston's velocity"
+    confounders: ClassVar[tuple[str, ...]] = ("position_force",)
+    separated_by: ClassVar[str] = "slow and fast motion about several places of the stroke"
+    before: ClassVar[int] = SPEEDS
+
+    @property
+    def kernel(self) -> Kernel:
+        """The compiled contribution."""
+        return _over_speed
+
+    def knot_names(self) -> tuple[str, ...]:
+        """Name the knots."""
+        return tuple(f"friction_{self.joint + 1}_knot_{k}" for k in range(1, SPEEDS + 1))
+
+    def shape_names(self) -> tuple[str, ...]:
+        """Name knots, presliding distance and transition speed."""
+        return (*self.knot_names(), *super().shape_names())
+
+    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
+        """Return knots [m/s], presliding distance [m] and transition speed [m/s]."""
+        speed = rig.joints[self.joint].limits.speed
+        return (*knot_shapes(self.knot_names(), "m/s", 0.0, speed), *super().shapes(rig))
+
+    def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
+        """Return knots at quantiles of the joint's speed, each with some presliding distances."""
+        speed = evidence.of_joint(self.joint, lambda x: np.abs(x.sd[:, self.joint]))
+        knots = spread_knots(speed, (0.0, 0.35, 0.75, LAST), low=0.0)
+        return tuple((*map(float, knots), d) for d in PRESLIDING) if len(knots) else ()
+
+    @staticmethod
+    def _shared(rig: Rig) -> Array:
+        return LEVEL if rig.electric else np.eye(SPEEDS)
+
+    def _names(self, rig: Rig) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        joint = self.joint + 1
+        count = self._shared(rig).shape[1]
+        shared = tuple(f"friction_{joint}_shared_{k}" for k in range(1, count + 1))
+        return shared, tuple(f"friction_{joint}_extending_{k}" for k in range(1, SPEEDS + 1))
+
+    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
+        """Return the values at the knots [N]: of f (electric: but for its slope), then of g."""
+        unit = force_unit(rig, self.joint)
+        return tuple(Coefficient(n, unit, "mechanical") for part in self._names(rig) for n in part)
+
+    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
+        """Return G z and G |z| times the curves' bases."""
+        i, given = self.joint, self.shape_of(rig, shape)
+        z = self.contact(rig, signals, given)
+        basis = spline(given[:SPEEDS], np.abs(signals.sd[:, i]))
+        shared, own = self._names(rig)
+        odd = (signals.G[:, i] * z)[:, None] * (basis @ self._shared(rig))
+        even = (signals.G[:, i] * np.abs(z))[:, None] * basis
+        return self.row(dict(zip((*shared, *own), (*odd.T, *even.T), strict=True)))
+
+    def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
+        """Return joint, distance, transition speed, then the two curves."""
+        given = self.shape_of(rig, shape)
+        shared, own = self._names(rig)
+        f = self._shared(rig) @ np.array([values[name] for name in shared])
+        g = np.array([values[name] for name in own])
+        distance, _, speed = self.contact_of(given)
+        knots = given[:SPEEDS]
+        return np.array([self.joint, distance, speed, *packed(knots, f), *packed(knots, g)])
+
+    def branches(self, rig: Rig, shape: Sequence[float]) -> tuple[Branch, ...]:
+        """Return friction [N] over speed [m/s], the joint's Fv at mid-stroke included."""
+        knots, (shared, own) = shape[:SPEEDS], self._names(rig)
+        v = np.concatenate((-shown(knots)[::-1], shown(knots)))
+        basis, side = spline(knots, np.abs(v)), np.repeat([-1.0, 1.0], len(v) // 2)
+        lever = float(rig.joints[self.joint].geometry(0.0)[1])
+        weights = dict(zip(shared, (side[:, None] * (basis @ self._shared(rig))).T, strict=True))
+        weights |= dict(zip(own, basis.T, strict=True))
+        weights[f"Fv{self.joint + 1}"] = v / lever**2
+        unit = force_unit(rig, self.joint)
+        return (Branch("friction over speed", v, weights, "m/s", unit),)
+
+    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
+        """Refuse friction that drives, and more than half of the cylinder's force."""
+        (line,) = self.branches(rig, self.shape_of(rig, shape))
+        y = sum(w * values.get(name, 0.0) for name, w in line.weights.items())
+        against = np.asarray(y) * np.sign(line.x)
+        most = float(np.max(np.abs(against)))
+        if np.min(against[line.x != 0.0]) < -DRIVES * most:
+            return "friction would drive the piston"
+        return refuse_large(against, force_limit(rig, self.joint), "friction")
+
+
+@kernel
+def _over_speed(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == CONTRIBUTE:
+        i = int(par[0])
+        v = x[SD, i]
+        state, dz[0] = slide(v, z[0], par[1], 0.0, par[2])
+        force = state * curve_at(abs(v), par, 3, 4) + abs(state) * curve_at(abs(v), par, 15, 4)
+        out[TORQUE, i] -= x[G, i] * force
+
+
+@dataclass(frozen=True)
+class PositionForce(Effect):
+    """F = f(s) against extension: a force over the piston's position, f a curve (`curve`).
+
+    One of its values follows from the others, by weights (`gauge`) that come with the knots. Where
+    records show one pose of the joints below, a weight is a force over position too, and the curve
+    is what the weight does not explain; elsewhere it is without its shortest wave.
+    """
+
+    name: ClassVar[str] = "position_force"
+    family: ClassVar[str] = "mechanics"
+    mechanism: ClassVar[str] = "position_force"
+    free: ClassVar[bool] = True
+    by_data: ClassVar[bool] = True
+    variable: ClassVar[str] = "the piston's position"
+    confounders: ClassVar[tuple[str, ...]] = ("friction_curve",)
+    separated_by: ClassVar[str] = "slow motion over the whole stroke at two poses of other joints"
+    per_joint: ClassVar[bool] = True
+    where: str = "joint 1"
+
+    @property
+    def kernel(self) -> Kernel:
+        """The compiled contribution."""
+        return _over_position
+
+    def shape_names(self) -> tuple[str, ...]:
+        """Name the knots."""
+        joint, each = self.joint + 1, range(1, PLACES + 1)
+        knots = tuple(f"position_{joint}_knot_{k}" for k in each)
+        return (*knots, *(f"position_{joint}_gauge_{k}" for k in each))
+
+    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
+        """Return knots [m] and gauge [-]."""
+        low, high = rig.joints[self.joint].position_range
+        names = self.shape_names()
+        even = np.linspace(low, high, PLACES)
+        gauge = zip(names[PLACES:], shortest_wave(even), strict=True)
+        fixed = tuple(Shape(name, "", -1.0, 1.0, (float(v),), fixed=True) for name, v in gauge)
+        return (*knot_shapes(names[:PLACES], "m", low, high), *fixed)
+
+    def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
+        """Return knots at quantiles of the piston's position, and the gauge of these records."""
+        place = evidence.of_joint(self.joint, lambda x: x.s[:, self.joint])
+        knots = spread_knots(place, (1.0 - LAST, 0.2, 0.4, 0.6, 0.8, LAST))
+        if not len(knots):
+            return ()
+        gauge = self._weight(rig, evidence, knots)
+        gauge = shortest_wave(knots) if gauge is None else gauge
+        return ((*map(float, knots), *map(float, gauge)),)
+
+    def _weight(self, rig: Rig, evidence: Evidence, knots: Array) -> Array | None:
+        """Return the gauge (K,) that leaves the joint's weight to gravity.
+
+        None where the records tell the weight by itself: a joint below moves too, or stands in
+        several poses, or nothing weighs.
+        """
+        i = self.joint
+        below = any(s.moving is not None and s.moving[:i].any() for s in evidence.signals)
+        if below or rig.gravity == 0 or getattr(rig, "prismatic", False):
+            return None
+        place = evidence.of_joint(i, lambda x: x.s[:, i])
+        lever = evidence.of_joint(i, lambda x: x.G[:, i])
+        basis = lever[:, None] * spline(tuple(knots), place)
+        pull = evidence.of_joint(i, lambda x: np.sin(x.theta[:, i]))
+        like = np.linalg.lstsq(basis, pull, rcond=1e-9)[0]
+        if np.linalg.norm(pull - basis @ like) > ALIKE * np.linalg.norm(pull - np.mean(pull)):
+            return None
+        gauge = basis.T @ pull
+        return np.asarray(gauge / np.linalg.norm(gauge))
+
+    def _names(self) -> tuple[str, ...]:
+        return tuple(f"F_position_{self.joint + 1}_{k}" for k in range(1, PLACES))
+
+    def _basis(self, shape: Sequence[float], x: Array) -> Array:
+        """Return the curve (n, K - 1) per unit of every coefficient."""
+        return np.asarray(spline(shape[:PLACES], x) @ freed(np.array(shape[PLACES:])))
+
+    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
+        """Return the values at the knots [N] but one, which follows from them."""
+        unit = force_unit(rig, self.joint)
+        return tuple(Coefficient(name, unit, "mechanical") for name in self._names())
+
+    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
+        """Return G times the curve's basis."""
+        i = self.joint
+        basis = self._basis(self.shape_of(rig, shape), signals.s[:, i])
+        columns = (signals.G[:, i, None] * basis).T
+        return {equation("torque", i): dict(zip(self._names(), columns, strict=True))}
+
+    def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
+        """Return joint, curve."""
+        given = self.shape_of(rig, shape)
+        y = freed(np.array(given[PLACES:])) @ np.array([values[name] for name in self._names()])
+        return np.array([self.joint, *packed(given[:PLACES], y)])
+
+    def branches(self, rig: Rig, shape: Sequence[float]) -> tuple[Branch, ...]:
+        """Return the force [N] over the position [m]."""
+        at = shown(shape[:PLACES])
+        weights = dict(zip(self._names(), self._basis(shape, at).T, strict=True))
+        unit = force_unit(rig, self.joint)
+        return (Branch("force over position", at, weights, "m", unit),)
+
+    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
+        """Refuse more than half of the cylinder's force."""
+        y = np.array([values[name] for name in self._names()])
+        return refuse_large(y, force_limit(rig, self.joint), "the force")
+
+    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
+        """Return the piston's position [m]."""
+        return {equation("torque", self.joint): signals.s[:, self.joint]}
+
+
+@kernel
+def _over_position(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == CONTRIBUTE:
+        i = int(par[0])
+        out[TORQUE, i] -= x[G, i] * curve_at(x[S, i], par, 1, 6)
+
+
+TERMS = (FrictionCurve, PositionForce)

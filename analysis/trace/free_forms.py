@@ -1,0 +1,74 @@
+"""Mechanisms without a name for their form: what is tried where no named effect explains."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+
+import numpy as np
+
+from analysis.effects.base import Effect
+from analysis.trace.data.regression_data import RegressionData
+from analysis.trace.judge import gates
+from analysis.trace.remaining import Rest, left_over
+from analysis.trace.result import Found
+from analysis.trace.search.hypothesis import Hypothesis
+from analysis.trace.search.hypothesis_set import DEEPEST, HypothesisSet
+
+log = logging.getLogger(__name__)
+
+TRIED = 4  # free forms that are put through the gates
+NEAR = 2.0  # times the least energy left: of sets within it the simplest goes first
+
+
+def drawn_by_data(
+    hypotheses: HypothesisSet, free: Sequence[Effect], winner: Hypothesis,
+    holdout_data: RegressionData, rng: np.random.Generator,
+) -> tuple[HypothesisSet, tuple[Found, ...], Hypothesis, list[Rest]] | None:  # fmt: skip
+    """Explain the records with a mechanism whose form the data draw; None where none does.
+
+    Returns the sets tried, what was judged, the set that stands and what it leaves. `free` are the
+    mechanisms, `winner` what stood of the named effects. A mechanism stands beside those effects,
+    or in the place of readings of it. Every gate of every effect must hold with it, nothing may be
+    left that speaks against it, and no named effect may fit as well: then what a name failed at is
+    no matter of form.
+    """
+    if not free:
+        return None
+    wide = hypotheses.widened(free)
+    tried: list[Hypothesis] = []
+    for start in _starts(wide, winner):
+        for single in wide.extensions(start, free=True):
+            one = single if wide.formed(single) else _with_more(wide, single)
+            if wide.formed(one) and not wide.physical(one):
+                tried.append(wide.prune(one))
+    least = min((one.total for one in tried), default=0.0)
+    first = sorted(tried, key=lambda one: (one.total > NEAR * least, one.size[1], one.total))
+    for one in list({o.keys: o for o in first}.values())[:TRIED]:
+        found = gates.judge(wide, one, holdout_data, rng)
+        rest = left_over(wide, one, holdout_data)
+        failed = [(f.name, g.name, g.detail) for f in found for g in f.gates if not g.ok]
+        log.info("free form %s: %s %s", sorted(one.keys), [r.words for r in rest], failed)
+        names = {kind.name for kind in wide.effects if not kind.free}
+        named = any(r.tied and r.name in names for f in found if f.free for r in f.rivals)
+        if named or not all(map(gates.stands, found)) or any(r.veto for r in rest):
+            continue
+        return wide, found, one, rest
+    return None
+
+
+def _with_more(wide: HypothesisSet, one: Hypothesis) -> Hypothesis:
+    """Return the set with one more effect where equations keep too much, else the set."""
+    loud = {e for e, v in one.excess_energy.items() if not wide.negligible(e, v)}
+    return (wide.closer(one, loud) if len(one.effects) < DEEPEST else None) or one
+
+
+def _starts(wide: HypothesisSet, winner: Hypothesis) -> list[Hypothesis]:
+    """Return what a free mechanism may join: what stood, and without readings of one mechanism."""
+    out = {winner.keys: winner}
+    for used in winner.effects:
+        same = (used.term.mechanism, used.term.where)  # type: ignore[attr-defined]
+        kept = [u for u in winner.effects if (u.term.mechanism, u.term.where) != same]  # type: ignore[attr-defined]
+        one = wide.exact(kept) if kept else wide.empty
+        out[one.keys] = one
+    return list(out.values())
