@@ -58,13 +58,17 @@ class Shape:
 
 @dataclass(frozen=True)
 class Branch:
-    """One line of an effect's curve: y(x) = sum of weights (m,) times parameters, by name."""
+    """One line of an effect's curve: y(x) = sum of weights (m,) times parameters, by name.
+
+    The parameters are the rows' coefficients (1/b under the name of b); `reciprocal` marks 1 / y.
+    """
 
     label: str
     x: Array
     weights: Mapping[str, Array]
     unit_x: str
     unit_y: str
+    reciprocal: bool = False
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from analysis.trace.data.noise_floor import STATED
 from analysis.trace.data.regression_data import RegressionData, regression_data
 from analysis.trace.data.spectral_lines import lines
 from analysis.trace.data.temperature_nuisance import stripped, temperature_terms
-from analysis.trace.free_forms import drawn_by_data
+from analysis.trace.free_forms import drawn_by_data, mechanisms
 from analysis.trace.judge import gates, held_out
 from analysis.trace.judge.shooting import reshaped, told
 from analysis.trace.next_experiment.proposal import propose
@@ -104,12 +104,11 @@ def trace(
     else:
         winner = hypotheses.run()
         found, winner, verdict, rest = _named(hypotheses, winner, holdout_data, rng)
-        if verdict == UNEXPLAINED and free_forms:
-            free = _unknown(free_mechanisms(rig), known)
-            drawn = drawn_by_data(hypotheses, free, winner, holdout_data, rng)
-            if drawn is not None:
-                hypotheses, found, winner, rest = drawn
-                verdict = CONFOUNDED if _tied(found) else EXPLAINED
+        free = _unknown(free_mechanisms(rig), known) if free_forms else []
+        drawn = _drawn(hypotheses, free, winner, verdict, holdout_data, rng)
+        if drawn is not None:
+            hypotheses, found, winner, rest = drawn
+            verdict = CONFOUNDED if _tied(found) else EXPLAINED
         refused = tuple(f for f in found if not gates.stands(f))
         found = tuple(f for f in found if gates.stands(f))
         notes += _rest_notes(verdict, rest, quiet, bool(found))
@@ -205,6 +204,17 @@ def _notes(train_data: RegressionData, holdout_data: RegressionData) -> list[str
     if all(f.source == STATED for f in holdout_data.floors):
         out.append("the held-out noise floor is the rig file's stated sensor noise")
     return out
+
+
+def _drawn(
+    hypotheses: HypothesisSet, free: Sequence[Effect], winner: Hypothesis, verdict: str,
+    holdout_data: RegressionData, rng: np.random.Generator,
+) -> tuple[HypothesisSet, tuple[Found, ...], Hypothesis, list[Rest]] | None:  # fmt: skip
+    """Try free mechanisms where no name explains, or only several with more than noise left."""
+    fewer = verdict != UNEXPLAINED
+    if fewer and (mechanisms(winner) < 2 or within(winner.excess_energy, hypotheses.limits)):
+        return None
+    return drawn_by_data(hypotheses, free, winner, holdout_data, rng, fewer)
 
 
 def _rest_notes(verdict: str, rest: Sequence[Rest], quiet: bool, found: bool) -> list[str]:

@@ -18,12 +18,13 @@ from analysis.trace.search.hypothesis_set import DEEPEST, HypothesisSet
 log = logging.getLogger(__name__)
 
 TRIED = 4  # free forms that are put through the gates
+LESS = 0.5  # of what several named mechanisms leave: the most that one in their place may
 NEAR = 2.0  # times the least energy left: of sets within it the simplest goes first
 
 
 def drawn_by_data(
     hypotheses: HypothesisSet, free: Sequence[Effect], winner: Hypothesis,
-    holdout_data: RegressionData, rng: np.random.Generator,
+    holdout_data: RegressionData, rng: np.random.Generator, fewer: bool = False,
 ) -> tuple[HypothesisSet, tuple[Found, ...], Hypothesis, list[Rest]] | None:  # fmt: skip
     """Explain the records with a mechanism whose form the data draw; None where none does.
 
@@ -31,16 +32,18 @@ def drawn_by_data(
     mechanisms, `winner` what stood of the named effects. A mechanism stands beside those effects,
     or in the place of readings of it. Every gate of every effect must hold with it, nothing may be
     left that speaks against it, and no named effect may fit as well: then what a name failed at is
-    no matter of form.
+    no matter of form. With `fewer` the named effects explain, within what their forms may miss, but
+    need several mechanisms: what replaces them must need fewer and leave half as much.
     """
     if not free:
         return None
     wide = hypotheses.widened(free)
     tried: list[Hypothesis] = []
-    for start in _starts(wide, winner):
+    for start in _starts(wide, winner, fewer):
         for single in wide.extensions(start, free=True):
             one = single if wide.formed(single) else _with_more(wide, single)
-            if wide.formed(one) and not wide.physical(one):
+            less = one.total < LESS * winner.total and mechanisms(one) < mechanisms(winner)
+            if wide.formed(one) and not wide.physical(one) and (less or not fewer):
                 tried.append(wide.prune(one))
     least = min((one.total for one in tried), default=0.0)
     first = sorted(tried, key=lambda one: (one.total > NEAR * least, one.size[1], one.total))
@@ -63,8 +66,18 @@ def _with_more(wide: HypothesisSet, one: Hypothesis) -> Hypothesis:
     return (wide.closer(one, loud) if len(one.effects) < DEEPEST else None) or one
 
 
-def _starts(wide: HypothesisSet, winner: Hypothesis) -> list[Hypothesis]:
-    """Return what a free mechanism may join: what stood, and without readings of one mechanism."""
+def mechanisms(one: Hypothesis) -> int:
+    """Count the mechanisms, each at its place, that a set of effects needs."""
+    return len({(u.term.mechanism, u.term.where) for u in one.effects})  # type: ignore[attr-defined]
+
+
+def _starts(wide: HypothesisSet, winner: Hypothesis, fewer: bool) -> list[Hypothesis]:
+    """Return what a free mechanism may join: what stood, and without readings of one mechanism.
+
+    Where it must need `fewer`, nothing: it is tried alone.
+    """
+    if fewer:
+        return [wide.empty]
     out = {winner.keys: winner}
     for used in winner.effects:
         same = (used.term.mechanism, used.term.where)  # type: ignore[attr-defined]

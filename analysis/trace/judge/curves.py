@@ -32,8 +32,10 @@ def curves_of(data: RegressionData, model: ExactFit, used: Used) -> tuple[Curve,
         y = W @ np.array([known[n] for n in here])
         spread = W @ covariance[np.ix_(at, at)] * W
         half = WIDE * np.sqrt(np.maximum(spread.sum(axis=1), 0.0))
-        units = (line.unit_x, line.unit_y)
-        out.append(Curve(line.label, line.x, y, y - half, y + half, *units))
+        ends = (y - half, y + half)
+        if line.reciprocal:
+            y, ends = 1.0 / y, (1.0 / ends[1], 1.0 / ends[0])
+        out.append(Curve(line.label, line.x, y, *ends, line.unit_x, line.unit_y))
     return tuple(out)
 
 

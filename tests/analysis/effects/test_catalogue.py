@@ -32,6 +32,7 @@ CONTRACT = {
     "internal_leakage", "external_leakage", "supply_sag", "tank_pressure", "entrained_air",
     "dead_volume", "channel_delay", "sensor_gain", "sensor_offset",
     "asymmetric_viscous_friction", "periodic_disturbance", "friction_curve", "position_force",
+    "metering_curve", "leakage_curve", "bulk_modulus_curve",
 }  # fmt: skip
 
 
@@ -289,6 +290,24 @@ REFUSED = [
         "joint 2",
         {f"F_position_2_{k}": 1e5 for k in range(1, 6)},
         (-0.03, -0.02, -0.01, 0.01, 0.02, 0.03, 0.1, -0.5, 0.7, -0.7, 0.5, -0.1),
+    ),
+    (
+        "metering_curve",
+        "joint 2",
+        {f"C_{e}_2_at_{k}": (3 - k) * 1e-7 for e in ("pp", "pm", "mp", "mm") for k in (2, 3, 4)},
+        (0.0, 0.05, 0.1, 0.15, 0.2),
+    ),
+    (
+        "leakage_curve",
+        "joint 2",
+        {f"Q_leak_2_{k}": -1e-6 for k in (2, 3, 4, 5)},
+        (0.0, 1e6, 2e6, 3e6, 4e6),
+    ),
+    (
+        "bulk_modulus_curve",
+        "bench",
+        {f"softness_{k}": -1e-8 for k in (1, 2, 3)},
+        (0.0, 2e6, 4e6, 6e6),
     ),
     ("base_inclination", "bench", {}, (0.35,)),
     ("payload", "bench", {"m_payload": -1.0}, ()),

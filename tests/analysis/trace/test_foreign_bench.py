@@ -15,6 +15,7 @@ from analysis.simulation.model import load_model, save_model
 from analysis.trace.engine import trace
 from analysis.trace.result import Trace, to_json
 from rig.model.rig import Rig
+from tests.analysis.small_bench import TRUTH
 from tests.analysis.trace.foreign_bench import (
     KARNOPP,
     SIGMOID,
@@ -157,6 +158,28 @@ def test_a_spring_that_hardens_is_a_force_over_position(rig: Rig) -> None:
     assert line.y + weight / lever == pytest.approx(pull, abs=0.03 * np.abs(pull).max())
     without = traced(rig, Hidden(spring=20.0, hardening=150.0), free_forms=False)
     assert without.verdict == "unexplained"
+
+
+def test_a_tapered_metering_edge_is_a_curve_over_the_spool(rig: Rig) -> None:
+    result = traced(rig, Hidden(taper=2.0))
+    assert result.verdict == "explained"
+    assert [(e.name, e.free) for e in result.effects] == [("metering_curve", True)]
+    cap, rod = result.effects[0].curves
+    u = cap.x
+    for line, ahead, astern in ((cap, "C_pp_2", "C_pm_2"), (rod, "C_mp_2", "C_mm_2")):
+        opening = (u + 2.0 * u * np.abs(u)) * (1 if line is cap else -1)
+        there = np.where(u > 0, TRUTH[ahead], TRUTH[astern]) * opening
+        assert line.y == pytest.approx(there, abs=0.01 * np.abs(there).max())
+
+
+def test_a_leak_by_the_root_of_the_pressure_is_a_curve_and_not_two_names(rig: Rig) -> None:
+    result = traced(rig, Hidden(leak_root=5e-9))
+    assert result.verdict == "explained"
+    assert [(e.name, e.free) for e in result.effects] == [("leakage_curve", True)]
+    (line,) = result.effects[0].curves
+    wide = line.x > 0.2 * line.x[-1]
+    assert line.y[wide] == pytest.approx(5e-9 * np.sqrt(line.x[wide]), rel=0.05)
+    assert result.model_after.values["b"] == pytest.approx(TRUTH["b"], rel=0.02)
 
 
 def rig_angle(rig: Rig) -> float:

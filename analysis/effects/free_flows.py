@@ -1,0 +1,411 @@
+"""Flows whose form the data draw: metering edges over the spool, leakage, the oil's softness.
+
+Named effects are restrictions of these; what none of them is, is the curve itself.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Final
+
+import numpy as np
+from numba import njit
+
+from analysis.effects.base import Array, Branch, Effect, Evidence, Shape
+from analysis.effects.curve import (
+    LAST,
+    curve_at,
+    knot_shapes,
+    packed,
+    refuse_large,
+    shown,
+    spline,
+    spread_knots,
+)
+from analysis.signals.conditioning import Signals
+from analysis.terms.base import (
+    COMP_CAP,
+    COMP_ROD,
+    CONTRIBUTE,
+    FLOW_CAP,
+    FLOW_ROD,
+    P_CAP,
+    P_ROD,
+    P_S,
+    P_TANK,
+    V_CAP,
+    V_ROD,
+    Coefficient,
+    Columns,
+    Kernel,
+    U,
+    equation,
+    kernel,
+)
+from rig.model.parameters import gain_names
+from rig.model.rig import Rig
+
+OPENINGS: Final = 5  # knots of |u|, the first at the null; that and the last have no value
+DROPS: Final = 5  # knots of a leak's pressure, the first at zero, where nothing leaks
+PRESSURES: Final = 4  # knots of the oil's pressure; the last has no value: it is 1/b
+BACKWARDS: Final = 0.05  # of its largest that an edge or a leak may pass against: uncertainty
+EDGES: Final = ("pp", "pm", "mp", "mm")
+
+
+@dataclass(frozen=True)
+class MeteringCurve(Effect):
+    """Each edge passes (C |u| + f(|u|)) sqrt(dp): an edge's form over the spool, f a curve.
+
+    f is zero at the null and at the largest opening of the records, where C is the whole edge.
+    """
+
+    name: ClassVar[str] = "metering_curve"
+    family: ClassVar[str] = "valve"
+    mechanism: ClassVar[str] = "metering_curve"
+    free: ClassVar[bool] = True
+    by_data: ClassVar[bool] = True
+    hydraulic: ClassVar[bool] = True
+    variable: ClassVar[str] = "the spool"
+    confounders: ClassVar[tuple[str, ...]] = ("leakage_curve", "supply_sag", "tank_pressure")
+    separated_by: ClassVar[str] = "the same opening at several pressures across the edge"
+    per_joint: ClassVar[bool] = True
+    where: str = "joint 1"
+
+    @property
+    def kernel(self) -> Kernel:
+        """The compiled contribution."""
+        return _edges
+
+    def shape_names(self) -> tuple[str, ...]:
+        """Name the knots."""
+        return tuple(f"opening_{self.joint + 1}_knot_{k}" for k in range(1, OPENINGS + 1))
+
+    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
+        """Return the knots [V]."""
+        stroke = rig.joints[self.joint].valve.spool_stroke
+        return knot_shapes(self.shape_names(), "V", 0.0, stroke)
+
+    def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
+        """Return knots at quantiles of the spool's travel."""
+        travel = evidence.of_joint(self.joint, lambda x: np.abs(x.u[:, self.joint]))
+        knots = spread_knots(travel, (0.0, 0.2, 0.45, 0.75, LAST), low=0.0)
+        return (tuple(map(float, knots)),) if len(knots) else ()
+
+    def _names(self, edge: str) -> tuple[str, ...]:
+        return tuple(f"C_{edge}_{self.joint + 1}_at_{k}" for k in range(2, OPENINGS))
+
+    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
+        """Return the values of f at the inner knots, edge by edge [m^3/(s Pa^0.5)]."""
+        names = (name for edge in EDGES for name in self._names(edge))
+        return tuple(Coefficient(name, "m^3/(s*Pa^0.5)", "fluid") for name in names)
+
+    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
+        """Return the roots of the edge that is open times the curve's basis."""
+        i = self.joint
+        u, cap, rod = signals.u[:, i], signals.p_cap[:, i], signals.p_rod[:, i]
+        basis = spline(self.shape_of(rig, shape), np.abs(u))[:, 1:-1]
+        p_s, p_t, ahead, astern = signals.p_s, signals.p_tank, u > 0.0, u < 0.0
+        drops = {
+            "pp": ahead * _root(p_s - cap), "pm": -(astern * _root(cap - p_t)),
+            "mp": -(ahead * _root(rod - p_t)), "mm": astern * _root(p_s - rod),
+        }  # fmt: skip
+        out: Columns = {}
+        for edge, drop in drops.items():
+            kind = "flow_cap" if edge[0] == "p" else "flow_rod"
+            row = out.setdefault(equation(kind, i), {})
+            row |= zip(self._names(edge), (drop[:, None] * basis).T, strict=True)
+        return out
+
+    def _values(self, values: Mapping[str, float], edge: str) -> Array:
+        return np.array([0.0, *(values[name] for name in self._names(edge)), 0.0])
+
+    def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
+        """Return joint, then one curve an edge."""
+        knots = self.shape_of(rig, shape)
+        curves = [packed(knots, self._values(values, edge)) for edge in EDGES]
+        return np.concatenate(([self.joint], *curves))
+
+    def branches(self, rig: Rig, shape: Sequence[float]) -> tuple[Branch, ...]:
+        """Return flow into each chamber over root of pressure drop, over the spool."""
+        at = shown(shape)
+        x = np.concatenate((-at[::-1], at))
+        basis = spline(shape, np.abs(x))[:, 1:-1]
+        pp, pm, mp, mm = gain_names(self.joint + 1)
+        unit = "m^3/(s*Pa^0.5)"
+        out = []
+        for label, ahead, astern, gains, sign in (
+            ("cap edges over the spool", "pp", "pm", (pp, pm), 1.0),
+            ("rod edges over the spool", "mp", "mm", (mp, mm), -1.0),
+        ):
+            weights = {gains[0]: sign * np.maximum(x, 0.0), gains[1]: sign * np.minimum(x, 0.0)}
+            weights |= zip(self._names(ahead), (sign * (x > 0.0) * basis.T), strict=True)
+            weights |= zip(self._names(astern), (-sign * (x < 0.0) * basis.T), strict=True)
+            out.append(Branch(label, x, weights, "V", unit))
+        return tuple(out)
+
+    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
+        """Refuse an edge that passes oil backwards or closes as the spool opens it."""
+        knots = self.shape_of(rig, shape)
+        at = shown(knots)
+        for edge, gain in zip(EDGES, gain_names(self.joint + 1), strict=True):
+            own = spline(knots, at) @ self._values(values, edge)
+            whole = own + values.get(gain, 0.0) * at
+            least = -BACKWARDS * float(np.max(np.abs(whole)))
+            if np.min(whole) < least or np.min(whole - np.maximum.accumulate(whole)) < least:
+                return f"edge {gain} would close as the spool opens it, or pass oil backwards"
+        return ""
+
+    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
+        """Return the spool [V]."""
+        u = signals.u[:, self.joint]
+        return {equation(kind, self.joint): u for kind in ("flow_cap", "flow_rod")}
+
+
+@dataclass(frozen=True)
+class LeakageCurve(Effect):
+    """Q = f(|dp|) sign(dp): a leak over the pressure across it, f a curve with f(0) = 0.
+
+    Between the chambers, or out of one of them to the tank.
+    """
+
+    name: ClassVar[str] = "leakage_curve"
+    family: ClassVar[str] = "fluid"
+    mechanism: ClassVar[str] = "leakage_curve"
+    free: ClassVar[bool] = True
+    by_data: ClassVar[bool] = True
+    hydraulic: ClassVar[bool] = True
+    variable: ClassVar[str] = "the pressure across the leak"
+    confounders: ClassVar[tuple[str, ...]] = ("metering_curve", "underlap_leakage")
+    separated_by: ClassVar[str] = "a load that drives the pressures far apart while little moves"
+    per_joint: ClassVar[bool] = True
+    where: str = "joint 1"
+
+    @property
+    def kernel(self) -> Kernel:
+        """The compiled contribution."""
+        return _leak
+
+    @classmethod
+    def all_places(cls, rig: Rig) -> tuple[str, ...]:
+        """Return each joint, between its chambers, then each of its chambers."""
+        return tuple(
+            f"{joint}{side}" for joint in super().all_places(rig) for side in ("", " cap", " rod")
+        )
+
+    @property
+    def _mark(self) -> str:
+        return f"{self.joint + 1}" + (f"_{self.side}" if self.side else "")
+
+    def across(self, signals: Signals) -> Array:
+        """Return the pressure across the leak (n,) [Pa]."""
+        cap, rod = signals.p_cap[:, self.joint], signals.p_rod[:, self.joint]
+        if not self.side:
+            return np.asarray(cap - rod)
+        return np.asarray((cap if self.side == "cap" else rod) - signals.p_tank)
+
+    def shape_names(self) -> tuple[str, ...]:
+        """Name the knots."""
+        return tuple(f"leak_{self._mark}_knot_{k}" for k in range(1, DROPS + 1))
+
+    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
+        """Return the knots [Pa]."""
+        return knot_shapes(self.shape_names(), "Pa", 0.0, rig.supply.pressure)
+
+    def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
+        """Return knots at quantiles of the pressure across the leak."""
+        drop = evidence.of_joint(self.joint, lambda x: np.abs(self.across(x)))
+        knots = spread_knots(drop, (0.0, 0.1, 0.35, 0.7, LAST), low=0.0)
+        return (tuple(map(float, knots)),) if len(knots) else ()
+
+    def _names(self) -> tuple[str, ...]:
+        return tuple(f"Q_leak_{self._mark}_{k}" for k in range(2, DROPS + 1))
+
+    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
+        """Return the flows at the knots [m^3/s]."""
+        return tuple(Coefficient(name, "m^3/s", "fluid") for name in self._names())
+
+    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
+        """Return the curve's basis, out of the chamber that leaks and into the other."""
+        drop = self.across(signals)
+        basis = spline(self.shape_of(rig, shape), np.abs(drop))[:, 1:]
+        out = dict(zip(self._names(), (np.sign(drop) * basis.T), strict=True))
+        given = {name: -column for name, column in out.items()}
+        i = self.joint
+        if self.side:
+            return {equation(f"flow_{self.side}", i): given}
+        return {equation("flow_cap", i): given, equation("flow_rod", i): out}
+
+    def _values(self, values: Mapping[str, float]) -> Array:
+        return np.array([0.0, *(values[name] for name in self._names())])
+
+    def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
+        """Return joint, side (0 for between the chambers, 1 cap, 2 rod), curve."""
+        side = ("", "cap", "rod").index(self.side)
+        curve = packed(self.shape_of(rig, shape), self._values(values))
+        return np.array([self.joint, side, *curve])
+
+    def branches(self, rig: Rig, shape: Sequence[float]) -> tuple[Branch, ...]:
+        """Return the flow [m^3/s] over the pressure [Pa]."""
+        at = shown(shape)
+        weights = dict(zip(self._names(), spline(shape, at)[:, 1:].T, strict=True))
+        return (Branch("leakage over pressure", at, weights, "Pa", "m^3/s"),)
+
+    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
+        """Refuse a leak that pumps, and one of more than half the pump's flow."""
+        knots = self.shape_of(rig, shape)
+        flow = spline(knots, shown(knots)) @ self._values(values)
+        if np.min(flow) < -BACKWARDS * float(np.max(np.abs(flow))):
+            return "the leak would pump"
+        return refuse_large(flow, 0.5 * rig.supply.flow, "the leak")
+
+    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
+        """Return the pressure across the leak [Pa]."""
+        kinds = (f"flow_{self.side}",) if self.side else ("flow_cap", "flow_rod")
+        return {equation(kind, self.joint): self.across(signals) for kind in kinds}
+
+
+@dataclass(frozen=True)
+class BulkModulusCurve(Effect):
+    """1/b_eff = 1/b + f(p): the oil's softness over its pressure, f a curve.
+
+    f is zero at the highest pressure of the records, where b is the whole modulus.
+    """
+
+    name: ClassVar[str] = "bulk_modulus_curve"
+    family: ClassVar[str] = "fluid"
+    mechanism: ClassVar[str] = "bulk_modulus_curve"
+    free: ClassVar[bool] = True
+    by_data: ClassVar[bool] = True
+    hydraulic: ClassVar[bool] = True
+    variable: ClassVar[str] = "the pressure rate, by the pressure"
+    confounders: ClassVar[tuple[str, ...]] = ("dead_volume", "spool_lag")
+    separated_by: ClassVar[str] = "fast pressure changes at low and at high chamber pressure"
+
+    @property
+    def kernel(self) -> Kernel:
+        """The compiled contribution."""
+        return _softness
+
+    @classmethod
+    def all_places(cls, rig: Rig) -> tuple[str, ...]:
+        """Return the bench."""
+        return ("bench",)
+
+    def shape_names(self) -> tuple[str, ...]:
+        """Name the knots."""
+        return tuple(f"bulk_knot_{k}" for k in range(1, PRESSURES + 1))
+
+    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
+        """Return the knots [Pa]."""
+        return knot_shapes(self.shape_names(), "Pa", 0.0, rig.supply.pressure)
+
+    def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
+        """Return knots at quantiles of the moving joints' chamber pressures."""
+        joints = range(len(rig.joints))
+        parts = [evidence.of_joint(i, lambda x, i=i: x.p_cap[:, i]) for i in joints]  # type: ignore[misc]
+        parts += [evidence.of_joint(i, lambda x, i=i: x.p_rod[:, i]) for i in joints]  # type: ignore[misc]
+        knots = spread_knots(np.concatenate(parts), (1.0 - LAST, 0.25, 0.65, LAST))
+        return (tuple(map(float, knots)),) if len(knots) else ()
+
+    def _names(self) -> tuple[str, ...]:
+        return tuple(f"softness_{k}" for k in range(1, PRESSURES))
+
+    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
+        """Return the additional softness at the knots [1/Pa]."""
+        return tuple(Coefficient(name, "Pa^-1", "fluid") for name in self._names())
+
+    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
+        """Return - V dp/dt times the curve's basis of each chamber."""
+        knots, out = self.shape_of(rig, shape), {}
+        for i in range(signals.joints):
+            for side, V, p, rate in (
+                ("flow_cap", signals.V_cap, signals.p_cap, signals.pd_cap),
+                ("flow_rod", signals.V_rod, signals.p_rod, signals.pd_rod),
+            ):
+                basis = spline(knots, p[:, i])[:, :-1]
+                columns = (-(V[:, i] * rate[:, i])[:, None] * basis).T
+                out[equation(side, i)] = dict(zip(self._names(), columns, strict=True))
+        return out
+
+    def _values(self, values: Mapping[str, float]) -> Array:
+        return np.array([*(values[name] for name in self._names()), 0.0])
+
+    def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
+        """Return the curve."""
+        return packed(self.shape_of(rig, shape), self._values(values))
+
+    def branches(self, rig: Rig, shape: Sequence[float]) -> tuple[Branch, ...]:
+        """Return the bulk modulus [Pa] over pressure [Pa]."""
+        at = shown(shape)
+        weights = dict(zip(self._names(), spline(shape, at)[:, :-1].T, strict=True))
+        weights["b"] = np.ones_like(at)
+        return (Branch("bulk modulus over pressure", at, weights, "Pa", "Pa", reciprocal=True),)
+
+    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
+        """Refuse oil that gives way to no pressure."""
+        knots = self.shape_of(rig, shape)
+        b = values.get("b", rig.nominal.get("b", math.nan))
+        soft = spline(knots, shown(knots)) @ self._values(values) + 1.0 / b
+        return "" if not np.min(soft) <= 0.0 else "the oil would not be compressible"
+
+    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
+        """Return each chamber's pressure [Pa]."""
+        out: dict[str, Array] = {}
+        for i in range(signals.joints):
+            out[equation("flow_cap", i)] = signals.p_cap[:, i]
+            out[equation("flow_rod", i)] = signals.p_rod[:, i]
+        return out
+
+
+def _root(drop: Array) -> Array:
+    return np.sqrt(np.maximum(drop, 0.0))
+
+
+@njit(cache=True)
+def _signed(drop):  # type: ignore[no-untyped-def]
+    return math.sqrt(drop) if drop >= 0.0 else -math.sqrt(-drop)
+
+
+@kernel
+def _edges(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase != CONTRIBUTE:
+        return
+    i = int(par[0])
+    u, cap, rod = x[U, i], x[P_CAP, i], x[P_ROD, i]
+    if u > 0.0:
+        out[FLOW_CAP, i] += curve_at(u, par, 1, 5) * _signed(bench[P_S] - cap)
+        out[FLOW_ROD, i] -= curve_at(u, par, 31, 5) * _signed(rod - bench[P_TANK])
+    elif u < 0.0:
+        out[FLOW_CAP, i] -= curve_at(-u, par, 16, 5) * _signed(cap - bench[P_TANK])
+        out[FLOW_ROD, i] += curve_at(-u, par, 46, 5) * _signed(bench[P_S] - rod)
+
+
+@kernel
+def _leak(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase != CONTRIBUTE:
+        return
+    i, side = int(par[0]), int(par[1])
+    cap, rod = x[P_CAP, i], x[P_ROD, i]
+    drop = cap - rod if side == 0 else (cap if side == 1 else rod) - bench[P_TANK]
+    flow = curve_at(abs(drop), par, 2, 5)
+    flow = flow if drop > 0.0 else -flow
+    if side == 0:
+        out[FLOW_CAP, i] -= flow
+        out[FLOW_ROD, i] += flow
+    elif side == 1:
+        out[FLOW_CAP, i] -= flow
+    else:
+        out[FLOW_ROD, i] -= flow
+
+
+@kernel
+def _softness(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == CONTRIBUTE:
+        for i in range(x.shape[1]):
+            out[COMP_CAP, i] += x[V_CAP, i] * curve_at(x[P_CAP, i], par, 0, 4)
+            out[COMP_ROD, i] += x[V_ROD, i] * curve_at(x[P_ROD, i], par, 0, 4)
+
+
+TERMS = (MeteringCurve, LeakageCurve, BulkModulusCurve)
