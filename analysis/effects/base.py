@@ -124,6 +124,8 @@ class Effect(Term):
     def place(self) -> str:
         """Where it is, in the contract's words: `bench`, `joint I` or `joint I cap|rod`."""
         words = self.where.split()
+        if words[0] == "bench":
+            return "bench"
         return " ".join(words[:2]) if words[-1] in ("piston", "spool") else self.where
 
     @property
@@ -138,6 +140,11 @@ class Effect(Term):
     def side(self) -> str:
         """What `where` says after the joint: `cap`, `rod`, a sensor, or nothing."""
         return self.where.split()[2] if len(self.where.split()) > 2 else ""
+
+    @property
+    def least_joints(self) -> int:
+        """How many joints must move for it to be anything of its own."""
+        return 1
 
     def least_shapes(self) -> tuple[float, ...]:
         """Return the first shapes of its smallest size of interest."""

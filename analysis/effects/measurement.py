@@ -1,12 +1,13 @@
-"""Effects of measurement: a channel that lags, a wrong gain, an offset.
+"""Effects of measurement: a channel that is late or lags, a wrong gain, an offset, cross-talk.
 
 They transform data, not the model: `prepare` undoes them in the signals, and the plant's equations
 hold between what is left. `correct` does the same to sampled channels, so that a simulation is
 compared with what a right sensor would have shown.
 
 `where` is `joint I cap|rod` for a chamber's pressure, `joint I piston|spool` for those sensors
-(reported as `joint I`: the parameter's name says which), and `bench` for the supply pressure.
-Source: each is the first-order model of a sensor, reading(t) = gain x(t - delay) + offset.
+(reported as `joint I`: the parameter's name says which), and `bench` for the supply pressure. What
+all channels of a kind share stands at `bench pressure|piston|spool` (reported as `bench`).
+Source: each is the first-order model of a sensor, tau y' + y = gain x(t - delay) + offset.
 """
 
 from __future__ import annotations
@@ -45,8 +46,26 @@ class Sensor(Effect):
         return NO_KERNEL
 
     @property
+    def shared(self) -> str:
+        """The kind of all channels that share it: `pressure`, `piston`, `spool` or none ('')."""
+        return self.where.removeprefix("bench").strip() if self.where.startswith("bench ") else ""
+
+    @property
+    def least_joints(self) -> int:
+        """How many joints must move: with one, all pistons are that joint's."""
+        return 2 if self.shared in ("piston", "spool") else 1
+
+    def each(self, rig: Rig) -> tuple[Sensor, ...]:
+        """Return the effect at every channel that shares it."""
+        sides = ("cap", "rod") if self.shared == "pressure" else (self.shared,)
+        joints = range(1, len(rig.joints) + 1)
+        return tuple(type(self)(f"joint {i} {side}") for i in joints for side in sides)
+
+    @property
     def channel(self) -> str:
-        """The channel's name."""
+        """The channel's name, or of several the kind."""
+        if self.shared:
+            return self.shared
         if self.where == "bench":
             return ch.SUPPLY
         return ch.channel(KINDS[self.side], self.joint + 1)
@@ -76,6 +95,10 @@ class Sensor(Effect):
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Undo the distortion in the channel's signal and all that is made of it."""
+        if self.shared:
+            for one in self.each(rig):
+                signals = one.prepare(rig, signals, self.shape_of(rig, shape))
+            return signals
         value = self.shape_of(rig, shape)[0]
         if self.where == "bench":
             return replace(signals, p_s=self.undone(signals.p_s, 0, signals.rate, value))
@@ -122,6 +145,8 @@ class Sensor(Effect):
     ) -> dict[str, Array]:
         """Return the channels as a right sensor would have sampled them, each (n,)."""
         out = dict(channels)
+        for one in self.each(rig) if self.shared else ():
+            out = one.correct(rig, out, rate, self.shape_of(rig, shape))
         if self.channel in out:
             value = self.shape_of(rig, shape)[0]
             out[self.channel] = self.undone(out[self.channel], 0, rate, value)
@@ -133,6 +158,9 @@ class Sensor(Effect):
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return the channel, in the rows where it stands first."""
+        if self.shared:
+            found = [one.abscissa(rig, signals) for one in self.each(rig)]
+            return {name: x for one in found for name, x in one.items()}
         if self.where == "bench":
             kinds = ("flow_cap", "flow_rod")
             joints = range(signals.joints)
@@ -152,13 +180,32 @@ class Sensor(Effect):
 
 
 @dataclass(frozen=True)
-class ChannelDelay(Sensor):
+class Late(Sensor):
+    """What delays and lags share: they may be those of all channels of a kind."""
+
+    @classmethod
+    def all_places(cls, rig: Rig) -> tuple[str, ...]:
+        """Return every channel, then all pressures, and all pistons or spools of several joints."""
+        kinds = ("pressure", "piston", "spool") if len(rig.joints) > 1 else ("pressure",)
+        return (*super().all_places(rig), *(f"bench {kind}" for kind in kinds))
+
+    def _shown(self, x: Array) -> Array:
+        return np.gradient(x[:, self.joint])
+
+
+@dataclass(frozen=True)
+class ChannelDelay(Late):
     """reading(t) = x(t - delay), beyond the delay and skew that the rig file states."""
 
     name: ClassVar[str] = "channel_delay"
     least_shape: ClassVar[tuple[float, ...]] = (1e-3,)  # [s]
     variable: ClassVar[str] = "the channel's rate"
-    confounders: ClassVar[tuple[str, ...]] = ("spool_lag", "entrained_air", "dead_volume")
+    confounders: ClassVar[tuple[str, ...]] = (
+        "sensor_lag",
+        "spool_lag",
+        "entrained_air",
+        "dead_volume",
+    )
     separated_by: ClassVar[str] = (
         "a wide band: a delay turns the phase in proportion to frequency and leaves the amplitude"
     )
@@ -182,8 +229,81 @@ class ChannelDelay(Sensor):
         valid[len(valid) - lost :] = False
         return super().prepare(rig, replace(signals, valid=valid), shape)
 
-    def _shown(self, x: Array) -> Array:
-        return np.gradient(x[:, self.joint])
+
+@dataclass(frozen=True)
+class SensorLag(Late):
+    """tau d(reading)/dt + reading = x: a damped gauge line, an amplifier's filter."""
+
+    name: ClassVar[str] = "sensor_lag"
+    least_shape: ClassVar[tuple[float, ...]] = (1e-3,)  # [s]
+    variable: ClassVar[str] = "the channel's rate"
+    confounders: ClassVar[tuple[str, ...]] = ("channel_delay", "spool_lag", "dead_volume")
+    separated_by: ClassVar[str] = (
+        "a wide band: a lag loses amplitude at high frequencies, a delay only phase"
+    )
+
+    def shape_names(self) -> tuple[str, ...]:
+        """Name the time constant."""
+        return (f"lag_{self.channel}",)
+
+    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
+        """Return the time constant [s], up to a tenth of a second."""
+        return (Shape(self.shape_names()[0], "s", 0.0, 0.1, (5e-4, 2e-3, 8e-3, 3e-2), 0.0),)
+
+    def undone(self, x: Array, order: int, rate: float, value: float) -> Array:
+        """Return x + tau dx/dt."""
+        return np.asarray(x + value * rate * np.gradient(x))
+
+
+@dataclass(frozen=True)
+class SensorCrosstalk(Sensor):
+    """reading of one chamber's pressure = p + k times the other chamber's: wires side by side."""
+
+    name: ClassVar[str] = "sensor_crosstalk"
+    least_shape: ClassVar[tuple[float, ...]] = (0.01,)
+    variable: ClassVar[str] = "the other chamber's pressure"
+    confounders: ClassVar[tuple[str, ...]] = (
+        "sensor_gain",
+        "sensor_offset",
+        "pressure_dependent_friction",
+    )
+    separated_by: ClassVar[str] = "loads at which one chamber's pressure moves and the other stands"
+    where: str = "joint 1 cap"
+
+    @classmethod
+    def all_places(cls, rig: Rig) -> tuple[str, ...]:
+        """Return each chamber's pressure."""
+        places = super().all_places(rig)
+        return tuple(place for place in places if place.endswith(("cap", "rod")))
+
+    def shape_names(self) -> tuple[str, ...]:
+        """Name the share."""
+        return (f"crosstalk_{self.channel}",)
+
+    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
+        """Return the share of the other pressure that is seen [-], up to three tenths."""
+        return (Shape(self.shape_names()[0], "", -0.3, 0.3, (-0.06, -0.015, 0.015, 0.06), 0.0),)
+
+    def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
+        """Take the other chamber's share from the pressure and its rate."""
+        share, i = self.shape_of(rig, shape)[0], self.joint
+        other = "rod" if self.side == "cap" else "cap"
+        new = {}
+        for field in ("p", "pd"):
+            x = getattr(signals, f"{field}_{self.side}").copy()
+            x[:, i] -= share * getattr(signals, f"{field}_{other}")[:, i]
+            new[f"{field}_{self.side}"] = x
+        return replace(signals, **new)
+
+    def correct(
+        self, rig: Rig, channels: Mapping[str, Array], rate: float, shape: Sequence[float]
+    ) -> dict[str, Array]:
+        """Return the channels as a right sensor would have sampled them, each (n,)."""
+        out = dict(channels)
+        other = ch.channel(KINDS["rod" if self.side == "cap" else "cap"], self.joint + 1)
+        if self.channel in out and other in out:
+            out[self.channel] = out[self.channel] - self.shape_of(rig, shape)[0] * out[other]
+        return out
 
 
 @dataclass(frozen=True)
@@ -284,4 +404,4 @@ def corrected_channels(
     return out
 
 
-TERMS = (ChannelDelay, SensorGain, SensorOffset)
+TERMS = (ChannelDelay, SensorLag, SensorGain, SensorOffset, SensorCrosstalk)

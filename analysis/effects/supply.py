@@ -34,7 +34,7 @@ from rig.model.parameters import gain_names
 from rig.model.rig import Rig
 
 NEWTON: Final = 12  # steps; the equation is monotone and smooth but for u = 0
-LONGEST: Final = 5.0  # [s] of the pump's flow: the most oil between supply sensor and valves
+LONGEST: Final = 100.0  # [s] of the pump's flow: as soft as an accumulator in the line
 
 
 @dataclass(frozen=True)
@@ -88,8 +88,9 @@ class SupplySag(_PortEffect):
     laminar below the share r_t of the pump's flow, turbulent above (Merritt 1967, chapter 3; the
     two asymptotes joined as in Churchill and Usagi 1972). Where it does not, pump or relief valve
     give way nearly in proportion to the flow. A sudden demand is met by the oil V_supply between
-    sensor and valves until the line follows: dQ/dt = (Q_drawn - Q) b / (V_supply d dp/dQ); the
-    simulation leaves that out. dp, r_t and V_supply are shapes.
+    sensor and valves, or an accumulator as soft as that, until the line follows:
+    dQ/dt = (Q_drawn - Q) b / (V_supply d dp/dQ); the simulation leaves that out.
+    dp, r_t and V_supply are shapes.
     """
 
     mechanism: ClassVar[str] = "supply_curve"
@@ -116,7 +117,7 @@ class SupplySag(_PortEffect):
         return (
             Shape("dp_supply", "Pa", 0.0, 0.9 * p, (0.05 * p, 0.2 * p), 0.0),
             Shape("laminar_share", "", 0.0, 1.5, (0.1, 0.3), resolution=True),
-            Shape("V_supply", "m^3", 0.0, most, (0.1 * most,), resolution=True),
+            Shape("V_supply", "m^3", 0.0, most, (0.005 * most, 0.1 * most), resolution=True),
         )
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
@@ -183,10 +184,11 @@ class TankPressure(_PortEffect):
         return np.array([constant, back / rig.supply.flow**2, *_gains(rig, values, (2, 1))])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Refuse pressures at their bounds, but for one of the two that is not there."""
+        """Refuse pressures at their bounds, but for a line's part that is not there."""
         constant, back = self.whole(rig, shape)
-        if max(constant, back) <= 1e-3 * rig.supply.pressure:
-            return f"p_tank = {constant:.4g} Pa is nothing"
+        if constant <= 1e-3 * rig.supply.pressure:
+            more = "" if back <= constant else ": this is return_line"
+            return f"p_tank = {constant:.4g} Pa is nothing{more}"
         inner = tuple(s.grid[-1] for s in self.shapes(rig))
         kept = (v if v > 1e-3 * s.high else g for v, s, g in
                 zip((constant, back), self.shapes(rig), inner, strict=True))  # fmt: skip
@@ -199,6 +201,55 @@ class TankPressure(_PortEffect):
             out[equation("flow_cap", i)] = signals.p_cap[:, i]
             out[equation("flow_rod", i)] = signals.p_rod[:, i]
         return out
+
+
+@dataclass(frozen=True)
+class ReturnLine(_PortEffect):
+    """The return stands under its line's pressure: dp r (r^3 + r_t^3)^(1/3), r = Q / Q_pump.
+
+    Laminar below the share r_t of the pump's flow, turbulent above (as `supply_sag`; Merritt 1967,
+    chapter 3). What stands at no flow as well is `tank_pressure`.
+    """
+
+    name: ClassVar[str] = "return_line"
+    mechanism: ClassVar[str] = "return_line"
+    least_shape: ClassVar[tuple[float, ...]] = (0.2e6,)  # [Pa] at the rated flow
+    variable: ClassVar[str] = "the flow given back to the tank"
+    confounders: ClassVar[tuple[str, ...]] = ("tank_pressure", "supply_sag")
+    separated_by: ClassVar[str] = "two amplitudes: a tank's own pressure stays, the line's grows"
+
+    @property
+    def kernel(self) -> Kernel:
+        """The compiled preparation."""
+        return _return_line
+
+    def shape_names(self) -> tuple[str, ...]:
+        """Name the drop and where it turns turbulent."""
+        return ("dp_return", "return_laminar")
+
+    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
+        """Return the turbulent drop at the pump's whole flow [Pa], and r_t."""
+        p = rig.supply.pressure
+        return (
+            Shape("dp_return", "Pa", 0.0, 0.9 * p, (0.03 * p, 0.15 * p), 0.0),
+            Shape("return_laminar", "", 0.0, 1.5, (0.5,), resolution=True, detail=True),
+        )
+
+    def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
+        """Raise the tank pressure."""
+        dp, share = self.whole(rig, shape)
+        ratio = port_flow(rig, signals, drawn=False) / rig.supply.flow
+        return replace(signals, p_tank=signals.p_tank + dp * ratio * np.cbrt(ratio**3 + share**3))
+
+    def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
+        """Return dp / Q_pump^2, the flow where it turns turbulent, C_mp and C_pm of each joint."""
+        dp, share = self.whole(rig, shape)
+        flow = rig.supply.flow
+        return np.array([dp / flow**2, share * flow, *_gains(rig, values, (2, 1))])
+
+    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
+        """Return the flow given back [m^3/s]."""
+        return _everywhere(signals, port_flow(rig, signals, drawn=False))
 
 
 def _gains(rig: Rig, values: Mapping[str, float], chosen: tuple[int, int]) -> list[float]:
@@ -282,4 +333,11 @@ def _tank(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
             bench[P_TANK] += par[1] * Q * Q
 
 
-TERMS = (SupplySag, TankPressure)
+@kernel
+def _return_line(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    if phase == PREPARE and par[0] > 0.0:
+        Q = _valve_flow(x, bench[P_TANK], -1.0, par[0], par[1], par, False)
+        bench[P_TANK] += lost(Q, par[0], par[1])[0]
+
+
+TERMS = (SupplySag, TankPressure, ReturnLine)

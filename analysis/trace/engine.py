@@ -92,7 +92,8 @@ def trace(
     train_data = regression_data(rig, terms, train)
     _refuse_short(train_data, train)
     holdout_data = regression_data(rig, terms, judged, train_data.beta)
-    candidates = _unknown(catalogue(rig) if effects is None else effects, known)
+    moving = len({s.equation.rsplit("_", 1)[1] for s in train_data.segments})
+    candidates = _unknown(catalogue(rig) if effects is None else effects, known, moving)
     hypotheses = HypothesisSet(train_data, candidates)
     before = stripped(identify(runs, terms=terms, estimator=PLAIN).model)
     notes = _notes(train_data, holdout_data)
@@ -303,10 +304,11 @@ def _fraction(hypotheses: HypothesisSet, winner: Hypothesis) -> float:
     return float(min(1.0, winner.total / start)) if start > 0 else 0.0
 
 
-def _unknown(candidates: Sequence[Effect], known: Sequence[Used]) -> list[Effect]:
-    """Return the candidates that are not in the model already."""
+def _unknown(candidates: Sequence[Effect], known: Sequence[Used], moving: int = 1) -> list[Effect]:
+    """Return the candidates that are not in the model, and are something where so many move."""
     there = {(u.term.name, u.term.where) for u in known}
-    return [c for c in candidates if (c.name, c.where) not in there]
+    fresh = [c for c in candidates if (c.name, c.where) not in there]
+    return [c for c in fresh if c.least_joints <= moving]
 
 
 def _extended(

@@ -33,11 +33,12 @@ CONTRACT = {
     "dead_volume", "channel_delay", "sensor_gain", "sensor_offset",
     "asymmetric_viscous_friction", "periodic_disturbance", "friction_curve", "position_force",
     "metering_curve", "leakage_curve", "bulk_modulus_curve",
+    "sensor_lag", "sensor_crosstalk", "spool_hysteresis", "return_line",
 }  # fmt: skip
 
 
 # Forms of edge, line and seal, no sizes.
-DETAILS = ("rounding", "corner", "V_supply", "stiffening", "transition")
+DETAILS = ("return_laminar", "rounding", "corner", "V_supply", "stiffening", "transition")
 
 
 def effects(rig: Rig) -> list[Effect]:
@@ -155,7 +156,7 @@ def hidden_state(e: Effect, rig: Rig, signals: Signals, shape: tuple[float, ...]
         distance, *stiffening = shape[4:] if e.name == "friction_curve" else shape
         path = worked(s, signals.sd[:, e.joint], sum(stiffening))
         return np.asarray(distance * contact_state(path, distance))
-    if e.name == "spool_lag":
+    if e.name in ("spool_lag", "spool_hysteresis"):
         return e.prepare(rig, signals, shape).u[:, e.joint]
     return np.zeros(len(signals.t))
 
@@ -235,6 +236,8 @@ def edge_flows(
             drop, gain = (port - cap, pp) if u > 0 else (port - rod, mm)
         else:
             port = shape[0] + shape[1] * ratio**2
+            if e.name == "return_line":
+                port = shape[0] * ratio * np.cbrt(ratio**3 + shape[1] ** 3)
             drop, gain = (rod - port, mp) if u > 0 else (cap - port, pm)
         out.append(gain * abs(u) * np.sqrt(max(drop, 0.0)))
     return out
@@ -309,6 +312,11 @@ REFUSED = [
         {f"softness_{k}": -1e-8 for k in (1, 2, 3)},
         (0.0, 2e6, 4e6, 6e6),
     ),
+    ("sensor_lag", "joint 1 cap", {}, (0.1,)),
+    ("sensor_crosstalk", "joint 1 cap", {}, (0.3,)),
+    ("spool_hysteresis", "joint 1", {}, (0.14,)),
+    ("return_line", "bench", {}, (6.3e6, 0.2)),
+    ("tank_pressure", "bench", {}, (0.0, 5e5)),
     ("base_inclination", "bench", {}, (0.35,)),
     ("payload", "bench", {"m_payload": -1.0}, ()),
     ("joint_spring", "joint 2", {"k_spring_2": -30.0}, (-1.44,)),

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,14 +22,15 @@ from tests.analysis.trace.foreign_bench import (
     SIGMOID,
     TANH,
     Hidden,
+    Sensors,
     pair_of_runs,
 )
 
 LEAK = 2e-12  # [m^3/(s Pa)]
 
 
-def traced(rig: Rig, hidden: Hidden, free_forms: bool = True, **measured: float) -> Trace:
-    train, held_out = pair_of_runs(rig, hidden, **measured)  # type: ignore[arg-type]
+def traced(rig: Rig, hidden: Hidden, free_forms: bool = True, **measured: Any) -> Trace:
+    train, held_out = pair_of_runs(rig, hidden, **measured)
     return trace([train], [held_out], look_ahead=False, free_forms=free_forms)
 
 
@@ -180,6 +182,33 @@ def test_a_leak_by_the_root_of_the_pressure_is_a_curve_and_not_two_names(rig: Ri
     wide = line.x > 0.2 * line.x[-1]
     assert line.y[wide] == pytest.approx(5e-9 * np.sqrt(line.x[wide]), rel=0.05)
     assert result.model_after.values["b"] == pytest.approx(TRUTH["b"], rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("hidden", "sensors", "named", "parameter", "size"),
+    [
+        (
+            Hidden(), Sensors(("cap_pressure", "rod_pressure"), late=3e-3),
+            ("channel_delay", "bench"), "delay_pressure", 3e-3,
+        ),
+        (
+            Hidden(), Sensors(("cap_pressure",), lag=3e-3),
+            ("sensor_lag", "joint 2 cap"), "lag_cap_pressure_2", 3e-3,
+        ),
+        (
+            Hidden(play=6e-3), Sensors(),
+            ("spool_hysteresis", "joint 2"), "w_hysteresis_2", 6e-3,
+        ),
+    ],
+)  # fmt: skip
+def test_what_stands_between_the_world_and_the_records_is_named(
+    rig: Rig, hidden: Hidden, sensors: Sensors, named: tuple[str, str], parameter: str, size: float
+) -> None:
+    result = traced(rig, hidden, sensors=sensors)
+    assert result.verdict == "explained"
+    assert [(e.name, e.where) for e in result.effects] == [named]
+    assert result.effects[0].parameters[parameter].value == pytest.approx(size, rel=0.03)
+    assert result.model_after.values["Fv2"] == pytest.approx(4.43, rel=0.02)
 
 
 def rig_angle(rig: Rig) -> float:
