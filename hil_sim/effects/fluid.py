@@ -145,3 +145,29 @@ class DeadVolume(PlantEffect):
     def apply(self, t: Tables) -> None:
         """Put the effect into the plant's tables."""
         t.joints[f"{self.chamber}_volume"][self.joint] += self.volume
+
+
+class ReturnLine(PlantEffect):
+    """A return line that holds back: no pressure at rest, this much at the rig's pump flow.
+
+    ``turbulent`` with the flow's square, ``laminar`` in proportion, ``filter`` half of each.
+    """
+
+    drawn_at = "bench"
+    sizes: ClassVar = {"drop": (0.4e6, 1.5e6)}
+
+    places = ("bench",)
+    forms = ("turbulent", "laminar", "filter")
+    name: Literal["return_line"]
+    where: str = "bench"
+    drop: Pressure = Field(gt=0)
+    lag: Time = Field(default=1e-3, ge=5e-4)
+    form: Literal["turbulent", "laminar", "filter"] = "turbulent"
+
+    def apply(self, t: Tables) -> None:
+        """Put the effect into the plant's tables."""
+        square = {"turbulent": 1.0, "laminar": 0.0, "filter": 0.5}[self.form]
+        rated = t.rig.supply.flow
+        t.bench["tank_resistance"] += square * self.drop / rated**2
+        t.bench["tank_laminar"] += (1.0 - square) * self.drop / rated
+        t.bench["tank_lag"] = self.lag

@@ -1,13 +1,13 @@
-"""Effects of measurement: a channel that lags, a wrong gain, an offset."""
+"""Effects of measurement: a channel that is late or lags, a wrong gain, an offset, cross-talk."""
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from hil_sim.effects.base import PlantEffect, Tables, read_with_unit
-from rig.model.channels import kind_of, unit_of
+from rig.model.channels import channel, kind_of, unit_of
 from rig.model.quantity import Ratio, Time
 
 
@@ -72,3 +72,61 @@ class SensorOffset(_Sensor):
     def apply(self, t: Tables) -> None:
         """Put the effect into the plant's tables."""
         t.channels["offset"][t.rig.channels.index(self.channel)] += self.offset
+
+
+class SensorLag(_Sensor):
+    """The channel follows the world behind a filter of this time constant.
+
+    ``pole`` is one, ``poles`` are two equal ones of half of it each.
+    """
+
+    drawn_at = "pressure"
+    sizes: ClassVar = {"time": (1e-3, 6e-3)}
+    forms = ("pole", "poles")
+    name: Literal["sensor_lag"]
+    time: Time = Field(ge=2e-4, le=0.2)
+    form: Literal["pole", "poles"] = "pole"
+
+    def apply(self, t: Tables) -> None:
+        """Put the effect into the plant's tables."""
+        k = t.rig.channels.index(self.channel)
+        t.channels["filter_time"][k] = self.time
+        t.channels["filter_stages"][k] = 1 + (self.form == "poles")
+
+
+class SensorCrosstalk(_Sensor):
+    """The channel reads a share of another beside its own, in the ratio of their units.
+
+    ``wire`` sees the other as it is, ``coupling`` what passes a capacitor: its quick part alone,
+    behind a slow filter of a second.
+    """
+
+    drawn_at = "pressure"
+    sizes: ClassVar = {"share": (0.01, 0.06)}
+    signed = ("share",)
+    forms = ("wire", "coupling")
+    name: Literal["sensor_crosstalk"]
+    share: Ratio = Field(ge=-0.5, le=0.5)
+    other: str | None = None
+    form: Literal["wire", "coupling"] = "wire"
+
+    @model_validator(mode="after")
+    def _pressure(self) -> Self:
+        kind = kind_of(self.channel)[0]
+        if not self.other and kind not in ("cap_pressure", "rod_pressure"):
+            raise ValueError(f"say which channel {self.channel!r} sees, as `other`")
+        return self
+
+    @property
+    def seen(self) -> str:
+        """The other channel; of a chamber's pressure the other chamber's by default."""
+        kind, joint = kind_of(self.channel)
+        other = "rod_pressure" if kind == "cap_pressure" else "cap_pressure"
+        return self.other or channel(other, joint or 1)
+
+    def apply(self, t: Tables) -> None:
+        """Put the effect into the plant's tables."""
+        k = t.rig.channels.index(self.channel)
+        t.channels["seen"][k] = 1 + t.rig.channels.index(self.seen)
+        t.channels["seen_share"][k] = self.share
+        t.channels["seen_quick"][k] = float(self.form == "coupling")

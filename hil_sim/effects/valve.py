@@ -86,3 +86,24 @@ class SpoolLag(PlantEffect):
     def apply(self, t: Tables) -> None:
         """Put the effect into the plant's tables."""
         t.joints["opening_rate"][self.joint] = 1.0 / self.time
+
+
+class SpoolHysteresis(PlantEffect):
+    """The metered opening follows the LVDT behind play of this width, half of it either way.
+
+    ``backlash`` is the play itself; ``friction`` a dry contact whose push grows with the travel
+    since the last reversal, over a third of the width (no corner).
+    """
+
+    drawn_at = "joint"
+    sizes: ClassVar = {"width": (3e-3, 12e-3)}
+    forms = ("backlash", "friction")
+    name: Literal["spool_hysteresis"]
+    where: str
+    width: Voltage = Field(gt=0)
+    form: Literal["backlash", "friction"] = "backlash"
+
+    def apply(self, t: Tables) -> None:
+        """Put the effect into the plant's tables."""
+        t.joints["play"][self.joint] += self.width
+        t.joints["play_travel"][self.joint] = self.width / 3.0 if self.form == "friction" else 0.0

@@ -209,7 +209,8 @@ def supply_rates(
         dy[at + 1] = stiff * (line - demand) / bench.manifold_volume
     stiff = softening(y[at], warmth, bench)
     dy[at] = stiff * (bench.pump - relief(p_supply, bench) - line) / bench.supply_volume
-    back = bench.tank_pressure + bench.tank_resistance * returned * abs(returned)
+    back = bench.tank_pressure + bench.tank_laminar * returned
+    back += bench.tank_resistance * returned * abs(returned)
     dy[at + 2] = (back - y[at + 2]) / bench.tank_lag
 
 

@@ -50,7 +50,7 @@ JOINT: Final = _records(
     "friction_plus friction_minus stribeck stribeck_speed friction_pressure friction_scale "
     "friction_taper friction_width friction_corner bristle_stiffness bristle_damping "
     "bristle_limit drag_plus drag_minus drag_thinning drag_lever "
-    "wave_torque wave_rate wave_form wave_now "
+    "wave_torque wave_rate wave_form wave_now play play_travel "
     "output_top output_range",
 )
 BENCH: Final = _records(
@@ -58,10 +58,14 @@ BENCH: Final = _records(
     "half_bulk trapped air air_dissolution air_exponent laminar sin_slope cos_slope "
     "pump supply_volume relief_crack relief_slope relief_rounding "
     "line_gain line_laminar manifold_volume "
-    "tank_pressure tank_resistance tank_lag "
+    "tank_pressure tank_resistance tank_laminar tank_lag "
     "temperature band period_1 phase_1 period_2 phase_2 bulk_temperature viscosity_temperature",
 )
-CHANNEL: Final = _records("kind joint", "noise gain offset lag low step scale top")
+CHANNEL: Final = _records(
+    "kind joint filter_stages seen",
+    "noise gain offset lag low step scale top filter_time filter_before filter_first filter_second "
+    "filter_started seen_share seen_quick seen_slow",
+)
 LAW: Final = _records("start first period", "gain bias position_gain setpoint limit")
 
 

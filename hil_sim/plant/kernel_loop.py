@@ -5,7 +5,7 @@ Spool state, shape (3, N): LVDT voltage, its rate, effective opening of the edge
 
 from __future__ import annotations
 
-from math import copysign, cos, sin, sqrt
+from math import copysign, cos, exp, sin, sqrt
 from typing import Any
 
 import numpy as np
@@ -30,12 +30,26 @@ def spool_rates(u: float, w: float, x: float, target: float, joint: Any) -> Any:
 
 
 @jit
+def pushed(x: float, u_before: float, x_before: float, u: float, joint: Any) -> float:
+    """Return the opening behind a spool's play, x being where it would stand without.
+
+    It stands off by at most half the play, reached at once or along a travel.
+    """
+    half = 0.5 * joint.play
+    if joint.play_travel <= 0.0:
+        return float(min(max(x_before, x - half), x + half))
+    side = copysign(half, u - u_before)
+    off = u_before - joint.null - x_before
+    return float(x - side - (off - side) * exp(-abs(u - u_before) / joint.play_travel))
+
+
+@jit
 def move_spool(start: Any, target: Any, h: float, joints: Any, end: Any) -> None:
     """Advance every spool by h [s] (RK4 on its own three states), `start` to `end`, (3, N)."""
     for i in range(len(joints)):
         j = joints[i]
         u, w, x, r = start[0, i], start[1, i], start[2, i], target[i]
-        if u == r and w == 0.0 and x == u - j.null:
+        if u == r and w == 0.0 and (x == u - j.null or j.play > 0.0):
             end[0, i], end[1, i], end[2, i] = u, w, x
             continue
         g = 0.5 * h
@@ -52,6 +66,8 @@ def move_spool(start: Any, target: Any, h: float, joints: Any, end: Any) -> None
             u, w = copysign(j.spool_stroke, u), 0.0
         if j.opening_rate <= 0.0 or abs(x - u + j.null) < 1e-13:
             x = u - j.null
+        if j.play > 0.0:
+            x = pushed(x, start[0, i], start[2, i], u, j)
         end[0, i], end[1, i], end[2, i] = u, w, x
 
 
@@ -65,7 +81,7 @@ def crossing(start: Any, end: Any, h: float, joints: Any) -> float:
     first = 1.0
     for i in range(len(joints)):
         a, b = start[2, i], end[2, i]
-        if a * b >= 0.0 or joints[i].opening_rate > 0.0:
+        if a * b >= 0.0 or joints[i].opening_rate > 0.0 or joints[i].play > 0.0:
             continue
         da, db = start[1, i] * h, end[1, i] * h
         c2, c3 = 3.0 * (b - a) - 2.0 * da - db, da + db - 2.0 * (b - a)
@@ -183,6 +199,39 @@ def delayed(tick: int, c: int, lag: float, values: Any, slopes: Any) -> float:
 
 
 @jit
+def filtered(x: float, h: Any, period: float) -> float:
+    """Return what a sensor's filter shows of x, exact for an input straight between ticks."""
+    if h.filter_time <= 0.0:
+        return x
+    tau = h.filter_time / h.filter_stages
+    kept = exp(-period / tau)
+    if h.filter_started == 0.0:
+        h.filter_started = 1.0
+        h.filter_before = h.filter_first = h.filter_second = x
+    first = behind(x, h.filter_before, h.filter_first, tau / period, kept)
+    second = behind(first, h.filter_first, h.filter_second, tau / period, kept)
+    h.filter_before, h.filter_first, h.filter_second = x, first, second
+    shown: float = second if h.filter_stages > 1 else first
+    return shown
+
+
+@jit
+def behind(x: float, before: float, shown: float, tau: float, kept: float) -> float:
+    """Return a lag's output one tick later, tau in ticks; its input went from `before` to x."""
+    slope = tau * (x - before)
+    return x - slope + (shown - before + slope) * kept
+
+
+@jit
+def seen(x: float, h: Any, period: float) -> float:
+    """Return what a channel sees of another's x: its share, or of its quick part alone."""
+    if h.seen_quick > 0.0:
+        h.seen_slow += (x - h.seen_slow) * period  # a filter of one second
+        x -= h.seen_slow
+    return float(h.seen_share * x)
+
+
+@jit
 def temperature(time: float, bench: Any) -> float:
     """Return the oil's temperature [degC]: two slow waves that stay within the band."""
     a = sin(2.0 * np.pi * (time / bench.period_1 + bench.phase_1))
@@ -238,7 +287,11 @@ def run(
         sense(y, k[0], spool, heat, joints, bench, channels, period, values[ring], slopes[ring])
         for c in range(len(channels)):
             h = channels[c]
-            true = delayed(tick, c, h.lag / period, values, slopes)
+            true = filtered(delayed(tick, c, h.lag / period, values, slopes), h, period)
+            if h.seen > 0:
+                source = h.seen - 1
+                lag = channels[source].lag / period
+                true += seen(delayed(tick, source, lag, values, slopes), h, period)
             read = h.gain * true + h.offset + h.noise * noise[row, c]
             code = min(max(np.rint((read - h.low) * h.scale), 0.0), h.top)
             measured[row, c] = int(code)

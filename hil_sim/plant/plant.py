@@ -113,17 +113,20 @@ class Plant:
 
     def mark(self) -> object:
         """Return what `rewind` needs to come back to now."""
-        state = (self._state, self._spool, self._values, self._slopes)
-        return self.tick, [array.copy() for array in state]
+        return self.tick, [array.copy() for array in self._moving]
 
     def rewind(self, mark: Any) -> None:
         """Be as at the mark, as if nothing had been computed since; the same noise comes again."""
         tick, before = mark
         self._used -= self.tick - tick
         self.tick = tick
-        state = (self._state, self._spool, self._values, self._slopes)
-        for array, values in zip(state, before, strict=True):
+        for array, values in zip(self._moving, before, strict=True):
             array[:] = values
+
+    @property
+    def _moving(self) -> tuple[NDArray[Any], ...]:
+        """What a tick changes in place; among the channels it is what their filters hold."""
+        return self._state, self._spool, self._values, self._slopes, self._tables.channels
 
     def _drawn(self, ticks: int) -> Array:
         """Return the noise of the next `ticks` ticks, (ticks, channels).

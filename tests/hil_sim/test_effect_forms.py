@@ -8,7 +8,9 @@ import pytest
 from hil_sim.effects import CLASSES
 from hil_sim.plant import kernel
 from hil_sim.plant.kernel_data import ATMOSPHERE, record
+from hil_sim.plant.plant import Plant
 from hil_sim.plant.tables import build
+from hil_sim.scenario.file import parse_scenario
 from hil_sim.scenario.truth import load_machine
 from tests.hil_sim.plant_trace import CLOSED, bench, scenario, sine, story
 from tests.hil_sim.test_plant_effects import sliding
@@ -88,13 +90,56 @@ def test_a_laminar_supply_line_drops_in_proportion_to_the_flow() -> None:
     assert record(soft.bench).manifold_volume > 10 * b.manifold_volume
 
 
-@pytest.mark.parametrize("kind", [c for c in CLASSES if c.forms], ids=lambda c: c.effect_name())
+def shown(effect: str) -> np.ndarray:
+    """What cap_pressure_2 reads [Pa] without noise while joint 2 moves."""
+    clean = parse_scenario(f"effects: [{effect}]\nnoise: 0", "today.yaml")
+    plant = Plant(RIG, clean, 3)
+    codes, _ = plant.advance(600, MOVE_2)
+    k = RIG.channels.index("cap_pressure_2")
+    sensor = RIG.sensors.of("cap_pressure")
+    low, high = sensor.range
+    return low + codes[:, k] * (high - low) / ((1 << sensor.bits) - 1)
+
+
+def test_a_lagging_sensor_follows_its_world_behind_one_pole_or_two() -> None:
+    true = shown("")
+    text = "{name: sensor_lag, channel: cap_pressure_2, time: 4 ms, form: %s}"
+    one, two = (shown(text % form) for form in ("pole", "poles"))
+    rate = RIG.sample_rate
+    # One pole by its own equation, two by theirs: tau/2 twice.
+    inner = slice(5, -5)
+    back = one + 4e-3 * np.gradient(one) * rate
+    assert np.abs(back - true)[inner].max() < 0.02 * np.ptp(true)
+    twice = two + 4e-3 * np.gradient(two) * rate
+    twice += 4e-6 * np.gradient(np.gradient(two)) * rate**2
+    assert np.abs(twice - true)[inner].max() < 0.02 * np.ptp(true)
+    assert np.abs(one - two).max() > 50.0
+
+
+def test_cross_talk_shows_the_other_chamber_or_its_quick_part() -> None:
+    text = "{name: sensor_crosstalk, channel: cap_pressure_2, share: 0.05, form: %s}"
+    wire, coupling = (shown(text % form) - shown("") for form in ("wire", "coupling"))
+    rod = 0.05 * story(MOVE_2, 0.6, "", rate=1000.0)["rod_pressure"][:, 1]
+    n = min(len(rod), len(wire))
+    assert np.abs(wire[:n] - rod[:n]).max() < 0.02 * np.abs(rod).max()
+    # What a coupling shows falls off within a second: x' = wire' - x / 1 s.
+    faded = np.cumsum(coupling) / RIG.sample_rate
+    change = coupling - coupling[0] + faded - (wire - wire[0])
+    assert np.abs(change).max() < 0.02 * np.abs(wire).max()
+    assert np.abs(coupling - wire).max() > 50.0
+
+
+MOVERS = [c for c in CLASSES if c.forms and c.drawn_at != "pressure"]
+
+
+@pytest.mark.parametrize("kind", MOVERS, ids=lambda c: c.effect_name())
 def test_every_form_runs_and_moves_the_bench_otherwise(kind) -> None:
     key, (_, most) = next(iter(kind.sizes.items()))
     more = ", speed: 20 mm/s" if kind.effect_name() == "stribeck_friction" else ""
     more = ", retracting: 10 N" if kind.effect_name() == "asymmetric_friction" else more
     unit = {"force": "N", "extending": "N", "coefficient": "N/Pa", "width": "V",
-            "line_drop": "Pa", "fraction": "", "torque": "N*m"}[key]  # fmt: skip
+            "line_drop": "Pa", "fraction": "", "torque": "N*m",
+            "drop": "Pa", "time": "s", "share": ""}[key]  # fmt: skip
     if kind.effect_name() == "asymmetric_viscous_friction":
         unit, more = "N*s/m", ", retracting: 10 N*s/m"
     more = ", frequency: 7 Hz" if kind.effect_name() == "periodic_disturbance" else more

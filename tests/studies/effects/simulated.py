@@ -68,6 +68,16 @@ EXAMPLES: Final[tuple[Example, ...]] = (
     ("spool_offset", "joint 1", "where: joint 1, voltage: 3 mV", {"u_null_1": 3e-3}),
     ("underlap_leakage", "joint 2", "where: joint 2, width: 5 mV", {"w_underlap_2": 5e-3}),
     ("spool_lag", "joint 2", "where: joint 2, time: 3 ms", {"tau_spool_2": 3e-3}),
+    ("spool_hysteresis", "joint 2", "where: joint 2, width: 6 mV", {"w_hysteresis_2": 6e-3}),
+    ("return_line", "bench", "drop: 1.5 MPa", {"dp_return": 1.5e6}),
+    (
+        "sensor_lag", "joint 1 cap", "channel: cap_pressure_1, time: 3 ms",
+        {"lag_cap_pressure_1": 3e-3},
+    ),
+    (
+        "sensor_crosstalk", "joint 2 cap", "channel: cap_pressure_2, share: 0.05",
+        {"crosstalk_cap_pressure_2": 0.05},
+    ),
     (
         "internal_leakage", "joint 1", "where: joint 1, conductance: 2e-12 m^3/(s*Pa)",
         {"c_internal_1": 2e-12},

@@ -44,6 +44,10 @@ SINGLES: Final[tuple[Sizes, ...]] = (
     ("spool_offset", "joint {j}", "voltage", ("1 mV", "4 mV", "10 mV"), ""),
     ("underlap_leakage", "joint {j}", "width", ("4 mV", "8 mV", "15 mV"), ""),
     ("spool_lag", "joint {j}", "time", ("1 ms", "2 ms", "5 ms"), ""),
+    ("spool_hysteresis", "joint {j}", "width", ("2 mV", "5 mV", "12 mV"), ""),
+    ("return_line", "bench", "drop", ("0.4 MPa", "0.8 MPa", "1.5 MPa"), ""),
+    ("sensor_lag", "channel cap_pressure_{j}", "time", ("1 ms", "3 ms", "6 ms"), ""),
+    ("sensor_crosstalk", "channel cap_pressure_{j}", "share", ("0.01", "0.03", "0.06"), ""),
     (
         "internal_leakage", "joint {j}", "conductance",
         ("3e-13 m^3/(s*Pa)", "1e-12 m^3/(s*Pa)", "3e-12 m^3/(s*Pa)"), "",
@@ -64,6 +68,7 @@ SINGLES: Final[tuple[Sizes, ...]] = (
     ),
 )  # fmt: skip
 # Things the catalogue has no entry for: what they are, the variables that tell it, the scenario.
+# A mechanism whose curve the data draw may stand for those of `FORM_OF`.
 STRANGERS: Final = (
     ("hardening spring", "piston acceleration",
      "{name: joint_spring, where: joint %d, stiffness: 30 N*m/rad, hardening: 40 rad^-2}"),
@@ -74,6 +79,7 @@ STRANGERS: Final = (
     ("tapered bore", "piston velocity",
      "{name: coulomb_friction, where: joint %d, force: 80 N, taper: 40 m^-1}"),
 )  # fmt: skip
+FORM_OF: Final[Mapping[str, str]] = {"hardening spring": "position_force"}
 # Where the scenario's size stands in the trace's result: parameter and factor.
 SIZE_OF: Final[Mapping[str, tuple[str, float]]] = {
     "coulomb_friction": ("Fc", 1.0), "base_inclination": ("", 1.0),
@@ -91,7 +97,8 @@ class Case:
     """One experiment: scenario text, its kind, the right names and places, the seed.
 
     With `machine` the bench and what it hides are drawn by the seed (`study_machines`); `bent` says
-    how its records are changed afterwards (`study_distorted`).
+    how its records are changed afterwards (`study_distorted`). `form` is the mechanism that may
+    stand for what has no name, its curve drawn by the data.
     """
 
     kind: str
@@ -104,6 +111,7 @@ class Case:
     noise: float = 1.0
     machine: bool = False
     bent: str = ""
+    form: str = ""
 
 
 def place_of(where: str) -> str:
@@ -177,7 +185,12 @@ def cases(
             scenario = f"effects: [{text}]\nnoise: {noise:g}"
             truth = tuple(key for _, key, _ in members)
             sizes = tuple(size for *_, size in members)
-            out.append(Case(kind, label, scenario, truth, seed + k, sizes, moves, noise))
+            out.append(
+                Case(
+                    kind, label, scenario, truth, seed + k, sizes, moves, noise,
+                    form=FORM_OF.get(label, ""),
+                )
+            )  # fmt: skip
     return out
 
 

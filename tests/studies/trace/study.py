@@ -175,7 +175,8 @@ def right(o: Outcome) -> str:  # noqa: PLR0911  a table of answers
         return "right" if o.verdict == "clean" else ("false alarm" if named else "abstained")
     if o.case.kind == OUTSIDE:
         if o.verdict != "unexplained":
-            return "quiet" if o.verdict == "clean" else "wrong"
+            drawn = o.verdict == "explained" and {n for n, _ in named} == {o.case.form}
+            return "quiet" if o.verdict == "clean" else "right" if drawn else "wrong"
         wanted = o.case.moves.split()
         clue = any(d.rsplit("_", 1)[0] in wanted for d in o.depends_on[:2])
         return "right" if clue else "no clue"
