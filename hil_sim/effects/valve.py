@@ -96,7 +96,7 @@ class SpoolHysteresis(PlantEffect):
     """
 
     drawn_at = "joint"
-    sizes: ClassVar = {"width": (3e-3, 12e-3)}
+    sizes: ClassVar = {"width": (1e-3, 4e-3)}
     forms = ("backlash", "friction")
     name: Literal["spool_hysteresis"]
     where: str

@@ -44,7 +44,7 @@ SINGLES: Final[tuple[Sizes, ...]] = (
     ("spool_offset", "joint {j}", "voltage", ("1 mV", "4 mV", "10 mV"), ""),
     ("underlap_leakage", "joint {j}", "width", ("4 mV", "8 mV", "15 mV"), ""),
     ("spool_lag", "joint {j}", "time", ("1 ms", "2 ms", "5 ms"), ""),
-    ("spool_hysteresis", "joint {j}", "width", ("2 mV", "5 mV", "12 mV"), ""),
+    ("spool_hysteresis", "joint {j}", "width", ("1 mV", "2 mV", "4 mV"), ""),
     ("return_line", "bench", "drop", ("0.4 MPa", "0.8 MPa", "1.5 MPa"), ""),
     ("sensor_lag", "channel cap_pressure_{j}", "time", ("1 ms", "3 ms", "6 ms"), ""),
     ("sensor_crosstalk", "channel cap_pressure_{j}", "share", ("0.01", "0.03", "0.06"), ""),
