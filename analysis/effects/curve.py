@@ -27,11 +27,14 @@ def bending(knots: Array) -> Array:
     """Return S (K, K): the second derivatives at the knots per unit of the values there."""
     K, h = len(knots), np.diff(knots)
     left, right = np.zeros((K, K)), np.zeros((K, K))
-    left[0, :3] = -1.0 / h[0], 1.0 / h[0] + 1.0 / h[1], -1.0 / h[1]
-    left[-1, -3:] = -1.0 / h[-2], 1.0 / h[-2] + 1.0 / h[-1], -1.0 / h[-1]
     for i in range(1, K - 1):
         left[i, i - 1 : i + 2] = h[i - 1] / 6.0, (h[i - 1] + h[i]) / 3.0, h[i] / 6.0
         right[i, i - 1 : i + 2] = 1.0 / h[i - 1], -1.0 / h[i - 1] - 1.0 / h[i], 1.0 / h[i]
+    if K == 3:  # one parabola
+        left[0, :2], left[2, 1:] = (1.0, -1.0), (-1.0, 1.0)
+    else:
+        left[0, :3] = -1.0 / h[0], 1.0 / h[0] + 1.0 / h[1], -1.0 / h[1]
+        left[-1, -3:] = -1.0 / h[-2], 1.0 / h[-2] + 1.0 / h[-1], -1.0 / h[-1]
     return np.asarray(np.linalg.solve(left, right))
 
 

@@ -38,7 +38,9 @@ LONGEST: Final = 100.0  # [s] of the pump's flow: as soft as an accumulator in t
 
 
 @dataclass(frozen=True)
-class _PortEffect(Effect):
+class PortEffect(Effect):
+    """What acts on the pressure at all valves' ports: no coefficient, only shapes."""
+
     hydraulic: ClassVar[bool] = True
     family: ClassVar[str] = "fluid"
     alters: ClassVar[tuple[str, ...]] = ("fluid",)
@@ -81,7 +83,7 @@ def port_flow(rig: Rig, signals: Signals, drawn: bool) -> Array:
 
 
 @dataclass(frozen=True)
-class SupplySag(_PortEffect):
+class SupplySag(PortEffect):
     """The valves see less than the supply: p_s - dp r (r^3 + r_t^3)^(1/3), r = Q / Q_pump.
 
     Where the rig measures its supply, what can be missing is the line between sensor and valves:
@@ -132,7 +134,7 @@ class SupplySag(_PortEffect):
         """Return dp / Q_pump^2, the flow where it turns turbulent, C_pp and C_mm of each joint."""
         dp, share, _ = self.shape_of(rig, shape)
         flow = rig.supply.flow
-        return np.array([dp / flow**2, share * flow, *_gains(rig, values, (0, 3))])
+        return np.array([dp / flow**2, share * flow, *edge_gains(rig, values, (0, 3))])
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return the flow drawn [m^3/s]."""
@@ -140,7 +142,7 @@ class SupplySag(_PortEffect):
 
 
 @dataclass(frozen=True)
-class TankPressure(_PortEffect):
+class TankPressure(PortEffect):
     """The return stands at p_t + p_back (Q / Q_pump)^2 instead of zero (Merritt 1967, chapter 3).
 
     The line's part is turbulent; Q is the flow that the valves give back.
@@ -181,7 +183,7 @@ class TankPressure(_PortEffect):
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
         """Return p_t, p_back / Q_pump^2, then C_mp and C_pm of each joint."""
         constant, back = self.whole(rig, shape)
-        return np.array([constant, back / rig.supply.flow**2, *_gains(rig, values, (2, 1))])
+        return np.array([constant, back / rig.supply.flow**2, *edge_gains(rig, values, (2, 1))])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Refuse pressures at their bounds, but for a line's part that is not there."""
@@ -204,7 +206,7 @@ class TankPressure(_PortEffect):
 
 
 @dataclass(frozen=True)
-class ReturnLine(_PortEffect):
+class ReturnLine(PortEffect):
     """The return stands under its line's pressure: dp r (r^3 + r_t^3)^(1/3), r = Q / Q_pump.
 
     Laminar below the share r_t of the pump's flow, turbulent above (as `supply_sag`; Merritt 1967,
@@ -245,14 +247,14 @@ class ReturnLine(_PortEffect):
         """Return dp / Q_pump^2, the flow where it turns turbulent, C_mp and C_pm of each joint."""
         dp, share = self.whole(rig, shape)
         flow = rig.supply.flow
-        return np.array([dp / flow**2, share * flow, *_gains(rig, values, (2, 1))])
+        return np.array([dp / flow**2, share * flow, *edge_gains(rig, values, (2, 1))])
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return the flow given back [m^3/s]."""
         return _everywhere(signals, port_flow(rig, signals, drawn=False))
 
 
-def _gains(rig: Rig, values: Mapping[str, float], chosen: tuple[int, int]) -> list[float]:
+def edge_gains(rig: Rig, values: Mapping[str, float], chosen: tuple[int, int]) -> list[float]:
     """Return for each joint the gains of its two chosen edges, that of a positive spool first."""
     names = (gain_names(i) for i in range(1, len(rig.joints) + 1))
     return [values[joint[k]] for joint in names for k in chosen]

@@ -32,7 +32,7 @@ CONTRACT = {
     "internal_leakage", "external_leakage", "supply_sag", "tank_pressure", "entrained_air",
     "dead_volume", "channel_delay", "sensor_gain", "sensor_offset",
     "asymmetric_viscous_friction", "periodic_disturbance", "friction_curve", "position_force",
-    "metering_curve", "leakage_curve", "bulk_modulus_curve",
+    "metering_curve", "leakage_curve", "bulk_modulus_curve", "supply_curve",
     "sensor_lag", "sensor_crosstalk", "spool_hysteresis", "return_line",
 }  # fmt: skip
 
@@ -203,7 +203,7 @@ def test_kernels_and_rows_are_the_same_equations(rig: Rig, state: Signals) -> No
 
 def consistent(rig: Rig, signals: Signals, e: Effect, shape: tuple[float, ...]) -> Signals:
     """Pressure rates such that continuity holds: the kernels solve orifices, the rows measure."""
-    drawn = e.name == "supply_sag"
+    drawn = e.name in ("supply_sag", "supply_curve")
     rig_flow, pd_cap, pd_rod = rig.supply.flow, signals.pd_cap.copy(), signals.pd_rod.copy()
     for k in range(len(signals.t)):
         low, high = 0.0, 1.0
@@ -230,7 +230,14 @@ def edge_flows(
     for i in range(2):
         u, cap, rod = signals.u[k, i], signals.p_cap[k, i], signals.p_rod[k, i]
         pp, pm, mp, mm = (TRUTH[name] for name in gain_names(i + 1))
-        if e.name == "supply_sag":
+        if e.name == "supply_curve":
+            # A parabola through the three values, and its tangent beyond the last.
+            bent = np.polyfit(shape[:3], (0.0, *shape[3:]), 2)
+            Q, last = ratio * rig.supply.flow, shape[2]
+            beyond = np.polyval(np.polyder(bent), last) * max(Q - last, 0.0)
+            port = signals.p_s[k] - np.polyval(bent, min(Q, last)) - beyond
+            drop, gain = (port - cap, pp) if u > 0 else (port - rod, mm)
+        elif e.name == "supply_sag":
             # Turbulent and laminar asymptote, joined.
             port = signals.p_s[k] - shape[0] * ratio * np.cbrt(ratio**3 + shape[1] ** 3)
             drop, gain = (port - cap, pp) if u > 0 else (port - rod, mm)
@@ -312,6 +319,7 @@ REFUSED = [
         {f"softness_{k}": -1e-8 for k in (1, 2, 3)},
         (0.0, 2e6, 4e6, 6e6),
     ),
+    ("supply_curve", "bench", {}, (0.0, 1e-4, 2e-4, 6e5, 3e5)),
     ("sensor_lag", "joint 1 cap", {}, (0.1,)),
     ("sensor_crosstalk", "joint 1 cap", {}, (0.3,)),
     ("spool_hysteresis", "joint 1", {}, (0.14,)),

@@ -12,7 +12,7 @@ from analysis.effects.curve import curve_at, freed, packed, shortest_wave, splin
 
 
 @given(
-    st.lists(st.floats(0.05, 1.0), min_size=3, max_size=6),
+    st.lists(st.floats(0.05, 1.0), min_size=2, max_size=6),
     st.lists(st.floats(-5.0, 5.0), min_size=7, max_size=7),
 )
 def test_the_curve_is_a_not_a_knot_spline_with_straight_ends(

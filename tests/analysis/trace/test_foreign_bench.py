@@ -19,6 +19,7 @@ from rig.model.rig import Rig
 from tests.analysis.small_bench import TRUTH
 from tests.analysis.trace.foreign_bench import (
     KARNOPP,
+    PUMP,
     SIGMOID,
     TANH,
     Hidden,
@@ -209,6 +210,16 @@ def test_what_stands_between_the_world_and_the_records_is_named(
     assert [(e.name, e.where) for e in result.effects] == [named]
     assert result.effects[0].parameters[parameter].value == pytest.approx(size, rel=0.03)
     assert result.model_after.values["Fv2"] == pytest.approx(4.43, rel=0.02)
+
+
+def test_a_supply_whose_sag_has_no_name_in_the_catalogue_is_a_curve_over_the_flow(rig: Rig) -> None:
+    """Without `supply_sag` among the candidates the data draw the line that is there."""
+    train, held_out = pair_of_runs(rig, Hidden(sag=2e6))
+    result = trace([train], [held_out], effects=(), look_ahead=False)
+    assert result.verdict == "explained"
+    assert [e.name for e in result.effects] == ["supply_curve"]
+    (line,) = result.effects[0].curves
+    assert line.y == pytest.approx(2e6 * line.x / PUMP, abs=0.01 * line.y.max())
 
 
 def rig_angle(rig: Rig) -> float:

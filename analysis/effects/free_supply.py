@@ -1,0 +1,135 @@
+"""Supply pressure that is lost over the drawn flow, in a form that the data draw."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar, Final
+
+import numpy as np
+
+from analysis.effects.base import Array, Branch, Evidence, Shape
+from analysis.effects.curve import (
+    LAST,
+    curve_at,
+    knot_shapes,
+    packed,
+    shown,
+    spline,
+    spread_knots,
+)
+from analysis.effects.supply import PortEffect, edge_gains, port_flow
+from analysis.signals.conditioning import Signals
+from analysis.terms.base import P_CAP, P_ROD, P_S, PREPARE, Kernel, U, equation, kernel
+from rig.model.rig import Rig
+
+FLOWS: Final = 3  # knots of the flow, the first at rest, where nothing is lost
+LOOKS: Final = (0.05, 0.2)  # of the supply pressure, lost at the pump's flow, of first look
+
+
+@dataclass(frozen=True)
+class SupplyCurve(PortEffect):
+    """The valves see p_s - f(Q): the supply's drop over the flow drawn, f a curve with f(0) = 0.
+
+    Its values at the knots stand under the orifices' roots: they are shapes.
+    """
+
+    name: ClassVar[str] = "supply_curve"
+    mechanism: ClassVar[str] = "supply_curve"
+    free: ClassVar[bool] = True
+    by_data: ClassVar[bool] = True
+    variable: ClassVar[str] = "the flow drawn from the supply"
+    confounders: ClassVar[tuple[str, ...]] = ("metering_curve", "tank_pressure")
+    separated_by: ClassVar[str] = "two amplitudes, one and both joints at once"
+
+    @property
+    def kernel(self) -> Kernel:
+        """The compiled preparation."""
+        return _lost
+
+    def shape_names(self) -> tuple[str, ...]:
+        """Name the knots, then the drops at those above zero."""
+        knots = tuple(f"supply_knot_{k}" for k in range(1, FLOWS + 1))
+        return (*knots, *(f"supply_drop_{k}" for k in range(2, FLOWS + 1)))
+
+    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
+        """Return the knots [m^3/s] and the drops [Pa]."""
+        names, p = self.shape_names(), rig.supply.pressure
+        drops = (
+            Shape(name, "Pa", 0.0, 0.9 * p, tuple(share * p for share in LOOKS), 0.0)
+            for name in names[FLOWS:]
+        )
+        return (*knot_shapes(names[:FLOWS], "m^3/s", 0.0, rig.supply.flow), *drops)
+
+    def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
+        """Return knots at quantiles of the drawn flow, with drops in proportion to it."""
+        flow = np.concatenate([port_flow(rig, s, drawn=True) for s in evidence.signals])
+        knots = spread_knots(flow, (0.0, 0.6, LAST), low=0.0)
+        if not len(knots):
+            return ()
+        p, share = rig.supply.pressure, knots[1:] / rig.supply.flow
+        return tuple((*map(float, knots), *map(float, look * p * share)) for look in LOOKS)
+
+    def _drops(self, shape: Sequence[float]) -> Array:
+        return np.array([0.0, *shape[FLOWS:]])
+
+    def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
+        """Take the drop from the supply pressure."""
+        given = self.shape_of(rig, shape)
+        flow = port_flow(rig, signals, drawn=True)
+        return replace(signals, p_s=signals.p_s - spline(given[:FLOWS], flow) @ self._drops(given))
+
+    def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
+        """Return the curve, then C_pp and C_mm of each joint."""
+        given = self.shape_of(rig, shape)
+        curve = packed(given[:FLOWS], self._drops(given))
+        return np.concatenate((curve, edge_gains(rig, values, (0, 3))))
+
+    def branches(self, rig: Rig, shape: Sequence[float]) -> tuple[Branch, ...]:
+        """Return the drop [Pa] over the flow [m^3/s]."""
+        at = shown(shape[:FLOWS])
+        basis = spline(shape[:FLOWS], at)[:, 1:]
+        weights = dict(zip(self.shape_names()[FLOWS:], basis.T, strict=True))
+        return (Branch("supply's drop over flow", at, weights, "m^3/s", "Pa"),)
+
+    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
+        """Refuse drops at their bounds, and one that falls as the flow rises."""
+        given = self.shape_of(rig, shape)
+        drop = spline(given[:FLOWS], shown(given[:FLOWS])) @ self._drops(given)
+        if np.min(np.diff(drop)) < -1e-3 * float(np.max(np.abs(drop))):
+            return "the supply would lose less at more flow"
+        return self.outside(rig, shape)
+
+    def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
+        """Return the flow drawn [m^3/s]."""
+        flow, kinds = port_flow(rig, signals, drawn=True), ("flow_cap", "flow_rod")
+        return {equation(kind, i): flow for i in range(signals.joints) for kind in kinds}
+
+
+@kernel
+def _lost(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
+    # The flow through the line is what the open edges take at what is left of the pressure.
+    if phase == PREPARE:
+        low, high = 0.0, 0.0
+        for i in range(x.shape[1]):
+            u = x[U, i]
+            p = x[P_CAP, i] if u > 0.0 else x[P_ROD, i]
+            gain = par[9 + 2 * i] if u > 0.0 else par[10 + 2 * i]
+            high += gain * abs(u) * math.sqrt(max(bench[P_S] - p, 0.0))
+        for _ in range(48):
+            flow = 0.5 * (low + high)
+            port, taken = bench[P_S] - curve_at(flow, par, 0, 3), 0.0
+            for i in range(x.shape[1]):
+                u = x[U, i]
+                p = x[P_CAP, i] if u > 0.0 else x[P_ROD, i]
+                gain = par[9 + 2 * i] if u > 0.0 else par[10 + 2 * i]
+                taken += gain * abs(u) * math.sqrt(max(port - p, 0.0))
+            if taken > flow:
+                low = flow
+            else:
+                high = flow
+        bench[P_S] -= curve_at(low, par, 0, 3)
+
+
+TERMS = (SupplyCurve,)
