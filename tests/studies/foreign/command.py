@@ -1,0 +1,51 @@
+"""The study `foreign`: the trace on benches that share no formula with simulator or catalogue."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Annotated
+
+import typer
+
+from rig.cli.options import JsonOption
+from rig.cli.output import progress, write_json
+from tests.studies.estimators.command import ClusterOption, KeepOption, WorkersOption
+
+
+def foreign(
+    seed: Annotated[int, typer.Option(min=0, help="First seed.")] = 0,
+    count: Annotated[int, typer.Option(min=1, help="Of benches.")] = 30,
+    stride: Annotated[int, typer.Option(min=1, help="Between seeds: 2 takes odd or even.")] = 2,
+    only: Annotated[str, typer.Option(help="Hide this effect alone, by name.")] = "",
+    clean: Annotated[bool, typer.Option("--clean", help="Hide nothing.")] = False,
+    workers: WorkersOption = 1,
+    cluster: ClusterOption = None,
+    json: JsonOption = None,
+    keep: KeepOption = None,
+) -> None:
+    """Hide effects in benches of textbook physics and count what the trace makes of them.
+
+    Odd seeds are for tuning, even ones judge.
+
+    Example: python -m tests.studies foreign --seed 2 --count 5
+    """
+    from tests.studies.foreign.study import Job, Outcome, line_of, loaded, perform, text
+    from tests.studies.pool import Kept, performed
+
+    def tell(done: int, of: int, job: Job, found: Outcome | Exception) -> None:
+        failed = isinstance(found, Exception)
+        progress(f"{done}/{of} " + (f"seed {job.seed}: {found}" if failed else line_of(found)))
+
+    kept = (
+        Kept(keep, lambda j: f"{j.seed} {j.only} {j.clean}.json", asdict, loaded) if keep else None
+    )
+    work = [Job(seed + stride * k, only, clean) for k in range(count)]
+    done = performed(work, perform, cluster or workers, tell, kept, left_out=(Exception,))
+    outcomes = sorted((o for _, o in done), key=lambda o: o.seed)
+    write_json(json, [asdict(o) for o in outcomes])
+    typer.echo(text(outcomes))
+
+
+def register(app: typer.Typer) -> None:
+    """Add the study to the command line."""
+    app.command()(foreign)

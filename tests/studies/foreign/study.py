@@ -1,0 +1,211 @@
+"""What the trace makes of strangers' benches: judged, counted, with bounds."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from scipy.stats import beta as beta_distribution
+
+from rig.cli.output import table
+from tests.studies.foreign.bench import runs_of
+from tests.studies.foreign.cases import NONE, OUTSIDE, Case, case_of
+
+LOUD = 3.0  # repeatable residual over the noise from which an effect must be found
+CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True)
+class Job:
+    """One case by its seed."""
+
+    seed: int
+    only: str = ""
+    clean: bool = False
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What the trace made of a case; plain data, so that it can be kept."""
+
+    seed: int
+    kind: str
+    label: str
+    bench: str
+    answer: str
+    verdict: str
+    named: tuple[tuple[str, str], ...]
+    tied: tuple[tuple[str, str], ...]
+    refused: tuple[str, ...]
+    loudness: float
+    size_error: float
+    hits: tuple[int, int]  # sizes within their 95 % interval, sizes
+    parameter_hits: tuple[int, int]
+    parameter_error: float
+    error_ratio: float
+    notes: tuple[str, ...]
+    seconds: float
+
+
+def perform(job: Job) -> Outcome:
+    """Make a case's records and trace them."""
+    from analysis.trace.engine import trace
+
+    case = case_of(job.seed, job.only, job.clean)
+    train, held_out = runs_of(case.bench, job.seed)
+    started = time.process_time()
+    found = trace([train], held_out, look_ahead=False)
+    seconds = time.process_time() - started
+    named = tuple((e.name, e.where) for e in found.effects)
+    after = found.model_after.parameters
+    truth = case.bench.truth
+    errors, hits = _sizes(case, found.effects)
+    b = case.bench
+    return Outcome(
+        case.seed, case.kind, case.label,
+        f"spool form {b.form}, noise {b.noise:g}, repeats {b.repeats}",
+        answer_of(case, found.verdict, set(named), set(found.tied)), found.verdict,
+        named, tuple(found.tied),
+        tuple(f"{e.name} at {e.where} ({_failed(e)})" for e in found.refused),
+        max(f.ratio for f in found.floors), max(errors, default=math.nan), hits,
+        (sum(_within(after[n], v) for n, v in truth.items()), len(truth)),
+        max(abs(after[n].value / v - 1) for n, v in truth.items()),
+        found.worst(found.after), found.notes, seconds,
+    )  # fmt: skip
+
+
+def _failed(found: Any) -> str:
+    return "; ".join(f"{gate.name}: {gate.detail}" for gate in found.gates if not gate.ok)
+
+
+def _within(estimate: Any, value: float) -> bool:
+    return bool(estimate.ci95[0] <= value <= estimate.ci95[1])
+
+
+def _sizes(case: Case, effects: Iterable[Any]) -> tuple[list[float], tuple[int, int]]:
+    """Return relative errors of the sizes found at the right place, and intervals that hold."""
+    errors, hits = [], []
+    for wrong in case.hidden:
+        for e in effects:
+            if (e.name, e.where) != (wrong.name, wrong.where):
+                continue
+            for stem, size in wrong.sizes.items():
+                name = next((n for n in e.parameters if n.startswith(stem)), None)
+                if name is None:
+                    continue
+                estimate = e.parameters[name]
+                one = 1.0 if wrong.name == "sensor_gain" else 0.0
+                errors.append(abs((abs(estimate.value) - one) / (abs(size) - one) - 1))
+                low, high = sorted(map(abs, estimate.ci95))
+                hits.append(low <= abs(size) <= high)
+    return errors, (sum(hits), len(hits))
+
+
+def answer_of(  # noqa: PLR0911  a table of answers
+    case: Case, verdict: str, named: set[tuple[str, str]], tied: set[tuple[str, str]]
+) -> str:
+    """Judge an answer: right, in class, quiet, partly, abstained, wrong, false alarm."""
+    from analysis.trace.data.candidates import catalogue
+
+    truth, own = case.truth, named - case.allowed
+    known = {e.name for e in catalogue(case.bench.rig)}
+    if case.kind == NONE:
+        return "right" if verdict == "clean" else "false alarm" if named else "abstained"
+    if case.kind == OUTSIDE or any(name not in known for name, _ in truth):
+        right = {t for t in truth if t[0] in known}
+        if verdict == "clean":
+            return "quiet"
+        free = named and named <= case.allowed
+        if verdict == "unexplained" or free:
+            return "refused" if own <= right or free else "wrong beside unexplained"
+        return "in class" if verdict == "confounded" else "wrong"
+    if verdict == "clean":
+        return "quiet"
+    settled = verdict in ("explained", "confounded")
+    if settled and truth <= named and own <= truth:
+        return "right"
+    if verdict == "confounded" and truth <= named | tied:
+        return "in class"
+    if settled:
+        return "partly" if own < truth else "wrong"
+    if own <= truth:
+        return "abstained, truth found" if truth <= named else "abstained"
+    return "wrong beside unexplained"
+
+
+def line_of(o: Outcome) -> str:
+    """Return an outcome in one line."""
+    named = ", ".join(f"{n} at {w}" for n, w in o.named) or "nothing"
+    hit = f"{o.hits[0]}/{o.hits[1]}" if o.hits[1] else "-"
+    return (
+        f"[{o.answer}] seed {o.seed} {o.label} [{o.bench}] {o.loudness:.1f} x noise: {o.verdict}, "
+        f"{named}" + (f"; tied {', '.join(' at '.join(t) for t in o.tied)}" if o.tied else "")
+        + (f"; refused {'; '.join(o.refused)}" if o.refused else "")
+        + f"; size off {100 * o.size_error:.2g} %, ci {hit}, baseline ci {o.parameter_hits[0]}/"
+        f"{o.parameter_hits[1]}, parameters off {100 * o.parameter_error:.2g} %, "
+        f"error {o.error_ratio:.2f} x floor, {o.seconds:.0f} s"
+        + "".join(f"; {note}" for note in o.notes)
+    )  # fmt: skip
+
+
+def bounds(hits: int, of: int) -> tuple[float, float]:
+    """Return the one-sided 95 % bounds (Clopper and Pearson) of a share."""
+    if of == 0:
+        return 0.0, 1.0
+    low = 0.0 if hits == 0 else float(beta_distribution.ppf(1 - CONFIDENCE, hits, of - hits + 1))
+    high = 1.0 if hits == of else float(beta_distribution.ppf(CONFIDENCE, hits + 1, of - hits))
+    return low, high
+
+
+def text(outcomes: Sequence[Outcome]) -> str:
+    """Return the pooled tables and the list of every wrong name."""
+    loud = [o for o in outcomes if o.kind == NONE or o.loudness >= LOUD]
+    columns = sorted({o.answer for o in outcomes})
+    rows = []
+    for kind in dict.fromkeys(o.kind for o in outcomes):
+        for word, chosen in ((kind, outcomes), (f"{kind}, loud", loud)):
+            here = [o for o in chosen if o.kind == kind]
+            count = Counter(o.answer for o in here)
+            rows.append([word, str(len(here)), *(str(count[c] or "") for c in columns)])
+    pooled = []
+    hidden = [o for o in loud if o.kind not in (NONE, OUTSIDE)]
+    clean = [o for o in outcomes if o.kind == NONE]
+    for word, hits, of in (
+        ("right or in class, loud", _count(hidden, "right", "in class", "refused"), len(hidden)),
+        ("wrong name, explained or confounded", _count(outcomes, "wrong"), len(outcomes)),
+        ("wrong name beside unexplained", _count(outcomes, "wrong beside unexplained"),
+         len(outcomes)),
+        ("false alarm", _count(clean, "false alarm"), len(clean)),
+        ("intervals of sizes that hold", *_sum(o.hits for o in outcomes)),
+        ("intervals of the baseline that hold, right answers",
+         *_sum(o.parameter_hits for o in outcomes if o.answer == "right")),
+    ):  # fmt: skip
+        low, high = bounds(hits, of)
+        share = f"{100 * hits / of:.0f} %" if of else "-"
+        pooled.append([word, f"{hits} of {of}", share, f"{100 * low:.0f} to {100 * high:.0f} %"])
+    wrong = [line_of(o) for o in outcomes if o.answer.startswith(("wrong", "false", "partly"))]
+    return "\n\n".join((
+        table(["kind", "cases", *columns], rows),
+        table(["pooled", "count", "share", "95 % bounds"], pooled),
+        "every wrong or partial name:\n" + ("\n".join(wrong) or "none"),
+    ))  # fmt: skip
+
+
+def _count(outcomes: Iterable[Outcome], *answers: str) -> int:
+    return sum(o.answer in answers for o in outcomes)
+
+
+def _sum(pairs: Iterable[tuple[int, int]]) -> tuple[int, int]:
+    pairs = list(pairs)
+    return sum(a for a, _ in pairs), sum(b for _, b in pairs)
+
+
+def loaded(job: Job, data: Mapping[str, Any]) -> Outcome:
+    """Return a kept outcome."""
+    plain = {k: tuple(data[k]) for k in ("refused", "hits", "parameter_hits", "notes")}
+    pairs = {k: tuple((n, w) for n, w in data[k]) for k in ("named", "tied")}
+    return Outcome(**{**data, **plain, **pairs})
