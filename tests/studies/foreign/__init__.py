@@ -1,1 +1,1 @@
-"""Benches of textbook physics, written apart from simulator and analysis, and what is made of them."""
+"""Benches of textbook physics, written apart from simulator and analysis."""

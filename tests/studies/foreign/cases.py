@@ -162,8 +162,8 @@ def _underlap(rng: np.random.Generator, i: int) -> Wrong:
 
 def _null(rng: np.random.Generator, i: int) -> Wrong:
     null = _size(rng, 1e-3, 1e-2)
-    return Wrong("spool_offset", f"joint {i + 1}", f"{1e3 * null:.2g} mV", joint=(i, {"null": null}),
-                 sizes={"u_null": null})  # fmt: skip
+    return Wrong("spool_offset", f"joint {i + 1}", f"{1e3 * null:.2g} mV",
+                 joint=(i, {"null": null}), sizes={"u_null": null})  # fmt: skip
 
 
 def _spool_lag(rng: np.random.Generator, i: int) -> Wrong:
@@ -317,8 +317,12 @@ def _tapered(rng: np.random.Generator, i: int) -> Wrong:
 STRANGERS: Final[tuple[Draw, ...]] = (_hardening, _drag, _worn, _tapered)
 
 
-def case_of(seed: int, only: str = "", clean: bool = False) -> Case:
-    """Return the case of a seed; with `only` an effect of that name alone is hidden."""
+def case_of(seed: int, only: str = "", clean: bool = False, spool: int | None = None) -> Case:
+    """Return the case of a seed.
+
+    With `only` an effect of that name alone is hidden; `spool` is how the spool follows its command
+    (`plant.CONTINUOUS` …), drawn where it is None.
+    """
     rng = np.random.default_rng([seed, STREAM])
     rig, truth = drawn_rig(rng)
     bench: dict[str, Any] = {
@@ -327,6 +331,8 @@ def case_of(seed: int, only: str = "", clean: bool = False) -> Case:
         "noise": float(rng.choice([0.5, 1.0, 1.0, 2.0])),
         "repeats": int(rng.choice([1, 2, 4, 4])), "rms": _size(rng, 0.025, 0.05),
     }  # fmt: skip
+    if spool is not None:
+        bench["form"] = spool
     own = {"spool_time": _size(rng, 1e-3, 3e-3), "spool_hertz": _size(rng, 50, 120),
            "spool_damping": float(rng.uniform(0.6, 0.9))}  # fmt: skip
     names = list(SINGLES)

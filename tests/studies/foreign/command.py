@@ -1,4 +1,4 @@
-"""The study `foreign`: the trace on benches that share no formula with simulator or catalogue."""
+"""The studies `foreign` and `intervals`: trace and identify on benches of textbook physics."""
 
 from __future__ import annotations
 
@@ -18,6 +18,9 @@ def foreign(
     stride: Annotated[int, typer.Option(min=1, help="Between seeds: 2 takes odd or even.")] = 2,
     only: Annotated[str, typer.Option(help="Hide this effect alone, by name.")] = "",
     clean: Annotated[bool, typer.Option("--clean", help="Hide nothing.")] = False,
+    spool: Annotated[
+        int | None, typer.Option(min=0, max=2, help="0 continuous, 1 or 2 held and lagging.")
+    ] = None,
     workers: WorkersOption = 1,
     cluster: ClusterOption = None,
     json: JsonOption = None,
@@ -37,9 +40,40 @@ def foreign(
         progress(f"{done}/{of} " + (f"seed {job.seed}: {found}" if failed else line_of(found)))
 
     kept = (
-        Kept(keep, lambda j: f"{j.seed} {j.only} {j.clean}.json", asdict, loaded) if keep else None
+        Kept(keep, lambda j: f"{j.seed} {j.only} {j.clean} {j.spool}.json", asdict, loaded)
+        if keep
+        else None
     )
-    work = [Job(seed + stride * k, only, clean) for k in range(count)]
+    work = [Job(seed + stride * k, only, clean, spool) for k in range(count)]
+    done = performed(work, perform, cluster or workers, tell, kept, left_out=(Exception,))
+    outcomes = sorted((o for _, o in done), key=lambda o: o.seed)
+    write_json(json, [asdict(o) for o in outcomes])
+    typer.echo(text(outcomes))
+
+
+def intervals(
+    seed: Annotated[int, typer.Option(min=0, help="First seed.")] = 0,
+    count: Annotated[int, typer.Option(min=1, help="Of benches.")] = 20,
+    stride: Annotated[int, typer.Option(min=1, help="Between seeds: 2 takes odd or even.")] = 2,
+    estimator: Annotated[str, typer.Option(help="As `bramah identify --estimator`.")] = "auto",
+    workers: WorkersOption = 1,
+    cluster: ClusterOption = None,
+    json: JsonOption = None,
+    keep: KeepOption = None,
+) -> None:
+    """Identify clean benches of textbook physics and count intervals that hold the truth.
+
+    Example: python -m tests.studies intervals --seed 2 --count 5
+    """
+    from tests.studies.foreign.intervals import Covered, line_of, loaded, perform, text
+    from tests.studies.pool import Kept, performed
+
+    def tell(done: int, of: int, job: tuple[int, str], found: Covered | Exception) -> None:
+        failed = isinstance(found, Exception)
+        progress(f"{done}/{of} " + (f"seed {job[0]}: {found}" if failed else line_of(found)))
+
+    kept = Kept(keep, lambda j: f"{j[0]} {j[1]}.json", asdict, loaded) if keep else None
+    work = [(seed + stride * k, estimator) for k in range(count)]
     done = performed(work, perform, cluster or workers, tell, kept, left_out=(Exception,))
     outcomes = sorted((o for _, o in done), key=lambda o: o.seed)
     write_json(json, [asdict(o) for o in outcomes])
@@ -47,5 +81,6 @@ def foreign(
 
 
 def register(app: typer.Typer) -> None:
-    """Add the study to the command line."""
+    """Add the studies to the command line."""
     app.command()(foreign)
+    app.command()(intervals)

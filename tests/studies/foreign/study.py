@@ -26,6 +26,7 @@ class Job:
     seed: int
     only: str = ""
     clean: bool = False
+    spool: int | None = None
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ def perform(job: Job) -> Outcome:
     """Make a case's records and trace them."""
     from analysis.trace.engine import trace
 
-    case = case_of(job.seed, job.only, job.clean)
+    case = case_of(job.seed, job.only, job.clean, job.spool)
     train, held_out = runs_of(case.bench, job.seed)
     started = time.process_time()
     found = trace([train], held_out, look_ahead=False)
