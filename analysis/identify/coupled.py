@@ -42,6 +42,7 @@ def coupled(
     estimator: str = "auto",
     bootstrap: int = 0,
     rng: np.random.Generator | None = None,
+    nuisances: bool = True,
 ) -> Identification:
     """Identify all parameters of the terms `used` from all records of the runs at once.
 
@@ -57,7 +58,7 @@ def coupled(
 
             fitted, check = free_run_fit(rig, runs, used, solutions)
             return Refined(fitted, (check,), estimator)
-        job = EstimationJob(rig, runs, used, built, estimator, bootstrap, rng)
+        job = EstimationJob(rig, runs, used, built, estimator, bootstrap, rng, nuisances)
         return refine(job, solutions)
 
     built = build_rows(rig, runs, used, filtering)

@@ -58,7 +58,10 @@ _FITS: Mapping[str, Callable[[Sequence[RepeatBlock]], EquationFit]] = {
 
 @dataclass(frozen=True)
 class EstimationJob:
-    """What to estimate from: rig, runs, the model's terms, and the rows built with them."""
+    """What to estimate from: rig, runs, the model's terms, and the rows built with them.
+
+    With `nuisances` the small effects of `analysis.identify.estimators.nuisance` are fitted beside.
+    """
 
     rig: Rig
     runs: Sequence[Run]
@@ -67,6 +70,7 @@ class EstimationJob:
     estimator: str = "ls"
     bootstrap: int = 0
     rng: np.random.Generator | None = None
+    nuisances: bool = True
 
 
 @dataclass(frozen=True)
@@ -165,7 +169,7 @@ def _prepare(
     for s in solutions.values():
         for name, v in zip(s.names, s.value, strict=True):
             values[name] = float(1.0 / v) if name == "b" and v != 0 else float(v)
-    extra = list(nu.nuisance_terms(job.terms, job.runs, values))
+    extra = list(nu.nuisance_terms(job.terms, job.runs, values)) if job.nuisances else []
     built = with_columns(job.rig, job.terms, job.built, extra)
     checks: list[Check] = []
     out = []
@@ -174,7 +178,7 @@ def _prepare(
         mine = [n for n in solution.names if n not in solution.unidentifiable]
         if not mine:
             continue
-        beside = [n for n in (nu.KAPPA, nu.TAU) if n in columns]
+        beside = [n for n in (nu.KAPPA, nu.TAU) if n in columns and n not in mine]
         prepared = _family(built, family, columns, mine, beside)
         for name in tuple(beside):
             fit = least_squares(prepared.blocks)

@@ -26,6 +26,7 @@ from analysis.trace.data.spectral_lines import lines
 from analysis.trace.data.temperature_nuisance import stripped, temperature_terms
 from analysis.trace.free_forms import drawn_by_data, mechanisms
 from analysis.trace.judge import gates, held_out
+from analysis.trace.judge.scatter import widened
 from analysis.trace.judge.shooting import reshaped, told
 from analysis.trace.next_experiment.proposal import propose
 from analysis.trace.remaining import Rest, clues_to, left_over
@@ -119,11 +120,11 @@ def trace(
     if verdict not in (CLEAN, EXPLAINED):
         moves, formulas = clues_to(train_data, holdout_data, winner, split)
     further = propose(hypotheses, winner, found, verdict, moves) if look_ahead else None
-    after = _extended(runs, terms, winner, before)
+    after = _extended(runs, terms, winner, before, train_data)
     again = reshaped(runs, holdout, after, train_data, holdout_data, winner)
     if again.winner is not winner:
         winner = again.winner
-        after = _extended(runs, terms, winner, before)
+        after = _extended(runs, terms, winner, before, train_data)
         split = lines(train_data, winner.fit.residual)
     found = tuple(told(f, again.shots) for f in found)
     first, last = (
@@ -312,9 +313,15 @@ def _unknown(candidates: Sequence[Effect], known: Sequence[Used], moving: int = 
 
 
 def _extended(
-    runs: Sequence[Run], terms: Sequence[Used], winner: Hypothesis, before: Model
+    runs: Sequence[Run],
+    terms: Sequence[Used],
+    winner: Hypothesis,
+    before: Model,
+    train_data: RegressionData,
 ) -> Model:
-    """Identify everything again together with the effects."""
+    """Identify everything again together with the effects, their shapes' errors included."""
     if not winner.effects:
         return before
-    return stripped(identify(runs, terms=ordered((*terms, *winner.effects)), estimator=PLAIN).model)
+    every = ordered((*terms, *winner.effects))
+    found = identify(runs, terms=every, estimator="ls", nuisances=False).model
+    return stripped(widened(train_data, winner.fit, found))

@@ -46,6 +46,8 @@ def left_over(
 ) -> list[Rest]:
     """Return the equations that keep more than is nothing, and say what.
 
+    What the band lets pass as a form's is still looked at for another effect (`negligible`).
+
     Beside those that keep more than the noise floor's band (`gates.remaining`), those whose rest
     one formula holds: it is no noise, and no form that is only a little simpler. It speaks against
     an effect that acts in this equation, where a bench with as much left would not be clean.
@@ -53,6 +55,11 @@ def left_over(
     out = [Rest(*r, True) for r in gates.remaining(hypotheses, winner, holdout_data)]
     seen = _seen(hypotheses, winner) if winner.effects else {}
     known = {r.equation for r in out}
+    for e, residual in winner.excess_energy.items():
+        if winner.effects and e not in known and not hypotheses.negligible(e, residual):
+            share = 100 * residual / max(hypotheses.empty.excess_energy[e], 1e-30)
+            words = f"{share:.2g} % of what repeated stays, which the named form may miss"
+            out.append(Rest(e, words, False))
     asked = [equation for equation in seen if equation not in known]
     if not asked:
         return out

@@ -21,10 +21,10 @@ from analysis.trace.judge import inference
 from analysis.trace.judge.curves import curves_of
 from analysis.trace.judge.held_out import residual as held_left
 from analysis.trace.judge.invariance import invariance
+from analysis.trace.judge.scatter import NORMAL, form_shift
 from analysis.trace.result import Found, Gate, Rival
 from analysis.trace.search.hypothesis import Hypothesis, excess_of, parameter_values
 from analysis.trace.search.hypothesis_set import HypothesisSet
-from analysis.trace.search.linear_fit import FORM
 
 Array = NDArray[np.float64]
 Key = tuple[str, str]
@@ -35,7 +35,9 @@ P_LIMIT = 0.01
 TIE = 1.10  # held-out rms of a rival over the best's: below, the data do not tell them apart
 TIE_TRAINING = 1.25
 HARM = 1.2  # energy above noise in an equation over that before: a cause does not make it worse
-HELD_FORM, HELD_QUIET = 0.05, 1.3  # share that may stay where the held-out error is this small
+# Of an equation's energy before, what a named form may miss of the real one: on training records,
+# and on held-out ones, which may be quieter. It does not shrink with the noise.
+MISSED, MISSED_HELD = 0.05, 0.10
 HELD_BAND = 1.5  # held-out rms after over the noise floor, per equation
 SHOWN = 4  # rivals in a result
 
@@ -64,6 +66,7 @@ def judge(
     steady = inference.stability(hypotheses, winner, rng)
     after = held_left(holdout_data, winner.fit)
     physical = hypotheses.physical(winner)
+    shift = form_shift(train_data, winner.fit)
     out = []
     for used in winner.effects:
         assert isinstance(used.term, Effect)
@@ -90,7 +93,7 @@ def judge(
             Found(
                 used.term.name,
                 _place(used.term),
-                _parameters(train_data, used, errors),
+                _parameters(train_data, used, errors, shift),
                 p,
                 removed,
                 (*twins, *rivals),
@@ -109,8 +112,8 @@ def remaining(
 ) -> list[tuple[str, str]]:
     """Return the equations that keep more than the noise floor's band, and say on which records.
 
-    What a catalogue's simpler form leaves in the training records may be somewhat more where the
-    held-out error of that equation is the noise's.
+    What a catalogue's simpler form misses of an effect is a share of what was there before, however
+    well it is measured.
     """
     after = held_left(holdout_data, winner.fit)
     start = excess_of(holdout_data, held_left(holdout_data, hypotheses.empty.fit))
@@ -119,8 +122,7 @@ def remaining(
     out = []
     for e, residual in winner.excess_energy.items():
         share = residual / max(hypotheses.empty.excess_energy[e], 1e-30)
-        quiet = share <= HELD_FORM and ratio.get(e, np.inf) <= HELD_QUIET
-        if not (quiet or hypotheses.negligible(e, residual)):
+        if share > MISSED and not hypotheses.negligible(e, residual):
             times = residual / hypotheses.limits.band[e]
             out.append(
                 (e, f"{100 * share:.2g} % of what repeated stays, {times:.2g} times the band")
@@ -128,7 +130,7 @@ def remaining(
     out += [
         (e, f"held-out error {r:.2f} times the noise floor")
         for e, r in ratio.items()
-        if r > HELD_BAND and now[e] > 2 * FORM * start[e]
+        if r > HELD_BAND and now[e] > MISSED_HELD * start[e]
     ]
     return out
 
@@ -255,14 +257,19 @@ def _ratio(
 
 
 def _parameters(
-    train_data: RegressionData, used: Used, errors: inference.EffectErrors
+    train_data: RegressionData,
+    used: Used,
+    errors: inference.EffectErrors,
+    shift: Mapping[str, float],
 ) -> dict[str, Estimate]:
     units = {c.parameter: c.unit for c in used.term.coefficients(train_data.rig)}
     units |= {s.parameter: s.unit for s in shapes_of(train_data.rig, used)}
-    half = half_width(errors.std, np.full(len(errors.std), errors.dof))
+    more = np.array([shift.get(name, 0.0) for name in errors.names])
+    half = np.hypot(half_width(errors.std, errors.dof), NORMAL * more)
+    std = np.hypot(errors.std, more)
     return {
         name: Estimate(float(v), units.get(name, ""), float(s), (float(v - h), float(v + h)))
-        for name, v, s, h in zip(errors.names, errors.value, errors.std, half, strict=True)
+        for name, v, s, h in zip(errors.names, errors.value, std, half, strict=True)
     }
 
 

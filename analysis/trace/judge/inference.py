@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from analysis.effects.base import Effect, shape_values, shapes_of
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
+from analysis.trace.judge.scatter import scatter
 from analysis.trace.search import linear_fit
 from analysis.trace.search.hypothesis import Hypothesis, excess_of
 from analysis.trace.search.hypothesis_set import HypothesisSet
@@ -211,39 +212,27 @@ def _again(
 
 @dataclass(frozen=True)
 class EffectErrors:
-    """An effect's parameters with standard errors over repeats, and the t distribution's dof."""
+    """An effect's parameters (k,) with standard errors, and the t distributions' dof (k,)."""
 
     names: tuple[str, ...]
     value: Array
     std: Array
-    dof: float
+    dof: Array
 
 
 def spread(
     train_data: RegressionData, model: ExactFit, used: Used, values: Mapping[str, float]
 ) -> EffectErrors:
-    """Return an effect's parameters with errors from the scatter between repeats."""
+    """Return an effect's parameters with errors: scatter between repeats, and lack of fit."""
     names, J = jacobian(train_data, model, used)
     base = others(train_data, model, names)
     J_p = J - base @ (base.T @ J)
     scale = np.linalg.norm(J_p, axis=0)  # units differ by many powers of ten
     scale[scale == 0] = 1.0
-    pinv = np.linalg.pinv(J_p / scale, rcond=1e-8) / scale[:, None]
-    variance, dof = np.zeros(len(names)), 0
-    for group in sorted({s.group for s in train_data.segments}):
-        parts = [s for s in train_data.segments if s.group == group]
-        R = parts[0].repeats
-        if R < 2:
-            variance += sum(np.sum(pinv[:, s.where] ** 2, axis=1) for s in parts)
-            continue
-        each = sum(
-            pinv[:, s.where] @ train_data.residual[:R, s.where].T / np.sqrt(R) for s in parts
-        )
-        variance += R * np.var(each, axis=1, ddof=1)
-        dof += R - 1
+    error = scatter(train_data, J_p / scale, model.residual)
     known = {**shape_values(train_data.rig, used), **values}
     value = np.array([known.get(n, np.nan) for n in names])
-    return EffectErrors(names, value, np.sqrt(variance), float(max(dof, 1)))
+    return EffectErrors(names, value, np.sqrt(np.diag(error.covariance)) / scale, error.dof)
 
 
 def others(train_data: RegressionData, model: ExactFit, own: Sequence[str]) -> Array:

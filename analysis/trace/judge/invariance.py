@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 TOLERANCE = 0.2  # relative disagreement that a catalogue's simpler form may cause
 DEVIATIONS = 3.5
-TELLS = 0.05  # of a column's energy off the others': a subset with less says nothing of a size
+TELLS = 0.12  # of a column's energy off the others': a subset with less holds a tail, not the size
 POWER = 0.25  # a subset judges a parameter that it knows this well, relative
 
 

@@ -257,6 +257,18 @@ def jacobian(data: RegressionData, model: ExactFit, used: Used) -> tuple[tuple[s
     return tuple(names), stack
 
 
+def alternatives(data: RegressionData, found: ExactFit) -> list[ExactFit]:
+    """Return the fit with each effect in its other forms, one after another."""
+    out = []
+    for used in found.terms:
+        if used in data.terms or not isinstance(used.term, Effect):
+            continue
+        for shape in used.term.other_forms(data.rig, used.shape):
+            terms = _with(found.terms, used, Used(used.term, shape))
+            out.append(_searched(data, terms, MOST_STEPS))
+    return out
+
+
 def rebased(data: RegressionData, model: ExactFit) -> RegressionData:
     """Return the stage with a fitted model in place of its own."""
     rows = table(data, model.terms)

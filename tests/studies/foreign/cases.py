@@ -21,7 +21,9 @@ MIX: Final = ((NONE, 0.15), (SINGLE, 0.60), (PAIR, 0.15), (OUTSIDE, 0.10))
 class Wrong:
     """One thing wrong: the trace's name and place, what it does, true sizes by parameter stem.
 
-    `also` are names at the same place that may stand beside it (a breakaway sits on a level).
+    `also` are names at the same place that may stand beside it (a breakaway sits on a level, a
+    curve of its mechanism is right for what has no name), `kin` those that may stand beside
+    `unexplained`: the right mechanism in a form that is too simple.
     """
 
     name: str
@@ -32,6 +34,7 @@ class Wrong:
     sensors: Mapping[str, Sensor] = field(default_factory=dict)
     sizes: Mapping[str, float] = field(default_factory=dict)
     also: tuple[str, ...] = ()
+    kin: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -57,6 +60,11 @@ class Case:
     def allowed(self) -> set[tuple[str, str]]:
         """What may be named beside the truth."""
         return {(name, w.where) for w in self.hidden for name in w.also}
+
+    @property
+    def related(self) -> set[tuple[str, str]]:
+        """What may be named beside `unexplained`."""
+        return self.allowed | {(name, w.where) for w in self.hidden for name in w.kin}
 
 
 Draw = Callable[[np.random.Generator, int], Wrong]
@@ -292,7 +300,7 @@ SINGLES: Final[Mapping[str, Draw]] = {
 def _hardening(rng: np.random.Generator, i: int) -> Wrong:
     own = {"stiffness": _size(rng, 20, 60), "cubic": _size(rng, 20, 80)}
     return Wrong("hardening spring", f"joint {i + 1}", "cubic", joint=(i, own),
-                 also=("position_force",))  # fmt: skip
+                 also=("position_force",), kin=("joint_spring",))  # fmt: skip
 
 
 def _drag(rng: np.random.Generator, i: int) -> Wrong:
@@ -304,14 +312,14 @@ def _drag(rng: np.random.Generator, i: int) -> Wrong:
 def _worn(rng: np.random.Generator, i: int) -> Wrong:
     own = {"internal": _size(rng, 5e-13, 2e-12), "worn": _size(rng, 2, 8)}
     return Wrong("worn bore", f"joint {i + 1}", f"x {own['worn']:.2g} in its middle",
-                 joint=(i, own), also=("leakage_curve",))  # fmt: skip
+                 joint=(i, own), also=("leakage_curve",), kin=("internal_leakage",))  # fmt: skip
 
 
 def _tapered(rng: np.random.Generator, i: int) -> Wrong:
     force, (word, contact) = _size(rng, 40, 150), _contact(rng)
     own = {**contact, "ahead": force, "astern": force, "taper": _size(rng, 15, 25)}
     return Wrong("tapered bore", f"joint {i + 1}", f"{force:.0f} N, {word}", joint=(i, own),
-                 also=("friction_curve",))  # fmt: skip
+                 also=("friction_curve",), kin=("coulomb_friction",))  # fmt: skip
 
 
 STRANGERS: Final[tuple[Draw, ...]] = (_hardening, _drag, _worn, _tapered)

@@ -15,6 +15,7 @@ from rig.cli.output import table
 from tests.studies.foreign.bench import runs_of
 from tests.studies.foreign.cases import NONE, OUTSIDE, Case, case_of
 
+BESIDE = "wrong beside unexplained"
 LOUD = 3.0  # repeatable residual over the noise from which an effect must be found
 CONFIDENCE = 0.95
 
@@ -122,7 +123,7 @@ def answer_of(  # noqa: PLR0911  a table of answers
             return "quiet"
         free = named and named <= case.allowed
         if verdict == "unexplained" or free:
-            return "refused" if own <= right or free else "wrong beside unexplained"
+            return "refused" if free or named - case.related <= right else BESIDE
         return "in class" if verdict == "confounded" else "wrong"
     if verdict == "clean":
         return "quiet"
@@ -135,7 +136,7 @@ def answer_of(  # noqa: PLR0911  a table of answers
         return "partly" if own < truth else "wrong"
     if own <= truth:
         return "abstained, truth found" if truth <= named else "abstained"
-    return "wrong beside unexplained"
+    return BESIDE
 
 
 def line_of(o: Outcome) -> str:
@@ -178,7 +179,7 @@ def text(outcomes: Sequence[Outcome]) -> str:
     for word, hits, of in (
         ("right or in class, loud", _count(hidden, "right", "in class", "refused"), len(hidden)),
         ("wrong name, explained or confounded", _count(outcomes, "wrong"), len(outcomes)),
-        ("wrong name beside unexplained", _count(outcomes, "wrong beside unexplained"),
+        ("wrong name beside unexplained", _count(outcomes, BESIDE),
          len(outcomes)),
         ("false alarm", _count(clean, "false alarm"), len(clean)),
         ("intervals of sizes that hold", *_sum(o.hits for o in outcomes)),

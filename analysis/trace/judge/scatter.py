@@ -1,0 +1,149 @@
+"""How far an effect's parameters may be off: noise between repeats, and what the form misses.
+
+The rows' influence on a parameter is grouped as in `analysis.identify.estimators.covariance`: by
+repeat, by the part of the excitation's period, and by the level of the state that a law depends on
+(a chamber's pressure; a piston's place and its speed). What the groups differ by beyond noise is a
+model that is wrong somewhere in every repeat alike, and enters as a systematic part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.identify.estimators.covariance import CovarianceParts, spread
+from analysis.identify.estimators.equations import LEVELS, Pieces, segments
+from analysis.regression.conditioned import ConditionedRecord
+from analysis.simulation.model import Model
+from analysis.trace.data.regression_data import RegressionData, Segment
+from analysis.trace.search.refinement import ExactFit, alternatives, jacobian, table
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+NORMAL = 1.96  # half-width of 95 % over the deviation, of what no repeat shows
+PERIOD, STATE, SPEED = "period", "state", "speed"
+
+
+def scatter(train_data: RegressionData, columns: Array, residual: Array) -> CovarianceParts:
+    """Return the covariance of coefficients of `columns` (M, k), all else projected off them.
+
+    `residual` (M,) is what the fitted model leaves of the averaged records.
+    """
+    inverse = np.asarray(
+        np.linalg.pinv(columns.T @ columns, rcond=1e-10, hermitian=True), dtype=np.float64
+    )
+    groupings = [_pieces(train_data, columns, residual, by) for by in (PERIOD, STATE, SPEED)]
+    return spread(groupings, inverse)
+
+
+def _pieces(train_data: RegressionData, columns: Array, residual: Array, by: str) -> Pieces:
+    """Return scores and information of every step, repeat and group of rows."""
+    strata = {g: k for k, g in enumerate(sorted({s.group for s in train_data.segments}))}
+    records = {conditioned.group: k for k, conditioned in enumerate(train_data.records)}
+    found: dict[tuple[int, int, int], tuple[Array, Array]] = {}
+    for number, s in enumerate(train_data.segments):
+        k = records[s.group]
+        time = train_data.rows[k][s.equation].time
+        label = _labels(train_data.records[k], s, time, by)
+        # In period the equations of one instant belong together; a level is an equation's own.
+        label = label if by == PERIOD else label + number * LEVELS
+        own = columns[s.where] / np.sqrt(s.repeats)
+        noise = train_data.residual[: s.repeats, s.where]
+        left = noise - noise.mean(axis=0) + residual[s.where] / np.sqrt(s.repeats)
+        for part in np.unique(label):
+            here = label == part
+            information = own[here].T @ own[here]
+            for repeat in range(s.repeats):
+                key = (strata[s.group], repeat, int(part))
+                score = own[here].T @ left[repeat, here]
+                before = found.get(key, (0.0, 0.0))
+                found[key] = (score + before[0], information + before[1])
+    keys = np.array(list(found), dtype=np.int64)
+    return Pieces(
+        keys[:, 0], keys[:, 1], keys[:, 2],
+        np.array([g for g, _ in found.values()]), np.array([a for _, a in found.values()]),
+    )  # fmt: skip
+
+
+def _labels(conditioned: ConditionedRecord, s: Segment, time: Array, by: str) -> Indices:
+    """Return the group of each row (m,): part of the period, or level of a state."""
+    record = conditioned.record
+    if by == PERIOD:
+        return segments(time, record.period / record.sample_rate)
+    signals = conditioned.signals
+    at = np.rint(time * record.sample_rate).astype(int).clip(0, len(signals.t) - 1)
+    kind, joint = s.equation.rsplit("_", 1)
+    i = int(joint) - 1
+    state = {"flow_cap": signals.p_cap, "flow_rod": signals.p_rod}.get(kind, signals.s)
+    x = (signals.sd if by == SPEED else state)[at, i]
+    rank = np.argsort(np.argsort(x))
+    return np.asarray(rank * LEVELS // max(len(rank), 1), dtype=np.int64)
+
+
+def form_shift(train_data: RegressionData, fit: ExactFit) -> dict[str, float]:
+    """Return how far every coefficient of the rows may be off since an effect's form is not known.
+
+    Where an effect has another form (`Effect.other_forms`), that is fitted as well. The two differ
+    by a shift of each coefficient; of it counts sqrt(E / E'), of the energies E and E' that they
+    leave above noise: nothing where the chosen form leaves noise only, all of it where the other
+    is as good.
+    """
+    noise = len(fit.residual)
+    own = max(fit.energy - noise, np.sqrt(2.0 * noise))
+    squares = dict.fromkeys(fit.beta, 0.0)
+    for other in alternatives(train_data, fit):
+        left = max(other.energy - noise, np.sqrt(2.0 * noise))
+        share = min(1.0, own / left)
+        for name, value in other.beta.items():
+            squares[name] = (
+                squares.get(name, 0.0) + share * (value - fit.beta.get(name, value)) ** 2
+            )
+    return {name: float(np.sqrt(v)) for name, v in squares.items()}
+
+
+def widened(train_data: RegressionData, fit: ExactFit, model: Model) -> Model:
+    """Return the model with what is not known of its effects' shapes and forms in every interval.
+
+    A model is identified with its shapes taken for exact. With the covariance S of shapes t, and
+    to first order beta(t) = beta - A^-1 X' J_t (t - t0), its variances grow by that of beta(t), and
+    by the square of `form_shift`.
+    """
+    rows = table(train_data, fit.terms)
+    size = np.linalg.norm(rows.matrix, axis=0)
+    more = _by_shapes(train_data, fit, rows.matrix / np.where(size > 0, size, 1.0), rows.names)
+    shift = form_shift(train_data, fit)
+    parameters, covariance = dict(model.parameters), model.covariance.copy()
+    names = list(parameters)
+    for k, name in enumerate(rows.names):
+        if name not in parameters or not parameters[name].identified or size[k] == 0:
+            continue
+        old = parameters[name]
+        # The rows may hold the reciprocal: relative sizes are the same.
+        relative = np.hypot(np.sqrt(more[k]) / size[k], shift.get(name, 0.0)) / abs(fit.beta[name])
+        grown = abs(old.value) * float(relative)
+        half = float(np.hypot(0.5 * (old.ci95[1] - old.ci95[0]), NORMAL * grown))
+        std = float(np.hypot(old.std, grown))
+        parameters[name] = replace(old, std=std, ci95=(old.value - half, old.value + half))
+        covariance[names.index(name), names.index(name)] += grown**2
+    return replace(model, parameters=parameters, covariance=covariance)
+
+
+def _by_shapes(train_data: RegressionData, fit: ExactFit, X: Array, own: Sequence[str]) -> Array:
+    """Return what the shapes' covariance adds to the variance of each coefficient of X (M, k)."""
+    columns = [
+        J[:, [k for k, n in enumerate(names) if n not in own]]
+        for names, J in (jacobian(train_data, fit, u) for u in fit.terms if u.shape)
+    ]
+    shapes = np.column_stack([np.zeros((len(X), 0)), *columns])
+    shapes = shapes[:, np.linalg.norm(shapes, axis=0) > 0]
+    if not shapes.shape[1]:
+        return np.zeros(X.shape[1])
+    unit = shapes / np.linalg.norm(shapes, axis=0)
+    moved = np.linalg.lstsq(X, unit, rcond=1e-6)[0]
+    error = scatter(train_data, unit - X @ moved, fit.residual)
+    variance = np.einsum("ki,ij,kj->k", moved, error.covariance, moved)
+    return np.asarray(np.maximum(variance, 0.0))
