@@ -46,8 +46,6 @@ def left_over(
 ) -> list[Rest]:
     """Return the equations that keep more than is nothing, and say what.
 
-    What the band lets pass as a form's is still looked at for another effect (`negligible`).
-
     Beside those that keep more than the noise floor's band (`gates.remaining`), those whose rest
     one formula holds: it is no noise, and no form that is only a little simpler. It speaks against
     an effect that acts in this equation, where a bench with as much left would not be clean.
@@ -55,23 +53,31 @@ def left_over(
     out = [Rest(*r, True) for r in gates.remaining(hypotheses, winner, holdout_data)]
     seen = _seen(hypotheses, winner) if winner.effects else {}
     known = {r.equation for r in out}
-    for e, residual in winner.excess_energy.items():
-        if winner.effects and e not in known and not hypotheses.negligible(e, residual):
-            share = 100 * residual / max(hypotheses.empty.excess_energy[e], 1e-30)
-            words = f"{share:.2g} % of what repeated stays, which the named form may miss"
-            out.append(Rest(e, words, False))
     asked = [equation for equation in seen if equation not in known]
     if not asked:
-        return out
+        return [*out, *_missed(hypotheses, winner, out)]
     now, later = rebased(hypotheses.stage, winner.fit), rebased(holdout_data, winner.fit)
     held = held_out.residual(holdout_data, winner.fit)
     for equation in asked:
         found = formula(now, winner.fit.residual, later, held, equation)
-        if found is not None and found.share >= HELD:
+        # A constant is no law of another cause: it is what a form has too little or too much.
+        if found is not None and found.share >= HELD and found.variables:
             words = f"{100 * seen[equation]:.2g} % of what repeated stays, and a formula holds it"
             loud = winner.excess_energy[equation] > hypotheses.limits.band[equation]
             veto = loud and seen[equation] < ACTED
             out.append(Rest(equation, f"{words}: {found.text}", veto))
+    return [*out, *_missed(hypotheses, winner, out)]
+
+
+def _missed(hypotheses: HypothesisSet, winner: Hypothesis, known: Sequence[Rest]) -> list[Rest]:
+    """Return the other equations that keep more than a further effect would leave unasked."""
+    listed = {r.equation for r in known}
+    out = []
+    for e, residual in winner.excess_energy.items():
+        if winner.effects and e not in listed and not hypotheses.negligible(e, residual):
+            share = 100 * residual / max(hypotheses.empty.excess_energy[e], 1e-30)
+            words = f"{share:.2g} % of what repeated stays, which the named form may miss"
+            out.append(Rest(e, words, False))
     return out
 
 

@@ -7,7 +7,7 @@ coefficient everywhere, whichever repeats are taken, and better than anything el
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,7 @@ Key = tuple[str, str]
 
 REMOVED = 0.5  # of the held-out energy above noise in the equations it touches
 CHOSEN = 0.9  # of half-samples
+RIVAL = 0.5  # of the other half-samples: what they choose so often cannot be told from the best
 P_LIMIT = 0.01
 TIE = 1.10  # held-out rms of a rival over the best's: below, the data do not tell them apart
 TIE_TRAINING = 1.25
@@ -72,12 +73,15 @@ def judge(
         assert isinstance(used.term, Effect)
         key = (used.term.name, used.term.where)
         rest = hypotheses.exact(tuple(u for u in winner.effects if u is not used))
-        rivals = _rivals(hypotheses, winner, key, holdout_data, after)
+        share, others = steady[key]
+        often = {
+            k for k, n in others.items() if share < CHOSEN and n >= RIVAL * sum(others.values())
+        }
+        rivals = _rivals(hypotheses, winner, key, holdout_data, after, often)
         removed = _removed(holdout_data, rest, after, _touched(hypotheses, winner, rest))
         worse = _worse(hypotheses, winner, rest)
         p = inference.p_value(rest.fit.energy - winner.fit.energy, null)
         errors = inference.spread(train_data, winner.fit, used, values)
-        share, others = steady[key]
         differing = invariance(train_data, winner.fit, used, errors, _joint(used.term))
         tied = [r for r in rivals if r.tied]
         twins = [Rival(name, where, 1.0, 1.0, True) for name, where in used.term.twins()]
@@ -213,8 +217,12 @@ def _rivals(
     key: Key,
     holdout_data: RegressionData,
     after: Array,
+    often: Collection[Key],
 ) -> list[Rival]:
-    """Return the sets that have another effect in place of one, those that leave least first."""
+    """Return the sets that have another effect in place of one, those that leave least first.
+
+    What half-samples choose `often` in its place is tied whatever it leaves.
+    """
     others = winner.keys - {key}
     rest = hypotheses.exact([u for u in winner.effects if (u.term.name, u.term.where) != key])
     equations = _touched(hypotheses, winner, rest)
@@ -232,9 +240,10 @@ def _rivals(
         training = _ratio(_energy(hypotheses.stage, one.fit.residual), own, equations)
         name, _ = next(iter(fresh))
         tied = ratio < TIE and (training < TIE_TRAINING or ratio < 0.95)
+        tied = tied or not fresh.isdisjoint(often)
         place = next(_place(u.term) for u in one.effects if (u.term.name, u.term.where) in fresh)  # type: ignore[arg-type]
         out.append(Rival(name, place, ratio, training, tied))
-    out.sort(key=lambda r: r.ratio)
+    out.sort(key=lambda r: (not r.tied, r.ratio))
     return out[:SHOWN]
 
 
@@ -282,12 +291,13 @@ def _differences(differing: Sequence[tuple[str, str, float, float]]) -> str:
     )
 
 
-def _chosen(share: float, others: Mapping[str, int], tied: bool) -> str:
+def _chosen(share: float, others: Mapping[Key, int], tied: bool) -> str:
     text = f"chosen in {100 * share:.0f} % of half-samples"
     if share < CHOSEN and tied:
         text = f"not asked, for a rival fits as well: {text}"
     if share < CHOSEN and others:
-        text += "; else " + ", ".join(sorted(others, key=lambda k: -others[k])[:2])
+        most = sorted(others, key=lambda k: -others[k])[:2]
+        text += "; else " + ", ".join(f"{name} at {where}" for name, where in most)
     return text
 
 

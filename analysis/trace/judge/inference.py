@@ -26,6 +26,7 @@ from analysis.trace.search.linear_fit import CandidateColumns, orthonormal
 from analysis.trace.search.refinement import ExactFit, jacobian, table
 
 Array = NDArray[np.float64]
+Key = tuple[str, str]
 
 FLIPS = 199
 ENOUGH_REPEATS = 8
@@ -163,7 +164,7 @@ def halves(
 
 def stability(
     hypotheses: HypothesisSet, winner: Hypothesis, rng: np.random.Generator
-) -> dict[tuple[str, str], tuple[float, dict[str, int]]]:
+) -> dict[Key, tuple[float, dict[Key, int]]]:
     """Return, by effect, in which share of half-samples it is chosen, and who else was."""
     train_data = hypotheses.stage
     near = sorted(hypotheses.listed.values(), key=lambda o: o.total)
@@ -172,7 +173,7 @@ def stability(
         near.append(winner)
     tangents = [linear(train_data, o) for o in near]
     counts = dict.fromkeys(winner.keys, 0)
-    others: dict[str, int] = {}
+    others: dict[Key, int] = {}
     samples = halves(train_data, rng)
     for change, weight, noise in samples:
         refitted = [
@@ -182,9 +183,8 @@ def stability(
         said = best.keys | _included(best)
         for key in winner.keys & said:
             counts[key] += 1
-        for name, where in best.keys - winner.keys:
-            label = f"{name} at {where}"
-            others[label] = others.get(label, 0) + 1
+        for other in best.keys - winner.keys:
+            others[other] = others.get(other, 0) + 1
     return {key: (count / len(samples), others) for key, count in counts.items()}
 
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
-from typing import Annotated
+from dataclasses import asdict, astuple
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from rig.cli.options import JsonOption
 from rig.cli.output import progress, write_json
 from tests.studies.estimators.command import ClusterOption, KeepOption, WorkersOption
+
+if TYPE_CHECKING:
+    from tests.studies.foreign.study import Job
 
 
 def foreign(
@@ -21,6 +24,9 @@ def foreign(
     spool: Annotated[
         int | None, typer.Option(min=0, max=2, help="0 continuous, 1 or 2 held and lagging.")
     ] = None,
+    better: Annotated[
+        bool, typer.Option("--better", help="Measure each better as well, three ways.")
+    ] = False,
     workers: WorkersOption = 1,
     cluster: ClusterOption = None,
     json: JsonOption = None,
@@ -32,23 +38,38 @@ def foreign(
 
     Example: python -m tests.studies foreign --seed 2 --count 5
     """
-    from tests.studies.foreign.study import Job, Outcome, line_of, loaded, perform, text
+    from tests.studies.foreign.study import (
+        BETTER,
+        Job,
+        Outcome,
+        line_of,
+        loaded,
+        perform,
+        text,
+        weakened,
+    )
     from tests.studies.pool import Kept, performed
 
     def tell(done: int, of: int, job: Job, found: Outcome | Exception) -> None:
         failed = isinstance(found, Exception)
         progress(f"{done}/{of} " + (f"seed {job.seed}: {found}" if failed else line_of(found)))
 
-    kept = (
-        Kept(keep, lambda j: f"{j.seed} {j.only} {j.clean} {j.spool}.json", asdict, loaded)
-        if keep
-        else None
-    )
-    work = [Job(seed + stride * k, only, clean, spool) for k in range(count)]
-    done = performed(work, perform, cluster or workers, tell, kept, left_out=(Exception,))
-    outcomes = sorted((o for _, o in done), key=lambda o: o.seed)
+    kept = Kept(keep, _name, asdict, loaded) if keep else None
+    work = [
+        Job(seed + stride * k, only, clean, spool, how)
+        for k in range(count)
+        for how in ("", *(BETTER if better else ()))
+    ]
+    found = dict(performed(work, perform, cluster or workers, tell, kept, left_out=(Exception,)))
+    outcomes = [found[job] for job in work if job in found]
     write_json(json, [asdict(o) for o in outcomes])
     typer.echo(text(outcomes))
+    if better:
+        typer.echo(weakened(found))
+
+
+def _name(job: Job) -> str:
+    return " ".join(map(str, astuple(job))) + ".json"
 
 
 def intervals(

@@ -6,16 +6,20 @@ import math
 import time
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from scipy.stats import beta as beta_distribution
 
 from rig.cli.output import table
-from tests.studies.foreign.bench import runs_of
+from tests.studies.foreign.bench import Bench, runs_of
 from tests.studies.foreign.cases import NONE, OUTSIDE, Case, case_of
 
+ABSTAINED_RIGHT = "abstained, truth found"
 BESIDE = "wrong beside unexplained"
+BETTER = ("repeats", "noise", "longer")
+# Answers from weak to strong: better data may only move a bench upwards.
+STRENGTH = ("quiet", "abstained", ABSTAINED_RIGHT, "refused", "in class", "right")
 LOUD = 3.0  # repeatable residual over the noise from which an effect must be found
 CONFIDENCE = 0.95
 
@@ -28,6 +32,7 @@ class Job:
     only: str = ""
     clean: bool = False
     spool: int | None = None
+    better: str = ""  # how the same bench is measured better: one of `BETTER`
 
 
 @dataclass(frozen=True)
@@ -53,11 +58,21 @@ class Outcome:
     seconds: float
 
 
+def measured_better(bench: Bench, how: str) -> Bench:
+    """Return the bench with twice the repeats, a third of the noise, or records twice as long."""
+    if how == "repeats":
+        return replace(bench, repeats=2 * bench.repeats)
+    if how == "noise":
+        return replace(bench, noise=bench.noise / 3)
+    return replace(bench, seconds=2 * bench.seconds) if how == "longer" else bench
+
+
 def perform(job: Job) -> Outcome:
     """Make a case's records and trace them."""
     from analysis.trace.engine import trace
 
     case = case_of(job.seed, job.only, job.clean, job.spool)
+    case = replace(case, bench=measured_better(case.bench, job.better))
     train, held_out = runs_of(case.bench, job.seed)
     started = time.process_time()
     found = trace([train], held_out, look_ahead=False)
@@ -135,7 +150,7 @@ def answer_of(  # noqa: PLR0911  a table of answers
     if settled:
         return "partly" if own < truth else "wrong"
     if own <= truth:
-        return "abstained, truth found" if truth <= named else "abstained"
+        return ABSTAINED_RIGHT if truth <= named else "abstained"
     return BESIDE
 
 
@@ -204,6 +219,25 @@ def _count(outcomes: Iterable[Outcome], *answers: str) -> int:
 def _sum(pairs: Iterable[tuple[int, int]]) -> tuple[int, int]:
     pairs = list(pairs)
     return sum(a for a, _ in pairs), sum(b for _, b in pairs)
+
+
+def weakened(outcomes: Mapping[Job, Outcome]) -> str:
+    """Return every bench whose answer is weaker when it is measured better."""
+    lines, count = [], 0
+    for job, found in outcomes.items():
+        before = outcomes.get(replace(job, better=""))
+        if not job.better or before is None:
+            continue
+        count += 1
+        known = before.answer in STRENGTH and found.answer in STRENGTH
+        if known and STRENGTH.index(found.answer) >= STRENGTH.index(before.answer):
+            continue
+        if found.answer != before.answer:
+            lines.append(
+                f"seed {job.seed}, {job.better}: {before.answer} -> {found.answer}\n"
+                f"  {line_of(before)}\n  {line_of(found)}"
+            )
+    return f"weaker when measured better: {len(lines)} of {count}\n" + "\n".join(lines)
 
 
 def loaded(job: Job, data: Mapping[str, Any]) -> Outcome:
