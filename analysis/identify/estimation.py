@@ -178,7 +178,8 @@ def _prepare(
         mine = [n for n in solution.names if n not in solution.unidentifiable]
         if not mine:
             continue
-        beside = [n for n in (nu.KAPPA, nu.TAU) if n in columns and n not in mine]
+        beside = [c.parameter for used in extra for c in used.term.coefficients(job.rig)]
+        beside = [n for n in beside if n in columns and n not in mine]
         prepared = _family(built, family, columns, mine, beside)
         for name in tuple(beside):
             fit = least_squares(prepared.blocks)

@@ -1,7 +1,7 @@
-"""Two small effects that the model leaves out, fitted as additional columns of the fluid rows.
+"""Small effects that the model leaves out, fitted as additional columns of the fluid rows.
 
-Both shift parameters by more than their scatter, so that without them no interval could be right;
-both are one column of the fluid rows, estimated with the rest, and neither is a parameter.
+They shift parameters by more than their scatter, so that without them no interval could be right;
+each is one column of the fluid rows, estimated with the rest, and none is a parameter.
 
 Oil temperature. Between two records the oil warms or cools, and its bulk modulus with it; one b
 for all records lies where the temperatures happened to be, and the gains of the steps shift with
@@ -15,6 +15,11 @@ and Thoma, 2002, and the orifices of common simulation libraries), to first orde
  C u sqrt(dp) (1 - dp_t^2 / (4 dp^2)),
 and so a little less than the root everywhere: at drops of a few MPa this looks like a smaller C.
 C is then that of fully turbulent flow. Known beforehand: dp_t is of the order of 0.1 MPa or below.
+
+Path between samples. A command that is held between samples makes the spool's path bend at every
+renewal: the path interpolated between samples leads or lags the true one by a part of the interval
+T, to first order C (u + f T du/dt) sqrt(dp), one f for each valve. A flow that follows du/dt looks
+like compression, and b takes it. Known beforehand: |f| is of the order of 0.05 or below.
 """
 
 from __future__ import annotations
@@ -39,6 +44,7 @@ Array = NDArray[np.float64]
 
 
 KAPPA, TAU = "1/b per kelvin", "transition pressure squared"
+BETWEEN = "spool's path between samples at joint "
 
 
 @dataclass(frozen=True)
@@ -93,6 +99,38 @@ class LaminarTransition(Term):
         return out
 
 
+@dataclass(frozen=True)
+class SpoolPath(Term):
+    """C T du/dt sqrt(dp) of every edge of joint `joint` (0-based), with first gains C."""
+
+    name: ClassVar[str] = "spool_path_nuisance"
+    gains: tuple[tuple[str, float], ...] = ()
+    joint: int = 0
+
+    def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
+        """Return f, in intervals of the samples."""
+        return (Coefficient(f"{BETWEEN}{self.joint + 1}", "", "fluid"),)
+
+    def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
+        """Return the column of each chamber; none where a joint stands still."""
+        C, i = dict(self.gains), self.joint
+        if i >= signals.joints:
+            return {}
+        pp, pm, mp, mm = (C.get(name, 0.0) for name in gain_names(i + 1))
+        u, p_s, p_t = signals.u[:, i], signals.p_s, signals.p_tank
+        cap, rod = signals.p_cap[:, i], signals.p_rod[:, i]
+        step = np.gradient(u)  # T du/dt
+        ahead, astern = np.where(u > 0, step, 0.0), np.where(u < 0, step, 0.0)
+        in_cap = pp * _root(p_s - cap) * ahead + pm * _root(cap - p_t) * astern
+        in_rod = -mp * _root(rod - p_t) * ahead - mm * _root(p_s - rod) * astern
+        name = f"{BETWEEN}{i + 1}"
+        return {equation("flow_cap", i): {name: in_cap}, equation("flow_rod", i): {name: in_rod}}
+
+
+def _root(drop: Array) -> Array:
+    return np.asarray(np.sqrt(np.maximum(drop, 0.0)))
+
+
 def _lost(drop: Array) -> Array:
     return np.asarray(
         -0.25 * np.maximum(drop, IDENTIFY.least_drop * IDENTIFY.transition_drop) ** -1.5
@@ -124,6 +162,8 @@ def nuisance_terms(
     gains = {n: v for n, v in values.items() if n.startswith("C_") and np.isfinite(v)}
     if "orifice" in names and gains:
         nuisances.append(Used(LaminarTransition(gains=tuple(gains.items()))))
+        joints = sorted({int(n.rsplit("_", 1)[1]) - 1 for n in gains})
+        nuisances += [Used(SpoolPath(gains=tuple(gains.items()), joint=i)) for i in joints]
     return tuple(nuisances)
 
 
@@ -139,6 +179,11 @@ def beliefs(names: Sequence[str], value: Array) -> list[Belief]:
         h = np.zeros(len(names))
         h[names.index(TAU)] = 1.0
         out.append(Belief(TAU, h, IDENTIFY.transition_drop**2))
+    for k, name in enumerate(names):
+        if name.startswith(BETWEEN):
+            h = np.zeros(len(names))
+            h[k] = 1.0
+            out.append(Belief(name, h, IDENTIFY.path_between_samples))
     return out
 
 
