@@ -25,6 +25,7 @@ from analysis.simulation.model import Model
 from analysis.simulation.validate import validate
 from analysis.terms import with_effects
 from analysis.terms.base import Used
+from analysis.trace.engine import trace
 from rig.cli.output import table
 from rig.model.records import Record, Run
 from rig.runs.exchange.columns import read_table
@@ -214,8 +215,32 @@ def closed_loop_table(data: Emps) -> str:
     return table(["closed loop", "position rmse [mm]", "drive error"], rows)
 
 
+def trace_table(file: Path) -> str:
+    """Return what the trace names, with and without the reference's period, either half unseen."""
+    rows = []
+    for period in (0, PERIOD):
+        data = load(file, period)
+        for word, seen, unseen in (
+            ("1st on 2nd", data.first, data.second), ("2nd on 1st", data.second, data.first)
+        ):  # fmt: skip
+            found = trace([seen], [unseen], look_ahead=False)
+            force = 100 * found.after["torque_1"] / found.size["torque_1"]
+            named = ", ".join(
+                f"{e.name} {value.value:.3g} {value.unit}"
+                for e in found.effects
+                for value in list(e.parameters.values())[:1]
+            )
+            open_loop_error = f"{1e3 * found.rmse_after['position_1']:.2f}"
+            period_said = "yes" if period else "no"
+            rows.append(
+                [word, period_said, found.verdict, named or "nothing", f"{force:.1f} %",
+                 open_loop_error]
+            )  # fmt: skip
+    return table(["trace", "period", "verdict", "named", "force", "open loop [mm]"], rows)
+
+
 def text(file: Path) -> str:
     """Return all tables."""
     data = load(file)
     tables = (models_table, cycles_table, filters_table, closed_loop_table)
-    return "\n\n".join(one(data) for one in tables)
+    return "\n\n".join((*(one(data) for one in tables), trace_table(file)))
