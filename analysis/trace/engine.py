@@ -42,6 +42,7 @@ from analysis.trace.result import (
 )
 from analysis.trace.search.hypothesis import Hypothesis, within
 from analysis.trace.search.hypothesis_set import HypothesisSet
+from analysis.trace.settings import SETTINGS
 from analysis.trace.words import sentence
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
@@ -51,11 +52,6 @@ log = logging.getLogger(__name__)
 
 # The other estimators add small faults of sensors of their own accord: here they are candidates.
 PLAIN = "plain"
-# Relative change of a baseline coefficient from which an effect matters to the user though what it
-# explains is within the band: beyond it a parameter would be wrong by more than its use allows.
-MATERIAL = 0.1
-SHOWN = 30.0  # whitened length of a coefficient's rows, the noise of one row being 1
-LEAST_ROWS = 40  # of an equation's rows in one record
 ELSEWHERE = (
     "the training records are met to within the noise, the held-out ones are not: train on "
     "records that excite as much as these do"
@@ -175,14 +171,14 @@ def _digest(record: Record) -> str:
 def _refuse_short(train_data: RegressionData, train: Sequence[ConditionedRecord]) -> None:
     for s in train_data.segments:
         count = s.where.stop - s.where.start
-        if count < LEAST_ROWS:
+        if count < SETTINGS.least_rows:
             seconds = next(
                 x.record.samples / x.record.sample_rate for x in train if x.group == s.group
             )
             raise InputError(
                 f"step {s.group[1]!r}: records of {seconds:.3g} s leave {count} rows of "
-                f"{s.equation} behind the filters' edges and masks; the trace needs {LEAST_ROWS}: "
-                "record longer"
+                f"{s.equation} behind the filters' edges and masks; the trace needs "
+                f"{SETTINGS.least_rows}: record longer"
             )
 
 
@@ -265,7 +261,9 @@ def _named(
         # What speaks against nothing is named if nothing else fits as well, or if it would move a
         # parameter of the baseline by much: else it is left alone.
         needed = any(r.veto for r in rest) or _tied(wider) == _tied(found)
-        needed = needed or (more is not None and _moved(hypotheses, winner, more) > MATERIAL)
+        needed = needed or (
+            more is not None and _moved(hypotheses, winner, more) > SETTINGS.material
+        )
         stand = needed and all(map(gates.stands, wider))
         if more is None or len(later) >= len(rest) or not stand:
             break
@@ -280,7 +278,7 @@ def _named(
 def _moved(hypotheses: HypothesisSet, winner: Hypothesis, more: Hypothesis) -> float:
     """Return the largest relative change of a baseline coefficient between two sets of effects.
 
-    Of coefficients whose rows stand out of the noise (`SHOWN` times): others are what they may be.
+    Of coefficients whose rows stand out of the noise (`Settings.shown`): others may be anything.
     """
     before, after = winner.fit.beta, more.fit.beta
     sizes = np.linalg.norm(hypotheses.stage.base, axis=0)
@@ -288,7 +286,7 @@ def _moved(hypotheses: HypothesisSet, winner: Hypothesis, more: Hypothesis) -> f
         (
             abs(before[name] / after[name] - 1.0)
             for name, size in zip(hypotheses.stage.names, sizes, strict=True)
-            if name in before and abs(after.get(name, 0.0)) * size > SHOWN
+            if name in before and abs(after.get(name, 0.0)) * size > SETTINGS.shown
         ),
         default=0.0,
     )

@@ -20,14 +20,7 @@ from analysis.trace.result import Dependence, Formula
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.refinement import rebased
-
-LOUD = 0.1  # of all that is left: an equation with less asks for no clue
-# What the band lets pass is looked at again from here on: deviations of the noise's own energy,
-# and share of what was there before. A catalogue's simpler form leaves what no formula holds.
-SEEN = 8.0
-SHARE = 0.005
-HELD = 0.7  # share of the rest from which a formula holds it
-ACTED = 0.5  # of what was left before: an equation that keeps more the effects do not act in
+from analysis.trace.settings import SETTINGS
 
 
 class Rest(NamedTuple):
@@ -61,10 +54,10 @@ def left_over(
     for equation in asked:
         found = formula(now, winner.fit.residual, later, held, equation)
         # A constant is no law of another cause: it is what a form has too little or too much.
-        if found is not None and found.share >= HELD and found.variables:
+        if found is not None and found.share >= SETTINGS.formula and found.variables:
             words = f"{100 * seen[equation]:.2g} % of what repeated stays, and a formula holds it"
             loud = winner.excess_energy[equation] > hypotheses.limits.band[equation]
-            veto = loud and seen[equation] < ACTED
+            veto = loud and seen[equation] < SETTINGS.acted
             out.append(Rest(equation, f"{words}: {found.text}", veto))
     return [*out, *_missed(hypotheses, winner, out)]
 
@@ -93,7 +86,7 @@ def _seen(hypotheses: HypothesisSet, winner: Hypothesis) -> dict[str, float]:
     return {
         e: share
         for e, share in shares.items()
-        if share > SHARE and winner.excess_energy[e] > SEEN * np.sqrt(2 * rows[e])
+        if share > SETTINGS.share and winner.excess_energy[e] > SETTINGS.seen * np.sqrt(2 * rows[e])
     }
 
 
@@ -108,7 +101,7 @@ def clues_to(
     now, later = rebased(train_data, winner.fit), rebased(holdout_data, winner.fit)
     loud = [e for e, v in sorted(winner.excess_energy.items(), key=lambda kv: -kv[1]) if v > 0]
     total = sum(winner.excess_energy[e] for e in loud)
-    loud = [e for e in loud if winner.excess_energy[e] > LOUD * total]
+    loud = [e for e in loud if winner.excess_energy[e] > SETTINGS.clue * total]
     moves = dependence.dependence(now, residual, later, held, loud)
     hum = frequency_clue(split, train_data, residual, holdout_data, held)
     found = [formula(now, residual, later, held, e) for e in loud]

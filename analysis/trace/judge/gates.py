@@ -25,22 +25,11 @@ from analysis.trace.judge.scatter import NORMAL, form_shift
 from analysis.trace.result import Found, Gate, Rival
 from analysis.trace.search.hypothesis import Hypothesis, excess_of, parameter_values
 from analysis.trace.search.hypothesis_set import HypothesisSet
+from analysis.trace.settings import SETTINGS
 
 Array = NDArray[np.float64]
 Key = tuple[str, str]
 
-REMOVED = 0.5  # of the held-out energy above noise in the equations it touches
-CHOSEN = 0.9  # of half-samples
-RIVAL = 0.5  # of the other half-samples: what they choose so often cannot be told from the best
-P_LIMIT = 0.01
-TIE = 1.10  # held-out rms of a rival over the best's: below, the data do not tell them apart
-TIE_TRAINING = 1.25
-HARM = 1.2  # energy above noise in an equation over that before: a cause does not make it worse
-# Of an equation's energy before, what a named form may miss of the real one: on training records,
-# and on held-out ones, which may be quieter. It does not shrink with the noise.
-MISSED, MISSED_HELD = 0.05, 0.10
-HELD_BAND = 1.5  # held-out rms after over the noise floor, per equation
-SHOWN = 4  # rivals in a result
 
 REMOVES, PHYSICAL, INVARIANT, STABLE, SIGNIFICANT, ALONE = (
     "removes on held-out", "physical", "invariant", "stable", "significant", "no rival",
@@ -75,7 +64,9 @@ def judge(
         rest = hypotheses.exact(tuple(u for u in winner.effects if u is not used))
         share, others = steady[key]
         often = {
-            k for k, n in others.items() if share < CHOSEN and n >= RIVAL * sum(others.values())
+            k
+            for k, n in others.items()
+            if share < SETTINGS.chosen and n >= SETTINGS.rival * sum(others.values())
         }
         rivals = _rivals(hypotheses, winner, key, holdout_data, after, often)
         removed = _removed(holdout_data, rest, after, _touched(hypotheses, winner, rest))
@@ -86,11 +77,13 @@ def judge(
         tied = [r for r in rivals if r.tied]
         twins = [Rival(name, where, 1.0, 1.0, True) for name, where in used.term.twins()]
         gates = (
-            Gate(REMOVES, removed >= REMOVED and not worse, _taken(removed, worse)),
+            Gate(REMOVES, removed >= SETTINGS.removed and not worse, _taken(removed, worse)),
             Gate(PHYSICAL, not physical, physical or "sign and size are"),
             Gate(INVARIANT, not differing, _differences(differing)),
-            Gate(STABLE, share >= CHOSEN or bool(tied), _chosen(share, others, bool(tied))),
-            Gate(SIGNIFICANT, p <= P_LIMIT, f"family-wise p = {p:.3g}"),
+            Gate(
+                STABLE, share >= SETTINGS.chosen or bool(tied), _chosen(share, others, bool(tied))
+            ),
+            Gate(SIGNIFICANT, p <= SETTINGS.p_limit, f"family-wise p = {p:.3g}"),
             Gate(ALONE, not (tied or twins), _told_apart([*twins, *rivals])),
         )
         out.append(
@@ -126,7 +119,7 @@ def remaining(
     out = []
     for e, residual in winner.excess_energy.items():
         share = residual / max(hypotheses.empty.excess_energy[e], 1e-30)
-        if share > MISSED and not hypotheses.negligible(e, residual):
+        if share > SETTINGS.missed and not hypotheses.negligible(e, residual):
             times = residual / hypotheses.limits.band[e]
             out.append(
                 (e, f"{100 * share:.2g} % of what repeated stays, {times:.2g} times the band")
@@ -134,7 +127,7 @@ def remaining(
     out += [
         (e, f"held-out error {r:.2f} times the noise floor")
         for e, r in ratio.items()
-        if r > HELD_BAND and now[e] > MISSED_HELD * start[e]
+        if r > SETTINGS.held_band and now[e] > SETTINGS.missed_held * start[e]
     ]
     return out
 
@@ -191,7 +184,7 @@ def _worse(hypotheses: HypothesisSet, winner: Hypothesis, rest: Hypothesis) -> l
         e
         for e, now in winner.excess_energy.items()
         if not hypotheses.negligible(e, now)
-        and now > HARM * max(0.0, hypotheses.empty.excess_energy[e])
+        and now > SETTINGS.harm * max(0.0, hypotheses.empty.excess_energy[e])
         and now > rest.excess_energy[e]
     ]
 
@@ -239,12 +232,12 @@ def _rivals(
         ratio = _ratio(theirs, mine, equations)
         training = _ratio(_energy(hypotheses.stage, one.fit.residual), own, equations)
         name, _ = next(iter(fresh))
-        tied = ratio < TIE and (training < TIE_TRAINING or ratio < 0.95)
+        tied = ratio < SETTINGS.tie and (training < SETTINGS.tie_training or ratio < 0.95)
         tied = tied or not fresh.isdisjoint(often)
         place = next(_place(u.term) for u in one.effects if (u.term.name, u.term.where) in fresh)  # type: ignore[arg-type]
         out.append(Rival(name, place, ratio, training, tied))
     out.sort(key=lambda r: (not r.tied, r.ratio))
-    return out[:SHOWN]
+    return out[: SETTINGS.rivals]
 
 
 def _energy(train_data: RegressionData, residual: Array) -> dict[str, tuple[float, int]]:
@@ -293,9 +286,9 @@ def _differences(differing: Sequence[tuple[str, str, float, float]]) -> str:
 
 def _chosen(share: float, others: Mapping[Key, int], tied: bool) -> str:
     text = f"chosen in {100 * share:.0f} % of half-samples"
-    if share < CHOSEN and tied:
+    if share < SETTINGS.chosen and tied:
         text = f"not asked, for a rival fits as well: {text}"
-    if share < CHOSEN and others:
+    if share < SETTINGS.chosen and others:
         most = sorted(others, key=lambda k: -others[k])[:2]
         text += "; else " + ", ".join(f"{name} at {where}" for name, where in most)
     return text

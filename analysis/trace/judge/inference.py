@@ -24,20 +24,14 @@ from analysis.trace.search.hypothesis import Hypothesis, excess_of
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.linear_fit import CandidateColumns, orthonormal
 from analysis.trace.search.refinement import ExactFit, jacobian, table
+from analysis.trace.settings import SETTINGS
 
 Array = NDArray[np.float64]
 Key = tuple[str, str]
 
-FLIPS = 199
-ENOUGH_REPEATS = 8
-BLOCK = 2.0  # [s] at least, where a record is one period
-HALVES = 40
-ABOUT_TWO = 1.9  # periods that a record must hold to be halved by them: the last may be cut short
-EDGE = 1e-3  # of its range: a shape nearer to its bound is at it
-
 
 def blocks(
-    train_data: RegressionData, seconds: float = BLOCK, fewest: float = 3.0
+    train_data: RegressionData, seconds: float = SETTINGS.block, fewest: float = 3.0
 ) -> NDArray[np.int64]:
     """Return for each row of the board the number of its block within its record (M,).
 
@@ -46,7 +40,7 @@ def blocks(
     out = np.zeros(train_data.base.shape[0], dtype=np.int64)
     index = {conditioned.group: k for k, conditioned in enumerate(train_data.records)}
     for segment in train_data.segments:
-        if segment.repeats >= ENOUGH_REPEATS:
+        if segment.repeats >= SETTINGS.enough_repeats:
             continue
         conditioned = train_data.records[index[segment.group]]
         rate, period = conditioned.record.sample_rate, conditioned.record.period
@@ -83,13 +77,17 @@ def null_maximum(
     residual: Array,
     rng: np.random.Generator,
 ) -> Array:
-    """Return the largest gain of any candidate at any shape under each flip (FLIPS,)."""
-    r = flipped(train_data, FLIPS, rng, residual)
+    """Return the largest gain of any candidate at any shape under each flip (flips,)."""
+    r = flipped(train_data, SETTINGS.flips, rng, residual)
     r = r - candidates.basis @ (candidates.basis.T @ r)
     c = candidates.columns.T @ r
     diagonal = np.diag(candidates.K)
     shows = (diagonal > linear_fit.VISIBLE**2 * candidates.raw) & (candidates.raw > 0)
-    best = np.max(c[shows] ** 2 / diagonal[shows, None], axis=0) if shows.any() else np.zeros(FLIPS)
+    best = (
+        np.max(c[shows] ** 2 / diagonal[shows, None], axis=0)
+        if shows.any()
+        else np.zeros(SETTINGS.flips)
+    )
     for group in candidates.groups:
         j = [k for k in group if shows[k]]
         if len(j) > 1:
@@ -124,14 +122,16 @@ def linear(train_data: RegressionData, one: Hypothesis) -> Linear:
         fixed = {
             s.parameter
             for s, v in zip(shapes_of(train_data.rig, u), u.shape, strict=True)
-            if not s.low + EDGE * (s.high - s.low) < v < s.high - EDGE * (s.high - s.low)
+            if not s.low + SETTINGS.edge * (s.high - s.low)
+            < v
+            < s.high - SETTINGS.edge * (s.high - s.low)
         }
         extra.append(J[:, [k for k, n in enumerate(names) if n in rows.names or n not in fixed]])
     return Linear(one, orthonormal(np.column_stack([rows.matrix, *extra])), one.fit.residual)
 
 
 def halves(
-    train_data: RegressionData, rng: np.random.Generator, count: int = HALVES
+    train_data: RegressionData, rng: np.random.Generator, count: int = SETTINGS.halves
 ) -> list[tuple[Array, Array, float]]:
     """Return random half-samples: change (M,) of the averaged residual, weights (M,), noise energy.
 
@@ -139,7 +139,7 @@ def halves(
     others without weight.
     """
     # A part of a period may lack the very speeds that tell two effects apart.
-    numbers = blocks(train_data, fewest=ABOUT_TWO)
+    numbers = blocks(train_data, fewest=SETTINGS.about_two)
     mean = train_data.mean
     out = []
     for _ in range(count):

@@ -17,13 +17,9 @@ from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.inference import EffectErrors, blocks, others
 from analysis.trace.search.linear_fit import FORM, orthonormal
 from analysis.trace.search.refinement import ExactFit, jacobian, table
+from analysis.trace.settings import SETTINGS
 
 Array = NDArray[np.float64]
-
-TOLERANCE = 0.2  # relative disagreement that a catalogue's simpler form may cause
-DEVIATIONS = 3.5
-TELLS = 0.12  # of a column's energy off the others': a subset with less holds a tail, not the size
-POWER = 0.25  # a subset judges a parameter that it knows this well, relative
 
 
 def subsets(train_data: RegressionData, joint: int | None) -> dict[str, Array]:
@@ -134,7 +130,7 @@ def invariance(
             own = _alone(J_s, k)
             size = float(own @ own)
             # What hardly acts there tells its form's tail, not its size.
-            if size < TELLS * whole[k] or size <= 0 or not np.isfinite(value.value[k]):
+            if size < SETTINGS.tells * whole[k] or size <= 0 or not np.isfinite(value.value[k]):
                 continue
             shift = float(own @ residual[mask]) / size
             error = 1.0 / np.sqrt(size)
@@ -145,9 +141,11 @@ def invariance(
             # Two levels of one effect are judged by the larger: 2 N beside 100 N is a detail.
             alike = [j for j, n in enumerate(names) if n in sizes and units[n] == units[name]]
             full = float(np.max(np.abs(value.value[alike] - neutral[alike])))
-            if error > POWER * full:
+            if error > SETTINGS.power * full:
                 continue
-            if abs(shift) > spill + DEVIATIONS * np.hypot(error, TOLERANCE / DEVIATIONS * full):
+            if abs(shift) > spill + SETTINGS.deviations * np.hypot(
+                error, SETTINGS.tolerance / SETTINGS.deviations * full
+            ):
                 out.append((label, name, float(value.value[k]) + shift, error))
     return out
 
@@ -170,14 +168,16 @@ def _of_curve(
         B = orthonormal(base[mask])
         own = whole[mask] - B @ (B.T @ whole[mask])
         size = float(own @ own)
-        if size <= TELLS * start or size < 0.01 * float(whole[mask] @ whole[mask]):
+        if size <= SETTINGS.tells * start or size < 0.01 * float(whole[mask] @ whole[mask]):
             continue
         shift = float(own @ model.residual[mask]) / size
         error = 1.0 / np.sqrt(size)
         if clusters is not None:
             rest = model.residual[mask] - B @ (B.T @ model.residual[mask]) - own * shift
             error = max(error, _clustered(own, rest, clusters[mask]) / size)
-        if error <= POWER and abs(shift) > DEVIATIONS * np.hypot(error, TOLERANCE / DEVIATIONS):
+        if error <= SETTINGS.power and abs(shift) > SETTINGS.deviations * np.hypot(
+            error, SETTINGS.tolerance / SETTINGS.deviations
+        ):
             out.append((label, "the curve's size", 1.0 + shift, error))
     return out
 

@@ -28,12 +28,10 @@ from analysis.trace.judge.held_out import rms_of
 from analysis.trace.result import Found
 from analysis.trace.search import refinement
 from analysis.trace.search.hypothesis import Hypothesis, excess_of
+from analysis.trace.settings import SETTINGS
 from rig.model.records import Run
 
 log = logging.getLogger(__name__)
-
-CLOSER = 0.99  # of what windows of held-out records leave
-NO_WORSE = 1.02  # times the held-out rms of any equation's rows
 
 
 @dataclass(frozen=True)
@@ -69,7 +67,9 @@ def reshaped(
         )
         fitted = refinement.fit(train_data, _with(winner.fit.terms, effect, found))
         rows, again = (rms_of(holdout_data, fit) for fit in (winner.fit, fitted))
-        better = now < CLOSER * before and all(again[e] <= NO_WORSE * rows[e] for e in rows)
+        better = now < SETTINGS.closer * before and all(
+            again[e] <= SETTINGS.no_worse * rows[e] for e in rows
+        )
         shots.append(replace(found, before=before, after=now, taken=better and found.settled))
         if shots[-1].taken:
             winner = replace(

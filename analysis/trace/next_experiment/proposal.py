@@ -171,7 +171,7 @@ def _unsettled(hypotheses: HypothesisSet) -> list[Question]:
 
 def _small(hypotheses: HypothesisSet) -> list[Explanation]:
     rig = hypotheses.stage.rig
-    effects = dict.fromkeys(v.effect for v in hypotheses.variants)
+    effects = dict.fromkeys(hypotheses.effects)
     found = (smallest(effect, rig) for effect in effects)
     return [h for h in found if h is not None]
 
