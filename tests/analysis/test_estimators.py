@@ -92,6 +92,27 @@ def test_instruments_are_not_biased_and_the_tool_prefers_them_unasked(
     assert low < iv.estimates["M2"].value < high
 
 
+def test_a_spool_that_leads_its_samples_does_not_soften_the_oil(multisine_run: Run) -> None:
+    """What a held command does between samples; a flow that follows the spool's rate is not b's."""
+    lead = 0.1  # of a sample's interval
+
+    def behind(channels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        n = np.arange(len(channels["spool_1"]))
+        late = {c: np.interp(n - lead, n, channels[c]) for c in ("spool_1", "spool_2")}
+        return {**channels, **late}
+
+    records = tuple(replace(r, channels=behind(dict(r.channels))) for r in multisine_run.records)
+    run = replace(multisine_run, records=records)
+    found, blind = identify([run], estimator="ls"), identify([run], estimator="plain")
+    assert inside(found, "b")
+    assert not inside(blind, "b")
+    assert error(found, "b") < 0.2 * error(blind, "b")
+    for joint in (1, 2):
+        said = check(found, f"spool's path between samples at joint {joint}")
+        assert said.ok
+        assert float(said.detail.split()[0]) == pytest.approx(lead, rel=0.2)
+
+
 def test_weights_from_measured_noise_do_not_move_what_is_right(multisine_run: Run) -> None:
     found = identify([multisine_run], estimator="wls")
     assert max(error(found, name) for name in TRUTH) < 0.004
