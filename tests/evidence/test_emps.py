@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from analysis.trace.engine import trace
 from rig.runs.exchange.importer import import_records
 from tests.studies.machines import emps as study
 
@@ -75,3 +76,13 @@ def test_the_machines_own_controller_gives_its_position_and_drive(data: study.Em
     assert np.sqrt(np.mean((q - channels["position_1"]) ** 2)) < 10e-6
     drive = channels["drive_1"]
     assert np.linalg.norm(v - drive) / np.linalg.norm(drive) < 0.06
+
+
+@pytest.mark.parametrize("period", [0, study.PERIOD])
+def test_the_trace_names_the_same_two_causes_with_and_without_the_period(period: int) -> None:
+    halves = study.load(FILE, period)
+    found = trace([halves.first], [halves.second], look_ahead=False)
+    assert found.verdict == "explained"
+    assert {e.name for e in found.effects} == {"coulomb_friction", "asymmetric_viscous_friction"}
+    assert found.after["torque_1"] < 0.043 * found.size["torque_1"]
+    assert found.rmse_after["position_1"] < 8e-3
