@@ -49,8 +49,8 @@ class IdentifySettings:
     shortest_segment: float = 0.25
     # Nuisances known beforehand: d ln b / dT [1/K] and its spread; dp_t^2 is 0 +- the square of
     # `transition_drop` [Pa]; drops below `least_drop` of them are beyond the first order and held
-    # there; the lead of the spool's path between samples is 0 +- `path_between_samples` [intervals];
-    # a value so many deviations away means that something else is there.
+    # there; the lead of the spool's path between samples is 0 +- `path_between_samples`
+    # intervals; a value so many deviations away means that something else is there.
     bulk_slope: float = -0.003
     bulk_slope_std: float = 0.003
     transition_drop: float = 1e5

@@ -42,7 +42,7 @@ from analysis.trace.result import (
 )
 from analysis.trace.search.hypothesis import Hypothesis, within
 from analysis.trace.search.hypothesis_set import HypothesisSet
-from analysis.trace.settings import SETTINGS
+from analysis.trace.settings import TRACE
 from analysis.trace.words import sentence
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
@@ -171,14 +171,14 @@ def _digest(record: Record) -> str:
 def _refuse_short(train_data: RegressionData, train: Sequence[ConditionedRecord]) -> None:
     for s in train_data.segments:
         count = s.where.stop - s.where.start
-        if count < SETTINGS.least_rows:
+        if count < TRACE.least_rows:
             seconds = next(
                 x.record.samples / x.record.sample_rate for x in train if x.group == s.group
             )
             raise InputError(
                 f"step {s.group[1]!r}: records of {seconds:.3g} s leave {count} rows of "
                 f"{s.equation} behind the filters' edges and masks; the trace needs "
-                f"{SETTINGS.least_rows}: record longer"
+                f"{TRACE.least_rows}: record longer"
             )
 
 
@@ -261,9 +261,7 @@ def _named(
         # What speaks against nothing is named if nothing else fits as well, or if it would move a
         # parameter of the baseline by much: else it is left alone.
         needed = any(r.veto for r in rest) or _tied(wider) == _tied(found)
-        needed = needed or (
-            more is not None and _moved(hypotheses, winner, more) > SETTINGS.material
-        )
+        needed = needed or (more is not None and _moved(hypotheses, winner, more) > TRACE.material)
         stand = needed and all(map(gates.stands, wider))
         if more is None or len(later) >= len(rest) or not stand:
             break
@@ -286,7 +284,7 @@ def _moved(hypotheses: HypothesisSet, winner: Hypothesis, more: Hypothesis) -> f
         (
             abs(before[name] / after[name] - 1.0)
             for name, size in zip(hypotheses.stage.names, sizes, strict=True)
-            if name in before and abs(after.get(name, 0.0)) * size > SETTINGS.shown
+            if name in before and abs(after.get(name, 0.0)) * size > TRACE.shown
         ),
         default=0.0,
     )

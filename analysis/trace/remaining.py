@@ -20,7 +20,7 @@ from analysis.trace.result import Dependence, Formula
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.refinement import rebased
-from analysis.trace.settings import SETTINGS
+from analysis.trace.settings import TRACE
 
 
 class Rest(NamedTuple):
@@ -54,10 +54,10 @@ def left_over(
     for equation in asked:
         found = formula(now, winner.fit.residual, later, held, equation)
         # A constant is no law of another cause: it is what a form has too little or too much.
-        if found is not None and found.share >= SETTINGS.formula and found.variables:
+        if found is not None and found.share >= TRACE.formula and found.variables:
             words = f"{100 * seen[equation]:.2g} % of what repeated stays, and a formula holds it"
             loud = winner.excess_energy[equation] > hypotheses.limits.band[equation]
-            veto = loud and seen[equation] < SETTINGS.acted
+            veto = loud and seen[equation] < TRACE.acted
             out.append(Rest(equation, f"{words}: {found.text}", veto))
     return [*out, *_missed(hypotheses, winner, out)]
 
@@ -86,7 +86,7 @@ def _seen(hypotheses: HypothesisSet, winner: Hypothesis) -> dict[str, float]:
     return {
         e: share
         for e, share in shares.items()
-        if share > SETTINGS.share and winner.excess_energy[e] > SETTINGS.seen * np.sqrt(2 * rows[e])
+        if share > TRACE.share and winner.excess_energy[e] > TRACE.seen * np.sqrt(2 * rows[e])
     }
 
 
@@ -101,7 +101,7 @@ def clues_to(
     now, later = rebased(train_data, winner.fit), rebased(holdout_data, winner.fit)
     loud = [e for e, v in sorted(winner.excess_energy.items(), key=lambda kv: -kv[1]) if v > 0]
     total = sum(winner.excess_energy[e] for e in loud)
-    loud = [e for e in loud if winner.excess_energy[e] > SETTINGS.clue * total]
+    loud = [e for e in loud if winner.excess_energy[e] > TRACE.clue * total]
     moves = dependence.dependence(now, residual, later, held, loud)
     hum = frequency_clue(split, train_data, residual, holdout_data, held)
     found = [formula(now, residual, later, held, e) for e in loud]

@@ -86,4 +86,4 @@ class Settings:
     """Rivals in a result."""
 
 
-SETTINGS: Final = Settings()
+TRACE: Final = Settings()

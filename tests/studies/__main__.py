@@ -13,9 +13,9 @@ from tests.studies.effects import command as effects
 from tests.studies.estimators import command as estimators
 from tests.studies.estimators import design_command as design
 from tests.studies.faults import command as faults
+from tests.studies.foreign import command as foreign
 from tests.studies.fuzz import command as fuzz
 from tests.studies.guard import command as guard
-from tests.studies.foreign import command as foreign
 from tests.studies.machines import crane_command as crane
 from tests.studies.machines import electric_command as electric
 from tests.studies.machines import emps_command as emps

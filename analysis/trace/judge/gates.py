@@ -25,7 +25,7 @@ from analysis.trace.judge.scatter import NORMAL, form_shift
 from analysis.trace.result import Found, Gate, Rival
 from analysis.trace.search.hypothesis import Hypothesis, excess_of, parameter_values
 from analysis.trace.search.hypothesis_set import HypothesisSet
-from analysis.trace.settings import SETTINGS
+from analysis.trace.settings import TRACE
 
 Array = NDArray[np.float64]
 Key = tuple[str, str]
@@ -66,7 +66,7 @@ def judge(
         often = {
             k
             for k, n in others.items()
-            if share < SETTINGS.chosen and n >= SETTINGS.rival * sum(others.values())
+            if share < TRACE.chosen and n >= TRACE.rival * sum(others.values())
         }
         rivals = _rivals(hypotheses, winner, key, holdout_data, after, often)
         removed = _removed(holdout_data, rest, after, _touched(hypotheses, winner, rest))
@@ -77,13 +77,11 @@ def judge(
         tied = [r for r in rivals if r.tied]
         twins = [Rival(name, where, 1.0, 1.0, True) for name, where in used.term.twins()]
         gates = (
-            Gate(REMOVES, removed >= SETTINGS.removed and not worse, _taken(removed, worse)),
+            Gate(REMOVES, removed >= TRACE.removed and not worse, _taken(removed, worse)),
             Gate(PHYSICAL, not physical, physical or "sign and size are"),
             Gate(INVARIANT, not differing, _differences(differing)),
-            Gate(
-                STABLE, share >= SETTINGS.chosen or bool(tied), _chosen(share, others, bool(tied))
-            ),
-            Gate(SIGNIFICANT, p <= SETTINGS.p_limit, f"family-wise p = {p:.3g}"),
+            Gate(STABLE, share >= TRACE.chosen or bool(tied), _chosen(share, others, bool(tied))),
+            Gate(SIGNIFICANT, p <= TRACE.p_limit, f"family-wise p = {p:.3g}"),
             Gate(ALONE, not (tied or twins), _told_apart([*twins, *rivals])),
         )
         out.append(
@@ -119,7 +117,7 @@ def remaining(
     out = []
     for e, residual in winner.excess_energy.items():
         share = residual / max(hypotheses.empty.excess_energy[e], 1e-30)
-        if share > SETTINGS.missed and not hypotheses.negligible(e, residual):
+        if share > TRACE.missed and not hypotheses.negligible(e, residual):
             times = residual / hypotheses.limits.band[e]
             out.append(
                 (e, f"{100 * share:.2g} % of what repeated stays, {times:.2g} times the band")
@@ -127,7 +125,7 @@ def remaining(
     out += [
         (e, f"held-out error {r:.2f} times the noise floor")
         for e, r in ratio.items()
-        if r > SETTINGS.held_band and now[e] > SETTINGS.missed_held * start[e]
+        if r > TRACE.held_band and now[e] > TRACE.missed_held * start[e]
     ]
     return out
 
@@ -184,7 +182,7 @@ def _worse(hypotheses: HypothesisSet, winner: Hypothesis, rest: Hypothesis) -> l
         e
         for e, now in winner.excess_energy.items()
         if not hypotheses.negligible(e, now)
-        and now > SETTINGS.harm * max(0.0, hypotheses.empty.excess_energy[e])
+        and now > TRACE.harm * max(0.0, hypotheses.empty.excess_energy[e])
         and now > rest.excess_energy[e]
     ]
 
@@ -232,12 +230,12 @@ def _rivals(
         ratio = _ratio(theirs, mine, equations)
         training = _ratio(_energy(hypotheses.stage, one.fit.residual), own, equations)
         name, _ = next(iter(fresh))
-        tied = ratio < SETTINGS.tie and (training < SETTINGS.tie_training or ratio < 0.95)
+        tied = ratio < TRACE.tie and (training < TRACE.tie_training or ratio < 0.95)
         tied = tied or not fresh.isdisjoint(often)
         place = next(_place(u.term) for u in one.effects if (u.term.name, u.term.where) in fresh)  # type: ignore[arg-type]
         out.append(Rival(name, place, ratio, training, tied))
     out.sort(key=lambda r: (not r.tied, r.ratio))
-    return out[: SETTINGS.rivals]
+    return out[: TRACE.rivals]
 
 
 def _energy(train_data: RegressionData, residual: Array) -> dict[str, tuple[float, int]]:
@@ -286,9 +284,9 @@ def _differences(differing: Sequence[tuple[str, str, float, float]]) -> str:
 
 def _chosen(share: float, others: Mapping[Key, int], tied: bool) -> str:
     text = f"chosen in {100 * share:.0f} % of half-samples"
-    if share < SETTINGS.chosen and tied:
+    if share < TRACE.chosen and tied:
         text = f"not asked, for a rival fits as well: {text}"
-    if share < SETTINGS.chosen and others:
+    if share < TRACE.chosen and others:
         most = sorted(others, key=lambda k: -others[k])[:2]
         text += "; else " + ", ".join(f"{name} at {where}" for name, where in most)
     return text

@@ -24,14 +24,14 @@ from analysis.trace.search.hypothesis import Hypothesis, excess_of
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.linear_fit import CandidateColumns, orthonormal
 from analysis.trace.search.refinement import ExactFit, jacobian, table
-from analysis.trace.settings import SETTINGS
+from analysis.trace.settings import TRACE
 
 Array = NDArray[np.float64]
 Key = tuple[str, str]
 
 
 def blocks(
-    train_data: RegressionData, seconds: float = SETTINGS.block, fewest: float = 3.0
+    train_data: RegressionData, seconds: float = TRACE.block, fewest: float = 3.0
 ) -> NDArray[np.int64]:
     """Return for each row of the board the number of its block within its record (M,).
 
@@ -40,7 +40,7 @@ def blocks(
     out = np.zeros(train_data.base.shape[0], dtype=np.int64)
     index = {conditioned.group: k for k, conditioned in enumerate(train_data.records)}
     for segment in train_data.segments:
-        if segment.repeats >= SETTINGS.enough_repeats:
+        if segment.repeats >= TRACE.enough_repeats:
             continue
         conditioned = train_data.records[index[segment.group]]
         rate, period = conditioned.record.sample_rate, conditioned.record.period
@@ -78,7 +78,7 @@ def null_maximum(
     rng: np.random.Generator,
 ) -> Array:
     """Return the largest gain of any candidate at any shape under each flip (flips,)."""
-    r = flipped(train_data, SETTINGS.flips, rng, residual)
+    r = flipped(train_data, TRACE.flips, rng, residual)
     r = r - candidates.basis @ (candidates.basis.T @ r)
     c = candidates.columns.T @ r
     diagonal = np.diag(candidates.K)
@@ -86,7 +86,7 @@ def null_maximum(
     best = (
         np.max(c[shows] ** 2 / diagonal[shows, None], axis=0)
         if shows.any()
-        else np.zeros(SETTINGS.flips)
+        else np.zeros(TRACE.flips)
     )
     for group in candidates.groups:
         j = [k for k in group if shows[k]]
@@ -122,16 +122,16 @@ def linear(train_data: RegressionData, one: Hypothesis) -> Linear:
         fixed = {
             s.parameter
             for s, v in zip(shapes_of(train_data.rig, u), u.shape, strict=True)
-            if not s.low + SETTINGS.edge * (s.high - s.low)
+            if not s.low + TRACE.edge * (s.high - s.low)
             < v
-            < s.high - SETTINGS.edge * (s.high - s.low)
+            < s.high - TRACE.edge * (s.high - s.low)
         }
         extra.append(J[:, [k for k, n in enumerate(names) if n in rows.names or n not in fixed]])
     return Linear(one, orthonormal(np.column_stack([rows.matrix, *extra])), one.fit.residual)
 
 
 def halves(
-    train_data: RegressionData, rng: np.random.Generator, count: int = SETTINGS.halves
+    train_data: RegressionData, rng: np.random.Generator, count: int = TRACE.halves
 ) -> list[tuple[Array, Array, float]]:
     """Return random half-samples: change (M,) of the averaged residual, weights (M,), noise energy.
 
@@ -139,7 +139,7 @@ def halves(
     others without weight.
     """
     # A part of a period may lack the very speeds that tell two effects apart.
-    numbers = blocks(train_data, fewest=SETTINGS.about_two)
+    numbers = blocks(train_data, fewest=TRACE.about_two)
     mean = train_data.mean
     out = []
     for _ in range(count):

@@ -17,7 +17,7 @@ from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.inference import EffectErrors, blocks, others
 from analysis.trace.search.linear_fit import FORM, orthonormal
 from analysis.trace.search.refinement import ExactFit, jacobian, table
-from analysis.trace.settings import SETTINGS
+from analysis.trace.settings import TRACE
 
 Array = NDArray[np.float64]
 
@@ -130,7 +130,7 @@ def invariance(
             own = _alone(J_s, k)
             size = float(own @ own)
             # What hardly acts there tells its form's tail, not its size.
-            if size < SETTINGS.tells * whole[k] or size <= 0 or not np.isfinite(value.value[k]):
+            if size < TRACE.tells * whole[k] or size <= 0 or not np.isfinite(value.value[k]):
                 continue
             shift = float(own @ residual[mask]) / size
             error = 1.0 / np.sqrt(size)
@@ -141,10 +141,10 @@ def invariance(
             # Two levels of one effect are judged by the larger: 2 N beside 100 N is a detail.
             alike = [j for j, n in enumerate(names) if n in sizes and units[n] == units[name]]
             full = float(np.max(np.abs(value.value[alike] - neutral[alike])))
-            if error > SETTINGS.power * full:
+            if error > TRACE.power * full:
                 continue
-            if abs(shift) > spill + SETTINGS.deviations * np.hypot(
-                error, SETTINGS.tolerance / SETTINGS.deviations * full
+            if abs(shift) > spill + TRACE.deviations * np.hypot(
+                error, TRACE.tolerance / TRACE.deviations * full
             ):
                 out.append((label, name, float(value.value[k]) + shift, error))
     return out
@@ -168,15 +168,15 @@ def _of_curve(
         B = orthonormal(base[mask])
         own = whole[mask] - B @ (B.T @ whole[mask])
         size = float(own @ own)
-        if size <= SETTINGS.tells * start or size < 0.01 * float(whole[mask] @ whole[mask]):
+        if size <= TRACE.tells * start or size < 0.01 * float(whole[mask] @ whole[mask]):
             continue
         shift = float(own @ model.residual[mask]) / size
         error = 1.0 / np.sqrt(size)
         if clusters is not None:
             rest = model.residual[mask] - B @ (B.T @ model.residual[mask]) - own * shift
             error = max(error, _clustered(own, rest, clusters[mask]) / size)
-        if error <= SETTINGS.power and abs(shift) > SETTINGS.deviations * np.hypot(
-            error, SETTINGS.tolerance / SETTINGS.deviations
+        if error <= TRACE.power and abs(shift) > TRACE.deviations * np.hypot(
+            error, TRACE.tolerance / TRACE.deviations
         ):
             out.append((label, "the curve's size", 1.0 + shift, error))
     return out

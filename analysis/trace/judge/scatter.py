@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.identify.estimators.covariance import CovarianceParts, spread
-from analysis.identify.estimators.equations import LEVELS, Pieces, segments
+from analysis.identify.estimators.equations import Pieces, segments
+from analysis.identify.settings import IDENTIFY
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.simulation.model import Model
 from analysis.trace.data.regression_data import RegressionData, Segment
@@ -50,7 +51,7 @@ def _pieces(train_data: RegressionData, columns: Array, residual: Array, by: str
         time = train_data.rows[k][s.equation].time
         label = _labels(train_data.records[k], s, time, by)
         # In period the equations of one instant belong together; a level is an equation's own.
-        label = label if by == PERIOD else label + number * LEVELS
+        label = label if by == PERIOD else label + number * IDENTIFY.state_levels
         own = columns[s.where] / np.sqrt(s.repeats)
         noise = train_data.residual[: s.repeats, s.where]
         left = noise - noise.mean(axis=0) + residual[s.where] / np.sqrt(s.repeats)
@@ -81,7 +82,7 @@ def _labels(conditioned: ConditionedRecord, s: Segment, time: Array, by: str) ->
     state = {"flow_cap": signals.p_cap, "flow_rod": signals.p_rod}.get(kind, signals.s)
     x = (signals.sd if by == SPEED else state)[at, i]
     rank = np.argsort(np.argsort(x))
-    return np.asarray(rank * LEVELS // max(len(rank), 1), dtype=np.int64)
+    return np.asarray(rank * IDENTIFY.state_levels // max(len(rank), 1), dtype=np.int64)
 
 
 def form_shift(train_data: RegressionData, fit: ExactFit) -> dict[str, float]:

@@ -28,7 +28,7 @@ from analysis.trace.judge.held_out import rms_of
 from analysis.trace.result import Found
 from analysis.trace.search import refinement
 from analysis.trace.search.hypothesis import Hypothesis, excess_of
-from analysis.trace.settings import SETTINGS
+from analysis.trace.settings import TRACE
 from rig.model.records import Run
 
 log = logging.getLogger(__name__)
@@ -67,8 +67,8 @@ def reshaped(
         )
         fitted = refinement.fit(train_data, _with(winner.fit.terms, effect, found))
         rows, again = (rms_of(holdout_data, fit) for fit in (winner.fit, fitted))
-        better = now < SETTINGS.closer * before and all(
-            again[e] <= SETTINGS.no_worse * rows[e] for e in rows
+        better = now < TRACE.closer * before and all(
+            again[e] <= TRACE.no_worse * rows[e] for e in rows
         )
         shots.append(replace(found, before=before, after=now, taken=better and found.settled))
         if shots[-1].taken:
