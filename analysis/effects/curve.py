@@ -67,12 +67,14 @@ def packed(knots: Sequence[float], values: Array) -> Array:
 @njit(cache=True, error_model="numpy")
 def curve_at(x, par, first, K):  # type: ignore[no-untyped-def]
     """Return the curve at x, its K knots, values and second derivatives in par from `first` on."""
-    j = 0
-    while j < K - 2 and x >= par[first + j + 1]:
-        j += 1
-    t, u = par[first + j], par[first + j + 1]
-    y, z = par[first + K + j], par[first + K + j + 1]
-    m, n = par[first + 2 * K + j], par[first + 2 * K + j + 1]
+    t, u = par[first], par[first + 1]
+    y, z = par[first + K], par[first + K + 1]
+    m, n = par[first + 2 * K], par[first + 2 * K + 1]
+    for j in range(1, K - 1):
+        if x >= par[first + j]:
+            t, u = par[first + j], par[first + j + 1]
+            y, z = par[first + K + j], par[first + K + j + 1]
+            m, n = par[first + 2 * K + j], par[first + 2 * K + j + 1]
     h = u - t
     if x < par[first]:
         return y + (x - t) * ((z - y) / h - h / 6.0 * (2.0 * m + n))
@@ -80,7 +82,7 @@ def curve_at(x, par, first, K):  # type: ignore[no-untyped-def]
         return z + (x - u) * ((z - y) / h + h / 6.0 * (m + 2.0 * n))
     b = (x - t) / h
     a = 1.0 - b
-    return a * y + b * z + ((a**3 - a) * m + (b**3 - b) * n) * h * h / 6.0
+    return a * y + b * z + ((a * a - 1.0) * a * m + (b * b - 1.0) * b * n) * h * h / 6.0
 
 
 def freed(gauge: Array) -> Array:

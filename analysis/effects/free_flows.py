@@ -386,7 +386,8 @@ def _edges(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
 def _leak(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
     if phase != CONTRIBUTE:
         return
-    i, side = int(par[0]), int(par[1])
+    i = int(par[0])
+    side = int(par[1])
     cap, rod = x[P_CAP, i], x[P_ROD, i]
     drop = cap - rod if side == 0 else (cap if side == 1 else rod) - bench[P_TANK]
     flow = curve_at(abs(drop), par, 2, 5)

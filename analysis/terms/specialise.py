@@ -5,7 +5,8 @@ read and evaluated as far as it can be before any sample is known: the phase, th
 and the joint of the term are numbers, loops over joints are unrolled, and every array element
 becomes a variable. The operations on floating-point numbers and their order stay what the kernel
 says, so that results are the same to the last bit. A function that a kernel calls is copied beside
-it, with the elements that it reads as arguments where it takes a whole array.
+it, with the elements that it reads as arguments where it takes a whole array, once for every set of
+integers that it is called with.
 """
 
 from __future__ import annotations
@@ -74,22 +75,28 @@ class Helpers:
     names: dict[tuple[Any, ...], tuple[str, tuple[str, ...]]] = field(default_factory=dict)
 
     def copy(
-        self, dispatcher: Any, arrays: Mapping[str, ScalarArray]
+        self, dispatcher: Any, arrays: Mapping[str, ScalarArray], numbers: Mapping[str, int]
     ) -> tuple[str, tuple[str, ...]]:
-        """Copy a function; return its name and the elements it reads of `arrays` (by parameter)."""
-        key = (dispatcher, *sorted(arrays.items()))
+        """Copy a function; return its name and the elements it reads of `arrays` (by parameter).
+
+        `numbers` are the parameters that are known integers.
+        """
+        key = (dispatcher, *sorted(arrays.items()), *sorted(numbers.items()))
         if key in self.names:
             return self.names[key]
         function = dispatcher.py_func
         tree = _definition(function)
         body = _Body(function, tree, arrays, self, "", inlined=False)
+        if changed := set(numbers) & body.stored:
+            raise NotSpecialisable(f"{function.__name__} changes its argument {min(changed)!r}")
+        body.known.update(numbers)
         statements = body.block(tree.body)
         if body.written:
             raise NotSpecialisable(f"{function.__name__} changes an array that it is handed")
         read = tuple(sorted(body.read))
         name = f"{function.__name__.strip('_')}_{len(self.names) + 1}"
         self.names[key] = name, read
-        kept = [a.arg for a in tree.args.args if a.arg not in arrays]
+        kept = [a.arg for a in tree.args.args if a.arg not in arrays and a.arg not in numbers]
         model = dispatcher.targetoptions.get("error_model", "python")
         head = f"@njit(error_model={model!r})\ndef {name}({', '.join([*kept, *read])}):\n"
         self.texts[name] = head + textwrap.indent(_unparse(statements), "    ")
@@ -167,6 +174,7 @@ class _Body(ast.NodeTransformer):
         self.places: dict[str, int] = {}
         names = [n for n in ast.walk(tree) if isinstance(n, ast.Name)]
         stored = [n.id for n in names if isinstance(n.ctx, ast.Store)]
+        self.stored = set(stored)
         self.locals = {*stored, *(a.arg for a in tree.args.args)}
         self.once = {name for name in stored if stored.count(name) == 1}
 
@@ -241,9 +249,11 @@ class _Body(ast.NodeTransformer):
             raise NotSpecialisable(f"line {loop.lineno}: the loop over {name} has no fixed length")
         numbers = [end for end in ends if end is not None]
         leaving = (ast.Break, ast.Return) if self.inlined else (ast.Break, ast.Return, ast.Continue)
-        if any(isinstance(n, leaving) for n in ast.walk(loop)):
-            if self.inlined:
-                raise NotSpecialisable(f"line {loop.lineno}: the loop over {name} is left early")
+        left = any(isinstance(n, leaving) for n in ast.walk(loop))
+        if left and self.inlined:
+            raise NotSpecialisable(f"line {loop.lineno}: the loop over {name} is left early")
+        nodes = (n for part in loop.body for n in ast.walk(part))
+        if left or not any(isinstance(n, ast.Name) and n.id == name for n in nodes):
             target = ast.Name(self.prefix + name, ast.Store())
             over = ast.Call(ast.Name("range", ast.Load()), list(map(ast.Constant, numbers)), [])
             return [ast.For(target, over, self.block(loop.body) or [ast.Pass()], [], lineno=0)]
@@ -339,12 +349,14 @@ class _Body(ast.NodeTransformer):
             for parameter, argument in zip(names, node.args, strict=True)
             if isinstance(argument, ast.Name) and argument.id in self.arrays
         }
-        name, read = self.helpers.copy(dispatcher, handed)
-        kept = [
-            self.visit(argument)
+        values = {
+            parameter: self.visit(argument)
             for parameter, argument in zip(names, node.args, strict=True)
             if parameter not in handed
-        ]
+        }
+        numbers = {p: whole for p, v in values.items() if (whole := _whole(v)) is not None}
+        name, read = self.helpers.copy(dispatcher, handed, numbers)
+        kept = [value for parameter, value in values.items() if parameter not in numbers]
         self.read.update(read)
         elements = [ast.Name(variable, ast.Load()) for variable in read]
         return ast.Call(ast.Name(name, ast.Load()), [*kept, *elements], [])

@@ -12,7 +12,7 @@ from typing import Final
 
 
 @dataclass(frozen=True)
-class Settings:
+class TraceSettings:
     """Numbers without unit are shares or ratios."""
 
     # Gates of an effect.
@@ -86,4 +86,4 @@ class Settings:
     """Rivals in a result."""
 
 
-TRACE: Final = Settings()
+TRACE: Final = TraceSettings()
