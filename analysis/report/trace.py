@@ -53,8 +53,8 @@ def body(
         "galleries": _pictures(rig, holdout, result),
         "overview": trace_figures.over_noise(result),
         "errors": _errors(result),
-        "effects": [_effect(e) for e in result.effects],
-        "refused": [_effect(e) for e in result.refused],
+        "effects": [_effect(e, f"d{k}") for k, e in enumerate(result.effects)],
+        "refused": [_effect(e, f"n{k}") for k, e in enumerate(result.refused)],
         "parameters": _parameters(result),
         "fits": [
             (
@@ -158,8 +158,9 @@ def _errors(result: Trace) -> list[tuple[str, ...]]:
     return out
 
 
-def _effect(found: Found) -> dict[str, Any]:
+def _effect(found: Found, key: str) -> dict[str, Any]:
     return {
+        "curve": trace_figures.curves(found, key) if found.curves else None,
         "name": found.name.replace("_", " "),
         "where": found.where,
         "values": [(n, quantity(e)) for n, e in found.parameters.items()],
@@ -184,6 +185,6 @@ def _parameters(result: Trace) -> list[tuple[str, ...]]:
     out: list[tuple[str, ...]] = []
     for name, one in result.model_before.parameters.items():
         if name in after and one.identified and after[name].identified:
-            change = 100 * (after[name].value / one.value - 1) if one.value else math.nan
-            out.append((name, quantity(one), quantity(after[name]), f"{change:+.1f} %"))
+            change = f"{100 * (after[name].value / one.value - 1):+.1f} %" if one.value else fm.DASH
+            out.append((name, quantity(one), quantity(after[name]), change))
     return out

@@ -41,7 +41,7 @@ from analysis.trace.data.conditioned_record import (
 )
 from analysis.trace.data.spectral_lines import CONSTANT, EVEN, EXCITED, ODD, members
 from analysis.trace.data.spectral_lines import SpectralLines as Spectrum
-from analysis.trace.result import Trace
+from analysis.trace.result import Found, Trace
 from analysis.trace.search.refinement import ExactFit
 from analysis.trace.words import loudest
 from rig.model import channels as ch
@@ -141,6 +141,22 @@ def against(
             note(axes, 0.98, 0.98, f"{word}: {fm.significant(rms)} {unit} rms", INK)
         made.tight_layout()
         return svg(made, key, f"Residual against {label}, before and after")
+
+
+def curves(found: Found, key: str) -> Markup:
+    """Draw the curves of an effect whose form the data draw, each with its band."""
+    with style():
+        made = figure(2.4, CARD * 2)
+        axes = made.add_subplot()
+        for one, colour in zip(found.curves, (BLUE, MODEL, GREY, INK), strict=False):
+            axes.fill_between(one.x, one.lo, one.hi, color=colour, alpha=0.18, lw=0)
+            axes.plot(one.x, one.y, color=colour, lw=1.6, label=one.label)
+        axes.set_xlabel(f"{found.variable} [{found.curves[0].unit_x}]")
+        axes.set_ylabel(f"[{found.curves[0].unit_y}]")
+        if len(found.curves) > 1:
+            axes.legend(frameon=False)
+        made.tight_layout()
+        return svg(made, key, f"{found.name.replace('_', ' ')} with its 95 % band")
 
 
 def in_time(line: ResidualSeries, noise: float, unit: str, key: str, after: bool) -> Markup:

@@ -22,8 +22,8 @@ def trace_text(result: Trace) -> str:
     rig = result.model_before.rig
     rows = [
         [
-            name, f"{result.noise_floor.get(name, math.nan):.2g}", f"{before:.2g}",
-            f"{result.after.get(name, math.nan):.2g}", unit_of_equation(rig, name),
+            name, _number(result.noise_floor.get(name, math.nan), 2), _number(before, 2),
+            _number(result.after.get(name, math.nan), 2), unit_of_equation(rig, name),
             *(_share(errors.get(name), result.size.get(name)) for errors in (
                 result.before, result.after)),
         ]
@@ -38,10 +38,10 @@ def trace_text(result: Trace) -> str:
     fits = [
         [
             name,
-            f"{before:.1f} %",
-            f"{result.fit_after.get(name, math.nan):.1f} %",
+            _percent(before),
+            _percent(result.fit_after.get(name, math.nan)),
             *(
-                f"{errors.get(name, math.nan):.3g}"
+                _number(errors.get(name, math.nan))
                 for errors in (
                     result.rmse_before,
                     result.rmse_after,
@@ -115,8 +115,17 @@ def _changed(result: Trace) -> list[list[str]]:
         if result.model_after is result.model_before or name not in after:
             continue
         change = 100 * (after[name].value / one.value - 1) if one.value else math.nan
-        out.append([name, f"{one.value:.4g}", f"{after[name].value:.4g}", f"{change:+.1f} %"])
+        values = (_number(p.value, 4) for p in (one, after[name]))
+        out.append([name, *values, _percent(change, "+")])
     return out
+
+
+def _percent(value: float, sign: str = "") -> str:
+    return f"{value:{sign}.1f} %" if math.isfinite(value) else "—"
+
+
+def _number(value: float, digits: int = 3) -> str:
+    return f"{value:.{digits}g}" if math.isfinite(value) else "—"
 
 
 def story_text(rounds: Sequence[Round], stopped: str) -> str:

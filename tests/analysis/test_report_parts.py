@@ -14,10 +14,11 @@ from analysis.identify.identify import identify
 from analysis.identify.stacked_rows import RecordRows, build_rows
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.rows import Rows
-from analysis.report import facts, paper
+from analysis.report import facts, paper, trace_figures
 from analysis.report import format as fm
 from analysis.report.plots import arm_plot, record_plots, style
 from analysis.report.residuals import per_repeat, residuals
+from analysis.trace.result import Curve, Found
 from rig.model.parameters import parameter_names
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
@@ -200,3 +201,15 @@ def test_a_bench_that_is_no_rigid_body_is_told_from_a_bad_identification() -> No
     assert "R12/W2 = 0.415 m for a link of 0.500 m" in said
     assert facts.truth_remark(rig, {"R12": 1.65, "W2": 3.30}) == ""
     assert facts.truth_remark(rig, None) == ""
+
+
+def test_a_curve_is_drawn_with_its_band_and_its_units() -> None:
+    x = np.linspace(0.0, 0.2, 9)
+    lines = tuple(Curve(way, x, 80 + x, 70 + x, 90 + x, "m/s", "N") for way in ("out", "back"))
+    found = Found(
+        "friction_curve", "joint 1", {}, 0.005, 0.9, (), (), "the piston's velocity",
+        mechanism="friction_curve", free=True, curves=lines,
+    )  # fmt: skip
+    drawn = str(trace_figures.curves(found, "c0"))
+    for said in ("friction curve with its 95 % band", "velocity [m/s]", "[N]", "out", "back"):
+        assert said in drawn

@@ -10,7 +10,7 @@ monomials are forces at the piston, times the linkage's G.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -60,8 +60,25 @@ def formula(
         return None
     values = fitted_to(one[:, chosen], first)
     terms = {names[k]: float(v) for k, v in zip(chosen, values, strict=True)}
+    if is_balance(equation, terms):
+        return None
     at_piston = equation.startswith("torque") and not train.rig.electric
     return Formula(equation, terms, share, at_piston)
+
+
+def is_balance(equation: str, terms: Mapping[str, float]) -> bool:
+    """Whether a formula takes both chambers' pressures against each other by one factor.
+
+    That is the cylinder's force times the factor: a torque's own balance makes the force follow
+    whatever the torque lacks, and with a factor too it answers and tells nothing.
+    """
+    kind, joint = equation.rsplit("_", 1)
+    sides = [ch.channel(side, int(joint)) for side in (ch.CAP, ch.ROD)]
+    cap, rod = (
+        {name[len(side) :]: value for name, value in terms.items() if name.startswith(side)}
+        for side in sides
+    )
+    return kind == "torque" and any(cap[by] * rod[by] < 0.0 for by in cap.keys() & rod.keys())
 
 
 def _library(

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from analysis.trace.clues.formula import is_balance
 from analysis.trace.data.candidates import catalogue
 from analysis.trace.engine import trace
 from analysis.trace.result import Formula, Trace, to_json
@@ -91,3 +92,20 @@ def test_its_variables_are_read_from_its_monomials(
     assert found.variables == variables
     assert found.sure == bool(variables)
     assert not replace(found, share=0.5).sure
+
+
+@pytest.mark.parametrize(
+    ("terms", "balance"),
+    [
+        ({"cap_pressure_1 time": 1e-3, "rod_pressure_1 time": -7e-4}, True),
+        ({"1": 2.0, "cap_pressure_1 sign(velocity_1)": 1.0, "rod_pressure_1 time": -1.0}, False),
+        ({"cap_pressure_1 sign(velocity_1)": 1.0, "rod_pressure_1 sign(velocity_1)": 1.0}, False),
+        ({"cap_pressure_1 time": 1e-3}, False),
+    ],
+)
+def test_the_cylinders_force_times_a_factor_is_no_clue(
+    terms: dict[str, float], balance: bool
+) -> None:
+    """A seal pressed on by both chambers, and one sensor that drifts, are none of it."""
+    assert is_balance("torque_1", terms) is balance
+    assert not is_balance("flow_cap_1", terms)

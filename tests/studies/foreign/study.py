@@ -162,7 +162,8 @@ def line_of(o: Outcome) -> str:
         f"[{o.answer}] seed {o.seed} {o.label} [{o.bench}] {o.loudness:.1f} x noise: {o.verdict}, "
         f"{named}" + (f"; tied {', '.join(' at '.join(t) for t in o.tied)}" if o.tied else "")
         + (f"; refused {'; '.join(o.refused)}" if o.refused else "")
-        + f"; size off {100 * o.size_error:.2g} %, ci {hit}, baseline ci {o.parameter_hits[0]}/"
+        + (f"; size off {100 * o.size_error:.2g} %" if o.hits[1] else "")
+        + f", ci {hit}, baseline ci {o.parameter_hits[0]}/"
         f"{o.parameter_hits[1]}, parameters off {100 * o.parameter_error:.2g} %, "
         f"error {o.error_ratio:.2f} x floor, {o.seconds:.0f} s"
         + "".join(f"; {note}" for note in o.notes)
