@@ -22,6 +22,18 @@ LAWS = ([CLOSED, CLOSED], [CLOSED, sine(RIG, 1.0)], [sine(RIG, 2.0), Law(bias=0.
 Asked = list[tuple[bool, int, int, int]]
 
 
+FILTERED = Scenario.model_validate(
+    {
+        "effects": [
+            {"name": "sensor_lag", "channel": "cap_pressure_2", "time": 0.004},
+            {"name": "sensor_crosstalk", "channel": "rod_pressure_1", "share": 0.05},
+            {"name": "spool_hysteresis", "where": "joint 2", "width": 0.05},
+        ]
+    }
+)
+
+
+@pytest.mark.parametrize("scenario", [Scenario(), FILTERED], ids=["plain", "filtered"])
 @settings(max_examples=25, deadline=None)
 @given(
     st.lists(
@@ -30,8 +42,10 @@ Asked = list[tuple[bool, int, int, int]]
         max_size=8,
     )
 )
-def test_samples_are_the_same_whether_the_block_ahead_was_right_or_wrong(asked: Asked) -> None:
-    ahead, plain = Prefetch(Plant(RIG, Scenario(), 4)), Plant(RIG, Scenario(), 4)
+def test_samples_are_the_same_whether_the_block_ahead_was_right_or_wrong(
+    scenario: Scenario, asked: Asked
+) -> None:
+    ahead, plain = Prefetch(Plant(RIG, scenario, 4)), Plant(RIG, scenario, 4)
     for early, guess, ticks, laws in asked:
         if early:
             ahead.prefetch(10 if ticks % 2 else ticks, LAWS[guess])

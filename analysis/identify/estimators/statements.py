@@ -42,9 +42,13 @@ def nuisance_statement(
             statement += "; b is that of the rig's nominal oil temperature"
         return Check("oil temperature", not wrong, statement)
     if belief.name.startswith(nu.BETWEEN):
-        statement = f"{value:+.3f} +- {2 * std:.3f} of a sample's interval from the interpolated one"
+        statement = (
+            f"{value:+.3f} +- {2 * std:.3f} of a sample's interval from the interpolated one"
+        )
         if wrong:
-            statement += ", more than a command held between samples makes (a lag, a delay?): left out"
+            statement += (
+                ", more than a command held between samples makes (a lag, a delay?): left out"
+            )
         return Check(belief.name, not wrong, statement)
     size = np.sqrt(max(value, 0.0) + 2 * std)
     statement = f"laminar below a drop of {size / 1e6:.2g} MPa at most by these records"

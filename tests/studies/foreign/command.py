@@ -51,8 +51,8 @@ def foreign(
     from tests.studies.pool import Kept, performed
 
     def tell(done: int, of: int, job: Job, found: Outcome | Exception) -> None:
-        failed = isinstance(found, Exception)
-        progress(f"{done}/{of} " + (f"seed {job.seed}: {found}" if failed else line_of(found)))
+        line = f"seed {job.seed}: {found}" if isinstance(found, Exception) else line_of(found)
+        progress(f"{done}/{of} {line}")
 
     kept = Kept(keep, _name, asdict, loaded) if keep else None
     work = [
@@ -90,8 +90,8 @@ def intervals(
     from tests.studies.pool import Kept, performed
 
     def tell(done: int, of: int, job: tuple[int, str], found: Covered | Exception) -> None:
-        failed = isinstance(found, Exception)
-        progress(f"{done}/{of} " + (f"seed {job[0]}: {found}" if failed else line_of(found)))
+        line = f"seed {job[0]}: {found}" if isinstance(found, Exception) else line_of(found)
+        progress(f"{done}/{of} {line}")
 
     kept = Kept(keep, lambda j: f"{j[0]} {j[1]}.json", asdict, loaded) if keep else None
     work = [(seed + stride * k, estimator) for k in range(count)]

@@ -10,10 +10,13 @@ or is the continuous waveform itself. A Runge-Kutta of fixed step integrates; th
 sample's interval, so that no jump of the command falls inside.
 """
 
+# mypy: disable-error-code="untyped-decorator"
+# numba has no types of its own.
+
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numba import njit
@@ -70,13 +73,13 @@ FAST_LINE: Final = 3e-4  # [s] lag of a line that has none worth speaking of
 
 
 @njit(cache=True)
-def root(x):
+def root(x: float) -> float:
     """Square root with the sign of x: an orifice passes oil either way."""
     return math.sqrt(x) if x >= 0.0 else -math.sqrt(-x)
 
 
 @njit(cache=True)
-def stroke(q, j):
+def stroke(q: float, j: Array) -> Any:
     """Piston displacement [m] and ds/dq [m], law of cosines."""
     square = j[A] ** 2 + j[C] ** 2 - 2.0 * j[A] * j[C] * math.cos(q + j[BETA])
     length = math.sqrt(square)
@@ -84,7 +87,7 @@ def stroke(q, j):
 
 
 @njit(cache=True)
-def opened(x, form, rounding):
+def opened(x: float, form: float, rounding: float) -> float:
     """Opening of an edge [V] at the spool's travel x past it; far out it is x."""
     if form == ROUNDED:
         return 0.5 * (x + math.sqrt(x * x + rounding * rounding))
@@ -98,7 +101,7 @@ def opened(x, form, rounding):
 
 
 @njit(cache=True)
-def level(v, s, cap, rod, j):
+def level(v: float, s: float, cap: float, rod: float, j: Array) -> Any:
     """Sliding friction [N] at speed v: by direction, falling with speed, by pressure, by place."""
     size = j[AHEAD] if v >= 0.0 else j[ASTERN]
     size += j[BREAKAWAY] * math.exp(-abs(v) / j[STRIBECK])
@@ -107,7 +110,7 @@ def level(v, s, cap, rod, j):
 
 
 @njit(cache=True)
-def dry(v, s, z, cap, rod, others, j):
+def dry(v: float, s: float, z: float, cap: float, rod: float, others: float, j: Array) -> Any:
     """Dry friction [N] and the bristle's rate [m/s]."""
     size = level(v, s, cap, rod, j)
     form = j[DRY_FORM]
@@ -130,7 +133,7 @@ def dry(v, s, z, cap, rod, others, j):
 
 
 @njit(cache=True)
-def modulus(p, m):
+def modulus(p: float, m: Array) -> Any:
     """Bulk modulus [Pa] of oil with free air at gauge pressure p."""
     if m[AIR] <= 0.0:
         return m[BULK]
@@ -145,7 +148,9 @@ def modulus(p, m):
 
 
 @njit(cache=True)
-def flows(cap, rod, s, x, at_valve, tank, j):
+def flows(
+    cap: float, rod: float, s: float, x: float, at_valve: float, tank: float, j: Array
+) -> Any:
     """Flows into cap and rod chamber, drawn from the supply and given to the tank [m^3/s]."""
     x -= j[NULL]
     form, soft = j[EDGE_FORM], j[EDGE_ROUNDING]
@@ -167,7 +172,9 @@ def flows(cap, rod, s, x, at_valve, tank, j):
 
 
 @njit(cache=True)
-def rates(y, t, m, joints, locked, command, out):  # noqa: PLR0912  one branch an effect's form
+def rates(  # noqa: PLR0912  one branch an effect's form
+    y: Array, t: float, m: Array, joints: Array, locked: Any, command: Any, out: Array
+) -> None:
     """Derivatives of the state; `command` [V] is each joint's at this instant."""
     out[:] = 0.0
     q1, q2, w1, w2 = y[0], y[1], y[2], y[3]
@@ -264,7 +271,7 @@ def rates(y, t, m, joints, locked, command, out):  # noqa: PLR0912  one branch a
 
 
 @njit(cache=True)
-def asked(t, s, i, waves, bias, centring):
+def asked(t: float, s: float, i: int, waves: Any, bias: Any, centring: Any) -> Any:
     """Command [V] of joint i: cosines, a bias, and slow centring on the piston."""
     u = bias[i] - centring * s
     for k in range(waves.shape[0]):
@@ -274,7 +281,10 @@ def asked(t, s, i, waves, bias, centring):
 
 
 @njit(cache=True)
-def integrated(start, steps, held, m, joints, locked, waves, bias, centring, first):
+def integrated(
+    start: Array, steps: int, held: Any, m: Array, joints: Array, locked: Any, waves: Any,
+    bias: Any, centring: Any, first: int,
+) -> Any:  # fmt: skip
     """Return states from step `first` on, (steps - first, SIZE), and the spools, (…, 2).
 
     The command is renewed every `held` steps (0: continuous).
