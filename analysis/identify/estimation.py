@@ -110,7 +110,8 @@ def refine(job: EstimationJob, solutions: Mapping[str, Solution]) -> Refined:
     found = {p.family: _solve(p, "ls" if estimator == "auto" else estimator) for p in prepared
              if estimator != "output-error"}  # fmt: skip
     if not single:
-        reference = {p.family: _solve(p, "ls") for p in prepared}
+        plain = found if estimator in ("ls", "auto") else None
+        reference = plain or {p.family: _solve(p, "ls") for p in prepared}
         statement = noise_statement(shifts_of(prepared, tests, reference))
         if estimator == "auto":
             estimator = "ls" if statement.ok else "iv"

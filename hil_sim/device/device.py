@@ -38,6 +38,9 @@ VIRTUAL_SILENCE = 10.0  # nothing moves while a virtual host thinks, so it may t
 POLL_SECONDS = 0.05
 WATCHDOG_RANGE_MS = (round(1e3 * WATCHDOG_RANGE[0]), round(1e3 * WATCHDOG_RANGE[1]))
 _U32 = 0xFFFF_FFFF
+# As numbers: every block has them, and an enumeration adds slowly.
+_STREAMING, _TRIPPED = int(Status.STREAMING), int(Status.TRIPPED)
+_ARMED, _CONTROLLED = int(Status.ARMED), int(Status.CONTROLLED)
 
 
 class Plant(Protocol):
@@ -118,16 +121,12 @@ class Device:
     @property
     def status(self) -> Status:
         """The status bits, without BLOCK."""
-        status = Status(0)
-        for bit, holds in (
-            (Status.STREAMING, self.streaming),
-            (Status.TRIPPED, self.cause != TripCause.NONE),
-            (Status.ARMED, self.laws.armed),
-            (Status.CONTROLLED, self._controller is not None),
-        ):
-            if holds:
-                status |= bit
-        return status
+        return Status(
+            _STREAMING * self.streaming
+            + _TRIPPED * (self.cause != TripCause.NONE)
+            + _ARMED * self.laws.armed
+            + _CONTROLLED * (self._controller is not None)
+        )
 
     def take_control(self, client: object) -> None:
         """Give `client` control, which is also a sign of life; refused while another has it."""

@@ -154,10 +154,15 @@ def pieces(fit: EquationFit, by: str = "segment") -> Pieces:
     for b, z, weight, e in zip(fit.blocks, fit.Z, fit.w, fit.residuals(), strict=True):
         weighted = z * weight[:, None]
         labels = b.segment if by == "segment" else b.level
-        for part in np.unique(labels):
-            here = labels == part
-            score, information = weighted[here].T @ e[here], weighted[here].T @ b.X[here]
-            key = (strata[b.stratum], b.repeat, int(part))
+        # Rows of one part side by side: a product over each stretch, no row looked at twice.
+        order = np.argsort(labels, kind="stable")
+        parts, first = np.unique(labels[order], return_index=True)
+        weighted, e, X = weighted[order], e[order], b.X[order]
+        ends = [*first[1:].tolist(), len(order)]
+        for part, begin, end in zip(parts.tolist(), first.tolist(), ends, strict=True):
+            here = weighted[begin:end].T
+            score, information = here @ e[begin:end], here @ X[begin:end]
+            key = (strata[b.stratum], b.repeat, part)
             if key in sums:
                 score, information = score + sums[key][0], information + sums[key][1]
             sums[key] = (score, information)
@@ -199,27 +204,23 @@ def levelled(
     bins of equally many rows; time by time the mean over the repeats decides, so that noise does
     not sort. A law that is wrong somewhere in the state leaves its misfit in few of the bins.
     """
-    states: dict[tuple[int, str, str], dict[float, list[float]]] = {}
-    for b in blocks:
-        state = states.setdefault((*b.stratum, b.equation), {})
-        for t, x in zip(np.round(b.time, 9), _state(b, records[b.run, b.record]), strict=True):
-            state.setdefault(float(t), []).append(float(x))
-    bins = {}
-    for number, (key, state) in enumerate(sorted(states.items())):
-        mean = np.array([np.mean(v) for v in state.values()])
-        rank = np.argsort(np.argsort(mean))
-        label = number * IDENTIFY.state_levels + rank * IDENTIFY.state_levels // len(rank)
-        bins[key] = dict(zip(state, label.tolist(), strict=True))
-    return [
-        replace(
-            b,
-            level=np.array(
-                [bins[*b.stratum, b.equation][float(t)] for t in np.round(b.time, 9)],
-                dtype=np.int64,
-            ),
-        )
-        for b in blocks
-    ]
+    alike: dict[tuple[int, str, str], list[int]] = {}
+    for k, b in enumerate(blocks):
+        alike.setdefault((*b.stratum, b.equation), []).append(k)
+    out = list(blocks)
+    for number, (_, mine) in enumerate(sorted(alike.items())):
+        own = [blocks[k] for k in mine]
+        ticks = np.round(np.concatenate([b.time for b in own]), 9)
+        state = np.concatenate([_state(b, records[b.run, b.record]) for b in own])
+        times, place = np.unique(ticks, return_inverse=True)
+        mean = np.bincount(place, state) / np.bincount(place)
+        rank = np.empty(len(times), dtype=np.int64)
+        rank[np.argsort(mean, kind="stable")] = np.arange(len(times))
+        label = number * IDENTIFY.state_levels + rank * IDENTIFY.state_levels // len(times)
+        ends = np.cumsum([len(b.time) for b in own])[:-1]
+        for k, level in zip(mine, np.split(label[place], ends), strict=True):
+            out[k] = replace(blocks[k], level=level)
+    return out
 
 
 def _state(b: RepeatBlock, record: Record) -> Array:
