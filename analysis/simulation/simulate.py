@@ -241,7 +241,8 @@ def simulate(
     samples = total - first if samples is None else samples
     N = drive.u.shape[1]
     hidden = ready.hidden
-    ys = np.zeros((samples, 4 * N + hidden))
+    ys = np.empty((samples, 4 * N + hidden))
+    ys[0] = 0.0
     ys[0, : 4 * N] = np.concatenate((start.q, start.qd, start.p_cap, start.p_rod))
     if start.hidden is not None:
         ys[0, 4 * N :] = start.hidden
@@ -254,7 +255,6 @@ def simulate(
         ready.address, ready.context, ready.par, ready.geometry, ready.work(),
         inputs, drive.rate, drive.locked, RTOL, atol, ys,
     )  # fmt: skip
-    ys[filled:] = ys[filled - 1]
     failure = ""
     if status != eq.OK:
         failure = f"{_REASONS[status]} {filled / drive.rate:.3f} s after the start"
@@ -266,29 +266,36 @@ def _result(
     evaluations: int,
 ) -> Simulation:  # fmt: skip
     N = drive.u.shape[1]
-    q, qd, cap, rod = (ys[:, k * N : (k + 1) * N].copy() for k in range(4))
-    for held in map(int, np.flatnonzero(drive.locked)):
-        q[:, held], qd[:, held] = inputs[:, 2 + N + held], inputs[:, 2 + 2 * N + held]
-    evaluated = int(evaluations)
-    if (geometry[:, eq.GAIN] != 0.0).all():
-        return Simulation(
-            drive.rate, q, qd, cap, rod, q, qd, failure, int(filled), 0, evaluated, electric=True
-        )
-    piston, speed = np.empty_like(q), np.empty_like(q)
-    outside = _cylinders(geometry, inputs, drive.locked, q, qd, cap, rod, filled, piston, speed)
-    return Simulation(
-        drive.rate, q, qd, cap, rod, piston, speed, failure, int(filled), int(outside), evaluated
+    q, qd, cap, rod, piston, speed = np.empty((6, len(ys), N))
+    electric = bool((geometry[:, eq.GAIN] != 0.0).all())
+    outside = _output(
+        geometry, inputs, drive.locked, ys, filled, electric, q, qd, cap, rod, piston, speed
     )
+    if electric:
+        piston, speed = q, qd
+    return Simulation(
+        drive.rate, q, qd, cap, rod, piston, speed, failure, int(filled), int(outside),
+        int(evaluations), electric,
+    )  # fmt: skip
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _cylinders(geometry, inputs, locked, q, qd, cap, rod, filled, piston, speed):  # type: ignore[no-untyped-def]
-    """Fill piston and speed (n, N); return how many samples have a pressure outside [0, p_s]."""
+def _output(geometry, inputs, locked, ys, filled, electric, q, qd, cap, rod, piston, speed):  # type: ignore[no-untyped-def]
+    """Fill all output (n, N) from the states ys (n, size), the last one of `filled` being held.
+
+    Return how many samples have a pressure outside [0, p_s]; none where the joints are electric.
+    """
     n, N = q.shape
     count = 0
     for k in range(n):
-        beyond = False
+        beyond, row = False, ys[min(k, filled - 1)]
         for i in range(N):
+            q[k, i], qd[k, i] = row[i], row[N + i]
+            cap[k, i], rod[k, i] = row[2 * N + i], row[3 * N + i]
+            if locked[i]:
+                q[k, i], qd[k, i] = inputs[k, 2 + N + i], inputs[k, 2 + 2 * N + i]
+            if electric:
+                continue
             a, c, beta = (
                 geometry[i, eq.PIN_A],
                 geometry[i, eq.PIN_C],
