@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -71,13 +71,23 @@ def _terms(runs: Sequence[Run], effects: Sequence[str], like: Path | None) -> Se
     from analysis.simulation.model import terms_like
     from analysis.terms import with_effects
     from analysis.terms.base import Used
-    from analysis.trace.search.shapes import with_shapes
 
     if like is not None:
         return terms_like(like, {run.source: run.rig for run in runs})
     if not effects:
         return None
+    from analysis.trace.search.shapes import with_shapes  # loads scipy.optimize, slowly
+
     return with_shapes(runs, [Used(term) for term in with_effects(runs[0].rig, effects)])
+
+
+def _shapes_in(result: Identification) -> dict[str, Any]:
+    """Return the shapes of the model's effects by name; most models have none."""
+    if not any(used.shape for used in result.model.terms):
+        return {}
+    from analysis.trace.search.shapes import shapes_in  # loads scipy.optimize, slowly
+
+    return dict(shapes_in(result.model.rig, result.model.terms))
 
 
 def identify(
@@ -148,7 +158,6 @@ def identify(
     from analysis.identify.result import to_json
     from analysis.regression.rows import FILTERINGS
     from analysis.simulation.model import save_model
-    from analysis.trace.search.shapes import shapes_in
     from rig.cli.render import identification_text, method_text, shapes_text
     from rig.cli.truth_file import read_truth
     from rig.model.parse import InputError
@@ -174,7 +183,7 @@ def identify(
             rng=np.random.default_rng(seed),
             search=SearchOptions(evaluations=evaluations),
         )
-    shapes = shapes_in(result.model.rig, result.model.terms)
+    shapes = _shapes_in(result)
     document, more = to_json(result), shapes_text(shapes) + method_text(result)
     if shapes:
         document["shapes"] = {n: {"value": v, "unit": s.unit} for n, (v, s) in shapes.items()}

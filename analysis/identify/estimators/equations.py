@@ -157,11 +157,11 @@ def pieces(fit: EquationFit, by: str = "segment") -> Pieces:
         # Rows of one part side by side: a product over each stretch, no row looked at twice.
         order = np.argsort(labels, kind="stable")
         parts, first = np.unique(labels[order], return_index=True)
-        weighted, e, X = weighted[order], e[order], b.X[order]
+        weighted, error, X = weighted[order], e[order], b.X[order]
         ends = [*first[1:].tolist(), len(order)]
         for part, begin, end in zip(parts.tolist(), first.tolist(), ends, strict=True):
             here = weighted[begin:end].T
-            score, information = here @ e[begin:end], here @ X[begin:end]
+            score, information = here @ error[begin:end], here @ X[begin:end]
             key = (strata[b.stratum], b.repeat, part)
             if key in sums:
                 score, information = score + sums[key][0], information + sums[key][1]
