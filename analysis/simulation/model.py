@@ -127,16 +127,18 @@ def model_json(model: Model) -> dict[str, Any]:
     }
 
 
-def save_model(model: Model, path: Path) -> None:
+def save_model(model: Model, path: str | Path) -> None:
     """Write the model file, replacing an old one only when the new one is complete."""
+    path = Path(path)
     text = json.dumps(model_json(model), indent=1, allow_nan=False)
     part = path.with_name(path.name + ".part")
     part.write_text(text + "\n", encoding="utf-8")
     part.replace(path)
 
 
-def load_model(path: Path) -> Model:
+def load_model(path: str | Path) -> Model:
     """Read a model file; raises InputError saying what is wrong with it."""
+    path = Path(path)
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
