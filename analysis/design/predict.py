@@ -97,14 +97,19 @@ def predict(
     steps: Sequence[PlannedStep],
     terms: Sequence[Used] | None = None,
     filtering: Filters = default_filtering,
+    tell: Callable[[float], None] | None = None,
 ) -> Prediction:
     """Predict what identifying these steps on this rig will give.
 
+    `tell` hears after each step which share of them is done.
     Raises InputError for a rig without nominal values and for steps the twin cannot follow.
     """
     used = tuple(terms) if terms is not None else tuple(Used(term) for term in baseline())
-    played = [play(rig, step) for step in steps]
-    found = [information(rig, one, used, filtering, moments=True) for one in played]
+    found = []
+    for number, step in enumerate(steps, start=1):
+        found.append(information(rig, play(rig, step), used, filtering, moments=True))
+        if tell is not None:
+            tell(number / len(steps))
     return combine(rig, used, found)
 
 

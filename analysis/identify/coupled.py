@@ -43,6 +43,7 @@ def coupled(
     bootstrap: int = 0,
     rng: np.random.Generator | None = None,
     nuisances: bool = True,
+    tell: Callable[[float], None] | None = None,
 ) -> Identification:
     """Identify all parameters of the terms `used` from all records of the runs at once.
 
@@ -61,7 +62,7 @@ def coupled(
         job = EstimationJob(rig, runs, used, built, estimator, bootstrap, rng, nuisances)
         return refine(job, solutions)
 
-    built = build_rows(rig, runs, used, filtering)
+    built = build_rows(rig, runs, used, filtering, tell)
     reductions = reduce_rows(rig, used, built)
     sources = [run.source for run in runs]
     result = conclude(

@@ -49,13 +49,21 @@ def build_rows(
     runs: Sequence[Run],
     terms: Sequence[Used],
     filtering: Callable[[Record], Filtering] = default_filtering,
+    tell: Callable[[float], None] | None = None,
 ) -> list[RecordRows]:
-    """Return the filtered, decimated rows of every record; raises InputError for a bad one."""
+    """Return the filtered, decimated rows of every record; raises InputError for a bad one.
+
+    `tell` hears which share of the runs is done.
+    """
     ck.refuse_dead_records(rig, runs)
-    return [
-        RecordRows(one, record_rows(rig, terms, one.signals, one.filtering))
-        for one in condition_runs(rig, runs, filtering)
-    ]
+    out: list[RecordRows] = []
+    for number, run in enumerate(runs):
+        for one in condition_runs(rig, [run], filtering):
+            rows = record_rows(rig, terms, one.signals, one.filtering)
+            out.append(RecordRows(replace(one, run=number), rows))
+        if tell is not None:
+            tell((number + 1) / len(runs))
+    return out
 
 
 def with_columns(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -35,8 +35,6 @@ from analysis.trace.result import (
     CONFOUNDED,
     EXPLAINED,
     UNEXPLAINED,
-    Dependence,
-    Formula,
     Found,
     Trace,
 )
@@ -52,6 +50,8 @@ log = logging.getLogger(__name__)
 
 # The other estimators add small faults of sensors of their own accord: here they are candidates.
 PLAIN = "plain"
+# Shares of a trace's time behind it, as measured on six records: told while it goes on.
+PREPARED, COLUMNS, JUDGED = 0.1, 0.55, 0.8
 ELSEWHERE = (
     "the training records are met to within the noise, the held-out ones are not: train on "
     "records that excite as much as these do"
@@ -67,6 +67,7 @@ def trace(
     look_ahead: bool = True,
     terms: Sequence[Used] | None = None,
     free_forms: bool = True,
+    tell: Callable[[float], None] | None = None,
 ) -> Trace:
     """Say what the baseline lacks on `runs`, name it or refuse to, and judge it on `holdout`.
 
@@ -75,8 +76,9 @@ def trace(
     share no parameter, so that what stays unexplained in one need not hide the other); `look_ahead`
     designs the next experiment; `terms` take the baseline's place: a model's with its effects,
     whose shapes stay as they are; with `free_forms` a mechanism whose curve the data draw may
-    explain what no named effect does. Raises InputError for records of different rigs, without
-    held-out records, with held-out ones that are training records, or too short to tell anything.
+    explain what no named effect does; `tell` hears about which share of the work is done. Raises
+    InputError for records of different rigs, without held-out records, with held-out ones that
+    are training records, or too short to tell anything.
     """
     started = time.perf_counter()
     rig = ck.common_rig([*runs, *holdout])
@@ -91,6 +93,7 @@ def trace(
     holdout_data = regression_data(rig, terms, judged, train_data.beta)
     moving = len({s.equation.rsplit("_", 1)[1] for s in train_data.segments})
     candidates = _unknown(catalogue(rig) if effects is None else effects, known, moving)
+    done = tell or _nobody
     hypotheses = HypothesisSet(train_data, candidates)
     before = stripped(identify(runs, terms=terms, estimator=PLAIN).model)
     notes = _notes(train_data, holdout_data)
@@ -100,7 +103,7 @@ def trace(
         refused: tuple[Found, ...] = ()
         winner, verdict = hypotheses.empty, CLEAN
     else:
-        winner = hypotheses.run()
+        winner = hypotheses.run(lambda share: done(PREPARED + (COLUMNS - PREPARED) * share))
         found, winner, verdict, rest = _named(hypotheses, winner, holdout_data, rng)
         free = _unknown(free_mechanisms(rig), known) if free_forms else []
         drawn = _drawn(hypotheses, free, winner, verdict, holdout_data, rng)
@@ -110,11 +113,13 @@ def trace(
         refused = tuple(f for f in found if not gates.stands(f))
         found = tuple(f for f in found if gates.stands(f))
         notes += _rest_notes(verdict, rest, quiet, bool(found))
+    done(JUDGED)
     split = lines(train_data, winner.fit.residual)
-    moves: tuple[Dependence, ...] = ()
-    formulas: tuple[Formula, ...] = ()
-    if verdict not in (CLEAN, EXPLAINED):
-        moves, formulas = clues_to(train_data, holdout_data, winner, split)
+    moves, formulas = (
+        ((), ())
+        if verdict in (CLEAN, EXPLAINED)
+        else clues_to(train_data, holdout_data, winner, split)
+    )
     further = propose(hypotheses, winner, found, verdict, moves) if look_ahead else None
     after = _extended(runs, terms, winner, before, train_data)
     again = reshaped(runs, holdout, after, train_data, holdout_data, winner)
@@ -140,6 +145,10 @@ def trace(
         seconds=time.perf_counter() - started,
     )  # fmt: skip
     return replace(result, sentence=sentence(result))
+
+
+def _nobody(_: float) -> None:
+    """Hear nothing."""
 
 
 def _refuse_same(runs: Sequence[Run], holdout: Sequence[Run]) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import replace
 from typing import Protocol
 
@@ -56,9 +56,12 @@ class Twin(Protocol):
         """Run the simulation."""
 
 
-def check(plan: Plan, rig: Rig, twin: Twin) -> CheckReport:
+def check(
+    plan: Plan, rig: Rig, twin: Twin, tell: Callable[[float], None] | None = None
+) -> CheckReport:
     """Predict every step on the twin and compare with the rig's limits.
 
+    `tell` hears after each step which share of them is done.
     Raises InputError where the twin cannot follow the commands at all; whether limits are kept
     is in the report.
     """
@@ -69,6 +72,8 @@ def check(plan: Plan, rig: Rig, twin: Twin) -> CheckReport:
         if same not in seen:
             seen[same] = check_step(step, rig, twin)
         steps.append(replace(seen[same], step=step.name))
+        if tell is not None:
+            tell(len(steps) / len(plan.excitations))
     return CheckReport(plan.protocol.name, rig.name, plan.seconds, tuple(steps), _timeline(plan))
 
 

@@ -419,6 +419,11 @@ class Bench:
         """Say where the protocol stands: the fields of `rig.bench.screens.snapshot.Progress`."""
         self._display.progress = replace(self._display.progress, **changes)
 
+    @property
+    def expected(self) -> float:
+        """How long [s] the whole run is expected to take, as the protocol said last; 0: unknown."""
+        return self._display.progress.total_s
+
     def event(self, event: str, tick: int | None = None, **fields: Any) -> None:
         """Note one event in the run's log."""
         if self.recorder is not None and self.recorder.is_open:

@@ -18,7 +18,7 @@ from rig.cli.options import (
     WaveSeedOption,
     overridden,
 )
-from rig.cli.output import write_json
+from rig.cli.output import Countdown, write_json
 
 
 def check(
@@ -45,7 +45,7 @@ def check(
     changes = overridden(repeats, duration, amplitude_scale, wave_seed, step, set_)
     bench = load_bench(rig)
     plan = resolve(library.load(protocol, changes.parameters), bench, changes)
-    proof = proved(plan, bench, predict=True)
+    proof = proved(plan, bench, predict=True, tell=Countdown("checking"))
     write_json(json, {**proof.report.as_dict(), "identification": proof.prediction})
     if json != Path("-"):
         known = "\n\nunchanged since it was proved; the kept proof stands" if proof.reused else ""

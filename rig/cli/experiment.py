@@ -20,7 +20,7 @@ from analysis.simulation.validate import to_json as validation_json
 from analysis.trace.engine import trace
 from analysis.trace.result import to_json as trace_json
 from protocols.files.plan import Overrides
-from rig.cli.output import progress, write_json
+from rig.cli.output import Countdown, progress, write_json
 from rig.cli.protocol_run import ProtocolJob, run_protocol
 from rig.cli.render import identification_text, parameter_table, validation_text
 from rig.cli.reports import provenance
@@ -94,7 +94,7 @@ def tell(out: Path, seed: int, repeats: int | None) -> None:
     write_json(folder / "validate.json", validation_json(done.validation))
     progress("tracing what the model lacks, judged on runs that the fit has not seen")
     held_out = (*done.unseen, *done.judged)
-    traced = trace(done.runs, held_out, seed=seed)
+    traced = trace(done.runs, held_out, seed=seed, tell=Countdown("tracing"))
     write_json(folder / "trace.json", trace_json(traced))
     save_model(traced.model_after, folder / "model.json")
     command = f"bramah demo --out {shlex.quote(str(out))} --seed {seed}"

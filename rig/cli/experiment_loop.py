@@ -23,6 +23,7 @@ from protocols.design.check import check
 from protocols.engine.errors import ProtocolAborted
 from protocols.files import library
 from protocols.files.plan import Overrides, resolve
+from rig.cli.output import Countdown
 from rig.cli.protocol_run import ProtocolJob, run_protocol
 from rig.model.parse import InputError
 from rig.model.records import Run
@@ -112,7 +113,10 @@ class Loop:
 
     def _trace(self, number: int, experiment: Mapping[str, Any] | None) -> None:
         self.say(f"round {number}: tracing {sum(len(r.records) for r in self.train)} records")
-        result = trace(self.train, self.judge, seed=self.wanted.seed)
+        result = trace(
+            self.train, self.judge, seed=self.wanted.seed,
+            tell=Countdown(f"round {number}: tracing", self.say),
+        )  # fmt: skip
         worth = None
         if experiment is not None:
             worth = achieved(self.rig, self.train[:-1], self.train[-1], experiment)

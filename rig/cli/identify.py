@@ -12,7 +12,7 @@ from rig.cli.options import (
     JsonOption,
     RunsArgument,
 )
-from rig.cli.output import write_json
+from rig.cli.output import Countdown, write_json
 
 if TYPE_CHECKING:
     from analysis.identify.result import Identification
@@ -25,7 +25,11 @@ def _load(folders: Sequence[Path]) -> list[Run]:
     from rig.runs.store import load_run, refuse_repeated
 
     refuse_repeated(folders)
-    return [load_run(folder) for folder in folders]
+    tell, loaded = Countdown("loading"), []
+    for folder in folders:
+        loaded.append(load_run(folder))
+        tell(len(loaded) / len(folders))
+    return loaded
 
 
 def _refuse_unstreamed(option: str, method: str, estimator: str | None, bootstrap: int) -> None:
@@ -182,6 +186,7 @@ def identify(
             bootstrap=bootstrap,
             rng=np.random.default_rng(seed),
             search=SearchOptions(evaluations=evaluations),
+            tell=Countdown("identifying"),
         )
     shapes = _shapes_in(result)
     document, more = to_json(result), shapes_text(shapes) + method_text(result)

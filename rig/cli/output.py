@@ -5,14 +5,49 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
+
+EVERY: Final = 3.0  # [s] between two lines of a countdown, and before its first
 
 
 def progress(message: str) -> None:
     """Tell the person how the work goes, on standard error."""
     print(message, file=sys.stderr, flush=True)
+
+
+def clock_text(seconds: float) -> str:
+    """Return a time as 0:07, 12:30 or 3:05:00."""
+    minutes, rest = divmod(round(max(0.0, seconds)), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+class Countdown:
+    """Tells how far a work is and how long it will still take; called with the share done, 0 to 1.
+
+    Nothing is said within the first seconds: short work stays quiet.
+    """
+
+    def __init__(
+        self,
+        what: str,
+        say: Callable[[str], None] = progress,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._what, self._say, self._clock = what, say, clock
+        self._began = self._said = clock()
+
+    def __call__(self, share: float) -> None:
+        """Take the share that is done by now."""
+        now = self._clock()
+        if now - self._said < EVERY or not 0.0 < share < 1.0:
+            return
+        self._said = now
+        left = (now - self._began) * (1.0 - share) / share
+        self._say(f"{self._what}: {100 * share:.0f} %, about {clock_text(left)} left")
 
 
 def _plain(value: Any) -> Any:

@@ -26,6 +26,8 @@ from rig.model.parse import InputError
 from rig.model.rig import Rig
 from rig.runs.rigs import load_bench
 
+CHECKED = 0.4  # of the time of a check with its prediction, spent on the limits
+
 
 @dataclass(frozen=True)
 class Foresight:
@@ -45,22 +47,26 @@ class ForeseenText:
     text: str
 
 
-def foreseen(plan: Plan, rig: Rig) -> ForeseenText:
+def foreseen(plan: Plan, rig: Rig, tell: Callable[[float], None] | None = None) -> ForeseenText:
     """Check and predict a plan; InputError where the twin cannot follow it."""
-    forecast = of_plan(plan, rig)
+    forecast = of_plan(plan, rig, tell)
     return ForeseenText(
         forecast.limits, as_dict(forecast)["identification"], prediction_text(forecast)
     )
 
 
-def of_plan(plan: Plan, rig: Rig) -> Foresight:
+def of_plan(plan: Plan, rig: Rig, tell: Callable[[float], None] | None = None) -> Foresight:
     """Check and predict a plan; what cannot be predicted is said, the limits stand without it."""
-    limits = check(plan, rig, simulate_commands)
+
+    def part(begin: float, end: float) -> Callable[[float], None] | None:
+        return None if tell is None else lambda share: tell(begin + (end - begin) * share)
+
+    limits = check(plan, rig, simulate_commands, part(0.0, CHECKED))
     biases = {step.step: step.biases for step in limits.steps}
     if not plan.steps:
         return Foresight(limits, None, "it takes no records of excited joints")
     try:
-        return Foresight(limits, predict(rig, planned_steps(plan, biases)))
+        return Foresight(limits, predict(rig, planned_steps(plan, biases), tell=part(CHECKED, 1.0)))
     except InputError as error:
         return Foresight(limits, None, str(error))
 

@@ -11,7 +11,7 @@ import hashlib
 import json
 import logging
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
@@ -28,6 +28,7 @@ from rig.model.rig import Rig
 
 log = logging.getLogger(__name__)
 
+Tell = Callable[[float], None]
 NAME = "proof.json"
 CACHE_VARIABLE = "BRAMAH_CACHE"
 KEPT = 200  # proofs in the cache; the oldest go
@@ -65,11 +66,11 @@ class PlanProof:
         write_json(folder / NAME, self.as_dict())
 
 
-def proved(plan: Plan, rig: Rig, *, predict: bool = False) -> PlanProof:
+def proved(plan: Plan, rig: Rig, *, predict: bool = False, tell: Tell | None = None) -> PlanProof:
     """Return the proof of a plan, from the cache where nothing changed.
 
-    With `predict` also the standard errors to expect. Raises InputError where the twin cannot
-    follow; whether limits are kept is in the report.
+    With `predict` also the standard errors to expect; `tell` hears the share that is done. Raises
+    InputError where the twin cannot follow; whether limits are kept is in the report.
     """
     key = proof_key(plan, rig)
     kept = _from_cache(key)
@@ -79,7 +80,7 @@ def proved(plan: Plan, rig: Rig, *, predict: bool = False) -> PlanProof:
     from protocols.design.check_report import remedy_text
 
     try:
-        report, prediction, text = _checked(plan, rig, predict=predict)
+        report, prediction, text = _checked(plan, rig, predict, tell)
     except NotCentred as refused:
         scale = _passing_scale(refused.step, rig)
         raise InputError(f"{refused}; {remedy_text(scale)}") from refused
@@ -95,17 +96,17 @@ def proved(plan: Plan, rig: Rig, *, predict: bool = False) -> PlanProof:
 
 
 def _checked(
-    plan: Plan, rig: Rig, *, predict: bool
+    plan: Plan, rig: Rig, predict: bool, tell: Tell | None
 ) -> tuple[CheckReport, Mapping[str, Any] | None, str]:
     if predict:
         from rig.cli.predicted_errors import foreseen
 
-        made = foreseen(plan, rig)
+        made = foreseen(plan, rig, tell)
         return made.limits, made.plain, made.text
     from analysis.simulation.twin import simulate_commands
     from protocols.design.check import check
 
-    return check(plan, rig, simulate_commands), None, ""
+    return check(plan, rig, simulate_commands, tell), None, ""
 
 
 def _passing_scale(step: StepPlan, rig: Rig) -> float | None:

@@ -20,6 +20,7 @@ from rig.bench.screens.past import PlanLine
 from rig.bench.screens.sockets import AttachError, Publisher
 from rig.bench.session import Bench
 from rig.cli.attended import TrackedEstimates, terminal_lines
+from rig.cli.output import Countdown, clock_text
 from rig.cli.proofs import proved
 from rig.cli.provenance import provenance_of
 from rig.cli.sheets import plan_text
@@ -64,7 +65,9 @@ class _Story:
     def phase(self, step: str, phase: str, repeat: int, repeats: int, message: str) -> None:
         recorder = self._bench.recorder
         at = 0.0 if recorder is None else recorder.elapsed
-        self._say(f"{at:8.1f} s  {step:10s} {phase:8s}  {message}")
+        left = self._bench.expected - at
+        more = f"  ({clock_text(left)} left)" if left > 0.0 else ""
+        self._say(f"{at:8.1f} s  {step:10s} {phase:8s}  {message}{more}")
         self._message = message
         self._bench.event("phase", self._bench.tick, step=step, phase=phase, message=message)
         self._bench.status(
@@ -114,7 +117,7 @@ def run_protocol(job: ProtocolJob, say: Say) -> Path:
     say(plan_text(plan))
     require_space(plan, rig, job.out)
     say(f"checking {plan.protocol.name} on the twin of {rig.name}")
-    proof = proved(plan, rig)
+    proof = proved(plan, rig, tell=Countdown("checking", say))
     proof.report.require()
     for note in proof.report.notes:
         say(f"note: {note}")

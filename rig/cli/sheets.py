@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from protocols.design.check_report import CheckReport, Moment, MotionPrediction
 from protocols.design.proof import Proof, Verdicts
 from protocols.files.plan import Plan
-from rig.cli.output import table
+from rig.cli.output import clock_text, table
 from rig.model.units import LIMITS, display_unit
 
 _BAR = 40  # characters of the timeline
@@ -51,8 +51,8 @@ def plan_text(plan: Plan) -> str:
     for number, part in enumerate(plan.sequence, start=1):
         lines.append(f"  {number:3d}. {part.name}: {part.title} (about {part.seconds:.0f} s)")
         lines += [f"         {inner.name}: {inner.title}" for inner in part.nested]
-    longest = "" if plan.longest <= plan.seconds else f", at most {_clock(plan.longest)}"
-    lines.append(f"  {len(plan.records)} records, about {_clock(plan.seconds)}{longest}")
+    longest = "" if plan.longest <= plan.seconds else f", at most {clock_text(plan.longest)}"
+    lines.append(f"  {len(plan.records)} records, about {clock_text(plan.seconds)}{longest}")
     return "\n".join(lines)
 
 
@@ -65,10 +65,8 @@ def timeline_text(moments: Sequence[Moment]) -> str:
         last = max(first + 1, round(_BAR * (moment.begins + moment.seconds) / end))
         bar = " " * first + "#" * (last - first)
         most = f" (at most {moment.longest:.0f} s)" if moment.longest > moment.seconds else ""
-        text = f"{moment.name}: {moment.title}"
-        rows.append(
-            f"{_clock(moment.begins):>8}  {moment.seconds:6.0f} s  |{bar:<{_BAR}}|  {text}{most}"
-        )
+        begins, text = clock_text(moment.begins), f"{moment.name}: {moment.title}"
+        rows.append(f"{begins:>8}  {moment.seconds:6.0f} s  |{bar:<{_BAR}}|  {text}{most}")
     return "\n".join(["  begins      time", *rows])
 
 
@@ -114,12 +112,6 @@ def _picture(line: MotionPrediction) -> str:
 
 def _place(line: MotionPrediction) -> str:
     return "bench" if line.joint is None else f"joint {line.joint}"
-
-
-def _clock(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
 def proof_text(proof: Proof) -> str:

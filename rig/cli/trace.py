@@ -8,7 +8,7 @@ from typing import Annotated, Final
 import typer
 
 from rig.cli.options import JsonOption
-from rig.cli.output import progress, write_json
+from rig.cli.output import Countdown, progress, write_json
 
 FAMILIES_OF: Final = {
     "all": ("mechanical", "fluid"), "torque": ("mechanical",), "flow": ("fluid",),
@@ -60,7 +60,8 @@ def trace(
     progress(f"tracing {sum(len(r.records) for r in loaded)} records")
     rigs = {run.source: run.rig for run in (*loaded, *judged)}
     known = None if like is None else terms_like(like, rigs)
-    result = trace_runs(loaded, judged, seed=seed, families=FAMILIES_OF[equations], terms=known)
+    result = trace_runs(loaded, judged, seed=seed, families=FAMILIES_OF[equations], terms=known,
+                        tell=Countdown("tracing"))  # fmt: skip
     write_json(json, to_json(result))
     if model is not None:
         save_model(result.model_after, model)

@@ -328,3 +328,12 @@ def test_records_shorter_than_the_filter_are_refused(multisine_run: Run) -> None
     short = replace(record, channels={k: v[:50] for k, v in record.channels.items()})
     with pytest.raises(InputError, match="too short"):
         identify([replace(multisine_run, records=(short,))])
+
+
+def test_an_identification_tells_which_share_of_the_runs_is_done(
+    multisine_run: Run, sine_run: Run
+) -> None:
+    shares: list[float] = []
+    together = identify([multisine_run, sine_run], tell=shares.append)
+    assert shares == [0.5, 1.0]
+    assert together.rows == identify([multisine_run, sine_run]).rows

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
+
+from tests.conftest import CACHE_VARIABLE
 
 HEAVY = (
     "numpy",
@@ -48,8 +51,14 @@ def test_help_loads_no_library_but_the_command_lines(arguments: tuple[str, ...])
     assert verbs == set()
 
 
-def test_a_protocol_is_proved_without_the_slow_libraries() -> None:
-    modules = loaded("check", "lock-and-excite", "--rig", "shinshu-2dof", "--step", "step1")
+def test_a_protocol_is_proved_without_the_slow_libraries(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))  # no proof is kept there yet
+    checked = ("check", "lock-and-excite", "--rig", "shinshu-2dof", "--step", "step1")
+    modules = loaded(*checked)
     assert "analysis.simulation.simulate" in modules  # it did its work
     assert modules.isdisjoint(SLOW)
     assert "rig.bench.session" not in modules
+    again = loaded(*checked)
+    assert again.isdisjoint({*SLOW, "numba", "scipy", "analysis.simulation"})

@@ -10,7 +10,7 @@ adds 1 per row to a residual's energy, whatever the unit and the number of repea
 from __future__ import annotations
 
 import logging
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
@@ -207,11 +207,20 @@ def evidence(data: RegressionData, residual: Array) -> Evidence:
     return Evidence(signals, left)
 
 
-def variant_columns(data: RegressionData, chosen: Sequence[Variant]) -> list[VariantColumns]:
-    """Return the columns of every variant that shows on the board, in the variants' order."""
+def variant_columns(
+    data: RegressionData, chosen: Sequence[Variant], tell: Callable[[float], None] | None = None
+) -> list[VariantColumns]:
+    """Return the columns of every variant that shows on the board, in the variants' order.
+
+    `tell` hears after each which share of them is done.
+    """
     seen = [prepared(data.rig, data.terms, conditioned) for conditioned in data.records]
     with ThreadPoolExecutor(WORKERS) as pool:
-        found = pool.map(lambda v: _entry(data, v, seen), chosen)
+        found = []
+        for entry in pool.map(lambda v: _entry(data, v, seen), chosen):
+            found.append(entry)
+            if tell is not None:
+                tell(len(found) / len(chosen))
     return [entry for entry in found if entry is not None]
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 import logging
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -136,9 +136,12 @@ class HypothesisSet:
         near = [o for o in allowed if o is least or self.better(o, least)]
         return min(near, key=lambda o: (o.size[1], o.size[0], o.total))
 
-    def run(self) -> Hypothesis:
-        """Search: singles and pairs from the first board, then extensions; returns the winner."""
-        self.found = variant_columns(self.stage, self._variants(self.stage, self.stage.mean))
+    def run(self, tell: Callable[[float], None] | None = None) -> Hypothesis:
+        """Search: singles and pairs from the first board, then extensions; returns the winner.
+
+        `tell` hears which share of the first board's columns is there.
+        """
+        self.found = variant_columns(self.stage, self._variants(self.stage, self.stage.mean), tell)
         field = self.field = self._field(self.stage, self.found)
         r = self.stage.mean
         r = r - field.basis @ (field.basis.T @ r)

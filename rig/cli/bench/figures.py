@@ -23,7 +23,7 @@ from rig.cli.bench.screen_figures import screen_figures
 from rig.cli.bench.stream_figures import stream_figures
 from rig.cli.bench.wire_figures import wire_figures
 from rig.cli.experiment import RIG, Experiment, experiment
-from rig.cli.output import table
+from rig.cli.output import clock_text, table
 from rig.cli.simulated_bench import simulated_bench
 from rig.model import channels as ch
 from rig.model.parse import InputError
@@ -31,6 +31,8 @@ from rig.runs.rigs import load_rig
 from rig.runs.store import load_run
 
 JUDGING_SEED = 100  # seeds below were used to tune; these and above judge
+# About how long a group takes on two cores [s]; of the demo, a seed. Others say it themselves.
+SECONDS: Final = {"plant": 20.0, "analysis": 60.0, "stream": 60.0, "demo": 30.0}
 LONG: Final = ("wires", "faults", "screen")  # measured only when asked for
 Say = Callable[[str], None]
 
@@ -154,8 +156,16 @@ def measure(minutes: float, seeds: int, only: str | None, say: Say) -> list[Figu
     if only is not None and only not in groups:
         raise InputError(f"--only {only}: expected one of: {' '.join(groups)}")
     with tempfile.TemporaryDirectory(prefix="bramah-bench-") as folder:
-        chosen = [groups[only]] if only else [groups[name] for name in groups if name not in LONG]
-        return [figure for group in chosen for figure in group(Path(folder), say)]
+        chosen = [only] if only else [name for name in groups if name not in LONG]
+        expected = {"acquisition": 60.0 * minutes, "demo": SECONDS["demo"] * seeds}
+        seconds = {name: expected.get(name, SECONDS.get(name, 0.0)) for name in chosen}
+        figures: list[Figure] = []
+        for number, name in enumerate(chosen):
+            left = sum(seconds[later] for later in chosen[number:])
+            about = f", about {clock_text(left)} left" if left else ""
+            say(f"{name}: group {number + 1} of {len(chosen)}{about}")
+            figures += groups[name](Path(folder), say)
+        return figures
 
 
 def as_json(figures: Sequence[Figure]) -> list[dict[str, Any]]:

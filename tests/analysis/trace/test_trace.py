@@ -34,8 +34,21 @@ def quiet(rig: Rig) -> tuple[Run, Run]:
 
 
 @pytest.fixture(scope="module")
-def leaking(rig: Rig) -> Trace:
-    return traced(rig, c_internal=2e-12)
+def shares() -> list[float]:
+    """What the trace of the leaking bench told of its progress."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def leaking(rig: Rig, shares: list[float]) -> Trace:
+    train, held_out = pair_of_runs(rig, c_internal=2e-12)
+    return trace([train], [held_out], look_ahead=False, tell=shares.append)
+
+
+def test_a_trace_tells_how_far_it_is(leaking: Trace, shares: list[float]) -> None:
+    assert len(shares) > 20
+    assert shares == sorted(shares)
+    assert 0.0 < shares[0] < shares[-1] < 1.0
 
 
 def test_a_bench_with_nothing_wrong_is_clean_and_nothing_is_named(quiet: tuple[Run, Run]) -> None:
