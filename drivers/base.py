@@ -158,7 +158,7 @@ class Driver(Protocol):
         """Return the next block, waiting for it; also feeds the device's watchdog."""
 
     def stop(self) -> None:
-        """Stop streaming."""
+        """Stop streaming; a host-timed driver, which follows no law then, zeroes the outputs."""
 
     def trip_cause(self) -> str | None:
         """Say why the device has zeroed its outputs and keeps them so, or None if it has not."""

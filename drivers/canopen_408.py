@@ -12,7 +12,7 @@ import io
 import logging
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, ClassVar, Final
@@ -69,9 +69,9 @@ class ValveBusSettings(WireSettings):
 class CanOpenValves:
     """`drivers.polled.InputsOutputs` over the nodes of a bus."""
 
-    def __init__(self, wire: Wire, rig: Rig) -> None:
+    def __init__(self, wire: Wire, rig: Rig, clock: Callable[[], float]) -> None:
         at = ValveBusSettings.of(wire)
-        self._wire, self._rig, self._at = wire, rig, at
+        self._wire, self._rig, self._at, self._clock = wire, rig, at, clock
         self._numbers = at.nodes or tuple(range(1, len(rig.joints) + 1))
         if len(set(self._numbers)) != len(rig.joints) or at.host in self._numbers:
             raise InputError(
@@ -282,7 +282,7 @@ class CanOpenValves:
 
     def _heartbeat(self, *, force: bool = False) -> None:
         # From whoever serves the outputs, so that a host that stands still is silent.
-        now = time.monotonic()
+        now = self._clock()
         if force or now - self._beat > self._wire.watchdog / _HEARTBEATS:
             state = bytes([cia408.OPERATIONAL])
             self._port.send(CanFrame(cia408.HEARTBEAT_ID + self._at.host, state))
@@ -314,13 +314,23 @@ class CanOpenValves:
 
 
 class CanOpen408Driver(PolledDriver):
-    """`drivers.base.Driver` of valves of CiA 408; a valve's own fault is a latched trip."""
+    """`drivers.base.Driver` of valves of CiA 408; a valve's own fault is a latched trip.
+
+    `clock` [s] and `sleep` [s] pace samples and heartbeat; they may be replaced in tests.
+    """
 
     settings: ClassVar[type[WireSettings]] = ValveBusSettings
 
-    def __init__(self, wire: Wire, rig: Rig) -> None:
-        self._valves = CanOpenValves(wire, rig)
-        super().__init__(wire, rig, self._valves)
+    def __init__(
+        self,
+        wire: Wire,
+        rig: Rig,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._valves = CanOpenValves(wire, rig, clock)
+        super().__init__(wire, rig, self._valves, clock=clock, sleep=sleep)
 
     def connect(self) -> DeviceInfo:
         """Open the bus, zero the outputs; a fault in a valve stays until `reset`."""
@@ -335,11 +345,15 @@ class CanOpen408Driver(PolledDriver):
 
     def trip_cause(self) -> str | None:
         """Say why outputs were zeroed without the host's word, or None if they were not."""
+        cause = super().trip_cause()
         self._note()
-        return super().trip_cause()
+        return self._cause or cause
 
     def reset(self) -> None:
         """Clear a latched trip, in the valves as well; only on a person's word."""
+        self._safely(self._valves.read)  # for the valves' states, which may be old
+        if self.trip_cause() is None:
+            return
         self._zero_laws()
         self._safely(self._valves.reset)
         super().reset()

@@ -137,10 +137,12 @@ class PolledDriver:
         self._origin: float | None = None
         self._open = self._streaming = False
         self._sequence = 0
+        self._block_end: int | None = None  # tick after the last block of the stream
         self._last = -1  # newest tick that is served or in a row
         self._volts = np.zeros(len(rig.joints))
         self._written = 0.0
         self._cause: str | None = None
+        self._gone: str | None = None  # why the device was lost, until it is opened again
         self._timing = Timing()
 
     @property
@@ -155,7 +157,7 @@ class PolledDriver:
         self._zero_laws()
         self._streaming = False
         identity = self._safely(self._device.open)
-        self._open = True
+        self._open, self._gone = True, None
         try:
             self._put(self._volts)
             self._prove_speed()
@@ -214,7 +216,7 @@ class PolledDriver:
         self._streaming = False
         self._drop()
         self._safely(self._device.open)
-        self._open = True
+        self._open, self._gone = True, None
         try:
             self._put(self._volts)
         except DeviceError:
@@ -223,16 +225,22 @@ class PolledDriver:
 
     def trip_cause(self) -> str | None:
         """Say why the driver has zeroed the outputs by itself, or None if it has not."""
+        self._require_open()
+        if self._streaming:
+            self._heed_silence()
         return self._cause
 
     def reset(self) -> None:
         """Clear a latched trip; only on a person's word."""
-        self._cause = None
+        if self._cause is not None:
+            self._cause = None
+            self._written = self._clock()  # the silence that made the trip is over
 
     # -- outputs ----------------------------------------------------------------------------
 
     def upload(self, joint: int, wave: Array) -> None:
         """Store one period of joint `joint`'s (0-based) waveform [V]; it acts from `apply` on."""
+        self._require_open()
         if not 0 <= joint < len(self._ranges):
             raise DeviceError(f"no joint {joint + 1} on a rig of {len(self._ranges)}")
         volts = np.array(wave, dtype=np.float64).ravel()
@@ -249,6 +257,9 @@ class PolledDriver:
 
     def apply(self, laws: Sequence[OutputLaw], *, restart: bool = False) -> int:
         """Set all laws at one tick; `restart` starts the waveforms there. Returns that tick."""
+        self._require_open()
+        if self._streaming:
+            self._heed_silence()
         if len(laws) != len(self._ranges):
             raise DeviceError(f"{len(laws)} laws for a rig of {len(self._ranges)} joints")
         for joint, (law, most) in enumerate(zip(laws, self._ranges, strict=True), start=1):
@@ -268,11 +279,10 @@ class PolledDriver:
 
     def start(self) -> None:
         """Start serving ticks, blocks numbered and waveforms played from their beginning."""
-        if not self._open or self._origin is None:
-            raise DeviceLost(f"the device of wire {self._wire.kind} is closed; connect first")
+        self._require_open()
         self._rows.clear()
         self._resampler.restart()
-        self._sequence = 0
+        self._sequence, self._block_end = 0, None
         self._written = self._clock()
         self._last = max(self._last, math.floor(self._periods(self._written) + _EARLY))
         self._laws.restart(self._last + 1)
@@ -282,11 +292,11 @@ class PolledDriver:
 
     def stop(self) -> None:
         """Stop serving ticks; nothing follows a law then, so the outputs go to zero."""
+        self._require_open()
         self._streaming = False
         self._rows.clear()
         self._zero_laws()
-        if self._open:
-            self._put(self._volts)
+        self._put(self._volts)
 
     def read_block(self) -> SampleBlock:
         """Serve ticks until a block is full or a gap ends it, and return it.
@@ -294,6 +304,8 @@ class PolledDriver:
         Raises DeviceLost or DeviceError with the outputs zeroed if the device still obeys.
         """
         if not self._streaming:
+            if self._gone is not None:
+                raise DeviceLost(self._gone)
             raise DeviceError(f"the device of wire {self._wire.kind} is not started; start it")
         patience = self._wire.timeout + self._block_samples / self._rig.sample_rate
         deadline = self._clock() + self._silence_allowed + patience
@@ -346,9 +358,13 @@ class PolledDriver:
         if count == 0 or (full and count < self._block_samples and count == len(rows)):
             return None
         taken = [rows.popleft() for _ in range(count)]
+        first = taken[0][0].tick
+        if self._block_end is not None and first > self._block_end:
+            self._sequence += 1  # what is missing counts as one block
+        self._block_end = first + count
         block = SampleBlock(
             sequence=self._sequence,
-            tick=taken[0][0].tick,
+            tick=first,
             data=np.array([np.concatenate((row.values, volts)) for row, volts, _ in taken]),
             saturated=np.array([row.saturated for row, _, _ in taken]),
             backlog=0,
@@ -438,6 +454,12 @@ class PolledDriver:
             with suppress(DeviceError):
                 self._put(self._volts)
 
+    def _require_open(self) -> None:
+        if not self._open or self._origin is None:
+            raise DeviceLost(
+                self._gone or f"the device of wire {self._wire.kind} is closed; connect first"
+            )
+
     def _drop(self) -> None:
         self._open = False
         try:
@@ -449,10 +471,14 @@ class PolledDriver:
         """Call the device; raises only DeviceLost and DeviceError."""
         try:
             return call()
+        except DeviceLost as error:
+            self._gone = str(error)
+            raise
         except DeviceError:
             raise
         except OSError as error:
-            raise DeviceLost(f"the device of wire {self._wire.kind} is gone: {error}") from error
+            self._gone = f"the device of wire {self._wire.kind} is gone: {error}"
+            raise DeviceLost(self._gone) from error
         except Exception as error:
             raise DeviceError(
                 f"the device of wire {self._wire.kind} failed: {type(error).__name__}: {error}"

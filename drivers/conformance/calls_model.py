@@ -103,9 +103,12 @@ class Model:
         self.trial.zero_at_device("after zero_outputs")
 
     def stop(self) -> None:
-        """Stop the stream."""
+        """Stop the stream; where the host evaluates the laws they end with it."""
         self.driver.stop()
         self.streaming = False
+        if self.trial.claims.host_timed:
+            self.trial.zero_at_device("after stop")
+            self.segments = [(self._end(), self.trial.playing(self.trial.off()))]
 
     def reset(self) -> None:
         """Clear a trip, if there is one."""

@@ -25,9 +25,10 @@ class Capabilities:
     """What driver and device claim; a check that needs what is not claimed is skipped, and said.
 
     `outputs`: laws drive outputs (False: the device only plays samples). `host_timed`: the driver
-    evaluates the laws at the host's rate; its blocks may lag. `virtual_time`: the device's clock
-    stands still while nobody reads. `latches_trips`: after a loss of the host the device keeps its
-    outputs at zero until `reset`. `refuses_other_rigs`: the device can tell which rig it is.
+    evaluates the laws at the host's rate; its blocks may lag, and `stop` ends the laws.
+    `virtual_time`: the device's clock stands still while nobody reads. `latches_trips`: after a
+    loss of the host the device keeps its outputs at zero until `reset`. `refuses_other_rigs`: the
+    device can tell which rig it is.
     """
 
     outputs: bool = True

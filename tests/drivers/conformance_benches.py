@@ -80,11 +80,12 @@ FAULTS: Final[Mapping[str, Mapping[str, WireFault]]] = {
     RTU: {**EVERYWHERE, "flip": FLIP},
     SERIAL: {**EVERYWHERE, "flip": FLIP},
 }
-# The quickest that between them reach every branch; `make study NAME=conformance` takes all.
+# What `make test` tries: on TCP the quickest that between them reach every branch, elsewhere what
+# that wire alone can suffer. `make study NAME=conformance` takes all.
 FEW: Final[Mapping[str, Sequence[str]]] = {
-    TCP: ("lose one", "late answer", "close", "short", "fewer", "miscounted", "silent"),
-    RTU: ("lose one", "late answer", "flip", "split", "twice", "silent"),
-    SERIAL: ("lose one", "late answer", "flip", "merged", "twice", "close", "silent"),
+    TCP: ("lose one", "late answer", "close", "short", "fewer", "miscounted"),
+    RTU: ("late answer", "twice"),
+    SERIAL: ("flip", "merged"),
 }
 
 
@@ -152,7 +153,7 @@ def _bench(wire: str, names: Sequence[str]) -> Iterator[Bench]:
             silence=held.silence,
             spoil=spoil,
             faults=tuple(names),
-            lost=tuple(name for name in LOST if name in names),
+            lost=tuple(name for name in LOST if name in names) or LOST[:1],
             saturate=held.saturate,
         )
 

@@ -247,7 +247,7 @@ def test_after_a_timeout_the_late_answer_reaches_nobody(port: int) -> None:
     delay_next_answer(port, 1200)
     with pytest.raises(DeviceLost, match=r"does not answer \(0.3 s\)"):
         driver.read_block()
-    with pytest.raises(DeviceError, match="not started"):
+    with pytest.raises(DeviceLost, match="is closed"):
         driver.read_block()
     driver.zero_outputs()
     assert put_out(port) == [0.0, 0.0]

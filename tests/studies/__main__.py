@@ -9,6 +9,7 @@ import sys
 import typer
 
 from rig.cli.errors import guarded
+from tests.studies.conformance import command as conformance
 from tests.studies.effects import command as effects
 from tests.studies.estimators import command as estimators
 from tests.studies.estimators import design_command as design
@@ -42,6 +43,7 @@ STUDIES = (
     electric,
     measured_figures,
     faults,
+    conformance,
     fuzz,
     nights,
 )

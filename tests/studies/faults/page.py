@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import logging
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from drivers.base import DeviceLost
@@ -19,6 +17,7 @@ from rig.cli.bench.fault_trials import Outcome, kinds, try_fault, wires
 from rig.cli.bench.figures import text
 from rig.model.trips import SafetyTrip
 from rig.runs.rigs import load_rig
+from tests.studies.quiet import quiet
 
 HEADER = ("fault", "wire", "what notices", "after", "what the operator reads", "what is kept")
 _PLACE = re.compile(r"(/tmp/\S*?/line|127\.0\.0\.1:\d+)")
@@ -115,14 +114,3 @@ def _kept(outcome: Outcome) -> str:
     whole = outcome.blocks - outcome.lost_blocks
     kept = f"all {whole} blocks" if not outcome.lost_blocks else f"{whole} of {outcome.blocks}"
     return f"{kept}, {outcome.missing} samples marked missing" if outcome.missing else kept
-
-
-@contextmanager
-def quiet() -> Iterator[None]:
-    """Keep provoked warnings off the terminal."""
-    root = logging.getLogger()
-    before, root.handlers = root.handlers, [logging.NullHandler()]
-    try:
-        yield
-    finally:
-        root.handlers = before

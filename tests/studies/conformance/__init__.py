@@ -1,0 +1,1 @@
+"""Conformance of every shipped driver with every fault of its wire at full effort."""
