@@ -29,6 +29,7 @@ from rig.runs.files import read_text
 from rig.runs.rigs import load_bench
 
 USUAL_SHARE: Final = 0.01  # of the frames that a fault given by its name strikes
+VALVES_RATE: Final = 1000.0  # [Hz] of the plant behind valves that the host samples when it likes
 
 
 @dataclass(frozen=True)
@@ -93,6 +94,9 @@ def serve_bench(what: Served) -> None:
     if what.wire not in WIRES:
         raise InputError(f"--wire {what.wire}: expected one of: {' '.join(WIRES)}")
     rig = load_bench(what.rig)
+    if what.wire == VALVES:
+        # The rig's rate is the host's; a sensor is converted when SYNC comes, not at its ticks.
+        rig = rig.model_copy(update={"sample_rate": max(VALVES_RATE, rig.sample_rate)})
     scenario = hidden(what, rig)
     faults = (*scenario.wire_faults, *wire_faults(what.wire_faults))
     plant = FaultyPlant(rig, scenario, what.seed)
