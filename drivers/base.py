@@ -104,7 +104,8 @@ class WireSettings(Part):
             key = ".".join(str(part) for part in first["loc"])
             known = " ".join(cls.model_fields)
             if first["type"] == "extra_forbidden":
-                text = f"unknown key of wire {wire.kind}; expected: kind timeout watchdog {known}"
+                usual = "kind timeout watchdog jitter"
+                text = f"unknown key of wire {wire.kind}; expected: {usual} {known}"
             elif first["type"] == "missing":
                 text = f"wire {wire.kind} needs it"
             else:

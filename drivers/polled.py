@@ -6,8 +6,8 @@ since its outputs were last written.
 
 The law of tick k is that of `drivers.base`, with the position s read in that tick. A host that is
 late serves the newest tick that is due, so that waveforms keep their phase; the ticks it left out
-are interpolated or missing (`drivers.resample`). The command of a row is the voltage put out in its
-tick or, where the tick was left out, the one still held then.
+are interpolated or missing (`rig.model.wire.resample`). The command of a row is the voltage put out
+in its tick or, where the tick was left out, the one still held then.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ from drivers.base import (
     SampleBlock,
     WireSettings,
 )
-from drivers.resample import LONGEST, Resampler, Row
 from rig.model import channels as ch
 from rig.model.parse import InputError
 from rig.model.parts import Wire
 from rig.model.rig import Rig
+from rig.model.wire.resample import LONGEST, Resampler, Row
 
 logger = logging.getLogger(__name__)
 Result = TypeVar("Result")

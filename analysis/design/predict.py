@@ -15,11 +15,12 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.design.lateness import BULK, LatenessCost, lateness_cost
 from analysis.design.sensor_noise import score_covariance
 from analysis.design.settings import DESIGN
 from analysis.design.twin_records import PlannedStep, Played, ideal, play
@@ -75,7 +76,8 @@ class Expected:
 class Prediction:
     """What an experiment is expected to tell: by parameter, and by family its conditioning.
 
-    `covariance` is of the rows' coefficients (1/b), relative to their nominal values.
+    `covariance` is of the rows' coefficients (1/b), relative to their nominal values. `lateness`
+    is what a host-timed device's samples cost b; its interval includes that.
     """
 
     parameters: Mapping[str, Expected]
@@ -84,6 +86,7 @@ class Prediction:
     covariance: Mapping[str, Array]
     names: Mapping[str, tuple[str, ...]]
     masked_share: float
+    lateness: LatenessCost | None = None
 
     @property
     def worst(self) -> str:
@@ -97,20 +100,29 @@ def predict(
     steps: Sequence[PlannedStep],
     terms: Sequence[Used] | None = None,
     filtering: Filters = default_filtering,
+    jitter: float | None = None,
     tell: Callable[[float], None] | None = None,
 ) -> Prediction:
     """Predict what identifying these steps on this rig will give.
 
+    `jitter` [s] is that of a host-timed device's samples, None where the device has the clock;
     `tell` hears after each step which share of them is done.
     Raises InputError for a rig without nominal values and for steps the twin cannot follow.
     """
     used = tuple(terms) if terms is not None else tuple(Used(term) for term in baseline())
-    found = []
+    played, parts = [], []
     for number, step in enumerate(steps, start=1):
-        found.append(information(rig, play(rig, step), used, filtering, moments=True))
+        played.append(play(rig, step))
+        parts.append(information(rig, played[-1], used, filtering, moments=True))
         if tell is not None:
             tell(number / len(steps))
-    return combine(rig, used, found)
+    predicted = combine(rig, used, parts)
+    cost = None if jitter is None else lateness_cost(rig, played, used, filtering, jitter)
+    if cost is None:
+        return predicted
+    bulk = predicted.parameters[BULK]
+    widened = {BULK: replace(bulk, half=cost.widened(bulk.half))}
+    return replace(predicted, parameters={**predicted.parameters, **widened}, lateness=cost)
 
 
 def coefficients(rig: Rig, terms: Sequence[Used]) -> dict[str, float]:
@@ -262,4 +274,5 @@ def to_json(prediction: Prediction) -> dict[str, object]:
         "rank": {f: list(v) for f, v in prediction.rank.items()},
         "masked_share": finite(prediction.masked_share),
         "worst": prediction.worst,
+        "lateness": None if prediction.lateness is None else asdict(prediction.lateness),
     }

@@ -48,6 +48,10 @@ class DesignSettings:
     # Hydraulic Control Systems, ch. 2); the swing of `oil.temperature_band` is taken as a sine's.
     bulk_fall: float = 0.005
     seed: int = 0  # of the noise whose share in the rows is judged
+    # Draws of the instants at which a host takes its samples, and their spread [s] where neither
+    # the rig file nor a measurement states it: a desktop's sleep and one exchange over Ethernet.
+    late_draws: int = 8
+    jitter: float = 1e-3
     # Step of a finite difference over the noise that the filtered signal still carries.
     noise_step: float = 0.1
 

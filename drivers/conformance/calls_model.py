@@ -162,6 +162,7 @@ class Model:
             self.trial.spoil(HEALTHY)
         if failed:
             self.trial.zero_somehow(self.driver, f"{fault}: after an error of {name}")
+        if failed or name == "zero":  # zeroing may have taken a new link, which ends the session
             self.close()
 
     def end(self) -> None:

@@ -14,6 +14,8 @@ from rig.model.codes import encode_input
 from rig.model.rig import Rig
 
 GOOD: Final = "ok"
+TIMED_SAMPLES: Final = 100  # of a host-timed device, whose lateness is measured
+MOST_BLOCKS: Final = 400  # read for that
 EMPTY_PRESSURE: Final = 0.1e6  # [Pa] gauge below which a chamber counts as without pressure
 
 
@@ -33,16 +35,41 @@ class Reading:
     mark: str
 
 
+@dataclass(frozen=True)
+class Lateness:
+    """How late [s] a host-timed device's samples were taken: mean and standard deviation."""
+
+    samples: int
+    mean: float
+    jitter: float
+
+
 def probe(driver: Driver, rig: Rig) -> list[Reading]:
     """Connect, read one block, close; outputs stay at zero. Raises DeviceError, DeviceLost."""
+    return probe_timed(driver, rig)[0]
+
+
+def probe_timed(driver: Driver, rig: Rig) -> tuple[list[Reading], Lateness | None]:
+    """Read one block as `probe` does; of a host-timed device more, for the lateness of samples."""
+    late: list[NDArray[np.float64]] = []
     try:
         driver.connect()
         driver.start()
         block = driver.read_block()
+        taken = block
+        for _ in range(MOST_BLOCKS):
+            if taken.read_at is None or sum(map(len, late)) >= TIMED_SAMPLES:
+                break
+            taken = driver.read_block()
+            if taken.read_at is not None:
+                due = (taken.tick + np.arange(len(taken.data))) / rig.sample_rate
+                late.append((taken.read_at - due)[np.isfinite(taken.read_at)])
         driver.stop()
     finally:
         driver.close()
-    return readings(block, rig)
+    every = np.concatenate(late) if late else np.empty(0)
+    timing = Lateness(len(every), float(every.mean()), float(every.std())) if len(every) else None
+    return readings(block, rig), timing
 
 
 def readings(block: SampleBlock, rig: Rig) -> list[Reading]:

@@ -13,8 +13,10 @@ import numpy as np
 from analysis.design.moves import Tone
 from analysis.design.optimise import Design, improve
 from analysis.design.predict import Prediction, predict, to_json
+from analysis.design.settings import DESIGN
 from analysis.design.twin_records import PlannedStep
 from analysis.simulation.twin import simulate_commands
+from drivers.registry import driver_class
 from protocols.design.check import check
 from protocols.design.check_report import CheckReport
 from protocols.files import library
@@ -23,6 +25,7 @@ from protocols.files.writer import protocol_text
 from rig.cli.output import progress, table
 from rig.cli.planned import designed_protocol, designed_step, empty_lines, planned_steps
 from rig.model.parse import InputError
+from rig.model.parts import Wire
 from rig.model.rig import Rig
 from rig.runs.rigs import load_bench
 
@@ -36,6 +39,7 @@ class Foresight:
     limits: CheckReport
     prediction: Prediction | None
     why: str = ""
+    stated: Wire | None = None
 
 
 @dataclass(frozen=True)
@@ -55,6 +59,37 @@ def foreseen(plan: Plan, rig: Rig, tell: Callable[[float], None] | None = None) 
     )
 
 
+def jitter_of(rig: Rig) -> float | None:
+    """Return the spread [s] of a host-timed device's sample times, None where it has the clock."""
+    if not driver_class(rig.wire.kind).host_timed:
+        return None
+    return DESIGN.jitter if rig.wire.jitter is None else rig.wire.jitter
+
+
+def lateness_text(found: Foresight) -> str:
+    """Return in one line what late samples cost b, and by which assumption."""
+    p, wire = found.prediction, found.stated
+    if p is None or p.lateness is None or wire is None:
+        return ""
+    cost = p.lateness
+    origin = (
+        "assumed, for wire.jitter is not stated; `bramah probe` measures it"
+        if wire.jitter is None
+        else "wire.jitter"
+    )
+    missing = f", {percent(cost.missing)} % of them missing," if cost.missing else ""
+    moved = (
+        f"move b by {100 * cost.shift:+.3g} % and scatter it by {percent(cost.scatter)} %; its "
+        "interval includes that"
+        if math.isfinite(cost.shift)
+        else "leave no b; lower the rig's sample_rate"
+    )
+    return (
+        f"host-timed ({wire.kind}): samples {1e3 * cost.jitter:.3g} ms late ({origin}) and put "
+        f"onto even ticks{missing} {moved}"
+    )
+
+
 def of_plan(plan: Plan, rig: Rig, tell: Callable[[float], None] | None = None) -> Foresight:
     """Check and predict a plan; what cannot be predicted is said, the limits stand without it."""
 
@@ -66,7 +101,9 @@ def of_plan(plan: Plan, rig: Rig, tell: Callable[[float], None] | None = None) -
     if not plan.steps:
         return Foresight(limits, None, "it takes no records of excited joints")
     try:
-        return Foresight(limits, predict(rig, planned_steps(plan, biases), tell=part(CHECKED, 1.0)))
+        steps = planned_steps(plan, biases)
+        predicted = predict(rig, steps, jitter=jitter_of(rig), tell=part(CHECKED, 1.0))
+        return Foresight(limits, predicted, stated=rig.wire)
     except InputError as error:
         return Foresight(limits, None, str(error))
 
@@ -103,6 +140,7 @@ def prediction_text(found: Foresight) -> str:
         lines.append(f"{100 * p.masked_share:.2g} % of the rows would be masked")
     lines += [f"NOT determined {n}: {e.note}" for n, e in p.parameters.items() if e.note]
     lines.append(f"worst known: {p.worst}")
+    lines += [lateness_text(found)] if p.lateness is not None else []
     return "\n".join(lines)
 
 

@@ -19,17 +19,26 @@ if TYPE_CHECKING:
 def probe(rig: RigOption, endpoint: EndpointOption = None, json: JsonOption = None) -> None:
     """Read one block of every channel and move nothing; exit 1 where a channel is not plausible.
 
+    Where the host takes the samples, their lateness is measured as well.
+
     Example: bramah probe --rig shinshu-2dof
     """
     from rig.bench import probe as bench
     from rig.cli.errors import WorkError
 
     described, driver = device_of(rig, endpoint)
-    readings = bench.probe(driver, described)
+    readings, timing = bench.probe_timed(driver, described)
     write_json(json, [asdict(one) for one in readings])
     if json != Path("-"):
         header = ("channel", "mean", "least", "most", "unit", "codes", "")
         typer.echo(table(header, [_row(one) for one in readings]))
+    if timing is not None:
+        typer.echo(
+            f"host-timed: {timing.samples} samples taken {1e3 * timing.mean:.3g} ms late, standard "
+            f"deviation {1e3 * timing.jitter:.3g} ms; in the rig file: wire: jitter: "
+            f"{1e3 * timing.jitter:.3g} ms",
+            err=json == Path("-"),
+        )
     print_pressure(bench.pressurised(readings), aside=json == Path("-"))
     odd = [one.channel for one in readings if one.mark != bench.GOOD]
     if odd:

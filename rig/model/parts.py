@@ -320,6 +320,9 @@ class Wire(Part):
     kind: str = Field(default="modbus-tcp", pattern=r"^[a-z][a-z0-9-]*$")
     timeout: Time = Field(default=1.0, gt=0, description="answer expected within [s]")
     watchdog: Time = Field(default=0.5, gt=0, description="host silence after which outputs zero")
+    jitter: Time | None = Field(
+        default=None, ge=0, description="of a host-timed device's samples, standard deviation [s]"
+    )
 
     @field_validator("watchdog")
     @classmethod
@@ -336,7 +339,8 @@ class Wire(Part):
 
     def reached_by(self, kind: str, settings: Mapping[str, Any]) -> Wire:
         """Return a wire with the same times, of this kind and with these settings."""
-        return Wire(kind=kind, timeout=self.timeout, watchdog=self.watchdog, **settings)
+        times = {"timeout": self.timeout, "watchdog": self.watchdog, "jitter": self.jitter}
+        return Wire(kind=kind, **times, **settings)
 
     @property
     def endpoint(self) -> str:

@@ -14,10 +14,10 @@ from drivers.modbus_map import InputEntry, MapSettings, OutputEntry, register_ma
 from drivers.nidaqmx_card import CardInput, CardOutput, CardSettings, wiring
 from drivers.polled import InputsOutputs, PolledDriver
 from drivers.register_types import RegisterType
-from drivers.resample import LONGEST
 from rig.model.parse import parse_model
 from rig.model.parts import Wire
 from rig.model.rig import Rig
+from rig.model.wire.resample import LONGEST
 from tests.hil_sim.integrator import seed_rig
 
 DOCS = Path(__file__).parents[2] / "docs"

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.resample import LONGEST, Resampler, Row
+from rig.model.wire.resample import LONGEST, Resampler, Row
 
 CLEAR = np.zeros(2, dtype=np.bool_)
 

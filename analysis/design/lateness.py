@@ -1,0 +1,149 @@
+"""What samples taken late by a host cost the bulk modulus, before the experiment.
+
+A host-timed device has no sample clock: sample k is taken at k + e_k periods, e_k >= 0 random, and
+put onto the even grid by `rig.model.wire.resample`. The twin's noise-free records (a cubic spline
+through them, for the instants between ticks) are sampled so, resampled as the driver does it, and
+identified; b moves by
+
+    m = mean over draws of b_uneven / b_even - 1,
+
+and scatters by s / sqrt(n) for n repeats, s the draws' standard deviation. Where h is the relative
+half width of b's interval by sensor noise, the widened one is |m| + sqrt(h^2 + (2 s)^2 / n).
+Assumed: e is exponential, independent from sample to sample, and stamped without error.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from analysis.design.settings import DESIGN
+from analysis.design.twin_records import Played, ideal
+from analysis.identify.stacked_rows import build_rows
+from analysis.regression.rows import Filtering, parameters_of
+from analysis.regression.solve import merge, triangle
+from analysis.terms.base import Used, family_of
+from rig.model.records import Record, Run
+from rig.model.rig import Rig
+from rig.model.wire.resample import Resampler
+
+Array = NDArray[np.float64]
+Filters = Callable[[Record], Filtering]
+BULK = "b"
+
+
+@dataclass(frozen=True)
+class LatenessCost:
+    """What late samples cost b: `jitter` [s] as assumed, shift and scatter relative to b.
+
+    `scatter` is that of one experiment, both are NaN where no draw left a b at all; `missing` is
+    the share of samples left out because two that were taken lay too far apart.
+    """
+
+    jitter: float
+    shift: float
+    scatter: float
+    missing: float
+
+    def widened(self, half: float) -> float:
+        """Return the relative half width of b's interval with this cost, from that without."""
+        return abs(self.shift) + math.hypot(half, 2.0 * self.scatter)
+
+
+def late_times(samples: int, jitter: float, rng: np.random.Generator) -> Array:
+    """Return when a host serves ticks 0 to `samples` - 1 [periods], `jitter` [periods] its spread.
+
+    One that is late by more than a period serves the newest tick that is due, as
+    `drivers.polled` does.
+    """
+    times: list[float] = []
+    tick = 0
+    late = rng.exponential(jitter, samples) if jitter > 0.0 else np.zeros(samples)
+    while tick < samples:
+        earliest = max(float(tick), times[-1]) if times else float(tick)
+        times.append(earliest + late[tick])
+        tick = max(tick + 1, math.floor(times[-1]))
+    return np.array(times)
+
+
+def taken_late(record: Record, jitter: float, rng: np.random.Generator) -> Record:
+    """Return a record as a host with `jitter` [s] would have made it; missing samples are NaN."""
+    names, n = list(record.channels), record.samples
+    ticks = np.arange(n, dtype=float)
+    times = late_times(n, jitter * record.sample_rate, rng)
+    between = CubicSpline(ticks, np.column_stack([record.channels[name] for name in names]))
+    values = between(np.minimum(times, n - 1.0))
+    out, resampler = np.full((n, len(names)), np.nan), Resampler()
+    unmarked = np.zeros(len(names), dtype=np.bool_)
+    for at, row in zip(times, values, strict=True):
+        for made in resampler.add(float(at), row, unmarked):
+            if made.tick < n:
+                out[made.tick] = made.values
+    # The driver's stream goes on before and after a record; only the twin's ends here.
+    out[:1], out[-1:] = values[:1], values[-1:]
+    return replace(record, channels={name: out[:, k] for k, name in enumerate(names)})
+
+
+def lateness_cost(
+    rig: Rig,
+    played: Sequence[Played],
+    terms: Sequence[Used],
+    filtering: Filters,
+    jitter: float,
+) -> LatenessCost | None:
+    """Return what `jitter` [s] costs b in these steps; None where b is not determined by them."""
+    rng = np.random.default_rng(DESIGN.seed)
+    even = _bulk(rig, played, terms, filtering, {})
+    if even is None:
+        return None
+    shifts, lost = [], []
+    for _ in range(DESIGN.late_draws):
+        late = {one.step.name: taken_late(one.record, jitter, rng) for one in played}
+        found = _bulk(rig, played, terms, filtering, late)
+        if found is not None:
+            shifts.append(found / even - 1.0)
+        first = rig.channels[0]
+        lost += [float(np.isnan(record.channels[first]).mean()) for record in late.values()]
+    share = float(np.mean(lost))
+    if not shifts:
+        return LatenessCost(jitter, math.nan, math.nan, share)
+    repeats = min(max(one.step.repeats, 1) for one in played)
+    scatter = float(np.std(shifts, ddof=1)) / math.sqrt(repeats) if len(shifts) > 1 else 0.0
+    return LatenessCost(jitter, float(np.mean(shifts)), scatter, share)
+
+
+def _bulk(
+    rig: Rig,
+    played: Sequence[Played],
+    terms: Sequence[Used],
+    filtering: Filters,
+    late: Mapping[str, Record],
+) -> float | None:
+    """Return b [Pa] by least squares over one record a step, weighted by its repeats."""
+    exact = ideal(rig)
+    names = parameters_of(rig, terms, "fluid")
+    if BULK not in names:
+        return None
+    triangles = []
+    for one in played:
+        record = late.get(one.step.name, one.record)
+        (built,) = build_rows(exact, [Run(exact, (record,), source="twin")], terms, filtering)
+        mine = [r for name, r in built.rows.items() if family_of(name) == "fluid"]
+        weight = math.sqrt(max(one.step.repeats, 1))
+        X = np.concatenate([r.matrix for r in mine])
+        triangles.append(weight * triangle(X, np.concatenate([r.rhs for r in mine])))
+    R = merge(triangles)
+    k = len(names)
+    scale = np.sqrt((R[:k, :k] ** 2).sum(axis=0))
+    kept = scale > 0.0
+    if not kept[names.index(BULK)]:
+        return None
+    beta = np.zeros(k)
+    beta[kept] = np.linalg.lstsq(R[:, :k][:, kept] / scale[kept], R[:, k])[0] / scale[kept]
+    inverse = beta[names.index(BULK)]
+    return float(1.0 / inverse) if inverse > 0.0 else None
