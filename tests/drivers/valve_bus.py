@@ -5,19 +5,22 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, Final
+from typing import Any, Final, Generic, Self, TypeVar
 
 from drivers.canopen_408 import CanOpen408Driver
 from drivers.conformance import Bench, Capabilities, Subject
 from drivers.registry import wire_at
 from hil_sim.device.can.adapters import SocketcandServer
 from hil_sim.device.can.valve_bench import POLL_SECONDS, ValveBench
+from hil_sim.device.device import Plant
 from rig.model import channels as ch
+from rig.model.parts import Wire
 from rig.model.rig import Rig
 from tests.drivers.can_bench import SpoiledAdapter
 from tests.drivers.polled_bench import FakeClock
 from tests.hil_sim.integrator import IntegratorPlant, seed_rig
 
+SomePlant = TypeVar("SomePlant", bound=Plant)
 TIMEOUT: Final = 0.3  # [s] of real time for an answer
 SILENCE: Final = 11.0  # [s]
 # No flipped bit: a bus node discards such a frame by its checksum, which is to lose it. The nodes
@@ -26,13 +29,17 @@ LOST: Final = ("silent",)
 FAULTS: Final = ("lose one", "late", "twice", "noise", "silent")
 
 
-class HeldValves:
-    """The integrator behind valves whose clock is the host's, plus what `outputs` has used."""
+class HeldValves(Generic[SomePlant]):
+    """A plant behind valves whose clock is the host's, plus what `outputs` has used.
 
-    def __init__(self) -> None:
-        self.rig = seed_rig()
+    Its context ends the valves' thread and the bus.
+    """
+
+    def __init__(self, rig: Rig, plant: SomePlant, timeout: float = 5.0) -> None:
+        self.rig = rig
+        self._timeout = timeout
         self.clock = FakeClock()
-        self.plant = IntegratorPlant(self.rig)
+        self.plant = plant
         self._server = SocketcandServer("127.0.0.1", 0)
         self.adapter = SpoiledAdapter(self._server)
         self._ahead = 0.0
@@ -47,7 +54,7 @@ class HeldValves:
         def run() -> list[float]:
             self._ahead += 10.0 / self.rig.sample_rate
             self._bench.poll(0.0)
-            return list(self.plant.volts)
+            return self._bench.volts
 
         # Frames that were sent before this call are in the socket: taken in by the first poll.
         self.adapter.inside(lambda: self._bench.poll(0.0))
@@ -64,16 +71,20 @@ class HeldValves:
         self.adapter.inside(lambda: [server._drop(client) for client in list(server._clients)])
         self.silence()
 
-    def saturate(self) -> int:
-        """Move the first piston beyond its sensor."""
-        self.plant.piston[0] = 1.0
-        return self.rig.channels.index(f"{ch.PISTON}_1")
+    def __enter__(self) -> Self:
+        return self
 
-    def driver(self, rig: Rig) -> Any:
-        """Return an unconnected driver whose time is this bench's."""
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def wire(self, rig: Rig) -> Wire:
+        """Return the wire that reaches the valves, its other times as the rig's."""
         wire = wire_at(self.adapter.endpoint.replace("can://", "canopen-408://", 1), rig.wire)
-        quick = wire.model_copy(update={"timeout": TIMEOUT})
-        return CanOpen408Driver(quick, rig, clock=self.clock, sleep=self.clock.sleep)
+        return wire.model_copy(update={"timeout": self._timeout})
+
+    def driver(self, rig: Rig) -> CanOpen408Driver:
+        """Return an unconnected driver whose time is this bench's."""
+        return CanOpen408Driver(self.wire(rig), rig, clock=self.clock, sleep=self.clock.sleep)
 
     def close(self) -> None:
         """End the valves' thread and the bus."""
@@ -90,8 +101,14 @@ class HeldValves:
 
 
 def _valves(faults: tuple[str, ...]) -> Iterator[Bench]:
-    held = HeldValves()
-    try:
+    rig = seed_rig()
+    plant = IntegratorPlant(rig)
+
+    def saturate() -> int:
+        plant.piston[0] = 1.0
+        return rig.channels.index(f"{ch.PISTON}_1")
+
+    with HeldValves(rig, plant, TIMEOUT) as held:
         yield Bench(
             held.rig,
             held.driver,
@@ -101,10 +118,8 @@ def _valves(faults: tuple[str, ...]) -> Iterator[Bench]:
             spoil=held.adapter.spoil,
             faults=faults,
             lost=LOST,
-            saturate=held.saturate,
+            saturate=saturate,
         )
-    finally:
-        held.close()
 
 
 # A valve knows neither the rig nor its sample rate; laws and samples are the host's.

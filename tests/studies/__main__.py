@@ -25,6 +25,7 @@ from tests.studies.machines import pendulum_command as pendulum
 from tests.studies.nights import command as nights
 from tests.studies.reproduction import command as reproduction
 from tests.studies.trace import command as trace
+from tests.studies.wires import command as wires
 
 # As in `rig.cli.main`: matrices are tall and narrow, BLAS threads slow each other down.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -44,6 +45,7 @@ STUDIES = (
     measured_figures,
     faults,
     conformance,
+    wires,
     fuzz,
     nights,
 )

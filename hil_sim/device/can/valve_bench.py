@@ -127,8 +127,9 @@ class ValveBench:
         rig: Rig,
         plant: Plant,
         adapter: Adapter,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._rig, self._plant, self._adapter, self._clock = rig, plant, adapter, time.monotonic
+        self._rig, self._plant, self._adapter, self._clock = rig, plant, adapter, clock
         self._network = AdapterNetwork(adapter)
         joints = range(1, len(rig.joints) + 1)
         self.valves = [ValveNode(self._network, number, self._clock) for number in joints]
