@@ -29,10 +29,11 @@ def slope(x: Array, y: Array) -> float:
 
 def test_the_catalogue_is_the_contracts() -> None:
     names = {kind.effect_name() for kind in CLASSES}
-    contract = """coulomb_friction stribeck_friction asymmetric_friction pressure_dependent_friction
-        base_inclination payload joint_spring torque_offset valve_deadband spool_offset
-        underlap_leakage spool_lag internal_leakage external_leakage supply_sag tank_pressure
-        entrained_air dead_volume channel_delay sensor_gain sensor_offset"""
+    contract = """coulomb_friction stribeck_friction asymmetric_friction asymmetric_viscous_friction
+        pressure_dependent_friction base_inclination payload joint_spring torque_offset
+        valve_deadband spool_offset underlap_leakage spool_lag spool_hysteresis internal_leakage
+        external_leakage supply_sag tank_pressure return_line entrained_air dead_volume
+        channel_delay sensor_lag sensor_gain sensor_offset sensor_crosstalk periodic_disturbance"""
     assert names == set(contract.split())
 
 

@@ -25,6 +25,7 @@ from analysis.trace.search.refinement import ExactFit, alternatives, jacobian, t
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
+DEPENDENT = 1e-10  # of the largest eigenvalue: columns with a smaller one depend on each other
 NORMAL = 1.96  # half-width of 95 % over the deviation, of what no repeat shows
 PERIOD, STATE, SPEED = "period", "state", "speed"
 
@@ -32,11 +33,21 @@ PERIOD, STATE, SPEED = "period", "state", "speed"
 def scatter(train_data: RegressionData, columns: Array, residual: Array) -> CovarianceParts:
     """Return the covariance of coefficients of `columns` (M, k), all else projected off them.
 
-    `residual` (M,) is what the fitted model leaves of the averaged records.
+    `residual` (M,) is what the fitted model leaves of the averaged records. Of columns that depend
+    on each other what the rows determine counts, and every coefficient has its least dof.
     """
-    inverse = np.asarray(
-        np.linalg.pinv(columns.T @ columns, rcond=1e-10, hermitian=True), dtype=np.float64
-    )
+    size, V = np.linalg.eigh(columns.T @ columns)
+    determined = V[:, size > DEPENDENT * max(float(size[-1]), 1e-300)]
+    if determined.shape[1] < len(V):
+        k = len(V)
+        if not determined.shape[1]:
+            return CovarianceParts(np.zeros((k, k)), np.ones(k), np.zeros(k))
+        inner = scatter(train_data, columns @ determined, residual)
+        whole = determined @ inner.covariance @ determined.T
+        return CovarianceParts(
+            whole, np.full(k, inner.dof.min()), np.full(k, inner.systematic.max())
+        )
+    inverse = np.asarray((V / size) @ V.T, dtype=np.float64)
     groupings = [_pieces(train_data, columns, residual, by) for by in (PERIOD, STATE, SPEED)]
     return spread(groupings, inverse)
 
