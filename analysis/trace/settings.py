@@ -60,6 +60,9 @@ class TraceSettings:
     tells: float = 0.12
     """Of a column's energy off the others': a subset with less holds its form's tail, not its size
     (tuned: tails of seals reach 0.09, wrong names show from 0.2 on)."""
+    own: float = 0.01
+    """Of a column's energy that the effect's others cannot make: with less the whole effect is
+    judged, not this number (convention: a variance inflation factor of 100)."""
     power: float = 0.25
     """Relative standard error beyond which a subset judges nothing (tuned)."""
     # Chance.

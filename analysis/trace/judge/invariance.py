@@ -104,7 +104,7 @@ def invariance(
     names, J = jacobian(train_data, model, used)
     base = others(train_data, model, names)
     if isinstance(used.term, Effect) and used.term.free:
-        return _of_curve(train_data, model, used, (J, base), joint)
+        return _of_whole(train_data, model, used, (J, base), joint)
     residual = model.residual
     # A shape such as the presliding distance is the form's, not the effect's size.
     sizes = {c.parameter for c in used.term.coefficients(train_data.rig)}
@@ -117,6 +117,15 @@ def invariance(
     clusters = _unmeasured(train_data)
     J_all = J - base @ (base.T @ J)
     whole = [float(np.sum(_alone(J_all, k) ** 2)) for k in range(len(names))]
+    # What the effect's other numbers can stand for is no size of its own: then the whole is judged.
+    ridge = {
+        name
+        for k, name in enumerate(names)
+        if name in sizes and whole[k] < TRACE.own * float(J_all[:, k] @ J_all[:, k])
+    }
+    if ridge:
+        out += _of_whole(train_data, model, used, (J, base), joint)
+        sizes -= ridge
     for label, mask in subsets(train_data, joint).items():
         if not mask.any():
             continue
@@ -150,13 +159,14 @@ def invariance(
     return out
 
 
-def _of_curve(
+def _of_whole(
     train_data: RegressionData, model: ExactFit, used: Used, tangent: tuple[Array, Array],
     joint: int | None,
 ) -> list[tuple[str, str, float, float]]:  # fmt: skip
-    """Return where a free curve disagrees with itself: the factor by which it would be larger.
+    """Return where a whole effect disagrees with itself: the factor by which it would be larger.
 
-    Its single values trade places between knots; what must be the same everywhere is the curve.
+    Values of a curve trade places between knots, numbers on a ridge with each other; what must be
+    the same everywhere is what they make together.
     """
     J, base = tangent
     whole = J @ _amounts(train_data, model, used)
@@ -178,7 +188,7 @@ def _of_curve(
         if error <= TRACE.power and abs(shift) > TRACE.deviations * np.hypot(
             error, TRACE.tolerance / TRACE.deviations
         ):
-            out.append((label, "the curve's size", 1.0 + shift, error))
+            out.append((label, "the whole effect", 1.0 + shift, error))
     return out
 
 

@@ -171,7 +171,7 @@ def test_what_the_catalogue_lacks_stays_unexplained_and_its_variable_is_told(
 def test_a_spring_that_hardens_a_little_is_not_explained_by_one_that_does_not(rig: Rig) -> None:
     """Two hundredths of the energy are left, within the band; a cube of the place holds them."""
     train, held_out = (hardening(run, 3.5e5) for run in pair_of_runs(rig, k_spring=5.0))
-    result = trace([train], [held_out], look_ahead=False)
+    result = trace([train], [held_out], look_ahead=False, free_forms=False)
     assert result.verdict == "unexplained"
     assert [e.name for e in result.effects] == ["joint_spring"]  # named so far
     assert any("a formula holds it" in note and "piston_2³" in note for note in result.notes)
