@@ -66,7 +66,7 @@ class Monitor(ByHand, App[int]):
 
     TITLE = "bramah monitor"
     ENABLE_COMMAND_PALETTE = False
-    CSS = "Screen { background: $background; }"
+    CSS = "Screen, Canvas { background: ansi_default; color: ansi_default; }"
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("ctrl+c", "leave(130)", "quit", show=False, priority=True),
         Binding("ctrl+q", "leave(0)", "quit", show=False, priority=True),

@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
+import pty
+import re
+import select
+import signal
+import struct
 import subprocess
 import sys
 import tempfile
+import termios
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -104,3 +112,102 @@ async def test_a_run_that_does_not_answer_is_reported_and_one_that_dies_is_gone(
         await until(pilot, lambda: "STOP: NO ANSWER" in told(app))
         process.kill()
         await until(pilot, lambda: "RUN GONE" in told(app))
+
+
+class Terminal:
+    """`bramah monitor` in a terminal of its own."""
+
+    def __init__(self, sockets: Path, **environment: str) -> None:
+        self.inner, outer = pty.openpty()
+        self.outer = outer
+        self.resize(100, 30)
+        words = [sys.executable, "-c", "from rig.cli.main import run; run()", "monitor"]
+        other = ("NO_COLOR", "COLORTERM", "COLUMNS", "LINES")  # the terminal says its own size
+        known = {k: v for k, v in os.environ.items() if k not in other}
+        self.process = subprocess.Popen(
+            words, cwd=ROOT, stdin=outer, stdout=outer, stderr=outer, start_new_session=True,
+            env={**known, "XDG_RUNTIME_DIR": str(sockets), "TERM": "xterm", **environment},
+        )  # fmt: skip
+        self.drawn = ""
+
+    def resize(self, width: int, height: int) -> None:
+        size = struct.pack("HHHH", height, width, 0, 0)
+        fcntl.ioctl(self.outer, termios.TIOCSWINSZ, size)
+
+    def until(self, words: str) -> None:
+        """Read what is drawn until some words are in it, colours left out."""
+        while words not in self.drawn:
+            assert select.select([self.inner], [], [], PATIENCE)[0], f"no {words!r}"
+            raw = os.read(self.inner, 1 << 16).decode(errors="replace")
+            self.raw = getattr(self, "raw", "") + raw
+            self.drawn += re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", raw)
+
+    def press(self, keys: str) -> None:
+        self.drawn = ""
+        os.write(self.inner, keys.encode())
+
+    def end(self) -> int:
+        """Press q and read the rest; returns the exit code."""
+        self.press("q")
+        while self.process.poll() is None:
+            if select.select([self.inner], [], [], 0.05)[0]:
+                self.drawn += os.read(self.inner, 1 << 16).decode(errors="replace")
+        return self.process.returncode
+
+
+@pytest.fixture
+def terminal(sockets: Path) -> Iterator[Callable[..., Terminal]]:
+    opened: list[Terminal] = []
+
+    def begin(**environment: str) -> Terminal:
+        opened.append(Terminal(sockets, **environment))
+        return opened[-1]
+
+    yield begin
+    for one in opened:
+        one.process.kill()
+        one.process.wait()
+        os.close(one.inner)
+        os.close(one.outer)
+
+
+@pytest.mark.timeout(2 * PATIENCE)
+def test_a_terminal_of_16_colours_resized_to_nothing_and_back_goes_on(
+    start: Callable[..., subprocess.Popen[bytes]], terminal: Callable[..., Terminal]
+) -> None:
+    run = start()
+    screen = terminal()
+    screen.until("to nearest limit")
+    assert "38;2;" not in screen.raw, "no colour beyond the terminal's own 16"
+    for size in ((1, 1), (0, 0), (30, 5)):
+        screen.resize(*size)
+        os.kill(screen.process.pid, signal.SIGWINCH)
+    screen.until("SPACE STOPS")
+    screen.drawn = ""
+    screen.resize(100, 30)
+    os.kill(screen.process.pid, signal.SIGWINCH)
+    screen.until("to nearest limit")
+    screen.press(" ")
+    screen.until("OUTPUTS ZEROED")
+    assert run.wait(PATIENCE) == 0
+    assert screen.end() == 0
+    assert "Traceback" not in screen.drawn
+
+
+@pytest.mark.timeout(2 * PATIENCE)
+def test_without_colours_and_beside_the_sockets_of_a_dead_run_it_still_speaks(
+    sockets: Path, start: Callable[..., subprocess.Popen[bytes]], terminal: Callable[..., Terminal]
+) -> None:
+    dead = start("--rig", "dead")
+    while not list(sockets.glob("bramah/dead-*.pub")):
+        time.sleep(0.01)
+    dead.kill()
+    dead.wait()
+    screen = terminal(NO_COLOR="1")
+    screen.until("No protocol is running")
+    start()
+    screen.until("limit")
+    screen.press("4")
+    screen.until("time of the device")
+    assert not re.search(r"\x1b\[[0-9;]*\b(3[1-7]|4[1-7])\b[0-9;]*m", screen.raw)
+    assert screen.end() == 0

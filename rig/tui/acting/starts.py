@@ -13,7 +13,7 @@ from typing import Final
 from rig.runs.listing.summary import RunSummary
 from rig.tui.acting.commands import Commands
 from rig.tui.browse import TABS, Browsed, read_disk
-from rig.tui.jobs import Job, begin
+from rig.tui.jobs import Job, begin, rig_of_run
 from rig.tui.look import Dialog
 
 KEYS: Final = "↑ ↓ and Enter choose, Esc closes, SPACE stops"
@@ -96,7 +96,23 @@ class Starts(Commands):
         }
         if run.state == "interrupted":
             acts = {"recover what was recorded": lambda: self._job(("recover", path)), **acts}
+        if run.state == "tripped":
+            acts = {"reset the trip that it left": lambda: self._reset_run(run), **acts}
         self._offer(run.path.name, acts)
+
+    def _reset_run(self, run: RunSummary) -> None:
+        """Reset the bench that a run tripped, with a reason."""
+        rig = rig_of_run(str(run.path), run.rig)
+
+        def reset(reason: str) -> None:
+            if reason.strip():
+                self._job(("reset", "--rig", rig, "--reason", reason.strip()))
+            else:
+                self.remark = "reset: a reset needs a reason; nothing was reset."
+
+        body = (run.message, "", "What was found and done? It is kept with the trip.")
+        keys = "Enter resets device and bench, Esc closes"
+        self.ask(Dialog("reset", body, text="", keys=keys), reset)
 
     def _open(self, page: Path) -> None:
         if not page.is_file():
