@@ -19,6 +19,7 @@ from analysis.simulation import compiled_sources, fused, interpreted
 from analysis.simulation import equations as eq
 from analysis.simulation.integrator import integrate
 from analysis.simulation.model import Model
+from analysis.simulation.settings import SIMULATION
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from analysis.terms.specialise import NotSpecialisable
@@ -29,8 +30,6 @@ from rig.model.rig import Rig
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
-RTOL = 1e-6
-ATOL_ANGLE, ATOL_PRESSURE, ATOL_HIDDEN = 1e-7, 10.0, 1e-8  # rad, Pa; of rates the terms say
 _REASONS = {
     eq.LEFT_STROKE: "a piston went half a stroke past its end",
     eq.NOT_FINITE: "the state diverged",
@@ -247,13 +246,14 @@ def simulate(
     if start.hidden is not None:
         ys[0, 4 * N :] = start.hidden
     inputs = drive.inputs[first : first + samples]
+    angle, pressure = SIMULATION.angle_tolerance, SIMULATION.pressure_tolerance
     atol = np.repeat(
-        [ATOL_ANGLE, ready.rate_tolerance, ATOL_PRESSURE, ATOL_PRESSURE, ATOL_HIDDEN],
+        [angle, ready.rate_tolerance, pressure, pressure, SIMULATION.state_tolerance],
         [N, N, N, N, hidden],
     )
     status, filled, evaluations = integrate(
         ready.address, ready.context, ready.par, ready.geometry, ready.work(),
-        inputs, drive.rate, drive.locked, RTOL, atol, ys,
+        inputs, drive.rate, drive.locked, SIMULATION.relative_tolerance, atol, ys,
     )  # fmt: skip
     failure = ""
     if status != eq.OK:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.simulation.model import Model, nominal_model
+from analysis.simulation.settings import SIMULATION
 from analysis.simulation.simulate import DrivingInput, Simulation, simulate
 from analysis.simulation.twin import holding_state
 from analysis.terms import baseline
@@ -20,14 +21,6 @@ from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
-TRIM_ROUNDS = 4  # secant steps that centre an open-loop stroke
-LEAD = 2.0  # [s] simulated before the record starts, so that the start has faded
-END = 0.99  # of half the stroke: where a joint stands that is locked at its end
-
-
-# The integrator joins the spool's samples by straight lines, which takes (pi f / rate)^2 / 3 of a
-# line's amplitude: 0.01 % of the gains at 1 kHz. The model is therefore run at a finer rate.
-FINER = 4
 
 Wave = tuple[Array, tuple[int, ...]]  # one period of unit RMS, its lines
 
@@ -56,13 +49,13 @@ def lock_steps(joints: int) -> list[tuple[str, dict[int, float]]]:
     end while those beyond are retracted, then each of those extended; as the paper's STEP1 to
     STEP3 do for two joints. These are N (N + 1) / 2 steps, as many as inertia parameters.
     """
-    steps = []
+    steps, end = [], SIMULATION.end_share
     for k in range(joints - 1, -1, -1):
         below = dict.fromkeys(range(k), 0.0)
         beyond = range(k + 1, joints)
-        steps.append(below | dict.fromkeys(beyond, -END))
+        steps.append(below | dict.fromkeys(beyond, -end))
         for extended in range(len(beyond)):
-            steps.append(below | {j: END if n >= extended else -END for n, j in enumerate(beyond)})
+            steps.append(below | {j: end if n >= extended else -end for n, j in enumerate(beyond)})
     return [(f"step{number}", locked) for number, locked in enumerate(steps, start=1)]
 
 
@@ -86,11 +79,11 @@ def synthetic_run(
     rate = rig.sample_rate
     ideal = rig.model_copy(update={"sensors": rig.sensors.model_copy(update={"skew": 0.0})})
     model = nominal_model(rig, tuple(Used(term) for term in baseline()))
-    lead, n = round(LEAD * rate), round(seconds * rate)
+    lead, n = round(SIMULATION.lead * rate), round(seconds * rate)
     records = []
     for step, locked in lock_steps(len(rig.joints)):
-        fine = np.asarray(resample(wave[0], FINER * len(wave[0])))
-        spool = rms * fine[np.arange(FINER * (lead + n)) % len(fine)]
+        fine = np.asarray(resample(wave[0], SIMULATION.oversampling * len(wave[0])))
+        spool = rms * fine[np.arange(SIMULATION.oversampling * (lead + n)) % len(fine)]
         run = _centred(model, spool, locked)
         clean = _channels(rig, run[0], run[1], lead)
         for repeat in range(1, repeats + 1):
@@ -119,7 +112,7 @@ def _centred(
 ) -> tuple[DrivingInput, Simulation]:
     """Simulate with the bias that keeps the moving joint's stroke level."""
     rig = model.rig
-    N, n, rate = len(rig.joints), len(spool), FINER * rig.sample_rate
+    N, n, rate = len(rig.joints), len(spool), SIMULATION.oversampling * rig.sample_rate
     place = np.array(
         [locked.get(i, 0.0) * 0.5 * joint.cylinder.stroke for i, joint in enumerate(rig.joints)]
     )
@@ -130,7 +123,7 @@ def _centred(
     t = np.arange(n) / rate
     bias, slope_of_bias = np.zeros(N), np.full(N, np.nan)
     before: tuple[Array, Array] | None = None
-    for attempt in range(TRIM_ROUNDS + 1):
+    for attempt in range(SIMULATION.trim_rounds + 1):
         u = np.where(held, 0.0, spool[:, None] + bias)
         drive = DrivingInput(
             rate, u, np.full(n, rig.supply.pressure), np.full(n, rig.oil.temperature), held,
@@ -138,7 +131,7 @@ def _centred(
         )  # fmt: skip
         result = simulate(model, drive, state)
         drift = np.array([np.polyfit(t, result.piston[:, i], 1)[0] for i in range(N)])
-        if attempt == TRIM_ROUNDS:
+        if attempt == SIMULATION.trim_rounds:
             break
         if before is not None:
             slope_of_bias = (drift - before[1]) / np.where(held, 1.0, bias - before[0])
@@ -153,4 +146,4 @@ def _channels(rig: Rig, drive: DrivingInput, result: Simulation, lead: int) -> d
     for i in range(len(rig.joints)):
         every[ch.channel(ch.SPOOL, i + 1)] = drive.u[:, i]
     every[ch.SUPPLY], every[ch.TEMPERATURE] = drive.p_s, drive.temperature
-    return {name: every[name][::FINER][lead:] for name in rig.channels}
+    return {name: every[name][:: SIMULATION.oversampling][lead:] for name in rig.channels}

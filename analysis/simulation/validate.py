@@ -20,6 +20,7 @@ from analysis.signals.conditioning import Mask, Signals, aligned_channels, condi
 from analysis.signals.filters import Smoother
 from analysis.signals.locks import moving_by_step
 from analysis.simulation.model import Model, finite, refuse_other_rig
+from analysis.simulation.settings import SIMULATION
 from analysis.simulation.simulate import (
     Simulation,
     State,
@@ -36,11 +37,6 @@ from rig.model.records import Record, Run
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
-
-WINDOW = 0.25  # [s]
-START_SAMPLES = 0.04  # [s] of samples that the first state is fitted to
-START_DEGREE = 3
-GAP = 0.05  # [s] of lost samples that a simulation may bridge
 
 
 @dataclass(frozen=True)
@@ -149,10 +145,10 @@ def arrived(rig: Rig, record: Record) -> Mask:
     lost = lost_samples(rig, record).any(axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate(([False], lost, [False])).astype(np.int8)))
     longest = int(np.max(edges[1::2] - edges[::2], initial=0))
-    if longest > GAP * record.sample_rate:
+    if longest > SIMULATION.longest_gap * record.sample_rate:
         raise InputError(
             f"record {record.name!r}: {longest} samples in a row were lost; a model cannot be "
-            f"simulated through more than {1000 * GAP:g} ms without its spool"
+            f"simulated through more than {1000 * SIMULATION.longest_gap:g} ms without its spool"
         )
     return np.asarray(~lost)
 
@@ -167,7 +163,7 @@ def _compared(rig: Rig, channels: Mapping[str, Array], signals: Signals) -> dict
 
 
 def _windows(record: Record, smoother: Smoother) -> Iterator[tuple[int, int]]:
-    length = round(WINDOW * record.sample_rate)
+    length = round(SIMULATION.window * record.sample_rate)
     for first in range(smoother.reach, record.samples - smoother.reach - length + 1, length):
         yield first, length
 
@@ -180,7 +176,10 @@ def first_state(
     `channels` defaults to the record's, aligned. The filter has no samples before the first; a
     short one-sided fit is the better edge. The velocity is the fit's first derivative.
     """
-    count = min(record.samples, max(START_DEGREE + 2, round(START_SAMPLES * record.sample_rate)))
+    count = min(
+        record.samples,
+        max(SIMULATION.start_degree + 2, round(SIMULATION.start_samples * record.sample_rate)),
+    )
     t = np.arange(count) / record.sample_rate
     channels = aligned_channels(rig, record) if channels is None else channels
     state = state_at(signals, 0)
@@ -189,7 +188,7 @@ def first_state(
 
         def fitted(kind: str, joint: int = i) -> Array:
             samples = channels[ch.channel(kind, joint + 1)][:count]
-            return np.asarray(np.polynomial.polynomial.polyfit(t, samples, START_DEGREE))
+            return np.asarray(np.polynomial.polynomial.polyfit(t, samples, SIMULATION.start_degree))
 
         s = fitted(rig.position_kind)
         q[i], G, _ = rig.joints[i].geometry(s[0])

@@ -8,13 +8,11 @@ from collections.abc import Callable
 import numpy as np
 
 from drivers.base import DeviceError, SampleBlock
+from rig.bench.settings import BENCH
 from rig.model.rig import Rig
 from rig.model.trips import RecordingFailed
 
 log = logging.getLogger(__name__)
-
-SECONDS = 2.0  # of device time with every command at zero
-QUEUED = 4.0  # [s] of samples from before the zeroing that a device may still hold
 
 
 def record_zero(
@@ -22,7 +20,7 @@ def record_zero(
     read: Callable[[], SampleBlock],
     keep: Callable[[SampleBlock], None],
     clock: Callable[[], float],
-    seconds: float = SECONDS,
+    seconds: float = BENCH.zero_seconds,
 ) -> bool | None:
     """Read and keep blocks until `seconds` of samples in a row have every command at zero.
 
@@ -31,8 +29,8 @@ def record_zero(
     `seconds + QUEUED` of device time, or that much wall time and two answer times.
     """
     wanted = round(seconds * rig.sample_rate)
-    most = round((seconds + QUEUED) * rig.sample_rate)
-    deadline = clock() + seconds + QUEUED + 2 * rig.wire.timeout
+    most = round((seconds + BENCH.queued_seconds) * rig.sample_rate)
+    deadline = clock() + seconds + BENCH.queued_seconds + 2 * rig.wire.timeout
     quiet = taken = 0
     moving = False
     while quiet < wanted and taken < most and clock() < deadline:

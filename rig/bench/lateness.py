@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 import numpy as np
 
 from drivers.base import SampleBlock
-
-LATE_SHARE: Final = 0.5  # [periods] after its tick from which on a sample counts as late
-
-# A crystal's error either way, doubled: the earliest arrival so far may age by as much.
-_DRIFT = 200e-6
+from rig.bench.settings import BENCH
 
 
 class ArrivalClock:
@@ -27,7 +21,7 @@ class ArrivalClock:
         offset = now - (block.tick + len(block.data)) / self._sample_rate
         if self._best is None:
             self._best, self._last = offset, now
-        self._best = min(offset, self._best + _DRIFT * (now - self._last))
+        self._best = min(offset, self._best + BENCH.clock_drift * (now - self._last))
         self._last = now
         return offset - self._best
 
@@ -49,7 +43,7 @@ class HostTiming:
         own = np.isfinite(late)
         self._samples += len(late)
         self._interpolated += int(np.count_nonzero(~own))
-        self._late += int(np.count_nonzero(late[own] > LATE_SHARE / self._sample_rate))
+        self._late += int(np.count_nonzero(late[own] > BENCH.late_share / self._sample_rate))
         self._worst = max(self._worst, float(late[own].max(initial=0.0)))
 
     def summary(self) -> dict[str, float] | None:

@@ -10,13 +10,13 @@ from dataclasses import replace
 from typing import Final, TypeVar
 
 from drivers.base import DeviceError, DeviceInfo, DeviceLost, Driver, LatchesTrip, OutputLaw
+from rig.bench.settings import BENCH
 from rig.model.rig import Rig
 
 log = logging.getLogger(__name__)
 Result = TypeVar("Result")
 
 UNSURE: Final = "outputs not confirmed at zero"
-_ZERO_ATTEMPTS = 2
 
 
 class Outputs:
@@ -56,7 +56,7 @@ class Outputs:
         if not self._connected:
             return False
         problem: Exception | None = None
-        for _ in range(1 if self._silent else _ZERO_ATTEMPTS):
+        for _ in range(1 if self._silent else BENCH.zero_attempts):
             try:
                 self.driver.zero_outputs()
             except Exception as error:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.base import Driver, SampleBlock
+from rig.bench.settings import BENCH
 from rig.model import channels as ch
 from rig.model.codes import encode_input
 from rig.model.rig import Rig
@@ -16,7 +17,6 @@ from rig.model.rig import Rig
 GOOD: Final = "ok"
 TIMED_SAMPLES: Final = 100  # of a host-timed device, whose lateness is measured
 MOST_BLOCKS: Final = 400  # read for that
-EMPTY_PRESSURE: Final = 0.1e6  # [Pa] gauge below which a chamber counts as without pressure
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ def pressurised(found: list[Reading]) -> list[str]:
     out = []
     for one in found:
         kind, joint = ch.kind_of(one.channel)
-        if kind in (ch.CAP, ch.ROD, ch.SUPPLY) and one.mean > EMPTY_PRESSURE:
+        if kind in (ch.CAP, ch.ROD, ch.SUPPLY) and one.mean > BENCH.empty_pressure:
             place = "supply" if kind == ch.SUPPLY else f"joint {joint} {kind.split('_')[0]}"
             out.append(f"{place} {one.mean / 1e6:.2f} MPa")
     return out
@@ -121,6 +121,6 @@ def _mark(
         return "at the end of its converter's range: broken wire, or out of range?"
     if kind in (ch.CAP, ch.ROD) and x.mean() > supply + 5 * noise:
         return f"above the supply pressure of {supply / 1e6:.2f} MPa"
-    if kind in (ch.CAP, ch.ROD, ch.SUPPLY) and x.mean() < -5 * noise - EMPTY_PRESSURE:
+    if kind in (ch.CAP, ch.ROD, ch.SUPPLY) and x.mean() < -5 * noise - BENCH.empty_pressure:
         return "below zero"
     return GOOD

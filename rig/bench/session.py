@@ -28,7 +28,7 @@ from drivers.base import (
     OutputLaw,
     SampleBlock,
 )
-from rig.bench.after_zero import SECONDS, record_zero
+from rig.bench.after_zero import record_zero
 from rig.bench.alarms import AlarmLog
 from rig.bench.guard import Guard, GuardSettings, JointRole
 from rig.bench.handles import RecordHandle
@@ -40,6 +40,7 @@ from rig.bench.screens.commands import ACKNOWLEDGE, RELEASE, STOP, TAKE, Judge
 from rig.bench.screens.display import LOST, Display
 from rig.bench.screens.past import PlanLine
 from rig.bench.screens.sockets import Publisher
+from rig.bench.settings import BENCH
 from rig.bench.stops import StopFlag
 from rig.model.alarms.states import AlarmTable
 from rig.model.rig import Rig
@@ -102,7 +103,7 @@ class Bench:
         self._timing = HostTiming(rig.sample_rate)
         self._expected: int | None = None
         self._judge: Judge | None = None
-        self.recorded_after = SECONDS  # [s] with the outputs at zero, after an early end
+        self.recorded_after = BENCH.zero_seconds  # [s] with the outputs at zero, after an early end
 
     # Entry and exit
 

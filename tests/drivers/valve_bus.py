@@ -16,7 +16,7 @@ from hil_sim.device.device import Plant
 from rig.model import channels as ch
 from rig.model.parts import Wire
 from rig.model.rig import Rig
-from tests.drivers.can_bench import SpoiledAdapter
+from tests.drivers.can_bench import SpoiledAdapter, drop_all
 from tests.drivers.polled_bench import FakeClock
 from tests.hil_sim.integrator import IntegratorPlant, seed_rig
 
@@ -68,7 +68,7 @@ class HeldValves(Generic[SomePlant]):
     def cut(self) -> None:
         """End the host's link; a node does not see that, its watch on the heartbeat does."""
         server = self._server
-        self.adapter.inside(lambda: [server._drop(client) for client in list(server._clients)])
+        self.adapter.inside(lambda: drop_all(server))
         self.silence()
 
     def __enter__(self) -> Self:

@@ -8,6 +8,7 @@ from analysis.simulation import simulate as sim
 from analysis.simulation.fmu.kernel_source import KERNEL_KINDS, KernelLibrary
 from analysis.simulation.fmu.variables import UnitVariables
 from analysis.simulation.model import Model
+from analysis.simulation.settings import SIMULATION
 from analysis.terms import base
 
 _ENUMERATIONS = (
@@ -48,11 +49,11 @@ def model_header(model: Model, variables: UnitVariables, token: str) -> str:
         "CONSTANTS": len(variables.constants),
     }
     numbers = {
-        "RTOL": sim.RTOL,
-        "ATOL_ANGLE": sim.ATOL_ANGLE,
+        "RTOL": SIMULATION.relative_tolerance,
+        "ATOL_ANGLE": SIMULATION.angle_tolerance,
         "ATOL_RATE": ready.rate_tolerance,
-        "ATOL_PRESSURE": sim.ATOL_PRESSURE,
-        "ATOL_HIDDEN": sim.ATOL_HIDDEN,
+        "ATOL_PRESSURE": SIMULATION.pressure_tolerance,
+        "ATOL_HIDDEN": SIMULATION.state_tolerance,
         "FIRST_STEP": 0.2 / model.rig.sample_rate,
     }
     lines = [

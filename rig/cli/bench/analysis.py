@@ -14,10 +14,8 @@ from scipy.integrate import odeint as scipy_odeint
 from analysis.identify.identify import identify
 from analysis.simulation.equations import call_rates
 from analysis.simulation.model import Model, nominal_model
+from analysis.simulation.settings import SIMULATION
 from analysis.simulation.simulate import (
-    ATOL_ANGLE,
-    ATOL_PRESSURE,
-    RTOL,
     Compiled,
     DrivingInput,
     State,
@@ -72,11 +70,14 @@ def simulation_figures(rig: Rig, repeats: int = 5) -> dict[str, Any]:
     own = _spent(lambda: simulate(ready, drive, start), repeats)
     p = hand_fused.constants(rig, model.values)
     y0 = np.concatenate((start.q, start.qd, start.p_cap, start.p_rod))
-    atol = np.repeat([ATOL_ANGLE, ready.rate_tolerance, ATOL_PRESSURE, ATOL_PRESSURE], 2)
+    angle, pressure = SIMULATION.angle_tolerance, SIMULATION.pressure_tolerance
+    atol = np.repeat([angle, ready.rate_tolerance, pressure, pressure], 2)
     out = np.zeros((len(drive.u), 12))
 
     def by_hand() -> None:
-        hand_fused.free_run(y0, drive.u, drive.p_s, drive.rate, p, RTOL, atol, out)
+        hand_fused.free_run(
+            y0, drive.u, drive.p_s, drive.rate, p, SIMULATION.relative_tolerance, atol, out
+        )
 
     by_hand()
     hand = _spent(by_hand, repeats)

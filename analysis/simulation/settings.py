@@ -1,0 +1,37 @@
+"""Thresholds of simulation and validation: unit, meaning, origin."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+
+@dataclass(frozen=True)
+class SimulationSettings:
+    """Tolerances of the integrator, windows of validation, making of synthetic records.
+
+    The smallest step of the integrator is compiled into its loop (`integrator.MIN_STEP`).
+    """
+
+    # Local error allowed in a step; the absolute ones are far below any sensor's resolution.
+    relative_tolerance: float = 1e-6
+    angle_tolerance: float = 1e-7  # [rad]
+    pressure_tolerance: float = 10.0  # [Pa]
+    state_tolerance: float = 1e-8  # of an effect's own state, in its unit
+
+    # -- validation ----------------------------------------------------------------------------
+    window: float = 0.25  # [s] simulated from a measured state (contract of `validate`)
+    start_samples: float = 0.04  # [s] of samples that the first state is fitted to
+    start_degree: int = 3  # of the polynomial fitted to them: rates and accelerations exist
+    longest_gap: float = 0.05  # [s] of lost samples that a simulation may bridge
+
+    # -- synthetic records ---------------------------------------------------------------------
+    trim_rounds: int = 4  # secant steps that centre an open-loop stroke
+    lead: float = 2.0  # [s] simulated before the record starts, so that the start has faded
+    end_share: float = 0.99  # of half the stroke: where a joint stands that is locked at its end
+    # The integrator joins the spool's samples by straight lines, which takes (pi f / rate)^2 / 3
+    # of a line's amplitude: 0.01 % of the gains at 1 kHz. The model runs so many times finer.
+    oversampling: int = 4
+
+
+SIMULATION: Final = SimulationSettings()
