@@ -108,11 +108,12 @@ class Way:
 
     def due(self, now: float) -> list[Piece]:
         """Return the pieces that go now."""
-        if self._buffer and now - self._heard > QUIET:
+        quiet = bool(self._buffer) and now - self._heard > QUIET
+        while self._before and (quiet or self._before[0].at <= now):  # older than the buffer
+            self._queue([replace(self._before.pop(0).piece, wait=0.0)], now)
+        if quiet:
             whole, self._buffer = self._buffer, b""
             self._queue([Piece(whole)], now)
-        while self._before and self._before[0].at <= now:
-            self._queue([replace(self._before.pop(0).piece, wait=0.0)], now)
         chunks = []
         while self._ready and self._ready[0].at <= now:
             chunks.append(self._ready.popleft().piece)

@@ -10,7 +10,7 @@ import tty
 from collections.abc import Iterator
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
@@ -53,6 +53,7 @@ class Line:
 
 
 @given(st.lists(st.binary(max_size=40), max_size=20), st.sampled_from(sorted(HARMLESS)))
+@example([b"\x01", b"\x00", b"\x00"], "frames_merged")
 def test_a_fault_that_loses_nothing_hands_on_every_byte_in_order(
     pieces: list[bytes], name: str
 ) -> None:
