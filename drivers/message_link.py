@@ -145,7 +145,7 @@ class MessageLink:
                 return self._checked(answer, kind, size, about)
         raise DeviceSilent(self._silence())
 
-    def tell(self, kind: Message) -> None:
+    def send_unanswered(self, kind: Message) -> None:
         """Send a request once and wait for no answer; raises DeviceLost when the line has gone."""
         self._number = self.next_number()
         self.note(kind, self._number, b"")

@@ -108,7 +108,7 @@ class MessageStreamDriver:
             logger.debug("while closing: %s", error)
             # Perhaps only the answers are lost: then the next host need not wait for the watchdog.
             with suppress(DeviceError):
-                self._link.tell(Message.CLOSE)
+                self._link.send_unanswered(Message.CLOSE)
         finally:
             self._stream = None
             self._link.close()

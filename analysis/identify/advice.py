@@ -92,7 +92,7 @@ def mechanical_help(rig: Rig, found: Determined) -> list[str]:
         best = max(range(len(rows)), key=lambda i: (ranks[i], clear[i]))
         if not ranks[best]:
             break
-        helps.append(_words(rig, *steps[best]))
+        helps.append(_motion_text(rig, *steps[best]))
         undetermined = (basis @ seen[best][2][ranks[best] :].T).T / scale
     return helps
 
@@ -126,7 +126,7 @@ def _rows(rig: Rig, excited: int, places: tuple[float, ...]) -> Array:
     return predicted_rows(rig, moved, locked)["mechanical"]
 
 
-def _words(rig: Rig, excited: int, places: tuple[float, ...]) -> str:
+def _motion_text(rig: Rig, excited: int, places: tuple[float, ...]) -> str:
     at = {-1.0: "at end_min", 1.0: "at end_max", 0.0: "closed at 0 mm"}
     still = [f"joint {i + 1} closed at 0 mm" for i in range(excited)]
     still += [f"joint {i} {at[p]}" for i, p in enumerate(places, start=excited + 2)]

@@ -204,13 +204,13 @@ def _price(rig: Rig, solution: Solution, X: Array, y: Array, found: Minimum) -> 
         return Price(0.0, (), (), 1.0)
     apart = C @ solution.value
     gap = tuple(
-        _words(label, rig, solution, row, value)
+        _constraint_text(label, rig, solution, row, value)
         for label, row, value in zip(found.labels, C, apart, strict=True)
     )
     return Price(growth, found.labels, gap, _probability(solution, C, apart))
 
 
-def _words(label: str, rig: Rig, solution: Solution, row: Array, apart: float) -> str:
+def _constraint_text(label: str, rig: Rig, solution: Solution, row: Array, apart: float) -> str:
     """Say how far the data alone are from one active constraint."""
     std = float(np.sqrt(row @ solution.covariance @ row))
     far = f", {abs(apart) / std:.3g} standard errors" if std > 0 else ""

@@ -251,7 +251,7 @@ def silent_device_is_lost(trial: Trial) -> None:
 
 
 @check(LATCH, SILENCE)
-def trip_is_told(trial: Trial) -> None:
+def trip_is_reported(trial: Trial) -> None:
     """A tripped device says so: in `trip_cause` and in its blocks."""
     driver = _driven(trial)
     _fall_silent(trial)

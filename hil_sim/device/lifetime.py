@@ -40,7 +40,7 @@ def _exists(pid: int) -> bool:
 
 
 @contextmanager
-def told_to_end() -> Iterator[list[int]]:
+def termination_signals() -> Iterator[list[int]]:
     """Collect SIGTERM and SIGINT in the list given, instead of dying of them."""
     signals: list[int] = []
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 
 from hil_sim.device.device import Device, Plant
-from hil_sim.device.lifetime import PARENT_SECONDS, Owner, told_to_end
+from hil_sim.device.lifetime import PARENT_SECONDS, Owner, termination_signals
 from hil_sim.device.pty_line import PtyLine
 from hil_sim.device.serial_session import SerialSession
 from hil_sim.faults.device import DeviceFault
@@ -38,7 +38,7 @@ def serve_serial(
     line = PtyLine()
     device = Device(rig, plant, realtime=realtime, faults=faults)
     try:
-        with told_to_end() as ended:
+        with termination_signals() as ended:
             on_ready(f"serial://{line.name}")
             serve_port(line, device, ended, None if parent is None else Owner(parent))
     finally:

@@ -42,7 +42,7 @@ class ServedDevice:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._endpoint: Future[str] = Future()
         work = self._serve_port if wire == SERIAL else lambda: asyncio.run(self._serve(wire))
-        self._thread = threading.Thread(target=self._serve_or_tell, args=(work,), daemon=True)
+        self._thread = threading.Thread(target=self._serve_or_report, args=(work,), daemon=True)
         self._thread.start()
         target = self._endpoint.result(_SECONDS)
         self.link = faulty_link(target, faults, seed=seed, seconds=seconds)
@@ -78,7 +78,7 @@ class ServedDevice:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _serve_or_tell(self, work: Callable[[], None]) -> None:
+    def _serve_or_report(self, work: Callable[[], None]) -> None:
         try:
             work()
         except Exception as error:

@@ -39,7 +39,7 @@ class Observers:
         """Let an observer see from now on."""
         self._all.append(observer)
 
-    def _tell(self, call: Callable[[Observer], None]) -> None:
+    def _notify(self, call: Callable[[Observer], None]) -> None:
         for observer in tuple(self._all):
             try:
                 call(observer)
@@ -50,12 +50,12 @@ class Observers:
     def block(self, block: SampleBlock) -> None:
         """Show a block."""
         if self._all:
-            self._tell(lambda one: one.block(block))
+            self._notify(lambda one: one.block(block))
 
     def record_begins(self, meta: RecordMeta, start: int, ticks: int | None) -> None:
         """Tell that a record begins."""
-        self._tell(lambda one: one.record_begins(meta, start, ticks))
+        self._notify(lambda one: one.record_begins(meta, start, ticks))
 
     def record_ends(self, meta: RecordMeta, start: int, ticks: int, state: str) -> None:
         """Tell that a record has ended."""
-        self._tell(lambda one: one.record_ends(meta, start, ticks, state))
+        self._notify(lambda one: one.record_ends(meta, start, ticks, state))

@@ -19,9 +19,9 @@ def demo(
 
     Example: bramah demo --out demo-out
     """
-    from rig.cli.experiment import tell
+    from rig.cli.experiment import run_demo
 
-    tell(out, seed, repeats)
+    run_demo(out, seed, repeats)
 
 
 def register(app: typer.Typer) -> None:

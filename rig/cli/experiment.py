@@ -83,7 +83,7 @@ def experiment(
     )
 
 
-def tell(out: Path, seed: int, repeats: int | None) -> None:
+def run_demo(out: Path, seed: int, repeats: int | None) -> None:
     """Run the demo into a new folder of `out`, print its results and write its reports."""
     from rig.cli.reports import write_trace
 

@@ -85,18 +85,18 @@ def loop(
             going.stopped = f"{type(error).__name__}: {error}"
             raise
         finally:
-            _tell(going, json, report or out / "loop.html")
+            _show_result(going, json, report or out / "loop.html")
 
 
 def _asked(experiment: Mapping[str, Any]) -> bool:
     return typer.confirm(f"Run the next experiment ({experiment['text']})?", err=True)
 
 
-def _tell(going: Any, json: Path | None, report: Path) -> None:
+def _show_result(going: Any, json: Path | None, report: Path) -> None:
     from analysis.simulation.model import save_model
     from analysis.trace.loop_rounds import rounds_json
     from rig.cli.reports import write_loop
-    from rig.cli.trace_text import story_text
+    from rig.cli.trace_text import rounds_text
 
     if not going.rounds and not going.wanted.out.is_dir():
         return  # ended before anything was taken
@@ -108,7 +108,7 @@ def _tell(going: Any, json: Path | None, report: Path) -> None:
         write_loop(report, going.train, going.judge, going.rounds, going.stopped)
         save_model(going.rounds[-1].result.model_after, going.wanted.out / "model.json")
         if json != Path("-"):
-            typer.echo(story_text(going.rounds, going.stopped))
+            typer.echo(rounds_text(going.rounds, going.stopped))
             typer.echo(f"report: {report}")
 
 

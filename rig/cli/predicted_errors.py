@@ -33,7 +33,7 @@ CHECKED = 0.4  # of the time of a check with its prediction, spent on the limits
 
 
 @dataclass(frozen=True)
-class Foresight:
+class CheckedForecast:
     """A protocol's limits on the twin, and what it will tell (None, and why, where unknown)."""
 
     limits: CheckReport
@@ -43,7 +43,7 @@ class Foresight:
 
 
 @dataclass(frozen=True)
-class ForeseenText:
+class ForecastText:
     """A foresight as plain data and as a person reads it."""
 
     limits: CheckReport
@@ -51,10 +51,12 @@ class ForeseenText:
     text: str
 
 
-def foreseen(plan: Plan, rig: Rig, tell: Callable[[float], None] | None = None) -> ForeseenText:
+def forecast_text(
+    plan: Plan, rig: Rig, tell: Callable[[float], None] | None = None
+) -> ForecastText:
     """Check and predict a plan; InputError where the twin cannot follow it."""
     forecast = of_plan(plan, rig, tell)
-    return ForeseenText(
+    return ForecastText(
         forecast.limits, as_dict(forecast)["identification"], prediction_text(forecast)
     )
 
@@ -66,7 +68,7 @@ def jitter_of(rig: Rig) -> float | None:
     return DESIGN.jitter if rig.wire.jitter is None else rig.wire.jitter
 
 
-def lateness_text(found: Foresight) -> str:
+def lateness_text(found: CheckedForecast) -> str:
     """Return in one line what late samples cost b, and by which assumption."""
     p, wire = found.prediction, found.stated
     if p is None or p.lateness is None or wire is None:
@@ -90,7 +92,7 @@ def lateness_text(found: Foresight) -> str:
     )
 
 
-def of_plan(plan: Plan, rig: Rig, tell: Callable[[float], None] | None = None) -> Foresight:
+def of_plan(plan: Plan, rig: Rig, tell: Callable[[float], None] | None = None) -> CheckedForecast:
     """Check and predict a plan; what cannot be predicted is said, the limits stand without it."""
 
     def part(begin: float, end: float) -> Callable[[float], None] | None:
@@ -99,16 +101,16 @@ def of_plan(plan: Plan, rig: Rig, tell: Callable[[float], None] | None = None) -
     limits = check(plan, rig, simulate_commands, part(0.0, CHECKED))
     biases = {step.step: step.biases for step in limits.steps}
     if not plan.steps:
-        return Foresight(limits, None, "it takes no records of excited joints")
+        return CheckedForecast(limits, None, "it takes no records of excited joints")
     try:
         steps = planned_steps(plan, biases)
         predicted = predict(rig, steps, jitter=jitter_of(rig), tell=part(CHECKED, 1.0))
-        return Foresight(limits, predicted, stated=rig.wire)
+        return CheckedForecast(limits, predicted, stated=rig.wire)
     except InputError as error:
-        return Foresight(limits, None, str(error))
+        return CheckedForecast(limits, None, str(error))
 
 
-def as_dict(found: Foresight) -> dict[str, Any]:
+def as_dict(found: CheckedForecast) -> dict[str, Any]:
     """Return the check as plain data, with the prediction, or why there is none."""
     document: dict[str, Any] = {"impossible": found.why}
     if found.prediction is not None:
@@ -121,7 +123,7 @@ def percent(value: float) -> str:
     return f"{100.0 * value:.3g}" if math.isfinite(value) else "—"
 
 
-def prediction_text(found: Foresight) -> str:
+def prediction_text(found: CheckedForecast) -> str:
     """Return each parameter's predicted error, conditioning, and what is not determined."""
     p = found.prediction
     if p is None:
@@ -151,8 +153,8 @@ class Designed:
     text: str
     plan: Plan
     design: Design
-    before: Foresight
-    after: Foresight
+    before: CheckedForecast
+    after: CheckedForecast
 
 
 def _checker(plan: Plan, rig: Rig) -> Callable[[PlannedStep, Mapping[int, Tone]], bool]:

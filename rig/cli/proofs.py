@@ -100,9 +100,9 @@ def _checked(
     plan: Plan, rig: Rig, predict: bool, tell: Tell | None
 ) -> tuple[CheckReport, Mapping[str, Any] | None, str]:
     if predict:
-        from rig.cli.predicted_errors import foreseen
+        from rig.cli.predicted_errors import forecast_text
 
-        made = foreseen(plan, rig, tell)
+        made = forecast_text(plan, rig, tell)
         return made.limits, made.plain, made.text
     from analysis.simulation.twin import simulate_commands
     from protocols.design.check import check

@@ -140,7 +140,7 @@ def run_protocol(job: ProtocolJob, say: Say) -> Path:
         desk = Desk(machine=desk_machine, terminal=terminal_lines(job.attended))
         if tracking is not None:
             followed = tracking  # for the closure: it is not None
-            tracking.tell(story.note, lambda text: story.tracked(text, followed.parameters))
+            tracking.subscribe(story.note, lambda text: story.tracked(text, followed.parameters))
             bench.observers.add(tracking)
             desk = replace(desk, estimates=TrackedEstimates(tracking))
         engine.run(plan, rig, bench, story.phase, desk)

@@ -68,7 +68,7 @@ def _absolute(name: str, shipped: tuple[str, ...]) -> str:
     return name if name in shipped else str(Path(name).expanduser().absolute())
 
 
-def _words(*options: tuple[str, object]) -> tuple[str, ...]:
+def _arguments(*options: tuple[str, object]) -> tuple[str, ...]:
     return tuple(
         str(part) for name, value in options if value is not None for part in (name, value)
     )
@@ -134,7 +134,7 @@ def add(
     from rig.runs.store import refuse_occupied
 
     now = datetime.now(UTC)
-    changed = _words(
+    changed = _arguments(
         ("--repeats", repeats), ("--duration", duration), ("--wave-seed", wave_seed),
         ("--amplitude-scale", None if amplitude_scale == 1.0 else amplitude_scale),
         *(("--step", one) for one in step or ()),

@@ -76,13 +76,13 @@ def envelope_text(report: CheckReport) -> str:
     for step in report.steps:
         lines.append(f"{step.step}:")
         lines += [
-            f"  {_place(line):9} {line.quantity:34} {_picture(line)}  {margin_words(line)}"
+            f"  {_place(line):9} {line.quantity:34} {_picture(line)}  {margin_text(line)}"
             for line in step.predictions
         ]
     return "\n".join(lines)
 
 
-def margin_words(line: MotionPrediction) -> str:
+def margin_text(line: MotionPrediction) -> str:
     """Say how far a prediction stays from its nearer limit, and on which side."""
     shown = display_unit(line.unit, LIMITS)
     scale, unit = shown.scale, shown.text

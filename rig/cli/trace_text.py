@@ -128,7 +128,7 @@ def _number(value: float, digits: int = 3) -> str:
     return f"{value:.{digits}g}" if math.isfinite(value) else "—"
 
 
-def story_text(rounds: Sequence[Round], stopped: str) -> str:
+def rounds_text(rounds: Sequence[Round], stopped: str) -> str:
     """Return a loop's rounds as a table, the last trace, and why it stopped."""
     rows = [
         [

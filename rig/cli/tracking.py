@@ -86,7 +86,9 @@ class Tracking:
         self._dropped = 0
         self._next_say = -math.inf
 
-    def tell(self, note: Callable[[dict[str, Any]], None], show: Callable[[str], None]) -> None:
+    def subscribe(
+        self, note: Callable[[dict[str, Any]], None], show: Callable[[str], None]
+    ) -> None:
         """Say who notes the estimates at each record's end, and who shows the running ones."""
         self._notes.append(note)
         self._shows.append(show)

@@ -25,8 +25,8 @@ from rig.runs.runstate import (
     STREAM,
     EventLog,
     StreamClock,
-    give_up_ownership,
     now,
+    release_ownership,
     write_state,
 )
 from rig.runs.sections import Written
@@ -128,7 +128,7 @@ class Recorder:
         except RecordingFailed:
             with suppress(OSError):
                 write_state(self.folder, ABORTED)
-                give_up_ownership(self.folder)
+                release_ownership(self.folder)
             raise
 
     def _open_files(self, info: DeviceInfo) -> None:
@@ -233,7 +233,7 @@ class Recorder:
             if self._events is not None:
                 self._events.close()
             with suppress(OSError):
-                give_up_ownership(self.folder)
+                release_ownership(self.folder)
 
     def _finalise(self, journal: Journal, state: str, message: str) -> None:
         try:

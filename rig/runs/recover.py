@@ -66,7 +66,7 @@ def recover(path: str | Path, *, force: bool = False) -> RecoverReport:
             write_trip_window(folder)
             return report
         finally:
-            runstate.give_up_ownership(folder)
+            runstate.release_ownership(folder)
     except OSError as error:
         raise RecordingFailed(f"{folder}: cannot be finalised: {error}") from error
 
@@ -175,7 +175,7 @@ def _without_journal(folder: Path) -> RecoverReport:
     written = count(archive)
     runstate.write_state(folder, state)
     with suppress(OSError):
-        runstate.give_up_ownership(folder)
+        runstate.release_ownership(folder)
     return _report(folder, state, written, "was finalised already")
 
 

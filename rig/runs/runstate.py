@@ -92,7 +92,7 @@ def take_ownership(folder: Path) -> None:
     replace_text(folder / _OWNER, json.dumps(asdict(owner)) + "\n")
 
 
-def give_up_ownership(folder: Path) -> None:
+def release_ownership(folder: Path) -> None:
     """Remove the note of who writes the run."""
     (folder / _OWNER).unlink(missing_ok=True)
 

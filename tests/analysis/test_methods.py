@@ -17,7 +17,7 @@ from analysis.identify.methods.search import (
     make_task,
     score,
     searched_names,
-    step_one,
+    single_joint_record,
 )
 from analysis.identify.result import Identification, to_json
 from analysis.identify.settings import IDENTIFY
@@ -143,7 +143,7 @@ def test_simultaneous_without_such_records_says_what_is_needed(multisine_run: Ru
 
 @pytest.fixture(scope="module")
 def task(rig: Rig, sine_run: Run) -> SearchTask:
-    record = step_one([sine_run])
+    record = single_joint_record([sine_run])
     terms = tuple(Used(term) for term in baseline())
     return make_task(rig, record, terms, default_filtering(record), SMALL)
 

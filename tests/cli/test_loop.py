@@ -19,7 +19,7 @@ from protocols.files import library
 from protocols.files.plan import resolve
 from rig.cli import experiment_loop
 from rig.cli.experiment_loop import DECLINED, FLOOR, NOTHING, REFUSED, ROUNDS, Loop, Wanted
-from rig.cli.trace_text import story_text
+from rig.cli.trace_text import rounds_text
 from rig.runs.rigs import load_rig
 from tests.analysis.page import Page
 from tests.cli.bench import bramah
@@ -77,7 +77,7 @@ def test_the_story_is_told_in_json_in_words_and_on_one_page(air: Inside) -> None
     assert told["verdict"] == "explained"
     assert [r["trace"]["verdict"] for r in told["rounds"]] == ["clean", "explained"]
     assert told["rounds"][1]["runs"] == ["run-2", "holdout-2"]
-    text = story_text(air.rounds, air.stopped)
+    text = rounds_text(air.rounds, air.stopped)
     assert f"stopped: {FLOOR}" in text
     page = Page(render(air.train, air.judge, air.rounds, air.stopped))
     for words in ("Round 1: clean", "Round 2: explained", "entrained air", FLOOR):

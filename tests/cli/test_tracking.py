@@ -84,7 +84,7 @@ def test_the_process_beside_the_run_finds_what_is_found_here(
     noted: list[dict[str, object]] = []
     meta = RecordMeta("step1", 1, record.locked, record.period, record.lines)
     with Tracking(rig, tmp_path, said.append) as tracking:
-        tracking.tell(noted.append, lambda _: None)
+        tracking.subscribe(noted.append, lambda _: None)
         tracking.record_begins(meta, 100, None)
         for tick, data in blocks(rig, record, 100):
             tracking.block(block_of(rig, tick, data))

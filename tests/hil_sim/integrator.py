@@ -31,7 +31,7 @@ def seed_rig(**wire: object) -> Rig:
     """The shipped two-joint rig, its wire changed where asked."""
     text = (resources.files("rig") / "shipped" / "shinshu-2dof.yaml").read_text("utf-8")
     rig = parse_model(Rig, text, "shinshu-2dof.yaml")
-    changed = Wire(**{**rig.wire.model_dump(), **wire})  # type: ignore[arg-type]
+    changed = Wire(**{**rig.wire.model_dump(), **wire})
     return rig.model_copy(update={"wire": changed})
 
 

@@ -115,7 +115,7 @@ def searched_names(rig: Rig) -> tuple[str, ...]:
     return (last, f"Fv{N}", f"W{N}", "b", *gain_names(N))
 
 
-def step_one(runs: Sequence[Run]) -> Record:
+def single_joint_record(runs: Sequence[Run]) -> Record:
     """Return the first record that moves the last joint alone; raises InputError without one."""
     for run in runs:
         N = len(run.rig.joints)

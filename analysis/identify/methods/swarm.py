@@ -29,7 +29,7 @@ from analysis.identify.methods.search import (
     SearchTask,
     make_task,
     score,
-    step_one,
+    single_joint_record,
 )
 from analysis.identify.result import Identification, estimates_of
 from analysis.identify.settings import IDENTIFY
@@ -88,7 +88,7 @@ def search(
     or where every candidate lost its state.
     """
     rig = ck.common_rig(runs)
-    record = step_one(runs)
+    record = single_joint_record(runs)
     ck.refuse_dead_channels(rig, record)
     task = make_task(rig, record, terms, filtering(record), options)
     trail = run_search(method, task, options, rng)

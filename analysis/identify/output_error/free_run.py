@@ -58,7 +58,7 @@ class _Record:
         self.here: Mask = arrived(rig, record)
         self.measured: Array = np.column_stack([channels[n] for n in self.names])[self.here]
 
-    def left(self, model: Model) -> Array:
+    def residual(self, model: Model) -> Array:
         """Return measured less simulated positions (n, F)."""
         found = simulate(compiled(model, Effort.FIT), self.drive, self.start)
         if found.failure:
@@ -74,10 +74,10 @@ class FreeRuns:
         self.rig, self.terms = rig, tuple(terms)
         self.records = [_Record(rig, one) for one in condition_runs(rig, runs)]
 
-    def left(self, values: Mapping[str, float]) -> list[Array]:
+    def residual(self, values: Mapping[str, float]) -> list[Array]:
         """Return every record's measured less simulated positions (n, F)."""
         model = model_of(self.rig, self.terms, values)
-        return [record.left(model) for record in self.records]
+        return [record.residual(model) for record in self.records]
 
 
 def free_run_fit(
@@ -95,7 +95,7 @@ def free_run_fit(
     scale = np.abs(solution.value)
 
     def stacked(share: Array) -> Array:
-        left = ready.left(dict(zip(solution.names, map(float, share * scale), strict=True)))
+        left = ready.residual(dict(zip(solution.names, map(float, share * scale), strict=True)))
         return np.concatenate([part.ravel() for part in left])
 
     first = solution.value / scale

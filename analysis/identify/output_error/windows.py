@@ -122,7 +122,7 @@ class Windows:
     def sigma(self) -> dict[int, Array]:
         """Return the outputs' noise by step, (3 F,): the sensors' stated, behind the filter."""
         sensors = self.rig.sensors
-        taps = left_of_noise(self.rig)
+        taps = noise_gain(self.rig)
         base = np.array([sensors.piston.noise, *[sensors.chamber_pressure.noise] * 2]) * taps
         steps = [(r[1] - r[0]) / (1 << bits) for r, bits in (
             (sensors.piston.range, sensors.piston.bits),
@@ -266,6 +266,6 @@ class Windows:
         )
 
 
-def left_of_noise(rig: Rig) -> float:
+def noise_gain(rig: Rig) -> float:
     """Return what the channels' filter leaves of white noise, as a share of its amplitude."""
     return float(np.linalg.norm(channel_filter(rig.sample_rate).taps[0]))

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from hil_sim.device.can.adapters import Adapter
 from hil_sim.device.can.session import CanSession
 from hil_sim.device.device import Device, Plant
-from hil_sim.device.lifetime import PARENT_SECONDS, Owner, told_to_end
+from hil_sim.device.lifetime import PARENT_SECONDS, Owner, termination_signals
 from hil_sim.faults.device import DeviceFault
 from rig.model.rig import Rig
 from rig.model.wire.can_database import database_text
@@ -43,7 +43,7 @@ def serve_can(
     """
     device = Device(rig, plant, realtime=realtime, faults=faults)
     try:
-        with told_to_end() as ended:
+        with termination_signals() as ended:
             on_ready(adapter.endpoint)
             run_device(
                 adapter,

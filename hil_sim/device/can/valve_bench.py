@@ -19,7 +19,7 @@ import numpy as np
 from hil_sim.device.can.adapters import Adapter
 from hil_sim.device.device import Plant
 from hil_sim.device.laws import OFF, DeviceLaw
-from hil_sim.device.lifetime import PARENT_SECONDS, Owner, told_to_end
+from hil_sim.device.lifetime import PARENT_SECONDS, Owner, termination_signals
 from rig.model import channels as ch
 from rig.model.codes import decode_input
 from rig.model.rig import Rig
@@ -194,7 +194,7 @@ def serve_valves(
     owner = None if parent is None else Owner(parent)
     look = time.monotonic()
     try:
-        with told_to_end() as ended:
+        with termination_signals() as ended:
             on_ready(adapter.endpoint.replace("can://", "canopen-408://", 1))
             while not ended:
                 bench.poll(POLL_SECONDS)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rig.model.records import Run
 from rig.runs import archive, store
-from rig.runs.runstate import give_up_ownership
+from rig.runs.runstate import release_ownership
 
 
 def write_run(folder: str | Path, run: Run) -> Path:
@@ -22,5 +22,5 @@ def write_run(folder: str | Path, run: Run) -> Path:
             archive.write_group(file, r.name, r.channels, more, run.rig.unit_of)
     archive.put_in_place(fresh, path / archive.NAME)
     store.mark_done(path)
-    give_up_ownership(path)
+    release_ownership(path)
     return path

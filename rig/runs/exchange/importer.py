@@ -27,7 +27,7 @@ from rig.runs.exchange.manifest import (
     load_manifest,
 )
 from rig.runs.rigs import load_rig
-from rig.runs.runstate import DONE, EventLog, give_up_ownership, write_state
+from rig.runs.runstate import DONE, EventLog, release_ownership, write_state
 
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
@@ -260,7 +260,7 @@ def _write(
         raise RecordingFailed(f"{folder}: cannot be written: {error}") from error
     finally:
         with suppress(OSError):
-            give_up_ownership(folder)
+            release_ownership(folder)
 
 
 def _write_archive(source: _Source, records: list[_Imported], folder: Path) -> None:

@@ -76,7 +76,7 @@ def describe(
         "@id": "./",
         "@type": "Dataset",
         "name": f"Run {name} on {header.rig.name}",
-        "description": _story(head, header),
+        "description": _description(head, header),
         "datePublished": datetime.now(UTC).date().isoformat(),
         "dateCreated": header.created,
         "license": _ref(licence_id),
@@ -112,7 +112,7 @@ def describe(
     return {"@context": CONTEXT, "@graph": graph}
 
 
-def _story(head: RunHead, header: Header) -> str:
+def _description(head: RunHead, header: Header) -> str:
     protocol = str((header.protocol or {}).get("name", "")) or header.source or "no protocol"
     whole = sum(bool(record.attributes["complete"]) for record in head.records)
     return (

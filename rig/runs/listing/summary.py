@@ -49,7 +49,7 @@ def summarise(folder: Path) -> RunSummary:
     except InputError as error:
         return RunSummary(folder, UNREADABLE, "", "", "", -1, str(error))
     state = read_state(folder)
-    recovered, message = _story(read_events(folder), state, folder)
+    recovered, message = _end_of_run(read_events(folder), state, folder)
     counted = _UNKNOWN
     try:
         counted = _count(folder)
@@ -75,7 +75,7 @@ def summarise(folder: Path) -> RunSummary:
     )
 
 
-def _story(events: list[dict[str, Any]], state: str, folder: Path) -> tuple[bool, str]:
+def _end_of_run(events: list[dict[str, Any]], state: str, folder: Path) -> tuple[bool, str]:
     """Return whether a run was recovered, and the message of its latest end."""
     ends = [e for e in events if e.get("event") in ("end", "recovered")]
     waiting = (folder / JOURNAL).exists()

@@ -31,7 +31,7 @@ _STATES = {"open": 21, "complete": 29, "partial": 27, "discarded": 31}  # type o
 
 
 @dataclass(frozen=True)
-class FoundRow:
+class SalvagedRow:
     """A row's columns, where it begins in its file, and its number (None if that is damaged)."""
 
     offset: int
@@ -46,7 +46,7 @@ def raw_bytes(path: Path) -> Bytes:
     return np.memmap(path, dtype=np.uint8, mode="r")
 
 
-def block_rows(raw: Bytes) -> Iterator[FoundRow]:
+def block_rows(raw: Bytes) -> Iterator[SalvagedRow]:
     """Yield what looks like a row of the block table; only its checksum tells whether it is."""
 
     def like(types: list[Bytes]) -> Any:
@@ -73,7 +73,7 @@ def marks(raw: Bytes) -> Iterator[Mark]:
             yield Mark(row.number or 0, stream, start, ticks, state, meta)
 
 
-def _rows(raw: Bytes, columns: int, short: int, like: Like) -> Iterator[FoundRow]:
+def _rows(raw: Bytes, columns: int, short: int, like: Like) -> Iterator[SalvagedRow]:
     """Yield rows of so many columns, of which the first is NULL (it is the rowid).
 
     `like` judges the types of the first `short` columns, each one byte in the header.
@@ -92,7 +92,7 @@ def _rows(raw: Bytes, columns: int, short: int, like: Like) -> Iterator[FoundRow
         for place in places[like(types)].tolist():
             row = _row(part, place, columns)
             if row is not None:
-                yield FoundRow(begin + place, *row)
+                yield SalvagedRow(begin + place, *row)
 
 
 def _row(part: Bytes, place: int, columns: int) -> tuple[int | None, tuple[Any, ...]] | None:

@@ -61,15 +61,15 @@ def study(protocols: Sequence[str], rig: str, first: int, seeds: int, say: Say) 
     still = bench.model_copy(update={"oil": oil})
     out = []
     for name in protocols:
-        foreseen = of_plan(resolve(library.load(name), bench), bench)
-        if foreseen.prediction is None:
-            raise InputError(f"{name}: {foreseen.why}")
+        forecast_text = of_plan(resolve(library.load(name), bench), bench)
+        if forecast_text.prediction is None:
+            raise InputError(f"{name}: {forecast_text.why}")
         benches = range(first, first + seeds)
         found = [
             _found(name, still, benches, PLAIN, say),
             _found(name, bench, benches, DEFAULT, say),
         ]
-        out.append(Studied(name, seeds, foreseen.prediction.parameters, *found))
+        out.append(Studied(name, seeds, forecast_text.prediction.parameters, *found))
     return out
 
 
