@@ -33,6 +33,7 @@ class BlockDecoder:
         self._low = np.array([sensor.range[0] for sensor in sensors])
         high = np.array([sensor.range[1] for sensor in sensors])
         self._top = np.array([(1 << sensor.bits) - 1 for sensor in sensors])
+        self._narrow = bool((self._top < 0xFFFF).any())  # a wider code has no register to be in
         self._step = (high - self._low) / self._top
         self._most = np.array([(1 << (j.valve.command_bits - 1)) - 1 for j in rig.joints])
         self._volt = np.array([j.valve.command_range for j in rig.joints]) / self._most
@@ -68,11 +69,14 @@ class BlockDecoder:
         """Return the block in SI; raises DeviceError if it is impossible after the last one."""
         sequence, tick = self._follow(header)
         codes, outputs = reg.unpack_samples(answer[2 * reg.HEADER_WORDS :], self.layout)
-        self._possible(codes > self._top, codes, 0)
+        if self._narrow:
+            self._possible(codes > self._top, codes, 0)
         self._possible(np.abs(outputs.astype(np.int32)) > self._most, outputs, codes.shape[1])
         data = np.empty((self.layout.samples, self.layout.columns))
-        data[:, : self.layout.channels] = self._low + codes * self._step
-        data[:, self.layout.channels :] = outputs * self._volt
+        measured = data[:, : self.layout.channels]
+        np.multiply(codes, self._step, out=measured)
+        measured += self._low
+        np.multiply(outputs, self._volt, out=data[:, self.layout.channels :])
         self._sequence, self.tick = sequence, tick + self.layout.samples
         return SampleBlock(
             sequence=sequence,

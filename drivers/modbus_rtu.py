@@ -8,6 +8,8 @@ is listened to until it is quiet, and blocks carry a sequence number that only t
 from __future__ import annotations
 
 import logging
+import os
+import select
 import time
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -47,6 +49,18 @@ class RtuSettings(WireSettings):
         return {"device": url.path, **query}
 
 
+class _WaitingClient(ModbusSerialClient):
+    """pymodbus's client, which else looks every millisecond whether something has come."""
+
+    def _wait_for_data(self) -> int:
+        line: Any = self.socket
+        if os.name != "posix" or line is None:
+            return int(super()._wait_for_data())
+        if select.select([line.fileno()], [], [], self.comm_params.timeout_connect)[0]:
+            return int(line.in_waiting)
+        return 0
+
+
 class RtuConnection(ModbusConnection):
     """A serial line that is opened once and, broken once, stays closed until opened again."""
 
@@ -56,7 +70,7 @@ class RtuConnection(ModbusConnection):
         self._at = at
 
     def _new_client(self) -> ModbusSerialClient:
-        return ModbusSerialClient(
+        return _WaitingClient(
             self._at.device,
             baudrate=self._at.baud,
             parity=self._at.parity,

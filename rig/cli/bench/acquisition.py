@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
@@ -62,10 +64,7 @@ def measure_acquisition(
 
 def timing(ends: np.ndarray, arrivals: np.ndarray) -> dict[str, float | int]:
     """Return lateness, jitter and drift of blocks whose last samples were taken at `ends` [s]."""
-    late = arrivals - ends
-    drift = float(np.polyfit(ends - ends[0], late, 1)[0]) if len(late) > 2 else 0.0
-    late = late - drift * (ends - ends[0])
-    late -= late.min()
+    late, drift = lateness(ends, arrivals)
     interval = np.diff(arrivals) if len(arrivals) > 1 else np.zeros(1)
     return {
         "lateness_mean_s": float(late.mean()),
@@ -75,3 +74,23 @@ def timing(ends: np.ndarray, arrivals: np.ndarray) -> dict[str, float | int]:
         "interval_max_s": float(interval.max()),
         "clock_drift_ppm": drift * 1e6,
     }
+
+
+def lateness(ends: np.ndarray, arrivals: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return how late [s] each block came against the earliest, and the clocks' drift [s/s]."""
+    late = arrivals - ends
+    drift = float(np.polyfit(ends - ends[0], late, 1)[0]) if len(late) > 2 else 0.0
+    late = late - drift * (ends - ends[0])
+    late -= late.min()
+    return late, drift
+
+
+def waited_seconds() -> float:
+    """Return how long [s] this thread was ready to run and had no processor; NaN where unknown.
+
+    Linux tells it: the second number of /proc/thread-self/schedstat [ns].
+    """
+    try:
+        return 1e-9 * int(Path("/proc/thread-self/schedstat").read_text("ascii").split()[1])
+    except (OSError, ValueError, IndexError):
+        return math.nan

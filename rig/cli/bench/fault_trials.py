@@ -19,11 +19,11 @@ import numpy as np
 
 from drivers import make_driver, wire_at
 from drivers.base import DeviceError, DeviceLost, OutputLaw, SampleBlock
-from hil_sim.device.server import WIRES
 from hil_sim.faults import CLASSES
 from hil_sim.faults.base import Fault
 from hil_sim.faults.device import ClockDrift, ClockJump, DeviceFault, QueueOverrun, Reboots
 from hil_sim.faults.wire import WireFault
+from hil_sim.link.served import SERVED
 from rig.bench.guard import EXCITED, JointRole
 from rig.bench.latch import BenchState
 from rig.bench.session import Bench
@@ -325,5 +325,5 @@ def _of_machine(fault: Fault, trip: SafetyTrip | Alarm) -> Naming:
 
 
 def wires() -> tuple[str, ...]:
-    """Name the wires that trials are made on."""
-    return WIRES
+    """Name the wires that trials are made on: those that a faulty link stands on."""
+    return SERVED

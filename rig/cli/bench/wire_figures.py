@@ -25,7 +25,7 @@ from drivers.base import Driver
 from drivers.serial_stream import SerialSettings
 from hil_sim.device.server import RTU, SERIAL, TCP, VALVES, WIRES
 from rig.bench.session import Bench
-from rig.cli.bench.acquisition import timing
+from rig.cli.bench.acquisition import lateness, waited_seconds
 from rig.cli.bench.figure import Figure
 from rig.cli.simulated_bench import simulated_bench
 from rig.model import registers as reg
@@ -48,7 +48,8 @@ Say = Callable[[str], None]
 class Stream:
     """All channels of a wire streamed in real time through driver, guard and recorder.
 
-    `core_share` is the acquisition process's of one core; times are in seconds.
+    `core_share` is the acquisition process's of one core; times are in seconds. `worst_waited` is
+    how long, of the worst lateness, this process was ready to run and had no processor.
     """
 
     samples: int
@@ -57,6 +58,7 @@ class Stream:
     core_share: float
     late_p99: float
     late_worst: float
+    worst_waited: float
 
 
 def wire_figures(say: Say, minutes: float) -> list[Figure]:
@@ -92,19 +94,24 @@ def stream_of(wire: str, seconds: float) -> Stream:
         with Bench(reached, make_driver(reached.wire, reached), recorder, signals=False) as bench:
             bench.run_for(0.5)  # what is imported and opened first is not the stream
             lost, busy, began = bench.lost_samples, time.process_time(), time.perf_counter()
-            ends, arrivals, samples, disordered = [], [], 0, 0
+            ends, arrivals, waits, samples, disordered = [], [], [], 0, 0
             while time.perf_counter() - began < seconds:
                 before = bench.tick
                 block = bench.exchange()
                 arrivals.append(time.perf_counter())
+                waits.append(waited_seconds())
                 ends.append((block.tick + len(block.data)) / reached.sample_rate)
                 samples += len(block.data)
                 disordered += block.tick < before
             share = (time.process_time() - busy) / (time.perf_counter() - began)
             lost = bench.lost_samples - lost
-    measured = timing(np.array(ends), np.array(arrivals))
+    late, _ = lateness(np.array(ends), np.array(arrivals))
+    worst = int(late.argmax())
+    # What made the block late lies between the last one that was not and this one.
+    before_it = np.flatnonzero(late[:worst] < 0.1 * late[worst])
+    waited = waits[worst] - waits[int(before_it[-1]) if len(before_it) else 0]
     return Stream(
-        samples, lost, disordered, share, measured["lateness_p99_s"], measured["lateness_max_s"]
+        samples, lost, disordered, share, float(np.quantile(late, 0.99)), float(late[worst]), waited
     )
 
 
@@ -120,6 +127,7 @@ def acquisition_of(wire: str, seconds: float) -> list[Figure]:
         Figure(GROUP, f"{wire}: of one core, driver + guard + recorder", share, "%", 25.0),
         Figure(GROUP, f"{wire}: lateness, 99 %", 1e3 * stream.late_p99, "ms"),
         Figure(GROUP, f"{wire}: lateness, worst", 1e3 * stream.late_worst, "ms", 50.0),
+        Figure(GROUP, f"{wire}: of it without a processor", 1e3 * stream.worst_waited, "ms"),
     ]
 
 
