@@ -9,14 +9,16 @@ from concurrent.futures import Future
 from typing import Final, Self, TypeVar
 
 from hil_sim.device.device import Device
+from hil_sim.device.lifetime import EndpointError
 from hil_sim.device.pty_line import PtyLine
 from hil_sim.device.rtu_server import serve_line
 from hil_sim.device.serial_server import serve_port
-from hil_sim.device.server import RTU, SERIAL, serve_until
+from hil_sim.device.server import RTU, SERIAL, TCP, serve_until
 from hil_sim.faults.wire import WireFault
 from hil_sim.link.wires import faulty_link
 
 Answer = TypeVar("Answer")
+SERVED: Final = (TCP, RTU, SERIAL)  # wires that a device and a faulty link stand on here
 _SECONDS: Final = 60.0  # nothing here takes that long; a hang ends in an error
 
 
@@ -24,7 +26,8 @@ class ServedDevice:
     """A device behind a wire, for benches that look into the device while a host drives it.
 
     `link` is what the host reaches it by (`link.endpoint`); `inside` makes a call while the
-    device rests. A context manager that ends both.
+    device rests. A context manager that ends both. Raises EndpointError for a wire other than
+    those of `SERVED`.
     """
 
     def __init__(
@@ -36,6 +39,8 @@ class ServedDevice:
         seed: int = 0,
         seconds: Callable[[], float] | None = None,
     ) -> None:
+        if wire not in SERVED:
+            raise EndpointError(f"no faults for wire {wire}; expected one of: {' '.join(SERVED)}")
         self.device = device
         self._lock = threading.Lock()
         self._ended: list[bool] = []
