@@ -17,12 +17,13 @@ from urllib.parse import SplitResult, parse_qs
 
 from pydantic import Field
 from pymodbus.client import ModbusSerialClient
-from serial import SerialException
+from serial import Serial, SerialException
 
 from drivers.base import DeviceError, DeviceLost, WireSettings
 from drivers.bench_protocol import AnswerDamaged
 from drivers.modbus_tcp import ModbusTcpDriver
 from drivers.modbus_transport import ModbusConnection
+from drivers.serial_transport import OPENING_ERRORS, why_not_opened
 from rig.model.parts import Wire
 
 logger = logging.getLogger(__name__)
@@ -78,6 +79,14 @@ class RtuConnection(ModbusConnection):
             retries=0,
             trace_packet=self._note,
         )
+
+    def _not_connected(self) -> DeviceError:
+        # The library keeps the reason to itself.
+        try:
+            Serial(self._at.device, self._at.baud, exclusive=True).close()
+        except OPENING_ERRORS as error:
+            return why_not_opened(self._at.device, self._at.baud, error)
+        return super()._not_connected()
 
     def _connected(self, client: Any) -> None:
         client.socket.reset_input_buffer()

@@ -74,7 +74,7 @@ class ModbusConnection:
         return self._client is not None and self._client.connected
 
     def open(self) -> None:
-        """Connect; raises DeviceLost when nothing listens there."""
+        """Connect; raises DeviceLost where nothing listens, DeviceError where it may not be."""
         self.close()
         self._factor = 1.0
         client = self._new_client()
@@ -82,9 +82,7 @@ class ModbusConnection:
         for kind in answer_classes():
             client.register(kind)
         if not client.connect() or client.socket is None:
-            raise DeviceLost(
-                f"nothing answers at {self.where}; is the device (or `bramah sim`) running there?"
-            )
+            raise self._not_connected()
         self._connected(client)
         self._client = client
 
@@ -95,6 +93,12 @@ class ModbusConnection:
             timeout=self._timeout,
             retries=0,
             trace_packet=self._note,
+        )
+
+    def _not_connected(self) -> DeviceError:
+        """Return why `open` has failed."""
+        return DeviceLost(
+            f"nothing answers at {self.where}; is the device (or `bramah sim`) running there?"
         )
 
     def _connected(self, client: Any) -> None:

@@ -5,6 +5,7 @@ Another library takes pyserial's place by another class with the four methods of
 
 from __future__ import annotations
 
+import errno
 import os
 import select
 import time
@@ -16,13 +17,14 @@ import serial
 from drivers.base import DeviceBusy, DeviceError, DeviceLost
 
 _CHUNK = 65_536
+_WRITE_TIMEOUT = 1.0  # [s]
 _SLICE_SECONDS = 0.02  # how long pyserial waits at a time: reading ends that much late, at most
 _ERRORS: tuple[type[Exception], ...] = (OSError,)  # pyserial's own are OSErrors
 with suppress(ImportError):  # none on Windows
     import termios
 
     _ERRORS = (OSError, termios.error)
-_OPENING_ERRORS: tuple[type[Exception], ...] = (*_ERRORS, ValueError)
+OPENING_ERRORS: tuple[type[Exception], ...] = (*_ERRORS, ValueError)
 
 
 class Transport(Protocol):
@@ -56,7 +58,27 @@ class Transport(Protocol):
         """Close the port; never raises."""
 
 
-_WRITE_TIMEOUT = 1.0  # [s]
+def why_not_opened(device: str, baud: int, error: Exception) -> DeviceError:
+    """Return the error of a serial port that the system would not open, and what to do about it."""
+    text = str(error)
+    if "exclusively lock" in text:
+        return PortInUse(
+            f"the port {device} is in use by another program, which has control; end it, or wait "
+            "for its end"
+        )
+    number = error.errno if isinstance(error, OSError) else None
+    if number in (errno.EPERM, errno.EACCES):
+        return DeviceError(
+            f"no permission to open {device}; on Linux join the group that owns it (often "
+            "`dialout`) and log in again"
+        )
+    if number == errno.ENOENT:
+        return DeviceLost(
+            f"there is no port {device}; is the device plugged in (or `bramah sim` running there)?"
+        )
+    if f"({errno.ENOTTY}," in text or number == errno.ENOTTY:
+        return DeviceError(f"{device} is no serial port; expected one such as /dev/ttyUSB0 or COM3")
+    return DeviceLost(f"cannot open {device} at {baud} baud: {text}")
 
 
 def _written(file: int, data: bytes) -> int:
@@ -99,8 +121,8 @@ class PySerialTransport:
                 write_timeout=_WRITE_TIMEOUT,
                 exclusive=None if shared else True,
             )
-        except _OPENING_ERRORS as error:
-            raise self._why_not(error) from error
+        except OPENING_ERRORS as error:
+            raise why_not_opened(self._device, self._baud, error) from error
         self._file = self._port.fileno() if os.name == "posix" else None
 
     def write(self, data: bytes) -> None:
@@ -172,23 +194,3 @@ class PySerialTransport:
     def _gone(self) -> DeviceLost:
         self.close()
         return DeviceLost(f"the port {self._device} has gone: device unplugged or ended")
-
-    def _why_not(self, error: Exception) -> DeviceError:
-        text = str(error)
-        if "exclusively lock" in text:
-            return PortInUse(
-                f"the port {self._device} is in use by another program, which has control; "
-                "end it, or wait for its end"
-            )
-        number = error.errno if isinstance(error, OSError) else None
-        if number in (1, 13):
-            return DeviceError(
-                f"no permission to open {self._device}; on Linux join the group that owns it "
-                "(often `dialout`) and log in again"
-            )
-        if number == 2:
-            return DeviceLost(
-                f"there is no port {self._device}; is the device plugged in (or `bramah sim` "
-                "running there)?"
-            )
-        return DeviceLost(f"cannot open {self._device} at {self._baud} baud: {text}")

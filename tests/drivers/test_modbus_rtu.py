@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from serial import SerialException
 
 from drivers import make_driver, wire_at
-from drivers.base import OFF, DeviceError, DeviceLost, OutputLaw
+from drivers.base import OFF, DeviceBusy, DeviceError, DeviceLost, OutputLaw
 from drivers.modbus_rtu import ModbusRtuDriver
 from hil_sim.device.rtu_server import checksum, frame_length, sound
 from rig.model.parse import InputError
@@ -133,3 +135,34 @@ def test_after_a_late_answer_the_next_request_gets_its_own(
     line.fault = "late"
     driver.read_block()
     driver.upload(1, np.zeros(7))
+
+
+def to_port(device: str) -> ModbusRtuDriver:
+    rig = seed_rig(timeout=TIMEOUT)
+    driver = make_driver(wire_at(f"modbus-rtu://{device}", rig.wire), rig)
+    assert isinstance(driver, ModbusRtuDriver)
+    return driver
+
+
+def test_a_port_that_cannot_be_opened_is_named_with_the_reason(endpoint: str) -> None:
+    with pytest.raises(DeviceLost, match="there is no port /dev/nothing-here"):
+        to_port("/dev/nothing-here").connect()
+    with pytest.raises(DeviceError, match="is no serial port; expected one such as"):
+        to_port(__file__).connect()
+    taken = to_port(endpoint.removeprefix("modbus-rtu://"))
+    taken.connect()
+    try:
+        with pytest.raises(DeviceBusy, match="in use by another program, which has control"):
+            to_port(endpoint.removeprefix("modbus-rtu://")).connect()
+    finally:
+        taken.close()
+
+
+def test_a_port_that_may_not_be_opened_says_who_may(monkeypatch: pytest.MonkeyPatch) -> None:
+    def denied(*_: object, **__: object) -> None:
+        raise SerialException(errno.EACCES, "could not open port /dev/ttyUSB0: Permission denied")
+
+    monkeypatch.setattr("serial.serial_for_url", denied)
+    monkeypatch.setattr("drivers.modbus_rtu.Serial", denied)
+    with pytest.raises(DeviceError, match=r"no permission to open /dev/ttyUSB0; .*dialout"):
+        to_port("/dev/ttyUSB0").connect()

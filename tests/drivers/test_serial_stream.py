@@ -630,7 +630,7 @@ def test_a_port_that_is_none_is_a_lost_device() -> None:
 
 
 def test_a_file_is_no_port() -> None:
-    with pytest.raises(DeviceLost, match="cannot open"):
+    with pytest.raises(DeviceError, match=r"is no serial port; expected one such as /dev/ttyUSB0"):
         host(__file__).connect()
 
 

@@ -225,7 +225,10 @@ class _Reader:
     def _signal(self, name: str, bits: int) -> tuple[Any, Any]:
         places = self._places.get(name, [])
         if not places:
-            raise InputError(f"{self._source}: signal {name} is missing; the bench needs it")
+            raise InputError(
+                f"{self._source}: signal {name} is missing; the bench needs it (`bramah dbc` "
+                "writes the whole file of a rig)"
+            )
         if len(places) > 1:
             names = " and ".join(message.name for message, _ in places)
             raise InputError(f"{self._source}: signal {name} stands in {names}; expected in one")
