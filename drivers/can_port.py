@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import logging
+import os
 import queue
 import select
 import socket
@@ -19,6 +20,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import can
+from can.interfaces.slcan import slcanBus
 from can.interfaces.socketcand import SocketCanDaemonBus
 
 from drivers.base import DeviceError, DeviceLost
@@ -233,6 +235,8 @@ class CanPort:
                     data_bitrate=self._data_bitrate,
                     data_sample_point=75.0,
                 )
+            if os.name == "posix" and self._make is can.Bus:
+                return _SlcanBus(place.channel, **rates)
         elif self._data_bitrate is not None:
             rates |= {"fd": True, "data_bitrate": self._data_bitrate}
         return self._make(interface=place.interface, channel=place.channel, **rates)
@@ -288,6 +292,33 @@ class _SocketcandBus(SocketCanDaemonBus):
     def _end(self) -> socket.socket:
         end: socket.socket = getattr(self, "_SocketCanDaemonBus__socket")  # noqa: B009 - mangled
         return end
+
+
+class _SlcanBus(slcanBus):
+    """python-can's client, which asks the system for every byte by itself."""
+
+    def _read(self, timeout: float | None) -> str | None:
+        end = None if timeout is None else time.monotonic() + timeout
+        port = self.serialPortOrig
+        while True:
+            if (text := _first_text(self._buffer)) is not None:
+                return text
+            left = _SLICE_SECONDS if end is None else end - time.monotonic()
+            ready = select.select([port.fileno()], [], [], min(max(left, 0.0), _SLICE_SECONDS))[0]
+            if ready:
+                self._buffer.extend(port.read(port.in_waiting or 1))
+            elif end is not None and left <= 0.0:
+                return None
+
+
+def _first_text(begun: bytearray) -> str | None:
+    """Take the first whole text, up to its end or error mark, from what has come."""
+    ends = [at for mark in (b"\r", b"\a") if (at := begun.find(mark)) >= 0]
+    if not ends:
+        return None
+    text = bytes(begun[: min(ends) + 1])
+    del begun[: len(text)]
+    return text.decode("ascii", "replace")
 
 
 @dataclass
