@@ -22,7 +22,8 @@ def bench(
     only: Annotated[
         str | None,
         typer.Option(
-            help="One of: plant, analysis, stream, demo, acquisition, wires, faults, screen."
+            help="One of: plant, analysis, growth, run, stream, demo, acquisition, wires, faults, "
+            "screen."
         ),
     ] = None,
     docs: Annotated[Path | None, typer.Option(help="Also write the table as a page.")] = None,

@@ -169,7 +169,7 @@ def _streaming(rig: Rig) -> Iterator[Driver]:
 
 
 @contextmanager
-def _bare_modbus(rig: Rig) -> Iterator[Callable[[], object]]:
+def bare_modbus(rig: Rig) -> Iterator[Callable[[], object]]:
     """Ask for blocks with pymodbus and nothing else."""
     client, layout = _client(rig.wire), reg.block_layout(len(rig.channels), len(rig.joints))
     client.connect()
@@ -235,4 +235,4 @@ def _bare_serial(rig: Rig) -> Iterator[Callable[[], object]]:
         request(Message.CLOSE, 3)
 
 
-_BARE: Final = {TCP: _bare_modbus, RTU: _bare_modbus, SERIAL: _bare_serial}
+_BARE: Final = {TCP: bare_modbus, RTU: bare_modbus, SERIAL: _bare_serial}

@@ -1,0 +1,85 @@
+"""Times beside their anchors, as figures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from hil_sim.plant.plant import Plant
+from hil_sim.scenario.file import Scenario
+from rig.cli.bench.figure import Figure
+from rig.cli.bench.plant import hard_laws
+from rig.cli.bench.speed.free_run import free_run_times
+from rig.cli.bench.timing import Spent, spent_together
+from rig.model.rig import Rig
+
+BLOCK, TICKS = 10, 5000
+
+
+def beside(
+    group: str, name: str, own: Spent, anchor: tuple[str, Spent] | None, limit: float | None
+) -> list[Figure]:
+    """Return a time, its anchor and their ratio; `limit` bounds that, or the time without one."""
+    bound = None if anchor else limit
+    figures = [
+        Figure(group, name, 1e3 * own.least, "ms", bound),
+        Figure(group, f"{name}, median", 1e3 * own.median, "ms"),
+    ]
+    if anchor is None:
+        return figures
+    other, time = anchor
+    return [
+        *figures,
+        Figure(group, other, 1e3 * time.least, "ms"),
+        Figure(group, f"{other}, median", 1e3 * time.median, "ms"),
+        Figure(group, f"{name} over {other}", own.least / time.least, "x as long", limit),
+    ]
+
+
+def free_run_figures(rig: Rig) -> list[Figure]:
+    """Measure a free run of 10 s beside what else solves the same equations."""
+    group, found = "analysis", free_run_times(rig)
+    own, hand = found["own"], found["hand"]
+    figures = [
+        *beside(group, "free run of 10 s, both joints", own, ("the same by hand", hand), 1.4),
+        Figure(group, "free run", found["times_real_time"], "x real time", 500, True),
+        Figure(group, "difference of the two", found["difference_to_hand"], "rad", 1e-9),
+        Figure(group, "its largest error over a state's range", found["error"]),
+    ]
+    for name, limit in (("odeint", 9.0), ("cvodes", 14.0)):
+        if name in found:
+            other = found[name]
+            figures += [
+                Figure(group, f"{name}, as exact", 1e3 * other.least, "ms"),
+                Figure(group, f"{name}, median", 1e3 * other.median, "ms"),
+                Figure(group, f"{name}, its error", found[f"{name}_error"]),
+                Figure(
+                    group,
+                    f"{name} over free run",
+                    other.least / own.least,
+                    "x as long",
+                    limit,
+                    True,
+                ),
+            ]
+    return figures
+
+
+def plant_over_kernel(rig: Rig) -> list[Figure]:
+    """Measure the plant in blocks as they are served beside one call of its compiled loop."""
+
+    def run(ticks: int) -> Callable[[], None]:
+        plant, laws = Plant(rig, Scenario(), 1), hard_laws(rig)
+
+        def work() -> None:
+            for _ in range(TICKS // ticks):
+                plant.advance(ticks, laws)
+
+        return work
+
+    times = spent_together({"blocks": run(BLOCK), "kernel": run(TICKS)})
+    blocks, kernel = times["blocks"], times["kernel"]
+    seconds = TICKS / rig.sample_rate
+    return [
+        Figure("plant", "in blocks of 10", seconds / blocks.least, "x real time", 160, True),
+        *beside("plant", "5 s in blocks of 10", blocks, ("5 s at once", kernel), 1.1),
+    ]

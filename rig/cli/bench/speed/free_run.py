@@ -1,0 +1,136 @@
+"""A free run of the model beside the same equations written by hand, odeint and CVODES."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Final
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.integrate import odeint as scipy_odeint
+
+from analysis.simulation.equations import call_rates
+from analysis.simulation.model import Model, nominal_model
+from analysis.simulation.settings import SIMULATION
+from analysis.simulation.simulate import (
+    Compiled,
+    DrivingInput,
+    State,
+    compiled,
+    simulate,
+)
+from analysis.simulation.synthetic import multisine
+from analysis.simulation.twin import holding_state
+from analysis.terms import baseline_of
+from analysis.terms.base import Used
+from rig.cli.bench.speed import hand_fused
+from rig.cli.bench.timing import REPEATS, spent_together
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+
+SPOOL_RMS: Final = 0.006  # [V] moves both joints by some centimetres
+SCALE: Final = np.array([1.0, 1.0, 1.0, 1.0, 1e6, 1e6, 1e6, 1e6])  # rad, rad/s, Pa
+# A quarter of a decade apart: a coarser choice would let an anchor solve more exactly than asked.
+TOLERANCES: Final = tuple(10.0 ** (-exponent / 4.0) for exponent in range(16, 41))
+
+
+def free_run_times(rig: Rig, repeats: int = REPEATS) -> dict[str, Any]:
+    """Return what a free run of 10 s with both joints moving takes, beside what it is held against.
+
+    `own`, `hand`, `odeint`: processor time of this program, of the same equations and steps written
+    by hand (`hand_fused`), and of scipy's odeint over the same compiled right-hand side at the
+    loosest tolerance at which no state is less exact (largest error over its range, LSODA at rtol
+    1e-12 being the truth). All have the same output: states, pistons, their speeds.
+    """
+    model, drive, start = both_moving(rig)
+    ready = compiled(model)
+    found = simulate(ready, drive, start)
+    p = hand_fused.constants(rig, model.values)
+    y0 = np.concatenate((start.q, start.qd, start.p_cap, start.p_rod))
+    angle, pressure = SIMULATION.angle_tolerance, SIMULATION.pressure_tolerance
+    atol = np.repeat([angle, ready.rate_tolerance, pressure, pressure], 2)
+    out = np.zeros((len(drive.u), 12))
+
+    def by_hand() -> None:
+        hand_fused.free_run(
+            y0, drive.u, drive.p_s, drive.rate, p, SIMULATION.relative_tolerance, atol, out
+        )
+
+    by_hand()
+    rates, t = _compiled_callback(ready, drive), np.arange(len(drive.u)) / drive.rate
+
+    def odeint(rtol: float) -> Array:
+        return np.asarray(scipy_odeint(rates, y0, t, tfirst=True, rtol=rtol, atol=rtol * SCALE))
+
+    true = odeint(1e-12)
+
+    size = np.ptp(true, axis=0)
+
+    def error(states: Array) -> float:
+        return float((np.abs(states - true).max(axis=0) / size).max())
+
+    own = np.hstack((found.q, found.qd, found.p_cap, found.p_rod))
+    exact = error(own)
+    rtol = next(r for r in TOLERANCES if error(odeint(r)) <= exact)
+    links = [joint.linkage for joint in rig.joints]
+
+    def by_odeint() -> None:
+        states = odeint(rtol)
+        for i, link in enumerate(links):
+            link.piston(states[:, i])
+            _ = link.jacobian(states[:, i]) * states[:, 2 + i]
+
+    works: dict[str, Callable[[], object]] = {
+        "own": lambda: simulate(ready, drive, start),
+        "hand": by_hand,
+        "odeint": by_odeint,
+    }
+    times = spent_together(works, repeats)
+    return {
+        **times,
+        "simulated_seconds": t[-1],
+        "times_real_time": float(t[-1] / times["own"].least),
+        "error": exact,
+        "odeint_rtol": rtol,
+        "odeint_error": error(odeint(rtol)),
+        "difference_to_hand": float(np.abs(out[:, :2] - found.q).max()),
+        "failure": found.failure,
+    }
+
+
+def _compiled_callback(ready: Compiled, drive: DrivingInput) -> Callable[[float, Array], Array]:
+    """Return dy/dt(t, y) as one compiled call of two arguments: Python's share is odeint's own."""
+    work, address, n, rate = ready.work(), ready.address, len(drive.u), drive.rate
+    arrays = (drive.inputs, drive.locked, ready.geometry, ready.par, ready.context, work)
+    inputs, locked, geometry, par, context, room = (int(a.ctypes.data) for a in arrays)
+
+    @njit(error_model="numpy")
+    def rates(t, y):  # type: ignore[no-untyped-def]
+        dy = np.empty_like(y)
+        call_rates(
+            address, t, y.ctypes.data, dy.ctypes.data, inputs, n, rate, locked, geometry, par,
+            context, room,
+        )  # fmt: skip
+        return dy
+
+    # The arrays live as long as whoever calls.
+    rates.held = arrays
+    return rates  # type: ignore[no-any-return]
+
+
+def both_moving(rig: Rig) -> tuple[Model, DrivingInput, State]:
+    """Return the nominal model, 10 s of a spool that moves all joints, and a state at rest."""
+    model = nominal_model(rig, tuple(Used(term) for term in baseline_of(rig)))
+    start = holding_state(rig, model, np.zeros(len(rig.joints)))
+    rng, n = np.random.default_rng(0), round(10.0 * rig.sample_rate) + 1
+    wave = multisine(rng, rig.sample_rate, 10.0, 4.0)[0]
+    shifts = [k * len(wave) // 3 for k in range(len(rig.joints))]
+    spools = np.column_stack([SPOOL_RMS * np.resize(np.roll(wave, k), n) for k in shifts])
+    still = np.zeros((n, len(rig.joints)))
+    drive = DrivingInput(
+        rig.sample_rate, spools, np.full(n, rig.supply.pressure), np.full(n, rig.oil.temperature),
+        np.zeros(len(rig.joints), dtype=bool), still, still, still,
+    )  # fmt: skip
+    return model, drive, start

@@ -1,0 +1,149 @@
+"""A run over the wire beside bare pymodbus that moves as many blocks from the same device."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from drivers import make_driver, wire_at
+from protocols.engine import engine
+from protocols.engine.desk import Desk
+from protocols.engine.states import Machine, State
+from protocols.files import library
+from protocols.files.plan import Overrides, resolve
+from rig.bench.screens.sockets import Publisher
+from rig.bench.session import Bench
+from rig.cli.bench.figure import Figure
+from rig.cli.bench.wire_figures import bare_modbus
+from rig.cli.simulated_bench import simulated_bench
+from rig.model.rig import Rig
+from rig.runs.recorder import Recorder
+from rig.runs.rigs import load_rig
+
+GROUP: Final = "run"
+RIG, PROTOCOL, STEP = "shinshu-2dof", "lock-and-excite", "step1"
+ROUNDS: Final = 5
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class _Cost:
+    """What one block cost: processor time of this process and wall time [s]."""
+
+    processor: float
+    wall: float
+
+
+def run_figures(folder: Path, say: Say, seconds: float) -> list[Figure]:
+    """Measure a run in virtual time, and `seconds` of streaming in real time, beside pymodbus."""
+    say(f"run: {PROTOCOL}, {STEP}, in virtual time, {ROUNDS} times")
+    rig = load_rig(RIG)
+    pairs = []
+    for number in range(ROUNDS):
+        own, blocks = _protocol_run(rig, folder / f"run-{number}")
+        pairs.append((own, _bare(rig, blocks)))
+    figures = _figures("virtual time", pairs, 1.3)
+    say(f"run: streaming in real time for {ROUNDS} times {seconds / ROUNDS:g} s")
+    count = max(10, round(seconds / ROUNDS * rig.sample_rate / 10))
+    pairs = []
+    for number in range(ROUNDS):
+        own = _streamed(rig, folder / f"stream-{number}", count)
+        pairs.append((own, _bare(rig, count, real_time=True)))
+    return figures + _figures("real time", pairs, 1.6)
+
+
+def _figures(kind: str, pairs: list[tuple[_Cost, _Cost]], limit: float) -> list[Figure]:
+    """Return least and median of a block's times, and what the wish is about.
+
+    In virtual time nobody waits, so a run takes as long as its wall time; in real time what counts
+    is the processor.
+    """
+    figures = []
+    for what, wished in (("processor", kind == "real time"), ("wall", kind == "virtual time")):
+        own, bare = (
+            [1e3 * getattr(cost, what) for cost in costs] for costs in zip(*pairs, strict=True)
+        )
+        name = f"{kind}, a block, {what} time"
+        figures += [
+            Figure(GROUP, name, min(own), "ms"),
+            Figure(GROUP, f"{name}, median", float(np.median(own)), "ms"),
+            Figure(GROUP, f"{name}, bare pymodbus", min(bare), "ms"),
+            Figure(GROUP, f"{name}, bare pymodbus, median", float(np.median(bare)), "ms"),
+            Figure(
+                GROUP, f"{name}, over bare", min(own) / min(bare), "x as long",
+                limit if wished else None,
+            ),
+        ]  # fmt: skip
+    return figures
+
+
+def _at(rig: Rig, endpoint: str) -> Rig:
+    return rig.model_copy(update={"wire": wire_at(endpoint, rig.wire)})
+
+
+def _cost(work: Callable[[], int]) -> tuple[_Cost, int]:
+    """Return what a block costs in work that returns how many it moved, and that number."""
+    began, busy = time.perf_counter(), time.process_time()
+    blocks = work()
+    busy, wall = time.process_time() - busy, time.perf_counter() - began
+    return _Cost(busy / blocks, wall / blocks), blocks
+
+
+def _protocol_run(rig: Rig, folder: Path) -> tuple[_Cost, int]:
+    """Run one step with guard, journal and a publisher, as `bramah run` does."""
+    plan = resolve(library.load(PROTOCOL), rig, Overrides(repeats=1, steps=(STEP,)))
+    with simulated_bench(RIG, seed=0) as endpoint:
+        reached = _at(rig, endpoint)
+        driver, machine = make_driver(reached.wire, reached), Machine()
+        machine.to(State.CHECKING, PROTOCOL)
+        recorder, publisher = Recorder(folder, reached), Publisher(f"bench-{rig.name}")
+        with Bench(reached, driver, recorder, publisher, signals=False) as bench:
+            first = bench.exchange()
+
+            def work() -> int:
+                engine.run(plan, reached, bench, lambda *_: None, Desk(machine=machine))
+                return (bench.tick - first.tick) // len(first.data)
+
+            return _cost(work)
+
+
+def _streamed(rig: Rig, folder: Path, count: int) -> _Cost:
+    """Take blocks in real time with guard, journal and a publisher."""
+    with simulated_bench(RIG, seed=0, real_time=True) as endpoint:
+        reached = _at(rig, endpoint)
+        recorder, publisher = Recorder(folder, reached), Publisher(f"bench-{rig.name}")
+        driver = make_driver(reached.wire, reached)
+        with Bench(reached, driver, recorder, publisher, signals=False) as bench:
+            bench.run_for(0.5)
+
+            def work() -> int:
+                for _ in range(count):
+                    bench.exchange()
+                return count
+
+            return _cost(work)[0]
+
+
+def _bare(rig: Rig, blocks: int, *, real_time: bool = False) -> _Cost:
+    """Move blocks with pymodbus and nothing else; in real time, asking when the next is due."""
+    with (
+        simulated_bench(RIG, seed=0, real_time=real_time) as endpoint,
+        bare_modbus(_at(rig, endpoint)) as ask,
+    ):
+        ask()
+
+        def work() -> int:
+            due = time.perf_counter()
+            for _ in range(blocks):
+                if real_time:
+                    due += 10 / rig.sample_rate
+                    time.sleep(max(0.0, due - time.perf_counter()))
+                ask()
+            return blocks
+
+        return _cost(work)[0]

@@ -1,0 +1,45 @@
+"""Processor time of a piece of work: the least and the median of some repeats."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+REPEATS: Final = 5
+
+
+@dataclass(frozen=True)
+class Spent:
+    """Processor time [s] of one piece of work: least and median of its repeats.
+
+    The least is what the work costs; a median far above it says that the machine was busy.
+    """
+
+    least: float
+    median: float
+
+
+def spent(work: Callable[[], object], repeats: int = REPEATS) -> Spent:
+    """Return the processor time of `work`, done `repeats` times."""
+    (only,) = spent_together({"": work}, repeats).values()
+    return only
+
+
+def spent_together(
+    works: dict[str, Callable[[], object]], repeats: int = REPEATS
+) -> dict[str, Spent]:
+    """Return the processor time of each of several pieces of work, done in turns.
+
+    In turns, because a machine that gets busier meanwhile slows all of them alike.
+    """
+    times: dict[str, list[float]] = {name: [] for name in works}
+    for _ in range(repeats):
+        for name, work in works.items():
+            began = time.process_time()
+            work()
+            times[name].append(time.process_time() - began)
+    return {name: Spent(min(t), float(np.median(t))) for name, t in times.items()}
