@@ -66,7 +66,6 @@ def analysis_figures(folder: Path, say: Say) -> list[Figure]:
         Figure("analysis", "load and identify", loading + found["identify_seconds"], "s", 5.0),
         Figure("analysis", "of it the solve", 1e3 * found["solve_seconds"], "ms", 50.0),
         *beside("analysis", "identify 12 of them", found["twelve"], None, 300.0),
-        *beside("analysis", "solve", found["solve"], ("lstsq", found["lstsq"]), 1.1),
         *free_run_figures(load_rig(RIG)),
     ]
 
@@ -184,14 +183,13 @@ tune.
   hard multisine on both joints; speed in processor time, converters and noise included; in blocks
   as served, beside one call of the same compiled loop; the time that scipy's LSODA takes for the
   same input at equal accuracy.
-- **analysis**: 30 records of 10 s taken over the wire, loaded and identified; the solution beside
-  numpy's lstsq on the same rows; a free run of 10 s with both joints moving, beside the same
-  equations and steps written by hand and scipy's odeint over the same compiled equations, at the
-  loosest of tolerances a quarter of a decade apart at which no state is less exact; all with the
-  same output.
+- **analysis**: 30 records of 10 s taken over the wire, loaded and identified; a free run of
+  10 s with both joints moving, beside the same equations and steps written by hand and scipy's
+  odeint over the same compiled equations, at the loosest of tolerances a quarter of a decade apart
+  at which no state is less exact; all with the same output.
 - **growth**: with records, their length, joints and effects; least of five.
-- **run**: a run of lock-and-excite over the wire, beside bare pymodbus that moves as many blocks
-  from the same device: processor time and wall time in virtual time, processor time in real time.
+- **run**: lock-and-excite over the wire, beside bare pymodbus that moves as many blocks from the
+  same device; a block's processor time in this process, and wall time, in virtual and real time.
 - **seed N**: a simulated bench started, run, identified and validated as in `bramah demo`; FIT
   is compared with every cell of the paper's Table IV.
 - **acquisition**: every channel at 1 kHz in real time over the wire. Lateness is a block's arrival
