@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
 from rig.cli.options import (
     DurationOption,
     JsonOption,
+    ProtocolArgument,
     RepeatsOption,
     RigOption,
     ScaleOption,
@@ -22,7 +22,7 @@ from rig.cli.output import Countdown, write_json
 
 
 def check(
-    protocol: Annotated[str, typer.Argument(help="A shipped protocol's name, or a file.")],
+    protocol: ProtocolArgument,
     rig: RigOption,
     repeats: RepeatsOption = None,
     duration: DurationOption = None,

@@ -7,11 +7,11 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.options import JsonOption, RigOption
+from rig.cli.options import JsonOption, ProtocolArgument, RigOption
 
 
 def design(
-    protocol: Annotated[str, typer.Argument(help="A shipped protocol's name, or a file.")],
+    protocol: ProtocolArgument,
     rig: RigOption,
     out: Annotated[Path, typer.Option(help="The protocol file to write.")],
     criterion: Annotated[

@@ -19,6 +19,8 @@ from rig.cli.errors import LogFormatter, guarded
 # Matrices here are tall and narrow, and there are many: BLAS threads get in each other's way.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+NAME: Final = "bramah"
+COMPLETING: Final = "_BRAMAH_COMPLETE"  # set by the shell's completion, which Typer installs
 # In the order of `bramah --help`: a verb, and the module whose `register` adds it.
 VERBS: Final = {
     "demo": "rig.cli.demo",
@@ -59,10 +61,9 @@ nothing, `bramah check` proves a protocol, `bramah run` runs it; then come `bram
 def command_line(verbs: Sequence[str]) -> typer.Typer:
     """Return the command line with these verbs in full, the others by name and summary only."""
     app = typer.Typer(
-        name="bramah",
+        name=NAME,
         help=GUIDE,
         pretty_exceptions_enable=False,
-        add_completion=False,
         rich_markup_mode=None,
     )
     app.callback()(_bramah)
@@ -111,6 +112,15 @@ def _summary(module: str) -> str:
     raise AssertionError(f"{module} has no verb")
 
 
+def _typed(words: Sequence[str]) -> Sequence[str]:
+    """Return the words of a call; where a shell asks for a completion, those typed so far."""
+    if COMPLETING not in os.environ:
+        return words
+    # Bash hands on its own list of words, the other shells theirs.
+    line = os.environ.get("COMP_WORDS") or os.environ.get("_TYPER_COMPLETE_ARGS", "")
+    return line.split()[1:]
+
+
 def __getattr__(name: str) -> Any:
     # The whole command line, for whoever asks for it; a call imports its own verb alone.
     if name == "app":
@@ -126,10 +136,11 @@ def run(arguments: list[str] | None = None) -> None:
     handler = logging.StreamHandler()
     handler.setFormatter(LogFormatter("%(levelname)s %(name)s: %(message)s"))
     logging.basicConfig(level=logging.DEBUG if debug else logging.WARNING, handlers=[handler])
-    verb = next((word for word in words if not word.startswith("-")), "")
+    verb = next((word for word in _typed(words) if not word.startswith("-")), "")
 
     def work() -> int | None:
-        result: int | None = command_line([verb])(words, standalone_mode=False)
+        app = command_line([verb])
+        result: int | None = app(words, prog_name=NAME, standalone_mode=False)
         return result
 
     sys.exit(guarded(work, debug=debug))

@@ -11,8 +11,30 @@ import typer
 if TYPE_CHECKING:
     from protocols.files.plan import Overrides
 
+
+def _rigs(incomplete: str) -> list[str]:
+    """Return the shipped rigs that a shell may complete a word to; files it completes itself."""
+    from rig.runs.rigs import shipped_rigs
+
+    return [name for name in shipped_rigs() if name.startswith(incomplete)]
+
+
+def _protocols(incomplete: str) -> list[str]:
+    """Return the shipped protocols that a shell may complete a word to."""
+    from protocols.files.library import shipped_names
+
+    return [name for name in shipped_names() if name.startswith(incomplete)]
+
+
 RigOption = Annotated[
-    str, typer.Option("--rig", help="A shipped rig's name, or the path of a rig file.")
+    str,
+    typer.Option(
+        "--rig", help="A shipped rig's name, or the path of a rig file.", autocompletion=_rigs
+    ),
+]
+ProtocolArgument = Annotated[
+    str,
+    typer.Argument(help="A shipped protocol's name, or a file.", autocompletion=_protocols),
 ]
 RepeatsOption = Annotated[int | None, typer.Option(min=1, help="Instead of the file's.")]
 DurationOption = Annotated[

@@ -16,6 +16,7 @@ from rig.cli.options import (
     DurationOption,
     EndpointOption,
     JsonOption,
+    ProtocolArgument,
     RepeatsOption,
     RigOption,
     ScaleOption,
@@ -83,7 +84,7 @@ def queue_group() -> None:
 
 def add(
     context: typer.Context,
-    protocol: Annotated[str, typer.Argument(help="A shipped protocol's name, or a file.")],
+    protocol: ProtocolArgument,
     rig: RigOption,
     out: Annotated[
         Path | None, typer.Option(help="The run folder.  [default: runs/NUMBER-PROTOCOL here]")

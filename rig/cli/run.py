@@ -10,6 +10,7 @@ import typer
 from rig.cli.options import (
     DurationOption,
     EndpointOption,
+    ProtocolArgument,
     RepeatsOption,
     RigOption,
     ScaleOption,
@@ -22,7 +23,7 @@ from rig.cli.output import progress
 
 
 def run(
-    protocol: Annotated[str, typer.Argument(help="A shipped protocol's name, or a file.")],
+    protocol: ProtocolArgument,
     rig: RigOption,
     out: Annotated[Path, typer.Option(help="The run folder to make.")],
     endpoint: EndpointOption = None,

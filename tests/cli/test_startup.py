@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -62,3 +63,45 @@ def test_a_protocol_is_proved_without_the_slow_libraries(
     assert "rig.bench.session" not in modules
     again = loaded(*checked)
     assert again.isdisjoint({*SLOW, "numba", "scipy", "analysis.simulation"})
+
+
+def completed(line: str, shell: str = "bash") -> list[str]:
+    """What a shell would offer for a line that was typed so far."""
+    words = line.split(" ")
+    given = {
+        "bash": {"COMP_WORDS": line, "COMP_CWORD": str(len(words) - 1)},
+        "zsh": {"_TYPER_COMPLETE_ARGS": line},
+        "fish": {"_TYPER_COMPLETE_ARGS": line, "_TYPER_COMPLETE_FISH_ACTION": "get-args"},
+    }[shell]
+    environment = {**os.environ, "_BRAMAH_COMPLETE": f"complete_{shell}", **given}
+    code = "import sys; sys.argv = ['bramah']; from rig.cli.main import run; run()"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    return done.stdout.split()
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_a_shell_completes_verbs_options_and_shipped_names(shell: str) -> None:
+    for line, word in (
+        ("bramah che", "check"),
+        ("bramah check lab", "lab-sheet"),
+        ("bramah queue mo", "move"),
+        ("bramah check lab-sheet --amp", "--amplitude-scale"),
+        ("bramah run lab-sheet --rig shin", "shinshu-2dof"),
+    ):
+        assert word in " ".join(completed(line, shell)), line
+
+
+def test_a_word_that_no_shipped_name_begins_with_is_left_to_the_shells_files() -> None:
+    assert completed("bramah check ./my-own") == []
+    assert completed("bramah identify ru") == []
+
+
+def test_the_completion_of_a_shell_is_shown_and_named_after_the_program() -> None:
+    code = "from rig.cli.main import run; run(['--show-completion', 'bash'])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "complete -o default -F _bramah_completion bramah" in done.stdout
