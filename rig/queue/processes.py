@@ -13,6 +13,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 from pathlib import Path
 from typing import IO, Any, Final
 
@@ -44,9 +45,13 @@ class Answer:
 
 
 def reason_in(text: str) -> str:
-    """Return the last line in which a verb said why it ended, '' if it did not."""
-    lines = [line for line in text.splitlines() if _SAID in line]
-    return lines[-1].partition(_SAID)[2].replace("\033[0m", "").strip() if lines else ""
+    """Return the last lines in which a verb said why it ended, joined by ';', '' if it did not."""
+    lines = [line.partition(_SAID) for line in text.splitlines()]
+    while lines and not lines[-1][1]:
+        lines.pop()
+    told = list(takewhile(lambda parts: parts[1], reversed(lines)))
+    said = [reason.replace("\033[0m", "").strip() for _, _, reason in reversed(told)]
+    return "; ".join(said)
 
 
 def reason_of(path: Path) -> str:

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from rig.model.parse import InputError
 from rig.queue.items import channel_condition, check_wanted, parse_time, result_condition
+from rig.queue.processes import reason_in
 from rig.queue.store import QueueStore
 from rig.runs.store import load_run
 from tests.queue.nights import LONG, Night, reset, until
@@ -42,6 +43,15 @@ def test_a_night_ends_with_each_item_in_a_named_state_and_a_reason(night: Night)
     assert [night.starts(k) for k in range(1, 7)] == [1, 1, 0, 0, 1, 1]
     assert night.item(1).found["parameters"]["b"]["value"] == 2.0
     assert night.run().ended == ()
+
+
+def test_the_reason_of_a_verb_is_all_that_it_said_last() -> None:
+    log = "bramah: an earlier word\nprogress\nbramah: sheet.yaml:3: a\nbramah: sheet.yaml:9: b\n"
+    assert reason_in(log + "the last line of another\n") == "sheet.yaml:3: a; sheet.yaml:9: b"
+    assert (
+        reason_in("\033[1;37;41mbramah: outputs not confirmed\033[0m\n") == "outputs not confirmed"
+    )
+    assert reason_in("nothing was said\n") == ""
 
 
 def test_higher_priorities_start_first_and_a_moved_item_takes_its_place(night: Night) -> None:
