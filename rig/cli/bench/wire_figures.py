@@ -49,7 +49,7 @@ class Stream:
     """All channels of a wire streamed in real time through driver, guard and recorder.
 
     `core_share` is the acquisition process's of one core; times are in seconds. `worst_waited` is
-    how long, of the worst lateness, this process was ready to run and had no processor.
+    how long this process was ready to run and had no processor while the worst built up.
     """
 
     samples: int
@@ -127,7 +127,7 @@ def acquisition_of(wire: str, seconds: float) -> list[Figure]:
         Figure(GROUP, f"{wire}: of one core, driver + guard + recorder", share, "%", 25.0),
         Figure(GROUP, f"{wire}: lateness, 99 %", 1e3 * stream.late_p99, "ms"),
         Figure(GROUP, f"{wire}: lateness, worst", 1e3 * stream.late_worst, "ms", 50.0),
-        Figure(GROUP, f"{wire}: of it without a processor", 1e3 * stream.worst_waited, "ms"),
+        Figure(GROUP, f"{wire}: without a processor meanwhile", 1e3 * stream.worst_waited, "ms"),
     ]
 
 

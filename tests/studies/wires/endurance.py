@@ -18,7 +18,7 @@ HEADER: Final = (
     "of a core",
     "late, 99 %",
     "late, worst",
-    "of it without a processor",
+    "without a processor meanwhile",
 )
 
 
