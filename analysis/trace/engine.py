@@ -285,7 +285,7 @@ def _named(
 def _moved(hypotheses: HypothesisSet, winner: Hypothesis, more: Hypothesis) -> float:
     """Return the largest relative change of a baseline coefficient between two sets of effects.
 
-    Of coefficients whose rows stand out of the noise (`Settings.shown`): others may be anything.
+    Of coefficients whose rows stand out of the noise (`TRACE.shown`): others may be anything.
     """
     before, after = winner.fit.beta, more.fit.beta
     sizes = np.linalg.norm(hypotheses.stage.base, axis=0)
