@@ -71,8 +71,8 @@ def test_the_figures_say_which_group_comes_and_what_is_left(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     said: list[str] = []
-    for name in ("plant", "analysis", "stream", "demo", "acquisition"):
+    for name in ("plant", "analysis", "stream", "demo", "growth", "run", "acquisition"):
         monkeypatch.setattr(figures, f"{name}_figures", lambda *_: [])
     figures.measure(10.0, 2, None, said.append)
-    assert said[0] == "plant: group 1 of 5, about 13:20 left"
-    assert said[-1] == "acquisition: group 5 of 5, about 10:00 left"
+    assert said[0] == "plant: group 1 of 7, about 16:40 left"
+    assert said[-1] == "acquisition: group 7 of 7, about 10:00 left"

@@ -13,7 +13,6 @@ from analysis.identify.identify import identify
 from analysis.identify.result import Identification
 from analysis.simulation.validate import validate
 from hil_sim.plant.plant import Law, Plant
-from hil_sim.plant.sensors import converters
 from hil_sim.scenario.file import Scenario
 from protocols.design.generate import generate
 from protocols.design.validation_steps import validation
@@ -23,6 +22,7 @@ from protocols.files.schema import Protocol
 from protocols.files.writer import protocol_text
 from protocols.steps.plans import StepPlan
 from rig.cli.step_planning import predictor
+from rig.model.channels import kind_of
 from rig.model.codes import decode_input
 from rig.model.parameters import parameter_names
 from rig.model.records import Record, Run
@@ -68,11 +68,11 @@ def recorded(rig: Rig, steps: Sequence[StepPlan], seed: int, repeats: int, secon
         plant.advance(round(SETTLE * rig.sample_rate), told)
         for repeat in range(1, repeats + 1):
             codes, _ = plant.advance(round(seconds * rig.sample_rate), told)
-            values = np.empty(codes.shape)
-            for part in converters(rig):
-                columns = list(part.columns)
-                values[:, columns] = decode_input(codes[:, columns], part.low, part.high, part.bits)
-            channels = dict(zip(rig.channels, values.T, strict=True))
+            values = []
+            for name, code in zip(rig.channels, codes.T, strict=True):
+                sensor = rig.sensors.of(kind_of(name)[0])
+                values.append(decode_input(code, *sensor.range, sensor.bits))
+            channels = dict(zip(rig.channels, values, strict=True))
             locked = tuple(held.joint + 1 for held in step.locks)
             records.append(
                 Record(
@@ -160,6 +160,7 @@ def test_one_joint_goes_from_plan_to_validation_over_the_wire(wire: tuple[Path, 
         assert record["fit"]["piston_1"] > 98.0
 
 
+@pytest.mark.slow
 def test_three_joints_speak_over_the_wire(tmp_path: Path, planned: Protocol, digger: Rig) -> None:
     """Fourteen channels and three outputs; one short step tells whether all arrive in place."""
     step = planned.steps[0]

@@ -25,6 +25,7 @@ from tests.studies.machines import pendulum_command as pendulum
 from tests.studies.nights import command as nights
 from tests.studies.reproduction import command as reproduction
 from tests.studies.trace import command as trace
+from tests.studies.variants import command as variants
 from tests.studies.wires import command as wires
 
 # As in `rig.cli.main`: matrices are tall and narrow, BLAS threads slow each other down.
@@ -48,6 +49,7 @@ STUDIES = (
     wires,
     fuzz,
     nights,
+    variants,
 )
 
 app = typer.Typer(

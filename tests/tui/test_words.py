@@ -12,7 +12,7 @@ from rig.bench.screens.sockets import ChannelView
 from rig.model.alarms.states import Alarm, AlarmTable, raised, returned
 from rig.tui.app import farewell
 from rig.tui.drawing.bar import bar
-from rig.tui.drawing.rows import text_of, width_of
+from rig.tui.drawing.rows import Row, width_of
 from rig.tui.following.history import History
 from rig.tui.following.link import Frame, LinkStage
 from rig.tui.following.story import tell
@@ -33,6 +33,10 @@ from tests.tui.recorded import Bench, snapshot, stopped, tripped
 HERE = endpoint()
 VIEW = snapshot(Bench(), 80)
 LIVE = Frame(LinkStage.ATTACHED, (HERE,), HERE, VIEW, received=100.0)
+
+
+def text_of(line: Row) -> str:
+    return "".join(text for text, _ in line)
 
 
 def said(frame: Frame, stop: Stop | None = None, now: float = 100.0) -> list[tuple[str, str]]:

@@ -42,11 +42,6 @@ def row(*parts: str | Part) -> Row:
     return tuple((part, PLAIN) if isinstance(part, str) else part for part in parts)
 
 
-def text_of(line: Row) -> str:
-    """Return a row's characters."""
-    return "".join(text for text, _ in line)
-
-
 class Fitted(tuple[Part, ...]):
     """A row whose width is known: it is not measured again on its way to the terminal."""
 

@@ -37,7 +37,14 @@ def traced(rig: Rig, hidden: Hidden, free_forms: bool = True, **measured: Any) -
 
 @pytest.mark.parametrize(
     ("form", "width"),
-    [(TANH, 1e-4), (TANH, 1e-3), (TANH, 5e-3), (TANH, 1e-2), (SIGMOID, 1e-3), (SIGMOID, 5e-3)],
+    [
+        (TANH, 1e-4),
+        (SIGMOID, 5e-3),
+        *(
+            pytest.param(*variant, marks=pytest.mark.slow)
+            for variant in ((TANH, 1e-3), (TANH, 5e-3), (TANH, 1e-2), (SIGMOID, 1e-3))
+        ),
+    ],
 )
 def test_dry_friction_of_one_level_is_coulomb_friction_whatever_its_transition(
     rig: Rig, form: int, width: float
@@ -49,7 +56,7 @@ def test_dry_friction_of_one_level_is_coulomb_friction_whatever_its_transition(
     assert result.model_after.values["Fv2"] == pytest.approx(4.43, rel=0.06)
 
 
-@pytest.mark.parametrize("width", [1e-3, 5e-3])
+@pytest.mark.parametrize("width", [1e-3, pytest.param(5e-3, marks=pytest.mark.slow)])
 def test_dry_friction_of_two_levels_is_asymmetric_friction(rig: Rig, width: float) -> None:
     result = traced(rig, Hidden(100.0, 60.0, width))
     assert result.verdict == "explained"
@@ -78,9 +85,9 @@ def test_breakaway_above_the_sliding_level_is_still_stribeck_friction(rig: Rig) 
         (2.0, {"repeats": 4}),
         (2.0, {"repeats": 1}),
         (0.7, {"noise": 1 / 3}),
-        (0.7, {"noise": 1.0}),
-        (0.7, {"noise": 3.0}),
-        (0.7, {"seconds": 5.0}),
+        pytest.param(0.7, {"noise": 1.0}, marks=pytest.mark.slow),
+        pytest.param(0.7, {"noise": 3.0}, marks=pytest.mark.slow),
+        pytest.param(0.7, {"seconds": 5.0}, marks=pytest.mark.slow),
     ],
 )
 def test_a_leak_is_explained_however_well_it_is_measured(
@@ -97,7 +104,14 @@ def test_what_vetoes_no_leak_is_clean_without_one(rig: Rig) -> None:
     assert traced(rig, Hidden(2.0, 2.0)).verdict == "clean"
 
 
-@pytest.mark.parametrize(("ahead", "astern"), [(300.0, 100.0), (60.0, 0.0), (20.0, 90.0)])
+@pytest.mark.parametrize(
+    ("ahead", "astern"),
+    [
+        (20.0, 90.0),
+        pytest.param(300.0, 100.0, marks=pytest.mark.slow),
+        pytest.param(60.0, 0.0, marks=pytest.mark.slow),
+    ],
+)
 def test_slopes_by_direction_are_asymmetric_viscous_friction(
     rig: Rig, ahead: float, astern: float
 ) -> None:
@@ -110,7 +124,7 @@ def test_slopes_by_direction_are_asymmetric_viscous_friction(
     assert result.model_after.values["Fv2"] == pytest.approx(4.43, rel=0.02)
 
 
-@pytest.mark.parametrize("frequency", [3.14, 7.3])
+@pytest.mark.parametrize("frequency", [3.14, pytest.param(7.3, marks=pytest.mark.slow)])
 def test_a_hum_that_begins_with_the_record_is_a_periodic_disturbance(
     rig: Rig, frequency: float
 ) -> None:
@@ -148,6 +162,7 @@ def test_friction_with_a_cube_of_the_speed_is_a_curve_without_a_name(
     assert {k["unit"] for n, k in knots.items() if "knot" in n} == {"m/s"}
 
 
+@pytest.mark.slow
 def test_a_spring_that_hardens_is_a_force_over_position(rig: Rig) -> None:
     result = traced(rig, Hidden(spring=20.0, hardening=150.0))
     assert result.verdict == "explained"
@@ -175,6 +190,7 @@ def test_a_tapered_metering_edge_is_a_curve_over_the_spool(rig: Rig) -> None:
         assert line.y == pytest.approx(there, abs=0.01 * np.abs(there).max())
 
 
+@pytest.mark.slow
 def test_a_leak_by_the_root_of_the_pressure_is_a_curve_and_not_two_names(rig: Rig) -> None:
     result = traced(rig, Hidden(leak_root=5e-9))
     assert result.verdict == "explained"

@@ -65,10 +65,13 @@ def _figures(kind: str, pairs: list[tuple[_Cost, _Cost]], limit: float) -> list[
     is the processor.
     """
     figures = []
-    for what, wished in (("processor", kind == "real time"), ("wall", kind == "virtual time")):
-        own, bare = (
-            [1e3 * getattr(cost, what) for cost in costs] for costs in zip(*pairs, strict=True)
-        )
+    own_costs, bare_costs = zip(*pairs, strict=True)
+    of: tuple[tuple[str, bool, Callable[[_Cost], float]], ...] = (
+        ("processor", kind == "real time", lambda cost: cost.processor),
+        ("wall", kind == "virtual time", lambda cost: cost.wall),
+    )
+    for what, wished, time_of in of:
+        own, bare = ([1e3 * time_of(cost) for cost in costs] for costs in (own_costs, bare_costs))
         name = f"{kind}, a block, {what} time"
         figures += [
             Figure(GROUP, name, min(own), "ms"),

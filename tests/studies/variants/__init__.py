@@ -1,0 +1,1 @@
+"""Further variants of the tests, too slow for every commit."""
