@@ -20,7 +20,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from analysis.design.settings import DESIGN
 from analysis.design.twin_records import Played, ideal
@@ -73,6 +72,8 @@ def late_times(samples: int, jitter: float, rng: np.random.Generator) -> Array:
 
 def taken_late(record: Record, jitter: float, rng: np.random.Generator) -> Record:
     """Return a record as a host with `jitter` [s] would have made it; missing samples are NaN."""
+    from scipy.interpolate import CubicSpline  # noqa: PLC0415 - loads slowly
+
     names, n = list(record.channels), record.samples
     ticks = np.arange(n, dtype=float)
     times = late_times(n, jitter * record.sample_rate, rng)

@@ -19,7 +19,6 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from drivers.registry import driver_class
 from protocols.design.check_report import CheckReport
 from protocols.files.plan import Plan
 from protocols.steps.plans import StepPlan
@@ -122,7 +121,7 @@ def proof_key(plan: Plan, rig: Rig) -> str:
     parts = (
         plan.protocol.model_dump_json(),
         rig.model_dump_json(exclude={"wire"}),
-        f"{driver_class(rig.wire.kind).host_timed} {rig.wire.jitter}",
+        f"{rig.wire.kind} {rig.wire.jitter}",  # whether the host keeps the time, and how well
         _source_digest(),
     )
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()

@@ -110,7 +110,11 @@ def test_the_same_command_writes_result_model_and_report(
 def test_on_the_measured_carriage_both_are_found(train: str, holdout_data: str) -> None:
     data = study.load(FILE, period=study.PERIOD)
     result = trace([getattr(data, train)], [getattr(data, holdout_data)])
-    assert named(result) == BOTH
+    # Between an offset and a drag that differs by direction the force over the speed decides.
+    assert named(result) == {
+        ("coulomb_friction", "joint 1"),
+        ("asymmetric_viscous_friction", "joint 1"),
+    }
     assert result.before["torque_1"] > 0.17 * result.size["torque_1"]
     assert result.after["torque_1"] <= 0.05 * result.size["torque_1"]
     assert result.rmse_before["position_1"] > 35e-3

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from analysis.identify.identify import identify
 from analysis.simulation.simulate import compiled, simulate
-from analysis.terms import with_effects
+from analysis.terms import BASELINE, known, with_effects
 from analysis.terms.base import Used
 from rig.cli.bench.analysis import bench_run
 from rig.cli.bench.figure import Figure
@@ -20,11 +20,7 @@ GROUP: Final = "growth"
 RECORDS: Final = (3, 6, 12, 24)
 SECONDS: Final = (5.0, 10.0, 20.0, 40.0)
 RIGS: Final = ("boom-1dof", "shinshu-2dof", "digger-3dof")
-# Effects added to the model one after another, as a trace does with its candidates.
-CANDIDATES: Final = (
-    "coulomb_friction", "internal_leakage", "joint_spring", "torque_offset",
-    "pressure_dependent_friction", "external_leakage",
-)  # fmt: skip
+CANDIDATES: Final = 4  # effects added to the model at most, as a trace does with its candidates
 Say = Callable[[str], None]
 
 
@@ -62,10 +58,19 @@ def _joints() -> Iterator[tuple[str, Callable[[], Any]]]:
         )
 
 
+def _linear_effects() -> list[str]:
+    """Name the effects of a joint that have coefficients alone, no shape, in their order."""
+    return sorted(
+        name
+        for name, term in known().items()
+        if term.per_joint and name not in BASELINE and not term("joint 1").shape_names()
+    )
+
+
 def _candidates(rig: Rig) -> Iterator[tuple[str, Callable[[], Any]]]:
     run = bench_run(rig, repeats=2)
-    for count in range(0, len(CANDIDATES) + 1, 2):
-        used = [Used(term) for term in with_effects(rig, CANDIDATES[:count])]
+    for count in range(0, CANDIDATES + 1, 2):
+        used = [Used(term) for term in with_effects(rig, _linear_effects()[:count])]
         yield (
             f"identify, 6 records, {count} effects of every joint beside the model",
             lambda u=used: identify([run], terms=u),  # type: ignore[misc]
