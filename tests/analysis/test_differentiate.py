@@ -107,6 +107,7 @@ def test_a_filter_beyond_nyquist_is_refused() -> None:
         d.windowed_sinc(200.0, 80.0, 40.0)
 
 
+@pytest.mark.slow
 def test_the_study_shows_why_the_default_is_the_default(rig: Rig) -> None:
     entries = table(rig, np.random.default_rng(3), repeats=1)
     by = {(e.excitation.split()[0], e.filtering.split(";")[0]): e for e in entries}

@@ -170,6 +170,7 @@ def test_a_question_that_nobody_answers_ends_an_unattended_run(tmp_path: Path) -
     assert not stream(run, "command_1").any()
 
 
+@pytest.mark.slow
 def test_a_condition_that_never_comes_ends_the_run_with_what_was_waited_for(
     tmp_path: Path,
 ) -> None:
@@ -295,6 +296,7 @@ steps:
 """
 
 
+@pytest.mark.slow
 def test_a_parameter_in_other_units_is_the_same_and_another_value_another_run(
     tmp_path: Path,
 ) -> None:

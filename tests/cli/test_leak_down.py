@@ -28,7 +28,7 @@ def statement(told: dict[str, Any], name: str) -> tuple[bool, str]:
     return found["ok"], found["detail"]
 
 
-@pytest.mark.parametrize("leaks", [False, True])
+@pytest.mark.parametrize("leaks", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_hold_shows_the_leak_and_leaves_the_parameters_alone(leaks: bool, tmp_path: Path) -> None:
     (tmp_path / "short.yaml").write_text(SHORT)
     (tmp_path / "leak.yaml").write_text(LEAK if leaks else "effects: []\n")

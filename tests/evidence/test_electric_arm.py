@@ -10,6 +10,7 @@ import pytest
 from tests.cli.bench import bramah, study
 
 
+@pytest.mark.slow
 def test_an_arm_on_a_slope_from_its_files_to_its_parameters(tmp_path: Path) -> None:
     made = study("electric", "--slope", "12", "--seed", "101", "--out", tmp_path / "arm")
     assert made.returncode == 0, made.stderr

@@ -109,7 +109,9 @@ def test_the_run_undamaged_is_whole(run: Path) -> None:
     assert assert_only_what_was_measured(run) == BLOCKS * 10
 
 
-@pytest.mark.parametrize("seed", range(52))
+@pytest.mark.parametrize(
+    "seed", [*range(16), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(16, 52))]
+)
 def test_whatever_is_damaged_is_said_kept_and_read_as_far_as_it_goes(run: Path, seed: int) -> None:
     path = run / "journal.sqlite"
     what = damage(path, seed)

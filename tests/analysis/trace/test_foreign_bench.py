@@ -178,6 +178,7 @@ def test_a_spring_that_hardens_is_a_force_over_position(rig: Rig) -> None:
     assert without.verdict == "unexplained"
 
 
+@pytest.mark.slow
 def test_a_tapered_metering_edge_is_a_curve_over_the_spool(rig: Rig) -> None:
     result = traced(rig, Hidden(taper=2.0))
     assert result.verdict == "explained"
