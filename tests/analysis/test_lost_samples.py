@@ -19,6 +19,7 @@ from analysis.terms.base import Used
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
+from tests.analysis import small_bench as bench
 from tests.analysis.small_bench import TRUTH
 
 TERMS = tuple(Used(term) for term in baseline())
@@ -95,3 +96,17 @@ def test_a_report_can_be_made_of_records_with_gaps(multisine_run: Run, tmp_path:
     run = with_lost(multisine_run, (3000, 3020))
     write_report(tmp_path / "report.html", runs=[run], identification=identify([run]))
     assert "lost samples" in (tmp_path / "report.html").read_text()
+
+
+def test_a_repeat_cut_so_short_that_it_has_no_rows_leaves_the_other_one_to_be_identified(
+    rig: Rig,
+) -> None:
+    steps = (bench.Step("step1", (1,), (0.0, 0.0)),)
+    waves = {"step1": {1: bench.Excitation.sine(0.05)}}
+    run = bench.experiment(rig, waves, repeats=2, seed=5, steps=steps, seconds=6.0)
+    whole, other = run.records
+    cut = replace(other, channels={name: x[:500] for name, x in other.channels.items()})
+    found = identify([Run(rig, (whole, cut))])
+    assert found.estimates["b"].value == pytest.approx(TRUTH["b"], rel=0.01)
+    with pytest.raises(InputError, match="needs two or more repeats"):
+        identify([Run(rig, (whole, cut))], estimator="iv")

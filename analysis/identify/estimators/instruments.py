@@ -10,6 +10,7 @@ Soederstroem and Stoica, Instrumental Variable Methods for System Identification
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -47,8 +48,18 @@ class Hausman:
         return np.asarray(self.p < IDENTIFY.instrument_level / len(self.p))
 
 
+def comparable(blocks: Sequence[RepeatBlock]) -> bool:
+    """Whether every equation of every step has rows that two repeats share: instruments exist.
+
+    A repeat that was cut short may keep none behind the filters' edges.
+    """
+    shared = common(blocks)
+    count = Counter((*b.stratum, b.equation) for b in shared if len(b.y))
+    return all(count[*b.stratum, b.equation] > 1 for b in shared)
+
+
 def instrumental_variables(blocks: Sequence[RepeatBlock]) -> EquationFit:
-    """Solve with the other repeats' mean rows as instruments; every step needs two repeats."""
+    """Solve with the other repeats' mean rows as instruments; `comparable` ones."""
     blocks = common(blocks)
     sums = over_repeats(blocks, [b.X for b in blocks])
     Z = [(total - b.X) / (n - 1) for b, (total, n) in zip(blocks, sums, strict=True)]
