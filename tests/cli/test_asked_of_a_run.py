@@ -221,6 +221,7 @@ def test_a_device_that_comes_back_is_taken_up_where_its_records_ended(tmp_path: 
     assert after[:2] == [State.HOMING, State.LOCKED]
 
 
+@pytest.mark.slow
 def test_a_budget_of_retries_that_is_used_up_ends_the_run_by_name(tmp_path: Path) -> None:
     sheet = tmp_path / "again.yaml"
     sheet.write_text(SHORT.replace("repeats: 2", "repeats: 40") + "retry: {times: 1, wait: 1 s}\n")

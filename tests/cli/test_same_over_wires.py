@@ -45,7 +45,14 @@ def by_tcp(experiment: Experiment) -> WireResult:
     return experiment(TCP)
 
 
-@pytest.mark.parametrize("wire", [wire for wire in WIRES if wire != TCP])
+@pytest.mark.parametrize(
+    "wire",
+    [
+        pytest.param(wire, marks=[pytest.mark.slow] * (wire in ("modbus-rtu", "can-slcan")))
+        for wire in WIRES
+        if wire != TCP
+    ],
+)
 def test_a_wire_changes_no_parameter(wire: str, experiment: Experiment, by_tcp: WireResult) -> None:
     found = experiment(wire)
     if wire != VALVES:  # by these what is hardly determined may stay undetermined

@@ -31,7 +31,13 @@ WIRES: dict[str, Callable[[], Subject]] = {
 }
 
 
-@pytest.mark.parametrize("wire", WIRES)
+@pytest.mark.parametrize(
+    "wire",
+    [
+        pytest.param(wire, marks=[pytest.mark.slow] * (wire in ("modbus-rtu", "canopen-408")))
+        for wire in WIRES
+    ],
+)
 def test_a_shipped_driver_conforms_over_a_wire_that_fails(wire: str) -> None:
     subject = WIRES[wire]()
     report = run(subject, effort=QUICK if wire == TCP else SHORT)

@@ -51,6 +51,7 @@ def test_a_dead_band_with_two_edges_is_what_the_flows_lack_most() -> None:
 
 
 @measured
+@pytest.mark.slow
 def test_with_the_dead_band_known_an_unseen_ramp_is_followed_ten_times_closer() -> None:
     data = study.load(FOLDER)
     said, left = study.known_band([data.second, data.full], [data.first])

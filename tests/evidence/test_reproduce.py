@@ -88,6 +88,7 @@ def tables(sections: list[Section]) -> dict[str, Table]:
     return {p.caption: p for s in sections for p in s.parts if isinstance(p, Table)}
 
 
+@pytest.mark.slow
 def test_the_page_sets_every_number_beside_the_papers(done: Reproduction) -> None:
     found = tables(page(done, "python -m tests.studies reproduce"))
     third = found["Table III, 2 experiments"]

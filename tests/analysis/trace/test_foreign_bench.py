@@ -66,6 +66,7 @@ def test_dry_friction_of_two_levels_is_asymmetric_friction(rig: Rig, width: floa
     assert found["F_ret_2"].value == pytest.approx(60.0, rel=0.03)
 
 
+@pytest.mark.slow
 def test_a_joint_that_sticks_has_dry_friction_of_one_level_and_no_breakaway(rig: Rig) -> None:
     """Karnopp's band of standstill: the filtered velocity does not show it, the level is right."""
     result = traced(rig, Hidden(80.0, 80.0, 5e-4, KARNOPP))
@@ -83,7 +84,7 @@ def test_breakaway_above_the_sliding_level_is_still_stribeck_friction(rig: Rig) 
     ("rubbing", "measured"),
     [
         (2.0, {"repeats": 4}),
-        (2.0, {"repeats": 1}),
+        pytest.param(2.0, {"repeats": 1}, marks=pytest.mark.slow),
         (0.7, {"noise": 1 / 3}),
         pytest.param(0.7, {"noise": 1.0}, marks=pytest.mark.slow),
         pytest.param(0.7, {"noise": 3.0}, marks=pytest.mark.slow),
@@ -205,9 +206,9 @@ def test_a_leak_by_the_root_of_the_pressure_is_a_curve_and_not_two_names(rig: Ri
 @pytest.mark.parametrize(
     ("hidden", "sensors", "named", "parameter", "size"),
     [
-        (
+        pytest.param(
             Hidden(), Sensors(("cap_pressure", "rod_pressure"), late=3e-3),
-            ("channel_delay", "bench"), "delay_pressure", 3e-3,
+            ("channel_delay", "bench"), "delay_pressure", 3e-3, marks=pytest.mark.slow,
         ),
         (
             Hidden(), Sensors(("cap_pressure",), lag=3e-3),
@@ -244,7 +245,7 @@ def rig_angle(rig: Rig) -> float:
     return float(rig.joints[0].geometry(0.0)[0])
 
 
-@pytest.mark.parametrize("drop", [1e6, 2e6])
+@pytest.mark.parametrize("drop", [1e6, pytest.param(2e6, marks=pytest.mark.slow)])
 def test_a_supply_that_sags_in_proportion_to_the_flow_is_named(rig: Rig, drop: float) -> None:
     """Laminar share and drop lie on a ridge: what counts is the drop at the flows that were."""
     result = traced(rig, Hidden(sag=drop))

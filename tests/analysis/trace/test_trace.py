@@ -146,6 +146,7 @@ def test_what_only_the_held_out_records_show_is_not_called_clean(rig: Rig) -> No
     assert any("train on records that excite as much" in note for note in result.notes)
 
 
+@pytest.mark.slow
 def test_a_quiet_effect_is_found_beside_a_loud_one_of_other_equations(rig: Rig) -> None:
     """Beside so wide a dead band hardly anything hangs on which friction it is."""
     result = traced(rig, w_ahead=2e-2, w_astern=2e-2, Fs=15)
@@ -168,6 +169,7 @@ def test_what_the_catalogue_lacks_stays_unexplained_and_its_variable_is_told(
     assert kept == [e.name for e in result.effects]
 
 
+@pytest.mark.slow
 def test_a_spring_that_hardens_a_little_is_not_explained_by_one_that_does_not(rig: Rig) -> None:
     """Two hundredths of the energy are left, within the band; a cube of the place holds them."""
     train, held_out = (hardening(run, 3.5e5) for run in pair_of_runs(rig, k_spring=5.0))
