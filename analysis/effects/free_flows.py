@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import ClassVar, Final
 
 import numpy as np
-from numba import njit
 
 from analysis.effects.base import Array, Branch, Effect, Evidence, Shape
 from analysis.effects.curve import (
@@ -44,6 +43,7 @@ from analysis.terms.base import (
     equation,
     kernel,
 )
+from analysis.terms.orifice import root_of_drop, signed_root
 from rig.model.parameters import gain_names
 from rig.model.rig import Rig
 
@@ -108,8 +108,8 @@ class MeteringCurve(Effect):
         basis = spline(self.shape_of(rig, shape), np.abs(u))[:, 1:-1]
         p_s, p_t, ahead, astern = signals.p_s, signals.p_tank, u > 0.0, u < 0.0
         drops = {
-            "pp": ahead * _root(p_s - cap), "pm": -(astern * _root(cap - p_t)),
-            "mp": -(ahead * _root(rod - p_t)), "mm": astern * _root(p_s - rod),
+            "pp": ahead * root_of_drop(p_s - cap), "pm": -(astern * root_of_drop(cap - p_t)),
+            "mp": -(ahead * root_of_drop(rod - p_t)), "mm": astern * root_of_drop(p_s - rod),
         }  # fmt: skip
         out: Columns = {}
         for edge, drop in drops.items():
@@ -359,15 +359,6 @@ class BulkModulusCurve(Effect):
         return out
 
 
-def _root(drop: Array) -> Array:
-    return np.sqrt(np.maximum(drop, 0.0))
-
-
-@njit(cache=True)
-def _signed(drop):  # type: ignore[no-untyped-def]
-    return math.sqrt(drop) if drop >= 0.0 else -math.sqrt(-drop)
-
-
 @kernel
 def _edges(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
     if phase != CONTRIBUTE:
@@ -375,11 +366,11 @@ def _edges(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
     i = int(par[0])
     u, cap, rod = x[U, i], x[P_CAP, i], x[P_ROD, i]
     if u > 0.0:
-        out[FLOW_CAP, i] += curve_at(u, par, 1, 5) * _signed(bench[P_S] - cap)
-        out[FLOW_ROD, i] -= curve_at(u, par, 31, 5) * _signed(rod - bench[P_TANK])
+        out[FLOW_CAP, i] += curve_at(u, par, 1, 5) * signed_root(bench[P_S] - cap)
+        out[FLOW_ROD, i] -= curve_at(u, par, 31, 5) * signed_root(rod - bench[P_TANK])
     elif u < 0.0:
-        out[FLOW_CAP, i] -= curve_at(-u, par, 16, 5) * _signed(cap - bench[P_TANK])
-        out[FLOW_ROD, i] += curve_at(-u, par, 46, 5) * _signed(bench[P_S] - rod)
+        out[FLOW_CAP, i] -= curve_at(-u, par, 16, 5) * signed_root(cap - bench[P_TANK])
+        out[FLOW_ROD, i] += curve_at(-u, par, 46, 5) * signed_root(bench[P_S] - rod)
 
 
 @kernel

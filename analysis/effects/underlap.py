@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numba import njit
 
 from analysis.effects.base import Array, Shape
 from analysis.effects.edges import corner, edge, opened, rounding
@@ -29,6 +27,7 @@ from analysis.terms.base import (
     equation,
     kernel,
 )
+from analysis.terms.orifice import root_of_drop, signed_root
 from rig.model.parameters import gain_names, parameter_unit
 from rig.model.rig import Rig
 
@@ -91,23 +90,20 @@ class UnderlapLeakage(ValveEffect):
         astern = opened(w - u, r, c) - np.maximum(-u, 0.0)
         cap, rod, p_s, p_t = signals.p_cap[:, i], signals.p_rod[:, i], signals.p_s, signals.p_tank
         return {
-            equation("flow_cap", i): {pp: ahead * _root(p_s - cap), pm: -astern * _root(cap - p_t)},
-            equation("flow_rod", i): {mp: -ahead * _root(rod - p_t), mm: astern * _root(p_s - rod)},
+            equation("flow_cap", i): {
+                pp: ahead * root_of_drop(p_s - cap),
+                pm: -astern * root_of_drop(cap - p_t),
+            },
+            equation("flow_rod", i): {
+                mp: -ahead * root_of_drop(rod - p_t),
+                mm: astern * root_of_drop(p_s - rod),
+            },
         }
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
         """Return joint, gains, underlap, rounding, corner."""
         gains = [values[name] for name in gain_names(self.joint + 1)]
         return np.array([self.joint, *gains, *self.whole(rig, shape)])
-
-
-def _root(drop: Array) -> Array:
-    return np.sqrt(np.maximum(drop, 0.0))
-
-
-@njit(cache=True)
-def _signed(drop):  # type: ignore[no-untyped-def]
-    return math.sqrt(drop) if drop >= 0.0 else -math.sqrt(-drop)
 
 
 @kernel
@@ -119,8 +115,12 @@ def _underlap(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-d
     ahead = edge(u + w, par[6], par[7]) - max(u, 0.0)
     astern = edge(w - u, par[6], par[7]) - max(-u, 0.0)
     cap, rod, p_s, p_t = x[P_CAP, i], x[P_ROD, i], bench[P_S], bench[P_TANK]
-    out[FLOW_CAP, i] += par[1] * ahead * _signed(p_s - cap) - par[2] * astern * _signed(cap - p_t)
-    out[FLOW_ROD, i] += par[4] * astern * _signed(p_s - rod) - par[3] * ahead * _signed(rod - p_t)
+    out[FLOW_CAP, i] += par[1] * ahead * signed_root(p_s - cap) - par[2] * astern * signed_root(
+        cap - p_t
+    )
+    out[FLOW_ROD, i] += par[4] * astern * signed_root(p_s - rod) - par[3] * ahead * signed_root(
+        rod - p_t
+    )
 
 
 TERMS = (UnderlapLeakage,)

@@ -64,12 +64,12 @@ class Orifice(Term):
             cap, rod = signals.p_cap[:, i], signals.p_rod[:, i]
             opened, closed = np.maximum(u, 0.0), np.minimum(u, 0.0)
             out[equation("flow_cap", i)] = {
-                pp: _root(p_s - cap) * opened,
-                pm: _root(cap - p_t) * closed,
+                pp: root_of_drop(p_s - cap) * opened,
+                pm: root_of_drop(cap - p_t) * closed,
             }
             out[equation("flow_rod", i)] = {
-                mp: -_root(rod - p_t) * opened,
-                mm: -_root(p_s - rod) * closed,
+                mp: -root_of_drop(rod - p_t) * opened,
+                mm: -root_of_drop(p_s - rod) * closed,
             }
         return out
 
@@ -85,12 +85,14 @@ class Orifice(Term):
         return out
 
 
-def _root(drop: Array) -> Array:
-    return np.sqrt(np.maximum(drop, 0.0))
+def root_of_drop(drop: Array) -> Array:
+    """Return the roots [Pa^0.5] of pressure drops [Pa], zero where the drop is not positive."""
+    return np.asarray(np.sqrt(np.maximum(drop, 0.0)))
 
 
 @njit(cache=True)
-def _signed_root(drop):  # type: ignore[no-untyped-def]
+def signed_root(drop):  # type: ignore[no-untyped-def]
+    """Return the root [Pa^0.5] of one drop's amount, with the drop's sign."""
     return math.sqrt(drop) if drop >= 0.0 else -math.sqrt(-drop)
 
 
@@ -102,11 +104,11 @@ def _kernel(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def
     for i in range(x.shape[1]):
         u, cap, rod = x[U, i], x[P_CAP, i], x[P_ROD, i]
         if u > 0.0:
-            out[FLOW_CAP, i] += par[4 * i] * _signed_root(p_s - cap) * u
-            out[FLOW_ROD, i] -= par[4 * i + 2] * _signed_root(rod - p_t) * u
+            out[FLOW_CAP, i] += par[4 * i] * signed_root(p_s - cap) * u
+            out[FLOW_ROD, i] -= par[4 * i + 2] * signed_root(rod - p_t) * u
         else:
-            out[FLOW_CAP, i] += par[4 * i + 1] * _signed_root(cap - p_t) * u
-            out[FLOW_ROD, i] -= par[4 * i + 3] * _signed_root(p_s - rod) * u
+            out[FLOW_CAP, i] += par[4 * i + 1] * signed_root(cap - p_t) * u
+            out[FLOW_ROD, i] -= par[4 * i + 3] * signed_root(p_s - rod) * u
 
 
 TERMS = (Orifice,)

@@ -35,6 +35,7 @@ from analysis.identify.estimators.covariance import CovarianceParts
 from analysis.identify.settings import IDENTIFY
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import Coefficient, Columns, Term, Used, equation
+from analysis.terms.orifice import root_of_drop
 from rig.model import channels as ch
 from rig.model.parameters import gain_names
 from rig.model.records import Run
@@ -121,14 +122,10 @@ class SpoolPath(Term):
         cap, rod = signals.p_cap[:, i], signals.p_rod[:, i]
         step = np.gradient(u)  # T du/dt
         ahead, astern = np.where(u > 0, step, 0.0), np.where(u < 0, step, 0.0)
-        in_cap = pp * _root(p_s - cap) * ahead + pm * _root(cap - p_t) * astern
-        in_rod = -mp * _root(rod - p_t) * ahead - mm * _root(p_s - rod) * astern
+        in_cap = pp * root_of_drop(p_s - cap) * ahead + pm * root_of_drop(cap - p_t) * astern
+        in_rod = -mp * root_of_drop(rod - p_t) * ahead - mm * root_of_drop(p_s - rod) * astern
         name = f"{BETWEEN}{i + 1}"
         return {equation("flow_cap", i): {name: in_cap}, equation("flow_rod", i): {name: in_rod}}
-
-
-def _root(drop: Array) -> Array:
-    return np.asarray(np.sqrt(np.maximum(drop, 0.0)))
 
 
 def _lost(drop: Array) -> Array:
