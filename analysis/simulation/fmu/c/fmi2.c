@@ -168,12 +168,7 @@ EXPORT fmi2Status fmi2DoStep(fmi2Component c, double time, double length, int no
 EXPORT fmi2Status fmi2GetFMUstate(fmi2Component c, void **state)
 {
     struct instance *s = c;
-    if (!*state)
-        *state = malloc(sizeof s->bench);
-    if (!*state)
-        return fail(s, "no memory for the state");
-    memcpy(*state, &s->bench, sizeof s->bench);
-    return fmi2OK;
+    return copy_state(state, &s->bench) ? fmi2OK : fail(s, "no memory for the state");
 }
 
 EXPORT fmi2Status fmi2SetFMUstate(fmi2Component c, void *state)
@@ -210,12 +205,7 @@ EXPORT fmi2Status fmi2DeSerializeFMUstate(fmi2Component c, const char *bytes, si
 {
     if (size < sizeof(struct bench))
         return fail(c, "too few bytes for a state");
-    if (!*state)
-        *state = malloc(sizeof(struct bench));
-    if (!*state)
-        return fail(c, "no memory for the state");
-    memcpy(*state, bytes, sizeof(struct bench));
-    return fmi2OK;
+    return copy_state(state, bytes) ? fmi2OK : fail(c, "no memory for the state");
 }
 
 /* What the model does not have: variables of other types, derivatives, asynchronous steps. */

@@ -157,12 +157,7 @@ EXPORT fmi3Status fmi3DoStep(fmi3Instance c, double time, double length, bool no
 EXPORT fmi3Status fmi3GetFMUState(fmi3Instance c, void **state)
 {
     struct instance *s = c;
-    if (!*state)
-        *state = malloc(sizeof s->bench);
-    if (!*state)
-        return fail(s, "no memory for the state");
-    memcpy(*state, &s->bench, sizeof s->bench);
-    return fmi3OK;
+    return copy_state(state, &s->bench) ? fmi3OK : fail(s, "no memory for the state");
 }
 
 EXPORT fmi3Status fmi3SetFMUState(fmi3Instance c, void *state)
@@ -199,12 +194,7 @@ EXPORT fmi3Status fmi3DeserializeFMUState(fmi3Instance c, const uint8_t *bytes, 
 {
     if (size < sizeof(struct bench))
         return fail(c, "too few bytes for a state");
-    if (!*state)
-        *state = malloc(sizeof(struct bench));
-    if (!*state)
-        return fail(c, "no memory for the state");
-    memcpy(*state, bytes, sizeof(struct bench));
-    return fmi3OK;
+    return copy_state(state, bytes) ? fmi3OK : fail(c, "no memory for the state");
 }
 
 /* What the standard asks every unit to export and the model does not have. */

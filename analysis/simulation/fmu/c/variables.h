@@ -80,3 +80,13 @@ static int communicate(struct bench *b, double time, double length)
     memset(b->slope, 0, sizeof b->slope);
     return status;
 }
+
+/* Copy a bench's state from `bytes` to `state`, allocated where it is null; 0 without memory. */
+static int copy_state(void **state, const void *bytes)
+{
+    if (!*state)
+        *state = malloc(sizeof(struct bench));
+    if (*state)
+        memcpy(*state, bytes, sizeof(struct bench));
+    return *state != 0;
+}
