@@ -13,9 +13,14 @@ from analysis.identify import checks as ck
 from analysis.identify.advice import base_statements
 from analysis.identify.checks import Check, consistency
 from analysis.identify.estimation import UNBIASED, EstimationJob, Refined, refine
-from analysis.identify.reduction import RecordReduction, reduce_rows, solve_reductions
+from analysis.identify.reduction import (
+    RecordReduction,
+    record_checks,
+    reduce_rows,
+    solve_reductions,
+)
 from analysis.identify.result import PLAIN, Identification, estimates_of, with_ends
-from analysis.identify.stacked_rows import build_rows, repeats_of
+from analysis.identify.stacked_rows import build_rows
 from analysis.regression.rows import Filtering, default_filtering
 from analysis.regression.solve import Solution
 from analysis.simulation.model import Estimate, Model
@@ -91,7 +96,7 @@ def conclude(
     rows = {family: solution.rows for family, solution in solutions.items()}
     masked = sum(reduction.masked for reduction in reductions)
     statements = (
-        *_statements(rig, reductions, refinement, estimates, rows, masked),
+        *_statements(rig, reductions, refinement, estimates, rows),
         *refinement.checks,
     )
     provenance = {
@@ -113,21 +118,9 @@ def _statements(
     found: Refined,
     estimates: Mapping[str, Estimate],
     rows: Mapping[str, int],
-    masked: int,
 ) -> tuple[Check, ...]:
     return (
-        ck.repeats(
-            repeats_of(
-                (reduction.run, reduction.head)
-                for reduction in reductions
-                if not ck.is_hold(rig, reduction.head)
-            )
-        ),
-        ck.joints_excited(rig, [reduction.head for reduction in reductions]),
-        *ck.clipping(rig, [(reduction.head, reduction.clipped) for reduction in reductions]),
-        *ck.leak_down(rig, [reduction.head for reduction in reductions]),
-        ck.lost_samples([(reduction.head, reduction.lost) for reduction in reductions]),
-        ck.masked(sum(rows.values()), masked),
+        *record_checks(rig, reductions, rows),
         *ck.identifiability(found.solutions),
         *base_statements(rig, found.solutions),
         ck.noise_bias(found.solutions, found.estimator in UNBIASED),

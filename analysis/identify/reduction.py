@@ -276,3 +276,22 @@ def solve_reductions(
             linear = solve(names, clusters, noise, reject_noise)
             out[family] = reduced(rig, terms, linear, clusters, noise, reject_noise)
     return out
+
+
+def record_checks(
+    rig: Rig, reductions: Sequence[RecordReduction], rows: Mapping[str, int]
+) -> list[ck.Check]:
+    """State repeats, excited joints, clipping, creep, lost and masked samples of the records.
+
+    `rows` counts the rows that the solution used, by family.
+    """
+    heads = [reduction.head for reduction in reductions]
+    moving = [(part.run, part.head) for part in reductions if not ck.is_hold(rig, part.head)]
+    return [
+        ck.repeats(repeats_of(moving)),
+        ck.joints_excited(rig, heads),
+        *ck.clipping(rig, [(reduction.head, reduction.clipped) for reduction in reductions]),
+        *ck.leak_down(rig, heads),
+        ck.lost_samples([(reduction.head, reduction.lost) for reduction in reductions]),
+        ck.masked(sum(rows.values()), sum(reduction.masked for reduction in reductions)),
+    ]

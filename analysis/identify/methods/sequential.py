@@ -22,10 +22,16 @@ import numpy as np
 from analysis.identify import checks as ck
 from analysis.identify.checks import Check, consistency
 from analysis.identify.methods.stages import Outcome, StepRows, as_solution, solve_stages
-from analysis.identify.reduction import RecordReduction, clusters_of, noise_of, reduce_rows
+from analysis.identify.reduction import (
+    RecordReduction,
+    clusters_of,
+    noise_of,
+    record_checks,
+    reduce_rows,
+)
 from analysis.identify.result import Identification, estimates_of
 from analysis.identify.settings import IDENTIFY
-from analysis.identify.stacked_rows import build_rows, repeats_of
+from analysis.identify.stacked_rows import build_rows
 from analysis.regression.rows import Filtering, parameters_of
 from analysis.simulation.model import Estimate, Model, estimate_json, finite
 from analysis.terms.base import FAMILIES, Used
@@ -62,18 +68,7 @@ def sequential(
     heads = [reduction.head for reduction in reductions]
     statements = (
         _uniqueness(shown),
-        ck.repeats(
-            repeats_of(
-                (reduction.run, reduction.head)
-                for reduction in reductions
-                if not ck.is_hold(rig, reduction.head)
-            )
-        ),
-        ck.joints_excited(rig, heads),
-        *ck.clipping(rig, [(reduction.head, reduction.clipped) for reduction in reductions]),
-        *ck.leak_down(rig, [reduction.head for reduction in reductions]),
-        ck.lost_samples([(reduction.head, reduction.lost) for reduction in reductions]),
-        ck.masked(sum(rows.values()), masked),
+        *record_checks(rig, reductions, rows),
         *consistency(rig, estimates),
     )
     provenance = {
