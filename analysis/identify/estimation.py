@@ -22,7 +22,11 @@ from analysis.identify.estimators.equations import (
     levelled,
     pieces,
 )
-from analysis.identify.estimators.instruments import comparable, hausman, instrumental_variables
+from analysis.identify.estimators.instruments import (
+    hausman,
+    instrumental_variables,
+    steps_without_instruments,
+)
 from analysis.identify.estimators.robust import robust
 from analysis.identify.estimators.shifts import certain_shift, including, shifts_of
 from analysis.identify.estimators.statements import (
@@ -97,15 +101,18 @@ def refine(job: EstimationJob, solutions: Mapping[str, Solution]) -> Refined:
     """
     refuse_unknown(job.estimator)
     counted = repeats_of((one.conditioned.run, one.record) for one in job.built)
-    single = sorted(step for (_, step), n in counted.items() if n < 2)
     prepared, checks = _prepare(job, solutions)
-    if not single and not all(comparable(p.blocks) for p in prepared):
-        single = sorted({step for _, step in counted})  # cut so short that no two can be compared
+    single = sorted(
+        {step for (_, step), n in counted.items() if n < 2}.union(
+            *(steps_without_instruments(p.blocks) for p in prepared)
+        )
+    )
     if single and job.estimator in NEED_REPEATS:
         raise InputError(
             f"--estimator {job.estimator} needs two or more repeats of every step, with the same "
-            f"excitation started at the same sample; there is one only of: {' '.join(single)}. "
-            "Record more repeats (bramah run --repeats 4), or use --estimator output-error"
+            "excitation started at the same sample; these steps have one, or none that share a "
+            f"row: {' '.join(single)}. Record more repeats (bramah run --repeats 4), or use "
+            "--estimator output-error"
         )
     tests = {} if single else {p.family: hausman(p.blocks) for p in prepared}
     estimator = job.estimator

@@ -175,16 +175,25 @@ def pieces(fit: EquationFit, by: str = "segment") -> Pieces:
 
 def common(blocks: Sequence[RepeatBlock]) -> list[RepeatBlock]:
     """Return the blocks cut to the rows that every repeat of their step and equation kept."""
+    shared = shared_ticks(blocks)
+    out = []
+    for b in blocks:
+        here = np.isin(_ticks(b), shared[*b.stratum, b.equation])
+        out.append(b if here.all() else rows_of(b, here))
+    return out
+
+
+def shared_ticks(blocks: Sequence[RepeatBlock]) -> dict[tuple[int, str, str], Array]:
+    """Return, by (run, step, equation), the times [s] whose rows every repeat kept."""
     shared: dict[tuple[int, str, str], Array] = {}
     for b in blocks:
         key = (*b.stratum, b.equation)
-        ticks = np.round(b.time, 9)
-        shared[key] = np.intersect1d(shared[key], ticks) if key in shared else ticks
-    out = []
-    for b in blocks:
-        here = np.isin(np.round(b.time, 9), shared[*b.stratum, b.equation])
-        out.append(b if here.all() else rows_of(b, here))
-    return out
+        shared[key] = np.intersect1d(shared[key], _ticks(b)) if key in shared else _ticks(b)
+    return shared
+
+
+def _ticks(b: RepeatBlock) -> Array:
+    return np.round(b.time, 9)
 
 
 def rows_of(b: RepeatBlock, here: NDArray[np.bool_]) -> RepeatBlock:

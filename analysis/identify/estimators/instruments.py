@@ -25,6 +25,7 @@ from analysis.identify.estimators.equations import (
     least_squares,
     over_repeats,
     pieces,
+    shared_ticks,
     solve,
 )
 from analysis.identify.settings import IDENTIFY
@@ -48,18 +49,18 @@ class Hausman:
         return np.asarray(self.p < IDENTIFY.instrument_level / len(self.p))
 
 
-def comparable(blocks: Sequence[RepeatBlock]) -> bool:
-    """Whether every equation of every step has rows that two repeats share: instruments exist.
+def steps_without_instruments(blocks: Sequence[RepeatBlock]) -> set[str]:
+    """Return the steps with an equation of which no two repeats share a row.
 
     A repeat that was cut short may keep none behind the filters' edges.
     """
-    shared = common(blocks)
-    count = Counter((*b.stratum, b.equation) for b in shared if len(b.y))
-    return all(count[*b.stratum, b.equation] > 1 for b in shared)
+    repeats = Counter((*b.stratum, b.equation) for b in blocks)
+    shared = shared_ticks(blocks)
+    return {key[1] for key, n in repeats.items() if n < 2 or not len(shared[key])}
 
 
 def instrumental_variables(blocks: Sequence[RepeatBlock]) -> EquationFit:
-    """Solve with the other repeats' mean rows as instruments; `comparable` ones."""
+    """Solve with the other repeats' mean rows as instruments; every step needs two repeats."""
     blocks = common(blocks)
     sums = over_repeats(blocks, [b.X for b in blocks])
     Z = [(total - b.X) / (n - 1) for b, (total, n) in zip(blocks, sums, strict=True)]
