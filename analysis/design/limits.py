@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.design.settings import DESIGN
-from analysis.design.twin_records import PlannedStep, Played
+from analysis.design.twin_records import Played, TwinStep
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
@@ -46,7 +46,7 @@ def _share(signal: Array, low: float, high: float) -> float:
     return max(up / (high - mean), down / (mean - low))
 
 
-def bounds(rig: Rig, step: PlannedStep, motion: Mapping[str, Array]) -> list[Bound]:
+def bounds(rig: Rig, step: TwinStep, motion: Mapping[str, Array]) -> list[Bound]:
     """Return what a step's motion on the twin must stay within."""
     out: list[Bound] = []
     demand = np.zeros(len(motion["piston"]))
@@ -67,7 +67,7 @@ def bounds(rig: Rig, step: PlannedStep, motion: Mapping[str, Array]) -> list[Bou
     return out
 
 
-def _joint_bounds(rig: Rig, step: PlannedStep, motion: Mapping[str, Array], j: int) -> list[Bound]:
+def _joint_bounds(rig: Rig, step: TwinStep, motion: Mapping[str, Array], j: int) -> list[Bound]:
     joint = rig.joints[j]
     limits, valve = joint.limits, joint.valve
     piston = motion["piston"][:, j]

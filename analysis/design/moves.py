@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from analysis.design.limits import Spectrum
 from analysis.design.settings import DESIGN
-from analysis.design.twin_records import PlannedStep
+from analysis.design.twin_records import TwinStep
 
 Array = NDArray[np.float64]
 Lines = NDArray[np.int64]
@@ -113,7 +113,7 @@ def envelope(tone: Tone) -> Array:
     return np.asarray(np.interp(tone.lines, tone.lines[in_use], size[in_use]))
 
 
-def with_tones(step: PlannedStep, tones: Mapping[int, Tone]) -> PlannedStep:
+def with_tones(step: TwinStep, tones: Mapping[int, Tone]) -> TwinStep:
     """Return the step with the waves of these tones."""
     n, waves, lines = step.period, dict(step.waves), set()
     for joint, tone in tones.items():

@@ -26,7 +26,7 @@ from analysis.design.limits import forecast_of, used
 from analysis.design.moves import Tone, mutated, tilted, tone_of, with_tones
 from analysis.design.predict import StepInformation, coefficients, covariance, information
 from analysis.design.settings import DESIGN
-from analysis.design.twin_records import PlannedStep, Played, play
+from analysis.design.twin_records import Played, TwinStep, play
 from analysis.regression.rows import parameters_of
 from analysis.terms import baseline
 from analysis.terms.base import FAMILIES, Used
@@ -37,7 +37,7 @@ Array = NDArray[np.float64]
 Lines = NDArray[np.int64]
 log = logging.getLogger(__name__)
 Say = Callable[[str], None]
-Passes = Callable[[PlannedStep, Mapping[int, Tone]], bool]
+Passes = Callable[[TwinStep, Mapping[int, Tone]], bool]
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Candidate:
 class Design:
     """The improved steps, and relative standard errors by parameter before and after."""
 
-    steps: tuple[PlannedStep, ...]
+    steps: tuple[TwinStep, ...]
     tones: tuple[Mapping[int, Tone], ...]
     before: Mapping[str, float]
     after: Mapping[str, float]
@@ -67,7 +67,7 @@ class Design:
 
 def improve(
     rig: Rig,
-    steps: Sequence[PlannedStep],
+    steps: Sequence[TwinStep],
     empty: Mapping[tuple[str, int], tuple[int, ...]],
     criterion: str,
     budget: int,
@@ -187,9 +187,7 @@ class _Search:
         what = "worst direction" if self.criterion == "E" else self.criterion
         return f"{what}: {100 * math.sqrt(value):.4f} %"
 
-    def first(
-        self, step: PlannedStep, empty: Mapping[tuple[str, int], tuple[int, ...]]
-    ) -> Candidate:
+    def first(self, step: TwinStep, empty: Mapping[tuple[str, int], tuple[int, ...]]) -> Candidate:
         """Play the protocol's own step and lay its tones out."""
         tones = {
             j: tone_of(j, wave, empty.get((step.name, j), ())) for j, wave in step.waves.items()
@@ -198,7 +196,7 @@ class _Search:
         self.gains[step.name] = candidate.played.gains
         return candidate
 
-    def judged(self, step: PlannedStep, tones: Mapping[int, Tone]) -> Candidate:
+    def judged(self, step: TwinStep, tones: Mapping[int, Tone]) -> Candidate:
         """Play a step; raises InputError where the twin cannot."""
         played = play(self.rig, step)
         step_information = information(self.rig, played, self.terms)

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from analysis.design.lateness import BULK, LatenessCost, lateness_cost
 from analysis.design.sensor_noise import score_covariance
 from analysis.design.settings import DESIGN
-from analysis.design.twin_records import PlannedStep, Played, ideal, play
+from analysis.design.twin_records import Played, TwinStep, ideal, play
 from analysis.identify.settings import IDENTIFY
 from analysis.identify.stacked_rows import build_rows
 from analysis.regression.least_squares import scaled_inverse
@@ -97,7 +97,7 @@ class Prediction:
 
 def predict(
     rig: Rig,
-    steps: Sequence[PlannedStep],
+    steps: Sequence[TwinStep],
     terms: Sequence[Used] | None = None,
     filtering: Filters = default_filtering,
     jitter: float | None = None,

@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class PlannedStep:
+class TwinStep:
     """One step in device terms, joints 0-based.
 
     `waves` maps an excited joint to one period of its command [V] (all the same length), `lines`
@@ -71,7 +71,7 @@ class Played:
     their commands, as the bench will measure it to centre them.
     """
 
-    step: PlannedStep
+    step: TwinStep
     record: Record
     motion: Mapping[str, Array]
     gains: Mapping[int, float]
@@ -88,7 +88,7 @@ def ideal(rig: Rig) -> Rig:
     return rig.model_copy(update={"sensors": sensors.model_copy(update={**parts, "skew": 0.0})})
 
 
-def play(rig: Rig, step: PlannedStep, trims: int = DESIGN.trims) -> Played:
+def play(rig: Rig, step: TwinStep, trims: int = DESIGN.trims) -> Played:
     """Play a step on the twin, trimming the biases until the pistons stay where they belong.
 
     Raises InputError where the twin's state ceases to exist or it cannot be centred.
@@ -109,7 +109,7 @@ def play(rig: Rig, step: PlannedStep, trims: int = DESIGN.trims) -> Played:
     )
 
 
-def _held(rig: Rig, step: PlannedStep) -> dict[int, float]:
+def _held(rig: Rig, step: TwinStep) -> dict[int, float]:
     out = {}
     for joint, piston in step.held.items():
         half = 0.5 * rig.joints[joint].cylinder.stroke - DESIGN.end_distance
@@ -117,7 +117,7 @@ def _held(rig: Rig, step: PlannedStep) -> dict[int, float]:
     return out
 
 
-def _commands(rig: Rig, step: PlannedStep) -> tuple[Array, Array, int]:
+def _commands(rig: Rig, step: TwinStep) -> tuple[Array, Array, int]:
     """Return commands (n, N) [V] that end with a record, start pistons (N,), and its first."""
     rate, joints = rig.sample_rate, len(rig.joints)
     lead = min(step.period, round(DESIGN.lead * rate))
@@ -134,8 +134,8 @@ def _commands(rig: Rig, step: PlannedStep) -> tuple[Array, Array, int]:
 
 
 def _trimmed(
-    rig: Rig, step: PlannedStep, commands: Array, piston: Array, lead: int, good: int
-) -> tuple[PlannedStep, bool, dict[int, float]]:
+    rig: Rig, step: TwinStep, commands: Array, piston: Array, lead: int, good: int
+) -> tuple[TwinStep, bool, dict[int, float]]:
     """Return the step with better biases and starts, whether it was steady, and the gains."""
     rate, gains = rig.sample_rate, {}
     biases, starts, steady = dict(step.biases), dict(step.strokes), good == len(piston)
@@ -160,7 +160,7 @@ def _trimmed(
     return replace(step, biases=biases, strokes=starts), steady, gains
 
 
-def _record(rig: Rig, step: PlannedStep, motion: Mapping[str, Array]) -> Record:
+def _record(rig: Rig, step: TwinStep, motion: Mapping[str, Array]) -> Record:
     channels: dict[str, Array] = {}
     kinds = {
         ch.SPOOL: "spool", ch.PISTON: "piston", ch.CAP: "cap_pressure", ch.ROD: "rod_pressure",

@@ -27,7 +27,7 @@ _BAR_COLOURS: Final = {"done": BLUE, "tripped": "#d03030"}
 
 
 @dataclass(frozen=True)
-class Estimate:
+class NightEstimate:
     """An identified parameter, SI; `std` is NaN where it is not known."""
 
     value: float
@@ -54,7 +54,7 @@ class NightItem:
     records: int = -1
     samples: int = -1
     lost_samples: int = -1
-    parameters: Mapping[str, Estimate] = field(default_factory=dict)
+    parameters: Mapping[str, NightEstimate] = field(default_factory=dict)
     unidentified: str = ""
 
 
@@ -209,7 +209,7 @@ def _drift(rig: str, items: Sequence[NightItem]) -> dict[str, Any]:
     }
 
 
-def change(values: Sequence[Estimate]) -> tuple[float, float]:
+def change(values: Sequence[NightEstimate]) -> tuple[float, float]:
     """Return the last minus the first estimate, and over the two errors together (0: unknown).
 
     The errors of two runs are independent: their squares add.

@@ -68,7 +68,7 @@ def rates(t, y, dy, inputs, n, rate, locked, geometry, par, context, work):
 
 
 @dataclass(frozen=True)
-class Source:
+class GeneratedSource:
     """The text, and the elements of `par` (by index) that it holds as fixed places."""
 
     text: str
@@ -79,7 +79,7 @@ class Source:
 def _remembered(
     terms: tuple[Term, ...], lengths: tuple[int, ...], hidden: tuple[int, ...],
     electric: tuple[bool, ...],
-) -> list[Source]:  # fmt: skip
+) -> list[GeneratedSource]:  # fmt: skip
     """Return the list of the sources made of a set of terms, for `source_of` to fill."""
     return []
 
@@ -101,7 +101,7 @@ def source_of(
 
 def _generated(
     terms: Sequence[Used], packed: Sequence[Array], hidden: Sequence[int], electric: Sequence[bool]
-) -> Source:
+) -> GeneratedSource:
     """Return the source of the terms' right-hand side, of one joint for each of `electric`.
 
     `packed` is what each term packs, `hidden` its number of hidden states. Raises
@@ -152,7 +152,7 @@ def _generated(
     body.add(f"return {eq.OK}")
     names = ", ".join(f"{used.term.name} at {used.term.where}" for used in terms)
     parts = [_HEAD.format(names=names), *helpers.texts.values(), _DEFINITION + body.text()]
-    return Source("\n".join(parts), places)
+    return GeneratedSource("\n".join(parts), places)
 
 
 class _Lines:

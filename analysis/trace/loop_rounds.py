@@ -22,7 +22,7 @@ from analysis.trace.data.temperature_nuisance import base_terms
 from analysis.trace.next_experiment.discrimination import (
     Explanation,
     Ground,
-    Question,
+    OpenQuestion,
     present,
     smallest,
 )
@@ -112,10 +112,10 @@ def _one(
     )
 
 
-def _small(one: Sequence[Mapping[str, Any]], rig: Rig) -> Question:
+def _small(one: Sequence[Mapping[str, Any]], rig: Rig) -> OpenQuestion:
     (used,) = effects_of(one)
     assert isinstance(used.term, Effect)
-    return Question(smallest(used.term, rig) or Explanation((used,)), Explanation(), False)
+    return OpenQuestion(smallest(used.term, rig) or Explanation((used,)), Explanation(), False)
 
 
 def effects_of(side: Sequence[Mapping[str, Any]]) -> list[Used]:

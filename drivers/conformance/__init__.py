@@ -1,23 +1,30 @@
 """What every driver must do, on any wire, as checks that anybody can run (docs/conformance.md)."""
 
-from drivers.conformance.catalogue import Check
+from drivers.conformance.catalogue import ConformanceCheck
 from drivers.conformance.live import live_subject
-from drivers.conformance.random_calls import Effort
-from drivers.conformance.runner import Report, Result, Verdict, all_checks, run, run_check
-from drivers.conformance.subject import HEALTHY, Bench, Capabilities, Subject
+from drivers.conformance.random_calls import RandomCallBudget
+from drivers.conformance.runner import (
+    CheckVerdict,
+    ConformanceReport,
+    Result,
+    all_checks,
+    run,
+    run_check,
+)
+from drivers.conformance.subject import HEALTHY, Capabilities, DeviceUnderTest, Subject
 from drivers.conformance.watched import NotConforming
 
 __all__ = [
     "HEALTHY",
-    "Bench",
     "Capabilities",
-    "Check",
-    "Effort",
+    "CheckVerdict",
+    "ConformanceCheck",
+    "ConformanceReport",
+    "DeviceUnderTest",
     "NotConforming",
-    "Report",
+    "RandomCallBudget",
     "Result",
     "Subject",
-    "Verdict",
     "all_checks",
     "live_subject",
     "run",

@@ -16,7 +16,7 @@ from drivers.conformance.watched import Watched, follows, require, rows_of
 _PENDING: Final = -1  # a waveform's first tick is that of the next stream
 
 
-class Model:
+class DeviceModel:
     """One sequence of calls on one fresh bench, and what may be seen after them."""
 
     def __init__(self, subject: Subject) -> None:

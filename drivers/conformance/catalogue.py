@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from drivers.conformance.subject import Bench, Capabilities
+from drivers.conformance.subject import Capabilities, DeviceUnderTest
 from drivers.conformance.trial import Trial
 
 Body = Callable[[Trial], None]
@@ -24,7 +24,7 @@ SATURATION: Final = "a sensor at the end of its range"
 
 
 @dataclass(frozen=True)
-class Check:
+class ConformanceCheck:
     """One thing that every driver must do.
 
     `needs` are the capabilities without which it is skipped; `moves` says whether it asks the
@@ -38,7 +38,7 @@ class Check:
     body: Body
 
 
-_found: list[Check] = []
+_found: list[ConformanceCheck] = []
 
 
 def described(body: Body) -> str:
@@ -51,18 +51,18 @@ def check(*needs: str, moves: bool = True) -> Callable[[Body], Body]:
 
     def enter(body: Body) -> Body:
         wanted = (OUTPUTS, *needs) if moves else needs
-        _found.append(Check(body.__name__, described(body), wanted, moves, body))
+        _found.append(ConformanceCheck(body.__name__, described(body), wanted, moves, body))
         return body
 
     return enter
 
 
-def catalogue() -> tuple[Check, ...]:
+def catalogue() -> tuple[ConformanceCheck, ...]:
     """Return every check whose module was imported."""
     return tuple(_found)
 
 
-def lacking(check: Check, bench: Bench, claims: Capabilities) -> str | None:
+def lacking(check: ConformanceCheck, bench: DeviceUnderTest, claims: Capabilities) -> str | None:
     """Return the first capability that a check needs and a bench has not, or None."""
     has = {
         OUTPUTS: claims.outputs,

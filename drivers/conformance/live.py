@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from drivers.base import DeviceError
-from drivers.conformance.subject import Bench, Capabilities, Subject
+from drivers.conformance.subject import Capabilities, DeviceUnderTest, Subject
 from drivers.registry import driver_class, make_driver
 from rig.model.rig import Rig
 
@@ -30,8 +30,8 @@ def live_subject(rig: Rig) -> Subject:
         raise DeviceError(f"the device has tripped ({tripped}); find the cause, then reset it")
 
     @contextmanager
-    def make() -> Iterator[Bench]:
-        yield Bench(rig, lambda wanted: make_driver(wanted.wire, wanted))
+    def make() -> Iterator[DeviceUnderTest]:
+        yield DeviceUnderTest(rig, lambda wanted: make_driver(wanted.wire, wanted))
 
     claims = Capabilities(
         host_timed=driver_class(rig.wire.kind).host_timed,

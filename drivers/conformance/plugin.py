@@ -14,8 +14,8 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from drivers.conformance.catalogue import Check
-from drivers.conformance.runner import Verdict, all_checks, run_check
+from drivers.conformance.catalogue import ConformanceCheck
+from drivers.conformance.runner import CheckVerdict, all_checks, run_check
 from drivers.conformance.subject import Subject
 
 FIXTURE = "conformance_check"
@@ -38,12 +38,12 @@ def pytest_generate_tests(metafunc: Any) -> None:
     metafunc.parametrize(FIXTURE, list(cases.values()), ids=list(cases))
 
 
-def _assert_passes(check: Check, subject: Subject) -> None:
+def _assert_passes(check: ConformanceCheck, subject: Subject) -> None:
     """Run one check; fails or skips the test with the reason."""
     import pytest  # noqa: PLC0415 - a dependency of development only
 
     result = run_check(check, subject)
-    if result.verdict == Verdict.SKIPPED:
+    if result.verdict == CheckVerdict.SKIPPED:
         pytest.skip(result.reason)
-    if result.verdict == Verdict.FAILED:
+    if result.verdict == CheckVerdict.FAILED:
         pytest.fail(f"{subject.name}: {check.says} {result.reason}", pytrace=False)

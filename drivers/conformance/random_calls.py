@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Final
 
-from drivers.conformance.calls_model import Model
+from drivers.conformance.calls_model import DeviceModel
 from drivers.conformance.subject import Subject
 from drivers.conformance.watched import NotConforming, Skipped
 
@@ -19,7 +19,7 @@ _LAW = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class Effort:
+class RandomCallBudget:
     """How many sequences of calls are tried, how long each may be, and whether to shorten."""
 
     sequences: int = 60
@@ -49,7 +49,7 @@ def _machine(subject: Subject, last: dict[str, list[str]]) -> Any:
 
         def __init__(self) -> None:
             super().__init__()
-            self.model = Model(subject)
+            self.model = DeviceModel(subject)
             last["calls"] = self.model.driver.log
 
         def read_blocks(self, blocks: int) -> None:
@@ -137,7 +137,7 @@ def _machine(subject: Subject, last: dict[str, list[str]]) -> Any:
     return Calls
 
 
-def try_random_calls(subject: Subject, effort: Effort) -> None:
+def try_random_calls(subject: Subject, effort: RandomCallBudget) -> None:
     """Try random sequences of calls on fresh benches.
 
     Raises NotConforming with the calls that led there, Skipped without hypothesis.

@@ -10,8 +10,8 @@ from typing import Final
 
 from drivers.base import DeviceError
 from drivers.conformance import fault_checks, output_checks, session_checks
-from drivers.conformance.catalogue import Check, catalogue, described, lacking
-from drivers.conformance.random_calls import Effort, try_random_calls
+from drivers.conformance.catalogue import ConformanceCheck, catalogue, described, lacking
+from drivers.conformance.random_calls import RandomCallBudget, try_random_calls
 from drivers.conformance.subject import Subject
 from drivers.conformance.trial import Trial
 from drivers.conformance.watched import NotConforming, Skipped
@@ -21,7 +21,7 @@ logger = logging.getLogger(__name__)
 MODULES: Final = (session_checks, output_checks, fault_checks)
 
 
-class Verdict(StrEnum):
+class CheckVerdict(StrEnum):
     """How one check ended."""
 
     PASSED = "passed"
@@ -34,18 +34,18 @@ class Result:
     """One check's verdict; `reason` says in one line why it failed or was skipped."""
 
     check: str
-    verdict: Verdict
+    verdict: CheckVerdict
     reason: str = ""
 
 
 @dataclass(frozen=True)
-class Report:
+class ConformanceReport:
     """What a subject did in every check that was run."""
 
     subject: str
     results: tuple[Result, ...]
 
-    def of(self, verdict: Verdict) -> tuple[Result, ...]:
+    def of(self, verdict: CheckVerdict) -> tuple[Result, ...]:
         """Return the results of one verdict."""
         return tuple(result for result in self.results if result.verdict == verdict)
 
@@ -53,24 +53,28 @@ class Report:
 def random_calls(trial: Trial) -> None:
     """Random sequences of every call, losses and faults among them: ticks rise, samples follow
     the law, and after zero, close or an error the outputs are zero."""
-    try_random_calls(trial.subject, Effort())
+    try_random_calls(trial.subject, RandomCallBudget())
 
 
-RANDOM_CALLS: Final = Check("random_calls", described(random_calls), (), True, random_calls)
+RANDOM_CALLS: Final = ConformanceCheck(
+    "random_calls", described(random_calls), (), True, random_calls
+)
 
 
-def all_checks() -> tuple[Check, ...]:
+def all_checks() -> tuple[ConformanceCheck, ...]:
     """Return every check: of sessions, outputs and faults; the random calls last."""
     order = [module.__name__ for module in MODULES]
     known = [check for check in catalogue() if check.body.__module__ in order]
     return (*sorted(known, key=lambda check: order.index(check.body.__module__)), RANDOM_CALLS)
 
 
-def run_check(check: Check, subject: Subject, effort: Effort | None = None) -> Result:
+def run_check(
+    check: ConformanceCheck, subject: Subject, effort: RandomCallBudget | None = None
+) -> Result:
     """Run one check on a fresh bench of the subject; never raises for what the driver does."""
     try:
         if check is RANDOM_CALLS:
-            try_random_calls(subject, effort or Effort())
+            try_random_calls(subject, effort or RandomCallBudget())
         else:
             with subject.make() as bench:
                 need = lacking(check, bench, subject.capabilities)
@@ -78,17 +82,17 @@ def run_check(check: Check, subject: Subject, effort: Effort | None = None) -> R
                     raise Skipped(f"not claimed: {need}")
                 _run_on(check, Trial(subject, bench))
     except Skipped as why:
-        return Result(check.name, Verdict.SKIPPED, str(why))
+        return Result(check.name, CheckVerdict.SKIPPED, str(why))
     except NotConforming as error:
-        return Result(check.name, Verdict.FAILED, _line(str(error)))
+        return Result(check.name, CheckVerdict.FAILED, _line(str(error)))
     except DeviceError as error:
         text = f"unexpected {type(error).__name__}: {error}"
-        return Result(check.name, Verdict.FAILED, _line(text))
+        return Result(check.name, CheckVerdict.FAILED, _line(text))
     logger.debug("%s: %s passed", subject.name, check.name)
-    return Result(check.name, Verdict.PASSED)
+    return Result(check.name, CheckVerdict.PASSED)
 
 
-def _run_on(check: Check, trial: Trial) -> None:
+def _run_on(check: ConformanceCheck, trial: Trial) -> None:
     try:
         check.body(trial)
     except BaseException:
@@ -110,9 +114,9 @@ def run(
     *,
     only: Sequence[str] = (),
     outputs: bool = True,
-    effort: Effort | None = None,
+    effort: RandomCallBudget | None = None,
     until_failure: bool = False,
-) -> Report:
+) -> ConformanceReport:
     """Run the checks on a subject and return their results.
 
     `only` names checks to run instead of all; `outputs` False leaves out whatever asks for
@@ -129,9 +133,9 @@ def run(
             continue
         if check.moves and not outputs:
             why = "asks for outputs other than zero"
-            results.append(Result(check.name, Verdict.SKIPPED, why))
+            results.append(Result(check.name, CheckVerdict.SKIPPED, why))
             continue
         results.append(run_check(check, subject, effort))
-        if until_failure and results[-1].verdict == Verdict.FAILED:
+        if until_failure and results[-1].verdict == CheckVerdict.FAILED:
             break
-    return Report(subject.name, tuple(results))
+    return ConformanceReport(subject.name, tuple(results))

@@ -39,7 +39,7 @@ class Capabilities:
 
 
 @dataclass(frozen=True)
-class Bench:
+class DeviceUnderTest:
     """One fresh device, its outputs at zero and not tripped, and what can be done to it.
 
     `driver` makes an unconnected driver for a rig. `outputs` returns every output [V] after at
@@ -70,6 +70,6 @@ class Subject:
     """
 
     name: str
-    make: Callable[[], AbstractContextManager[Bench]]
+    make: Callable[[], AbstractContextManager[DeviceUnderTest]]
     capabilities: Capabilities = Capabilities()
     volts: float = 1.0

@@ -10,7 +10,7 @@ import numpy as np
 
 from drivers.base import OFF, Array, DeviceError, DeviceLost, OutputLaw, SampleBlock
 from drivers.conformance.law import Playing, commands, in_volts, require_law
-from drivers.conformance.subject import HEALTHY, Bench, Subject
+from drivers.conformance.subject import HEALTHY, DeviceUnderTest, Subject
 from drivers.conformance.watched import NotConforming, Watched, follows, require, rows_of
 from rig.model.rig import Rig
 
@@ -22,7 +22,7 @@ SETTLING = 3  # blocks after zeroing that may still show the law before, if time
 class Trial:
     """One run of one check: a bench, and drivers that are closed at its end."""
 
-    def __init__(self, subject: Subject, bench: Bench) -> None:
+    def __init__(self, subject: Subject, bench: DeviceUnderTest) -> None:
         self.subject = subject
         self.bench = bench
         self.rig = bench.rig

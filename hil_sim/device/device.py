@@ -43,7 +43,7 @@ _STREAMING, _TRIPPED = int(Status.STREAMING), int(Status.TRIPPED)
 _ARMED, _CONTROLLED = int(Status.ARMED), int(Status.CONTROLLED)
 
 
-class Plant(Protocol):
+class PlantInterface(Protocol):
     """What the device needs of a plant; it is deterministic and owns all physical state."""
 
     @property
@@ -65,7 +65,7 @@ class Device:
     def __init__(
         self,
         rig: Rig,
-        plant: Plant,
+        plant: PlantInterface,
         *,
         realtime: bool,
         clock: Callable[[], float] = time.monotonic,
@@ -81,7 +81,7 @@ class Device:
         # In real time the plant is never ahead of the clock; faults may change it between blocks.
         ahead = not realtime and not faults and isinstance(plant, Rewindable)
         self._prefetch = Prefetch(plant) if ahead and isinstance(plant, Rewindable) else None
-        self._plant: Plant = plant if self._prefetch is None else self._prefetch
+        self._plant: PlantInterface = plant if self._prefetch is None else self._prefetch
         self._clock = clock
         self._heard = self._polled = self._origin = clock()
         self._drift = 0.0  # by which share the sample clock runs fast

@@ -16,7 +16,7 @@ class EndpointError(Exception):
     """The bench cannot be offered there; the message names the place and what to do."""
 
 
-class Owner:
+class ParentProcess:
     """The process that a server belongs to and ends with."""
 
     def __init__(self, pid: int) -> None:

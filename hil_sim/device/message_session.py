@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from hil_sim.device.device import Device
 from hil_sim.device.laws import Refused
-from hil_sim.device.register_map import RegisterMap
+from hil_sim.device.register_map import DeviceRegisters
 from rig.model import registers as reg
 from rig.model.registers import BlockHeader, Refusal, Register, Status
 from rig.model.wire import serial_messages as msg
@@ -41,7 +41,7 @@ class MessageSession:
     def __init__(self, device: Device) -> None:
         self._device = device
         device.on_restart = self._restarted
-        self._registers = RegisterMap(device)
+        self._registers = DeviceRegisters(device)
         self._host: _Host | None = None
         self._stream = 0  # number of the request that started it
         self._next = 0  # number of the block to be sent next

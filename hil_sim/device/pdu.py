@@ -9,7 +9,7 @@ from pymodbus.constants import ExcCodes
 from pymodbus.pdu import ExceptionResponse, ModbusPDU
 
 from hil_sim.device.laws import Refused
-from hil_sim.device.register_map import RegisterMap
+from hil_sim.device.register_map import DeviceRegisters
 from rig.model.registers import MAX_READ, MAX_WRITE, Refusal
 
 _EXCEPTIONS = {
@@ -21,13 +21,13 @@ _EXCEPTIONS = {
 _MAX_WRITE_BESIDE_READ = 121
 
 
-class Session(Protocol):
+class DeviceSession(Protocol):
     """What a request needs to know of the connection it came by."""
 
-    registers: RegisterMap
+    registers: DeviceRegisters
 
 
-class Answer(ModbusPDU):
+class ResponsePdu(ModbusPDU):
     """An answer that was bytes from the start."""
 
     def __init__(self, function_code: int, data: bytes) -> None:
@@ -43,7 +43,7 @@ class Answer(ModbusPDU):
 class Request(ModbusPDU):
     """A request kept as bytes until its connection answers it."""
 
-    session: Session
+    session: DeviceSession
     data = b""
 
     def decode(self, data: bytes) -> None:
@@ -60,7 +60,7 @@ class Request(ModbusPDU):
     def answered(self) -> ModbusPDU:
         """Return the answer, or why there is none in the terms of Modbus."""
         try:
-            return Answer(self.function_code, self.answer())
+            return ResponsePdu(self.function_code, self.answer())
         except Refused as refused:
             code = _EXCEPTIONS.get(refused.reason, ExcCodes.ILLEGAL_VALUE)
         except (struct.error, ValueError):
@@ -128,14 +128,14 @@ class ReadWrite(Request):
 REQUESTS: list[type[ModbusPDU]] = [ReadHolding, ReadInput, WriteOne, WriteMany, ReadWrite]
 
 
-def _read(session: Session, address: int, count: int) -> bytes:
+def _read(session: DeviceSession, address: int, count: int) -> bytes:
     if not 1 <= count <= MAX_READ:
         raise ValueError("register count")
     data = session.registers.read(session, address, count)
     return bytes([len(data)]) + data
 
 
-def _write(session: Session, address: int, count: int, data: bytes, most: int) -> None:
+def _write(session: DeviceSession, address: int, count: int, data: bytes, most: int) -> None:
     if not 1 <= count <= most or len(data) != 2 * count:
         raise ValueError("register count")
     session.registers.write(session, address, data)

@@ -15,7 +15,7 @@ from rig.model.registers import Refusal
 _U32 = 0xFFFF_FFFF
 
 
-class RegisterMap:
+class DeviceRegisters:
     """Reads and writes of registers, carried out on one device."""
 
     def __init__(self, device: Device) -> None:

@@ -19,7 +19,7 @@ from pymodbus.pdu import ExceptionResponse, ModbusPDU
 
 from hil_sim.device.device import Device
 from hil_sim.device.pdu import REQUESTS, Request
-from hil_sim.device.register_map import RegisterMap
+from hil_sim.device.register_map import DeviceRegisters
 
 logger = logging.getLogger(__name__)
 
@@ -37,7 +37,7 @@ class _LineSession:
     """What a serial line is to the device: one host for ever, whose end nothing announces."""
 
     def __init__(self, device: Device) -> None:
-        self.registers = RegisterMap(device)
+        self.registers = DeviceRegisters(device)
 
 
 class RtuLine:

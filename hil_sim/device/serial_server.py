@@ -11,8 +11,8 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 
-from hil_sim.device.device import Device, Plant
-from hil_sim.device.lifetime import PARENT_SECONDS, Owner, termination_signals
+from hil_sim.device.device import Device, PlantInterface
+from hil_sim.device.lifetime import PARENT_SECONDS, ParentProcess, termination_signals
 from hil_sim.device.pty_line import PtyLine
 from hil_sim.device.serial_session import SerialSession
 from hil_sim.faults.device import DeviceFault
@@ -23,7 +23,7 @@ logger = logging.getLogger(__name__)
 
 def serve_serial(
     rig: Rig,
-    plant: Plant,
+    plant: PlantInterface,
     *,
     realtime: bool = False,
     on_ready: Callable[[str], None] = logger.info,
@@ -40,7 +40,7 @@ def serve_serial(
     try:
         with termination_signals() as ended:
             on_ready(f"serial://{line.name}")
-            serve_port(line, device, ended, None if parent is None else Owner(parent))
+            serve_port(line, device, ended, None if parent is None else ParentProcess(parent))
     finally:
         device.zero()
         line.close()
@@ -50,7 +50,7 @@ def serve_port(
     line: PtyLine,
     device: Device,
     ended: Sequence[object],
-    owner: Owner | None = None,
+    owner: ParentProcess | None = None,
     lock: AbstractContextManager[object] | None = None,
 ) -> None:
     """Serve a device on a pty until `ended` is not empty, or its owner has ended.

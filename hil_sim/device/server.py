@@ -18,11 +18,11 @@ from pymodbus.server.requesthandler import ServerRequestHandler
 from pymodbus.simulator import DataType, SimData, SimDevice
 from pymodbus.transport import ModbusProtocol
 
-from hil_sim.device.device import Device, Plant
+from hil_sim.device.device import Device, PlantInterface
 from hil_sim.device.laws import LawTable
-from hil_sim.device.lifetime import PARENT_SECONDS, EndpointError, Owner
+from hil_sim.device.lifetime import PARENT_SECONDS, EndpointError, ParentProcess
 from hil_sim.device.pdu import REQUESTS, Request
-from hil_sim.device.register_map import RegisterMap
+from hil_sim.device.register_map import DeviceRegisters
 from hil_sim.device.rtu_server import serve_line
 from hil_sim.device.serial_server import serve_serial
 from hil_sim.faults.device import DeviceFault
@@ -66,7 +66,7 @@ class _Connection(ServerRequestHandler):
     own: more work than the answer, and a second request of the same segment would be lost by it.
     """
 
-    def __init__(self, server: BenchServer, device: Device, registers: RegisterMap) -> None:
+    def __init__(self, server: BenchServer, device: Device, registers: DeviceRegisters) -> None:
         super().__init__(server, None, None, self._connection)  # type: ignore[no-untyped-call]
         self._device = device
         self.registers = registers
@@ -124,7 +124,7 @@ class BenchServer(ModbusTcpServer):
         self._address = (host, port)
         self._device = device
         device.on_restart = self.abort_connections
-        self._registers = RegisterMap(device)
+        self._registers = DeviceRegisters(device)
 
     async def listen(self) -> bool:
         """Open the socket; raises EndpointError with the reason, where the library only says no."""
@@ -183,7 +183,7 @@ async def serve_until(
 
 def serve(
     rig: Rig,
-    plant: Plant,
+    plant: PlantInterface,
     host: str = "127.0.0.1",
     port: int = 0,
     *,
@@ -239,7 +239,7 @@ def serve(
     asyncio.run(_serve(on_wire, device, parent))
 
 
-def warm_up(rig: Rig, spare: Plant) -> None:
+def warm_up(rig: Rig, spare: PlantInterface) -> None:
     """Run one block on a plant that is not served, so that whatever compiles has compiled."""
     table = LawTable(rig)
     spare.advance(reg.block_layout(len(rig.channels), len(rig.joints)).samples, table.active)
@@ -266,7 +266,7 @@ async def _serve(
 
 async def _end_with(parent: int, stop: asyncio.Event) -> None:
     """Set `stop` when process `parent` is gone."""
-    owner = Owner(parent)
+    owner = ParentProcess(parent)
     while not stop.is_set():
         if owner.has_ended():
             logger.info("process %d, which this server served, has ended", parent)

@@ -11,7 +11,7 @@ from hil_sim.effects.base import Tables, set_relief
 from hil_sim.plant.kernel_data import ATMOSPHERE, BENCH, JOINT, Table
 from hil_sim.plant.sensors import channel_table
 from hil_sim.scenario.file import Scenario, check_fits
-from hil_sim.scenario.truth import Constants, Machine
+from hil_sim.scenario.truth import Constants, TrueMachine
 from rig.model.parse import InputError
 from rig.model.parts import Joint
 from rig.model.rig import Rig
@@ -43,7 +43,9 @@ def inertia_matrix(parameters: Mapping[str, float], joints: int) -> Table:
     return R
 
 
-def build(rig: Rig, machine: Machine, scenario: Scenario, periods: Mapping[str, float]) -> Tables:
+def build(
+    rig: Rig, machine: TrueMachine, scenario: Scenario, periods: Mapping[str, float]
+) -> Tables:
     """Return the plant's tables; `periods` holds the oil temperature's periods and phases.
 
     Raises InputError for effects at places the rig has not and for impossible parameters.
@@ -71,7 +73,7 @@ def _refuse_impossible(parameters: Mapping[str, float]) -> None:
             raise InputError(f"parameter {name} is {value:g}; no bench has that, check its sign")
 
 
-def _fill_joint(table: Table, i: int, joint: Joint, rig: Rig, machine: Machine) -> None:
+def _fill_joint(table: Table, i: int, joint: Joint, rig: Rig, machine: TrueMachine) -> None:
     a, c, offset = joint.linkage.base_pin, joint.linkage.arm_pin, joint.linkage.offset
     cylinder, valve, constants = joint.cylinder, joint.valve, machine.constants
     half = cylinder.stroke / 2

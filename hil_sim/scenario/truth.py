@@ -43,7 +43,7 @@ class Constants(BaseModel):
     relief_rounding: Pressure = Field(default=20e3, gt=0)
 
 
-class Machine(BaseModel):
+class TrueMachine(BaseModel):
     """The true parameters by name [SI] and the plant's constants."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -63,7 +63,7 @@ def machine_text(name: str) -> str | None:
     return path.read_text(encoding="utf-8") if path.is_file() else None
 
 
-def load_machine(rig: Rig, overrides: Mapping[str, float] | None = None) -> Machine:
+def load_machine(rig: Rig, overrides: Mapping[str, float] | None = None) -> TrueMachine:
     """Return the machine of `rig`, parameters [SI] overridden by name.
 
     Raises InputError naming parameters that are missing or that the rig does not have.
@@ -71,10 +71,10 @@ def load_machine(rig: Rig, overrides: Mapping[str, float] | None = None) -> Mach
     names = parameter_names(len(rig.joints))
     text = machine_text(rig.name)
     if text is None:
-        machine, source = Machine(parameters=dict(rig.nominal)), f"rig {rig.name!r}: nominal"
+        machine, source = TrueMachine(parameters=dict(rig.nominal)), f"rig {rig.name!r}: nominal"
     else:
         source = f"machines/{rig.name}.yaml"
-        machine = parse_model(Machine, text, source)
+        machine = parse_model(TrueMachine, text, source)
     for name in (*machine.parameters, *(overrides or {})):
         if name not in names:
             where = "scenario parameters" if name in (overrides or {}) else source
@@ -88,4 +88,4 @@ def load_machine(rig: Rig, overrides: Mapping[str, float] | None = None) -> Mach
         raise InputError(
             f"{source}: the simulated bench needs every parameter; missing: {' '.join(missing)}"
         )
-    return Machine(parameters={n: merged[n] for n in names}, constants=machine.constants)
+    return TrueMachine(parameters={n: merged[n] for n in names}, constants=machine.constants)

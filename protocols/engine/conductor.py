@@ -15,7 +15,7 @@ from protocols.engine.excitation import ExcitationRun
 from protocols.engine.locking import Hold, lock
 from protocols.engine.placing import LOOK, look, move
 from protocols.engine.session import BenchSession, Session
-from protocols.engine.states import Machine, State
+from protocols.engine.states import EngineState, StateMachine
 from protocols.files.plan import Plan
 from protocols.language.conditions import ELAPSED, Condition
 from protocols.steps.base import PlannedStep, Question
@@ -62,7 +62,7 @@ class Conductor:
     # Where it stands
 
     @property
-    def machine(self) -> Machine:
+    def machine(self) -> StateMachine:
         """The state of the run."""
         return self.desk.machine
 
@@ -96,7 +96,7 @@ class Conductor:
         self.bench.status(total_s=self.elapsed + self.left())
         self._on_phase(step, phase, repeat, repeats, message)
 
-    def note_state(self, before: State, after: State, why: str) -> None:
+    def note_state(self, before: EngineState, after: EngineState, why: str) -> None:
         """Write a change of state to the run's log and show it."""
         self.bench.event("state", self.bench.tick, before=str(before), state=str(after), why=why)
         self.bench.status(engine=str(after))
@@ -156,7 +156,7 @@ class Conductor:
 
     def hold(self, planned: PlannedStep, locks: Sequence[LockPlan], seconds: float) -> None:
         """Bring joints to their places, close every valve, and record the time."""
-        self.machine.to(State.HOMING, planned.title)
+        self.machine.to(EngineState.HOMING, planned.title)
         self.session.bench.guard([FREE] * self.session.joints)
         self.session.wait(LOOK)
         if locks:
@@ -165,7 +165,7 @@ class Conductor:
             move(
                 self.session, targets, self._place, self._place.tolerance, SETTLE, planned.name
             )  # fmt: skip
-        self.machine.to(State.LOCKED, "valves closed")
+        self.machine.to(EngineState.LOCKED, "valves closed")
         self.session.off()
         if planned.step.name is None:
             self._pass(seconds)
@@ -193,14 +193,14 @@ class Conductor:
 
     def lock(self, planned: PlannedStep, locks: Sequence[LockPlan]) -> None:
         """Prove that joints can be locked; the steps that follow lock them again."""
-        self.machine.to(State.HOMING, planned.title)
+        self.machine.to(EngineState.HOMING, planned.title)
         self.session.bench.guard([FREE] * self.session.joints)
         self.session.wait(LOOK)
         hold = Hold(planned.name, SETTLE, 1.0)
         for part in locks:
             self.tell(planned.name, "lock", 0, 0, f"joint {part.joint + 1} {part.at}")
             lock(self.session, part, self._place, hold)
-            self.machine.to(State.LOCKED, f"joint {part.joint + 1} {part.at}")
+            self.machine.to(EngineState.LOCKED, f"joint {part.joint + 1} {part.at}")
         self.rest_now("locks are proved")
 
     def rest(self, seconds: float, why: str) -> None:
@@ -221,7 +221,7 @@ class Conductor:
         self.rest_now("a question")
         control = self.desk.control
         control.answers, control.wishes.answer = question.answers, None
-        self.machine.to(State.PROMPTING, question.text)
+        self.machine.to(EngineState.PROMPTING, question.text)
         self.bench.status(prompt=question.text, answers=list(question.answers))
         choice = f"{question.text} [{'/'.join(question.answers)}]"
         self.tell("prompt", "prompt", 0, 0, choice)
@@ -231,7 +231,7 @@ class Conductor:
             control.answers = ()
             self.bench.status(prompt="", answers=[])
         self.bench.event("answer", self.bench.tick, prompt=question.text, answer=answer, by=source)
-        self.machine.to(State.IDLE, f"answered {answer!r} ({source})")
+        self.machine.to(EngineState.IDLE, f"answered {answer!r} ({source})")
         return answer
 
     def _answer(self, question: Question) -> tuple[str, str]:
@@ -302,8 +302,8 @@ class Conductor:
         """Put every output to zero and the state to idle; unconfirmed where the device is lost."""
         if confirmed:
             self.session.off()
-        if self.machine.state not in (State.TRIPPED, State.SAFE):
-            self.machine.to(State.IDLE, why)
+        if self.machine.state not in (EngineState.TRIPPED, EngineState.SAFE):
+            self.machine.to(EngineState.IDLE, why)
 
     def reconnect(self, wait: float) -> None:
         """Connect anew to a lost device and forget what was read of it."""
@@ -324,7 +324,7 @@ class Conductor:
             return
         self.rest_now("a pause was asked for")
         wishes.pause = wishes.resume = False
-        self.machine.to(State.PAUSED, "until someone resumes")
+        self.machine.to(EngineState.PAUSED, "until someone resumes")
         self.tell("pause", "paused", 0, 0, "outputs at zero until someone resumes")
         began = self.elapsed
         while not wishes.resume and not wishes.skip:
@@ -334,7 +334,7 @@ class Conductor:
                 )
             self.session.wait(LOOK)
         wishes.resume = False
-        self.machine.to(State.IDLE, "resumed; places and locks are made anew")
+        self.machine.to(EngineState.IDLE, "resumed; places and locks are made anew")
 
     def _skipped(self, name: str) -> bool:
         wishes = self.desk.control.wishes
@@ -353,7 +353,7 @@ class Conductor:
         while done is None or not done():
             if self.desk.control.wishes.skip:
                 return True
-            if self.desk.control.wishes.pause and self.machine.state is State.IDLE:
+            if self.desk.control.wishes.pause and self.machine.state is EngineState.IDLE:
                 self._safe_point()
             left = seconds - (self.elapsed - began)
             if left <= 0.5 / self.session.rate:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from protocols.engine.states import Machine, State
+from protocols.engine.states import EngineState, StateMachine
 from rig.bench.screens.commands import Command
 
 
@@ -24,10 +24,10 @@ class Wishes:
     answer: str | None = None
 
 
-class Control:
+class RunControl:
     """Judges the commands of screens; the engine takes what they wish."""
 
-    def __init__(self, machine: Machine) -> None:
+    def __init__(self, machine: StateMachine) -> None:
         self.wishes = Wishes()
         self.answers: tuple[str, ...] = ()  # of the open prompt
         self._machine = machine
@@ -35,7 +35,7 @@ class Control:
     def accept(self, command: Command) -> str | None:
         """Take a command; returns None, or in one line why it is refused."""
         state = self._machine.state
-        if state in (State.SAFE, State.TRIPPED):
+        if state in (EngineState.SAFE, EngineState.TRIPPED):
             return f"the run is over ({state}); nothing can be asked of it"
         handler = {
             "pause": self._pause,
@@ -48,16 +48,16 @@ class Control:
             return f"no command {command.word!r}; expected pause, resume, skip, abort or answer"
         return handler(command, state)
 
-    def _pause(self, command: Command, state: State) -> str | None:
-        if state is State.PAUSED:
+    def _pause(self, command: Command, state: EngineState) -> str | None:
+        if state is EngineState.PAUSED:
             return "the run is paused already"
         if self.wishes.pause:
             return "a pause is asked for already; it comes at the end of the record"
         self.wishes.pause = True
         return None
 
-    def _resume(self, command: Command, state: State) -> str | None:
-        if state is not State.PAUSED:
+    def _resume(self, command: Command, state: EngineState) -> str | None:
+        if state is not EngineState.PAUSED:
             if self.wishes.pause:
                 self.wishes.pause = False  # taken back before it came
                 return None
@@ -65,18 +65,18 @@ class Control:
         self.wishes.resume = True
         return None
 
-    def _skip(self, command: Command, state: State) -> str | None:
-        if state is State.CHECKING:
+    def _skip(self, command: Command, state: EngineState) -> str | None:
+        if state is EngineState.CHECKING:
             return "nothing runs yet that could be skipped"
         self.wishes.skip = True
         return None
 
-    def _abort(self, command: Command, state: State) -> str | None:
+    def _abort(self, command: Command, state: EngineState) -> str | None:
         self.wishes.abort = f"aborted by {command.holder or 'the operator'} (from the screen)"
         return None
 
-    def _answer(self, command: Command, state: State) -> str | None:
-        if state is not State.PROMPTING:
+    def _answer(self, command: Command, state: EngineState) -> str | None:
+        if state is not EngineState.PROMPTING:
             return f"nothing is asked now; the run is {state}"
         if command.value not in self.answers:
             return f"{command.value!r} is no answer; expected one of: {', '.join(self.answers)}"

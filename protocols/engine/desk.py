@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from protocols.engine.control import Control
-from protocols.engine.states import Machine
+from protocols.engine.control import RunControl
+from protocols.engine.states import StateMachine
 
 
 class Estimates(Protocol):
@@ -41,14 +41,14 @@ class Desk:
     last before the run ends.
     """
 
-    machine: Machine = field(default_factory=Machine)
-    control: Control = field(init=False)
+    machine: StateMachine = field(default_factory=StateMachine)
+    control: RunControl = field(init=False)
     terminal: Callable[[], str | None] | None = None
     estimates: Estimates = field(default_factory=NoEstimates)
     longest_pause: float = 3600.0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "control", Control(self.machine))
+        object.__setattr__(self, "control", RunControl(self.machine))
 
     @property
     def attended(self) -> bool:

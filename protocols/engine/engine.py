@@ -16,7 +16,7 @@ from protocols.engine.conductor import Conductor
 from protocols.engine.desk import Desk
 from protocols.engine.errors import ProtocolAborted, RunEnded
 from protocols.engine.session import BenchSession
-from protocols.engine.states import State
+from protocols.engine.states import EngineState
 from protocols.files.plan import Plan
 from protocols.steps.base import PlannedStep
 from rig.model.rig import Rig
@@ -46,7 +46,7 @@ def run(
     machine = conductor.machine
     machine.listen(conductor.note_state)
     bench.listen(conductor.desk.control.accept)
-    machine.to(State.IDLE, "the plan is proved")
+    machine.to(EngineState.IDLE, "the plan is proved")
     try:
         _all(plan, conductor)
         conductor.tell(plan.sequence[-1].name, "done", 0, 0, f"{conductor.records} records")
@@ -99,7 +99,7 @@ def _reconnect(conductor: Conductor, error: DeviceLost, wait: float, left: int) 
 
 
 def _trip(plan: Plan, conductor: Conductor, trip: SafetyTrip) -> None:
-    conductor.machine.to(State.TRIPPED, str(trip))
+    conductor.machine.to(EngineState.TRIPPED, str(trip))
     if plan.protocol.on_trip.mark:
         with suppress(RecordingFailed):
             conductor.mark(plan.protocol.on_trip.mark)
@@ -114,4 +114,4 @@ def _make_safe(conductor: Conductor) -> None:
         sure = False
     if sure:
         with suppress(RecordingFailed):
-            conductor.machine.to(State.SAFE, "outputs confirmed at zero")
+            conductor.machine.to(EngineState.SAFE, "outputs confirmed at zero")

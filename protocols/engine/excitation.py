@@ -12,7 +12,7 @@ from protocols.engine.locking import Hold, JointLock, give, lock
 from protocols.engine.placing import LOOK, look, move
 from protocols.engine.playback import Playback
 from protocols.engine.session import Session
-from protocols.engine.states import Machine, State
+from protocols.engine.states import EngineState, StateMachine
 from protocols.steps.parts import CLOSED, Place
 from protocols.steps.plans import LockPlan, StepPlan
 from rig.bench.guard import EXCITED, FREE, JointRole
@@ -28,7 +28,7 @@ class ExcitationDesk(Protocol):
     """What an excitation needs of the engine that runs it."""
 
     @property
-    def machine(self) -> Machine:
+    def machine(self) -> StateMachine:
         """The state of the run."""
 
     @property
@@ -90,12 +90,12 @@ class ExcitationRun:
 
     def _start(self) -> Playback:
         """Place, lock and let the waveforms grow."""
-        self._desk.machine.to(State.HOMING, self.step.name)
+        self._desk.machine.to(EngineState.HOMING, self.step.name)
         self.session.bench.guard(self._roles(moving=True))
         nulls = self._place()
         self.locks = self._lock()
         self.session.bench.guard(self._roles())
-        self._desk.machine.to(State.EXCITING, self.step.name)
+        self._desk.machine.to(EngineState.EXCITING, self.step.name)
         excitation = Playback(self.session, self.step, self.place, self.locks)
         self.tell("warm-up", "waveforms grow under the position loop")
         excitation.warm_up(nulls)
@@ -104,7 +104,7 @@ class ExcitationRun:
     def _stop(self, excitation: Playback) -> None:
         self.tell("stop", "waveforms shrink, valves close")
         excitation.stop()
-        self._desk.machine.to(State.IDLE, f"{self.step.name}: valves closed")
+        self._desk.machine.to(EngineState.IDLE, f"{self.step.name}: valves closed")
         self.locks = []
         self.session.bench.guard(self._roles(moving=True))
 
@@ -138,7 +138,7 @@ class ExcitationRun:
         for part in sorted(self.step.locks, key=lambda p: p.at == CLOSED):
             self.tell("lock", f"joint {part.joint + 1} {_lock_text(part)}")
             locks.append(lock(self.session, part, self.place, hold))
-            self._desk.machine.to(State.LOCKED, f"joint {part.joint + 1} {part.at}")
+            self._desk.machine.to(EngineState.LOCKED, f"joint {part.joint + 1} {part.at}")
         return locks
 
     def _records(self, excitation: Playback) -> bool:

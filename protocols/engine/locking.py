@@ -15,7 +15,7 @@ import numpy as np
 
 from drivers.base import OFF, OutputLaw
 from protocols.engine.errors import LockFailed
-from protocols.engine.placing import LOOK, STILL, Look, look, move, position_law
+from protocols.engine.placing import LOOK, STILL, PlacementReading, look, move, position_law
 from protocols.engine.session import Session
 from protocols.steps.parts import CLOSED, END_MAX, Place
 from protocols.steps.plans import LockPlan
@@ -113,7 +113,7 @@ def close_valve(session: Session, plan: LockPlan, place: Place, hold: Hold) -> J
     return JointLock(joint, plan.at, seen.piston, law, plan.tolerance)
 
 
-def _stand(session: Session, joint: int, law: OutputLaw, hold: Hold) -> Look:
+def _stand(session: Session, joint: int, law: OutputLaw, hold: Hold) -> PlacementReading:
     """Put a law in force, let the pressures find their balance, and look for as long again."""
     session.apply({joint: law})
     session.wait(hold.settle)
@@ -121,7 +121,7 @@ def _stand(session: Session, joint: int, law: OutputLaw, hold: Hold) -> Look:
     return look(session, joint, first, session.now)
 
 
-def _near(seen: Look, plan: LockPlan) -> bool:
+def _near(seen: PlacementReading, plan: LockPlan) -> bool:
     return abs(seen.piston - plan.piston) <= 0.5 * plan.tolerance
 
 

@@ -27,7 +27,7 @@ INTEGRAL = 0.5  # share of the remaining error that one look takes out
 
 
 @dataclass(frozen=True)
-class Look:
+class PlacementReading:
     """Mean piston [m], speed [m/s] and command [V] of one joint over a short time."""
 
     piston: float
@@ -35,7 +35,7 @@ class Look:
     command: float
 
 
-def look(session: Session, joint: int, first: int, last: int) -> Look:
+def look(session: Session, joint: int, first: int, last: int) -> PlacementReading:
     """Return what joint `joint` (0-based) did over ticks [first, last).
 
     Speed is the difference of the means of the two halves over half the time: unlike the
@@ -46,7 +46,7 @@ def look(session: Session, joint: int, first: int, last: int) -> Look:
     early, late = np.nanmean(piston[:middle]), np.nanmean(piston[middle:])
     speed = (late - early) / (0.5 * len(piston) / session.rate)
     command = np.nanmean(session.command(joint, first, last))
-    return Look(float(np.nanmean(piston)), float(speed), float(command))
+    return PlacementReading(float(np.nanmean(piston)), float(speed), float(command))
 
 
 def position_law(place: Place, target: float, bias: float) -> OutputLaw:
@@ -98,5 +98,5 @@ def move(
             )
 
 
-def _in_place(seen: Look, target: float, tolerance: float) -> bool:
+def _in_place(seen: PlacementReading, target: float, tolerance: float) -> bool:
     return abs(seen.piston - target) <= tolerance and abs(seen.speed) <= ROCKING

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.base import OFF, DeviceInfo, OutputLaw, SampleBlock
-from protocols.engine.states import Machine
+from protocols.engine.states import StateMachine
 from rig.bench.guard import JointRole
 from rig.bench.screens.commands import Judge
 from rig.model import channels as ch
@@ -89,7 +89,7 @@ class Session:
     """Holds the laws in force and the samples read lately; every wait is in device time."""
 
     def __init__(
-        self, bench: BenchSession, rig: Rig, keep: int, machine: Machine, heed: Watch
+        self, bench: BenchSession, rig: Rig, keep: int, machine: StateMachine, heed: Watch
     ) -> None:
         """Remember the last `keep` samples; `heed` is called before each block."""
         self.bench = bench

@@ -25,7 +25,7 @@ from typing import Final
 log = logging.getLogger(__name__)
 
 
-class State(StrEnum):
+class EngineState(StrEnum):
     """A state of the engine."""
 
     IDLE = "idle"
@@ -39,33 +39,38 @@ class State(StrEnum):
     SAFE = "safe"
 
 
-_ENDS = frozenset({State.TRIPPED, State.SAFE})
-WAYS: Final[Mapping[State, frozenset[State]]] = {
-    State.IDLE: frozenset({State.CHECKING, State.HOMING, State.PAUSED, State.PROMPTING}) | _ENDS,
-    State.CHECKING: frozenset({State.IDLE, State.SAFE}),
-    State.HOMING: frozenset({State.LOCKED, State.EXCITING, State.IDLE}) | _ENDS,
-    State.LOCKED: frozenset({State.HOMING, State.EXCITING, State.IDLE}) | _ENDS,
-    State.EXCITING: frozenset({State.IDLE}) | _ENDS,
-    State.PAUSED: frozenset({State.IDLE}) | _ENDS,
-    State.PROMPTING: frozenset({State.IDLE}) | _ENDS,
-    State.TRIPPED: frozenset({State.SAFE}),
-    State.SAFE: frozenset(),
+_ENDS = frozenset({EngineState.TRIPPED, EngineState.SAFE})
+WAYS: Final[Mapping[EngineState, frozenset[EngineState]]] = {
+    EngineState.IDLE: frozenset(
+        {EngineState.CHECKING, EngineState.HOMING, EngineState.PAUSED, EngineState.PROMPTING}
+    )
+    | _ENDS,
+    EngineState.CHECKING: frozenset({EngineState.IDLE, EngineState.SAFE}),
+    EngineState.HOMING: frozenset({EngineState.LOCKED, EngineState.EXCITING, EngineState.IDLE})
+    | _ENDS,
+    EngineState.LOCKED: frozenset({EngineState.HOMING, EngineState.EXCITING, EngineState.IDLE})
+    | _ENDS,
+    EngineState.EXCITING: frozenset({EngineState.IDLE}) | _ENDS,
+    EngineState.PAUSED: frozenset({EngineState.IDLE}) | _ENDS,
+    EngineState.PROMPTING: frozenset({EngineState.IDLE}) | _ENDS,
+    EngineState.TRIPPED: frozenset({EngineState.SAFE}),
+    EngineState.SAFE: frozenset(),
 }
-ENERGISED: Final = frozenset({State.HOMING, State.LOCKED, State.EXCITING})
+ENERGISED: Final = frozenset({EngineState.HOMING, EngineState.LOCKED, EngineState.EXCITING})
 
-OnChange = Callable[[State, State, str], None]
+OnChange = Callable[[EngineState, EngineState, str], None]
 
 
-class Machine:
+class StateMachine:
     """Holds the state of one run; every change is passed on, those before a listener are kept."""
 
     def __init__(self) -> None:
-        self._state = State.IDLE
+        self._state = EngineState.IDLE
         self._listener: OnChange | None = None
-        self._early: list[tuple[State, State, str]] = []
+        self._early: list[tuple[EngineState, EngineState, str]] = []
 
     @property
-    def state(self) -> State:
+    def state(self) -> EngineState:
         """The state now."""
         return self._state
 
@@ -74,7 +79,7 @@ class Machine:
         """Whether outputs other than zero are allowed now."""
         return self._state in ENERGISED
 
-    def to(self, state: State, why: str = "") -> None:
+    def to(self, state: EngineState, why: str = "") -> None:
         """Change the state; raises RuntimeError for a way that does not exist."""
         if state is self._state:
             return

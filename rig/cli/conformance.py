@@ -26,7 +26,7 @@ def conformance(
 
     Example: bramah conformance modbus-tcp --endpoint modbus-tcp://127.0.0.1:5020
     """
-    from drivers.conformance import Verdict, live_subject, run
+    from drivers.conformance import CheckVerdict, live_subject, run
     from drivers.registry import wire_at
     from rig.cli.errors import WorkError
     from rig.model.parse import InputError
@@ -52,7 +52,7 @@ def conformance(
     if json != Path("-"):
         rows = [(result.check, result.verdict.value, result.reason) for result in report.results]
         typer.echo(table(("check", "verdict", "why"), rows))
-    failed = [one.check for one in report.of(Verdict.FAILED)]
+    failed = [one.check for one in report.of(CheckVerdict.FAILED)]
     if failed:
         raise WorkError(f"{driver} fails {len(failed)} checks: {', '.join(failed)}")
 

@@ -6,7 +6,7 @@ import math
 from datetime import UTC, datetime
 from pathlib import Path
 
-from analysis.report.night import Estimate, Night, NightItem, write_night
+from analysis.report.night import Night, NightEstimate, NightItem, write_night
 from rig.queue.items import Item
 from rig.queue.store import QueueStore
 from rig.runs.listing.summary import summarise
@@ -60,7 +60,7 @@ def _shown(item: Item) -> NightItem:
         samples=-1 if summary is None else summary.samples,
         lost_samples=-1 if summary is None else summary.lost_samples,
         parameters={
-            name: Estimate(float(p["value"]), _number(p.get("std")), str(p.get("unit", "")))
+            name: NightEstimate(float(p["value"]), _number(p.get("std")), str(p.get("unit", "")))
             for name, p in parameters.items()
             if p.get("value") is not None
         },

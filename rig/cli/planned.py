@@ -8,7 +8,7 @@ import numpy as np
 
 from analysis.design.moves import Tone
 from analysis.design.optimise import Design
-from analysis.design.twin_records import PlannedStep
+from analysis.design.twin_records import TwinStep
 from protocols.files.plan import Plan, mapped
 from protocols.files.schema import Protocol
 from protocols.language.waveforms import Waveform
@@ -20,14 +20,14 @@ from protocols.steps.plans import StepPlan
 
 def planned_steps(
     plan: Plan, biases: Mapping[str, Mapping[int, float]] | None = None
-) -> list[PlannedStep]:
+) -> list[TwinStep]:
     """Return a plan's steps in device terms; `biases` [V] by step and 1-based joint, if known."""
     return [planned_step(step, (biases or {}).get(step.name, {})) for step in plan.steps]
 
 
-def planned_step(step: StepPlan, biases: Mapping[int, float]) -> PlannedStep:
+def planned_step(step: StepPlan, biases: Mapping[int, float]) -> TwinStep:
     """Return one step: waveforms repeated to the step's common period."""
-    return PlannedStep(
+    return TwinStep(
         name=step.name,
         waves={e.joint: np.resize(e.wave.samples, step.period) for e in step.excite},
         lines=step.lines,
@@ -53,7 +53,7 @@ def empty_lines(plan: Plan) -> dict[tuple[str, int], tuple[int, ...]]:
     }
 
 
-def designed_step(plan: Plan, planned: PlannedStep, tones: Mapping[int, Tone]) -> Step:
+def designed_step(plan: Plan, planned: TwinStep, tones: Mapping[int, Tone]) -> Step:
     """Return a protocol's step with the designed lines in place of its signals."""
     step = next(s for s in plan.steps if s.name == planned.name)
     source = next(s for s in plan.protocol.excitations if s.name == planned.name)

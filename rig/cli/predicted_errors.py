@@ -14,7 +14,7 @@ from analysis.design.moves import Tone
 from analysis.design.optimise import Design, improve
 from analysis.design.predict import Prediction, predict, to_json
 from analysis.design.settings import DESIGN
-from analysis.design.twin_records import PlannedStep
+from analysis.design.twin_records import TwinStep
 from analysis.simulation.twin import simulate_commands
 from drivers.registry import driver_class
 from protocols.design.check import check
@@ -157,10 +157,10 @@ class Designed:
     after: CheckedForecast
 
 
-def _checker(plan: Plan, rig: Rig) -> Callable[[PlannedStep, Mapping[int, Tone]], bool]:
+def _checker(plan: Plan, rig: Rig) -> Callable[[TwinStep, Mapping[int, Tone]], bool]:
     """Return the test that `check` will make of a step in the end, centring from nothing."""
 
-    def passes(planned: PlannedStep, tones: Mapping[int, Tone]) -> bool:
+    def passes(planned: TwinStep, tones: Mapping[int, Tone]) -> bool:
         alone = {"steps": (designed_step(plan, planned, tones),)}
         try:
             trial = resolve(plan.protocol.model_copy(update=alone), rig)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from drivers import make_driver, wire_at
 from protocols.engine import engine
 from protocols.engine.desk import Desk
-from protocols.engine.states import Machine, State
+from protocols.engine.states import EngineState, StateMachine
 from protocols.files import library
 from protocols.files.plan import Overrides, Plan, resolve
 from rig.bench.latch import reset_bench
@@ -112,8 +112,8 @@ def run_protocol(job: ProtocolJob, say: Say) -> Path:
     rig, plan = _plan(job.protocol, job.rig, job.overrides)
     wire = rig.wire if job.endpoint is None else wire_at(job.endpoint, rig.wire)
     rig = rig.model_copy(update={"wire": wire})
-    desk_machine = Machine()
-    desk_machine.to(State.CHECKING, plan.protocol.name)
+    desk_machine = StateMachine()
+    desk_machine.to(EngineState.CHECKING, plan.protocol.name)
     say(plan_text(plan))
     require_space(plan, rig, job.out)
     say(f"checking {plan.protocol.name} on the twin of {rig.name}")

@@ -130,7 +130,7 @@ def add(
     from protocols.files.library import shipped_names
     from rig.cli.queue_add import prove
     from rig.model.parse import InputError
-    from rig.queue.items import DONE, Job, channel_condition, check_wanted, parse_time
+    from rig.queue.items import DONE, QueueJob, channel_condition, check_wanted, parse_time
     from rig.runs.rigs import shipped_rigs
     from rig.runs.store import refuse_occupied
 
@@ -159,7 +159,7 @@ def add(
         title = name or Path(protocol).stem
         folder = (out or Path("runs", f"{store.next_number():03d}-{title}")).absolute()
         refuse_occupied(folder)
-        job = Job(
+        job = QueueJob(
             protocol=_absolute(protocol, shipped_names()),
             rig=_absolute(rig, shipped_rigs()),
             out=str(folder),

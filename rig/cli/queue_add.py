@@ -6,16 +6,16 @@ from typing import Any
 
 from rig.cli.errors import BAD_INPUT, WorkError
 from rig.model.parse import InputError
-from rig.queue.items import Job
+from rig.queue.items import QueueJob
 from rig.queue.processes import BRAMAH, call
-from rig.queue.runner import Settings
+from rig.queue.runner import QueueSettings
 
 _KEPT = ("protocol", "rig", "seconds", "ok")  # of the proof; its pictures belong to `check`
 
 
-def prove(job: Job) -> dict[str, Any]:
+def prove(job: QueueJob) -> dict[str, Any]:
     """Run `bramah check` on an item; raises InputError where it is refused, WorkError otherwise."""
-    answer = call(BRAMAH, job.check_words(), Settings().check_seconds)
+    answer = call(BRAMAH, job.check_words(), QueueSettings().check_seconds)
     if answer.code == BAD_INPUT:
         raise InputError(f"not queued: {answer.reason}")
     if answer.code != 0:

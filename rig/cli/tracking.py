@@ -47,7 +47,7 @@ NICE = 5
 
 
 @dataclass(frozen=True)
-class Settings:
+class TrackingSettings:
     """What the tracker is told at its start: `memory` [s], infinite for none."""
 
     rig: Rig
@@ -102,7 +102,7 @@ class Tracking:
         self._socket.set(zmq.LINGER, 0)
         # The end that connects queues what it sends before the other is there.
         self._socket.connect(endpoint)
-        settings = Settings(self._rig, self._memory, endpoint)
+        settings = TrackingSettings(self._rig, self._memory, endpoint)
         self._process = get_context("spawn").Process(target=work, args=(settings,), daemon=True)
         with environment():
             self._process.start()
@@ -222,7 +222,7 @@ class Tracking:
 # The tracker's side
 
 
-def work(settings: Settings) -> None:
+def work(settings: TrackingSettings) -> None:
     """Follow what comes in until told to stop, or until the run's process is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run says when to stop
     os.nice(NICE)  # the acquisition goes first
@@ -240,7 +240,7 @@ def work(settings: Settings) -> None:
         context.term()
 
 
-def _serve(settings: Settings, socket: zmq.Socket[bytes]) -> None:
+def _serve(settings: TrackingSettings, socket: zmq.Socket[bytes]) -> None:
     tracker = Tracker(settings.rig, memory=settings.memory)
     follower = Follower(settings.rig, tracker)
     width = len(settings.rig.recorded)

@@ -60,7 +60,7 @@ _CONDITION = re.compile(
 
 
 @dataclass(frozen=True)
-class Condition:
+class StartCondition:
     """A comparison of a channel's mean, or of an identified parameter, with a number in SI.
 
     `part` is '' for a channel; value, std or rsd (standard error over value) for a parameter.
@@ -84,7 +84,7 @@ def _split(text: str, option: str, example: str) -> re.Match[str]:
     return found
 
 
-def channel_condition(text: str) -> Condition:
+def channel_condition(text: str) -> StartCondition:
     """Read ``oil_temperature > 40 degC``; raises InputError for an unknown channel or unit."""
     found = _split(text, "--when", "'oil_temperature > 40 degC'")
     name = found["name"]
@@ -97,10 +97,10 @@ def channel_condition(text: str) -> Condition:
         bound = to_si(float(found["number"]), found["unit"], unit)
     except ValueError as error:
         raise InputError(f"--when {text!r}: {error}") from error
-    return Condition(text, name, "", found["sign"], bound)
+    return StartCondition(text, name, "", found["sign"], bound)
 
 
-def result_condition(text: str) -> Condition:
+def result_condition(text: str) -> StartCondition:
     """Read ``b.rsd < 0.5 %`` or ``M1 > 2`` (SI); raises InputError."""
     found = _split(text, "--if", "'b.rsd < 0.5 %'")
     part = found["part"] or "value"
@@ -109,7 +109,7 @@ def result_condition(text: str) -> Condition:
     if found["unit"] not in ("", "%"):
         raise InputError(f"--if {text!r}: the unit is {found['unit']!r}; expected % or none")
     scale = 0.01 if found["unit"] else 1.0
-    return Condition(text, found["name"], part, found["sign"], scale * float(found["number"]))
+    return StartCondition(text, found["name"], part, found["sign"], scale * float(found["number"]))
 
 
 def check_wanted(text: str) -> None:
@@ -143,7 +143,7 @@ def parse_time(text: str, now: datetime, option: str) -> datetime:
 
 
 @dataclass(frozen=True)
-class Job:
+class QueueJob:
     """What a person asked for; times are ISO 8601 in UTC, paths absolute, '' where not given.
 
     `options` are words that `bramah check` and `bramah run` both take, `run_options` those that
@@ -169,7 +169,7 @@ class Job:
         return asdict(self)
 
     @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> Job:
+    def from_dict(cls, data: Mapping[str, Any]) -> QueueJob:
         """Return it from plain data; keys of a later version are ignored."""
         known = {f.name for f in fields(cls)}
         kept = {key: value for key, value in data.items() if key in known}
@@ -201,7 +201,7 @@ class Item:
     place: float
     state: str
     reason: str
-    job: Job
+    job: QueueJob
     attempt: int = 0
     run: str = ""
     pid: int | None = None
@@ -226,7 +226,7 @@ class Item:
         return self.job.out if self.attempt == 0 else f"{self.job.out}-{self.attempt + 1}"
 
 
-def result_value(found: Mapping[str, Any], condition: Condition) -> float | None:
+def result_value(found: Mapping[str, Any], condition: StartCondition) -> float | None:
     """Return the part of an identified parameter that a condition compares, None if unknown."""
     entry = found.get("parameters", {}).get(condition.name)
     if not entry or entry.get("value") is None:

@@ -23,49 +23,53 @@ _DEVICE: Final = ("device:", "device in use:")
 
 
 @dataclass(frozen=True)
-class Outcome:
+class ItemOutcome:
     """The state an item ends in, and why; `latched`: an earlier trip kept it from starting."""
 
     state: str
     reason: str
     latched: bool = False
 
-    def adding(self, more: str) -> Outcome:
+    def adding(self, more: str) -> ItemOutcome:
         """Return it with a further reason."""
         return replace(self, reason=f"{self.reason}; {more}".removeprefix("; "))
 
-    def asked(self, state: str) -> Outcome:
+    def asked(self, state: str) -> ItemOutcome:
         """Return it as `state` where the process ended because it was asked to for that."""
         if not state or self.state not in (it.STOPPED, it.FAILED):
             return self
         return replace(self, state=state, latched=False)
 
 
-def outcome_of(code: int, reason: str, *, began: bool) -> Outcome:
+def outcome_of(code: int, reason: str, *, began: bool) -> ItemOutcome:
     """Judge an exit code; `began`: a run folder was made."""
     if code < 0:
-        return Outcome(it.INTERRUPTED, f"its process was killed by signal {-code}")
+        return ItemOutcome(it.INTERRUPTED, f"its process was killed by signal {-code}")
     if code not in _STATES:
-        return Outcome(it.FAILED, f"ended with {code}: {reason or 'no message'}")
+        return ItemOutcome(it.FAILED, f"ended with {code}: {reason or 'no message'}")
     latched = code == 3 and not began
-    return Outcome(_STATES[code], reason if code else "", latched)
+    return ItemOutcome(_STATES[code], reason if code else "", latched)
 
 
-def outcome_of_folder(folder: Path, said: str) -> Outcome:
+def outcome_of_folder(folder: Path, said: str) -> ItemOutcome:
     """Judge a process whose exit code nobody saw: its run folder and last line say how it ended."""
     unseen = "no runner saw its end"
     if not store.is_run(folder):
         if not said:
-            return Outcome(it.INTERRUPTED, "its process was killed before anything was recorded")
-        return Outcome(_told(said), f"{said}; {unseen}")
+            return ItemOutcome(
+                it.INTERRUPTED, "its process was killed before anything was recorded"
+            )
+        return ItemOutcome(_told(said), f"{said}; {unseen}")
     state = runstate.read_state(folder)
     if state == runstate.DONE:
-        return Outcome(it.DONE, unseen)
+        return ItemOutcome(it.DONE, unseen)
     if state == runstate.TRIPPED:
-        return Outcome(it.TRIPPED, said or _end_message(folder) or unseen)
+        return ItemOutcome(it.TRIPPED, said or _end_message(folder) or unseen)
     if state == runstate.ABORTED:
-        return Outcome(_told(said), f"{said or _end_message(folder)}; {unseen}".removeprefix("; "))
-    return Outcome(it.INTERRUPTED, "its process was killed while no runner watched")
+        return ItemOutcome(
+            _told(said), f"{said or _end_message(folder)}; {unseen}".removeprefix("; ")
+        )
+    return ItemOutcome(it.INTERRUPTED, "its process was killed while no runner watched")
 
 
 def _told(said: str) -> str:

@@ -29,7 +29,7 @@ _POLL = 0.05  # [s]
 
 
 @dataclass(frozen=True)
-class Answer:
+class ProcessResult:
     """How a verb ended: exit code, result on standard output, and the line that says why."""
 
     code: int
@@ -91,7 +91,7 @@ def ask_to_end(pid: int) -> None:
 def call(
     program: Sequence[str], words: Sequence[str], seconds: float,
     stopped: Callable[[], str | None] = lambda: None,
-) -> Answer:  # fmt: skip
+) -> ProcessResult:  # fmt: skip
     """Run a verb that moves nothing to its end; raises OperatorStop where `stopped` says why.
 
     After `seconds` it is killed: the answer then has code -9 and says so.
@@ -123,4 +123,4 @@ def call(
         reason = (
             f"ended with {child.returncode}: {(said.strip().splitlines() or ['no message'])[-1]}"
         )
-    return Answer(child.returncode, result, reason)
+    return ProcessResult(child.returncode, result, reason)

@@ -14,7 +14,7 @@ from rig.queue.items import (
     QUEUED,
     SKIPPED,
     Item,
-    Job,
+    QueueJob,
     channel_condition,
     result_condition,
     result_value,
@@ -22,7 +22,7 @@ from rig.queue.items import (
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Readiness:
     """May an item start? `state` is '' while it may still come to that, else the final state."""
 
     start: bool
@@ -30,61 +30,63 @@ class Verdict:
     state: str = ""
 
 
-Reading = Callable[[Job], Mapping[str, float] | str]  # channel means in SI, or why there are none
+Reading = Callable[
+    [QueueJob], Mapping[str, float] | str
+]  # channel means in SI, or why there are none
 
 
 def _shown(moment: datetime) -> str:
     return moment.astimezone().strftime("%Y-%m-%d %H:%M")
 
 
-def _wait(reason: str) -> Verdict:
-    return Verdict(False, reason)
+def _wait(reason: str) -> Readiness:
+    return Readiness(False, reason)
 
 
-def dependence(item: Item, others: Mapping[int, Item]) -> Verdict:
+def dependence(item: Item, others: Mapping[int, Item]) -> Readiness:
     """Judge what an item wants of the result of an earlier one."""
     wanted = item.job.wanted
     if item.job.after is None:
-        return Verdict(True)
+        return Readiness(True)
     other = others[item.job.after]
     if not other.over:
         return _wait(f"item {other.id} is {other.state}")
     if wanted in (ENDED, other.state):
-        return Verdict(True)
+        return Readiness(True)
     if wanted in OVER or other.state != DONE:
         expected = wanted if wanted in OVER else DONE
-        return Verdict(False, f"item {other.id} is {other.state}; wanted: {expected}", SKIPPED)
+        return Readiness(False, f"item {other.id} is {other.state}; wanted: {expected}", SKIPPED)
     return _compared(wanted, other)
 
 
-def _compared(wanted: str, other: Item) -> Verdict:
+def _compared(wanted: str, other: Item) -> Readiness:
     condition = result_condition(wanted)
     value = result_value(other.found, condition)
     if value is None:
         why = other.found.get("error", f"{condition.name} was not identified")
-        return Verdict(False, f"{wanted!r} of item {other.id} cannot be judged: {why}", SKIPPED)
+        return Readiness(False, f"{wanted!r} of item {other.id} cannot be judged: {why}", SKIPPED)
     if condition.holds(value):
-        return Verdict(True)
+        return Readiness(True)
     part = f"{condition.name}.{condition.part}"
-    return Verdict(False, f"{part} of item {other.id} is {value:.4g}; wanted: {wanted}", SKIPPED)
+    return Readiness(False, f"{part} of item {other.id} is {value:.4g}; wanted: {wanted}", SKIPPED)
 
 
-def judge(item: Item, others: Mapping[int, Item], moment: datetime, read: Reading) -> Verdict:
+def judge(item: Item, others: Mapping[int, Item], moment: datetime, read: Reading) -> Readiness:
     """Judge one queued item; `read` is asked last, and only where a channel decides."""
     job = item.job
     if job.not_after and moment >= datetime.fromisoformat(job.not_after):
         late = _shown(datetime.fromisoformat(job.not_after))
         wait = dependence(item, others).reason or (job.when and f"waited for {job.when}")
-        return Verdict(False, f"could not start before {late}" + (wait and f": {wait}"), EXPIRED)
+        return Readiness(False, f"could not start before {late}" + (wait and f": {wait}"), EXPIRED)
     depends = dependence(item, others)
     if not depends.start:
         return depends
     if job.not_before and moment < datetime.fromisoformat(job.not_before):
         return _wait(f"not before {_shown(datetime.fromisoformat(job.not_before))}")
-    return _channel(job, read) if job.when else Verdict(True)
+    return _channel(job, read) if job.when else Readiness(True)
 
 
-def _channel(job: Job, read: Reading) -> Verdict:
+def _channel(job: QueueJob, read: Reading) -> Readiness:
     condition = channel_condition(job.when)
     found = read(job)
     if isinstance(found, str):
@@ -93,16 +95,16 @@ def _channel(job: Job, read: Reading) -> Verdict:
     if value is None:
         return _wait(f"waits for {job.when}; the bench does not measure {condition.name}")
     if condition.holds(value):
-        return Verdict(True)
+        return Readiness(True)
     return _wait(f"waits for {job.when}; it is {value:.4g}")
 
 
 def choose(
     items: Sequence[Item], moment: datetime, read: Reading
-) -> tuple[Item | None, list[tuple[Item, Verdict]]]:
+) -> tuple[Item | None, list[tuple[Item, Readiness]]]:
     """Return the first item that may start now, and the verdicts on those before it."""
     others = {item.id: item for item in items}
-    passed: list[tuple[Item, Verdict]] = []
+    passed: list[tuple[Item, Readiness]] = []
     for item in items:
         if item.state != QUEUED:
             continue

@@ -28,9 +28,9 @@ from rig.model.trips import OperatorStop
 from rig.queue import items as it
 from rig.queue import processes, ready
 from rig.queue.hook import Hook
-from rig.queue.items import Item, Job
+from rig.queue.items import Item, QueueJob
 from rig.queue.locks import LockFile, held, holder
-from rig.queue.outcome import Outcome, outcome_of, outcome_of_folder
+from rig.queue.outcome import ItemOutcome, outcome_of, outcome_of_folder
 from rig.queue.store import QueueStore
 from rig.runs import runstate, store
 
@@ -42,7 +42,7 @@ PAUSED: Final = "paused"
 
 
 @dataclass(frozen=True)
-class Settings:
+class QueueSettings:
     """Times [s] and counts of a runner."""
 
     poll: float = 0.2  # between two looks at a child and at what a person wishes
@@ -57,7 +57,7 @@ class Settings:
 
 
 @dataclass(frozen=True)
-class Report:
+class QueueReport:
     """How a runner ended: exit code of the contract, why, and the items it ended, in order."""
 
     code: int
@@ -121,14 +121,14 @@ class Runner:
 
     def __init__(
         self, queue: QueueStore, say: Say, hook: Hook, *, serve: bool = False,
-        program: Sequence[str] = processes.BRAMAH, settings: Settings | None = None,
+        program: Sequence[str] = processes.BRAMAH, settings: QueueSettings | None = None,
     ) -> None:  # fmt: skip
         self._queue = queue
         self._say = say
         self._hook = hook
         self._serve = serve
         self._program = tuple(program)
-        self._settings = settings or Settings()
+        self._settings = settings or QueueSettings()
         self._stop = StopFlag()
         self._lock: LockFile | None = None
         self._ended: list[Item] = []
@@ -161,18 +161,18 @@ class Runner:
                 os.ftruncate(self._lock.fileno(), 0)
             self._lock.close()
 
-    def run(self) -> Report:
+    def run(self) -> QueueReport:
         """Run until nothing more may start, the queue is paused, or it must stop."""
         self._queue.note("runner begins", f"process {os.getpid()} on {runstate.here()}")
         try:
             self._resolve_leftovers()
             reason = self._loop()
             bad = [item for item in self._ended if item.state != it.DONE]
-            report = Report(1 if bad else 0, reason, tuple(self._ended))
+            report = QueueReport(1 if bad else 0, reason, tuple(self._ended))
         except OperatorStop as stopped:
-            report = Report(130, str(stopped), tuple(self._ended))
+            report = QueueReport(130, str(stopped), tuple(self._ended))
         except _Ending as ending:
-            report = Report(ending.code, ending.reason, tuple(self._ended))
+            report = QueueReport(ending.code, ending.reason, tuple(self._ended))
         self._queue.note("runner ends", report.reason)
         self._notify("end", None, report.reason)
         return report
@@ -206,17 +206,17 @@ class Runner:
 
     # Which item
 
-    def _choose(self) -> tuple[Item | None, list[tuple[Item, ready.Verdict]]]:
+    def _choose(self) -> tuple[Item | None, list[tuple[Item, ready.Readiness]]]:
         item, verdicts = ready.choose(self._queue.items(), datetime.now(UTC), self._read)
         for other, verdict in verdicts:
             if verdict.state:
-                self._finish(other, Outcome(verdict.state, verdict.reason))
+                self._finish(other, ItemOutcome(verdict.state, verdict.reason))
             elif self._told.get(other.id) != verdict.reason:
                 self._told[other.id] = verdict.reason
                 self._say(f"item {other.id} {other.job.name}: {verdict.reason}")
         return item, verdicts
 
-    def _read(self, job: Job) -> dict[str, float] | str:
+    def _read(self, job: QueueJob) -> dict[str, float] | str:
         """Return the means of a bench's channels, read again after a while; moves nothing."""
         key = (job.rig, job.endpoint)
         kept = self._readings.get(key)
@@ -236,7 +236,7 @@ class Runner:
             self._readings[key] = kept
         return kept[1]
 
-    def _call(self, words: Sequence[str], seconds: float) -> processes.Answer:
+    def _call(self, words: Sequence[str], seconds: float) -> processes.ProcessResult:
         return processes.call(self._program, words, seconds, lambda: self._stop.reason)
 
     # One item
@@ -253,16 +253,16 @@ class Runner:
             self._finish(item, outcome_of(proof.code, proof.reason, began=False))
             return
         if self._queue.item(item.id).cancel:
-            self._finish(item, Outcome(it.CANCELLED, "cancelled during its check"))
+            self._finish(item, ItemOutcome(it.CANCELLED, "cancelled during its check"))
             return
         begun = self._queue.begin(item.id)
         self._after(begun, self._run(begun))
 
-    def _run(self, item: Item) -> Outcome:
+    def _run(self, item: Item) -> ItemOutcome:
         """Run an item's process to its end and say how it ended."""
         lock = LockFile.take(item_lock(self._queue.path, item.id))
         if lock is None:
-            return Outcome(
+            return ItemOutcome(
                 it.FAILED, "a process of this item still lives; it was not started again"
             )
         self._say(f"item {item.id} {item.job.name}: running into {item.run}")
@@ -303,7 +303,7 @@ class Runner:
             time.sleep(self._settings.poll)
         return asked
 
-    def _after(self, item: Item, outcome: Outcome) -> None:
+    def _after(self, item: Item, outcome: ItemOutcome) -> None:
         """Finish an item, recover what its death left, and stop the queue where it must."""
         if outcome.latched:
             self._queue.release(item.id, f"not started: {outcome.reason}")
@@ -323,7 +323,7 @@ class Runner:
             raise _Ending(4, f"the device was lost {self._lost} times in a row: {outcome.reason}")
         self._heed()
 
-    def _make_safe(self, item: Item, outcome: Outcome) -> Outcome:
+    def _make_safe(self, item: Item, outcome: ItemOutcome) -> ItemOutcome:
         """Zero the outputs of a bench whose process died; its watchdog will have done so."""
         job = item.job
         place = ["--endpoint", job.endpoint] if job.endpoint else []
@@ -340,7 +340,7 @@ class Runner:
             (folder / runstate.JOURNAL).exists() or runstate.read_owner(folder) is not None
         )
 
-    def _recover(self, item: Item, outcome: Outcome) -> Outcome:
+    def _recover(self, item: Item, outcome: ItemOutcome) -> ItemOutcome:
         # Not stopped by a wish to end: what was recorded is safe before this process goes.
         answer = processes.call(
             self._program, ["recover", item.run], self._settings.recover_seconds
@@ -349,7 +349,7 @@ class Runner:
             return outcome.adding(f"recovered: {answer.output.strip()}")
         return outcome.adding(f"recover: {answer.reason}")
 
-    def _finish(self, item: Item, outcome: Outcome) -> None:
+    def _finish(self, item: Item, outcome: ItemOutcome) -> None:
         ended = self._queue.finish(item.id, outcome.state, outcome.reason)
         self._ended.append(ended)
         why = f": {outcome.reason}" if outcome.reason else ""
@@ -380,7 +380,7 @@ class Runner:
             elif item.state == it.RUNNING:
                 self._after(item, self._left_running(item))
 
-    def _left_running(self, item: Item) -> Outcome:
+    def _left_running(self, item: Item) -> ItemOutcome:
         lock = item_lock(self._queue.path, item.id)
         asked = it.CANCELLED if item.cancel else ""
         if held(lock):

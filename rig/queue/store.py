@@ -20,7 +20,7 @@ from rig.queue.items import (
     QUEUED,
     RUNNING,
     Item,
-    Job,
+    QueueJob,
 )
 from rig.runs.runstate import now
 
@@ -46,7 +46,7 @@ _PAUSE = "pause"
 
 
 @dataclass(frozen=True)
-class Line:
+class QueueLine:
     """One line of the history: `event` is a state that an item entered, or what a queue did."""
 
     time: str
@@ -60,8 +60,8 @@ def _item(row: Sequence[Any]) -> Item:
     (number, priority, place, state, reason, job, attempt, run, pid, cancel) = row[:10]
     added, started, ended, proof, found = row[10:]
     return Item(
-        number, priority, place, state, reason, Job.from_dict(json.loads(job)), attempt, run, pid,
-        bool(cancel), added, started, ended, json.loads(proof), json.loads(found),
+        number, priority, place, state, reason, QueueJob.from_dict(json.loads(job)), attempt, run,
+        pid, bool(cancel), added, started, ended, json.loads(proof), json.loads(found),
     )  # fmt: skip
 
 
@@ -158,13 +158,13 @@ class QueueStore:
             raise InputError(f"{self.path}: no item {number}; the queue has {which}")
         return _item(row)
 
-    def history(self, number: int | None = None) -> list[Line]:
+    def history(self, number: int | None = None) -> list[QueueLine]:
         """Return the history of an item, or of the whole queue, oldest first."""
         where = "" if number is None else "WHERE item = ?"
         values = () if number is None else (number,)
         sql = f"SELECT time, item, attempt, event, reason FROM history {where} ORDER BY id"
         with self._readable():
-            return [Line(*row) for row in self._db.execute(sql, values)]
+            return [QueueLine(*row) for row in self._db.execute(sql, values)]
 
     @property
     def paused(self) -> str:
@@ -175,7 +175,7 @@ class QueueStore:
 
     # A person's changes
 
-    def add(self, job: Job, priority: int, proof: dict[str, Any]) -> Item:
+    def add(self, job: QueueJob, priority: int, proof: dict[str, Any]) -> Item:
         """Append an item to those of its priority."""
         with self._transaction():
             if job.after is not None:

@@ -23,7 +23,7 @@ from rig.tui.browse import Browsed
 from rig.tui.canvas import Canvas
 from rig.tui.following.link import FRAME, Frame, Link, LinkStage, LocalSessions, Sessions
 from rig.tui.following.story import KINDS
-from rig.tui.look import PAGES, Dialog, Look, View
+from rig.tui.look import PAGES, Dialog, PlotView, ScreenStyle
 from rig.tui.pages.operation import in_order
 from rig.tui.pages.parts import joints_in
 from rig.tui.pages.whole import compose
@@ -85,7 +85,7 @@ class Monitor(ByHand, App[int]):
         self.rig, self.clock, self._threaded = rig, clock, threaded
         self.link = Link(sessions or LocalSessions(rig), clock)
         self.me = own_command("take").holder
-        self.look = Look()
+        self.look = ScreenStyle()
         self.browsed = browsed or Browsed()
         self.dialog: Dialog | None = None
         self.accept: Callable[[str], None] | None = None  # what the open question's answer does
@@ -134,7 +134,7 @@ class Monitor(ByHand, App[int]):
 
     # The picture
 
-    def view(self) -> View:
+    def view(self) -> PlotView:
         """Return everything the picture is drawn from."""
         newest = self.link.frame
         if newest.stage is LinkStage.CHOOSING and self.marked_session not in newest.sessions:
@@ -143,7 +143,7 @@ class Monitor(ByHand, App[int]):
         self.link.window_seconds = max(span, ALARM_WINDOW) if self.look.page == "alarms" else span
         if self.look.seconds != span:
             self.look = replace(self.look, seconds=span)
-        return View(
+        return PlotView(
             frame=self._held or newest,
             newest=newest,
             now=self.clock(),

@@ -14,7 +14,7 @@ from rig.queue.items import Item
 from rig.queue.store import QueueStore
 from rig.runs.listing.index import indexed_runs
 from rig.runs.listing.summary import RunSummary
-from rig.tui.jobs import Job
+from rig.tui.jobs import VerbJob
 
 TABS: Final = ("protocols", "runs", "queue")
 
@@ -34,7 +34,7 @@ class Browsed:
     paused: str = ""
     trouble: str = ""
     reading: bool = False
-    job: Job | None = None
+    job: VerbJob | None = None
     rig: str = ""
     endpoint: str | None = None
 

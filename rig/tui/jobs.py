@@ -33,7 +33,7 @@ MEANINGS: Final = {
 
 
 @dataclass(frozen=True)
-class Job:
+class VerbJob:
     """One verb: what was asked, its process, its output so far, its exit code once it has ended."""
 
     words: tuple[str, ...]
@@ -64,11 +64,11 @@ class Job:
             return None
 
 
-def begin(words: Sequence[str], changed: Callable[[Job], None]) -> None:
+def begin(words: Sequence[str], changed: Callable[[VerbJob], None]) -> None:
     """Start a verb; `changed` hears of its start at once, then of its output and its end."""
     # Closed by the thread that watches the child.
     output, errors = tempfile.TemporaryFile(), tempfile.TemporaryFile()  # noqa: SIM115
-    job = Job(tuple(words))
+    job = VerbJob(tuple(words))
     try:
         process = start([*BRAMAH, *words], output, errors)
     except OSError as error:
@@ -83,11 +83,11 @@ def begin(words: Sequence[str], changed: Callable[[Job], None]) -> None:
 
 
 def _watch(
-    job: Job,
+    job: VerbJob,
     process: subprocess.Popen[bytes],
     output: IO[bytes],
     errors: IO[bytes],
-    changed: Callable[[Job], None],
+    changed: Callable[[VerbJob], None],
 ) -> None:
     with output, errors:
         code = None

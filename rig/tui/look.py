@@ -28,7 +28,7 @@ PAGES: Final = (
 
 
 @dataclass(frozen=True)
-class Look:
+class ScreenStyle:
     """What is chosen: page, joint, channel, the marked line, span of the plots, filters."""
 
     page: str = "overview"
@@ -56,13 +56,13 @@ class Dialog:
 
 
 @dataclass(frozen=True)
-class View:
+class PlotView:
     """One picture: `frame` is shown, `newest` what the link has (they differ where held)."""
 
     frame: Frame
     newest: Frame
     now: float
-    look: Look = field(default_factory=Look)
+    look: ScreenStyle = field(default_factory=ScreenStyle)
     alarms: AlarmTable = field(default_factory=AlarmTable)
     stop: Stop | None = None
     dialog: Dialog | None = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from analysis.design.twin_records import PlannedStep
+from analysis.design.twin_records import TwinStep
 
 PERIOD = 2000  # samples
 LINES = tuple(range(1, 18, 2))  # 0.5 to 8.5 Hz
@@ -12,7 +12,7 @@ LINES = tuple(range(1, 18, 2))  # 0.5 to 8.5 Hz
 SIZES = {"step1": 0.16, "step2": 0.10, "step3": 0.07}
 
 
-def steps(periods: int = 3, repeats: int = 4) -> list[PlannedStep]:
+def steps(periods: int = 3, repeats: int = 4) -> list[TwinStep]:
     """Joint 2 behind a closed joint 1, then joint 1 with joint 2 at either end."""
     out = []
     for k, (name, size) in enumerate(SIZES.items()):
@@ -23,7 +23,7 @@ def steps(periods: int = 3, repeats: int = 4) -> list[PlannedStep]:
         joint = 1 if name == "step1" else 0
         ends = {"step1": {}, "step2": {1: -0.0375}, "step3": {1: 0.0375}}
         out.append(
-            PlannedStep(
+            TwinStep(
                 name=name,
                 waves={joint: wave},
                 lines=LINES,

@@ -10,7 +10,7 @@ import pytest
 
 from analysis.design.lateness import late_times, lateness_cost, taken_late
 from analysis.design.predict import predict
-from analysis.design.twin_records import PlannedStep, play
+from analysis.design.twin_records import TwinStep, play
 from analysis.identify.identify import identify
 from analysis.regression.rows import default_filtering
 from analysis.terms import baseline
@@ -30,7 +30,7 @@ def rig_at(rate: float) -> Rig:
     return parse_model(Rig, text, "shinshu-2dof.yaml").model_copy(update={"sample_rate": rate})
 
 
-def at_rate(rate: float) -> list[PlannedStep]:
+def at_rate(rate: float) -> list[TwinStep]:
     """The steps of `designed_steps`, which are of 1 kHz, at another rate."""
     every = round(1000.0 / rate)
     return [

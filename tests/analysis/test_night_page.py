@@ -7,7 +7,7 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 import pytest
 
-from analysis.report.night import Estimate, Night, NightItem, change, render
+from analysis.report.night import Night, NightEstimate, NightItem, change, render
 from tests.analysis.page import Page
 
 BEGIN = datetime(2026, 3, 1, 22, 0, tzinfo=UTC)
@@ -20,7 +20,8 @@ def item(number: int, state: str, reason: str = "", b: float | None = None) -> N
         number, f"job <{number}>", state, reason, "shinshu-2dof", f"/runs/{number}",
         start if ran else None, start + timedelta(minutes=12) if ran else None, int(ran),
         4 if ran else -1, 40_000 if ran else -1, 3 if ran else -1,
-        {} if b is None else {"b": Estimate(b, 0.01 * b, "Pa"), "M1": Estimate(2.0, 0.1, "kg*m^2")},
+        {} if b is None else {"b": NightEstimate(b, 0.01 * b, "Pa"),
+                              "M1": NightEstimate(2.0, 0.1, "kg*m^2")},
     )  # fmt: skip
 
 
@@ -73,8 +74,8 @@ def test_an_empty_night_is_a_page_too() -> None:
 def test_a_change_is_judged_by_both_errors() -> None:
     rng = np.random.default_rng(1)
     draws = [
-        change([Estimate(x, 2.0, ""), Estimate(y, 1.0, "")])[1]
+        change([NightEstimate(x, 2.0, ""), NightEstimate(y, 1.0, "")])[1]
         for x, y in zip(rng.normal(5, 2, 4000), rng.normal(5, 1, 4000), strict=True)
     ]
     assert np.std(draws) == pytest.approx(1.0, abs=0.04)  # nothing drifted: it is a standard normal
-    assert change([Estimate(1.0, float("nan"), ""), Estimate(2.0, 0.1, "")]) == (1.0, 0.0)
+    assert change([NightEstimate(1.0, float("nan"), ""), NightEstimate(2.0, 0.1, "")]) == (1.0, 0.0)

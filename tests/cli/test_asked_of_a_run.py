@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from protocols.engine.states import WAYS, State
+from protocols.engine.states import WAYS, EngineState
 from rig.bench.screens.commands import Command
 from rig.bench.screens.sockets import Attachment
 from rig.cli.main import run as bramah_here
@@ -76,7 +76,7 @@ class Desk:
             assert self.process.poll() is None, what
             time.sleep(0.02)
 
-    def until_state(self, state: State) -> None:
+    def until_state(self, state: EngineState) -> None:
         """Wait until the run is in a state."""
         self.until(lambda events: [s for s, _ in states(events)][-1:] == [state], str(state))
 
@@ -97,14 +97,14 @@ def test_pause_resume_skip_answer_and_abort_on_a_run_of_another_process(tmp_path
             assert "nothing is asked now" in str(desk.ask("answer", "yes"))
             assert desk.ask("pause") is None
             assert "held by operator at desk 1" in str(desk.ask("skip", holder="somebody else"))
-            desk.until_state(State.PAUSED)
+            desk.until_state(EngineState.PAUSED)
             assert "paused already" in str(desk.ask("pause"))
             assert desk.ask("resume") is None
-            desk.until_state(State.EXCITING)
+            desk.until_state(EngineState.EXCITING)
             assert desk.ask("skip") is None  # the step with its 400 records
             desk.until(lambda events: any(e.get("message") == REST for e in events), "the rest")
             assert desk.ask("skip") is None  # five minutes of rest
-            desk.until_state(State.PROMPTING)
+            desk.until_state(EngineState.PROMPTING)
             assert "expected one of: yes, no" in str(desk.ask("answer", "perhaps"))
             assert desk.ask("answer", "yes") is None
             _, said = process.communicate(timeout=LONG)
@@ -113,14 +113,14 @@ def test_pause_resume_skip_answer_and_abort_on_a_run_of_another_process(tmp_path
         assert outputs_are_zero(endpoint)
     events = read_events(run)
     seen = [state for state, _ in states(events)]
-    for before, after in itertools.pairwise([State.IDLE, *seen]):
+    for before, after in itertools.pairwise([EngineState.IDLE, *seen]):
         assert after in WAYS[before]
-    paused = seen.index(State.PAUSED)
+    paused = seen.index(EngineState.PAUSED)
     # From a pause back to motion only through places and locks.
     assert seen[paused + 1 : paused + 5] == [
-        State.IDLE, State.HOMING, State.LOCKED, State.EXCITING,
+        EngineState.IDLE, EngineState.HOMING, EngineState.LOCKED, EngineState.EXCITING,
     ]  # fmt: skip
-    assert seen[-2:] == [State.IDLE, State.SAFE]
+    assert seen[-2:] == [EngineState.IDLE, EngineState.SAFE]
     times = states(events)
     begins, ends = times[paused][1], times[paused + 1][1]
     for joint in (1, 2):
@@ -152,7 +152,7 @@ def test_an_abort_from_the_screen_is_a_stop_that_keeps_the_records(tmp_path: Pat
         assert outputs_are_zero(endpoint)
     assert (run / "state").read_text() == "aborted\n"
     assert len(load_run(run).records) >= 2
-    assert [state for state, _ in states(read_events(run))][-1] is State.SAFE
+    assert [state for state, _ in states(read_events(run))][-1] is EngineState.SAFE
 
 
 def test_a_question_that_nobody_answers_ends_an_unattended_run(tmp_path: Path) -> None:
@@ -218,7 +218,7 @@ def test_a_device_that_comes_back_is_taken_up_where_its_records_ended(tmp_path: 
     assert 0 < len(before) < 6
     # Nothing moves but by way of places and locks.
     after = [s for s, _ in states(events[lost:])]
-    assert after[:2] == [State.HOMING, State.LOCKED]
+    assert after[:2] == [EngineState.HOMING, EngineState.LOCKED]
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 import pytest
 
-from protocols.engine.states import ENERGISED, WAYS, State
+from protocols.engine.states import ENERGISED, WAYS, EngineState
 from rig.model.records import Record
 from rig.runs.runstate import read_events
 from rig.runs.store import load_run
@@ -22,9 +22,9 @@ SHEET = ("run", "lab-sheet", "--rig", RIG, "--set", "rest=1 s", "--duration", 2)
 COLD = 11  # a seed whose oil is below 40 degC for about a minute, then above
 
 
-def states(events: list[dict[str, Any]]) -> list[tuple[State, float]]:
+def states(events: list[dict[str, Any]]) -> list[tuple[EngineState, float]]:
     """The states a run went through, each with the time [s] at which it began."""
-    return [(State(e["state"]), e["t"]) for e in events if e["event"] == "state"]
+    return [(EngineState(e["state"]), e["t"]) for e in events if e["event"] == "state"]
 
 
 def stream(run: Path, channel: str) -> np.ndarray:
@@ -106,15 +106,15 @@ def test_nothing_is_measured_before_the_oil_is_warm(evening: Path) -> None:
 
 def test_the_states_it_went_through_are_those_of_the_sheet(evening: Path) -> None:
     seen = [state for state, _ in states(read_events(evening / "run"))]
-    for before, after in itertools.pairwise([State.IDLE, *seen]):
+    for before, after in itertools.pairwise([EngineState.IDLE, *seen]):
         assert after in WAYS[before]
-    sine = [State.HOMING, State.LOCKED, State.EXCITING, State.IDLE]
+    sine = [EngineState.HOMING, EngineState.LOCKED, EngineState.EXCITING, EngineState.IDLE]
     assert seen == [
-        State.CHECKING, State.IDLE, State.PROMPTING, State.IDLE,
-        State.HOMING, State.EXCITING, State.IDLE,
-        State.HOMING, State.LOCKED, State.IDLE,
+        EngineState.CHECKING, EngineState.IDLE, EngineState.PROMPTING, EngineState.IDLE,
+        EngineState.HOMING, EngineState.EXCITING, EngineState.IDLE,
+        EngineState.HOMING, EngineState.LOCKED, EngineState.IDLE,
         *sine, *sine, *sine, *sine,
-        State.SAFE,
+        EngineState.SAFE,
     ]  # fmt: skip
 
 
@@ -124,7 +124,9 @@ def test_outputs_are_other_than_zero_in_energised_states_only(evening: Path) -> 
     length = len(commands[0])
     seen = states(events)
     block = 0.02  # [s] a law takes effect within the block after it was asked for
-    for (state, begins), (_, ends) in itertools.pairwise([*seen, (State.SAFE, length / 1000.0)]):
+    for (state, begins), (_, ends) in itertools.pairwise(
+        [*seen, (EngineState.SAFE, length / 1000.0)]
+    ):
         span = slice(round(1000 * (begins + block)), round(1000 * ends))
         if state not in ENERGISED:
             assert not any(command[span].any() for command in commands), (state, begins)
@@ -164,7 +166,7 @@ def test_a_trip_follows_the_sheets_rule_and_keeps_what_was_measured(tmp_path: Pa
     marks = [e["text"] for e in events if e["event"] == "mark"]
     assert marks == ["look at the hoses before anyone resets this bench"]
     seen = [state for state, _ in states(events)]
-    assert seen[-2:] == [State.TRIPPED, State.SAFE]
+    assert seen[-2:] == [EngineState.TRIPPED, EngineState.SAFE]
     (trip,) = [e for e in events if e["event"] == "trip"]
     after = {channel: stream(run, channel)[trip["tick"] :] for channel in ("command_2", "piston_2")}
     assert len(after["piston_2"]) >= 5000  # on_trip.record, outputs at zero

@@ -13,7 +13,7 @@ from unittest.mock import patch
 
 from drivers import message_stream
 from drivers.can_stream import CanStreamDriver
-from drivers.conformance import HEALTHY, Bench, Capabilities, Subject
+from drivers.conformance import HEALTHY, Capabilities, DeviceUnderTest, Subject
 from hil_sim.device.can.adapters import SocketcandServer
 from hil_sim.device.can.server import layout_of, run_device
 from hil_sim.device.device import Device
@@ -193,7 +193,7 @@ def _noise(frames: list[CanFrame]) -> list[CanFrame]:
     return [CanFrame(0x7E0, b"\1\2\3"), CanFrame(frames[0].identifier, b"")]
 
 
-def _can(faults: tuple[str, ...]) -> Iterator[Bench]:
+def _can(faults: tuple[str, ...]) -> Iterator[DeviceUnderTest]:
     server = SocketcandServer("127.0.0.1", 0)
 
     def serve(end: Any, device: Device, ended: list[int]) -> None:
@@ -215,7 +215,7 @@ def _can(faults: tuple[str, ...]) -> Iterator[Bench]:
     try:
         # Let a virtual device's answers be lost as soon as a real one's.
         with patch.object(message_stream, "VIRTUAL_PATIENCE", 1.0):
-            yield Bench(
+            yield DeviceUnderTest(
                 served.rig,
                 driver,
                 outputs=served.outputs,

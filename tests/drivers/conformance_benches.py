@@ -10,7 +10,7 @@ from unittest.mock import patch
 import numpy as np
 
 from drivers import make_driver, message_stream, modbus_tcp, wire_at
-from drivers.conformance import HEALTHY, Bench, Capabilities, Subject
+from drivers.conformance import HEALTHY, Capabilities, DeviceUnderTest, Subject
 from hil_sim.device.device import Device
 from hil_sim.device.server import RTU, SERIAL, TCP
 from hil_sim.faults.wire import (
@@ -128,7 +128,7 @@ class Held:
         return self.rig.channels.index(f"{ch.PISTON}_1")
 
 
-def _bench(wire: str, names: Sequence[str]) -> Iterator[Bench]:
+def _bench(wire: str, names: Sequence[str]) -> Iterator[DeviceUnderTest]:
     held = Held(wire)
     link = held.served.link
     known = FAULTS[wire]
@@ -145,7 +145,7 @@ def _bench(wire: str, names: Sequence[str]) -> Iterator[Bench]:
         # Let a virtual device's answers be lost as soon as a real one's.
         for module in (modbus_tcp, message_stream):
             stack.enter_context(patch.object(module, "VIRTUAL_PATIENCE", 1.0))
-        yield Bench(
+        yield DeviceUnderTest(
             held.rig,
             driver,
             outputs=held.outputs,

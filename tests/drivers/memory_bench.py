@@ -21,7 +21,7 @@ from drivers.base import (
     OutputLaw,
     SampleBlock,
 )
-from drivers.conformance import HEALTHY, Bench, Capabilities, Subject
+from drivers.conformance import HEALTHY, Capabilities, DeviceUnderTest, Subject
 from rig.model import channels as ch
 from rig.model.codes import decode_output, encode_output
 from rig.model.rig import Rig
@@ -287,7 +287,7 @@ def memory_subject(
     """Return the bench as a subject of the conformance checks, everything claimed."""
 
     @contextmanager
-    def make() -> Iterator[Bench]:
+    def make() -> Iterator[DeviceUnderTest]:
         rig = seed_rig()
         found = device(rig)
         link = Link(found)
@@ -302,7 +302,7 @@ def memory_subject(
             found.stuck = rig.channels.index("cap_pressure_2")
             return found.stuck
 
-        yield Bench(
+        yield DeviceUnderTest(
             rig,
             lambda wanted: driver(link, wanted),  # type: ignore[arg-type, return-value]
             outputs=outputs,

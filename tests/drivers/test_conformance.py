@@ -7,7 +7,7 @@ from functools import partial
 
 import pytest
 
-from drivers.conformance import Effort, Subject, Verdict, live_subject, run
+from drivers.conformance import CheckVerdict, RandomCallBudget, Subject, live_subject, run
 from drivers.conformance.catalogue import IDENTITY
 from drivers.modbus_tcp import ModbusTcpDriver
 from hil_sim.device.server import TCP
@@ -22,8 +22,8 @@ from tests.hil_sim.integrator import seed_rig
 
 pytest_plugins = ["drivers.conformance.plugin"]
 SUBJECT = memory_subject()
-QUICK = Effort(sequences=12, calls=20, shorten=False)
-SHORT = Effort(sequences=3, calls=12, shorten=False)
+QUICK = RandomCallBudget(sequences=12, calls=20, shorten=False)
+SHORT = RandomCallBudget(sequences=3, calls=12, shorten=False)
 WIRES: dict[str, Callable[[], Subject]] = {
     **{wire: partial(on_wire, wire, names) for wire, names in FEW.items()},
     "can": partial(can_subject, ("flip", "noise")),
@@ -41,10 +41,10 @@ WIRES: dict[str, Callable[[], Subject]] = {
 def test_a_shipped_driver_conforms_over_a_wire_that_fails(wire: str) -> None:
     subject = WIRES[wire]()
     report = run(subject, effort=QUICK if wire == TCP else SHORT)
-    assert report.of(Verdict.FAILED) == ()
+    assert report.of(CheckVerdict.FAILED) == ()
     # Valves are no bench: they know neither the rig nor its sample rate.
     no_bench = not subject.capabilities.refuses_other_rigs
-    skipped = {result.check: result.reason for result in report.of(Verdict.SKIPPED)}
+    skipped = {result.check: result.reason for result in report.of(CheckVerdict.SKIPPED)}
     assert skipped == ({"other_rig_refused": f"not claimed: {IDENTITY}"} if no_bench else {})
 
 
@@ -65,10 +65,10 @@ def test_a_device_that_is_there_is_checked_without_moving_it() -> None:
         driver.connect()
         assert driver.trip_cause() is None
         driver.close()
-    assert not still.of(Verdict.FAILED)
-    assert len(still.of(Verdict.PASSED)) >= 8
-    assert not driving.of(Verdict.FAILED)
-    assert len(driving.of(Verdict.PASSED)) == 2
+    assert not still.of(CheckVerdict.FAILED)
+    assert len(still.of(CheckVerdict.PASSED)) >= 8
+    assert not driving.of(CheckVerdict.FAILED)
+    assert len(driving.of(CheckVerdict.PASSED)) == 2
 
 
 def test_the_plugin_makes_a_test_of_each_check(conformance_check: Callable[[], None]) -> None:

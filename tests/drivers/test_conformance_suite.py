@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.conformance import Effort, Verdict, all_checks, run
+from drivers.conformance import CheckVerdict, RandomCallBudget, all_checks, run
 from tests.drivers import mutants
 from tests.drivers.memory_bench import MemoryDevice, MemoryDriver, memory_subject
 
@@ -61,8 +61,8 @@ REJECTED: tuple[tuple[type[MemoryDriver] | type[MemoryDevice], str], ...] = (
 
 def test_the_correct_driver_passes_every_check() -> None:
     report = run(memory_subject())
-    assert report.of(Verdict.FAILED) == ()
-    assert report.of(Verdict.SKIPPED) == ()
+    assert report.of(CheckVerdict.FAILED) == ()
+    assert report.of(CheckVerdict.SKIPPED) == ()
     assert len(report.results) == len(all_checks()) > 40
 
 
@@ -72,7 +72,7 @@ def test_each_wrong_driver_is_rejected_by_the_check_for_it(
 ) -> None:
     mutant = mutants.Mutant(wrong)
     report = run(memory_subject(mutant.driver, mutant.device), until_failure=True)
-    (failed,) = report.of(Verdict.FAILED)
+    (failed,) = report.of(CheckVerdict.FAILED)
     assert failed.check == check
     assert failed.reason
     assert "\n" not in failed.reason
@@ -106,17 +106,17 @@ def test_random_calls_alone_find_it_and_name_the_calls(
 ) -> None:
     mutant = mutants.Mutant(wrong)
     subject = memory_subject(mutant.driver, mutant.device)
-    report = run(subject, only=["random_calls"], effort=Effort(shorten=False))
-    (failed,) = report.of(Verdict.FAILED)
+    report = run(subject, only=["random_calls"], effort=RandomCallBudget(shorten=False))
+    (failed,) = report.of(CheckVerdict.FAILED)
     assert "(calls: " in failed.reason
 
 
 def test_without_outputs_nothing_that_drives_is_asked_for() -> None:
     report = run(memory_subject(), outputs=False)
     drives = {check.name for check in all_checks() if check.moves}
-    assert {result.check for result in report.of(Verdict.SKIPPED)} == drives
-    assert not report.of(Verdict.FAILED)
-    assert report.of(Verdict.PASSED)
+    assert {result.check for result in report.of(CheckVerdict.SKIPPED)} == drives
+    assert not report.of(CheckVerdict.FAILED)
+    assert report.of(CheckVerdict.PASSED)
 
 
 def test_an_unknown_check_is_refused() -> None:

@@ -10,7 +10,14 @@ import numpy as np
 import pytest
 
 from drivers.base import OFF, DeviceError, DeviceLost, OutputLaw
-from drivers.conformance import Bench, Capabilities, Effort, Subject, Verdict, run
+from drivers.conformance import (
+    Capabilities,
+    CheckVerdict,
+    DeviceUnderTest,
+    RandomCallBudget,
+    Subject,
+    run,
+)
 from drivers.in_process import ActiveLaw, InProcessDriver, over
 from rig.model.rig import Rig
 from tests.hil_sim.integrator import IntegratorPlant, seed_rig
@@ -40,12 +47,12 @@ class Straight:
 @pytest.mark.parametrize("make", [IntegratorPlant, Straight])
 def test_it_conforms(make: Any) -> None:
     @contextmanager
-    def bench() -> Iterator[Bench]:
-        yield Bench(seed_rig(), lambda rig: over(make(rig), rig))
+    def bench() -> Iterator[DeviceUnderTest]:
+        yield DeviceUnderTest(seed_rig(), lambda rig: over(make(rig), rig))
 
-    report = run(Subject("in-process", bench, BARE), effort=Effort(20, 20, shorten=False))
-    assert report.of(Verdict.FAILED) == ()
-    assert len(report.of(Verdict.PASSED)) >= 25
+    report = run(Subject("in-process", bench, BARE), effort=RandomCallBudget(20, 20, shorten=False))
+    assert report.of(CheckVerdict.FAILED) == ()
+    assert len(report.of(CheckVerdict.PASSED)) >= 25
 
 
 def test_codes_of_a_plant_become_si() -> None:

@@ -12,7 +12,14 @@ import numpy as np
 import pytest
 
 from drivers.base import OFF, DeviceError, DeviceLost, OutputLaw
-from drivers.conformance import Bench, Capabilities, Effort, Subject, Verdict, run
+from drivers.conformance import (
+    Capabilities,
+    CheckVerdict,
+    DeviceUnderTest,
+    RandomCallBudget,
+    Subject,
+    run,
+)
 from drivers.replay import ReplayDriver
 from rig.model.rig import Rig
 from rig.runs import archive
@@ -49,12 +56,12 @@ def test_it_conforms(tmp_path: Path) -> None:
     recording(tmp_path)
 
     @contextmanager
-    def bench() -> Iterator[Bench]:
-        yield Bench(seed_rig(), lambda rig: player(tmp_path, rig))
+    def bench() -> Iterator[DeviceUnderTest]:
+        yield DeviceUnderTest(seed_rig(), lambda rig: player(tmp_path, rig))
 
-    report = run(Subject("replay", bench, PLAYS), effort=Effort(15, 20, shorten=False))
-    assert report.of(Verdict.FAILED) == ()
-    passed = {result.check for result in report.of(Verdict.PASSED)}
+    report = run(Subject("replay", bench, PLAYS), effort=RandomCallBudget(15, 20, shorten=False))
+    assert report.of(CheckVerdict.FAILED) == ()
+    passed = {result.check for result in report.of(CheckVerdict.PASSED)}
     assert {"samples_in_order", "other_rig_refused", "random_calls", "zero_any_time"} <= passed
 
 

@@ -8,11 +8,11 @@ from contextlib import contextmanager
 from typing import Any, Final, Generic, Self, TypeVar
 
 from drivers.canopen_408 import CanOpen408Driver
-from drivers.conformance import Bench, Capabilities, Subject
+from drivers.conformance import Capabilities, DeviceUnderTest, Subject
 from drivers.registry import wire_at
 from hil_sim.device.can.adapters import SocketcandServer
 from hil_sim.device.can.valve_bench import POLL_SECONDS, ValveBench
-from hil_sim.device.device import Plant
+from hil_sim.device.device import PlantInterface
 from rig.model import channels as ch
 from rig.model.parts import Wire
 from rig.model.rig import Rig
@@ -20,7 +20,7 @@ from tests.drivers.can_bench import SpoiledAdapter, drop_all
 from tests.drivers.polled_bench import FakeClock
 from tests.hil_sim.integrator import IntegratorPlant, seed_rig
 
-SomePlant = TypeVar("SomePlant", bound=Plant)
+SomePlant = TypeVar("SomePlant", bound=PlantInterface)
 TIMEOUT: Final = 0.3  # [s] of real time for an answer
 SILENCE: Final = 11.0  # [s]
 # No flipped bit: a bus node discards such a frame by its checksum, which is to lose it. The nodes
@@ -100,7 +100,7 @@ class HeldValves(Generic[SomePlant]):
             self._bench.poll(POLL_SECONDS)
 
 
-def _valves(faults: tuple[str, ...]) -> Iterator[Bench]:
+def _valves(faults: tuple[str, ...]) -> Iterator[DeviceUnderTest]:
     rig = seed_rig()
     plant = IntegratorPlant(rig)
 
@@ -109,7 +109,7 @@ def _valves(faults: tuple[str, ...]) -> Iterator[Bench]:
         return rig.channels.index(f"{ch.PISTON}_1")
 
     with HeldValves(rig, plant, TIMEOUT) as held:
-        yield Bench(
+        yield DeviceUnderTest(
             held.rig,
             held.driver,
             outputs=held.outputs,

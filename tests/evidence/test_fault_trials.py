@@ -11,7 +11,15 @@ from drivers.base import DeviceError, DeviceLost
 from hil_sim.faults.base import Fault
 from rig.cli.bench.fault_bench import FaultBench, fault_bench
 from rig.cli.bench.fault_figures import RIG, counted, jobs
-from rig.cli.bench.fault_trials import Naming, Outcome, example, kinds, naming, try_fault, wires
+from rig.cli.bench.fault_trials import (
+    Naming,
+    TrialOutcome,
+    example,
+    kinds,
+    naming,
+    try_fault,
+    wires,
+)
 from rig.model.alarms.states import Alarm
 from rig.model.rig import Rig
 from rig.model.trips import SafetyTrip, Violation
@@ -119,7 +127,7 @@ def trip(limit: str, joint: int | None, channel: str) -> SafetyTrip:
 def test_a_message_is_judged_by_what_was_done(
     fault: str, error: Exception | None, expected: Naming
 ) -> None:
-    assert naming(example(fault), Outcome(fault, "serial", error=error)) == expected
+    assert naming(example(fault), TrialOutcome(fault, "serial", error=error)) == expected
 
 
 @pytest.mark.parametrize(
@@ -133,15 +141,17 @@ def test_a_warning_counts_as_noticing_and_is_judged_like_a_trip(
         check="noisy sensor", channel=channel, joint=joint, value=2.0, limit=(None, 1.0),
         unit="Pa", tick=5, time=1.5, sentence="A sensor is noisy.", remedy="", trips=False,
     )  # fmt: skip
-    outcome = Outcome("sensor_noise", "serial", alarm=alarm)
+    outcome = TrialOutcome("sensor_noise", "serial", alarm=alarm)
     assert naming(example("sensor_noise"), outcome) == expected
     assert outcome.says == "warning: A sensor is noisy."
 
 
 def test_a_missed_number_shows_in_the_figures() -> None:
-    good = Outcome("sensor_stuck", "serial", struck=1, seconds=0.3, blocks=9, naming=Naming.NAMED)
-    bad = Outcome("frame_lost", "serial", struck=4, blocks=9, lost_blocks=1, zeroed=False)
-    late = Outcome("valve_stuck", "serial", struck=1, seconds=2.5, naming=Naming.NAMED)
+    good = TrialOutcome(
+        "sensor_stuck", "serial", struck=1, seconds=0.3, blocks=9, naming=Naming.NAMED
+    )
+    bad = TrialOutcome("frame_lost", "serial", struck=4, blocks=9, lost_blocks=1, zeroed=False)
+    late = TrialOutcome("valve_stuck", "serial", struck=1, seconds=2.5, naming=Naming.NAMED)
     figures = {figure.name: figure for figure in counted([good, bad, late])}
     assert not figures["outputs left on"].ok
     assert not figures["of them not in records.h5"].ok

@@ -10,7 +10,7 @@ import pytest
 
 from hil_sim.device.device import Device
 from hil_sim.device.laws import Refused
-from hil_sim.device.register_map import RegisterMap
+from hil_sim.device.register_map import DeviceRegisters
 from rig.model import registers as reg
 from rig.model.registers import Refusal
 from tests.hil_sim.integrator import IntegratorPlant, seed_rig
@@ -26,7 +26,7 @@ class Bench:
         self.now = 100.0
         self.plant = plant if plant is not None else IntegratorPlant(RIG)
         self.device = Device(RIG, self.plant, realtime=realtime, clock=lambda: self.now)
-        self.map = RegisterMap(self.device)
+        self.map = DeviceRegisters(self.device)
         self.beats = 0
 
     def pass_time(self, seconds: float, step: float = 0.02) -> None:

@@ -10,7 +10,7 @@ from hil_sim.plant.kernel_data import ATMOSPHERE, record
 from hil_sim.plant.plant import Law, Plant, compression
 from hil_sim.plant.tables import build
 from hil_sim.scenario.file import Scenario
-from hil_sim.scenario.truth import Machine, load_machine, machine_text
+from hil_sim.scenario.truth import TrueMachine, load_machine, machine_text
 from rig.model.parameters import parameter_names
 from rig.model.parse import InputError
 from rig.model.rig import Rig
@@ -25,7 +25,7 @@ def both_moving(seconds: float = 2.0, rate: float = 2000.0) -> Trace:
     return story([sine(rig, 1.2, 1.0, **centred), sine(rig, 1.2, 2.0, **centred)], seconds)
 
 
-def chain(joints: int) -> tuple[Rig, Machine]:
+def chain(joints: int) -> tuple[Rig, TrueMachine]:
     """Return a bench of equal joints and bodies drawn at random."""
     shipped = bench()
     rig = shipped.model_copy(
@@ -43,7 +43,7 @@ def chain(joints: int) -> tuple[Rig, Machine]:
         true |= {"M1": R[0, 0] + R[1, 1], "M2": R[1, 1], "R12": R[0, 1]}
     else:
         true |= {f"R{i + 1}{k + 1}": R[i, k] for i in range(joints) for k in range(i, joints)}
-    return rig, Machine(parameters=true)
+    return rig, TrueMachine(parameters=true)
 
 
 def lagrangian(q: Array, v: Array, true: dict[str, float], gravity: float) -> float:

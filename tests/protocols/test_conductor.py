@@ -11,10 +11,10 @@ from protocols.engine.desk import Desk
 from protocols.engine.engine import run
 from protocols.engine.errors import ProtocolAborted, RunEnded
 from protocols.engine.session import Session
-from protocols.engine.states import ENERGISED, WAYS, Machine, State
+from protocols.engine.states import ENERGISED, WAYS, EngineState, StateMachine
 from protocols.files.library import read_protocol
 from protocols.files.plan import Plan, resolve
-from rig.bench.screens.commands import Command, Holder
+from rig.bench.screens.commands import Command, CommandHolder
 from rig.model.rig import Rig
 from rig.model.trips import OperatorStop
 from rig.runs.rigs import load_rig
@@ -79,14 +79,14 @@ def test_every_run_ends_safe_and_only_homing_leads_from_rest_to_motion(rig: Rig)
     assert sheet.states == ["homing", "locked", "exciting", "idle", "safe"]
     assert sheet.at_rest()
     starts = {state for state, ways in WAYS.items() if ways & ENERGISED and state not in ENERGISED}
-    assert starts == {State.IDLE}
-    assert WAYS[State.IDLE] & ENERGISED == {State.HOMING}
+    assert starts == {EngineState.IDLE}
+    assert WAYS[EngineState.IDLE] & ENERGISED == {EngineState.HOMING}
 
 
 def test_a_session_at_rest_refuses_every_law(rig: Rig) -> None:
-    machine = Machine()
+    machine = StateMachine()
     session = Session(LittleBench(rig, default_cylinders()), rig, 100, machine, lambda: None)
-    for state in set(State) - ENERGISED:
+    for state in set(EngineState) - ENERGISED:
         machine._state = state
         with pytest.raises(RuntimeError, match=f"in state {state}"):
             session.apply({0: OutputLaw(bias=0.1, limit=1.0)})
@@ -248,7 +248,7 @@ def test_a_hold_records_the_creep_with_every_valve_closed(rig: Rig) -> None:
 
 
 def test_one_screen_holds_the_controls_and_anyone_may_stop() -> None:
-    holder = Holder()
+    holder = CommandHolder()
     first, second = Command("pause", holder="first"), Command("resume", holder="second")
     assert holder.judge(first, lambda _: None) is None
     refused = holder.judge(second, lambda _: None)

@@ -12,15 +12,15 @@ from pathlib import Path
 
 from rig.bench.latch import BenchState
 from rig.queue.hook import Hook
-from rig.queue.items import Item, Job
-from rig.queue.runner import Report, Runner, Settings
+from rig.queue.items import Item, QueueJob
+from rig.queue.runner import QueueReport, QueueSettings, Runner
 from rig.queue.store import QueueStore
 from rig.runs.rigs import load_rig
 from rig.runs.runstate import read_events
 
 ROOT = Path(__file__).parents[2]
 PROGRAM = (sys.executable, "-m", "tests.queue.program")
-QUICK = Settings(poll=0.02, wait_poll=0.05, probe_every=0.05, probe_seconds=60.0)
+QUICK = QueueSettings(poll=0.02, wait_poll=0.05, probe_every=0.05, probe_seconds=60.0)
 LONG = 120.0  # [s] a hang ends in an error that says so
 
 
@@ -35,10 +35,12 @@ class Night:
     def add(self, mode: str, priority: int = 0, **job: object) -> int:
         with QueueStore(self.path) as store:
             out = str(self.folder / f"run{store.next_number()}")
-            what = Job(mode, "shinshu-2dof", out, name=mode, **job)  # type: ignore[arg-type]
+            what = QueueJob(mode, "shinshu-2dof", out, name=mode, **job)  # type: ignore[arg-type]
             return store.add(what, priority, {"seconds": 1.0}).id
 
-    def run(self, *command: str, serve: bool = False, settings: Settings = QUICK) -> Report:
+    def run(
+        self, *command: str, serve: bool = False, settings: QueueSettings = QUICK
+    ) -> QueueReport:
         with QueueStore(self.path) as store:
             hook = Hook(command, self.folder / "hook.log", seconds=1.5)
             with Runner(

@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 
 from drivers.base import DeviceLost, SampleBlock
 from rig.bench.guard import EXCITED, JointRole
-from rig.bench.screens.commands import Holder
+from rig.bench.screens.commands import CommandHolder
 from rig.bench.screens.past import KEPT, PastKeeper, PastMinute, PlanLine, past_from
 from rig.bench.screens.snapshot import Snapshot, decimate, from_json, to_json
 from rig.bench.screens.sockets import AttachError, Attachment, Command, Endpoint, Publisher
@@ -344,7 +344,7 @@ def test_a_run_remembers_no_more_than_a_minute_of_snapshots() -> None:
 def test_the_controls_are_taken_over_explicitly_and_every_screen_sees_whose_they_are(
     tmp_path: Path,
 ) -> None:
-    holder = Holder()
+    holder = CommandHolder()
     one, two = (Command("pause", holder=name) for name in ("one", "two"))
     assert holder.judge(one, lambda _: None) is None
     assert "held by one" in str(holder.judge(two, lambda _: None))

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from rig.queue.items import Job as QueueJob
+from rig.queue.items import QueueJob
 from rig.queue.store import QueueStore
 from rig.runs.store import create_run
 from rig.tui import jobs
 from rig.tui.app import Monitor
 from rig.tui.browse import Browsed, read_disk
-from rig.tui.jobs import Job
+from rig.tui.jobs import VerbJob
 from tests.services.children import RIG
 from tests.tui.glass import Clock, Glass, Machine, Recorded, endpoint
 from tests.tui.recorded import Bench, followed, run
@@ -87,7 +87,7 @@ class Office:
             await shown.press("down")
         await shown.press("enter")
 
-    async def ended(self, shown: Glass) -> Job:
+    async def ended(self, shown: Glass) -> VerbJob:
         while self.app.browsed.job is None or self.app.browsed.job.code is None:
             await shown.pilot.pause(0.01)
         await shown.watch()
@@ -199,9 +199,9 @@ def test_a_verb_that_fails_says_why_in_one_line(said: Path) -> None:
     import threading
 
     over = threading.Event()
-    heard: list[Job] = []
+    heard: list[VerbJob] = []
 
-    def changed(job: Job) -> None:
+    def changed(job: VerbJob) -> None:
         heard.append(job)
         if job.code is not None:
             over.set()

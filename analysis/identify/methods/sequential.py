@@ -21,7 +21,7 @@ import numpy as np
 
 from analysis.identify import checks as ck
 from analysis.identify.checks import Check, consistency
-from analysis.identify.methods.stages import Outcome, StepRows, as_solution, solve_stages
+from analysis.identify.methods.stages import StageOutcome, StepRows, as_solution, solve_stages
 from analysis.identify.reduction import (
     RecordReduction,
     clusters_of,
@@ -116,7 +116,7 @@ def _stages(
 
 
 def _shown(
-    rig: Rig, terms: Sequence[Used], outcomes: Mapping[str, Outcome], name: str
+    rig: Rig, terms: Sequence[Used], outcomes: Mapping[str, StageOutcome], name: str
 ) -> list[tuple[str, Estimate]]:
     """Return every step's own value of one parameter, as an estimate in the parameter's unit."""
     family, outcome = next((f, o) for f, o in outcomes.items() if name in o.names)
@@ -158,7 +158,7 @@ def _uniqueness(shown: Mapping[str, Sequence[tuple[str, Estimate]]]) -> Check:
 
 
 def _json(
-    outcomes: Mapping[str, Outcome],
+    outcomes: Mapping[str, StageOutcome],
     shown: Mapping[str, Sequence[tuple[str, Estimate]]],
     first: Mapping[str, Estimate],
     averaged: Mapping[str, Estimate],

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Value:
+class StageValue:
     """One value of one coefficient: the step it came from, standard error, degrees of freedom."""
 
     step: str
@@ -50,22 +50,24 @@ class StepRows:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class StageOutcome:
     """One family solved step by step: every step's own values, E1's, E2's, and conditioning."""
 
     names: tuple[str, ...]
-    own: Mapping[str, tuple[Value, ...]]
-    first: Mapping[str, Value]
-    averaged: Mapping[str, Value]
+    own: Mapping[str, tuple[StageValue, ...]]
+    first: Mapping[str, StageValue]
+    averaged: Mapping[str, StageValue]
     condition: Mapping[str, float]
     rows: int
     everything: Array
     lost: Mapping[str, str] = field(default_factory=dict)
 
 
-def solve_stages(names: tuple[str, ...], stages: Sequence[StepRows], reject_noise: bool) -> Outcome:
+def solve_stages(
+    names: tuple[str, ...], stages: Sequence[StepRows], reject_noise: bool
+) -> StageOutcome:
     """Solve one family step by step in both ways."""
-    own: dict[str, list[Value]] = {name: [] for name in names}
+    own: dict[str, list[StageValue]] = {name: [] for name in names}
     condition = {}
     for stage in stages:
         alone = solve(names, stage.clusters, stage.noise, reject_noise)
@@ -75,17 +77,17 @@ def solve_stages(names: tuple[str, ...], stages: Sequence[StepRows], reject_nois
                 own[name].append(value)
     first, lost = _use_first(names, stages, reject_noise)
     averaged = _average(names, stages, own, reject_noise)
-    return Outcome(
+    return StageOutcome(
         names, {n: tuple(v) for n, v in own.items()}, first, averaged, condition,
         sum(c.rows for s in stages for c in s.clusters),
         merge(c.triangle for s in stages for c in s.clusters), lost,
     )  # fmt: skip
 
 
-def _values(step: str, solution: Solution) -> dict[str, Value]:
+def _values(step: str, solution: Solution) -> dict[str, StageValue]:
     std = np.sqrt(np.diag(solution.covariance))
     return {
-        name: Value(step, float(v), float(s), float(d))
+        name: StageValue(step, float(v), float(s), float(d))
         for name, v, s, d in zip(solution.names, solution.value, std, solution.dof, strict=True)
         if np.isfinite(v)
     }
@@ -93,9 +95,9 @@ def _values(step: str, solution: Solution) -> dict[str, Value]:
 
 def _use_first(
     names: tuple[str, ...], stages: Sequence[StepRows], reject_noise: bool
-) -> tuple[dict[str, Value], dict[str, str]]:
+) -> tuple[dict[str, StageValue], dict[str, str]]:
     """E1: let each step fix what it can, given what the steps before it fixed."""
-    known: dict[str, Value] = {}
+    known: dict[str, StageValue] = {}
     lost: dict[str, str] = {}
     waiting: list[StepRows] = []
     for place, stage in enumerate(stages):
@@ -113,7 +115,7 @@ def _use_first(
     return known, {name: why for name, why in lost.items() if name not in known}
 
 
-def _shows(names: tuple[str, ...], stage: StepRows, known: Mapping[str, Value]) -> bool:
+def _shows(names: tuple[str, ...], stage: StepRows, known: Mapping[str, StageValue]) -> bool:
     """Tell whether a stage's rows contain anything that is still unknown."""
     columns = [i for i, name in enumerate(names) if name not in known]
     return any(np.any(c.triangle[:, columns] != 0.0) for c in stage.clusters)
@@ -122,9 +124,9 @@ def _shows(names: tuple[str, ...], stage: StepRows, known: Mapping[str, Value]) 
 def _average(
     names: tuple[str, ...],
     stages: Sequence[StepRows],
-    own: Mapping[str, Sequence[Value]],
+    own: Mapping[str, Sequence[StageValue]],
     reject_noise: bool,
-) -> dict[str, Value]:
+) -> dict[str, StageValue]:
     """E2: average the steps' own values; what no step has alone comes from all rows then."""
     known = {}
     for name, values in own.items():
@@ -133,7 +135,7 @@ def _average(
             std = float(np.sqrt(sum(v.std**2 for v in values))) / n
             steps = " ".join(v.step for v in values)
             mean = float(np.mean([v.value for v in values]))
-            known[name] = Value(steps, mean, std, float(sum(v.dof for v in values)))
+            known[name] = StageValue(steps, mean, std, float(sum(v.dof for v in values)))
     if len(known) == len(names):
         return known
     rest = _values("all", _solve_rest(names, stages, known, reject_noise))
@@ -143,7 +145,7 @@ def _average(
 def _solve_rest(
     names: tuple[str, ...],
     stages: Sequence[StepRows],
-    known: Mapping[str, Value],
+    known: Mapping[str, StageValue],
     reject_noise: bool,
 ) -> Solution:
     """Solve the stages' rows for what is not known; known values count as exact."""
@@ -164,7 +166,7 @@ def _split(rows: Array) -> tuple[Array, Array]:
     return rows[:, :-1], rows[:, -1]
 
 
-def as_solution(outcome: Outcome, values: Mapping[str, Value]) -> Solution:
+def as_solution(outcome: StageOutcome, values: Mapping[str, StageValue]) -> Solution:
     """Return a list of values as a solution, with the residual it leaves in all rows together."""
     k = len(outcome.names)
     value, std, dof = (np.full(k, np.nan) for _ in range(3))

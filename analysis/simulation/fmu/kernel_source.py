@@ -43,7 +43,7 @@ class UntranslatableKernelError(Exception):
 
 
 @dataclass(frozen=True)
-class Value:
+class CValue:
     """A C expression and the kind of what it evaluates to; `size` is a tuple's length."""
 
     text: str
@@ -211,18 +211,18 @@ class _Translation:
             self.temporaries += 1
             kept = f"t{self.temporaries}"
             self._line(f"struct tuple{whole.size} {kept} = {whole.text};")
-            values = [Value(f"{kept}.v[{k}]", DOUBLE) for k in range(whole.size)]
+            values = [CValue(f"{kept}.v[{k}]", DOUBLE) for k in range(whole.size)]
         if len(values) != len(targets):
             raise self._refusal(value, f"{len(values)} values for {len(targets)} targets")
         kept_values = []
         for found in values:
             self.temporaries += 1
             self._line(f"{_C_TYPES[found.kind]} t{self.temporaries} = {found.text};")
-            kept_values.append(Value(f"t{self.temporaries}", found.kind))
+            kept_values.append(CValue(f"t{self.temporaries}", found.kind))
         for target, found in zip(targets, kept_values, strict=True):
             self._store(target, found)
 
-    def _store(self, target: ast.expr, value: Value) -> None:
+    def _store(self, target: ast.expr, value: CValue) -> None:
         if isinstance(target, ast.Name):
             self._line(f"{self._declare(target.id, value.kind)} = {value.text};")
             return
@@ -241,8 +241,8 @@ class _Translation:
 
     # -- expressions ---------------------------------------------------------------------------
 
-    def _value(self, node: ast.expr) -> Value:
-        kinds: dict[type[ast.expr], Callable[[Any], Value]] = {
+    def _value(self, node: ast.expr) -> CValue:
+        kinds: dict[type[ast.expr], Callable[[Any], CValue]] = {
             ast.Constant: self._constant,
             ast.Name: lambda n: self._name(n.id, n),
             ast.Subscript: self._subscript,
@@ -258,105 +258,105 @@ class _Translation:
             raise self._refusal(node, type(node).__name__)
         return translate(node)
 
-    def _constant(self, node: ast.Constant) -> Value:
+    def _constant(self, node: ast.Constant) -> CValue:
         if isinstance(node.value, bool | int):
-            return Value(str(int(node.value)), INT)
+            return CValue(str(int(node.value)), INT)
         if isinstance(node.value, float):
-            return Value(repr(node.value), DOUBLE)
+            return CValue(repr(node.value), DOUBLE)
         raise self._refusal(node, f"the constant {node.value!r}")
 
-    def _subscript(self, node: ast.Subscript) -> Value:
+    def _subscript(self, node: ast.Subscript) -> CValue:
         match node:
             case ast.Subscript(value=ast.Attribute(value=ast.Name(id=name), attr="shape")):
                 if self.arguments.get(name) != MATRIX or ast.unparse(node.slice) != "1":
                     raise self._refusal(node, "a shape other than the number of joints")
-                return Value("N", INT)
+                return CValue("N", INT)
             case ast.Subscript(value=ast.Call() as call, slice=ast.Constant(value=int() as k)):
-                return Value(f"{self._value(call).text}.v[{k}]", DOUBLE)
+                return CValue(f"{self._value(call).text}.v[{k}]", DOUBLE)
         return self._element(node)
 
-    def _unary(self, node: ast.UnaryOp) -> Value:
+    def _unary(self, node: ast.UnaryOp) -> CValue:
         operand = self._value(node.operand)
         if isinstance(node.op, ast.USub):
-            return Value(f"(-{operand.text})", operand.kind)
+            return CValue(f"(-{operand.text})", operand.kind)
         if isinstance(node.op, ast.Not):
-            return Value(f"(!{operand.text})", INT)
+            return CValue(f"(!{operand.text})", INT)
         raise self._refusal(node, type(node.op).__name__)
 
-    def _logical(self, node: ast.BoolOp) -> Value:
+    def _logical(self, node: ast.BoolOp) -> CValue:
         sign = " && " if isinstance(node.op, ast.And) else " || "
-        return Value(f"({sign.join(self._value(v).text for v in node.values)})", INT)
+        return CValue(f"({sign.join(self._value(v).text for v in node.values)})", INT)
 
-    def _choice(self, node: ast.IfExp) -> Value:
+    def _choice(self, node: ast.IfExp) -> CValue:
         body, orelse = self._value(node.body), self._value(node.orelse)
         kind = DOUBLE if DOUBLE in (body.kind, orelse.kind) else body.kind
-        return Value(f"({self._value(node.test).text} ? {body.text} : {orelse.text})", kind)
+        return CValue(f"({self._value(node.test).text} ? {body.text} : {orelse.text})", kind)
 
-    def _name(self, name: str, node: ast.expr) -> Value:
+    def _name(self, name: str, node: ast.expr) -> CValue:
         kind = self.locals.get(name) or self.arguments.get(name)
         if kind is not None:
-            return Value(_safe(name), kind)
+            return CValue(_safe(name), kind)
         value = self.globals.get(name)
         if isinstance(value, bool | int):
-            return Value(str(int(value)), INT)
+            return CValue(str(int(value)), INT)
         if isinstance(value, float):
-            return Value(repr(value), DOUBLE)
+            return CValue(repr(value), DOUBLE)
         raise self._refusal(node, f"the name {name}")
 
-    def _element(self, node: ast.Subscript) -> Value:
+    def _element(self, node: ast.Subscript) -> CValue:
         if not isinstance(node.value, ast.Name):
             raise self._refusal(node, "an element of something without a name")
         array = self._name(node.value.id, node)
         if array.kind == VECTOR:
-            return Value(f"{array.text}[{self._value(node.slice).text}]", DOUBLE)
+            return CValue(f"{array.text}[{self._value(node.slice).text}]", DOUBLE)
         if array.kind == MATRIX and isinstance(node.slice, ast.Tuple):
             row, column = (self._value(index).text for index in node.slice.elts)
-            return Value(f"{array.text}[({row}) * N + ({column})]", DOUBLE)
+            return CValue(f"{array.text}[({row}) * N + ({column})]", DOUBLE)
         raise self._refusal(node, "an element of what is no array")
 
-    def _binary(self, operator: ast.operator, left: Value, right: Value, node: ast.AST) -> Value:
+    def _binary(self, operator: ast.operator, left: CValue, right: CValue, node: ast.AST) -> CValue:
         if isinstance(operator, ast.Pow):
             if right.text == "2":
-                return Value(f"({left.text} * {left.text})", DOUBLE)
-            return Value(f"pow({left.text}, {right.text})", DOUBLE)
+                return CValue(f"({left.text} * {left.text})", DOUBLE)
+            return CValue(f"pow({left.text}, {right.text})", DOUBLE)
         sign = _BINARY.get(type(operator))
         if sign is None:
             raise self._refusal(node, type(operator).__name__)
         whole = left.kind == right.kind == INT
         if sign == "/" and whole:
-            return Value(f"((double){left.text} / {right.text})", DOUBLE)
-        return Value(f"({left.text} {sign} {right.text})", INT if whole else DOUBLE)
+            return CValue(f"((double){left.text} / {right.text})", DOUBLE)
+        return CValue(f"({left.text} {sign} {right.text})", INT if whole else DOUBLE)
 
-    def _compare(self, nodes: Sequence[ast.expr], operators: Sequence[ast.cmpop]) -> Value:
+    def _compare(self, nodes: Sequence[ast.expr], operators: Sequence[ast.cmpop]) -> CValue:
         values = [self._value(n).text for n in nodes]
         parts = [
             f"({values[k]} {_COMPARE[type(op)]} {values[k + 1]})" for k, op in enumerate(operators)
         ]
-        return Value(parts[0] if len(parts) == 1 else f"({' && '.join(parts)})", INT)
+        return CValue(parts[0] if len(parts) == 1 else f"({' && '.join(parts)})", INT)
 
-    def _call(self, node: ast.Call) -> Value:
+    def _call(self, node: ast.Call) -> CValue:
         if node.keywords:
             raise self._refusal(node, "an argument by name")
         values = [self._value(argument) for argument in node.args]
         texts = [v.text for v in values]
         match node.func:
             case ast.Attribute(value=ast.Name(id="math"), attr=name) if name in _MATH:
-                return Value(f"{name}({', '.join(texts)})", DOUBLE)
+                return CValue(f"{name}({', '.join(texts)})", DOUBLE)
             case ast.Name(id=name) if (name, len(texts)) in _BUILT_IN:
                 function, kind = _BUILT_IN[name, len(texts)]
-                return Value(f"{function}({', '.join(texts)})", kind)
+                return CValue(f"{function}({', '.join(texts)})", kind)
             case ast.Name(id=name) if hasattr(self.globals.get(name), "py_func"):
                 callee = self.library.add(self.globals[name], [v.kind for v in values])
                 if callee not in self.library.returns:
                     raise self._refusal(node, "a function that calls itself")
                 kind, size = self.library.returns[callee]
-                return Value(f"{callee}({', '.join(texts)})", kind, size)
+                return CValue(f"{callee}({', '.join(texts)})", kind, size)
         raise self._refusal(node, f"a call of {ast.unparse(node.func)}")
 
-    def _tuple(self, node: ast.Tuple) -> Value:
+    def _tuple(self, node: ast.Tuple) -> CValue:
         texts = ", ".join(self._value(v).text for v in node.elts)
         size = len(node.elts)
-        return Value(f"(struct tuple{size}){{{{{texts}}}}}", "tuple", size)
+        return CValue(f"(struct tuple{size}){{{{{texts}}}}}", "tuple", size)
 
     def _refusal(self, node: ast.AST, what: str) -> UntranslatableKernelError:
         line = getattr(node, "lineno", 0)

@@ -83,7 +83,7 @@ def smallest(effect: Effect, rig: Rig) -> Explanation | None:
 
 
 @dataclass(frozen=True)
-class Question:
+class OpenQuestion:
     """What an experiment is to tell: `one` or `other`; `both_ways` unless `one` is only wanted
     visible against `other`.
     """
@@ -94,7 +94,7 @@ class Question:
 
 
 @dataclass(frozen=True)
-class View:
+class MeasurementView:
     """An excitation's rows on the twin under the baseline, and the `noise` by equation, SI."""
 
     rig: Rig
@@ -134,7 +134,7 @@ def calibration(train_data: RegressionData) -> dict[str, float]:
 
 def view(
     train_data: RegressionData, excitation: CandidateExcitation, measured: Mapping[str, float]
-) -> View:
+) -> MeasurementView:
     """Build the rows of an excitation as the trace would of its record.
 
     `measured` is the board's `calibration`; of other equations nothing can be said: their joint
@@ -149,7 +149,9 @@ def view(
     stated = stated_noise(rig, train_data.terms, conditioned, rows, train_data.beta)
     noise = {e: measured[e] * stated[e] for e in rows}
     seen = prepared(rig, train_data.terms, conditioned)
-    return View(rig, tuple(train_data.terms), train_data.beta, conditioned, seen, rows, noise)
+    return MeasurementView(
+        rig, tuple(train_data.terms), train_data.beta, conditioned, seen, rows, noise
+    )
 
 
 class Ground:
@@ -159,7 +161,10 @@ class Ground:
     """
 
     def __init__(
-        self, train_data: RegressionData, seen: View | None = None, old: Ground | None = None
+        self,
+        train_data: RegressionData,
+        seen: MeasurementView | None = None,
+        old: Ground | None = None,
     ) -> None:
         self.stage, self.seen, self._old = train_data, seen, old
         self._known: dict[Used, dict[str, Array]] = {}
@@ -240,7 +245,7 @@ class Ground:
         }
 
 
-def separation(question: Question, old: Ground, new: Ground) -> tuple[float, str]:
+def separation(question: OpenQuestion, old: Ground, new: Ground) -> tuple[float, str]:
     """Return what an experiment separates [noise], and in which equation (see the module)."""
     assert new.seen is not None
     found = []
@@ -256,7 +261,7 @@ def separation(question: Question, old: Ground, new: Ground) -> tuple[float, str
     return min(found)
 
 
-def present(question: Question, old: Ground) -> float:
+def present(question: OpenQuestion, old: Ground) -> float:
     """Return the same figure [noise] of the records already taken: their loudest segment's."""
     return min(loudest(old.stage, old.residual(true, wrong)) for true, wrong in _ways(question))
 
@@ -268,6 +273,6 @@ def loudest(train_data: RegressionData, residual: Array) -> float:
     )
 
 
-def _ways(question: Question) -> Sequence[tuple[Explanation, Explanation]]:
+def _ways(question: OpenQuestion) -> Sequence[tuple[Explanation, Explanation]]:
     there = (question.one, question.other)
     return (there, there[::-1]) if question.both_ways else (there,)

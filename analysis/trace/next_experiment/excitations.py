@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from analysis.design.limits import Spectrum, forecast_of, used
 from analysis.design.moves import Tone, with_tones
-from analysis.design.twin_records import PlannedStep, Played, play
+from analysis.design.twin_records import Played, TwinStep, play
 from analysis.regression.conditioned import ConditionedRecord
 from rig.model import channels as ch
 from rig.model.parse import InputError
@@ -106,7 +106,7 @@ class CandidateExcitation:
     played: Played
 
     @property
-    def step(self) -> PlannedStep:
+    def step(self) -> TwinStep:
         """The step in device terms."""
         return self.played.step
 
@@ -200,10 +200,10 @@ def _tone(joint: int, family: Family, turn: int, rng: np.random.Generator) -> To
 
 def _step(
     rig: Rig, setting: Setting, family: Family, tones: Mapping[int, Tone]
-) -> PlannedStep:  # fmt: skip
+) -> TwinStep:  # fmt: skip
     period = round(rig.sample_rate / family.base)
     places = {j: family.centre * 0.5 * rig.joints[j].cylinder.stroke for j in tones}
-    return PlannedStep(
+    return TwinStep(
         name=f"next_{family.name}",
         waves={j: np.zeros(period) for j in tones},
         lines=(),

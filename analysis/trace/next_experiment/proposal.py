@@ -24,8 +24,8 @@ from analysis.trace.next_experiment import excitations as ex
 from analysis.trace.next_experiment.discrimination import (
     Explanation,
     Ground,
-    Question,
-    View,
+    MeasurementView,
+    OpenQuestion,
     calibration,
     loudest,
     present,
@@ -55,10 +55,10 @@ SEED = 0  # of the excitations' phases
 
 
 @dataclass(frozen=True)
-class Answer:
+class ExperimentProposal:
     """What the records hold on a question, and what an experiment promises, in units of noise."""
 
-    question: Question
+    question: OpenQuestion
     present: float
     promised: float = 0.0
     equation: str = ""
@@ -114,19 +114,19 @@ def learned(train_data: RegressionData) -> Rig:
 
 def _questions(
     hypotheses: HypothesisSet, winner: Hypothesis, found: Sequence[Found], verdict: str, old: Ground
-) -> list[Answer]:
+) -> list[ExperimentProposal]:
     if verdict == CLEAN:
-        asked = [Question(h, Explanation(), False) for h in _small(hypotheses)]
-        answers = [Answer(q, present(q, old)) for q in asked]
+        asked = [OpenQuestion(h, Explanation(), False) for h in _small(hypotheses)]
+        answers = [ExperimentProposal(q, present(q, old)) for q in asked]
         return [a for a in answers if a.present < PROMISE]
     if verdict == CONFOUNDED:
         others = tied_sets(hypotheses, winner, found)
-        pairs = [Question(explanation(winner), explanation(o)) for o in others]
+        pairs = [OpenQuestion(explanation(winner), explanation(o)) for o in others]
     elif verdict == UNEXPLAINED:
         pairs = _unsettled(hypotheses)
     else:
         return []
-    return [Answer(q, present(q, old)) for q in pairs]
+    return [ExperimentProposal(q, present(q, old)) for q in pairs]
 
 
 def explanation(one: Hypothesis) -> Explanation:
@@ -156,7 +156,7 @@ def _key(term: Any) -> tuple[str, str]:
     return term.name, str(getattr(term, "place", term.where))
 
 
-def _unsettled(hypotheses: HypothesisSet) -> list[Question]:
+def _unsettled(hypotheses: HypothesisSet) -> list[OpenQuestion]:
     """Return the best set against the others that leave about as little, and against none."""
     allowed = [o for o in hypotheses.listed.values() if o.effects and not hypotheses.physical(o)]
     allowed.sort(key=lambda o: o.total)
@@ -166,7 +166,7 @@ def _unsettled(hypotheses: HypothesisSet) -> list[Question]:
     limit = max(NEAR * best.total, best.total + 0.1 * hypotheses.limits.total)
     # A set that only adds to the best is not another explanation.
     near = [o for o in allowed[1:] if o.total <= limit and not best.keys <= o.keys][:RIVALS]
-    return [Question(explanation(best), explanation(o)) for o in near]
+    return [OpenQuestion(explanation(best), explanation(o)) for o in near]
 
 
 def _small(hypotheses: HypothesisSet) -> list[Explanation]:
@@ -177,19 +177,22 @@ def _small(hypotheses: HypothesisSet) -> list[Explanation]:
 
 
 def _choose(
-    asked: Sequence[Answer],
+    asked: Sequence[ExperimentProposal],
     tried: Sequence[ex.CandidateExcitation],
-    views: Sequence[View],
+    views: Sequence[MeasurementView],
     old: Ground,
-) -> tuple[list[ex.CandidateExcitation], list[Answer]] | None:
+) -> tuple[list[ex.CandidateExcitation], list[ExperimentProposal]] | None:
     """Return the steps that answer most, and what they promise; None if they promise nothing."""
     if not asked:
         return None
-    table: list[list[Answer]] = []
+    table: list[list[ExperimentProposal]] = []
     for seen in views:
         new = Ground(old.stage, seen, old)
         table.append(
-            [Answer(a.question, a.present, *separation(a.question, old, new)) for a in asked]
+            [
+                ExperimentProposal(a.question, a.present, *separation(a.question, old, new))
+                for a in asked
+            ]
         )
     chosen: list[int] = []
     while len(chosen) < min(STEPS, len(tried)):
@@ -204,12 +207,14 @@ def _choose(
     return ([tried[k] for k in chosen], told) if told else None
 
 
-def _best(table: Sequence[Sequence[Answer]], chosen: Sequence[int]) -> list[Answer]:
+def _best(
+    table: Sequence[Sequence[ExperimentProposal]], chosen: Sequence[int]
+) -> list[ExperimentProposal]:
     rows = [table[k] for k in chosen]
     return [max(column, key=lambda a: a.promised) for column in zip(*rows, strict=True)]
 
 
-def _worth(answers: Sequence[Answer]) -> float:
+def _worth(answers: Sequence[ExperimentProposal]) -> float:
     return sum(min(a.promised, ENOUGH) for a in answers if a.open)
 
 
@@ -218,7 +223,7 @@ def _explored(
     winner: Hypothesis,
     moves: Sequence[Dependence],
     tried: Sequence[ex.CandidateExcitation],
-    views: Sequence[View],
+    views: Sequence[MeasurementView],
 ) -> Mapping[str, Any] | None:
     """Return the experiment that shows what is unexplained where no record has been yet."""
     found = farther(train_data, moves, views, MORE) or richer(train_data, moves, tried)
@@ -241,7 +246,7 @@ def _told(
     train_data: RegressionData,
     kind: str,
     chosen: Sequence[ex.CandidateExcitation],
-    answers: Sequence[Answer],
+    answers: Sequence[ExperimentProposal],
 ) -> Mapping[str, Any]:
     weakest = min(answers, key=lambda a: a.promised)
     separates = _names(answers)
@@ -267,7 +272,7 @@ def _told(
     }  # fmt: skip
 
 
-def _names(answers: Sequence[Answer]) -> list[dict[str, str]]:
+def _names(answers: Sequence[ExperimentProposal]) -> list[dict[str, str]]:
     """Return names and places of all effects in question, each once."""
     keys = [k for a in answers for h in (a.question.one, a.question.other) for k in h.keys]
     found = dict.fromkeys((k["name"], k["where"]) for k in keys)
@@ -284,7 +289,7 @@ def _protocols(
     }
 
 
-def _in_words(winner: Hypothesis, asked: Sequence[Answer]) -> Mapping[str, Any] | None:
+def _in_words(winner: Hypothesis, asked: Sequence[ExperimentProposal]) -> Mapping[str, Any] | None:
     """Say what separates tied effects where no twin can try it: the rig has no nominal values."""
     texts = [getattr(known()[u.term.name], "separated_by", "") for u in winner.effects]
     return {

@@ -10,7 +10,7 @@ import numpy as np
 
 from analysis.trace.clues.variables import variables
 from analysis.trace.data.regression_data import RegressionData
-from analysis.trace.next_experiment.discrimination import View
+from analysis.trace.next_experiment.discrimination import MeasurementView
 from analysis.trace.next_experiment.excitations import CandidateExcitation
 from analysis.trace.result import Dependence
 
@@ -31,7 +31,10 @@ class Beyond:
 
 
 def farther(
-    train_data: RegressionData, moves: Sequence[Dependence], views: Sequence[View], least: float
+    train_data: RegressionData,
+    moves: Sequence[Dependence],
+    views: Sequence[MeasurementView],
+    least: float,
 ) -> Beyond | None:
     """Return what carries a clue's variable farthest, for the first clue that can be carried so.
 
@@ -55,7 +58,7 @@ def farther(
 
 
 def _reach(
-    train_data: RegressionData, one: View, joint: int, name: str, low: float, high: float
+    train_data: RegressionData, one: MeasurementView, joint: int, name: str, low: float, high: float
 ) -> float:
     """Return a variable's range over the records' and a candidate's, over the records' alone."""
     if joint + 1 in one.conditioned.record.locked:

@@ -11,8 +11,8 @@ from collections.abc import Callable, Sequence
 
 from hil_sim.device.can.adapters import Adapter
 from hil_sim.device.can.session import CanSession
-from hil_sim.device.device import Device, Plant
-from hil_sim.device.lifetime import PARENT_SECONDS, Owner, termination_signals
+from hil_sim.device.device import Device, PlantInterface
+from hil_sim.device.lifetime import PARENT_SECONDS, ParentProcess, termination_signals
 from hil_sim.faults.device import DeviceFault
 from rig.model.rig import Rig
 from rig.model.wire.can_database import database_text
@@ -28,7 +28,7 @@ def layout_of(rig: Rig, *, fd: bool = False) -> CanLayout:
 
 def serve_can(
     rig: Rig,
-    plant: Plant,
+    plant: PlantInterface,
     adapter: Adapter,
     *,
     layout: CanLayout | None = None,
@@ -50,7 +50,7 @@ def serve_can(
                 device,
                 layout_of(rig) if layout is None else layout,
                 ended,
-                None if parent is None else Owner(parent),
+                None if parent is None else ParentProcess(parent),
             )
     finally:
         device.zero()
@@ -62,7 +62,7 @@ def run_device(
     device: Device,
     layout: CanLayout,
     ended: Sequence[object],
-    owner: Owner | None = None,
+    owner: ParentProcess | None = None,
 ) -> None:
     """Serve a device until `ended` is not empty, or its owner has ended."""
     session = CanSession(device, layout)

@@ -17,9 +17,9 @@ import canopen
 import numpy as np
 
 from hil_sim.device.can.adapters import Adapter
-from hil_sim.device.device import Plant
+from hil_sim.device.device import PlantInterface
 from hil_sim.device.laws import OFF, DeviceLaw
-from hil_sim.device.lifetime import PARENT_SECONDS, Owner, termination_signals
+from hil_sim.device.lifetime import PARENT_SECONDS, ParentProcess, termination_signals
 from rig.model import channels as ch
 from rig.model.codes import decode_input
 from rig.model.rig import Rig
@@ -125,7 +125,7 @@ class ValveBench:
     def __init__(
         self,
         rig: Rig,
-        plant: Plant,
+        plant: PlantInterface,
         adapter: Adapter,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -183,7 +183,7 @@ class ValveBench:
 
 def serve_valves(
     rig: Rig,
-    plant: Plant,
+    plant: PlantInterface,
     adapter: Adapter,
     *,
     on_ready: Callable[[str], None] = logger.info,
@@ -191,7 +191,7 @@ def serve_valves(
 ) -> None:
     """Serve a plant behind valve nodes 1 to N until SIGTERM, SIGINT or the end of `parent`."""
     bench = ValveBench(rig, plant, adapter)
-    owner = None if parent is None else Owner(parent)
+    owner = None if parent is None else ParentProcess(parent)
     look = time.monotonic()
     try:
         with termination_signals() as ended:

@@ -64,7 +64,7 @@ def from_bytes(raw: bytes) -> Command | None:
     return Command(word, value, holder, pid)
 
 
-class Holder:
+class CommandHolder:
     """Lets one screen at a time command a run.
 
     The first to do so holds the controls until it releases them, is gone, or another takes them.

@@ -29,7 +29,7 @@ from rig.bench.screens.commands import (
     COMMANDS,
     PAST,
     Command,
-    Holder,
+    CommandHolder,
     Judge,
     from_bytes,
     own_command,
@@ -138,7 +138,7 @@ class Publisher:
         )
         self._context = zmq.Context(1)
         self._closed = False
-        self._holder = Holder()
+        self._holder = CommandHolder()
         self.past: Callable[[], tuple[dict[str, Any], bytes]] | None = None
         self._watched = False
         try:

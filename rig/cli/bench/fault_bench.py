@@ -23,7 +23,7 @@ _PATIENCE: Final = 300.0  # [s]: a busy computer may take long to begin
 
 
 @dataclass(frozen=True)
-class BenchState:
+class FaultBenchState:
     """What the device says of itself, past the driver and the wire."""
 
     driven: bool  # an output is not zero, or a law may move one
@@ -47,9 +47,9 @@ class FaultBench:
         """Let faults of the wire act from now on; `at` and `until` count from now."""
         self._ask("strike", tuple(faults))
 
-    def state(self) -> BenchState:
+    def state(self) -> FaultBenchState:
         """Return what the device says of itself."""
-        answer: BenchState = self._ask("state")
+        answer: FaultBenchState = self._ask("state")
         return answer
 
     def end(self) -> None:
@@ -133,12 +133,12 @@ class _Child:
         ]
         self._served.link.use(moved)
 
-    def state(self) -> BenchState:
+    def state(self) -> FaultBenchState:
         served = self._served
         assert served is not None
         device = served.device
         driven = served.inside(lambda: device.laws.armed or bool(device.outputs.any()))
-        return BenchState(driven, self._seconds(), sum(served.link.injected.values()))
+        return FaultBenchState(driven, self._seconds(), sum(served.link.injected.values()))
 
     def end(self) -> None:
         served, self._served = self._served, None

@@ -12,7 +12,7 @@ from typing import Final
 
 from hil_sim.faults.wire import WireFault
 from rig.cli.bench.fault_bench import fault_bench
-from rig.cli.bench.fault_trials import Naming, Outcome, kinds, try_fault, wires
+from rig.cli.bench.fault_trials import Naming, TrialOutcome, kinds, try_fault, wires
 from rig.cli.bench.figure import Figure
 from rig.model.rig import Rig
 from rig.runs.rigs import load_rig
@@ -40,14 +40,14 @@ def jobs(wire: str, least: int) -> Iterator[tuple[int, str]]:
         yield wires().index(wire) + len(wires()) * number, names[number % len(names)]
 
 
-def fault_trials(folder: Path, least: int, say: Say) -> list[Outcome]:
+def fault_trials(folder: Path, least: int, say: Say) -> list[TrialOutcome]:
     """Run at least `least` trials in virtual time, each with a fault of its own."""
     with _quiet(), ThreadPoolExecutor(len(wires())) as pool:  # they wait more than they work
         outcomes = pool.map(lambda wire: _on_wire(folder, wire, least, say), wires())
         return [outcome for part in outcomes for outcome in part]
 
 
-def _on_wire(folder: Path, wire: str, least: int, say: Say) -> list[Outcome]:
+def _on_wire(folder: Path, wire: str, least: int, say: Say) -> list[TrialOutcome]:
     rig, found = impatient(load_rig(RIG)), []
     chosen = list(jobs(wire, least))
     with fault_bench() as bench:
@@ -65,7 +65,7 @@ def fault_figures(folder: Path, say: Say, least: int = LEAST) -> list[Figure]:
     return counted(fault_trials(folder, least, say))
 
 
-def counted(outcomes: Sequence[Outcome]) -> list[Figure]:
+def counted(outcomes: Sequence[TrialOutcome]) -> list[Figure]:
     """Return the counts of trials as figures."""
     of = Counter(outcome.naming for outcome in outcomes)
     known = kinds()

@@ -72,7 +72,7 @@ class Naming(StrEnum):
 
 
 @dataclass
-class Outcome:
+class TrialOutcome:
     """What one trial showed; `seconds` from the fault's begin to the end, None without an end.
 
     `blocks` were given to the guard, `lost_blocks` of them are not in records.h5 as they came;
@@ -147,7 +147,7 @@ class _Warnings(logging.Handler):
 
 def try_fault(
     bench: FaultBench, rig: Rig, wire: str, name: str, folder: Path, seed: int, *, realtime: bool
-) -> Outcome:
+) -> TrialOutcome:
     """Run one trial; the fault begins at an instant that the seed draws.
 
     Raises DeviceError where no session could be begun before the fault.
@@ -156,7 +156,7 @@ def try_fault(
     early = () if isinstance(fault, WireFault) else (fault,)
     endpoint = bench.begin(rig, wire, early, seed, realtime=realtime)
     reached = rig.model_copy(update={"wire": wire_at(endpoint, rig.wire)})
-    outcome, warned = Outcome(name, wire), _Warnings()
+    outcome, warned = TrialOutcome(name, wire), _Warnings()
     logging.getLogger().addHandler(warned)
     try:
         for tries_left in reversed(range(_TRIES)):
@@ -187,7 +187,7 @@ def _session(
     rig: Rig,
     fault: Fault,
     folder: Path,
-    outcome: Outcome,
+    outcome: TrialOutcome,
     seed: int,
     realtime: bool,
 ) -> None:
@@ -272,7 +272,7 @@ def _not_in(archive: Path, rig: Rig, blocks: Sequence[SampleBlock]) -> int:
 # -- what the operator reads against what was done ----------------------------------------------
 
 
-def naming(fault: Fault, outcome: Outcome) -> Naming:
+def naming(fault: Fault, outcome: TrialOutcome) -> Naming:
     """Return how well the end of a trial fits its fault.
 
     A message names a fault of a sensor or of the machine by its channel, joint or supply, one of
@@ -288,7 +288,7 @@ def naming(fault: Fault, outcome: Outcome) -> Naming:
     return Naming.WRONG if trip is None else _of_machine(fault, trip)
 
 
-def _without_end(fault: Fault, outcome: Outcome) -> Naming:
+def _without_end(fault: Fault, outcome: TrialOutcome) -> Naming:
     if outcome.missing:
         return Naming.COUNTED
     if isinstance(fault, WireFault | ClockDrift):

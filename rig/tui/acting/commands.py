@@ -12,8 +12,8 @@ from rig.model.alarms.states import Alarm, AlarmState, AlarmTable
 from rig.model.trips import RecordingFailed
 from rig.runs.runstate import EventLog
 from rig.tui.following.link import Frame, Link, LinkStage
-from rig.tui.jobs import Job, begin, rig_of_run
-from rig.tui.look import Dialog, Look, View
+from rig.tui.jobs import VerbJob, begin, rig_of_run
+from rig.tui.look import Dialog, PlotView, ScreenStyle
 from rig.tui.pages.operation import in_order
 from rig.tui.words import KeyAnswer, Stop
 
@@ -31,7 +31,7 @@ class Commands:
     }  # fmt: skip
 
     link: Link
-    look: Look
+    look: ScreenStyle
     me: str
     remark: str
     clock: Callable[[], float]
@@ -40,7 +40,7 @@ class Commands:
     seen_alarms: frozenset[tuple[int, str]]
     reset_alarms: frozenset[tuple[int, str]]
     ask: Callable[..., None]
-    view: Callable[[], View]
+    view: Callable[[], PlotView]
     redraw: Callable[[], None]
     stop_answered: Callable[[Stop, bool], None]
     alarms_of: Callable[[Frame], AlarmTable]
@@ -195,7 +195,7 @@ class Commands:
         rig, pid = rig_of_run(snapshot.run, snapshot.rig), snapshot.pid
         self.remark = "reset: asking the device ..."
 
-        def changed(job: Job) -> None:
+        def changed(job: VerbJob) -> None:
             if job.code == 0:
                 self.reset_alarms |= {(pid, alarm.key)}
                 self.remark = f"reset: {job.output.strip()}"
@@ -205,6 +205,6 @@ class Commands:
 
         self.start(("reset", "--rig", rig, "--reason", reason.strip()), changed)
 
-    def start(self, words: tuple[str, ...], changed: Callable[[Job], None]) -> None:
+    def start(self, words: tuple[str, ...], changed: Callable[[VerbJob], None]) -> None:
         """Start a verb as a process of its own."""
         begin(words, changed)

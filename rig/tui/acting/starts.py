@@ -13,7 +13,7 @@ from typing import Final
 from rig.runs.listing.summary import RunSummary
 from rig.tui.acting.commands import Commands
 from rig.tui.browse import TABS, Browsed, read_disk
-from rig.tui.jobs import Job, begin, rig_of_run
+from rig.tui.jobs import VerbJob, begin, rig_of_run
 from rig.tui.look import Dialog
 
 KEYS: Final = "↑ ↓ and Enter choose, Esc closes, SPACE stops"
@@ -166,7 +166,7 @@ class Starts(Commands):
             return
         self.look = replace(self.look, offset=0)
 
-        def changed(job: Job) -> None:
+        def changed(job: VerbJob) -> None:
             self.browsed = replace(self.browsed, job=job)
             if job.code is not None:
                 self.remark = f"{job.words[0]}: {job.ended}"

@@ -20,7 +20,7 @@ from rig.bench.screens.past import PastMinute, PlanLine
 from rig.bench.screens.sockets import Attachment, Endpoint, Snapshot
 from rig.runs.runstate import read_events
 from rig.tui.following.history import EMPTY, History, HistoryWindow
-from rig.tui.following.story import Line, from_events, tell
+from rig.tui.following.story import EventLine, from_events, tell
 
 log = logging.getLogger(__name__)
 
@@ -107,7 +107,7 @@ class Frame:
     received: float = 0.0
     window: HistoryWindow = EMPTY
     speed: float = 1.0  # device seconds per wall second
-    story: tuple[Line, ...] = ()  # what happened, oldest first, the newest STORY lines of it
+    story: tuple[EventLine, ...] = ()  # what happened, oldest first, the newest STORY lines of it
     told: int = 0  # how many lines there have ever been
     plan: tuple[PlanLine, ...] = ()
     estimates: tuple[tuple[float, Mapping[str, Sequence[float | None]]], ...] = ()  # by run time

@@ -14,7 +14,7 @@ KINDS: Final = ("all", "alarms", "protocol", "people")  # what the log can be fi
 
 
 @dataclass(frozen=True)
-class Line:
+class EventLine:
     """One thing that happened, at a time [s] since the run began; `kind` is one of KINDS."""
 
     time: float
@@ -26,7 +26,7 @@ class Line:
 Said = tuple[str, str, str]  # text, style, kind
 
 
-def tell(last: Snapshot | None, snapshot: Snapshot) -> list[Line]:
+def tell(last: Snapshot | None, snapshot: Snapshot) -> list[EventLine]:
     """Return what is new in a snapshot after the one before it (None: it is a run's first)."""
     said: list[Said] = []
     if last is not None and (last.run, last.pid) != (snapshot.run, snapshot.pid):
@@ -49,7 +49,7 @@ def tell(last: Snapshot | None, snapshot: Snapshot) -> list[Line]:
         said.append((f"TRIP  {trip_text(snapshot.trip)}", ALARM_TEXT, "alarms"))
     if last is not None and snapshot.state != last.state:
         said.append((f"state: {last.state} → {snapshot.state}", STRONG, "protocol"))
-    return [Line(snapshot.done_s, *parts) for parts in said if parts[0]]
+    return [EventLine(snapshot.done_s, *parts) for parts in said if parts[0]]
 
 
 def _alarms(last: Snapshot | None, snapshot: Snapshot) -> list[Said]:
@@ -86,7 +86,7 @@ def trip_text(trip: str) -> str:
     return trip.removeprefix("safety trip: ")
 
 
-def from_events(events: Iterable[Mapping[str, Any]], snapshot: Snapshot) -> list[Line]:
+def from_events(events: Iterable[Mapping[str, Any]], snapshot: Snapshot) -> list[EventLine]:
     """Return the lines of a run's event log, for a screen that attached late.
 
     Times come from the events' ticks: `snapshot` says how they relate to the run's beginning.
@@ -101,7 +101,7 @@ def from_events(events: Iterable[Mapping[str, Any]], snapshot: Snapshot) -> list
         if said is None or not isinstance(tick, int):
             continue
         at = max(snapshot.done_s - (snapshot.tick - tick) / rate, 0.0)
-        found.append(Line(at, *said))
+        found.append(EventLine(at, *said))
     return found
 
 

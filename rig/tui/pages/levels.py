@@ -5,7 +5,7 @@ from __future__ import annotations
 from rig.model import channels as ch
 from rig.tui.drawing.rows import Part, Row, beside, block, box, columns, fit, row
 from rig.tui.drawing.styles import ALARM_TEXT, DIM, STRONG, WARN_TEXT
-from rig.tui.look import View
+from rig.tui.look import PlotView
 from rig.tui.pages.parts import (
     CURVES,
     GAUGES,
@@ -24,7 +24,7 @@ TWO = 110  # from this width on, curves stand in two columns
 LIST = 26  # width of the list of channels
 
 
-def joint_page(view: View, width: int, height: int) -> list[Row]:
+def joint_page(view: PlotView, width: int, height: int) -> list[Row]:
     """Return one joint: every channel as a curve where there is room, and as a bar."""
     snapshot = view.frame.snapshot
     assert snapshot is not None
@@ -54,7 +54,7 @@ def joint_page(view: View, width: int, height: int) -> list[Row]:
     )
 
 
-def channel_page(view: View, width: int, height: int) -> list[Row]:
+def channel_page(view: PlotView, width: int, height: int) -> list[Row]:
     """Return every channel in a list, the marked one as a plot with its bands in words."""
     snapshot = view.frame.snapshot
     assert snapshot is not None
@@ -83,7 +83,7 @@ def channel_page(view: View, width: int, height: int) -> list[Row]:
     return beside([(listed, LIST), ([*plot, *text], room)], height)
 
 
-def diagnostics_page(view: View, width: int, height: int) -> list[Row]:
+def diagnostics_page(view: PlotView, width: int, height: int) -> list[Row]:
     """Return the health of sampling and of the link, with the device's own time."""
     frame = view.newest
     snapshot = frame.snapshot
@@ -124,5 +124,5 @@ def diagnostics_page(view: View, width: int, height: int) -> list[Row]:
     return block([*found, row(), *listed][:height], width, height)
 
 
-def _state_of(view: View, last: float) -> str:
+def _state_of(view: PlotView, last: float) -> str:
     return "INVALID" if last != last else said_of(view) or "live"  # noqa: PLR0124 - NaN

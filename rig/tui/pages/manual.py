@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from rig.tui.drawing.rows import Row, beside, block, fit, row, wrapped
 from rig.tui.drawing.styles import ASK, DIM, STRONG, WARN_TEXT
-from rig.tui.look import View
+from rig.tui.look import PlotView
 from rig.tui.pages.parts import bench_bars, joint_box, joints_in
 
 MANUAL = "manual"  # the kind of session that takes jogs
 
 
-def manual_page(view: View, width: int, height: int) -> list[Row]:
+def manual_page(view: PlotView, width: int, height: int) -> list[Row]:
     """Return what can be done by hand now, and the joints."""
     snapshot = view.newest.snapshot
     if snapshot is None or view.newest.over:

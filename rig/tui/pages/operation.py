@@ -10,8 +10,8 @@ from rig.model.alarms.states import Alarm, folded
 from rig.tui.drawing.plot import PlotTrace, draw, time_axis
 from rig.tui.drawing.rows import Row, beside, block, box, columns, fit, row, wrapped
 from rig.tui.drawing.styles import ASK, ASK_TEXT, DIM, NORMAL, STRONG, WARN_TEXT
-from rig.tui.following.story import Line
-from rig.tui.look import View
+from rig.tui.following.story import EventLine
+from rig.tui.look import PlotView
 from rig.tui.pages.overview import alarm_mark
 from rig.tui.pages.parts import said_of
 from rig.tui.units import clock_text, limit, shown
@@ -22,7 +22,7 @@ AFTER = 0.5  # and after it [s]
 WIDE = 110  # from this width on, details stand beside the list
 
 
-def in_order(view: View) -> list[tuple[Alarm, bool]]:
+def in_order(view: PlotView) -> list[tuple[Alarm, bool]]:
     """Return the alarms as listed, each with whether it is a consequence of one above."""
     found = []
     for first, rest in folded(view.alarms):
@@ -31,7 +31,7 @@ def in_order(view: View) -> list[tuple[Alarm, bool]]:
     return found
 
 
-def alarms_page(view: View, width: int, height: int) -> list[Row]:
+def alarms_page(view: PlotView, width: int, height: int) -> list[Row]:
     """Return the alarms, first causes on top, and the marked one in full."""
     listed = in_order(view)
     if not listed:
@@ -64,7 +64,7 @@ def _window(rows: list[Row], at: int, height: int) -> list[Row]:
     return rows[first : first + height]
 
 
-def _detail(view: View, alarm: Alarm, width: int, height: int) -> list[Row]:
+def _detail(view: PlotView, alarm: Alarm, width: int, height: int) -> list[Row]:
     how = shown(alarm.unit)
     low, high = (limit(end) if math.isfinite(end) else None for end in alarm.limit)
     allowed = " … ".join(how.short(end) or "any" for end in (low, high))
@@ -91,7 +91,7 @@ def _detail(view: View, alarm: Alarm, width: int, height: int) -> list[Row]:
     return box(alarm.key, [*body, *plot], width, height)
 
 
-def _before(view: View, alarm: Alarm, width: int, height: int) -> list[Row]:
+def _before(view: PlotView, alarm: Alarm, width: int, height: int) -> list[Row]:
     """Return the 2 s before an alarm as a plot; nothing where they are not known."""
     window = view.frame.window
     if height < 4 or alarm.channel not in window.columns:
@@ -107,7 +107,7 @@ def _before(view: View, alarm: Alarm, width: int, height: int) -> list[Row]:
     return [row((text, DIM)), *draw(trace, width, height - 1)]
 
 
-def protocol_page(view: View, width: int, height: int) -> list[Row]:
+def protocol_page(view: PlotView, width: int, height: int) -> list[Row]:
     """Return the steps with the present one, what is asked, and who is in command."""
     snapshot = view.newest.snapshot
     assert snapshot is not None
@@ -141,7 +141,7 @@ def protocol_page(view: View, width: int, height: int) -> list[Row]:
     return block([*head, row(), *_window(steps, at - 1, height - len(head) - 1)], width, height)
 
 
-def filtered(view: View) -> list[Line]:
+def filtered(view: PlotView) -> list[EventLine]:
     """Return the lines of the log that the operator's filter and search keep."""
     wanted = view.look.search.lower()
     return [
@@ -151,7 +151,7 @@ def filtered(view: View) -> list[Line]:
     ]
 
 
-def log_page(view: View, width: int, height: int) -> list[Row]:
+def log_page(view: PlotView, width: int, height: int) -> list[Row]:
     """Return the log, the newest below; scrolled by whole lines."""
     lines = filtered(view)
     room = height - 1
@@ -165,7 +165,7 @@ def log_page(view: View, width: int, height: int) -> list[Row]:
     return block([head, *rows], width, height)
 
 
-def estimates_page(view: View, width: int, height: int) -> list[Row]:
+def estimates_page(view: PlotView, width: int, height: int) -> list[Row]:
     """Return each parameter that is followed with its 95 % interval, over the run's time."""
     series = view.newest.estimates
     names = [name for name in (series[-1][1] if series else {}) if _known(view, name)]
@@ -183,11 +183,11 @@ def estimates_page(view: View, width: int, height: int) -> list[Row]:
     return block(rows, width, height)
 
 
-def _known(view: View, name: str) -> bool:
+def _known(view: PlotView, name: str) -> bool:
     return view.newest.estimates[-1][1][name][0] is not None
 
 
-def _estimate(view: View, name: str, width: int, height: int) -> list[Row]:
+def _estimate(view: PlotView, name: str, width: int, height: int) -> list[Row]:
     nan = float("nan")
     points = [
         (at, [nan if v is None else float(v) for v in found[name]])

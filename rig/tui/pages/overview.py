@@ -15,7 +15,7 @@ from rig.tui.drawing.styles import (
     WARN,
     WARN_TEXT,
 )
-from rig.tui.look import View
+from rig.tui.look import PlotView
 from rig.tui.pages.parts import WIDTH, bench_bars, joint_box, joints_in
 from rig.tui.units import clock_text, shown
 from rig.tui.words import Headline, Margin, headline, nearest_margin
@@ -25,7 +25,7 @@ BIG = (150, 45)  # terminal of this size: letters twice as large
 GLANCE = 3  # alarms listed
 
 
-def overview(view: View, width: int, height: int) -> list[Row]:
+def overview(view: PlotView, width: int, height: int) -> list[Row]:
     """Return state, margin and time left in large letters, then alarms, then the joints."""
     snapshot = view.frame.snapshot
     assert snapshot is not None
@@ -39,7 +39,9 @@ def overview(view: View, width: int, height: int) -> list[Row]:
     return [*rows, *_joints(view, joints, width, height - len(rows) - len(bars)), *bars]
 
 
-def _band(found: Headline, margin: Margin | None, view: View, width: int, scale: int) -> list[Row]:
+def _band(
+    found: Headline, margin: Margin | None, view: PlotView, width: int, scale: int
+) -> list[Row]:
     """Return the large letters; what is not normal fills the band with its colour."""
     snapshot = view.newest.snapshot
     assert snapshot is not None
@@ -72,7 +74,7 @@ def _band(found: Headline, margin: Margin | None, view: View, width: int, scale:
     return beside(blocks, high + 1)
 
 
-def _step_line(view: View, snapshot: Snapshot, width: int) -> Row:
+def _step_line(view: PlotView, snapshot: Snapshot, width: int) -> Row:
     part = f"{snapshot.part} of {snapshot.parts}: " if snapshot.parts else ""
     now = row((" now   ", DIM), (f"{part}{snapshot.step or '–'} {snapshot.phase}", STRONG))
     plan = view.newest.plan
@@ -94,7 +96,7 @@ def _margin_line(margin: Margin | None, width: int) -> Row:
     return fit(row((" limit ", DIM), (text, style)), width)
 
 
-def alarm_lines(view: View, width: int, most: int) -> list[Row]:
+def alarm_lines(view: PlotView, width: int, most: int) -> list[Row]:
     """Return the most urgent alarms, one line each; unacknowledged ones blink."""
     groups = folded(view.alarms)
     if not groups:
@@ -111,7 +113,7 @@ def alarm_lines(view: View, width: int, most: int) -> list[Row]:
     return rows
 
 
-def alarm_mark(view: View, alarm: Alarm) -> Row:
+def alarm_mark(view: PlotView, alarm: Alarm) -> Row:
     """Return an alarm's shape and state; its colour blinks until somebody has acknowledged it."""
     shape, style, text = ("■", ALARM, ALARM_TEXT) if alarm.trips else ("▲", WARN, WARN_TEXT)
     bright = alarm.acknowledged or view.look.blink
@@ -120,7 +122,7 @@ def alarm_mark(view: View, alarm: Alarm) -> Row:
     return row((f" {word} ", text if alarm.acknowledged else style if bright else text))
 
 
-def _joints(view: View, joints: list[int], width: int, height: int) -> list[Row]:
+def _joints(view: PlotView, joints: list[int], width: int, height: int) -> list[Row]:
     """Return the joints side by side; those that do not fit are reached by scrolling."""
     if not joints or height < 3:
         return block([], width, max(height, 0))

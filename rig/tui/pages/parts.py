@@ -11,7 +11,7 @@ from rig.model import channels as ch
 from rig.tui.drawing.plot import PlotTrace, draw, time_axis
 from rig.tui.drawing.rows import Row, box, fit, row
 from rig.tui.drawing.styles import DIM, STRONG, WARN_TEXT
-from rig.tui.look import View
+from rig.tui.look import PlotView
 from rig.tui.pages.gauge import gauge
 from rig.tui.units import limit, shown
 from rig.tui.words import Freshness, value
@@ -41,7 +41,7 @@ def short_name(kind: str) -> str:
     return NAMES.get(kind, kind)
 
 
-def said_of(view: View) -> str:
+def said_of(view: PlotView) -> str:
     """Return what stands beside a picture that is not live, empty where it is."""
     return {
         Freshness.LIVE: "",
@@ -52,7 +52,7 @@ def said_of(view: View) -> str:
     }[view.fresh]
 
 
-def bar_of(view: View, name: str, label: str, width: int) -> Row:
+def bar_of(view: PlotView, name: str, label: str, width: int) -> Row:
     """Return a channel as a bar between its limits."""
     snapshot, window = view.frame.snapshot, view.frame.window
     assert snapshot is not None
@@ -72,7 +72,9 @@ def _warned(snapshot: Snapshot, name: str) -> tuple[float, float] | None:
     return low - spare, high + spare
 
 
-def curve(view: View, name: str, label: str, width: int, height: int, *, axis: bool) -> list[Row]:
+def curve(
+    view: PlotView, name: str, label: str, width: int, height: int, *, axis: bool
+) -> list[Row]:
     """Return a channel in words and as a plot of `height` rows in all."""
     snapshot, window = view.frame.snapshot, view.frame.window
     assert snapshot is not None
@@ -102,7 +104,7 @@ def curve(view: View, name: str, label: str, width: int, height: int, *, axis: b
     return [*rows, time_axis(start, stop, width)] if axis else rows
 
 
-def curves(view: View, names: dict[str, str], width: int, height: int) -> list[Row]:
+def curves(view: PlotView, names: dict[str, str], width: int, height: int) -> list[Row]:
     """Return as many of the channels ({name: label}) as curves as there is room for."""
     count = min(len(names), height // CURVE_HEIGHT)
     axis = height > CURVE_HEIGHT * count
@@ -114,7 +116,7 @@ def curves(view: View, names: dict[str, str], width: int, height: int) -> list[R
     return rows
 
 
-def joint_title(view: View, joint: int) -> str:
+def joint_title(view: PlotView, joint: int) -> str:
     """Return a joint's name with what it does now."""
     snapshot = view.frame.snapshot
     roles = snapshot.roles if snapshot is not None else []
@@ -122,7 +124,7 @@ def joint_title(view: View, joint: int) -> str:
     return f"joint {joint} {role}".rstrip()
 
 
-def joint_box(view: View, joint: int, width: int, height: int) -> list[Row]:
+def joint_box(view: PlotView, joint: int, width: int, height: int) -> list[Row]:
     """Return one joint in a frame: curves where there is room, bars always."""
     snapshot = view.frame.snapshot
     assert snapshot is not None
@@ -139,7 +141,7 @@ def joint_box(view: View, joint: int, width: int, height: int) -> list[Row]:
     return box(title, [*above, *bars], width, height, style, f"last {view.look.seconds:g} s")
 
 
-def bench_bars(view: View, width: int) -> list[Row]:
+def bench_bars(view: PlotView, width: int) -> list[Row]:
     """Return supply pressure and oil temperature as bars, side by side where there is room."""
     snapshot = view.frame.snapshot
     assert snapshot is not None

@@ -10,13 +10,13 @@ from rig.runs.listing.summary import RunSummary
 from rig.tui.browse import TABS
 from rig.tui.drawing.rows import Part, Row, beside, block, box, columns, fit, row, wrapped
 from rig.tui.drawing.styles import ALARM_TEXT, DIM, NORMAL, STRONG, WARN_TEXT
-from rig.tui.look import View
+from rig.tui.look import PlotView
 
 WIDE = 110  # from this width on, the verb's output stands beside the list
 STATES = {"tripped": "■", "unreadable": "✕", "interrupted": "▲", "aborted": "▲", "running": "●"}
 
 
-def runs_page(view: View, width: int, height: int) -> list[Row]:
+def runs_page(view: PlotView, width: int, height: int) -> list[Row]:
     """Return the open tab with the marked line, and the newest verb's output."""
     found = view.browsed
     tabs: Row = ((" ", ""),)
@@ -51,7 +51,7 @@ def _around(rows: list[Row], at: int, height: int) -> list[Row]:
     return rows[first : first + height]
 
 
-def _lines(view: View) -> list[Row]:
+def _lines(view: PlotView) -> list[Row]:
     found = view.browsed
     if found.name == "protocols":
         return [row(f" {name}") for name in found.protocols]
@@ -72,7 +72,7 @@ def _item(item: Item) -> list[str | Part]:
     return [f" {item.id}", (item.state, STRONG), item.job.name, item.reason]
 
 
-def _job(view: View, width: int, height: int) -> list[Row]:
+def _job(view: PlotView, width: int, height: int) -> list[Row]:
     """Return a verb with its output: a check's envelopes, parameters with intervals, progress."""
     job = view.browsed.job
     assert job is not None

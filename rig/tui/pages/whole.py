@@ -8,14 +8,14 @@ from typing import Final
 from rig.tui.drawing.rows import Row, beside, block, box, ends, fit, row, wrapped
 from rig.tui.drawing.styles import ASK, DIM, LEVELS, NORMAL, STRONG, SYMBOLS, WARN_TEXT
 from rig.tui.following.link import LinkStage
-from rig.tui.look import PAGES, View
+from rig.tui.look import PAGES, PlotView
 from rig.tui.pages import levels, manual, operation, overview, runs
 from rig.tui.units import age_text, clock_text
 from rig.tui.words import VERY_OLD, Freshness, headline, notices, run_time
 
 LEAST: Final = (60, 16)  # a smaller terminal shows the state and the stop, nothing else
 NOTICES: Final = 6  # rows they may take
-Page = Callable[[View, int, int], list[Row]]
+Page = Callable[[PlotView, int, int], list[Row]]
 OF_A_RUN: Final[Mapping[str, Page]] = {
     "overview": overview.overview,
     "joint": levels.joint_page,
@@ -40,7 +40,7 @@ KEYS: Final = {
 }
 
 
-def compose(view: View, width: int, height: int) -> list[Row]:
+def compose(view: PlotView, width: int, height: int) -> list[Row]:
     """Return `height` rows of `width` cells: the picture of everything."""
     if width <= 0 or height <= 0:
         return []
@@ -55,7 +55,7 @@ def compose(view: View, width: int, height: int) -> list[Row]:
     return _above(rows, view, width) if view.dialog is not None else rows
 
 
-def _page(view: View, width: int, height: int) -> list[Row]:
+def _page(view: PlotView, width: int, height: int) -> list[Row]:
     if view.look.page == "runs":
         return runs.runs_page(view, width, height)
     if view.look.page == "manual":
@@ -68,7 +68,7 @@ def _page(view: View, width: int, height: int) -> list[Row]:
     return page(view, width, height) if page is not None else []
 
 
-def too_small(view: View, width: int, height: int) -> list[Row]:
+def too_small(view: PlotView, width: int, height: int) -> list[Row]:
     """Return what a terminal without room for a page still says: the state, and that keys stop."""
     found = headline(view.newest, view.now)
     style = LEVELS[found.level]
@@ -80,12 +80,12 @@ def too_small(view: View, width: int, height: int) -> list[Row]:
     return block(lines, width, height)
 
 
-def header(view: View, width: int) -> list[Row]:
+def header(view: PlotView, width: int) -> list[Row]:
     """Return the lines on top: state, run, age and clock; the step; the pages."""
     return [_who(view, width), _where(view, width), _tabs(view, width)]
 
 
-def _who(view: View, width: int) -> Row:
+def _who(view: PlotView, width: int) -> Row:
     found = headline(view.newest, view.now)
     badge = (f" {found.symbol} {found.word} ", LEVELS[found.level])
     snapshot = view.newest.snapshot
@@ -106,7 +106,7 @@ def _who(view: View, width: int) -> Row:
     return ends(row(badge, (f" {snapshot.rig}", STRONG), (f"  {name}", DIM)), right, width)
 
 
-def _where(view: View, width: int) -> Row:
+def _where(view: PlotView, width: int) -> Row:
     snapshot = view.newest.snapshot
     if snapshot is None:
         return fit(row(), width)
@@ -124,7 +124,7 @@ def _where(view: View, width: int) -> Row:
     return ends(line, (*progress, (" ", "")), width)
 
 
-def _tabs(view: View, width: int) -> Row:
+def _tabs(view: PlotView, width: int) -> Row:
     count = len(view.alarms.alarms)
     fresh = len(view.alarms.unacknowledged)
     line: Row = ()
@@ -137,7 +137,7 @@ def _tabs(view: View, width: int) -> Row:
     return fit(line, width)
 
 
-def notice_rows(view: View, width: int) -> list[Row]:
+def notice_rows(view: PlotView, width: int) -> list[Row]:
     """Return what the operator must not miss, each on its own colour over the whole width."""
     rows: list[Row] = []
     found = notices(view.newest, view.stop, view.now, paused=view.held)
@@ -153,7 +153,7 @@ def notice_rows(view: View, width: int) -> list[Row]:
     return rows[:NOTICES]
 
 
-def _keys(view: View, width: int) -> Row:
+def _keys(view: PlotView, width: int) -> Row:
     stop = row((" SPACE STOP ", LEVELS["normal"]))
     if width >= 116:
         stop = (*stop, (" Esc-Esc too ", DIM))
@@ -161,7 +161,7 @@ def _keys(view: View, width: int) -> Row:
     return ends((*stop, (f" {keys}", "")), row((" ? help  q quit ", DIM)), width)
 
 
-def waiting(view: View, width: int, height: int) -> list[Row]:
+def waiting(view: PlotView, width: int, height: int) -> list[Row]:
     """Return what stands where there is no run: how to start one."""
     rig = view.rig or "shinshu-2dof"
     which = f" on rig {view.rig}" if view.rig else ""
@@ -178,7 +178,7 @@ def waiting(view: View, width: int, height: int) -> list[Row]:
     return block(lines, width, height)
 
 
-def chooser(view: View, width: int, height: int) -> list[Row]:
+def chooser(view: PlotView, width: int, height: int) -> list[Row]:
     """Return the runs to choose from."""
     lines = [
         row((" Several runs. Which one?  Enter attaches; SPACE stops the marked one.", STRONG))
@@ -190,7 +190,7 @@ def chooser(view: View, width: int, height: int) -> list[Row]:
     return block(lines, width, height)
 
 
-def _above(rows: list[Row], view: View, width: int) -> list[Row]:
+def _above(rows: list[Row], view: PlotView, width: int) -> list[Row]:
     """Return the rows with the open question over them."""
     dialog = view.dialog
     assert dialog is not None

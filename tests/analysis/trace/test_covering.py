@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from analysis.trace.next_experiment.discrimination import View, calibration, view
+from analysis.trace.next_experiment.discrimination import MeasurementView, calibration, view
 from analysis.trace.next_experiment.excitations import (
     FAMILIES,
     CandidateExcitation,
@@ -18,7 +18,7 @@ from tests.analysis.trace.test_next_experiment import sine
 
 
 @pytest.fixture(scope="module")
-def candidates() -> tuple[list[CandidateExcitation], list[View]]:
+def candidates() -> tuple[list[CandidateExcitation], list[MeasurementView]]:
     """Joint 2 moved at creeping speed and at all frequencies, on the twin of the bench."""
     rig, train_data = sine()
     first = settings(rig, train_data.records)[0]
@@ -34,7 +34,7 @@ def clue(variable: str, by: str = "") -> Dependence:
 
 
 def test_what_moves_with_the_acceleration_asks_for_faster_lines(
-    candidates: tuple[list[CandidateExcitation], list[View]],
+    candidates: tuple[list[CandidateExcitation], list[MeasurementView]],
 ) -> None:
     _, train_data = sine()
     found = farther(train_data, [clue("acceleration_2")], candidates[1], 1.3)
@@ -45,7 +45,7 @@ def test_what_moves_with_the_acceleration_asks_for_faster_lines(
 
 
 def test_a_clue_that_cannot_be_carried_farther_yields_to_the_next(
-    candidates: tuple[list[CandidateExcitation], list[View]],
+    candidates: tuple[list[CandidateExcitation], list[MeasurementView]],
 ) -> None:
     _, train_data = sine()
     moves = [clue("time"), clue("piston_2", "acceleration_2")]
@@ -56,7 +56,7 @@ def test_a_clue_that_cannot_be_carried_farther_yields_to_the_next(
 
 
 def test_records_of_one_sine_ask_for_many_lines(
-    candidates: tuple[list[CandidateExcitation], list[View]],
+    candidates: tuple[list[CandidateExcitation], list[MeasurementView]],
 ) -> None:
     _, train_data = sine()
     found = richer(train_data, [clue("supply_pressure")], candidates[0])

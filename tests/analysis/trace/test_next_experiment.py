@@ -15,7 +15,7 @@ from analysis.trace.data.regression_data import RegressionData, regression_data
 from analysis.trace.next_experiment.discrimination import (
     Explanation,
     Ground,
-    Question,
+    OpenQuestion,
     calibration,
     loudest,
     present,
@@ -70,15 +70,15 @@ def test_how_the_joints_stood_is_read_from_the_records() -> None:
 def test_what_an_explanation_can_imitate_is_no_separation() -> None:
     old, new = grounds()
     half = Explanation(LEAK.effects, {"c_internal_2": 5e-13})
-    assert separation(Question(LEAK, half), old, new)[0] < 1e-3
+    assert separation(OpenQuestion(LEAK, half), old, new)[0] < 1e-3
     # Against the baseline alone the same leak stands out far above the noise.
-    assert separation(Question(LEAK, Explanation(), False), old, new)[0] > 3.0
+    assert separation(OpenQuestion(LEAK, Explanation(), False), old, new)[0] > 3.0
 
 
 def test_the_separation_is_the_rms_that_stands_out_of_the_new_rows() -> None:
     """By hand: whiten, project with a QR of one's own, count energy per row and repeat."""
     old, new = grounds()
-    question = Question(AIR, LEAK, False)
+    question = OpenQuestion(AIR, LEAK, False)
     assert new.seen is not None
     energy = []
     for ground in (old, new):
@@ -99,7 +99,7 @@ def test_the_separation_is_the_rms_that_stands_out_of_the_new_rows() -> None:
 
 def test_air_hardly_shows_on_the_sine_and_shows_on_fast_lines() -> None:
     old, new = grounds()
-    question = Question(AIR, Explanation(), False)
+    question = OpenQuestion(AIR, Explanation(), False)
     assert present(question, old) < 0.5
     assert separation(question, old, new)[0] > 2 * present(question, old)
     _, small = grounds("small")

@@ -9,7 +9,7 @@ from typing import Annotated, Final
 
 import typer
 
-from drivers.conformance import Effort, Report, Subject, Verdict, run
+from drivers.conformance import CheckVerdict, ConformanceReport, RandomCallBudget, Subject, run
 from rig.cli.errors import WorkError
 from rig.cli.output import progress, table
 from rig.model.parse import InputError
@@ -47,10 +47,10 @@ def conformance(
         with subject.make() as bench:
             faults = len(bench.faults)
         with quiet():
-            report = run(subject, effort=Effort(sequences, calls))
+            report = run(subject, effort=RandomCallBudget(sequences, calls))
         rows.append(_row(report, faults, time.perf_counter() - began))
-        failed += len(report.of(Verdict.FAILED))
-        for verdict in (Verdict.FAILED, Verdict.SKIPPED):
+        failed += len(report.of(CheckVerdict.FAILED))
+        for verdict in (CheckVerdict.FAILED, CheckVerdict.SKIPPED):
             for result in report.of(verdict):
                 typer.echo(f"{name}: {verdict} {result.check}: {result.reason}")
     typer.echo(table(("wire", "faults", "passed", "failed", "skipped", "seconds"), rows))
@@ -58,8 +58,8 @@ def conformance(
         raise WorkError(f"{failed} checks failed; their reasons stand above the table")
 
 
-def _row(report: Report, faults: int, seconds: float) -> tuple[str, ...]:
-    verdicts = (Verdict.PASSED, Verdict.FAILED, Verdict.SKIPPED)
+def _row(report: ConformanceReport, faults: int, seconds: float) -> tuple[str, ...]:
+    verdicts = (CheckVerdict.PASSED, CheckVerdict.FAILED, CheckVerdict.SKIPPED)
     counts = (str(len(report.of(verdict))) for verdict in verdicts)
     return (report.subject, str(faults), *counts, f"{seconds:.0f}")
 

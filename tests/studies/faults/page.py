@@ -13,7 +13,7 @@ from hil_sim.faults.device import DeviceFault
 from hil_sim.faults.wire import WireFault
 from rig.cli.bench.fault_bench import fault_bench
 from rig.cli.bench.fault_figures import RIG, counted
-from rig.cli.bench.fault_trials import Outcome, kinds, try_fault, wires
+from rig.cli.bench.fault_trials import TrialOutcome, kinds, try_fault, wires
 from rig.cli.bench.figures import text
 from rig.model.trips import SafetyTrip
 from rig.runs.rigs import load_rig
@@ -36,7 +36,7 @@ def table_rows() -> list[tuple[str, str]]:
     return rows
 
 
-def one_of_each(folder: Path, say: Say) -> list[Outcome]:
+def one_of_each(folder: Path, say: Say) -> list[TrialOutcome]:
     """Run one session in real time for each row of the table."""
     rig, found = load_rig(RIG), []
     with fault_bench() as bench, quiet():
@@ -47,7 +47,7 @@ def one_of_each(folder: Path, say: Say) -> list[Outcome]:
     return found
 
 
-def noticed(outcomes: Sequence[Outcome]) -> str:
+def noticed(outcomes: Sequence[TrialOutcome]) -> str:
     """Return the table of one session a fault as Markdown."""
     rows = [HEADER, tuple("---" for _ in HEADER)]
     for outcome in outcomes:
@@ -67,9 +67,9 @@ def noticed(outcomes: Sequence[Outcome]) -> str:
     return "\n".join("| " + " | ".join(cells) + " |" for cells in rows)
 
 
-def _by_fault(outcomes: Sequence[Outcome]) -> list[tuple[str, ...]]:
+def _by_fault(outcomes: Sequence[TrialOutcome]) -> list[tuple[str, ...]]:
     """Return a row for each fault and wire: how often each naming came, and the slowest end."""
-    groups: dict[tuple[str, str], list[Outcome]] = {}
+    groups: dict[tuple[str, str], list[TrialOutcome]] = {}
     for fault in dict.fromkeys(outcome.fault for outcome in outcomes):
         for wire in wires():
             group = [o for o in outcomes if o.fault == fault and o.wire == wire]
@@ -86,7 +86,7 @@ def _by_fault(outcomes: Sequence[Outcome]) -> list[tuple[str, ...]]:
     return rows
 
 
-def counts(outcomes: Sequence[Outcome]) -> str:
+def counts(outcomes: Sequence[TrialOutcome]) -> str:
     """Return the counts of many sessions as Markdown: the figures, then a row a fault and wire."""
     head = ("fault", "wire", "sessions", "ended as", "slowest end")
     rows = [head, tuple("---" for _ in head), *_by_fault(outcomes)]
@@ -94,7 +94,7 @@ def counts(outcomes: Sequence[Outcome]) -> str:
     return f"```text\n{text(counted(outcomes))}\n```\n\n{table}"
 
 
-def _what_notices(outcome: Outcome) -> str:
+def _what_notices(outcome: TrialOutcome) -> str:
     error = outcome.error
     if isinstance(error, SafetyTrip):
         return f"guard: {error.limit}"
@@ -110,7 +110,7 @@ def _what_notices(outcome: Outcome) -> str:
     return "nothing" if outcome.naming == "unnoticed" else "nothing has to: every sample came"
 
 
-def _kept(outcome: Outcome) -> str:
+def _kept(outcome: TrialOutcome) -> str:
     whole = outcome.blocks - outcome.lost_blocks
     kept = f"all {whole} blocks" if not outcome.lost_blocks else f"{whole} of {outcome.blocks}"
     return f"{kept}, {outcome.missing} samples marked missing" if outcome.missing else kept

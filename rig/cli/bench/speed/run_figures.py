@@ -13,7 +13,7 @@ import numpy as np
 from drivers import make_driver, wire_at
 from protocols.engine import engine
 from protocols.engine.desk import Desk
-from protocols.engine.states import Machine, State
+from protocols.engine.states import EngineState, StateMachine
 from protocols.files import library
 from protocols.files.plan import Overrides, resolve
 from rig.bench.guard import GuardSettings
@@ -103,8 +103,8 @@ def _protocol_run(rig: Rig, folder: Path) -> tuple[_Cost, int]:
     plan = resolve(library.load(PROTOCOL), rig, Overrides(repeats=1, steps=(STEP,)))
     with simulated_bench(RIG, seed=0) as endpoint:
         reached = _at(rig, endpoint)
-        driver, machine = make_driver(reached.wire, reached), Machine()
-        machine.to(State.CHECKING, PROTOCOL)
+        driver, machine = make_driver(reached.wire, reached), StateMachine()
+        machine.to(EngineState.CHECKING, PROTOCOL)
         recorder, publisher = Recorder(folder, reached), Publisher(f"bench-{rig.name}")
         with Bench(reached, driver, recorder, publisher, signals=False) as bench:
             first = bench.exchange()

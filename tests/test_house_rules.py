@@ -1,7 +1,9 @@
-"""An effect is its class in the catalogue and its plant form; nobody else knows its name."""
+"""Rules of CONTRIBUTING.md that no linter checks: effects in two files, class names, folders."""
 
 from __future__ import annotations
 
+import ast
+from collections import defaultdict
 from pathlib import Path
 
 import pytest
@@ -11,6 +13,7 @@ from analysis.terms import known
 from hil_sim.effects import CLASSES
 
 ROOT = Path(__file__).parents[1]
+PACKAGES = ("rig", "protocols", "drivers", "analysis", "hil_sim")
 EFFECTS = {name: kind for name, kind in known().items() if issubclass(kind, Effect)}
 # What has a name has a form of the plant; a mechanism whose curve the data draw has none.
 CATALOGUE = {name: kind for name, kind in EFFECTS.items() if not kind.free}
@@ -28,8 +31,7 @@ def test_no_other_file_of_the_product_knows_an_effect_by_name(name: str) -> None
     homes = (ROOT / "analysis" / "effects", ROOT / "hil_sim" / "effects")
     users = [
         str(path.relative_to(ROOT))
-        for package in ("rig", "protocols", "drivers", "analysis", "hil_sim")
-        for path in (ROOT / package).rglob("*.py")
+        for path in _modules()
         if not any(home in path.parents for home in homes)
         and f'"{name}"' in path.read_text(encoding="utf-8")
     ]
@@ -41,3 +43,23 @@ def test_an_effect_carries_the_smallest_size_of_interest(kind: type[Effect]) -> 
     if kind.name in ("payload", "sensor_offset"):  # cannot show alone; differs by channel
         return
     assert kind.least or kind.least_shape
+
+
+def test_no_two_public_classes_share_a_name() -> None:
+    """An effect's class in the catalogue and its plant form are the one exception."""
+    homes: dict[str, list[str]] = defaultdict(list)
+    for path in _modules():
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                homes[node.name].append(path.relative_to(ROOT).as_posix())
+    pair = ["analysis/effects", "hil_sim/effects"]
+    shared = {
+        name: places
+        for name, places in homes.items()
+        if len(places) > 1 and sorted(str(Path(place).parent) for place in places) != pair
+    }
+    assert shared == {}
+
+
+def _modules() -> list[Path]:
+    return [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
