@@ -104,7 +104,7 @@ def lateness_cost(
         return None
     shifts, lost = [], []
     for _ in range(DESIGN.late_draws):
-        late = {one.step.name: taken_late(one.record, jitter, rng) for one in played}
+        late = {play.step.name: taken_late(play.record, jitter, rng) for play in played}
         found = _bulk(rig, played, terms, filtering, late)
         if found is not None:
             shifts.append(found / even - 1.0)
@@ -113,7 +113,7 @@ def lateness_cost(
     share = float(np.mean(lost))
     if not shifts:
         return LatenessCost(jitter, math.nan, math.nan, share)
-    repeats = min(max(one.step.repeats, 1) for one in played)
+    repeats = min(max(play.step.repeats, 1) for play in played)
     scatter = float(np.std(shifts, ddof=1)) / math.sqrt(repeats) if len(shifts) > 1 else 0.0
     return LatenessCost(jitter, float(np.mean(shifts)), scatter, share)
 
@@ -131,11 +131,11 @@ def _bulk(
     if BULK not in names:
         return None
     triangles = []
-    for one in played:
-        record = late.get(one.step.name, one.record)
+    for play in played:
+        record = late.get(play.step.name, play.record)
         (built,) = build_rows(exact, [Run(exact, (record,), source="twin")], terms, filtering)
         mine = [r for name, r in built.rows.items() if family_of(name) == "fluid"]
-        weight = math.sqrt(max(one.step.repeats, 1))
+        weight = math.sqrt(max(play.step.repeats, 1))
         X = np.concatenate([r.matrix for r in mine])
         triangles.append(weight * triangle(X, np.concatenate([r.rhs for r in mine])))
     R = merge(triangles)

@@ -46,7 +46,7 @@ class Candidate:
 
     tones: Mapping[int, Tone]
     played: Played
-    found: StepInformation
+    information: StepInformation
     share: float
     limit: str
 
@@ -88,15 +88,15 @@ def improve(
     ]
     if not free:
         raise InputError("no step has a multisine to improve; start from lock-and-excite-multisine")
-    search.begin([c.found for c in candidates])
-    before = search.errors([c.found for c in candidates])
-    shares = {c.found.step: (c.share, c.limit) for c in candidates}
+    search.begin([c.information for c in candidates])
+    before = search.errors([c.information for c in candidates])
+    shares = {c.information.step: (c.share, c.limit) for c in candidates}
     plays, kept, children = 0, 0, 0
     for s, _ in dict.fromkeys((s, 0) for s, _ in free):
         candidates[s], cost = search.fitted(candidates[s])
         plays += cost
-    best = search.value([c.found for c in candidates])
-    search.loosen([c.found for c in candidates])
+    best = search.value([c.information for c in candidates])
+    search.loosen([c.information for c in candidates])
     shapes = [(s, joint, tilt) for tilt in DESIGN.first_tilts for s, joint in free]
     while plays < budget:
         s, joint, tilt = shapes.pop(0) if shapes else (*free[int(rng.integers(len(free)))], None)
@@ -105,14 +105,14 @@ def improve(
         if child is None:
             continue
         trial = [*candidates[:s], child, *candidates[s + 1 :]]
-        value = search.value([c.found for c in trial])
+        value = search.value([c.information for c in trial])
         if value < best and passes(child.played.step, child.tones):
             candidates, best, kept = trial, value, kept + 1
             say(f"{plays:4d} of {budget}: {search.text(value)} ({child.limit} {child.share:.0%})")
     return Design(
         tuple(c.played.step for c in candidates), tuple(c.tones for c in candidates), before,
-        search.errors([c.found for c in candidates]), shares,
-        {c.found.step: (c.share, c.limit) for c in candidates}, children, kept,
+        search.errors([c.information for c in candidates]), shares,
+        {c.information.step: (c.share, c.limit) for c in candidates}, children, kept,
     )  # fmt: skip
 
 
@@ -132,9 +132,9 @@ class _Search:
         self.allowed: dict[str, float] = {}
         self.gains: dict[str, Mapping[int, float]] = {}
 
-    def begin(self, found: Sequence[StepInformation]) -> None:
+    def begin(self, steps: Sequence[StepInformation]) -> None:
         """Refuse steps that leave the wanted undetermined; remember how good each parameter was."""
-        errors = self.errors(found)
+        errors = self.errors(steps)
         lost = [n for n, e in errors.items() if not math.isfinite(e)]
         wanted = lost if self.criterion in ("D", "E") else [n for n in lost if n == self.criterion]
         if wanted:
@@ -147,30 +147,30 @@ class _Search:
         about = aim.get(self.criterion, known.get(self.criterion, 0.0))
         self.allowed = {n: max(DESIGN.kept_error * e, about) for n, e in known.items()}
 
-    def loosen(self, found: Sequence[StepInformation]) -> None:
+    def loosen(self, steps: Sequence[StepInformation]) -> None:
         """Rate a start that had to be made smaller to keep the limits by that smaller motion."""
-        for name, error in self.errors(found).items():
+        for name, error in self.errors(steps).items():
             if name in self.allowed:
                 self.allowed[name] = max(self.allowed[name], 1.001 * error)
 
-    def relative(self, found: Sequence[StepInformation]) -> dict[str, Array]:
+    def relative(self, steps: Sequence[StepInformation]) -> dict[str, Array]:
         """Return the covariance of each family relative to the nominal coefficients."""
         return {
-            f: covariance(found, f)[0] / np.outer(self.scale[f], self.scale[f]) for f in FAMILIES
+            f: covariance(steps, f)[0] / np.outer(self.scale[f], self.scale[f]) for f in FAMILIES
         }
 
-    def errors(self, found: Sequence[StepInformation]) -> dict[str, float]:
+    def errors(self, steps: Sequence[StepInformation]) -> dict[str, float]:
         """Return the relative standard errors by parameter."""
         out = {}
-        for family, cov in self.relative(found).items():
+        for family, cov in self.relative(steps).items():
             for name, variance in zip(self.names[family], np.diag(cov), strict=True):
                 out[name] = float(np.sqrt(variance))
         return out
 
-    def value(self, found: Sequence[StepInformation]) -> float:
+    def value(self, steps: Sequence[StepInformation]) -> float:
         """Return the criterion, smaller is better; infinite where a parameter got too poor."""
-        covariances = self.relative(found)
-        errors = self.errors(found)
+        covariances = self.relative(steps)
+        errors = self.errors(steps)
         if any(not errors[n] <= limit for n, limit in self.allowed.items()):
             return math.inf
         if self.criterion == "D":
@@ -228,7 +228,7 @@ class _Search:
         spectrum, plays = (
             mutated(tone, early, self.rng) if tilt is None else tilted(tone, tilt, self.rng)
         )
-        base, found = parent, None
+        base, fitting = parent, None
         for cost in range(1, plays + 1):
             known = forecast_of(self.rig, base.played, joint, tone.lines)
             spectrum, share = known.flattened(spectrum, DESIGN.phase_rounds)
@@ -240,13 +240,13 @@ class _Search:
                 spectrum, base = 0.5 * spectrum, parent
                 continue
             if not self.centrable(base):
-                return found, cost
+                return fitting, cost
             if base.share <= DESIGN.fill * DESIGN.over_fill:
-                found = base
+                fitting = base
                 if base.share > DESIGN.near_fill * DESIGN.fill:
-                    return found, cost
+                    return fitting, cost
             spectrum = spectrum * (DESIGN.fill / min(base.share, DESIGN.largest_scaling))
-        return found, plays
+        return fitting, plays
 
     def centrable(self, candidate: Candidate) -> bool:
         """Tell whether the pistons still follow their commands about as they did at first.

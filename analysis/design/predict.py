@@ -181,7 +181,7 @@ def _oil(rig: Rig, terms: Sequence[Used], rows: Mapping[str, Rows]) -> Array:
     return total
 
 
-def combine(rig: Rig, terms: Sequence[Used], found: Sequence[StepInformation]) -> Prediction:
+def combine(rig: Rig, terms: Sequence[Used], steps: Sequence[StepInformation]) -> Prediction:
     """Solve all steps together, each with its repeats, as the coupled method would."""
     parameters: dict[str, Expected] = {}
     condition, rank, covariances, order = {}, {}, {}, {}
@@ -190,20 +190,20 @@ def combine(rig: Rig, terms: Sequence[Used], found: Sequence[StepInformation]) -
     for family in FAMILIES:
         names = parameters_of(rig, terms, family)
         clusters = [
-            RowCluster(one.step, r, one.triangle[family], one.rows[family])
-            for one in found
-            for r in range(max(one.repeats, 2))
+            RowCluster(s.step, r, s.triangle[family], s.rows[family])
+            for s in steps
+            for r in range(max(s.repeats, 2))
         ]
         share = None
-        if all(one.moments for one in found):
-            parts = [max(one.repeats, 2) * one.moments[family] for one in found]
+        if all(s.moments for s in steps):
+            parts = [max(s.repeats, 2) * s.moments[family] for s in steps]
             share = np.sum(parts, axis=0)
         solved = solve(names, clusters, share)
         scale = np.array([nominal[name] for name in names])
         kept = np.array([name not in solved.unidentifiable for name in names])
-        cov, dof = covariance(found, family, kept)
+        cov, dof = covariance(steps, family, kept)
         std = np.sqrt(np.diag(cov)) / np.abs(scale)
-        oil = _oil_scatter(rig, found, kept) / np.abs(scale) if family == "fluid" else 0.0 * scale
+        oil = _oil_scatter(rig, steps, kept) / np.abs(scale) if family == "fluid" else 0.0 * scale
         half = half_width(std, dof)
         for i, name in enumerate(names):
             note = solved.unidentifiable.get(name, "")
@@ -213,44 +213,44 @@ def combine(rig: Rig, terms: Sequence[Used], found: Sequence[StepInformation]) -
             )
         condition[family], rank[family] = solved.condition_number, (int(kept.sum()), len(names))
         covariances[family], order[family] = cov / np.outer(scale, scale), names
-    rows = sum(sum(one.rows.values()) * one.repeats for one in found)
-    masked = sum(one.masked * one.repeats for one in found)
+    rows = sum(sum(s.rows.values()) * s.repeats for s in steps)
+    masked = sum(s.masked * s.repeats for s in steps)
     return Prediction(
         parameters, condition, rank, covariances, order, masked / max(rows + masked, 1)
     )
 
 
 def covariance(
-    found: Sequence[StepInformation], family: str, kept: NDArray[np.bool_] | None = None
+    steps: Sequence[StepInformation], family: str, kept: NDArray[np.bool_] | None = None
 ) -> tuple[Array, Array]:
     """Return cov beta (k, k) of one family and Satterthwaite's degrees of freedom (k,).
 
     Entries outside `kept` are NaN; columns that no row fills count as outside.
     """
-    A = np.sum([one.repeats * one.matrix[family] for one in found], axis=0)
+    A = np.sum([s.repeats * s.matrix[family] for s in steps], axis=0)
     kept = np.diag(A) > 0 if kept is None else kept & (np.diag(A) > 0)
     inverse = scaled_inverse(A[np.ix_(kept, kept)])
-    parts = [inverse @ one.scores[family][np.ix_(kept, kept)] @ inverse for one in found]
+    parts = [inverse @ s.scores[family][np.ix_(kept, kept)] @ inverse for s in steps]
     total = np.full(A.shape, np.nan)
-    inner = np.sum([one.repeats * part for one, part in zip(found, parts, strict=True)], axis=0)
+    inner = np.sum([s.repeats * part for s, part in zip(steps, parts, strict=True)], axis=0)
     total[np.ix_(kept, kept)] = inner
     dof = np.full(len(A), np.nan)
     squares = np.zeros(int(kept.sum()))
-    for one, part in zip(found, parts, strict=True):
+    for s, part in zip(steps, parts, strict=True):
         # identify divides the only repeat of a step into segments.
-        free = (one.repeats if one.repeats > 1 else IDENTIFY.record_segments) - 1
-        squares += (one.repeats * np.diag(part)) ** 2 / free
+        free = (s.repeats if s.repeats > 1 else IDENTIFY.record_segments) - 1
+        squares += (s.repeats * np.diag(part)) ** 2 / free
     dof[kept] = np.diag(inner) ** 2 / squares
     return total, dof
 
 
-def _oil_scatter(rig: Rig, found: Sequence[StepInformation], kept: NDArray[np.bool_]) -> Array:
+def _oil_scatter(rig: Rig, steps: Sequence[StepInformation], kept: NDArray[np.bool_]) -> Array:
     """Return the scatter (k,) of the coefficients if 1/b differs from step to step with the oil."""
-    A = np.sum([one.repeats * one.matrix["fluid"] for one in found], axis=0)
+    A = np.sum([s.repeats * s.matrix["fluid"] for s in steps], axis=0)
     kept = kept & (np.diag(A) > 0)
     inverse = scaled_inverse(A[np.ix_(kept, kept)])
     spread = DESIGN.bulk_fall * rig.oil.temperature_band / math.sqrt(2.0)
-    shifts = np.array([inverse @ (one.repeats * one.oil[kept]) for one in found])
+    shifts = np.array([inverse @ (s.repeats * s.oil[kept]) for s in steps])
     out = np.full(len(A), np.nan)
     out[kept] = spread * np.sqrt(np.sum(shifts**2, axis=0))
     return out

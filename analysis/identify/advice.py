@@ -45,13 +45,13 @@ def base_statements(rig: Rig, solutions: Mapping[str, Solution]) -> list[Check]:
     return out
 
 
-def _help(rig: Rig, family: str, found: Determined) -> list[str]:
+def _help(rig: Rig, family: str, lacking: Determined) -> list[str]:
     # The steps of electric rigs are not planned: no stroke says what motion is to be had. What an
     # effect's own parameters need stands in the catalogue, not here.
     known = parameter_names(len(rig.joints))
-    if rig.electric or any(name not in known for name in found.names):
+    if rig.electric or any(name not in known for name in lacking.names):
         return []
-    return mechanical_help(rig, found) if family == "mechanical" else fluid_help(rig, found)
+    return mechanical_help(rig, lacking) if family == "mechanical" else fluid_help(rig, lacking)
 
 
 def _joined(helps: Sequence[str]) -> str:
@@ -60,20 +60,20 @@ def _joined(helps: Sequence[str]) -> str:
     return "Add: " + ", and: ".join(helps)
 
 
-def fluid_help(rig: Rig, found: Determined) -> list[str]:
+def fluid_help(rig: Rig, lacking: Determined) -> list[str]:
     """Return what would show gains and bulk modulus."""
     helps = []
     for joint in range(1, len(rig.joints) + 1):
-        if set(gain_names(joint)) & set(found.lost):
+        if set(gain_names(joint)) & set(lacking.lost):
             helps.append(f"excite joint {joint} in both directions")
-    if not helps and "b" in found.lost:
+    if not helps and "b" in lacking.lost:
         helps.append("excite any joint faster, with a multisine to 5 Hz and above")
     return helps
 
 
-def mechanical_help(rig: Rig, found: Determined) -> list[str]:
+def mechanical_help(rig: Rig, lacking: Determined) -> list[str]:
     """Return the fewest steps found that show every null direction, in words."""
-    undetermined = found.null
+    undetermined = lacking.null
     steps = list(_candidates(rig))
     rows = [_rows(rig, excited, places) for excited, places in steps]
     scale = np.maximum(np.linalg.norm(np.vstack(rows), axis=0), 1e-300)

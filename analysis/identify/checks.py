@@ -120,14 +120,14 @@ def clipped_counts(rig: Rig, record: Record) -> dict[str, int]:
 
 
 def clipping(
-    rig: Rig, found: Iterable[tuple[Record | RecordHead, Mapping[str, int]]]
+    rig: Rig, counted: Iterable[tuple[Record | RecordHead, Mapping[str, int]]]
 ) -> list[Check]:
     """State every sensor that touched an end of its range, by step, with the worst record.
 
-    `found` holds what `clipped_counts` says of every record.
+    `counted` holds what `clipped_counts` says of every record.
     """
     worst: dict[tuple[str, str], tuple[int, float, str]] = {}
-    for head, counts in found:
+    for head, counts in counted:
         for name, count in counts.items():
             share = (count, count / head.samples, head.name)
             worst[head.step, name] = max(share, worst.get((head.step, name), share))
@@ -146,9 +146,9 @@ def clipping(
     return out or [Check("clipped sensor", True, "no sensor reached the end of its range")]
 
 
-def lost_samples(found: Iterable[tuple[Record | RecordHead, int]]) -> Check:
-    """State how many samples never arrived, `found` being (record, its lost samples)."""
-    pairs = [(lost, head) for head, lost in found]
+def lost_samples(counted: Iterable[tuple[Record | RecordHead, int]]) -> Check:
+    """State how many samples never arrived, `counted` being (record, its lost samples)."""
+    pairs = [(lost, head) for head, lost in counted]
     total = sum(lost for lost, _ in pairs)
     if not total:
         return Check("lost samples", True, "every sample arrived")
@@ -181,16 +181,16 @@ def is_hold(rig: Rig, head: Record | RecordHead) -> bool:
 
 def leak_down(rig: Rig, records: Sequence[Record | RecordHead]) -> list[Check]:
     """State how far pistons crept in the records of a hold, with every valve closed."""
-    found = [
+    creeps = [
         (abs(float(creep)) * head.sample_rate / head.samples, abs(float(creep)), i, head)
         for head in records
         if is_hold(rig, head) and head.samples
         for i in range(1, len(rig.joints) + 1)
         if isinstance(creep := head.attributes.get(f"creep_m_{i}"), int | float)
     ]
-    if not found:
+    if not creeps:
         return []
-    speed, creep, joint, head = max(found, key=lambda one: one[0])
+    speed, creep, joint, head = max(creeps, key=lambda one: one[0])
     seconds = head.samples / head.sample_rate
     ok = speed < IDENTIFY.most_creep
     why = "" if ok else "; oil passes the piston, leaves the joint, or passes a valve at rest"

@@ -115,15 +115,15 @@ def conclude(
 def _statements(
     rig: Rig,
     reductions: Sequence[RecordReduction],
-    found: Refined,
+    refinement: Refined,
     estimates: Mapping[str, Estimate],
     rows: Mapping[str, int],
 ) -> tuple[Check, ...]:
     return (
         *record_checks(rig, reductions, rows),
-        *ck.identifiability(found.solutions),
-        *base_statements(rig, found.solutions),
-        ck.noise_bias(found.solutions, found.estimator in UNBIASED),
+        *ck.identifiability(refinement.solutions),
+        *base_statements(rig, refinement.solutions),
+        ck.noise_bias(refinement.solutions, refinement.estimator in UNBIASED),
         *consistency(rig, estimates),
     )
 
@@ -134,7 +134,7 @@ def _fitting_estimator(rig: Rig, used: Sequence[Used], estimator: str, bootstrap
     Those have plain least squares and output error. None but the plain one is for parameters that
     are not linear in the rows (`Term.reduction`).
     """
-    reducing = [one.term.name for one in used if one.term.reduction(rig) is not None]
+    reducing = [use.term.name for use in used if use.term.reduction(rig) is not None]
     if estimator == PLAIN or not (rig.electric or reducing):
         return estimator
     if estimator == "output-error" and not reducing and not bootstrap:

@@ -100,7 +100,7 @@ def refine(job: EstimationJob, solutions: Mapping[str, Solution]) -> Refined:
     InputError for an estimator that needs repeats where a step has one only.
     """
     refuse_unknown(job.estimator)
-    counted = repeats_of((one.conditioned.run, one.record) for one in job.built)
+    counted = repeats_of((rows.conditioned.run, rows.record) for rows in job.built)
     prepared, checks = _prepare(job, solutions)
     single = sorted(
         {step for (_, step), n in counted.items() if n < 2}.union(
@@ -116,16 +116,16 @@ def refine(job: EstimationJob, solutions: Mapping[str, Solution]) -> Refined:
         )
     tests = {} if single else {p.family: hausman(p.blocks) for p in prepared}
     estimator = job.estimator
-    found = {p.family: _solve(p, "ls" if estimator == "auto" else estimator) for p in prepared
+    fits = {p.family: _solve(p, "ls" if estimator == "auto" else estimator) for p in prepared
              if estimator != "output-error"}  # fmt: skip
     if not single:
-        plain = found if estimator in ("ls", "auto") else None
+        plain = fits if estimator in ("ls", "auto") else None
         reference = plain or {p.family: _solve(p, "ls") for p in prepared}
         statement = noise_statement(shifts_of(prepared, tests, reference))
         if estimator == "auto":
             estimator = "ls" if statement.ok else "iv"
             if not statement.ok:
-                found = {p.family: _solve(p, "iv") for p in prepared}
+                fits = {p.family: _solve(p, "iv") for p in prepared}
         if not statement.ok and estimator in UNBIASED:
             words = "; the values given are those of instrumental variables instead"
             statement = replace(statement, ok=True, detail=statement.detail + words)
@@ -144,7 +144,7 @@ def refine(job: EstimationJob, solutions: Mapping[str, Solution]) -> Refined:
     new = dict(solutions)
     ends: dict[str, tuple[float, float]] = {}
     for p in prepared:
-        beta, total, fit = found[p.family]
+        beta, total, fit = fits[p.family]
         shift = np.zeros(p.parameters)
         if estimator == "ls" and tests:
             shift = certain_shift(tests[p.family], p)
@@ -251,12 +251,12 @@ def _first(s: CovarianceParts, k: int) -> CovarianceParts:
 
 
 def _named(
-    prepared: Sequence[Prepared], found: Mapping[str, tuple[Array, CovarianceParts, EquationFit]]
+    prepared: Sequence[Prepared], fits: Mapping[str, tuple[Array, CovarianceParts, EquationFit]]
 ) -> dict[str, float]:
     return {
         name: float(v)
         for p in prepared
-        for name, v in zip(p.names, found[p.family][0], strict=False)
+        for name, v in zip(p.names, fits[p.family][0], strict=False)
     }
 
 

@@ -122,11 +122,11 @@ class _Filter:
         self._time = -np.inf
         self._segments: list[_Segment] = []
 
-    def fold(self, head: RecordHead, found: Sequence[Rows], start: float) -> None:
+    def fold(self, head: RecordHead, equations: Sequence[Rows], start: float) -> None:
         """Fold the rows of a chunk, their times counting from `start` [s]."""
-        matrix = np.concatenate([r.matrix for r in found])
-        rhs = np.concatenate([r.rhs for r in found])
-        time = start + np.concatenate([r.time for r in found])
+        matrix = np.concatenate([r.matrix for r in equations])
+        rhs = np.concatenate([r.rhs for r in equations])
+        time = start + np.concatenate([r.time for r in equations])
         if not len(rhs):
             return
         now = max(float(time.max()), self._time)
@@ -162,19 +162,19 @@ class _Filter:
         if np.isfinite(self._memory):
             return
         pieces: dict[tuple[str, object], _Segment] = {}
-        for key, one in zip(self._keys(), self._segments, strict=True):
+        for key, segment in zip(self._keys(), self._segments, strict=True):
             if key in pieces:
-                both = merge((pieces[key].triangle, one.triangle))
-                pieces[key] = replace(one, triangle=both, rows=one.rows + pieces[key].rows)
+                both = merge((pieces[key].triangle, segment.triangle))
+                pieces[key] = replace(segment, triangle=both, rows=segment.rows + pieces[key].rows)
             else:
-                pieces[key] = one
+                pieces[key] = segment
         self._segments = list(pieces.values())
 
     def _keys(self) -> list[tuple[str, object]]:
         """Return stratum and cluster of every segment: repeats of a step where there are some."""
         repeats: dict[str, set[int]] = {}
-        for one in self._segments:
-            repeats.setdefault(one.step, set()).add(one.repeat)
+        for segment in self._segments:
+            repeats.setdefault(segment.step, set()).add(segment.repeat)
         whole = np.isinf(self._memory)
         return [
             (s.step, s.repeat if whole and len(repeats[s.step]) > 1 else (s.repeat, s.index))
@@ -188,11 +188,11 @@ class _Filter:
         # A step just begun has one piece, and no scatter of its own yet.
         others = [step for step, pieces in count.items() if pieces > 1]
         scatter = []
-        for (step, key), one in zip(keys, self._segments, strict=True):
+        for (step, key), segment in zip(keys, self._segments, strict=True):
             alone = count[step] == 1 and others
             stratum, cluster = (others[0], (step, key)) if alone else (step, key)
-            triangle = one.triangle * np.sqrt(self._weight(one))
-            scatter.append(RowCluster(stratum, cluster, triangle, one.rows))
+            triangle = segment.triangle * np.sqrt(self._weight(segment))
+            scatter.append(RowCluster(stratum, cluster, triangle, segment.rows))
         whole = RowCluster("all", "all", self._sum.triangle, self._sum.rows)
         return solve(self.names, [whole], scatter=scatter)
 
@@ -263,26 +263,26 @@ class Tracker:
         """End the record and drop its rows."""
         self._running, self._feed = self._kept, None
 
-    def _fold(self, found: Mapping[str, Rows]) -> bool:
-        if self._head is None or not found:
+    def _fold(self, by_equation: Mapping[str, Rows]) -> bool:
+        if self._head is None or not by_equation:
             return False
-        for family, one in self._running.items():
-            rows = [r for name, r in found.items() if family_of(name) == family]
+        for family, running in self._running.items():
+            rows = [r for name, r in by_equation.items() if family_of(name) == family]
             if rows:
-                one.fold(self._head, rows, self._start)
+                running.fold(self._head, rows, self._start)
                 self._clock = max([self._clock, *(self._start + r.time[-1:].sum() for r in rows)])
         return True
 
     def estimates(self) -> dict[str, Estimate]:
         """Return every parameter followed; NaN until rows tell it, no interval while it is held."""
-        solutions = {family: one.solution() for family, one in self._running.items()}
-        found, _ = estimates_of(self._rig, self._terms, solutions)
+        solutions = {family: running.solution() for family, running in self._running.items()}
+        values, _ = estimates_of(self._rig, self._terms, solutions)
         nothing = (float("nan"), float("nan"))
-        for one in self._running.values():
-            for name in one.held & found.keys():
+        for running in self._running.values():
+            for name in running.held & values.keys():
                 note = "not excited for long; the value is held"
-                found[name] = replace(found[name], std=float("nan"), ci95=nothing, note=note)
-        return found
+                values[name] = replace(values[name], std=float("nan"), ci95=nothing, note=note)
+        return values
 
 
 def track(tracker: Tracker, record: Record, block: int = 10) -> None:

@@ -54,12 +54,14 @@ def identify_folders(
         used = tuple(like.terms)
     _refuse_open(rig, used)
     steps = [
-        (number, one)
+        (number, repeats)
         for number, (folder, head) in enumerate(zip(folders, heads, strict=True))
-        for one in steps_of(rig, folder, head.records)
+        for repeats in steps_of(rig, folder, head.records)
     ]
-    decisions = workers.map(moving_task, [one for _, one in steps], reads=path_of)
-    moving = {(n, one.step): moves for (n, one), moves in zip(steps, decisions, strict=True)}
+    decisions = workers.map(moving_task, [repeats for _, repeats in steps], reads=path_of)
+    moving = {
+        (n, repeats.step): moves for (n, repeats), moves in zip(steps, decisions, strict=True)
+    }
     tasks = [
         RecordTask(
             rig,

@@ -149,10 +149,10 @@ def physical(result: Identification) -> Physical:
     return Physical(result.estimates, levels, max(accepted, default=0))
 
 
-def with_physics(result: Identification, found: Physical) -> Identification:
+def with_physics(result: Identification, physical: Physical) -> Identification:
     """Return the identification with the consistent parameters in place of the free ones."""
-    level = found.levels[found.given]
-    checks = (*result.checks, *found.checks)
+    level = physical.levels[physical.given]
+    checks = (*result.checks, *physical.checks)
     provenance = {
         **result.model.provenance,
         "physical": level.name,
@@ -179,9 +179,9 @@ def _level(result: Identification, name: str, rigid: bool) -> Level:
     return Level(name, estimates, covariance, prices)
 
 
-def _constrained(solution: Solution, X: Array, found: Minimum) -> Solution:
+def _constrained(solution: Solution, X: Array, minimum: Minimum) -> Solution:
     """Return the solution moved; its covariance loses the directions that are held."""
-    k, C = len(found.beta), found.active
+    k, C = len(minimum.beta), minimum.active
     if not len(C):
         return solution
     scale = 1.0 / np.linalg.norm(X, axis=0)
@@ -190,24 +190,24 @@ def _constrained(solution: Solution, X: Array, found: Minimum) -> Solution:
     lever = np.linalg.solve(A, held.T)
     P = np.eye(k) - lever @ np.linalg.pinv(held @ lever) @ held
     P = P * np.outer(scale, 1.0 / scale)
-    return replace(solution, value=found.beta, covariance=P @ solution.covariance @ P.T)
+    return replace(solution, value=minimum.beta, covariance=P @ solution.covariance @ P.T)
 
 
-def _price(rig: Rig, solution: Solution, X: Array, y: Array, found: Minimum) -> Price:
-    k = len(found.beta)
+def _price(rig: Rig, solution: Solution, X: Array, y: Array, minimum: Minimum) -> Price:
+    k = len(minimum.beta)
     rest = solution.triangle[k, k] ** 2
     before = float(np.sum((y - X @ solution.value) ** 2)) + rest
-    after = float(np.sum((y - X @ found.beta) ** 2)) + rest
+    after = float(np.sum((y - X @ minimum.beta) ** 2)) + rest
     growth = float(np.sqrt(after / before) - 1.0) if before > 0 else 0.0
-    C = found.active
+    C = minimum.active
     if not len(C):
         return Price(0.0, (), (), 1.0)
     apart = C @ solution.value
     gap = tuple(
         _constraint_text(label, rig, solution, row, value)
-        for label, row, value in zip(found.labels, C, apart, strict=True)
+        for label, row, value in zip(minimum.labels, C, apart, strict=True)
     )
-    return Price(growth, found.labels, gap, _probability(solution, C, apart))
+    return Price(growth, minimum.labels, gap, _probability(solution, C, apart))
 
 
 def _constraint_text(label: str, rig: Rig, solution: Solution, row: Array, apart: float) -> str:
@@ -259,10 +259,10 @@ def _verdict(price: Price) -> str:
     return f"{word}, p = {price.p:.2g}"
 
 
-def to_json(found: Physical) -> dict[str, Any]:
+def to_json(physical: Physical) -> dict[str, Any]:
     """Return both levels as plain data."""
     return {
-        "given": found.levels[found.given].name,
+        "given": physical.levels[physical.given].name,
         "levels": [
             {
                 "name": level.name,
@@ -277,6 +277,6 @@ def to_json(found: Physical) -> dict[str, Any]:
                     for family, price in level.prices.items()
                 },
             }
-            for level in found.levels
+            for level in physical.levels
         ],
     }

@@ -124,16 +124,16 @@ def reduce_rows(
     """Reduce the rows of all records of runs in memory."""
     disturbed: set[tuple[int, str]] = set()
     out = []
-    for one in built:
-        record, noise = one.record, None
-        if one.group not in disturbed:
-            disturbed.add(one.group)
-            noise = record_moments(rig, terms, one.conditioned, one.rows)
+    for item in built:
+        record, noise = item.record, None
+        if item.group not in disturbed:
+            disturbed.add(item.group)
+            noise = record_moments(rig, terms, item.conditioned, item.rows)
         duration = record.samples / record.sample_rate
-        parts, masked = _folded(rig, terms, [one.rows], duration)
+        parts, masked = _folded(rig, terms, [item.rows], duration)
         lost = int(lost_samples(rig, record).any(axis=1).sum())
         clipped = ck.clipped_counts(rig, record)
-        run = one.conditioned.run
+        run = item.conditioned.run
         out.append(RecordReduction(run, head_of(record), parts, masked, lost, clipped, noise))
     return out
 
@@ -198,7 +198,7 @@ def _folded(
             for part, inside in enumerate(parts_of(rows, duration)):
                 sums[family_of(name)][part].fold(rows.matrix[inside], rows.rhs[inside])
     return {
-        f: tuple((one.triangle, one.rows) for one in every) for f, every in sums.items()
+        f: tuple((part.triangle, part.rows) for part in every) for f, every in sums.items()
     }, masked
 
 
@@ -232,17 +232,17 @@ def clusters_of(reductions: Sequence[RecordReduction], family: str) -> list[RowC
     """Return one cluster per record, or one per part where its step has this record only."""
     repeats = repeats_of((reduction.run, reduction.head) for reduction in reductions)
     out: list[RowCluster] = []
-    for one in reductions:
-        stratum = (one.run, one.head.step)
-        filled = [(n, R, rows) for n, (R, rows) in enumerate(one.parts[family]) if rows]
+    for reduction in reductions:
+        stratum = (reduction.run, reduction.head.step)
+        filled = [(n, R, rows) for n, (R, rows) in enumerate(reduction.parts[family]) if rows]
         if repeats[stratum] > 1:
             if filled:
                 whole = merge(R for _, R, _ in filled)
                 rows = sum(rows for *_, rows in filled)
-                out.append(RowCluster(stratum, one.head.repeat, whole, rows))
+                out.append(RowCluster(stratum, reduction.head.repeat, whole, rows))
             continue
         for n, R, rows in filled:
-            key: Hashable = (one.head.repeat, n)
+            key: Hashable = (reduction.head.repeat, n)
             out.append(RowCluster(stratum, key, R, rows))
     return out
 
@@ -250,8 +250,8 @@ def clusters_of(reductions: Sequence[RecordReduction], family: str) -> list[RowC
 def noise_of(reductions: Sequence[RecordReduction], family: str) -> Array | None:
     """Return the noise moments of all records, each step's by the record that stands for it."""
     counts: dict[tuple[int, str], int] = {}
-    for one in reductions:
-        key = (one.run, one.head.step)
+    for reduction in reductions:
+        key = (reduction.run, reduction.head.step)
         counts[key] = counts.get(key, 0) + 1
     weighted = [
         counts[reduction.run, reduction.head.step] * reduction.noise[family]

@@ -58,9 +58,9 @@ def build_rows(
     ck.refuse_dead_records(rig, runs)
     out: list[RecordRows] = []
     for number, run in enumerate(runs):
-        for one in condition_runs(rig, [run], filtering):
-            rows = record_rows(rig, terms, one.signals, one.filtering)
-            out.append(RecordRows(replace(one, run=number), rows))
+        for conditioned in condition_runs(rig, [run], filtering):
+            rows = record_rows(rig, terms, conditioned.signals, conditioned.filtering)
+            out.append(RecordRows(replace(conditioned, run=number), rows))
         if tell is not None:
             tell((number + 1) / len(runs))
     return out
@@ -78,11 +78,13 @@ def with_columns(
         return list(built)
     families = {c.family for used in extra for c in used.term.coefficients(rig)}
     out = []
-    for one in built:
-        signals = prepared(rig, terms, one.conditioned.signals)
-        more = record_rows(rig, extra, signals, one.conditioned.filtering, families)
-        rows = {name: _joined(r, more[name]) if name in more else r for name, r in one.rows.items()}
-        out.append(replace(one, rows=rows))
+    for record in built:
+        signals = prepared(rig, terms, record.conditioned.signals)
+        more = record_rows(rig, extra, signals, record.conditioned.filtering, families)
+        rows = {
+            name: _joined(r, more[name]) if name in more else r for name, r in record.rows.items()
+        }
+        out.append(replace(record, rows=rows))
     return out
 
 

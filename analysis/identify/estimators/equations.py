@@ -90,12 +90,12 @@ def segments(
 def blocks_of(built: Sequence[RecordRows], family: str, kept: Sequence[int]) -> list[RepeatBlock]:
     """Return the blocks of one family with the columns `kept`."""
     blocks = []
-    for one in built:
-        record = one.record
-        for rows in one.family(family):
+    for record_rows in built:
+        record = record_rows.record
+        for rows in record_rows.family(family):
             blocks.append(
                 RepeatBlock(
-                    *one.group, record.repeat, record.name, rows.equation,
+                    *record_rows.group, record.repeat, record.name, rows.equation,
                     rows.matrix[:, list(kept)], rows.rhs, rows.time,
                     segments(rows.time, record.period / record.sample_rate),
                     np.zeros(len(rows.rhs), dtype=np.int64),

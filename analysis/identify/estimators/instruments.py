@@ -76,9 +76,9 @@ def hausman(blocks: Sequence[RepeatBlock]) -> Hausman:
     iv = instrumental_variables(blocks)
     ls = least_squares(iv.blocks)
     difference = ls.beta - iv.beta
-    one, other = pieces(ls), pieces(iv)
-    influence = one.score @ ls.inverse.T - other.score @ iv.inverse.T
-    scatter = stratified(np.column_stack((one.stratum, one.part)), influence)
+    plain, instrumented = pieces(ls), pieces(iv)
+    influence = plain.score @ ls.inverse.T - instrumented.score @ iv.inverse.T
+    scatter = stratified(np.column_stack((plain.stratum, plain.part)), influence)
     assert scatter is not None, "instruments exist only where steps have repeats"
     covariance, dof = scatter
     error = np.sqrt(np.diag(covariance))

@@ -208,10 +208,10 @@ def joined(
     move = np.eye(len(h)) - np.outer(gain, h)
     scatter = move @ V @ move.T
     after = scatter + belief.std**2 * np.outer(gain, gain)
-    left = np.diag(scatter)
+    remaining = np.diag(scatter)
     with np.errstate(divide="ignore", invalid="ignore"):
         # What is known beforehand needs no repeats: its part of the variance counts as known.
-        grown = np.where(left > 0, np.minimum(np.diag(after) / left, 1e3), 1.0)
+        grown = np.where(remaining > 0, np.minimum(np.diag(after) / remaining, 1e3), 1.0)
         systematic = np.minimum(spread.systematic, 1.0) / grown
     new = CovarianceParts(after, spread.dof * grown**2, systematic)
     return beta - gain * (h @ beta), new, move @ inverse

@@ -142,7 +142,7 @@ def disagreement(values: Sequence[Estimate]) -> float:
 
 def _uniqueness(shown: Mapping[str, Sequence[tuple[str, Estimate]]]) -> Check:
     """State which parameters have several values, and by how much the worst of them disagree."""
-    several = {name: found for name, found in shown.items() if len(found) > 1}
+    several = {name: by_step for name, by_step in shown.items() if len(by_step) > 1}
     if not several:
         return Check("one value each", True, "no parameter is identified by more than one step")
     by_size = sorted(several, key=lambda n: -disagreement([e for _, e in several[n]]))
@@ -168,13 +168,13 @@ def _json(
     return {
         "steps": list(next(iter(outcomes.values())).condition),
         "per_step": {
-            name: [{"step": step, **estimate_json(e)} for step, e in found]
-            for name, found in shown.items()
+            name: [{"step": step, **estimate_json(e)} for step, e in by_step]
+            for name, by_step in shown.items()
         },
         "disagreement": {
-            name: finite(disagreement([e for _, e in found]))
-            for name, found in shown.items()
-            if len(found) > 1
+            name: finite(disagreement([e for _, e in by_step]))
+            for name, by_step in shown.items()
+            if len(by_step) > 1
         },
         "E1": {n: {"step": taken.get(n), **estimate_json(e)} for n, e in first.items()},
         "E2": {n: {"steps": means.get(n), **estimate_json(e)} for n, e in averaged.items()},

@@ -119,16 +119,16 @@ def run_search(
             break
         points = np.asarray(population.get("X"), dtype=np.float64)
         scores = [score(task, _values(task, x)) for x in points]
-        found = np.array([s.error for s in scores])
+        scored = np.array([s.error for s in scores])
         sizes.append(len(scores))
         gone.append(sum(bool(s.fate) for s in scores))
         for s in scores:
             if s.fate:
                 lost[s.fate] += 1
-        if found.min() < best_error:
-            best, best_error = points[int(found.argmin())], float(found.min())
+        if scored.min() < best_error:
+            best, best_error = points[int(scored.argmin())], float(scored.min())
         errors.append(best_error)
-        evaluator.eval(wrap(found), population)
+        evaluator.eval(wrap(scored), population)
         algorithm.tell(infills=population)
     seconds = time.perf_counter() - started
     log.info("%s: %d candidates in %.1f s, %s lost", method, sum(sizes), seconds, lost)

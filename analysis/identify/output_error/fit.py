@@ -154,12 +154,12 @@ class Search:
         """Return each step's scatter of the outputs as the first fit left it."""
         out = {}
         for stratum, old in sigma.items():
-            left = [
+            residuals = [
                 r.residual for s, r in zip(self.stretches, reduced, strict=True)
                 if r is not None and s.stratum == stratum
             ]  # fmt: skip
             out[stratum] = (
-                old * np.sqrt(np.mean(np.concatenate(left) ** 2, axis=0)) if left else old
+                old * np.sqrt(np.mean(np.concatenate(residuals) ** 2, axis=0)) if residuals else old
             )
         return out
 

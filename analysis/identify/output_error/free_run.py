@@ -60,10 +60,10 @@ class _Record:
 
     def residual(self, model: Model) -> Array:
         """Return measured less simulated positions (n, F)."""
-        found = simulate(compiled(model, Effort.FIT), self.drive, self.start)
-        if found.failure:
+        result = simulate(compiled(model, Effort.FIT), self.drive, self.start)
+        if result.failure:
             return np.full(self.measured.shape, IDENTIFY.failed_state)
-        simulated = found.channels()
+        simulated = result.channels()
         return self.measured - np.column_stack([simulated[n] for n in self.names])[self.here]
 
 
@@ -72,7 +72,7 @@ class FreeRuns:
 
     def __init__(self, rig: Rig, runs: Sequence[Run], terms: Sequence[Used]) -> None:
         self.rig, self.terms = rig, tuple(terms)
-        self.records = [_Record(rig, one) for one in condition_runs(rig, runs)]
+        self.records = [_Record(rig, record) for record in condition_runs(rig, runs)]
 
     def residual(self, values: Mapping[str, float]) -> list[Array]:
         """Return every record's measured less simulated positions (n, F)."""
@@ -95,8 +95,8 @@ def free_run_fit(
     scale = np.abs(solution.value)
 
     def stacked(share: Array) -> Array:
-        left = ready.residual(dict(zip(solution.names, map(float, share * scale), strict=True)))
-        return np.concatenate([part.ravel() for part in left])
+        errors = ready.residual(dict(zip(solution.names, map(float, share * scale), strict=True)))
+        return np.concatenate([part.ravel() for part in errors])
 
     first = solution.value / scale
     optimum = least_squares(
@@ -119,7 +119,7 @@ def free_run_fit(
     return dict.fromkeys(solutions, new), check
 
 
-def _pieces(records: Sequence[_Record], found: OptimizeResult, jacobian: Array) -> Pieces:
+def _pieces(records: Sequence[_Record], result: OptimizeResult, jacobian: Array) -> Pieces:
     """Return the scores of ten parts of every record."""
     strata = {key: k for k, key in enumerate(dict.fromkeys(r.key for r in records))}
     stratum, repeat, part, score, information = [], [], [], [], []
@@ -128,7 +128,7 @@ def _pieces(records: Sequence[_Record], found: OptimizeResult, jacobian: Array) 
         stop = start + record.measured.size
         edges = np.linspace(start, stop, IDENTIFY.period_segments + 1).astype(int)
         for k, (low, high) in enumerate(itertools.pairwise(edges)):
-            J, r = jacobian[low:high], found.fun[low:high]
+            J, r = jacobian[low:high], result.fun[low:high]
             stratum.append(strata[record.key])
             repeat.append(record.repeat)
             part.append(k)

@@ -72,13 +72,13 @@ def completed(runs: Sequence[Run], model: Model) -> Model | None:
     for record in (r for run in runs for r in run.records):
         still &= set(record.locked)
     values = {}
-    for name, one in model.parameters.items():
-        if one.identified:
+    for name, estimate in model.parameters.items():
+        if estimate.identified:
             continue
         joints = {int(digit) for digit in name if digit.isdecimal()}
         if not joints & still or name not in rig.nominal:
             return None
-        values[name] = replace(one, value=rig.nominal[name], ci95=(rig.nominal[name],) * 2)
+        values[name] = replace(estimate, value=rig.nominal[name], ci95=(rig.nominal[name],) * 2)
     return replace(model, parameters={**model.parameters, **values})
 
 
@@ -92,18 +92,18 @@ def shot(runs: Sequence[Run], model: Model, effect: Effect) -> Shot | None:
         for name, shape in bounds.items():
             place = windows.names.index(name)
             low[place], high[place] = shape.low, shape.high
-        found = Search(windows, low, high).run(theta)
+        search = Search(windows, low, high).run(theta)
     except (InputError, np.linalg.LinAlgError) as error:
         log.info("%s is not shot: %s", effect.name, error)
         return None
-    half = half_width(np.sqrt(np.diag(found.spread.covariance)), found.spread.dof)
+    half = half_width(np.sqrt(np.diag(search.spread.covariance)), search.spread.dof)
     shapes = {}
     for name, shape in bounds.items():
         k = windows.names.index(name)
-        value, std = float(found.value[k]), float(np.sqrt(found.spread.covariance[k, k]))
+        value, std = float(search.value[k]), float(np.sqrt(search.spread.covariance[k, k]))
         ends = (value - float(half[k]), value + float(half[k]))
         shapes[name] = Estimate(value, shape.unit, std, ends)
-    return Shot(effect.name, effect.where, shapes, len(windows.stretches), found.check.ok)
+    return Shot(effect.name, effect.where, shapes, len(windows.stretches), search.check.ok)
 
 
 def rest_of(runs: Sequence[Run], model: Model, effect: Effect) -> float:

@@ -100,14 +100,14 @@ class Windows:
     @staticmethod
     def _fitting(good: Mask, length: int) -> list[int]:
         """Return the first samples of windows that lie end to end within good samples."""
-        found, first = [], 0
+        firsts, first = [], 0
         bad = np.flatnonzero(~good)
         for stop in (*bad.tolist(), len(good)):
             while first + length < stop:
-                found.append(first)
+                firsts.append(first)
                 first += length
             first = max(first, stop + 1)
-        return found
+        return firsts
 
     @property
     def every(self) -> int:
@@ -185,7 +185,7 @@ class Windows:
         """Shoot every window with every nudge; None for one whose state ceased to exist."""
         ready = [self._nudged(theta, source) for source in self.sources]
 
-        def one(k: int) -> Reduced | None:
+        def shot(k: int) -> Reduced | None:
             stretch = self.stretches[k]
             return self._window(stretch, starts[k], sigma[stretch.stratum], ready[stretch.record])
 
@@ -194,10 +194,10 @@ class Windows:
         reductions = {}
         for k, stretch in enumerate(self.stretches):
             if stretch.record not in self._idle:
-                reductions[k] = one(k)
+                reductions[k] = shot(k)
         rest = [k for k in range(len(self.stretches)) if k not in reductions]
         with ThreadPoolExecutor(IDENTIFY.window_workers) as pool:
-            reductions |= zip(rest, pool.map(one, rest), strict=True)
+            reductions |= zip(rest, pool.map(shot, rest), strict=True)
         return [reductions[k] for k in range(len(self.stretches))]
 
     def _window(
