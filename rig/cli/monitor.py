@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from rig.cli.errors import WorkError
 from rig.cli.options import EndpointOption
+from rig.cli.output import progress
 
 
 def monitor(
@@ -15,6 +18,14 @@ def monitor(
     plain: Annotated[
         bool, typer.Option("--plain", help="One line a second, for screen readers and logs.")
     ] = False,
+    web: Annotated[
+        bool,
+        typer.Option("--web", help="In a browser of this machine: prints the address to open."),
+    ] = False,
+    port: Annotated[
+        int | None,
+        typer.Option(help="With --web; 0 takes a free one.  [default: 0]", min=0, max=65535),
+    ] = None,
     runs: Annotated[
         Path,
         typer.Option("--runs", help="Where runs are listed, and new ones go."),
@@ -25,7 +36,13 @@ def monitor(
 
     Example: bramah monitor --rig shinshu-2dof
     """
+    from rig.model.parse import InputError
     from rig.runs.rigs import load_rig, shipped_rigs
+
+    if web and plain:
+        raise InputError("--web does not go with --plain: one is a page, the other lines of text")
+    if port is not None and not web:
+        raise InputError(f"--port {port}: expected with --web only")
 
     # Sessions are known by the rig's name, whatever its file is called.
     is_file = rig is not None and rig not in shipped_rigs() and Path(rig).is_file()
@@ -35,10 +52,41 @@ def monitor(
 
         read_aloud(name, typer.echo)
         return
+    if web:
+        raise typer.Exit(_serve(rig, runs, endpoint, port or 0))
     from rig.tui.app import main
     from rig.tui.browse import Browsed
 
     raise typer.Exit(main(name, Browsed(folder=runs, rig=rig or "", endpoint=endpoint)))
+
+
+def _serve(rig: str | None, runs: Path, endpoint: str | None, port: int) -> int:
+    """Serve the screen to browsers of this machine until a signal; return the exit code."""
+    if find_spec("textual_serve") is None:
+        raise WorkError(
+            "--web needs the package textual-serve, which is not installed: "
+            "pip install 'bramah[web]'"
+        )
+    from rig.queue.processes import BRAMAH
+    from rig.tui.web.server import listen, serve
+
+    options = {"--rig": rig, "--runs": str(runs), "--endpoint": endpoint}
+    given = [word for name, value in options.items() if value is not None for word in (name, value)]
+    try:
+        listening = listen(port)
+    except OSError as error:
+        raise WorkError(
+            f"--port {port}: {error.strerror}; expected a free port, or 0 to take one"
+        ) from error
+
+    def ready(address: str) -> None:
+        typer.echo(address)
+        progress(
+            "open this address in a browser of this machine; it lets whoever has it command a run. "
+            "Ctrl-C closes the pages, and no run ends by it"
+        )
+
+    return serve([*BRAMAH, "monitor", *given], listening, ready)
 
 
 def register(app: typer.Typer) -> None:

@@ -24,6 +24,8 @@ class Starts(Commands):
 
     browsed: Browsed
     open_page: Callable[[str], None]
+    is_web: bool
+    deliver_binary: Callable[..., str | None]
 
     def look_around(self) -> None:
         """Read what stands on the disk, beside the screen."""
@@ -117,6 +119,10 @@ class Starts(Commands):
     def _open(self, page: Path) -> None:
         if not page.is_file():
             self.remark = f"{page}: there is no such page yet; it is written by the line above."
+            return
+        if self.is_web:  # the browser that shows the screen, not one of the bench's computer
+            self.deliver_binary(page, open_method="browser", mime_type="text/html")
+            self.remark = f"opened {page} in another tab"
             return
         opened = webbrowser.open(page.absolute().as_uri())
         self.remark = f"opened {page}" if opened else f"no browser here; open {page.absolute()}"

@@ -1,0 +1,49 @@
+"""Who may use the screen's page: requests to this machine by its loopback name that hold the token.
+
+Other users of this machine reach a loopback port too, and a foreign page in the operator's browser
+can send requests to it. The token stands in the query of every address, not in a cookie: cookies
+are shared by all ports of a host, so that another user's server would receive it.
+"""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Sequence
+from typing import Final
+from urllib.parse import urlsplit
+
+LOOPBACK: Final = "127.0.0.1"
+NAMES: Final = frozenset({LOOPBACK, "localhost", "::1"})
+
+
+def new_token() -> str:
+    """Return a token of 256 random bits that can stand in an address."""
+    return secrets.token_urlsafe(32)
+
+
+def refusal(
+    hosts: Sequence[str], origins: Sequence[str], tokens: Sequence[str], token: str
+) -> str | None:
+    """Return in one line why a request is refused, None where it is served.
+
+    hosts, origins, tokens: what its headers `Host` and `Origin` and its query say, each time they
+    occur. The port of `Host` may be another (a forwarded one); the name must be a loopback name,
+    for a foreign name that resolves to loopback is a page of elsewhere (DNS rebinding).
+    """
+    host = hosts[0] if len(hosts) == 1 else ""
+    if host_name(host) not in NAMES:
+        return f"the address names the host {host!r}, expected {LOOPBACK} or localhost"
+    if any(origin != f"http://{host}" for origin in origins):
+        return f"it comes from a page of {origins[0]!r}, expected http://{host}"
+    if len(tokens) != 1 or not secrets.compare_digest(tokens[0].encode(), token.encode()):
+        return "the address holds no valid token; open the one that `bramah monitor --web` printed"
+    return None
+
+
+def host_name(host: str) -> str:
+    """Return the name in a `Host` header without its port, '' where it has none."""
+    try:
+        parts = urlsplit(f"//{host}")
+        return (parts.hostname or "") if parts.netloc == host and "@" not in host else ""
+    except ValueError:
+        return ""

@@ -1,0 +1,131 @@
+"""A screen as a process of its own, for one page; it attaches to a run like any other screen."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import shlex
+import tempfile
+from asyncio.subprocess import PIPE, Process
+from collections.abc import Awaitable, Callable, Sequence
+from contextlib import suppress
+from typing import IO, Final
+
+from textual_serve.app_service import AppService
+from textual_serve.download_manager import DownloadManager
+
+from rig.queue.processes import reason_in
+from rig.tui.web.page_driver import BEAT, GRACE, NAME
+
+log = logging.getLogger(__name__)
+
+MOST_CELLS: Final = 1000  # columns or rows of a page
+CLOSED: Final = "The screen is closed. A run that it showed goes on."
+_LONGEST = 4096  # of a beat's text or of an error, in characters
+
+
+class AttachedScreen(AppService):
+    """Starts `words` with a page for its terminal; `ended` hears in one line how it ended."""
+
+    def __init__(
+        self,
+        words: Sequence[str],
+        *,
+        write_bytes: Callable[[bytes], Awaitable[None]],
+        write_str: Callable[[str], Awaitable[None]],
+        ended: Callable[[str], Awaitable[None]],
+        downloads: DownloadManager,
+    ) -> None:
+        super().__init__(
+            shlex.join(words),
+            write_bytes=write_bytes,
+            write_str=write_str,
+            close=self._leaving,
+            download_manager=downloads,
+        )
+        self._words, self._ended = tuple(words), ended
+        # Closed when the process has ended.
+        self._errors: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115
+
+    def _build_environment(self, width: int = 80, height: int = 24) -> dict[str, str]:
+        return {**super()._build_environment(width, height), "TEXTUAL_DRIVER": NAME}
+
+    async def _open_app_process(self, width: int = 80, height: int = 24) -> Process:
+        # Without a shell, and in a session of its own: a Ctrl-C at the terminal is for the server.
+        self._process = process = await asyncio.create_subprocess_exec(
+            *self._words,
+            stdin=PIPE,
+            stdout=PIPE,
+            stderr=self._errors,
+            env=self._build_environment(width, height),
+            start_new_session=True,
+        )
+        # What it says on standard error is read at its end; until then nothing comes from there.
+        process.stderr = asyncio.StreamReader()
+        process.stderr.feed_eof()
+        self._stdin = process.stdin
+        return process
+
+    async def run(self) -> None:
+        """Hand on what the process draws until it has ended, then say how."""
+        await super().run()
+        assert self._process is not None
+        await self._wait(self._process)
+        said = self._said()
+        if self._process.returncode != 0:
+            log.warning("a screen ended with %s: %s", self._process.returncode, said)
+        with suppress(ConnectionError):  # the page may be gone
+            await self._ended(f"The screen ended: {said}" if said else CLOSED)
+
+    async def stop(self) -> None:
+        """Ask the process to end, wait for it, kill it where it does not; then nothing is left."""
+        task, self._task = self._task, None
+        if task is None:
+            return
+        await self._download_manager.cancel_app_downloads(app_service_id=self.app_service_id)
+        await self.send_meta({"type": "quit"})
+        assert self._process is not None
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        await self._wait(self._process)
+        await task
+        self._errors.close()
+
+    async def set_terminal_size(self, width: int, height: int) -> None:
+        """Resize the screen [characters], within reason."""
+        if not all(isinstance(size, int) and 0 < size <= MOST_CELLS for size in (width, height)):
+            raise ValueError(f"size {width} × {height}, expected 1 to {MOST_CELLS} characters")
+        await super().set_terminal_size(width, height)
+
+    async def beat(self, mark: object) -> None:
+        """Send a page's mark through the screen and back."""
+        await self.send_meta({"type": BEAT, "mark": str(mark)[:_LONGEST]})
+
+    async def on_meta(self, data: bytes) -> None:
+        """Hand a beat back to the page; everything else is textual-serve's."""
+        meta = json.loads(data)
+        if meta.get("type") == BEAT:
+            await self.remote_write_str(json.dumps([BEAT, meta["mark"]]))
+        else:
+            await super().on_meta(data)
+
+    async def _leaving(self) -> None:
+        """Let a screen that says it ends do so; the page hears of it when the process is gone."""
+
+    async def _wait(self, process: Process) -> None:
+        try:
+            await asyncio.wait_for(process.wait(), GRACE)
+        except TimeoutError:
+            with suppress(ProcessLookupError):
+                process.kill()
+            await process.wait()
+
+    def _said(self) -> str:
+        """Return why the process ended, in the words of its last error."""
+        if self._process is None or self._process.returncode == 0:
+            return ""
+        self._errors.seek(0)
+        text = self._errors.read().decode(errors="replace")
+        reason = reason_in(text) or f"with code {self._process.returncode}"
+        return reason[:_LONGEST]

@@ -1,0 +1,38 @@
+"""Textual's driver for a screen whose terminal is a page; it ends when its server is gone."""
+
+from __future__ import annotations
+
+import os
+from contextlib import suppress
+from threading import Timer
+from typing import Final
+
+from textual import messages
+from textual.drivers.web_driver import WebDriver
+
+NAME: Final = f"{__name__}:PageDriver"
+BEAT: Final = "beat"  # a message that the page sends and expects back behind the frames before it
+GRACE: Final = 2.0  # time in which a screen that was asked to end does so by itself [s]
+
+
+class PageDriver(WebDriver):
+    """Reads keys from its server and writes frames to it, over two pipes."""
+
+    def run_input_thread(self) -> None:
+        """Read until the server closes the pipe, which it also does by being killed; then end."""
+        super().run_input_thread()
+        if self.exit_event.is_set():
+            return
+        # A screen that hangs, or whose writes block, must not outlive its server either.
+        last = Timer(GRACE, os._exit, (1,))
+        last.daemon = True
+        last.start()
+        self._app.post_message(messages.ExitApp())
+
+    def on_meta(self, packet_type: str, payload: dict[str, object]) -> None:
+        """Send a beat back through the screen's loop: it is late where the screen is."""
+        if packet_type == BEAT:
+            with suppress(RuntimeError):  # the loop has ended
+                self._loop.call_soon_threadsafe(self.write_meta, payload)
+        else:
+            super().on_meta(packet_type, payload)
