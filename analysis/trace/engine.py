@@ -25,7 +25,7 @@ from analysis.trace.data.regression_data import RegressionData, regression_data
 from analysis.trace.data.spectral_lines import lines
 from analysis.trace.data.temperature_nuisance import stripped, temperature_terms
 from analysis.trace.free_forms import drawn_by_data, mechanisms
-from analysis.trace.judge import gates, held_out
+from analysis.trace.judge import gates, held_out, readings
 from analysis.trace.judge.scatter import widened
 from analysis.trace.judge.shooting import reshaped, told
 from analysis.trace.next_experiment.proposal import propose
@@ -104,6 +104,7 @@ def trace(
         winner, verdict = hypotheses.empty, CLEAN
     else:
         winner = hypotheses.run(lambda share: done(PREPARED + (COLUMNS - PREPARED) * share))
+        winner = readings.settled(hypotheses, winner, holdout_data)
         found, winner, verdict, rest = _named(hypotheses, winner, holdout_data, rng)
         free = _unknown(free_mechanisms(rig), known) if free_forms else []
         drawn = _drawn(hypotheses, free, winner, verdict, holdout_data, rng)

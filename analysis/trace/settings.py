@@ -25,9 +25,12 @@ class TraceSettings:
     p_limit: float = 0.01
     """Family-wise p over all candidates and shapes (convention)."""
     tie: float = 1.10
-    """Held-out rms of a rival over the best's, below which nothing tells them apart (tuned)."""
+    """Held-out rms of a rival over the best's, below which nothing tells them apart (tuned); of an
+    effect that takes less than the noise, the same share of what it takes."""
     tie_training: float = 1.25
     """The same on training records; a rival that fits these worse has another size (tuned)."""
+    ahead: float = 0.95
+    """Held-out rms of a rival over the best's: with less, training records do not count (tuned)."""
     harm: float = 1.2
     """Energy above noise in an equation over that before: a cause makes none worse (tuned)."""
     # What may stay.
@@ -56,7 +59,8 @@ class TraceSettings:
     tolerance: float = 0.2
     """Relative disagreement that a catalogue's simpler form may cause (tuned)."""
     deviations: float = 3.5
-    """Standard errors of a subset's own estimate (convention: 1 in 2000, some 10 subsets)."""
+    """Standard errors of a subset's own estimate, and of what held-out records lose by a simpler
+    reading or a rival (convention: 1 in 2000, some 10 subsets)."""
     tells: float = 0.12
     """Of a column's energy off the others': a subset with less holds its form's tail, not its size
     (tuned: tails of seals reach 0.09, wrong names show from 0.2 on)."""

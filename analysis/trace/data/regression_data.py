@@ -13,6 +13,7 @@ import logging
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,7 +71,7 @@ class RegressionData:
     floors: tuple[Floor, ...]
     records: tuple[ConditionedRecord, ...]
     rows: tuple[Mapping[str, Rows], ...]
-    memo: dict[Hashable, dict[str, Rows]] = field(default_factory=dict, repr=False, compare=False)
+    memo: dict[Hashable, Any] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def mean(self) -> Array:

@@ -21,6 +21,7 @@ from analysis.trace.judge import inference
 from analysis.trace.judge.curves import curves_of
 from analysis.trace.judge.held_out import residual as held_left
 from analysis.trace.judge.invariance import invariance
+from analysis.trace.judge.readings import loss, related
 from analysis.trace.judge.scatter import NORMAL, form_shift
 from analysis.trace.result import Found, Gate, Rival
 from analysis.trace.search.hypothesis import Hypothesis, excess_of, parameter_values
@@ -212,48 +213,87 @@ def _rivals(
 ) -> list[Rival]:
     """Return the sets that have another effect in place of one, those that leave least first.
 
-    What half-samples choose `often` in its place is tied whatever it leaves.
+    What half-samples choose `often` in its place is tied whatever it leaves. A simpler reading of
+    the effect is no rival: held-out records have said that it is too simple.
     """
     others = winner.keys - {key}
-    rest = hypotheses.exact([u for u in winner.effects if (u.term.name, u.term.where) != key])
+    (mine,) = (u.term for u in winner.effects if (u.term.name, u.term.where) == key)
+    rest = hypotheses.exact([u for u in winner.effects if u.term is not mine])
     equations = _touched(hypotheses, winner, rest)
+    judged, trained = (
+        _Near(data, equations, left, without)
+        for data, left, without in (
+            (holdout_data, after, held_left(holdout_data, rest.fit)),
+            (hypotheses.stage, winner.fit.residual, rest.fit.residual),
+        )
+    )
     out = []
-    mine = _energy(holdout_data, after)
-    own = _energy(hypotheses.stage, winner.fit.residual)
     for one in hypotheses.listed.values():
-        fresh = one.keys - winner.keys
+        fresh = [u.term for u in one.effects if (u.term.name, u.term.where) not in winner.keys]
         if key in one.keys or not others <= one.keys or len(fresh) != 1:
             continue
-        if one.size[1] > winner.size[1] or hypotheses.physical(one):
+        (other,) = fresh
+        assert isinstance(other, Effect)
+        assert isinstance(mine, Effect)
+        if one.size[1] > winner.size[1] or related(mine, other) or hypotheses.physical(one):
             continue
-        theirs = _energy(holdout_data, held_left(holdout_data, one.fit))
-        ratio = _ratio(theirs, mine, equations)
-        training = _ratio(_energy(hypotheses.stage, one.fit.residual), own, equations)
-        name, _ = next(iter(fresh))
-        tied = ratio < TRACE.tie and (training < TRACE.tie_training or ratio < 0.95)
-        tied = tied or not fresh.isdisjoint(often)
-        place = next(_place(u.term) for u in one.effects if (u.term.name, u.term.where) in fresh)  # type: ignore[arg-type]
-        out.append(Rival(name, place, ratio, training, tied))
+        held = held_left(holdout_data, one.fit)
+        if _refused_already(hypotheses, holdout_data, (mine, other), others, held):
+            continue
+        ratio = judged.ratio(held)
+        tied = judged.near(held, TRACE.tie) and (
+            trained.near(one.fit.residual, TRACE.tie_training) or ratio < TRACE.ahead
+        )
+        tied = tied or (other.name, other.where) in often
+        out.append(Rival(other.name, _place(other), ratio, trained.ratio(one.fit.residual), tied))
     out.sort(key=lambda r: (not r.tied, r.ratio))
     return out[: TRACE.rivals]
 
 
-def _energy(train_data: RegressionData, residual: Array) -> dict[str, tuple[float, int]]:
-    out: dict[str, tuple[float, int]] = {}
-    for s in train_data.segments:
-        part = residual[s.where]
-        energy, rows = out.get(s.equation, (0.0, 0))
-        out[s.equation] = energy + float(part @ part), rows + len(part)
-    return out
+def _refused_already(
+    hypotheses: HypothesisSet, holdout_data: RegressionData, pair: tuple[Effect, Effect],
+    others: frozenset[Key], held: Array,
+) -> bool:  # fmt: skip
+    """Tell whether a rival says no more than a simpler reading of both, which is refused."""
+    mine, other = pair
+    for name in set(other.includes) & set(mine.includes) if other.where == mine.where else ():
+        simple = hypotheses.listed.get(others | {(name, other.where)})
+        if simple is not None:
+            more = loss(held_left(holdout_data, simple.fit), held)
+            return more <= TRACE.deviations
+    return False
 
 
-def _ratio(
-    one: Mapping[str, tuple[float, int]], other: Mapping[str, tuple[float, int]],
-    equations: set[str],
-) -> float:  # fmt: skip
-    shared = [e for e in one if e in equations and e in other]
-    above, below = sum(one[e][0] for e in shared), sum(other[e][0] for e in shared)
-    return float(np.sqrt(above / below)) if below > 0 else float("nan")
+class _Near:
+    """Whether another fit leaves about as little as the best in the equations of an effect.
+
+    `left` (M,) is what the best leaves, `without` (M,) what is left without the effect.
+    """
+
+    def __init__(
+        self, data: RegressionData, equations: set[str], left: Array, without: Array
+    ) -> None:
+        self.rows = np.zeros(len(left), dtype=bool)
+        for s in data.segments:
+            self.rows[s.where] = s.equation in equations
+        self.left = left[self.rows]
+        self.energy = float(self.left @ self.left)
+        self.taken = float(without[self.rows] @ without[self.rows]) - self.energy
+
+    def ratio(self, other: Array) -> float:
+        """Return the rms of what another fit leaves over that of the best."""
+        energy = float(other[self.rows] @ other[self.rows])
+        return float(np.sqrt(energy / self.energy)) if self.energy > 0 else float("nan")
+
+    def near(self, other: Array, tie: float) -> bool:
+        """Tell whether another fit (M,) loses no more than noise, or than `tie` times the rms.
+
+        Of an effect that takes less than is left, what it takes is the measure, not the noise.
+        """
+        change = other[self.rows] - self.left
+        lost = float(change @ (other[self.rows] + self.left))
+        share = (tie**2 - 1.0) * min(self.energy, max(self.taken, 0.0))
+        return lost < share or loss(other[self.rows], self.left) <= TRACE.deviations
 
 
 def _parameters(

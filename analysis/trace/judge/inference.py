@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from analysis.effects.base import Effect, shape_values, shapes_of
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
+from analysis.trace.judge.readings import related
 from analysis.trace.judge.scatter import scatter
 from analysis.trace.search import linear_fit
 from analysis.trace.search.hypothesis import Hypothesis, excess_of
@@ -180,18 +181,25 @@ def stability(
             _again(train_data, t.one, _refitted(t, change, weight), noise) for t in tangents
         ]
         best = hypotheses.best(refitted)
-        said = best.keys | _included(best)
-        for key in winner.keys & said:
+        for key in _said(winner, best):
             counts[key] += 1
         for other in best.keys - winner.keys:
             others[other] = others.get(other, 0) + 1
     return {key: (count / len(samples), others) for key, count in counts.items()}
 
 
-def _included(one: Hypothesis) -> set[tuple[str, str]]:
-    """Return what a set says beside its own names: an effect with more numbers includes another."""
-    effects = [u.term for u in one.effects if isinstance(u.term, Effect)]
-    return {(name, effect.where) for effect in effects for name in effect.includes}
+def _said(winner: Hypothesis, best: Hypothesis) -> set[Key]:
+    """Return the winner's effects that a choice holds too, be it in another reading of theirs.
+
+    Which reading of a mechanism holds is asked on held-out records (`readings`), not here.
+    """
+    chosen = [u.term for u in best.effects if isinstance(u.term, Effect)]
+    return {
+        (u.term.name, u.term.where)
+        for u in winner.effects
+        if isinstance(u.term, Effect)
+        and any(u.term == other or related(u.term, other) for other in chosen)
+    }
 
 
 def _refitted(one: Linear, change: Array, weight: Array) -> Array:

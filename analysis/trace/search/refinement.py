@@ -8,8 +8,10 @@ side's size before the change.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +21,14 @@ from analysis.effects.base import Effect, Shape, shapes_of
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.rows import Rows
 from analysis.terms.base import Used
-from analysis.trace.data.conditioned_record import acts_on, held, model_rows
+from analysis.trace.data.conditioned_record import (
+    acts_on,
+    candidate_columns,
+    changes_signals,
+    held,
+    model_rows,
+    prepared,
+)
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.search.linear_fit import CHANCE, orthonormal
 from rig.model.rig import Rig
@@ -29,7 +38,7 @@ Array = NDArray[np.float64]
 TOLERANCE = 1e-4
 MOST_STEPS = 10
 DETAIL = 0.05  # of what is left above noise: less does not earn a detail of the form
-REMEMBERED = 300  # families of rows of scenes under a model, about 0.1 MB each
+REMEMBERED = 600  # families of rows of scenes under a model, at most about 0.1 MB each
 
 
 @dataclass(frozen=True)
@@ -87,18 +96,42 @@ def table(data: RegressionData, terms: Sequence[Used]) -> DesignMatrix:
 def _rows(
     data: RegressionData, terms: Sequence[Used], conditioned: ConditionedRecord
 ) -> dict[str, Rows]:
-    """Return a scene's rows, remembered: many sets share what acts on a family of its rows."""
+    """Return a scene's rows, remembered: many sets share what acts on a family of its rows.
+
+    A term that only has columns has them filtered alone, beside the rows of the others.
+    """
     here = [u for u in terms if not held(u.term, conditioned)]
     found: dict[str, Rows] = {}
     for family in conditioned.families:
-        acting = tuple(u for u in here if acts_on(data.rig, u.term, family))
-        key = (conditioned.group, family, acting)
-        if key not in data.memo:
-            if len(data.memo) >= REMEMBERED:
-                data.memo.clear()
-            data.memo[key] = model_rows(data.rig, acting, replace(conditioned, families=(family,)))
-        found |= data.memo[key]
+        acting = [u for u in here if acts_on(data.rig, u.term, family)]
+        added = [u for u in acting if isinstance(u.term, Effect) and not changes_signals(u.term)]
+        others = tuple(u for u in acting if u not in added)
+        key, own = (conditioned.group, family, others), replace(conditioned, families=(family,))
+        rows: dict[str, Rows] = _kept(data, key, partial(model_rows, data.rig, others, own))
+        for u in added:
+            seen = _kept(data, (*key, None), partial(prepared, data.rig, others, own))
+            more = partial(candidate_columns, data.rig, (), own, seen, rows, {}, u)
+            columns = _kept(data, (*key, u), more)
+            rows = {e: _beside(r, columns.get(e, {})) for e, r in rows.items()}
+        found |= rows
     return found
+
+
+def _kept(data: RegressionData, key: Any, make: Callable[[], Any]) -> Any:
+    """Return what belongs to a key, made where it is not remembered."""
+    if key not in data.memo:
+        if len(data.memo) >= REMEMBERED:
+            data.memo.clear()
+        data.memo[key] = make()
+    return data.memo[key]
+
+
+def _beside(rows: Rows, columns: Mapping[str, Array]) -> Rows:
+    """Return rows with columns (m,) of further parameters."""
+    if not columns:
+        return rows
+    matrix = np.column_stack([rows.matrix, *columns.values()])
+    return replace(rows, names=(*rows.names, *columns), matrix=matrix)
 
 
 def fit(data: RegressionData, terms: Sequence[Used]) -> ExactFit:
@@ -106,7 +139,8 @@ def fit(data: RegressionData, terms: Sequence[Used]) -> ExactFit:
     rows = table(data, terms)
     scale = np.linalg.norm(rows.matrix, axis=0)
     scale[scale == 0] = 1.0
-    value = np.linalg.lstsq(rows.matrix / scale, rows.rhs, rcond=1e-6)[0] / scale
+    Q, R = np.linalg.qr(rows.matrix / scale)
+    value = np.linalg.lstsq(R, Q.T @ rows.rhs, rcond=1e-6)[0] / scale
     beta = dict(zip(rows.names, value, strict=True))
     return ExactFit(tuple(terms), beta, rows.residual(beta))
 

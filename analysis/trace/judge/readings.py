@@ -1,0 +1,104 @@
+"""Readings of one mechanism: whether the simpler name loses more than noise and its form may.
+
+A name is a restriction of its mechanism's law: one level of dry friction where the law has two, no
+breakaway, no line behind the tank. The energy that a fit leaves cannot tell whether a restriction
+holds, for its scatter grows with all rows; what the number set to nothing would change in the
+held-out rows is one direction in them, along which noise is one.
+"""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.effects.base import Effect
+from analysis.terms.base import Used
+from analysis.trace.data.regression_data import RegressionData
+from analysis.trace.judge.held_out import residual as held_left
+from analysis.trace.search import linear_fit
+from analysis.trace.search.hypothesis import Hypothesis, Key
+from analysis.trace.search.hypothesis_set import DEEPEST, HypothesisSet
+from analysis.trace.settings import TRACE
+
+Array = NDArray[np.float64]
+log = logging.getLogger(__name__)
+
+
+def settled(
+    hypotheses: HypothesisSet, winner: Hypothesis, holdout_data: RegressionData
+) -> Hypothesis:
+    """Return the winner with the simplest reading of every mechanism that loses no more than noise.
+
+    A richer reading takes the place of one that it includes, or stands beside it. It must be
+    physical, which asks that its own number is more than a form's tolerance; training and held-out
+    records must lose by the restriction more than `TRACE.deviations` of their noise; and beside a
+    name it must take the share of what is left that a further effect must. Of several that
+    leave about as little the one with the fewest numbers stays.
+    """
+    while winner.effects:
+        held = held_left(holdout_data, winner.fit)
+        richer = [o for o in _richer(hypotheses, winner) if not hypotheses.physical(o)]
+        kept = [o for o in richer if _lost(hypotheses, winner, o, held, holdout_data)]
+        if not kept:
+            break
+        least = min(o.fit.energy for o in kept)
+        near = [o for o in kept if o.fit.energy <= least + linear_fit.CHANCE]
+        best = min(near, key=lambda o: (o.size, o.fit.energy))
+        log.info("richer reading: %s for %s", sorted(best.keys), sorted(winner.keys))
+        winner = best
+    return winner
+
+
+def loss(restricted: Array, richer: Array) -> float:
+    """Return by how many standard deviations of noise residuals (M,) lose by a restriction.
+
+    Both are whitened and of records that neither was fitted to. Noise alone gives a normal number;
+    what the richer model says rightly adds the length of the difference.
+    """
+    change = restricted - richer
+    size = float(np.linalg.norm(change))
+    return float(restricted @ change) / size if size > 0 else 0.0
+
+
+def related(one: Effect, other: Effect) -> bool:
+    """Tell whether one of two effects is a reading of the other's law at the same place."""
+    near = one.name in other.includes or other.name in one.includes
+    return near and one.where == other.where
+
+
+def _lost(
+    hypotheses: HypothesisSet, one: Hypothesis, other: Hypothesis, held: Array,
+    holdout_data: RegressionData,
+) -> bool:  # fmt: skip
+    """Tell whether training and held-out records lose by taking `one` for the richer `other`."""
+    gain = one.fit.energy - other.fit.energy
+    if gain <= TRACE.deviations**2:
+        return False
+    if len(other.effects) > len(one.effects):
+        price = linear_fit.CHANCE * (other.size[1] - one.size[1])
+        if gain <= max(price, linear_fit.ADD_SHARE * one.total):
+            return False
+    return loss(held, held_left(holdout_data, other.fit)) > TRACE.deviations
+
+
+def _richer(hypotheses: HypothesisSet, one: Hypothesis) -> list[Hypothesis]:
+    """Return the sets with a further reading of a mechanism, in the place of one or beside it."""
+    rig, sets = hypotheses.stage.rig, dict[frozenset[Key], tuple[Used, ...]]()
+    for used in one.effects:
+        assert isinstance(used.term, Effect)
+        for effect in hypotheses.effects:
+            if not related(effect, used.term) or (effect.name, effect.where) in one.keys:
+                continue
+            fresh = Used(effect, effect.shape_of(rig, ()))
+            beside = (*one.effects, fresh)
+            if used.term.name in effect.includes:
+                _keep(sets, tuple(u for u in beside if u is not used))
+            if len(beside) <= DEEPEST:
+                _keep(sets, beside)
+    return [hypotheses.exact(effects) for effects in sets.values()]
+
+
+def _keep(sets: dict[frozenset[Key], tuple[Used, ...]], effects: tuple[Used, ...]) -> None:
+    sets.setdefault(frozenset((u.term.name, u.term.where) for u in effects), effects)
