@@ -295,7 +295,13 @@ class _SocketcandBus(SocketCanDaemonBus):
 
 
 class _SlcanBus(slcanBus):
-    """python-can's client, which asks the system for every byte by itself."""
+    """python-can's client, which asks for every byte by itself and ends with a damaged text."""
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        try:
+            return super()._recv_internal(timeout)
+        except (ValueError, IndexError):  # the adapter's own line has no checksum
+            return None, False
 
     def _read(self, timeout: float | None) -> str | None:
         end = None if timeout is None else time.monotonic() + timeout

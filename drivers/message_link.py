@@ -210,7 +210,11 @@ class MessageLink:
             return DeviceBusy(f"another client has control of the device at {self.where}")
         return RequestRefused(what, Refusal(refusal.reason))
 
+    def complaint(self) -> str:
+        """Say what came since opening that may explain what is missing, or ''."""
+        return self._line.complaint(self._heard)
+
     def _silence(self) -> str:
         text = f"the device at {self.where} has not answered for {self._patience:g} s"
-        complaint = self._line.complaint(self._heard)
+        complaint = self.complaint()
         return f"{text}; {complaint}" if complaint else text

@@ -203,6 +203,7 @@ class MessageStreamDriver:
         period = self._layout.samples / self._rig.sample_rate
         pause = period + min(_RESEND_SECONDS, self._wire.watchdog / 5)
         deadline = self._clock() + period + self._link.patience
+        known = ""  # what was wrong with the line before it was waited for in vain
         for asked in count(1):
             due = min(self._clock() + pause, deadline)
             while not self._ready and (remaining := due - self._clock()) > 0.0:
@@ -210,10 +211,12 @@ class MessageStreamDriver:
                 self._accept()
             if self._ready:
                 break
+            if asked == 1:
+                known = self._link.complaint()
             # The note or the block was lost; the watchdog wants another note in any case.
             self._alive(resend=True)
             if asked % _NOTES_BEFORE_STATUS == 0:
-                self._why_no_block(overdue=self._clock() >= deadline)
+                self._why_no_block(overdue=self._clock() >= deadline, known=known)
         block = self._ready.popleft()
         return self._decoder.decode(block.header, reg.pack_header(block.header) + block.samples)
 
@@ -293,8 +296,8 @@ class MessageStreamDriver:
                 self._asked_for = self._expected
                 self._alive(resend=True)
 
-    def _why_no_block(self, *, overdue: bool) -> None:
-        """Raise the reason why the device sends no blocks, if it is one that lasts."""
+    def _why_no_block(self, *, overdue: bool, known: str = "") -> None:
+        """Raise the reason why no blocks come, if it is one that lasts; `known` is none for it."""
         where = self._link.where
         try:
             status = self._status()
@@ -311,9 +314,11 @@ class MessageStreamDriver:
             raise DeviceError(f"the device at {where} measures nothing any more: {cause}")
         self._accept()
         if overdue and not self._ready:
+            complaint = self._link.complaint()
+            damaged = complaint and complaint != known
+            what = f"no block came whole; {complaint}" if damaged else "it has measured nothing"
             raise DeviceLost(
-                f"the device at {where} answers, but has measured nothing for "
-                f"{self._link.patience:g} s"
+                f"the device at {where} answers, but for {self._link.patience:g} s {what}"
             )
 
 

@@ -1,8 +1,9 @@
 """Faults of the wire: what happens to the frames between host and device, whatever the wire is.
 
 A wire fault says what becomes of one frame: pieces of bytes, when each may go on, and whether the
-link ends. `hil_sim.link` carries it out on TCP and on pseudo-terminals. `at` and `until` are
-seconds of the device's time; delays are of the wall's clock, as a host's patience is.
+link ends. `hil_sim.link` carries it out on TCP, on pseudo-terminals and behind CAN adapters. `at`
+and `until` are seconds of the device's time; delays are of the wall's clock, as a host's patience
+is.
 """
 
 from __future__ import annotations
@@ -42,6 +43,14 @@ class End(Enum):
     LINK = auto()
 
 
+class Carrier(Enum):
+    """What lies beneath the frames and deals with damaged ones."""
+
+    LINE = auto()  # nothing: the damaged bytes arrive
+    TCP = auto()  # its checksum and its sending again
+    CAN = auto()  # the controllers: their CRC, and error frames
+
+
 @dataclass(frozen=True)
 class Piece:
     """Bytes that go on together, `wait` [s] after their release; `end` acts when they have gone."""
@@ -72,8 +81,14 @@ class WireFault(Fault):
         """Return what becomes of a frame."""
         raise NotImplementedError
 
-    def over_tcp(self, frame: bytes, rng: np.random.Generator) -> Sequence[Piece]:
-        """Return what becomes of a frame on a wire that has TCP beneath it."""
+    def on(
+        self, carrier: Carrier, frame: bytes, rng: np.random.Generator, error: bytes = b""
+    ) -> Sequence[Piece]:
+        """Return what becomes of a frame by what lies beneath it.
+
+        `error` is what a CAN adapter hands on for an error frame, nothing where it hands none on.
+        """
+        del carrier, error
         return self.spoil(frame, rng)
 
 
@@ -154,17 +169,28 @@ class FramesMerged(WireFault):
 class BitsFlipped(WireFault):
     """Some `bits` of the frame, drawn at random, are turned.
 
-    TCP's own checksum drops such a frame and sends it again; `past_checksum` lets it pass, as
-    behind a gateway that damages what it hands on.
+    TCP's own checksum drops such a frame and sends it again; on a CAN bus the controllers drop it
+    by its CRC and answer with an error frame. `past_checksum` lets it pass, as behind a gateway or
+    on an adapter's own line that damages what it hands on.
     """
 
     name: Literal["bits_flipped"]
     bits: int = Field(default=1, ge=1, le=64)
     past_checksum: bool = False
 
-    def over_tcp(self, frame: bytes, rng: np.random.Generator) -> Sequence[Piece]:
-        """Let TCP send the frame again, unless the damage is past its checksum."""
-        return self.spoil(frame, rng) if self.past_checksum else (Piece(frame, TCP_SENDS_AGAIN),)
+    def on(
+        self, carrier: Carrier, frame: bytes, rng: np.random.Generator, error: bytes = b""
+    ) -> Sequence[Piece]:
+        """Let TCP send the frame again, unless past its checksum; on CAN an error frame comes.
+
+        Controllers send a damaged frame again by themselves; here it stays lost, as for a receiver
+        that alone saw the damage in the last bit, or with automatic retransmission switched off.
+        """
+        if carrier is Carrier.LINE or self.past_checksum:
+            return self.spoil(frame, rng)
+        if carrier is Carrier.TCP:
+            return (Piece(frame, TCP_SENDS_AGAIN),)
+        return (Piece(error),) if error else ()
 
     def spoil(self, frame: bytes, rng: np.random.Generator) -> Sequence[Piece]:
         """Turn bits, each in another place."""

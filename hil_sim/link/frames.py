@@ -1,6 +1,8 @@
 """Where a frame ends in a stream of bytes, for each kind of wire.
 
-A cutter returns the length of the first whole frame of a buffer, 0 while it is not complete.
+A cutter returns the length of the first whole frame of a buffer, 0 while it is not complete. On a
+CAN bus reached through an adapter, the adapter's text for a frame stands for the frame; the rest of
+its text is no traffic of the bus.
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from hil_sim.device.rtu_server import frame_length
+from hil_sim.faults.wire import Carrier
 
 Cutter = Callable[[bytes], int]
 
@@ -18,12 +21,32 @@ _RTU_COUNTED: Final = (3, 4, 23)  # answers with a byte count
 _RTU_EXCEPTION: Final = 0x80
 
 
+def every_frame(frame: bytes) -> bool:
+    """Say that a frame is one of the wire, whatever it holds."""
+    del frame
+    return True
+
+
+def no_error(frame: bytes) -> bytes:
+    """Return what arrives instead of a frame that a controller has dropped: nothing."""
+    del frame
+    return b""
+
+
 @dataclass(frozen=True)
 class Framing:
-    """How the frames of each way are told apart."""
+    """How the frames of each way are told apart, and what deals with damaged ones.
+
+    `on_wire` tells a frame of the wire from an adapter's own talk, which no fault strikes;
+    `carrier` is None where the link's own kind says what lies beneath; `error_of` returns what the
+    host's adapter says of a frame that its controller has dropped.
+    """
 
     to_device: Cutter
     to_host: Cutter
+    on_wire: Callable[[bytes], bool] = every_frame
+    carrier: Carrier | None = None
+    error_of: Callable[[bytes], bytes] = no_error
 
 
 def modbus_tcp(data: bytes) -> int:
@@ -51,6 +74,32 @@ def between_zeros(data: bytes) -> int:
     """Return the length of a frame of the serial protocol: what ends with the next zero."""
     begun = len(data) - len(data.lstrip(b"\0"))
     return data.find(b"\0", begun) + 1 if begun < len(data) else 0
+
+
+def socketcand_text(data: bytes) -> int:
+    """Return the length of a text of socketcand: up to the next ``>``."""
+    return data.find(b">") + 1
+
+
+def socketcand_frame(text: bytes) -> bool:
+    """Say whether a text of socketcand is a frame of the bus."""
+    return text.split()[:2] in ([b"<", b"frame"], [b"<", b"send"])
+
+
+def socketcand_error(text: bytes) -> bytes:
+    """Return socketcand's text of an error frame, as candump shows one: class ``bus error``."""
+    return b"< error 00000088 %s >" % text.split()[3]  # at the time of the frame it is in place of
+
+
+def slcan_text(data: bytes) -> int:
+    """Return the length of a text of an slcan adapter: up to its end or its error mark."""
+    ends = [at for mark in (b"\r", b"\a") if (at := data.find(mark)) >= 0]
+    return min(ends) + 1 if ends else 0
+
+
+def slcan_frame(text: bytes) -> bool:
+    """Say whether a text of an slcan adapter is a frame of the bus."""
+    return text[:1] in (b"t", b"T", b"d", b"D", b"b", b"B")
 
 
 def _whole(data: bytes, length: int) -> int:

@@ -38,10 +38,10 @@ class LineLink(FaultyLink):
         port: int = 0,
     ) -> None:
         super().__init__(framing, faults, seed, seconds)
-        kind, _, self._target = target.partition("://")
+        kind, self._target = _prefix_and_device(target)
         self._folder = TemporaryDirectory(prefix="bramah-line-")
         self._name = Path(self._folder.name) / "line"
-        self._endpoint = f"{kind}://{self._name}"
+        self._endpoint = f"{kind}{self._name}"
         self._device: int | None = None
         self._unsent = b""
         self._to_device, self._to_host = self._ways()
@@ -138,3 +138,10 @@ class LineLink(FaultyLink):
     def _end(self) -> None:
         self._line.close()
         self._folder.cleanup()
+
+
+def _prefix_and_device(target: str) -> tuple[str, str]:
+    """Return what stands before a device file in an endpoint, ``can://slcan``, and the file."""
+    kind, _, rest = target.partition("://")
+    before, _, path = rest.partition("/")
+    return f"{kind}://{before}", f"/{path}"

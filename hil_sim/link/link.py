@@ -15,7 +15,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import ClassVar, Final, Self
 
-from hil_sim.faults.wire import TO_DEVICE, TO_HOST, WireFault
+from hil_sim.faults.wire import TO_DEVICE, TO_HOST, Carrier, WireFault
 from hil_sim.link.frames import Framing
 from hil_sim.link.way import Striker, Way
 
@@ -32,7 +32,7 @@ class FaultyLink(ABC):
     link was made. Frames are struck as `seed` draws it, each way by its own draw.
     """
 
-    tcp: ClassVar[bool] = False  # whether TCP carries it, whose checksum and retries lie beneath
+    beneath: ClassVar[Carrier] = Carrier.LINE  # what carries it, but for a wire with its own
 
     def __init__(
         self,
@@ -43,8 +43,8 @@ class FaultyLink(ABC):
     ) -> None:
         self._framing = framing
         self._strikers = (
-            Striker(TO_DEVICE, faults, (seed, 0), tcp=self.tcp),
-            Striker(TO_HOST, faults, (seed, 1), tcp=self.tcp),
+            Striker(TO_DEVICE, faults, (seed, 0), framing.carrier or self.beneath),
+            Striker(TO_HOST, faults, (seed, 1), framing.carrier or self.beneath),
         )
         made = time.monotonic()
         self.seconds = seconds or (lambda: time.monotonic() - made)
@@ -105,7 +105,11 @@ class FaultyLink(ABC):
         """Return the ways of a new connection: to the device, to the host."""
         to_device, to_host = self._strikers
         framing = self._framing
-        return Way(to_device, framing.to_device), Way(to_host, framing.to_host)
+        on_wire = framing.on_wire
+        return (
+            Way(to_device, framing.to_device, on_wire),
+            Way(to_host, framing.to_host, on_wire, framing.error_of),
+        )
 
     def _patience(self, ways: Sequence[Way], now: float) -> float:
         """Return how long [s] the link may wait for bytes before a piece is due."""

@@ -6,19 +6,28 @@ import asyncio
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
-from typing import Final, Self, TypeVar
+from typing import TYPE_CHECKING, Final, Self, TypeVar
 
 from hil_sim.device.device import Device
 from hil_sim.device.lifetime import EndpointError
 from hil_sim.device.pty_line import PtyLine
 from hil_sim.device.rtu_server import serve_line
 from hil_sim.device.serial_server import serve_port
-from hil_sim.device.server import RTU, SERIAL, TCP, serve_until
+from hil_sim.device.server import BITRATE, CAN, RTU, SERIAL, SLCAN, TCP, serve_until
 from hil_sim.faults.wire import WireFault
 from hil_sim.link.wires import faulty_link
 
+if TYPE_CHECKING:
+    from hil_sim.device.can.adapters import Adapter
+
 Answer = TypeVar("Answer")
-SERVED: Final = (TCP, RTU, SERIAL)  # wires that a device and a faulty link stand on here
+SERVED: Final = (
+    TCP,
+    RTU,
+    SERIAL,
+    CAN,
+    SLCAN,
+)  # wires that a device and a faulty link stand on here
 _SECONDS: Final = 60.0  # nothing here takes that long; a hang ends in an error
 
 
@@ -45,12 +54,17 @@ class ServedDevice:
         self._lock = threading.Lock()
         self._ended: list[bool] = []
         self._loop: asyncio.AbstractEventLoop | None = None
+        self._adapter: Adapter | None = None
         self._endpoint: Future[str] = Future()
-        work = self._serve_port if wire == SERIAL else lambda: asyncio.run(self._serve(wire))
-        self._thread = threading.Thread(target=self._serve_or_report, args=(work,), daemon=True)
+        self._thread = threading.Thread(target=self._serve_or_report, args=(wire,), daemon=True)
         self._thread.start()
         target = self._endpoint.result(_SECONDS)
         self.link = faulty_link(target, faults, seed=seed, seconds=seconds)
+
+    @property
+    def deserted(self) -> bool:
+        """Whether no program has the bus open: a node of a bus notices by its watchdog only."""
+        return self._adapter is not None and not self._adapter.attended
 
     def inside(self, call: Callable[[], Answer]) -> Answer:
         """Make a call in between what the device does for its host."""
@@ -83,9 +97,14 @@ class ServedDevice:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _serve_or_report(self, work: Callable[[], None]) -> None:
+    def _serve_or_report(self, wire: str) -> None:
         try:
-            work()
+            if wire == SERIAL:
+                self._serve_port()
+            elif wire in (CAN, SLCAN):
+                self._serve_bus(wire)
+            else:
+                asyncio.run(self._serve(wire))
         except Exception as error:
             if self._endpoint.done():
                 raise
@@ -99,6 +118,24 @@ class ServedDevice:
         finally:
             self.device.zero()
             line.close()
+
+    def _serve_bus(self, wire: str) -> None:
+        # Half a second of imports that no other wire needs.
+        from hil_sim.device.can import adapters, server  # noqa: PLC0415
+
+        adapter = (
+            adapters.SlcanLine(BITRATE)
+            if wire == SLCAN
+            else adapters.SocketcandServer("127.0.0.1", 0)
+        )
+        layout = server.layout_of(self.device.rig)
+        self._adapter = adapter
+        self._endpoint.set_result(adapter.endpoint)
+        try:
+            server.run_device(adapter, self.device, layout, self._ended, lock=self._lock)
+        finally:
+            self.device.zero()
+            adapter.close()
 
     async def _serve(self, wire: str) -> None:
         self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()

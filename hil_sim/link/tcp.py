@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import select
 import socket
 import time
@@ -13,12 +14,15 @@ from typing import ClassVar, Final
 from urllib.parse import urlsplit
 
 from hil_sim.device.lifetime import EndpointError
-from hil_sim.faults.wire import End, WireFault
+from hil_sim.faults.wire import Carrier, End, WireFault
 from hil_sim.link.frames import Framing
 from hil_sim.link.link import FaultyLink
 from hil_sim.link.way import Way
 
 _CHUNK: Final = 65_536
+_ADDRESS: Final = re.compile(
+    r"[^/]+:\d+"
+)  # in modbus-tcp://HOST:PORT, can://socketcand/HOST:PORT/can0
 _SEND_SECONDS: Final = 1.0  # that an end which does not read may take before its link ends
 
 
@@ -36,7 +40,7 @@ class _Side:
 class TcpLink(FaultyLink):
     """Listens on loopback, connects to the device at `target` for each host that comes."""
 
-    tcp: ClassVar[bool] = True
+    beneath: ClassVar[Carrier] = Carrier.TCP
 
     def __init__(
         self,
@@ -48,7 +52,8 @@ class TcpLink(FaultyLink):
         port: int = 0,
     ) -> None:
         super().__init__(framing, faults, seed, seconds)
-        url = urlsplit(target)
+        found = _ADDRESS.search(target)
+        url = urlsplit(f"//{found.group()}" if found else "")
         self._target = (str(url.hostname), int(url.port or 0))
         try:
             self._listener = socket.create_server(("127.0.0.1", port))
@@ -57,7 +62,8 @@ class TcpLink(FaultyLink):
                 f"cannot listen on 127.0.0.1:{port}: {error.strerror}; end what uses the port, "
                 "or choose another one (0: any free one)"
             ) from error
-        self._endpoint = f"{url.scheme}://127.0.0.1:{self._listener.getsockname()[1]}"
+        here = f"127.0.0.1:{self._listener.getsockname()[1]}"
+        self._endpoint = _ADDRESS.sub(here, target, count=1)
         self._sides: dict[socket.socket, _Side] = {}
         self._start()
 

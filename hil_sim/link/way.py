@@ -9,14 +9,14 @@ from __future__ import annotations
 import logging
 import math
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
-from hil_sim.faults.wire import End, Piece, Release, WireFault
-from hil_sim.link.frames import Cutter
+from hil_sim.faults.wire import Carrier, End, Piece, Release, WireFault
+from hil_sim.link.frames import Cutter, every_frame, no_error
 
 logger = logging.getLogger(__name__)
 
@@ -29,10 +29,14 @@ class Striker:
     """Draws, by a seed, which frames of one way are struck by which fault."""
 
     def __init__(
-        self, way: str, faults: Sequence[WireFault], seed: Sequence[int], *, tcp: bool = False
+        self,
+        way: str,
+        faults: Sequence[WireFault],
+        seed: Sequence[int],
+        carrier: Carrier = Carrier.LINE,
     ) -> None:
         self.way = way
-        self._tcp = tcp
+        self._carrier = carrier
         self._rng = np.random.default_rng([*seed, STREAM])
         self._faults: tuple[WireFault, ...] = ()
         self._struck: Counter[int] = Counter()
@@ -44,8 +48,11 @@ class Striker:
         self._struck = Counter()
         self._faults = tuple(fault for fault in faults if fault.strikes(self.way))
 
-    def strike(self, frame: bytes, seconds: float) -> Sequence[Piece]:
-        """Return what becomes of a frame at `seconds` of the device's time; one fault a frame."""
+    def strike(self, frame: bytes, seconds: float, error: bytes = b"") -> Sequence[Piece]:
+        """Return what becomes of a frame at `seconds` of the device's time; one fault a frame.
+
+        `error` is what the wire's adapter says instead of a frame that its controller has dropped.
+        """
         for number, fault in enumerate(self._faults):
             until = math.inf if fault.until is None else fault.until
             spent = fault.most is not None and self._struck[number] >= fault.most
@@ -56,7 +63,7 @@ class Striker:
             self._struck[number] += 1
             self.counts[fault.name] += 1
             logger.info("%.3f s: %s, %s, %d bytes", seconds, fault.name, self.way, len(frame))
-            return (fault.over_tcp if self._tcp else fault.spoil)(frame, self._rng)
+            return fault.on(self._carrier, frame, self._rng, error)
         return (Piece(frame),)
 
 
@@ -71,8 +78,16 @@ class _Due:
 class Way:
     """The frames of one direction of one connection, in order but where a fault says otherwise."""
 
-    def __init__(self, striker: Striker, cut: Cutter) -> None:
+    def __init__(
+        self,
+        striker: Striker,
+        cut: Cutter,
+        on_wire: Callable[[bytes], bool] = every_frame,
+        error_of: Callable[[bytes], bytes] = no_error,
+    ) -> None:
+        """Carry what `cut` cuts; faults strike what `on_wire` says is a frame of the wire."""
         self._striker, self._cut = striker, cut
+        self._on_wire, self._error_of = on_wire, error_of
         self._buffer = b""
         self._heard = 0.0
         self._ready: deque[_Due] = deque()
@@ -93,8 +108,7 @@ class Way:
         frames = 0
         while length := self._cut(self._buffer):
             frame, self._buffer = self._buffer[:length], self._buffer[length:]
-            self._frame(frame, now, seconds)
-            frames += 1
+            frames += self._frame(frame, now, seconds)
         return frames
 
     def other_way(self, now: float) -> None:
@@ -124,10 +138,14 @@ class Way:
         times = [due.at for due in (*list(self._ready)[:1], *self._before[:1])]
         return min([*times, *([self._heard + QUIET] if self._buffer else [])], default=math.inf)
 
-    def _frame(self, frame: bytes, now: float, seconds: float) -> None:
+    def _frame(self, frame: bytes, now: float, seconds: float) -> bool:
+        """Take one frame; returns whether it is one of the wire, not of the adapter's talk."""
+        if not self._on_wire(frame):
+            self._queue([] if self.ended else [Piece(frame)], now)
+            return False
         if self.ended:
-            return
-        pieces = list(self._striker.strike(frame, seconds))
+            return True
+        pieces = list(self._striker.strike(frame, seconds, self._error_of(frame)))
         joined, self._before = b"".join(due.piece.data for due in self._before), []
         behind, self._behind = self._behind, []
         if joined:
@@ -135,6 +153,7 @@ class Way:
             pieces.insert(0, replace(first, data=joined + first.data))
         self._queue(pieces, now)
         self._queue([replace(piece, release=Release.TIME) for piece in behind], now)
+        return True
 
     def _queue(self, pieces: Sequence[Piece], now: float) -> None:
         for piece in pieces:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from hil_sim.device.lifetime import EndpointError
-from hil_sim.faults.wire import WireFault
+from hil_sim.faults.wire import Carrier, WireFault
 from hil_sim.link import frames
 from hil_sim.link.frames import Framing
 from hil_sim.link.line import LineLink
@@ -24,11 +24,28 @@ class WireKind:
 
 
 _MODBUS_TCP: Final = WireKind(TcpLink, Framing(frames.modbus_tcp, frames.modbus_tcp))
+_SOCKETCAND: Final = WireKind(
+    TcpLink,
+    Framing(
+        frames.socketcand_text,
+        frames.socketcand_text,
+        frames.socketcand_frame,
+        Carrier.CAN,
+        frames.socketcand_error,
+    ),
+)
+_SLCAN: Final = WireKind(
+    LineLink, Framing(frames.slcan_text, frames.slcan_text, frames.slcan_frame, Carrier.CAN)
+)
+_SLCAN_ENDPOINT: Final = "can://slcan"
 WIRES: Final[Mapping[str, WireKind]] = {
     "modbus-tcp": _MODBUS_TCP,
     "modbus-map": _MODBUS_TCP,
     "modbus-rtu": WireKind(LineLink, Framing(frames.rtu_request, frames.rtu_answer)),
     "serial": WireKind(LineLink, Framing(frames.between_zeros, frames.between_zeros)),
+    "can": _SOCKETCAND,
+    "can-slcan": _SLCAN,
+    "canopen-408": _SOCKETCAND,
 }
 
 
@@ -45,7 +62,7 @@ def faulty_link(
     `port` is where it listens, on wires that have ports (0: any free one). Raises EndpointError
     for a kind of wire that no link stands on, or a place that is taken.
     """
-    kind = target.partition("://")[0]
+    kind = "can-slcan" if target.startswith(_SLCAN_ENDPOINT) else target.partition("://")[0]
     if kind not in WIRES:
         raise EndpointError(f"no faults for wire {kind}; expected one of: {' '.join(WIRES)}")
     wire = WIRES[kind]

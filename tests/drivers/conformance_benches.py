@@ -12,7 +12,7 @@ import numpy as np
 from drivers import make_driver, message_stream, modbus_tcp, wire_at
 from drivers.conformance import HEALTHY, Capabilities, DeviceUnderTest, Subject
 from hil_sim.device.device import Device
-from hil_sim.device.server import RTU, SERIAL, TCP
+from hil_sim.device.server import CAN, RTU, SERIAL, SLCAN, TCP
 from hil_sim.faults.wire import (
     BitsFlipped,
     FrameDuplicated,
@@ -71,6 +71,7 @@ EVERYWHERE: Final[Mapping[str, WireFault]] = {
     "close": LinkClosed(name="link_closed", most=None),
 }
 FLIP = BitsFlipped(name="bits_flipped", most=3)
+DAMAGED_TEXT = BitsFlipped(name="bits_flipped", bits=3, most=3, past_checksum=True)
 LOST = ("silent", "half closed", "close")
 FAULTS: Final[Mapping[str, Mapping[str, WireFault]]] = {
     TCP: {
@@ -79,6 +80,8 @@ FAULTS: Final[Mapping[str, Mapping[str, WireFault]]] = {
     },
     RTU: {**EVERYWHERE, "flip": FLIP},
     SERIAL: {**EVERYWHERE, "flip": FLIP},
+    CAN: {**EVERYWHERE, "flip": FLIP},
+    SLCAN: {**EVERYWHERE, "flip": FLIP, "damaged text": DAMAGED_TEXT},
 }
 # What `make test` tries: on TCP the quickest that between them reach every branch, elsewhere what
 # that wire alone can suffer. `make study NAME=conformance` takes all.
@@ -86,6 +89,8 @@ FEW: Final[Mapping[str, Sequence[str]]] = {
     TCP: ("lose one", "late answer", "close", "short", "fewer", "miscounted"),
     RTU: ("late answer", "twice"),
     SERIAL: ("flip", "merged"),
+    CAN: ("flip", "late answer"),
+    SLCAN: ("damaged text",),
 }
 
 
@@ -99,8 +104,15 @@ class Held:
         self.rig = seed_rig()
         self.now = 100.0
         self.plant = IntegratorPlant(self.rig)
-        device = Device(self.rig, self.plant, realtime=False, clock=lambda: self.now)
-        self.served = ServedDevice(device, wire)
+        self._served: ServedDevice | None = None
+        self._passing = False  # time is passed by `silence`
+        device = Device(self.rig, self.plant, realtime=False, clock=self._clock)
+        self.served = self._served = ServedDevice(device, wire)
+
+    def _clock(self) -> float:
+        if self._served is not None and self._served.deserted and not self._passing:
+            self.now += STEP
+        return self.now
 
     def outputs(self) -> list[float]:
         """Return the outputs [V] after one more block of the device's clock."""
@@ -116,9 +128,11 @@ class Held:
         """Let 11 s of the device's clock pass."""
 
         def wait() -> None:
+            self._passing = True
             for _ in range(round(11.0 / STEP)):
                 self.now += STEP
                 self.served.device.poll()
+            self._passing = False
 
         self.served.inside(wait)
 
@@ -136,6 +150,11 @@ def _bench(wire: str, names: Sequence[str]) -> Iterator[DeviceUnderTest]:
     def spoil(fault: str) -> None:
         link.use([] if fault == HEALTHY else [known[fault]])
 
+    def cut() -> None:
+        link.cut()
+        if wire in (CAN, SLCAN):  # a node of a bus does not see a program end: its watchdog does
+            held.silence()
+
     def driver(rig: Rig) -> Any:
         quick = rig.wire.model_copy(update={"timeout": TIMEOUT})
         return make_driver(wire_at(link.endpoint, quick), rig)
@@ -149,7 +168,7 @@ def _bench(wire: str, names: Sequence[str]) -> Iterator[DeviceUnderTest]:
             held.rig,
             driver,
             outputs=held.outputs,
-            cut=link.cut,
+            cut=cut,
             silence=held.silence,
             spoil=spoil,
             faults=tuple(names),

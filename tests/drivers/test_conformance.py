@@ -26,7 +26,7 @@ QUICK = RandomCallBudget(sequences=12, calls=20, shorten=False)
 SHORT = RandomCallBudget(sequences=3, calls=12, shorten=False)
 WIRES: dict[str, Callable[[], Subject]] = {
     **{wire: partial(on_wire, wire, names) for wire, names in FEW.items()},
-    "can": partial(can_subject, ("flip", "noise")),
+    "can, in its adapter": partial(can_subject, ("flip", "noise")),
     "canopen-408": partial(valves_subject, ("lose one", "late")),
 }
 

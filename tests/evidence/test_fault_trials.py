@@ -48,6 +48,8 @@ def bench() -> Iterator[FaultBench]:
         ("modbus-rtu", "queue_overrun", Naming.COUNTED, ""),
         ("serial", "reboots", Naming.NAMED, "has restarted"),
         ("serial", "frame_duplicated", Naming.HARMLESS, ""),
+        ("can", "frame_lost", Naming.HARMLESS, ""),
+        ("can-slcan", "link_closed", Naming.NAMED, "has gone"),
     ],
 )
 def test_a_session_meets_a_fault_ends_safe_and_keeps_every_block(

@@ -10,13 +10,14 @@ import tty
 from collections.abc import Iterator
 
 import pytest
+from can.interfaces.socketcand.socketcand import convert_ascii_message_to_can_message
 from hypothesis import example, given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from hil_sim.device.lifetime import EndpointError
 from hil_sim.faults import CLASSES
-from hil_sim.faults.wire import TO_DEVICE, TO_HOST, End, WireFault
+from hil_sim.faults.wire import TO_DEVICE, TO_HOST, Carrier, End, WireFault
 from hil_sim.link import frames
 from hil_sim.link.way import QUIET, Striker, Way
 from hil_sim.link.wires import WIRES, faulty_link
@@ -155,11 +156,59 @@ def test_a_cutter_never_cuts_beyond_what_it_has(data: bytes) -> None:
         (frames.rtu_answer, bytes.fromhex("018302c0f1")),
         (frames.rtu_answer, bytes.fromhex("0110000a0002") + b"xx"),
         (frames.between_zeros, message(5, 6, 7)),
+        (frames.socketcand_text, b"< frame 080 1.500000 A501 >"),
+        (frames.slcan_text, b"t0802A501\r"),
+        (frames.slcan_text, b"\a"),
     ],
 )
 def test_frames_are_told_apart(cut: frames.Cutter, frame: bytes) -> None:
     assert all(cut(frame[:n]) == 0 for n in range(len(frame)))
     assert cut(frame) == cut(frame + frame) == len(frame)
+
+
+@pytest.mark.parametrize(
+    ("is_frame", "talk", "traffic"),
+    [
+        (
+            frames.socketcand_frame,
+            (b"< hi >", b"< ok >", b"< open can0 >", b"< rawmode >", b"< error 088 1.0 >"),
+            (b"< frame 080 1.500000 A501 >", b"< send 080 2 A5 01 >", b"< send 80 0 >"),
+        ),
+        (
+            frames.slcan_frame,
+            (b"O\r", b"C\r", b"S8\r", b"\a", b"\r"),
+            (b"t0802A501\r", b"T000000800\r", b"d0801A5\r"),
+        ),
+    ],
+)
+def test_what_an_adapter_says_of_itself_is_no_traffic_of_the_bus(is_frame, talk, traffic) -> None:
+    assert not any(is_frame(text) for text in talk)
+    assert all(is_frame(text) for text in traffic)
+
+
+def test_a_fault_strikes_the_frames_of_a_can_bus_and_not_the_adapters_talk() -> None:
+    framing = WIRES["can"].framing
+    striker = Striker(TO_HOST, [fault("frame_lost")], (1,), Carrier.CAN)
+    way = Way(striker, framing.to_host, framing.on_wire, framing.error_of)
+    frame = b"< frame 080 1.500000 A501 >"
+    assert way.take(b"< hi >< ok >" + frame + b"< ok >", 0.0, 0.0) == 1
+    assert [piece.data for piece in way.due(0.0)] == [b"< hi >", b"< ok >", b"< ok >"]
+    assert striker.counts == {"frame_lost": 1}
+
+
+def test_a_damaged_frame_of_a_can_bus_is_an_error_frame_or_nothing_and_never_a_frame() -> None:
+    frame = b"< frame 080 1.500000 A501 >"
+    for wire, text, arrives in (
+        ("can", frame, [b"< error 00000088 1.500000 >"]),
+        ("can-slcan", b"t0802A501\r", []),  # its text has no word for error frames
+    ):
+        framing = WIRES[wire].framing
+        striker = Striker(TO_HOST, [fault("bits_flipped")], (1,), Carrier.CAN)
+        way = Way(striker, framing.to_host, framing.on_wire, framing.error_of)
+        way.take(text, 0.0, 0.0)
+        assert [piece.data for piece in way.due(0.0)] == arrives
+    read = convert_ascii_message_to_can_message("< error 00000088 1.500000 >")
+    assert read.is_error_frame
 
 
 # -- on real wires -----------------------------------------------------------------------------

@@ -50,6 +50,10 @@ class Adapter(Protocol):
     def free(self) -> bool:
         """Whether somebody listens and what was sent so far is on its way."""
 
+    @property
+    def attended(self) -> bool:
+        """Whether a program has the bus open."""
+
     def receive(self, patience: float) -> list[CanFrame]:
         """Return the frames that have come within `patience` [s], at once if there are any."""
 
@@ -114,6 +118,11 @@ class SocketcandServer:
     def free(self) -> bool:
         """Whether somebody listens."""
         return any(client.raw for client in self._clients)
+
+    @property
+    def attended(self) -> bool:
+        """Whether a program is connected."""
+        return bool(self._clients)
 
     def receive(self, patience: float) -> list[CanFrame]:
         """Return the frames that programs have sent; see `Adapter`."""
@@ -211,6 +220,11 @@ class SlcanLine:
     def free(self) -> bool:
         """Whether a program has the bus open and everything sent is on its way."""
         return self._on_bus and self._line.free
+
+    @property
+    def attended(self) -> bool:
+        """Whether a program has opened the bus."""
+        return self._opened
 
     @property
     def _on_bus(self) -> bool:

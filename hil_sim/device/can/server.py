@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 
 from hil_sim.device.can.adapters import Adapter
 from hil_sim.device.can.session import CanSession
@@ -63,16 +64,23 @@ def run_device(
     layout: CanLayout,
     ended: Sequence[object],
     owner: ParentProcess | None = None,
+    lock: AbstractContextManager[object] | None = None,
 ) -> None:
-    """Serve a device until `ended` is not empty, or its owner has ended."""
+    """Serve a device until `ended` is not empty, or its owner has ended.
+
+    Whoever else has the device takes `lock`, which is held here but while waiting for frames.
+    """
+    lock = lock or nullcontext()
     session = CanSession(device, layout)
     look = time.monotonic()
     while not ended:
-        for frame in adapter.receive(device.idle_seconds()):
-            adapter.send(session.receive(frame))
-        device.poll()
-        while adapter.free and (block := session.push()):
-            adapter.send(block)
+        received = adapter.receive(device.idle_seconds())
+        with lock:
+            for frame in received:
+                adapter.send(session.receive(frame))
+            device.poll()
+            while adapter.free and (block := session.push()):
+                adapter.send(block)
         if owner is not None and time.monotonic() > look:
             look = time.monotonic() + PARENT_SECONDS
             if owner.has_ended():

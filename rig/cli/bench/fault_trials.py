@@ -19,6 +19,7 @@ import numpy as np
 
 from drivers import make_driver, wire_at
 from drivers.base import DeviceError, DeviceLost, OutputLaw, SampleBlock
+from hil_sim.device.server import CAN, SLCAN, TCP
 from hil_sim.faults import CLASSES
 from hil_sim.faults.base import Fault
 from hil_sim.faults.device import ClockDrift, ClockJump, DeviceFault, QueueOverrun, Reboots
@@ -40,6 +41,7 @@ BEGIN: Final = 1.0  # [s] of device time before a fault begins
 REAL_BEGIN: Final = 3.0  # in real time, in which the clock runs while the session is begun
 WATCHED: Final = 3.0  # [s] of device time that a fault is watched for
 SHARE: Final = 0.1  # of the frames struck, for `STRIKING` [s]
+BUS_SHARE: Final = 0.01  # on a CAN bus, where a block is some thirty frames
 STRIKING: Final = 1.0
 STALE: Final = "stale data"  # the guard's limit that is one of the wall's clock
 _TRIES: Final = 5  # at connecting, on a busy computer
@@ -105,8 +107,8 @@ def kinds() -> dict[str, type[Fault]]:
     return {kind.fault_name(): kind for kind in CLASSES}
 
 
-def example(name: str, at: float = BEGIN) -> Fault:
-    """Return a fault of a name as the trials use it: of a size that a bench may well show.
+def example(name: str, at: float = BEGIN, wire: str = TCP) -> Fault:
+    """Return a fault of a name as the trials on a wire use it: of a size that a bench may show.
 
     A fault of machine, sensor or device begins at `at` [s], one of the wire at once.
     """
@@ -114,7 +116,7 @@ def example(name: str, at: float = BEGIN) -> Fault:
     if not issubclass(kind, WireFault):
         return kind.model_validate({"name": name, "at": at, **keys})
     if name not in _ONCE:
-        keys.update(probability=SHARE, until=STRIKING)
+        keys.update(probability=BUS_SHARE if wire in (CAN, SLCAN) else SHARE, until=STRIKING)
     return kind.model_validate({"name": name, **keys})
 
 
@@ -152,7 +154,7 @@ def try_fault(
 
     Raises DeviceError where no session could be begun before the fault.
     """
-    fault = example(name, REAL_BEGIN if realtime else BEGIN)
+    fault = example(name, REAL_BEGIN if realtime else BEGIN, wire)
     early = () if isinstance(fault, WireFault) else (fault,)
     endpoint = bench.begin(rig, wire, early, seed, realtime=realtime)
     reached = rig.model_copy(update={"wire": wire_at(endpoint, rig.wire)})

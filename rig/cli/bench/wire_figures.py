@@ -29,7 +29,7 @@ from rig.cli.bench.acquisition import lateness, waited_seconds
 from rig.cli.bench.figure import Figure
 from rig.cli.simulated_bench import simulated_bench
 from rig.model import registers as reg
-from rig.model.parts import Wire
+from rig.model.parts import WATCHDOG_RANGE, Wire
 from rig.model.rig import Rig
 from rig.model.wire import serial_messages as msg
 from rig.model.wire.frames import FrameDecoder, WireFrame, encode_frame
@@ -89,7 +89,9 @@ def stream_of(wire: str, seconds: float) -> Stream:
         simulated_bench(RIG, seed=0, real_time=True, wire=wire) as endpoint,
         tempfile.TemporaryDirectory(prefix="bramah-wires-") as folder,
     ):
-        reached = _at(rig, endpoint)
+        # A computer that stands still makes blocks late, which is measured; it must end nothing.
+        patient = rig.wire.model_copy(update={"watchdog": WATCHDOG_RANGE[1]})
+        reached = _at(rig.model_copy(update={"wire": patient}), endpoint)
         recorder = Recorder(Path(folder) / "run", reached)
         with Bench(reached, make_driver(reached.wire, reached), recorder, signals=False) as bench:
             bench.run_for(0.5)  # what is imported and opened first is not the stream

@@ -20,7 +20,7 @@ from tests.studies.quiet import quiet
 
 SUBJECTS: Final[Mapping[str, Callable[[], Subject]]] = {
     **{wire: partial(on_wire, wire) for wire in FAULTS},
-    "can": can_subject,
+    "can, in its adapter": can_subject,
     "canopen-408": valves_subject,
 }
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
@@ -12,6 +12,8 @@ from rig.cli.errors import WorkError
 from rig.cli.output import progress
 from tests.studies.pages import markdown_table, replace_section
 from tests.studies.wires import agreement, endurance
+
+PAGE: Final = "wires.md"
 
 
 def wires(
@@ -22,13 +24,19 @@ def wires(
     minutes: Annotated[
         float, typer.Option(min=0.0, help="Of streaming over each wire in real time; 0: none.")
     ] = 0.0,
+    wire: Annotated[
+        list[str] | None, typer.Option(help="Stream over this wire only; may be repeated.")
+    ] = None,
     same: Annotated[bool, typer.Option(help="Identify over every wire and compare.")] = True,
 ) -> None:
     """Identify the same parameters over every wire; with --minutes also stream for so long.
 
+    Rows of wires that were not streamed over stay in the page as they are.
+
     Example: python -m tests.studies wires --minutes 10 --docs docs
     """
     parts, apart = {}, ""
+    streamed = endurance.chosen(wire or ())
     if same:
         with TemporaryDirectory(prefix="bramah-wires-") as folder:
             results = agreement.every_wire(Path(folder), seed, progress)
@@ -40,12 +48,14 @@ def wires(
             if share > 1.0 or len(result.parameters) < len(results[0].parameters):
                 apart = f"{result.wire}: {name} lies {share:.2f} of both intervals from Modbus TCP"
     if minutes:
-        rows = endurance.rows(minutes, progress)
-        parts["long streams"] = "\n".join(markdown_table(endurance.HEADER, rows))
+        rows = endurance.rows(streamed, minutes, progress)
+        if docs is not None:
+            rows = endurance.with_rows_of(docs / PAGE, rows)
+        parts[endurance.SECTION] = "\n".join(markdown_table(endurance.HEADER, rows))
     for name, part in parts.items():
         typer.echo(part)
         if docs is not None:
-            replace_section(docs / "wires.md", name, part)
+            replace_section(docs / PAGE, name, part)
     if apart:
         raise WorkError(apart)
 

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Final
 
 from hil_sim.device.server import VALVES, WIRES
 from rig.cli.bench.wire_figures import stream_of
+from rig.model.parse import InputError
 from rig.model.trips import SafetyTrip
 
+STREAMED: Final = tuple(wire for wire in WIRES if wire != VALVES)  # there the host is the clock
+SECTION: Final = "long streams"
 HEADER: Final = (
     "wire",
     "minutes",
@@ -22,12 +26,18 @@ HEADER: Final = (
 )
 
 
-def rows(minutes: float, say: Callable[[str], None]) -> list[tuple[str, ...]]:
-    """Stream 16 channels at 1 kHz over each device-timed wire; returns the table's rows."""
+def chosen(wires: Sequence[str]) -> tuple[str, ...]:
+    """Return the wires to stream over, all of them by default; raises InputError for another."""
+    for wire in wires:
+        if wire not in STREAMED:
+            raise InputError(f"--wire {wire}: expected one of: {' '.join(STREAMED)}")
+    return tuple(wires) or STREAMED
+
+
+def rows(wires: Sequence[str], minutes: float, say: Callable[[str], None]) -> list[tuple[str, ...]]:
+    """Stream 16 channels at 1 kHz over device-timed wires; returns the table's rows."""
     found: list[tuple[str, ...]] = []
-    for wire in WIRES:
-        if wire == VALVES:  # the host is its clock: some tens of Hz
-            continue
+    for wire in wires:
         say(f"{wire}: {minutes:g} min in real time")
         try:
             stream = stream_of(wire, 60.0 * minutes)
@@ -49,6 +59,20 @@ def rows(minutes: float, say: Callable[[str], None]) -> list[tuple[str, ...]]:
             )
         )
     return found
+
+
+def with_rows_of(page: Path, rows: Sequence[tuple[str, ...]]) -> list[tuple[str, ...]]:
+    """Return rows in the order of the wires, with those of the page's table for the others.
+
+    Raises InputError where the page is not there.
+    """
+    if not page.is_file():
+        raise InputError(f"{page}: no such page")
+    table = page.read_text("utf-8").partition(f"<!-- {SECTION} -->")[2].partition("<!--")[0]
+    lines = [line for line in table.splitlines() if line.startswith("| `")]
+    kept = [tuple(cell.strip() for cell in line.strip("|").split("|")) for line in lines]
+    by_wire = {row[0].strip("`"): row for row in (*kept, *rows)}
+    return [by_wire[wire] for wire in STREAMED if wire in by_wire]
 
 
 def _line(trip: SafetyTrip) -> str:
