@@ -13,9 +13,10 @@ DIM: Final = "bright_black"
 NORMAL: Final = "reverse"  # a state that needs nobody
 ALARM: Final = "bold bright_white on red"  # a limit was passed, or the state is not known
 ALARM_TEXT: Final = "bold red"
-WARN: Final = "bold black on yellow"  # close to a limit, old, or ended early
+# Black is not bold: many terminals draw bold black as grey, which yellow and cyan swallow.
+WARN: Final = "black on yellow"  # close to a limit, old, or ended early
 WARN_TEXT: Final = "bold yellow"
-ASK: Final = "bold black on cyan"  # waits for the operator
+ASK: Final = "black on cyan"  # waits for the operator
 ASK_TEXT: Final = "bold cyan"
 STALE: Final = "italic bright_black"
 TRIP_LINE: Final = "red"

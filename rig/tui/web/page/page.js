@@ -4,12 +4,15 @@
 const BEAT = 200; // between two beats [ms]
 const STALE = 500; // a picture older than this is marked [ms]
 const EMERGENCY = "To stop: the emergency stop, or `bramah stop` on the bench's computer.";
+let connected = false; // before that the terminal's script cannot tell its server of the focus
 const connection = document.getElementById("connection");
 const keys = document.getElementById("keys");
 
 function show(notice, text) {
   if (notice.textContent !== text && text) notice.textContent = text;
+  const shown = notice.classList.contains("shown");
   notice.classList.toggle("shown", Boolean(text));
+  if (shown !== Boolean(text) && connected) window.dispatchEvent(new Event("resize")); // fits the terminal
 }
 
 // A beat goes through the server and the screen's own loop, and comes back behind every frame that
@@ -29,7 +32,10 @@ function watch(socket) {
       ? `◌ STALE: this picture is ${(age / 1000).toFixed(1)} s old; the connection is slow or lost. ${EMERGENCY}`
       : "");
   };
-  socket.addEventListener("open", () => { beating = setInterval(look, BEAT); });
+  socket.addEventListener("open", () => {
+    connected = true;
+    beating = setInterval(look, BEAT);
+  });
   socket.addEventListener("message", (event) => {
     if (typeof event.data !== "string") return;
     const [kind, value] = JSON.parse(event.data);
@@ -37,9 +43,10 @@ function watch(socket) {
     if (kind === "ended") ended = value;
   });
   socket.addEventListener("close", () => {
+    connected = false;
     clearInterval(beating);
     document.body.classList.add("old");
-    show(connection, ended || `⊘ DISCONNECTED: this picture is old, and a run goes on. ${EMERGENCY}`);
+    show(connection, ended || `⊘ DISCONNECTED: this picture is old; a run goes on unseen. ${EMERGENCY}`);
     const again = document.createElement("a");
     again.href = window.location.href;
     again.textContent = "open the screen again";
@@ -58,8 +65,8 @@ window.WebSocket = class extends Native {
 // Keys belong to the terminal, whatever was clicked.
 function keep() {
   const input = document.querySelector(".xterm-helper-textarea");
-  if (input && document.activeElement !== input) input.focus();
-  show(keys, document.hasFocus() ? "" : "▲ KEYS GO ELSEWHERE: click into this page, or SPACE does not stop");
+  if (connected && input && document.activeElement !== input) input.focus();
+  show(keys, document.hasFocus() || !connected ? "" : "▲ KEYS GO ELSEWHERE: click into this page, or SPACE does not stop");
 }
 setInterval(keep, BEAT);
 for (const name of ["focus", "blur", "click"]) window.addEventListener(name, keep);
