@@ -99,6 +99,18 @@ class RowFeed:
 
 
 @dataclass(frozen=True)
+class OnlineResidual:
+    """How well the estimates before a chunk predict its rows: rms of y - X beta and of y.
+
+    Both are in the rows' unit. The rows were not in the estimates yet, so they judge as held-out
+    rows do.
+    """
+
+    rms: float
+    size: float
+
+
+@dataclass(frozen=True)
 class _Segment:
     """The rows of one chunk as a triangle, their weight being 1 at `time` [s]."""
 
@@ -121,6 +133,7 @@ class _Filter:
         self._peak = np.zeros(len(names))
         self._time = -np.inf
         self._segments: list[_Segment] = []
+        self.residual: OnlineResidual | None = None  # of the newest chunk that could be predicted
 
     def fold(self, head: RecordHead, equations: Sequence[Rows], start: float) -> None:
         """Fold the rows of a chunk, their times counting from `start` [s]."""
@@ -135,12 +148,26 @@ class _Filter:
         root = np.exp(0.5 * (time - now) / self._memory)
         piece = Accumulator(len(self.names))
         piece.fold(matrix * root[:, None], rhs * root)
+        self.residual = self._predicted(piece) or self.residual
         self._sum.merge(piece.triangle, piece.rows)
         self._peak = np.maximum(self._peak, _norms(self._sum.triangle))
         self._time = now
         here = (head.step, head.repeat, len(self._segments))
         self._segments = [s for s in self._segments if self._weight(s) > IDENTIFY.online_spent]
         self._segments.append(_Segment(*here, piece.triangle, piece.rows, now))
+
+    def _predicted(self, piece: Accumulator) -> OnlineResidual | None:
+        """Return what the estimates so far leave of a chunk; None where it has unknown columns.
+
+        With T'T = [X y]'[X y] of the chunk, |y - X beta| = |T [-beta; 1]|.
+        """
+        T = piece.triangle / max(piece.rows, 1) ** 0.5
+        used = _norms(T) > 0.0
+        beta = solve(self.names, [RowCluster(0, 0, self._sum.triangle, 1)]).value
+        if not used.any() or np.isnan(beta[used]).any():
+            return None
+        left = np.linalg.norm(T @ np.append(np.where(used, -beta, 0.0), 1.0))
+        return OnlineResidual(float(left), float(np.linalg.norm(T[:, -1])))
 
     def _weight(self, segment: _Segment) -> float:
         return float(np.exp((segment.time - self._time) / self._memory))
@@ -283,6 +310,11 @@ class Tracker:
                 note = "not excited for long; the value is held"
                 values[name] = replace(values[name], std=float("nan"), ci95=nothing, note=note)
         return values
+
+    def residuals(self) -> dict[str, OnlineResidual]:
+        """Return, by family of rows, what the estimates left of the newest chunk before it came."""
+        found = {family: one.residual for family, one in self._running.items()}
+        return {family: left for family, left in found.items() if left is not None}
 
 
 def track(tracker: Tracker, record: Record, block: int = 10) -> None:

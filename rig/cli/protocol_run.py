@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -78,10 +78,12 @@ class _Story:
             message=message,
         )
 
-    def tracked(self, estimate: str, parameters: Mapping[str, Any]) -> None:
-        """Show an estimate beside what the run does, and all of them with their intervals."""
-        known = {name: [found["value"], *found["ci95"]] for name, found in parameters.items()}
-        self._bench.status(message=f"{self._message}; {estimate}", estimates=known)
+    def tracked(self, estimate: str, tracking: Tracking) -> None:
+        """Show an estimate beside what the run does, all with their intervals, and residuals."""
+        found = tracking.parameters.items()
+        known = {name: [one["value"], *one["ci95"]] for name, one in found}
+        message = f"{self._message}; {estimate}"
+        self._bench.status(message=message, estimates=known, residuals=tracking.residuals)
 
     def note(self, entry: dict[str, Any]) -> None:
         """Keep the estimates at a record's end in the run's log."""
@@ -140,7 +142,7 @@ def run_protocol(job: ProtocolJob, say: Say) -> Path:
         desk = Desk(machine=desk_machine, terminal=terminal_lines(job.attended))
         if tracking is not None:
             followed = tracking  # for the closure: it is not None
-            tracking.subscribe(story.note, lambda text: story.tracked(text, followed.parameters))
+            tracking.subscribe(story.note, lambda text: story.tracked(text, followed))
             bench.observers.add(tracking)
             desk = replace(desk, estimates=TrackedEstimates(tracking))
         engine.run(plan, rig, bench, story.phase, desk)

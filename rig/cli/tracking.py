@@ -78,6 +78,7 @@ class Tracking:
         if not memory > 0.0:
             raise InputError(f"--memory {memory:g}: expected more than 0 s")
         self.parameters: dict[str, Any] = {}
+        self.residuals: dict[str, list[float]] = {}  # by family: rms left of new rows, and theirs
         self.worst_handover = 0.0
         self._rig, self._out, self._say, self._memory = rig, out, say, memory
         self._history: list[dict[str, Any]] = []
@@ -204,6 +205,7 @@ class Tracking:
                 log.warning("the tracker stopped: %s", reply["message"])
                 return True
             self.parameters = reply["parameters"] or self.parameters
+            self.residuals = reply["residuals"]
             if reply["kind"] == "last":
                 return True
             if reply["kind"] == "record":
@@ -278,7 +280,9 @@ def _reply(socket: zmq.Socket[bytes], kind: str, tracker: Tracker, **more: str) 
     known = {name: estimate_json(e) for name, e in estimates.items()}
     if all(e["value"] is None for e in known.values()):
         known = {}
+    left = {family: [one.rms, one.size] for family, one in tracker.residuals().items()}
+    said = {"kind": kind, "parameters": known, "residuals": left, **more}
     try:
-        socket.send_string(json.dumps({"kind": kind, "parameters": known, **more}), zmq.NOBLOCK)
+        socket.send_string(json.dumps(said), zmq.NOBLOCK)
     except zmq.Again:
         log.debug("nobody hears the estimates")

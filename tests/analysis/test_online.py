@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 from analysis.identify.identify import identify
-from analysis.identify.online import RowFeed, Tracker, track
+from analysis.identify.online import RowFeed, Tracker, _Filter, track
 from analysis.identify.reduction import reduce_rows, solve_reductions
 from analysis.identify.result import PLAIN
 from analysis.identify.settings import IDENTIFY
 from analysis.identify.stacked_rows import build_rows
 from analysis.regression.chunks import Locks, stretch_rows
-from analysis.regression.rows import default_filtering
+from analysis.regression.rows import Rows, default_filtering
 from analysis.terms import baseline
 from analysis.terms.base import Used
 from rig.model.parse import InputError
-from rig.model.records import Record, Run, head_of
+from rig.model.records import Record, RecordHead, Run, head_of
 from rig.model.rig import Rig
 from tests.analysis import small_bench as bench
 from tests.analysis.small_bench import TRUTH
@@ -189,3 +189,27 @@ def test_repeats_take_over_from_pieces_of_the_only_record(multisine_run: Run, ri
     scale = tracker.estimates()["C_pp_2"].std ** 2
     k = batch["fluid"].names.index("C_pp_2")
     assert scale == pytest.approx(batch["fluid"].covariance[k, k], rel=1e-6)
+
+
+def test_the_residual_of_new_rows_is_that_of_the_estimates_before_them() -> None:
+    """Against numpy's least squares of the rows before; unknown columns have no residual."""
+    rng = np.random.default_rng(5)
+    first, second = rng.normal(size=(2, 60, 2))
+    y1, y2 = rng.normal(size=(2, 60))
+    head = RecordHead("step1_r1", "step1", (), 1, 1000.0, 60, ())
+    time = np.arange(60) / 10.0
+
+    def rows(matrix: np.ndarray, rhs: np.ndarray) -> Rows:
+        return Rows("flow_cap_1", ("a", "c"), matrix, rhs, time, 0)
+
+    kept = _Filter(("a", "c"), np.inf)
+    one_column = first * [1.0, 0.0]
+    kept.fold(head, [rows(one_column, y1)], 0.0)
+    assert kept.residual is None, "nothing was known before"
+    kept.fold(head, [rows(second, y2)], 6.0)
+    assert kept.residual is None, "its second column was not known"
+    before = np.linalg.lstsq(np.vstack((one_column, second)), np.append(y1, y2))[0]
+    kept.fold(head, [rows(first, y1)], 12.0)
+    assert kept.residual is not None
+    assert kept.residual.rms == pytest.approx(np.sqrt(np.mean((y1 - first @ before) ** 2)))
+    assert kept.residual.size == pytest.approx(np.sqrt(np.mean(y1**2)))

@@ -138,7 +138,26 @@ def followed(view: Snapshot) -> Snapshot:
         view, channels=channels, roles=roles, engine="exciting", part=2, parts=len(PLAN),
         wire="modbus-tcp://127.0.0.1:5020", sample_rate=RATE,
         alarms=(warning(),) if view.device_time > 6 else (),
+        **tracked(view.device_time),
     )  # fmt: skip
+
+
+def tracked(time: float, *, bad: bool = False) -> dict[str, dict[str, list[float | None]]]:
+    """Return what `--track` says after so many seconds, new every half second.
+
+    Joint 1 is not excited yet. In a bad experiment no interval shrinks and the residual grows.
+    """
+    count = int(2 * time)
+    if count < 2:
+        return {}
+    spread = 1.0 if bad else count**-0.5
+    swing = 0.3 * spread * np.sin(1.7 * count)
+    estimates: dict[str, list[float | None]] = {"C_pp_1": [None, None, None]}
+    for name, value, share in (("b", 2.33e8, 0.12), ("C_pp_2", 6.28e-7, 0.05)):
+        at, half = value * (1.0 + share * swing), value * share * spread
+        estimates[name] = [at, at - half, at + half]
+    left = 0.02 + 0.004 * count if bad else 0.004 * (1.0 + 2.0 / count)
+    return {"estimates": estimates, "residuals": {"fluid": [left * 3e-5, 3e-5]}}
 
 
 def _joints(view: Snapshot) -> list[str]:

@@ -11,7 +11,7 @@ from tests.tui.capture import capture
 
 KEPT = Path(__file__).parent / "pictures"
 SIZES = ((80, 24), (120, 40), (200, 60))
-LEVELS = ("overview", "joint", "channel", "diagnostics", "alarms", "protocol")
+LEVELS = ("overview", "joint", "channel", "diagnostics", "alarms", "protocol", "estimates")
 ALWAYS = ("EXCITING", "age 0.01 s", "t 0:07", "SPACE STOP", "0 lost", "left 0:32", "q quit")
 
 

@@ -45,7 +45,9 @@ class Snapshot:
     `alarms` are those that stand (`rig.model.alarms.states.folded` orders them). `engine` is the
     state of the protocol's engine; `prompt` the open question, with its possible `answers`. `part`
     of `parts` (from 1) is the step of the plan; `estimates` holds [value, low, high] in SI by
-    parameter, low to high being its 95 % interval. `device` is empty, or "lost"; `wire` is its
+    parameter, low to high being its 95 % interval; `residuals` holds [rms, size] in SI by family
+    of equations: what the estimates left of the newest rows before they took them in, and the rms
+    of those rows. `device` is empty, or "lost"; `wire` is its
     endpoint. `holder` is the screen that has the controls, `roles` what each joint does (excited,
     free, locked).
     """
@@ -81,6 +83,7 @@ class Snapshot:
     parts: int = 0
     device: str = ""
     estimates: dict[str, list[float | None]] = field(default_factory=dict)
+    residuals: dict[str, list[float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -102,6 +105,7 @@ class Progress:
     parts: int = 0
     device: str = ""
     estimates: dict[str, list[float | None]] = field(default_factory=dict)
+    residuals: dict[str, list[float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -94,6 +94,18 @@ class LinkStage(Enum):
 
 
 @dataclass(frozen=True)
+class TrackedPoint:
+    """What is estimated at a time [s] since the run began.
+
+    `values` holds [value, low, high] in SI by parameter, `residuals` [rms, size] by family.
+    """
+
+    time: float
+    values: Mapping[str, Sequence[float | None]]
+    residuals: Mapping[str, Sequence[float]]
+
+
+@dataclass(frozen=True)
 class Frame:
     """Everything the screen draws from; `received` is when the newest samples came [monotonic s].
 
@@ -110,7 +122,7 @@ class Frame:
     story: tuple[EventLine, ...] = ()  # what happened, oldest first, the newest STORY lines of it
     told: int = 0  # how many lines there have ever been
     plan: tuple[PlanLine, ...] = ()
-    estimates: tuple[tuple[float, Mapping[str, Sequence[float | None]]], ...] = ()  # by run time
+    estimates: tuple[TrackedPoint, ...] = ()  # oldest first
     interval: float = 0.0  # between two snapshots, smoothed [s of wall time]
     worst_age: float = 0.0  # of a block since the screen attached [s]
     trouble: str = ""  # why sessions cannot be looked for
@@ -148,6 +160,7 @@ class Link:
         self._asked_past = -float("inf")
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
+        self.on_window: Callable[[], None] = lambda: None  # called by the thread of the link
         self.window_seconds = 10.0  # set by the screen: how much of the past a frame carries
 
     @property
@@ -236,6 +249,7 @@ class Link:
             window = self._history.window(self.window_seconds)
             self._frame = replace(self._frame, window=window)
             self._framed, self._dirty = now, False
+            self.on_window()
 
     def _take(self, snapshot: Snapshot, now: float) -> None:
         before = self._frame
@@ -244,8 +258,9 @@ class Link:
         self._history.add(snapshot, after_gap=quiet)
         lines = tell(before.snapshot, snapshot)
         estimates = before.estimates
-        if snapshot.estimates and (not estimates or estimates[-1][1] != snapshot.estimates):
-            estimates = (*estimates, (snapshot.done_s, snapshot.estimates))[-STORY:]
+        if snapshot.estimates and (not estimates or estimates[-1].values != snapshot.estimates):
+            point = TrackedPoint(snapshot.done_s, snapshot.estimates, snapshot.residuals)
+            estimates = (*estimates, point)[-STORY:]
         # The window follows at the frame rate; what is said in words follows every snapshot.
         self._frame = replace(
             before,

@@ -1,21 +1,18 @@
-"""The pages of the run: alarms, protocol, log, estimates."""
+"""The pages of the run: alarms, protocol, log."""
 
 from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from rig.model.alarms.states import Alarm, folded
-from rig.tui.drawing.plot import PlotTrace, draw, time_axis
-from rig.tui.drawing.rows import Row, beside, block, box, columns, fit, row, wrapped
-from rig.tui.drawing.styles import ASK, ASK_TEXT, DIM, NORMAL, STRONG, WARN_TEXT
+from rig.tui.drawing.plot import PlotTrace, draw
+from rig.tui.drawing.rows import Row, beside, block, box, columns, row, wrapped
+from rig.tui.drawing.styles import ASK, ASK_TEXT, DIM, NORMAL, STRONG
 from rig.tui.following.story import EventLine
 from rig.tui.look import PlotView
 from rig.tui.pages.overview import alarm_mark
-from rig.tui.pages.parts import said_of
 from rig.tui.units import clock_text, limit, shown
-from rig.tui.words import Freshness, run_time
+from rig.tui.words import run_time
 
 BEFORE = 2.0  # of an alarm's channel shown before its first offending sample [s]
 AFTER = 0.5  # and after it [s]
@@ -163,52 +160,3 @@ def log_page(view: PlotView, width: int, height: int) -> list[Row]:
     head = row((f" {view.look.only}{search}", STRONG), (f"  {len(lines)} of {total}{where}", DIM))
     rows = [row((f"{line.time:10.2f} s  ", DIM), (line.text, line.style)) for line in shown_lines]
     return block([head, *rows], width, height)
-
-
-def estimates_page(view: PlotView, width: int, height: int) -> list[Row]:
-    """Return each parameter that is followed with its 95 % interval, over the run's time."""
-    series = view.newest.estimates
-    names = [name for name in (series[-1][1] if series else {}) if _known(view, name)]
-    if not names:
-        text = "Nothing is estimated yet: `bramah run --track` follows b and the flow gains."
-        return block(wrapped(f" {text}", width, DIM), width, height)
-    across = max(min(width // 38, len(names)), 1)
-    down = -(-len(names) // across)
-    each = (width - (across - 1)) // across
-    rows: list[Row] = []
-    for k in range(0, len(names), across):
-        share = max((height - len(rows)) // max(down - k // across, 1), 4)
-        boxes = [(_estimate(view, name, each, share), each) for name in names[k : k + across]]
-        rows += beside(boxes, share)
-    return block(rows, width, height)
-
-
-def _known(view: PlotView, name: str) -> bool:
-    return view.newest.estimates[-1][1][name][0] is not None
-
-
-def _estimate(view: PlotView, name: str, width: int, height: int) -> list[Row]:
-    nan = float("nan")
-    points = [
-        (at, [nan if v is None else float(v) for v in found[name]])
-        for at, found in view.newest.estimates
-        if name in found and found[name][0] is not None
-    ]
-    time = np.array([at for at, _ in points])
-    table = np.array([found for _, found in points])
-    low = np.where(np.isnan(table[:, 1]), table[:, 0], table[:, 1])
-    high = np.where(np.isnan(table[:, 2]), table[:, 0], table[:, 2])
-    value = table[-1, 0]
-    half = 0.5 * (table[-1, 2] - table[-1, 1])
-    share = abs(half / value) if value else nan
-    wide = ("▲ wide ", WARN_TEXT) if not share < 0.5 else ("", "")
-    line = fit(
-        row((f"{value:.4g}", STRONG), (f" ± {half:.2g} ({share:.0%}, 95 %)  ", DIM), wide),
-        width - 4,
-    )
-    span = max(time[-1], 1.0)
-    live = view.fresh is Freshness.LIVE
-    trace = PlotTrace(time, low, high, 0.0, span, (None, None), shown(""), live, True)
-    plot = draw(trace, width - 4, height - 4)
-    return box(name, [line, *plot, time_axis(0.0, span, width - 4)], width, height, DIM,
-               said_of(view))  # fmt: skip

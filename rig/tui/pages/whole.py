@@ -9,7 +9,7 @@ from rig.tui.drawing.rows import Row, beside, block, box, ends, fit, row, wrappe
 from rig.tui.drawing.styles import ASK, DIM, LEVELS, NORMAL, STRONG, SYMBOLS, WARN_TEXT
 from rig.tui.following.link import LinkStage
 from rig.tui.look import PAGES, PlotView
-from rig.tui.pages import levels, manual, operation, overview, runs
+from rig.tui.pages import estimates, levels, manual, operation, overview, runs
 from rig.tui.units import age_text, clock_text
 from rig.tui.words import VERY_OLD, Freshness, headline, notices, run_time
 
@@ -24,7 +24,7 @@ OF_A_RUN: Final[Mapping[str, Page]] = {
     "alarms": operation.alarms_page,
     "protocol": operation.protocol_page,
     "log": operation.log_page,
-    "estimates": operation.estimates_page,
+    "estimates": estimates.estimates_page,
 }
 KEYS: Final = {
     "overview": "t command  p pause/resume  a answer  k acknowledge  h hold",

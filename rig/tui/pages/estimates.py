@@ -1,0 +1,216 @@
+"""Live identification: parameters with intervals and the residual, while the experiment runs."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from rig.tui.drawing.plot import PlotTrace, draw, time_axis
+from rig.tui.drawing.rows import Row, beside, block, box, fit, row, wrapped
+from rig.tui.drawing.styles import DIM, STRONG, WARN_TEXT
+from rig.tui.following.link import TrackedPoint
+from rig.tui.look import PlotView
+from rig.tui.pages.parts import said_of
+from rig.tui.units import clock_text, shown
+from rig.tui.words import Freshness
+
+EQUATIONS: Final = {"fluid": ("flow", "m³/s"), "mechanical": ("torque", "N·m")}
+LEAST_PLOT: Final = 5  # rows of a box: its frame, its line, a row of curve, the axis
+
+
+@dataclass(frozen=True)
+class OnlineSettings:
+    """From when on an experiment is said to go badly; shares are of 1.
+
+    All are judged by eye on simulated benches, where a good experiment leaves 0.003 of the flow.
+    """
+
+    updates: int = 8  # that changed an interval, before it is judged: some 16 s
+    wide: float = 0.02  # half an interval over its value, below which it need not shrink
+    shrunk: float = 0.95  # of the interval at half the updates; 0.71 where each brings as much
+    few: int = 5  # newest residuals whose median counts
+    grown: float = 2.0  # times the least median before
+    small: float = 0.02  # of the equations' size, below which a residual need not worry
+    large: float = 0.5  # of the equations' size: the model says less than half of it
+
+
+ONLINE: Final = OnlineSettings()
+
+
+def half_widths(series: Sequence[TrackedPoint], name: str) -> list[tuple[float, float]]:
+    """Return (time [s], half the 95 % interval over the value) where either has changed.
+
+    A parameter that the present step does not excite stays as it is, and says nothing.
+    """
+    found: list[tuple[float, float]] = []
+    before: Sequence[float | None] = ()
+    for point in series:
+        newest = point.values.get(name, ())
+        if newest == before or len(newest) != 3:
+            continue
+        before = newest
+        value, low, high = newest
+        if value and low is not None and high is not None:
+            found.append((point.time, abs(0.5 * (high - low) / value)))
+    return found
+
+
+def shares(series: Sequence[TrackedPoint], family: str) -> list[tuple[float, float]]:
+    """Return (time [s], residual over the size of the equations) of a family."""
+    found = []
+    for point in series:
+        rms, size = point.residuals.get(family, (0.0, 0.0))
+        if size > 0.0:
+            found.append((point.time, rms / size))
+    return found
+
+
+def warnings_of(series: Sequence[TrackedPoint]) -> list[str]:
+    """Return in sentences what speaks against the experiment, the residual first."""
+    found = []
+    for family in families(series):
+        found += _about_residual(EQUATIONS.get(family, (family, ""))[0], shares(series, family))
+    for name in series[-1].values if series else ():
+        widths = half_widths(series, name)
+        if len(widths) < ONLINE.updates:
+            continue
+        then, before = widths[(len(widths) - 1) // 2]
+        now = widths[-1][1]
+        if now > max(ONLINE.wide, ONLINE.shrunk * before):
+            found.append(
+                f"{name}: its interval does not shrink, ±{before:.0%} at {clock_text(then)} and "
+                f"±{now:.0%} now: more amplitude, other lines, or air and play in the way?"
+            )
+    return found
+
+
+def _about_residual(name: str, left: Sequence[tuple[float, float]]) -> list[str]:
+    few = ONLINE.few
+    if len(left) < few:
+        return []
+    medians = [
+        statistics.median(share for _, share in left[k : k + few])
+        for k in range(len(left) - few + 1)
+    ]
+    now = medians[-1]
+    least = min(range(len(medians)), key=lambda k: medians[k])
+    if now > ONLINE.large:
+        return [
+            f"{name}: {now:.0%} of it is left over: the model says less than half of what is "
+            "measured. Check signs, units and sensors before going on."
+        ]
+    if now > max(ONLINE.small, ONLINE.grown * medians[least]):
+        when = clock_text(left[least + few - 1][0])
+        return [
+            f"{name}: the residual grows, {medians[least]:.1%} at {when} and {now:.1%} now: has "
+            "the bench changed (oil, air, a lock that gives)?"
+        ]
+    return []
+
+
+def families(series: Sequence[TrackedPoint]) -> list[str]:
+    """Return the families of equations that have a residual."""
+    return list(dict.fromkeys(family for point in series for family in point.residuals))
+
+
+def estimates_page(view: PlotView, width: int, height: int) -> list[Row]:
+    """Return residuals and parameters with their 95 % intervals over the run's time.
+
+    What speaks against the experiment stands above them, what is not known yet below.
+    """
+    series = view.newest.estimates
+    newest = series[-1].values if series else {}
+    names = [name for name, found in newest.items() if found[0] is not None]
+    if not names:
+        text = "Nothing is estimated yet: `bramah run --track` follows b and the flow gains."
+        return block(wrapped(f" {text}", width, DIM), width, height)
+    head: list[Row] = []
+    for text in warnings_of(series):
+        lines = wrapped(text, width - 3)
+        marks = ["▲", *" " * (len(lines) - 1)]
+        head += [
+            fit(row((f" {mark} ", WARN_TEXT), *((part, WARN_TEXT) for part, _ in line)), width)
+            for mark, line in zip(marks, lines, strict=True)
+        ]
+    unknown = ", ".join(name for name in newest if name not in names)
+    foot = wrapped(f" not known yet: {unknown}", width, DIM)[:1] if unknown else []
+    boxes = [*((_residual, family) for family in families(series)),
+             *((_estimate, name) for name in names)]  # fmt: skip
+    room = height - len(head) - len(foot)
+    across = max(min(width // 38, len(boxes)), 1)
+    down = min(-(-len(boxes) // across), max(room // LEAST_PLOT, 1))
+    hidden = len(boxes) - across * down
+    each = (width - (across - 1)) // across
+    rows: list[Row] = []
+    for k in range(down):
+        share = (room - len(rows)) // (down - k)
+        made = boxes[across * k : across * (k + 1)]
+        rows += beside([(draws(view, name, each, share), each) for draws, name in made], share)
+    if hidden > 0:
+        text = ", ".join(name for _, name in boxes[-hidden:])
+        foot = [fit(row((f" a larger terminal also shows {text}", DIM)), width)]
+    return block([*head, *rows, *foot], width, height)
+
+
+def _residual(view: PlotView, family: str, width: int, height: int) -> list[Row]:
+    """Return what the estimates leave of new rows before they take them in, as a share of them."""
+    name, unit = EQUATIONS.get(family, (family, ""))
+    left = shares(view.newest.estimates, family)
+    rms = view.newest.estimates[-1].residuals.get(family, (float("nan"),))[0]
+    time, share = np.array(left).reshape(-1, 2).T
+    bad = bool(_about_residual(name, left))
+    line = row(
+        (f"{share[-1]:.2%}" if len(share) else "–", STRONG),
+        (f" of it, rms {rms:.2g} {unit}  ", DIM),
+        ("▲", WARN_TEXT) if bad else ("", ""),
+    )
+    return _box(
+        view, f"residual of {name}, held out", line, time, 1e2 * share, 1e2 * share, width, height
+    )
+
+
+def _estimate(view: PlotView, name: str, width: int, height: int) -> list[Row]:
+    nan = float("nan")
+    points = [
+        (point.time, [nan if v is None else float(v) for v in point.values[name]])
+        for point in view.newest.estimates
+        if name in point.values and point.values[name][0] is not None
+    ]
+    time = np.array([at for at, _ in points])
+    table = np.array([found for _, found in points])
+    low = np.where(np.isnan(table[:, 1]), table[:, 0], table[:, 1])
+    high = np.where(np.isnan(table[:, 2]), table[:, 0], table[:, 2])
+    value = table[-1, 0]
+    half = 0.5 * (table[-1, 2] - table[-1, 1])
+    share = abs(half / value) if value else nan
+    wide = ("▲ wide ", WARN_TEXT) if not share < 0.5 else ("", "")
+    line = row((f"{value:.4g}", STRONG), (f" ± {half:.2g} ({share:.1%}, 95 %)  ", DIM), wide)
+    power = 3 * math.floor(math.log10(abs(value)) / 3) if value else 0  # the axis has few digits
+    title = f"{name}  axis in 1e{power}" if power else name
+    scale = 10.0**-power
+    return _box(view, title, line, time, scale * low, scale * high, width, height)
+
+
+def _box(
+    view: PlotView,
+    name: str,
+    line: Row,
+    time: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    width: int,
+    height: int,
+) -> list[Row]:
+    """Return a line and the band from `low` to `high`, each (n,), over time in a frame."""
+    inner = width - 4
+    span = max(float(time[-1]) if len(time) else 0.0, 1.0)
+    live = view.fresh is Freshness.LIVE
+    trace = PlotTrace(time, low, high, 0.0, span, (None, None), shown(""), live, True)
+    plot = draw(trace, inner, height - 4)
+    rows = [fit(line, inner), *plot, time_axis(0.0, span, inner)]
+    return box(name, rows, width, height, DIM, said_of(view))
