@@ -8,12 +8,15 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from typing import ClassVar, Final
 
 from textual import events
 from textual.app import App, ComposeResult
 from textual.binding import Binding, BindingType
+from textual.driver import Driver
+from textual.message import Message
 
 from rig.bench.screens.commands import own_command
 from rig.bench.screens.sockets import Endpoint
@@ -21,7 +24,7 @@ from rig.model.alarms.states import AlarmTable
 from rig.tui.acting.manual import ByHand
 from rig.tui.browse import Browsed
 from rig.tui.canvas import Canvas
-from rig.tui.following.link import FRAME, Frame, Link, LinkStage, LocalSessions, Sessions
+from rig.tui.following.link import Frame, Link, LinkStage, LocalSessions, Sessions
 from rig.tui.following.story import KINDS
 from rig.tui.look import PAGES, Dialog, PlotView, ScreenStyle
 from rig.tui.pages.operation import in_order
@@ -53,6 +56,18 @@ HELP: Final = (
     "● normal  ? asks you  ▲ warning  ■ alarm  □ ended",
     "◌ stale   ⊘ disconnected   ✕ invalid   ‖ held",
 )
+
+
+def with_early_keys(kind: type[Driver], early: Callable[[events.Key], None]) -> type[Driver]:
+    """Return a kind of driver that hands keys to `early` as soon as they are read."""
+
+    class EarlyKeys(kind):  # type: ignore[misc, valid-type]
+        def process_message(self, message: Message) -> None:
+            if isinstance(message, events.Key):
+                early(message)
+            super().process_message(message)
+
+    return EarlyKeys
 
 
 def automatic_span(speed: float) -> float:
@@ -99,7 +114,9 @@ class Monitor(ByHand, App[int]):
         self._drawn: object = None
         self._slow = -float("inf")
         self._escaped = -float("inf")
+        self._stopped_by: events.Key | None = None  # the newest key that stopped before its turn
         self._ticking: asyncio.Task[None] | None = None
+        self._wake: Callable[[], None] = lambda: None  # ends the wait for the next picture
         self.canvas = Canvas()
         self.pictures = 0  # drawn since the start; an idle screen draws none
 
@@ -115,11 +132,20 @@ class Monitor(ByHand, App[int]):
         self.draw()
 
     async def _tick(self) -> None:
-        """Draw at the frame rate while a run lives; look less often while nothing can change."""
+        """Draw as soon as the link has a new window; look less often while nothing can change."""
+        loop, woken = asyncio.get_running_loop(), asyncio.Event()
+
+        def wake() -> None:
+            with suppress(RuntimeError):  # the screen has closed
+                loop.call_soon_threadsafe(woken.set)
+
+        self._wake = self.link.on_window = wake
         while True:
             frame = self.link.frame
             idle = self._drawn is frame and (frame.over or frame.endpoint is None)
-            await asyncio.sleep(BLINK if idle else FRAME)
+            with suppress(TimeoutError):
+                await asyncio.wait_for(woken.wait(), BLINK if idle else SLOW)
+            woken.clear()
             self.draw()
 
     def on_unmount(self) -> None:
@@ -191,6 +217,18 @@ class Monitor(ByHand, App[int]):
 
     # Keys
 
+    def get_driver_class(self) -> type[Driver]:
+        """Return the terminal's driver, which lets a stop through before everything that waits."""
+        return with_early_keys(super().get_driver_class(), self.early_key)
+
+    def early_key(self, event: events.Key) -> None:
+        """Stop a live run by the thread that reads the terminal: nothing is drawn before."""
+        frame, dialog = self.link.frame, self.dialog
+        lives = frame.endpoint is not None and not frame.over
+        if lives and (event.key == "space" or (event.key == "s" and dialog is None)):
+            self._stopped_by = event
+            self.act_stop()
+
     def on_key(self, event: events.Key) -> None:
         """Do what a key asks for; the stop comes before everything else."""
         event.stop()
@@ -199,7 +237,9 @@ class Monitor(ByHand, App[int]):
         typing = self.dialog is not None and self.dialog.text is not None
         lives = self.link.frame.endpoint is not None and not self.link.frame.over
         choosing = self.link.frame.stage is LinkStage.CHOOSING
-        if key == "space" and (lives or choosing or not typing):
+        if event is self._stopped_by:
+            self._stopped_by = None
+        elif key == "space" and (lives or choosing or not typing):
             self.act_stop()
         elif key == "escape":
             self._escape()
@@ -370,8 +410,9 @@ class Monitor(ByHand, App[int]):
             self.redraw()
 
     def redraw(self) -> None:
-        """Draw at the next tick, whether or not anything arrived; any thread may ask."""
+        """Draw at once, whether or not anything arrived; any thread may ask."""
         self._drawn = None
+        self._wake()
 
 
 def farewell(frame: Frame) -> str:

@@ -26,6 +26,9 @@ def bench(
             "screen."
         ),
     ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Of the screen: 10 stops by key instead of 200.")
+    ] = False,
     docs: Annotated[Path | None, typer.Option(help="Also write the table as a page.")] = None,
 ) -> None:
     """Measure this machine: plant, identification, ten unseen benches, acquisition.
@@ -34,7 +37,7 @@ def bench(
     """
     from rig.cli.bench.figures import as_json, measure, page, text
 
-    figures = measure(minutes, seeds, only, progress)
+    figures = measure(minutes, seeds, only, progress, quick=quick)
     write_json(json, as_json(figures))
     if docs is not None:
         docs.write_text(page(figures), encoding="utf-8")

@@ -19,7 +19,7 @@ from rig.cli.bench.acquisition import measure_acquisition
 from rig.cli.bench.analysis import identify_figures
 from rig.cli.bench.fault_figures import fault_figures
 from rig.cli.bench.figure import Figure
-from rig.cli.bench.screen_figures import screen_figures
+from rig.cli.bench.screen.figures import screen_figures
 from rig.cli.bench.speed.figures import beside, free_run_figures, plant_over_kernel
 from rig.cli.bench.speed.growth import growth_figures
 from rig.cli.bench.speed.run_figures import run_figures
@@ -137,8 +137,13 @@ def _quiet(_: str) -> None:
     pass
 
 
-def measure(minutes: float, seeds: int, only: str | None, say: Say) -> list[Figure]:
-    """Measure all groups, or the one named; raises InputError for an unknown name."""
+def measure(
+    minutes: float, seeds: int, only: str | None, say: Say, *, quick: bool = False
+) -> list[Figure]:
+    """Measure all groups, or the one named; raises InputError for an unknown name.
+
+    `quick` takes fewer repetitions where a group counts events (stops by key).
+    """
     streamed = min(60.0 * minutes, 60.0)  # [s] in real time, within the group `run`
     groups: Mapping[str, Callable[[Path, Say], list[Figure]]] = {
         "plant": plant_figures,
@@ -150,7 +155,7 @@ def measure(minutes: float, seeds: int, only: str | None, say: Say) -> list[Figu
         "acquisition": lambda folder, tell: acquisition_figures(folder, tell, minutes),
         "wires": lambda _, tell: wire_figures(tell, minutes),
         "faults": fault_figures,
-        "screen": lambda _, tell: screen_figures(tell, min(60.0 * minutes, 30.0)),
+        "screen": lambda _, tell: screen_figures(tell, min(60.0 * minutes, 30.0), quick=quick),
     }
     if only is not None and only not in groups:
         raise InputError(f"--only {only}: expected one of: {' '.join(groups)}")
@@ -204,8 +209,8 @@ tune.
 
 Times are processor time, least and median of five, where nothing else is said.
 `bramah bench --only wires --minutes 10` (each wire: losses, processor time, lateness, the bare
-library), `--only faults` ([faults](faults.md)) and `--only screen` (the operator's screen, live and
-after the end of a run) are measured on their own.
+library), `--only faults` ([faults](faults.md)) and `--only screen` (the operator's screen:
+its cost, its stop, the age of its numbers: [screen](screen.md#figures)) are measured on their own.
 """
 
 

@@ -1,0 +1,1 @@
+"""Figures of the operator's screen: its cost, its stop, the age of its numbers."""

@@ -1,0 +1,154 @@
+"""How late blocks come while screens open, close and are killed, and how old the drawn numbers are.
+
+The screen shows its page of diagnostics, which writes the device's tick of the newest sample. The
+text is read from the terminal and stamped there, so that an age spans the whole way: device, wire,
+run, socket, screen, terminal.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.cli.bench.acquisition import lateness
+from rig.cli.bench.figure import Figure
+from rig.cli.bench.screen.runs import RIG, RunPlace, RunTimes, played
+from rig.cli.bench.screen.stops import ATTACH, SEED
+from rig.cli.bench.screen.terminal import Screen
+from rig.cli.errors import WorkError
+from rig.cli.simulated_bench import simulated_bench
+from rig.runs.rigs import load_rig
+
+Array = NDArray[np.float64]
+
+AGE_LIMIT: Final = 250.0  # [ms] of the newest sample on the screen, 99 % of the time
+NOISE: Final = 1.0  # second-to-second deviations without a screen, by which one may add lateness
+SLICE: Final = 1.0  # of a phase, whose medians are compared [s]
+SETTLE: Final = 3.0  # after a screen came or went, before a phase is measured [s]
+PAGE: Final = "4"  # of diagnostics
+_LINE: Final = 40  # characters that hold a tick
+_TICK: Final = re.compile(r"\btick (\d+)")
+
+
+@dataclass(frozen=True)
+class Phase:
+    """A stretch of a run, between two monotonic times [s], with a screen or without one."""
+
+    name: str
+    first: float
+    last: float
+    screen: bool
+
+
+def ages_on_glass(
+    drawn: Iterable[tuple[float, str]], origin: float, rate: float
+) -> tuple[Array, Array]:
+    """Return (age when drawn, time until the next) [s], each (n,), of the ticks in drawn text.
+
+    A number grows older on the screen until the next one is drawn.
+    """
+    seen: list[tuple[float, float]] = []
+    newest, before = -1, ""
+    for at, piece in drawn:
+        text = before + piece  # a line may come in two pieces
+        before = text[-_LINE:]
+        for found in _TICK.finditer(text):
+            tick = int(found[1])
+            if tick > newest:
+                newest = tick
+                seen.append((at, at - (origin + tick / rate)))
+    moments, ages = np.array(seen).reshape(-1, 2).T
+    return ages[:-1], np.diff(moments)
+
+
+def age_quantile(ages: Array, stays: Array, share: float) -> float:
+    """Return the age [s] that the numbers on the screen do not pass for a `share` of the time.
+
+    Number k is shown from the age `ages[k]` on for `stays[k]` [s], so the time spent below an age x
+    is the sum of clip(x - ages, 0, stays), which rises with x and is inverted at its corners.
+    """
+    corners = np.sort(np.concatenate((ages, ages + stays)))
+    below = np.array([np.clip(x - ages, 0.0, stays).sum() for x in corners])
+    return float(np.interp(share * stays.sum(), below, corners))
+
+
+def phase_medians(phase: Phase, arrivals: Array, late: Array) -> Array:
+    """Return the median lateness [s] of every whole slice of a phase."""
+    count = max(int((phase.last - phase.first) / SLICE), 1)
+    edges = np.searchsorted(arrivals, phase.first + SLICE * np.arange(count + 1))
+    pairs = itertools.pairwise(edges)
+    return np.array([np.median(late[first:last]) for first, last in pairs if last > first])
+
+
+def arrival_figures(runtime: Path, say: Callable[[str], None], seconds: float) -> list[Figure]:
+    """Measure one run's blocks, `seconds` per phase, and the ages while a screen is open."""
+    say(f"screen: arrival of blocks with the screen closed, open, killed, restarted: {seconds:g} s")
+    phases: list[Phase] = []
+
+    def measure(name: str, screen: Screen | None) -> None:
+        time.sleep(SETTLE)
+        first = time.monotonic()
+        time.sleep(seconds)
+        phases.append(Phase(name, first, time.monotonic(), screen is not None))
+
+    with simulated_bench(RIG, seed=SEED, real_time=True) as endpoint:
+        place = RunPlace(endpoint, runtime, runtime / "watched")
+        with played(place, driven=False) as run:
+            measure("closed", None)
+            drawn: list[list[tuple[float, str]]] = []  # of each screen
+            for name, after in (("open", "killed"), ("restarted", "closed again")):
+                with Screen(runtime) as screen:
+                    if not run.said("watched", ATTACH):
+                        raise WorkError("bench --only screen: the screen did not attach")
+                    screen.press(PAGE)
+                    measure(name, screen)
+                    drawn.append(screen.texts(phases[-1].first, phases[-1].last))
+                measure(after, None)
+            times = run.end()
+    return [*_lateness_figures(times, phases), *_age_figures(times, drawn)]
+
+
+def _lateness_figures(times: RunTimes, phases: list[Phase]) -> list[Figure]:
+    late, _ = lateness(times.ends, times.arrivals)
+    figures = [Figure("screen", "blocks of the run", len(late)),
+               Figure("screen", "samples lost", times.lost, "", 0.0)]  # fmt: skip
+    medians: dict[bool, list[Array]] = {True: [], False: []}
+    for phase in phases:
+        inside = (times.arrivals >= phase.first) & (times.arrivals < phase.last)
+        part = 1e3 * late[inside]
+        for word, share in (("median", 0.5), ("99 %", 0.99)):
+            name = f"lateness of blocks, {word}, screen {phase.name}"
+            figures.append(Figure("screen", name, float(np.quantile(part, share)), "ms"))
+        medians[phase.screen].append(phase_medians(phase, times.arrivals, late))
+    with_it, without = np.concatenate(medians[True]), np.concatenate(medians[False])
+    more = float(with_it.mean() - without.mean())
+    noise = float(without.std(ddof=1)) if len(without) > 1 else math.nan
+    return [
+        *figures,
+        Figure("screen", "lateness, median, that a screen adds", 1e3 * more, "ms"),
+        Figure("screen", "the same over its deviation without", more / noise, "", NOISE),
+    ]
+
+
+def _age_figures(times: RunTimes, drawn: list[list[tuple[float, str]]]) -> list[Figure]:
+    rate = load_rig(RIG).sample_rate
+    found = [ages_on_glass(one, times.origin, rate) for one in drawn]
+    ages, stays = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    if not len(ages):
+        raise WorkError("bench --only screen: no tick was drawn on the page of diagnostics")
+    quantile = {share: 1e3 * age_quantile(ages, stays, share) for share in (0.5, 0.99, 1.0)}
+    return [
+        Figure("screen", "pictures a second", 1.0 / float(stays.mean())),
+        Figure("screen", "sample age on screen, median", quantile[0.5], "ms"),
+        Figure("screen", "sample age on screen, 99 %", quantile[0.99], "ms", AGE_LIMIT),
+        Figure("screen", "sample age on screen, worst", quantile[1.0], "ms"),
+    ]

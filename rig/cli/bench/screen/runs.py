@@ -1,0 +1,210 @@
+"""Runs in processes of their own for a screen to watch and stop, timed on the device's clock.
+
+The simulated bench is on the same computer and its sample clock keeps pace with the monotonic
+clock of all processes here, so that sample n was taken at `origin` + n / rate. A block arrives
+after its last sample, hence
+
+    origin <= min over blocks of (arrival - ticks at its end / rate),
+
+and the minimum stands for the origin: it is late by the fastest block's way over the wire, 1 to
+2 ms, so that times after a key and ages are never measured too short by it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, Final, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers import make_driver, wire_at
+from drivers.base import OFF, Driver, OutputLaw, SampleBlock
+from rig.bench.guard import FREE
+from rig.bench.latch import BenchState
+from rig.bench.screens.sockets import Publisher
+from rig.bench.session import Bench
+from rig.cli.bench.screen.terminal import SESSIONS
+from rig.cli.errors import WorkError
+from rig.runs.recorder import Recorder
+from rig.runs.rigs import load_rig
+
+Array = NDArray[np.float64]
+
+RIG: Final = "digger-3dof"  # three joints: 17 values a sample
+SQUARE: Final = 0.05  # [V] of a square wave that is never zero
+HALF_PERIOD: Final = 0.02  # of it [s]
+AFTER: Final = 0.1  # recorded with the outputs at zero [s]
+ENDS: Final = 20.0  # a run's process ends within this time of being asked to [s]
+
+
+@dataclass(frozen=True)
+class RunPlace:
+    """Where a run is played: its device, the folder of sockets' parent, the run's own folder."""
+
+    endpoint: str
+    runtime: Path
+    out: Path
+
+
+@dataclass(frozen=True)
+class RunTimes:
+    """Blocks of a run: `ends` [s of device time], `arrivals` [monotonic s], each shape (blocks,).
+
+    `zeroed` is the device time [s] from which on every output was zero, NaN where it never was;
+    `zeroings` are the monotonic times [s] at which the run asked the device for it; `lost` counts
+    samples; `reason` says how the run ended, `held` whether a screen was in command.
+    """
+
+    ends: Array
+    arrivals: Array
+    lost: int
+    zeroed: float
+    zeroings: tuple[float, ...]
+    reason: str
+    held: bool
+
+    @property
+    def origin(self) -> float:
+        """The monotonic time [s] of device time 0, late by the fastest block's way at most."""
+        return float((self.arrivals - self.ends).min())
+
+
+class StampedDriver:
+    """A driver that notes when each block came and when an output was last not zero."""
+
+    def __init__(self, driver: Driver, inputs: int, rate: float) -> None:
+        self._driver, self._inputs, self._rate = driver, inputs, rate
+        self.ends: list[float] = []
+        self.arrivals: list[float] = []
+        self.zeroings: list[float] = []
+        self.last_output = -1  # the tick of the newest sample with an output
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._driver, name)
+
+    def read_block(self) -> SampleBlock:
+        """Return the next block."""
+        block = self._driver.read_block()
+        self.arrivals.append(time.monotonic())
+        self.ends.append((block.tick + len(block.data)) / self._rate)
+        moved = np.flatnonzero((block.data[:, self._inputs :] != 0.0).any(axis=1))
+        if len(moved):
+            self.last_output = block.tick + int(moved[-1])
+        return block
+
+    def zero_outputs(self) -> None:
+        """Put every output to zero."""
+        self.zeroings.append(time.monotonic())
+        self._driver.zero_outputs()
+
+    def times(self, lost: int, reason: str, *, held: bool) -> RunTimes:
+        """Return what was noted."""
+        known = self.last_output >= 0
+        zeroed = (self.last_output + 1) / self._rate if known else float("nan")
+        ends, arrivals = np.array(self.ends), np.array(self.arrivals)
+        return RunTimes(ends, arrivals, lost, zeroed, tuple(self.zeroings), reason, held)
+
+
+def play(place: RunPlace, pipe: Connection, *, driven: bool) -> None:
+    """Play one run until it is stopped, or until something comes in by `pipe`; a process's work.
+
+    `driven` puts a square wave on the first joint. Says "watched" once a screen is attached, "held"
+    once it is in command, and at the end the RunTimes.
+    """
+    rig = load_rig(RIG)
+    rig = rig.model_copy(update={"wire": wire_at(place.endpoint, rig.wire)})
+    driver = StampedDriver(make_driver(rig.wire, rig), len(rig.channels), rig.sample_rate)
+    publisher = Publisher(rig.name, place.runtime / SESSIONS)
+    state = BenchState(rig.wire, place.runtime)
+    recorder = Recorder(place.out, rig)
+    reason, lost, held = "", 0, False
+    try:
+        with Bench(rig, cast("Driver", driver), recorder, publisher, state=state) as bench:
+            bench.recorded_after = AFTER
+            bench.guard([FREE] * len(rig.joints))
+            if driven:
+                half = np.ones(round(HALF_PERIOD * rig.sample_rate))
+                bench.upload(0, SQUARE * np.concatenate((half, -half)))
+                laws = [OutputLaw(gain=1.0, limit=2 * SQUARE), *[OFF] * (len(rig.joints) - 1)]
+                bench.apply(laws, restart=True)
+            said = ""
+            while not pipe.poll():
+                bench.exchange()
+                lost = bench.lost_samples
+                word = "held" if publisher.holder else "watched" if publisher.watched else ""
+                held = bool(publisher.holder)
+                if word and word != said:
+                    said = word
+                    pipe.send(word)
+    except Exception as error:
+        reason = str(error) or repr(error)
+    pipe.send(driver.times(lost, reason, held=held))
+
+
+class PlayedRun:
+    """A run in a process of its own, and what it says."""
+
+    def __init__(self, pipe: Connection) -> None:
+        self._pipe = pipe
+        self._words: list[str] = []
+        self.times: RunTimes | None = None
+
+    def said(self, word: str, within: float) -> bool:
+        """Whether the run has said a word, waiting for it at most `within` [s]."""
+        self._hear(within, lambda: word in self._words)
+        return word in self._words
+
+    def ended(self, within: float = ENDS) -> RunTimes:
+        """Return the times of a run that ended; raises WorkError where it does not."""
+        self._hear(within, lambda: self.times is not None)
+        if self.times is None:
+            raise WorkError(f"bench --only screen: a run did not end within {within:g} s")
+        return self.times
+
+    def end(self) -> RunTimes:
+        """End the run from here and return its times."""
+        with suppress(OSError):
+            self._pipe.send("end")
+        return self.ended()
+
+    def _hear(self, within: float, enough: Callable[[], bool]) -> None:
+        until = time.monotonic() + within
+        while not enough() and self.times is None:
+            try:
+                if not self._pipe.poll(max(until - time.monotonic(), 0.0)):
+                    return
+                heard = self._pipe.recv()
+            except EOFError as error:
+                raise WorkError("bench --only screen: a run's process was lost") from error
+            if isinstance(heard, RunTimes):
+                self.times = heard
+            else:
+                self._words.append(heard)
+
+
+@contextmanager
+def played(place: RunPlace, *, driven: bool) -> Iterator[PlayedRun]:
+    """Play a run in a process of its own, which is gone in the end."""
+    context = get_context("forkserver")  # a new process in 20 ms, with everything imported
+    context.set_forkserver_preload([__name__])
+    ours, its = context.Pipe()
+    process = context.Process(target=play, args=(place, its), kwargs={"driven": driven})
+    process.start()
+    its.close()
+    try:
+        yield PlayedRun(ours)
+    finally:
+        with suppress(OSError):
+            ours.send("end")
+        process.join(ENDS)
+        if process.is_alive():
+            process.kill()
+            process.join()
+        ours.close()

@@ -1,0 +1,124 @@
+"""From the key to the outputs at zero, on the device's clock, with every core busy."""
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from rig.cli.bench.figure import Figure
+from rig.cli.bench.screen.runs import RIG, RunPlace, played
+from rig.cli.bench.screen.terminal import Screen
+from rig.cli.errors import WorkError
+from rig.cli.simulated_bench import simulated_bench
+
+STOP_LIMIT: Final = 100.0  # [ms] from key to zero, 99 %
+ATTACH: Final = 30.0  # a screen attaches to a run within this time, however busy the machine [s]
+AGAIN: Final = 1.0  # the key that takes the controls is pressed again after this time [s]
+SOON, LATE = 0.2, 0.5  # the stop is pressed so long after the controls were taken [s]
+SEED: Final = 100
+FAILURES, FAILURE_SHARE = 3, 0.1  # runs that may fail before their stop, at most
+FROM_SCREEN: Final = "from the screen"  # in the reason of a run that a screen stopped
+_BUSY: Final = "import os\nparent = os.getppid()\nwhile os.getppid() == parent: sum(range(100000))"
+
+
+class RunFailed(Exception):
+    """A run ended before the key that was to stop it; the message is its reason."""
+
+
+@contextmanager
+def busy_cores(count: int) -> Iterator[None]:
+    """Keep `count` cores busy with processes of this one's priority."""
+    working = [subprocess.Popen([sys.executable, "-c", _BUSY]) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for process in working:
+            process.kill()
+            process.wait()
+
+
+def one_stop(screen: Screen, place: RunPlace, wait: float) -> tuple[float, float]:
+    """Return the times [s] from a stop key to the run's act and to the outputs at zero.
+
+    The run is begun for it, the screen takes the controls, and the key comes `wait` [s] after. Both
+    are infinite for a key that did not stop its run. Raises RunFailed where the run ends before.
+    """
+    with played(place, driven=True) as run:
+        if not run.said("watched", ATTACH) and run.times is None:
+            raise WorkError("bench --only screen: the screen did not attach to the run")
+        time.sleep(SOON)
+        until = time.monotonic() + ATTACH
+        screen.press("t")
+        while not run.said("held", AGAIN) and run.times is None and time.monotonic() < until:
+            screen.press("t")
+        run.said("nothing", wait)
+        if run.times is not None:
+            raise RunFailed(run.times.reason)
+        pressed = screen.press(" ")
+        times = run.ended()
+    if not times.held or FROM_SCREEN not in times.reason:
+        return math.inf, math.inf
+    acted = min(at for at in times.zeroings if at > pressed)
+    return acted - pressed, times.origin + times.zeroed - pressed
+
+
+def many_stops(
+    runtime: Path, say: Callable[[str], None], count: int
+) -> tuple[list[tuple[float, float]], int]:
+    """Return the times of `count` stops, and how many runs failed before theirs.
+
+    A bench that has tripped for want of a processor is left for a new one.
+    """
+    rng = np.random.default_rng(SEED)
+    found: list[tuple[float, float]] = []
+    failed = 0
+    with Screen(runtime) as screen:
+        while len(found) < count:
+            with simulated_bench(RIG, seed=SEED, real_time=True) as endpoint, suppress(RunFailed):
+                while len(found) < count:
+                    out = runtime / f"stop-{failed}-{len(found)}"
+                    failed += 1  # until it has not
+                    wait = float(rng.uniform(SOON, LATE))
+                    found.append(one_stop(screen, RunPlace(endpoint, runtime, out), wait))
+                    failed -= 1
+                    shutil.rmtree(out)
+                    if len(found) % 20 == 0:
+                        say(f"screen: {len(found)} of {count} stops")
+            if failed > FAILURES + FAILURE_SHARE * count:
+                raise WorkError(
+                    f"bench --only screen: {failed} runs failed; the machine is too busy"
+                )
+    return found, failed
+
+
+def stop_figures(
+    runtime: Path, say: Callable[[str], None], count: int, busy: int | None = None
+) -> list[Figure]:
+    """Stop `count` runs of the simulated bench by a key, each from a screen in command.
+
+    `busy` processes keep the cores busy, by default as many as there are cores.
+    """
+    busy = (os.cpu_count() or 1) if busy is None else busy
+    say(f"screen: {count} stops by key, in real time, beside {busy} busy processes")
+    with busy_cores(busy):
+        found, failed = many_stops(runtime, say, count)
+    acted, late = 1e3 * np.array(found).T
+    return [
+        Figure("screen", f"stops by key, beside {busy} busy processes", count),
+        Figure("screen", "runs that failed before their stop", failed),
+        Figure("screen", "key to output zero, median", float(np.median(late)), "ms"),
+        Figure("screen", "key to output zero, 99 %", float(np.quantile(late, 0.99)), "ms",
+               STOP_LIMIT),
+        Figure("screen", "of it until the run acts, 99 %", float(np.quantile(acted, 0.99)), "ms"),
+        Figure("screen", "key to output zero, worst", float(late.max()), "ms"),
+    ]  # fmt: skip

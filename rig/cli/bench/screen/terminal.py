@@ -1,0 +1,104 @@
+"""`bramah monitor` as a process in a pseudo-terminal, read as a terminal reads it."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import pty
+import re
+import select
+import struct
+import subprocess
+import sys
+import termios
+import threading
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Final, Self
+
+SIZE: Final = (120, 40)
+SESSIONS: Final = "bramah"  # the folder of sockets within $XDG_RUNTIME_DIR
+_STYLE: Final = re.compile(rb"\x1b\[[0-9;:]*m")
+_CONTROL: Final = re.compile(rb"\x1b\[[0-9;?<>=]*[a-ln-zA-Z]|\x1b[()][0-9A-B]|\x1b[=>78]")
+
+
+@dataclass
+class Screen:
+    """A running screen: its process, and what it has drawn, with the time of each piece.
+
+    `runtime` is the folder that holds the sockets of its runs; a context manager that kills it.
+    """
+
+    runtime: Path
+    size: tuple[int, int] = SIZE
+    drawn: list[tuple[float, bytes]] = field(default_factory=list)
+    _closing: threading.Event = field(default_factory=threading.Event)
+
+    def __enter__(self) -> Self:
+        environment = {**os.environ, "XDG_RUNTIME_DIR": str(self.runtime), "TERM": "xterm-256color"}
+        environment.pop("NO_COLOR", None)
+        self._terminal, outer = pty.openpty()
+        columns, rows = self.size
+        fcntl.ioctl(outer, termios.TIOCSWINSZ, struct.pack("HHHH", rows, columns, 0, 0))
+        command = [sys.executable, "-c", "from rig.cli.main import run; run()", "monitor"]
+        self._process = subprocess.Popen(
+            command, stdin=outer, stdout=outer, stderr=outer, env=environment,
+            start_new_session=True,
+        )  # fmt: skip
+        os.close(outer)
+        self._reader = threading.Thread(target=self._read, name="bench-terminal", daemon=True)
+        self._reader.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._process.kill()
+        self._process.wait()
+        self._closing.set()
+        self._reader.join()
+        os.close(self._terminal)
+
+    @property
+    def pid(self) -> int:
+        """The process of the screen."""
+        return self._process.pid
+
+    def press(self, key: str) -> float:
+        """Write a key to the terminal; returns the monotonic time [s] just before."""
+        at = time.monotonic()
+        os.write(self._terminal, key.encode())
+        return at
+
+    def _read(self) -> None:
+        while not self._closing.is_set():
+            if not select.select([self._terminal], [], [], 0.1)[0]:
+                continue
+            try:
+                piece = os.read(self._terminal, 1 << 16)
+            except OSError:  # its other end is closed: the screen is gone
+                return
+            self.drawn.append((time.monotonic(), piece))
+
+    def bytes_since(self, moment: float) -> int:
+        """Return how many bytes it has drawn since a monotonic time [s]."""
+        return sum(len(piece) for at, piece in list(self.drawn) if at >= moment)
+
+    def texts(self, first: float, last: float) -> list[tuple[float, str]]:
+        """Return (monotonic time [s], text) of what was drawn between two times, styles removed."""
+        pieces = [(at, piece) for at, piece in list(self.drawn) if first <= at <= last]
+        return [(at, _plain(piece)) for at, piece in pieces]
+
+    def processor_seconds(self) -> float:
+        """Return the processor time [s] that its process has used (Linux)."""
+        fields = Path(f"/proc/{self.pid}/stat").read_text("ascii").rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _plain(piece: bytes) -> str:
+    return _CONTROL.sub(b"\n", _STYLE.sub(b"", piece)).decode(errors="replace")
