@@ -34,6 +34,9 @@ def monitor(
 ) -> None:
     """Watch, start and command a protocol; space stops it, q leaves it running.
 
+    With --web in a browser, also over ssh: ssh -t -L 8123:127.0.0.1:8123 BENCH
+    bramah monitor --web --port 8123, then open the printed address.
+
     Example: bramah monitor --rig shinshu-2dof
     """
     from rig.model.parse import InputError

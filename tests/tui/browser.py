@@ -1,4 +1,8 @@
-"""A headless browser, driven over its debugging socket; any of the Chromium family will do."""
+"""A headless browser, driven over its debugging socket; any of the Chromium family will do.
+
+BRAMAH_BROWSER names the program where it is not found by its name; BRAMAH_PICTURES a folder in
+which tests leave pictures of what they saw.
+"""
 
 from __future__ import annotations
 

@@ -72,7 +72,8 @@ async def test_an_operator_watches_a_run_in_a_browser_and_stops_it(
         await until(tab.notice, "^$")
         assert re.search(r"rod +\d\.\d\d MPa", seen)
         assert "▣ locked" in seen
-        assert "SPACE STOP" in seen
+        assert seen.count("SPACE STOP") == 1, "one size, that of the page"
+        assert re.search(r"^ SPACE STOP .{80,}q quit", seen, re.MULTILINE)
         await until(tab.terminal, r"command +[+−]0\.[1-9]")  # the outputs are not zero
         png = await tab.picture(pictures(tmp_path) / "running.png")
         assert len(png) > 20_000, "a page that is drawn is no plain area"

@@ -83,11 +83,13 @@ def test_only_loopback_names_are_hosts_of_the_page(host: str) -> None:
         (["127.0.0.1:8000"], [], [], "token"),
         (["127.0.0.1:8000"], [], ["righ"], "token"),
         (["127.0.0.1:8000"], [], ["ünicode"], "token"),
+        (["127.0.0.1:8000"], [], ["right\udcff"], "token"),
         (["127.0.0.1:8000"], [], ["wrong", "right"], "token"),
         (["bench.example:8000"], [], ["right"], "host"),
         (["127.0.0.1.example"], [], ["right"], "host"),
         (["example@127.0.0.1"], [], ["right"], "host"),
         (["[::1"], [], ["right"], "host"),
+        (["127.0.0.1:8000; script-src *"], [], ["right"], "host"),
         ([], [], ["right"], "host"),
         (["127.0.0.1", "127.0.0.1"], [], ["right"], "host"),
         (["127.0.0.1:8000"], ["http://127.0.0.1:9000"], ["right"], "page of"),
@@ -196,11 +198,14 @@ async def test_pages_come_and_go_and_every_screen_ends_with_its_page(
 
 @pytest.mark.timeout(PATIENCE)
 async def test_nonsense_from_a_page_ends_that_page_alone(
-    server: WebServer, client: aiohttp.ClientSession, monkeypatch: pytest.MonkeyPatch
+    server: WebServer, client: aiohttp.ClientSession
 ) -> None:
     with socket.create_connection(("127.0.0.1", server.port)) as raw:
         raw.sendall(b"\x00\xff nonsense\r\n\r\n")
         assert b"400" in raw.recv(1 << 12)
+    with socket.create_connection(("127.0.0.1", server.port)) as raw:
+        raw.sendall(b"GET /?token=\xff\xfe HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+        assert b" 40" in raw.recv(1 << 12).splitlines()[0]
     for nonsense in ("{", "[]", '["resize", {"width": 1000000, "height": 2}]', '["stdin", 7]'):
         async with page_of(client, server) as page:
             await page.socket.send_str(nonsense)
@@ -270,10 +275,12 @@ async def test_a_screen_that_hangs_outlives_neither_its_page_nor_a_killed_server
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         server = WebServer(process, process.stdout.readline().strip())
+        hanging: list[int] = []
 
         async def hang(page: OpenPage) -> int:
             await page.message("beat")
             (screen,) = server.screens()
+            hanging.append(screen)
             await page.press("x")
             while len(page.messages) < 50:  # until one does not come back
                 await page.socket.send_json(["beat", "2"])
@@ -295,6 +302,9 @@ async def test_a_screen_that_hangs_outlives_neither_its_page_nor_a_killed_server
                 await until(lambda: gone(screen))
         finally:
             process.kill()
+            for screen in hanging:
+                with suppress(ProcessLookupError):
+                    os.kill(screen, signal.SIGKILL)
 
 
 @pytest.mark.timeout(2 * PATIENCE)

@@ -35,15 +35,17 @@ def refusal(
         return f"the address names the host {host!r}, expected {LOOPBACK} or localhost"
     if any(origin != f"http://{host}" for origin in origins):
         return f"it comes from a page of {origins[0]!r}, expected http://{host}"
-    if len(tokens) != 1 or not secrets.compare_digest(tokens[0].encode(), token.encode()):
+    sent = [text.encode(errors="surrogateescape") for text in tokens]  # any bytes may come
+    if len(sent) != 1 or not secrets.compare_digest(sent[0], token.encode()):
         return "the address holds no valid token; open the one that `bramah monitor --web` printed"
     return None
 
 
 def host_name(host: str) -> str:
-    """Return the name in a `Host` header without its port, '' where it has none."""
+    """Return the name in a `Host` header without its port, '' for what is no name and port."""
     try:
         parts = urlsplit(f"//{host}")
-        return (parts.hostname or "") if parts.netloc == host and "@" not in host else ""
+        whole = parts.netloc == host and "@" not in host and (parts.port or 0) >= 0
     except ValueError:
         return ""
+    return parts.hostname or "" if whole else ""

@@ -45,6 +45,7 @@ class AttachedScreen(AppService):
             download_manager=downloads,
         )
         self._words, self._ended = tuple(words), ended
+        self._stopping = False
         # Closed when the process has ended.
         self._errors: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115
 
@@ -73,15 +74,17 @@ class AttachedScreen(AppService):
         assert self._process is not None
         await self._wait(self._process)
         said = self._said()
-        if self._process.returncode != 0:
-            log.warning("a screen ended with %s: %s", self._process.returncode, said)
+        if self._process.returncode != 0 and not self._stopping:
+            log.warning("a screen ended: %s", said)
         with suppress(ConnectionError):  # the page may be gone
             await self._ended(f"The screen ended: {said}" if said else CLOSED)
 
     async def stop(self) -> None:
         """Ask the process to end, wait for it, kill it where it does not; then nothing is left."""
+        self._stopping = True
         task, self._task = self._task, None
         if task is None:
+            self._errors.close()
             return
         await self._download_manager.cancel_app_downloads(app_service_id=self.app_service_id)
         await self.send_meta({"type": "quit"})
@@ -89,7 +92,8 @@ class AttachedScreen(AppService):
         assert self._process.stdin is not None
         self._process.stdin.close()
         await self._wait(self._process)
-        await task
+        with suppress(TimeoutError):
+            await asyncio.wait_for(task, GRACE)
         self._errors.close()
 
     async def set_terminal_size(self, width: int, height: int) -> None:
@@ -112,13 +116,18 @@ class AttachedScreen(AppService):
 
     async def _leaving(self) -> None:
         """Let a screen that says it ends do so; the page hears of it when the process is gone."""
+        asyncio.get_running_loop().call_later(GRACE, self._kill)
+
+    def _kill(self) -> None:
+        if self._process is not None and self._process.returncode is None:
+            with suppress(ProcessLookupError):
+                self._process.kill()
 
     async def _wait(self, process: Process) -> None:
         try:
             await asyncio.wait_for(process.wait(), GRACE)
         except TimeoutError:
-            with suppress(ProcessLookupError):
-                process.kill()
+            self._kill()
             await process.wait()
 
     def _said(self) -> str:

@@ -52,6 +52,15 @@ REPORT_POLICY: Final = (
 )
 
 
+class _InOneLine(logging.Filter):
+    """Leaves the traceback out of a line of the log, unless everything is logged."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        if not log.isEnabledFor(logging.DEBUG):
+            record.exc_info = None
+        return True
+
+
 class PageServer(Server):
     """Serves the page and its files, and starts a screen for each page that is open."""
 
@@ -221,6 +230,9 @@ async def _serve(
 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         asyncio.get_running_loop().add_signal_handler(number, heard, number)
+    # Whatever another program sends to the port, the operator's terminal shows no traceback.
+    logging.getLogger("aiohttp.server").addFilter(_InOneLine())
+    logging.getLogger("textual-serve").setLevel(logging.CRITICAL)  # a screen says why it ended
     token = new_token()
     app = await PageServer(words, token).make_app()
     runner = web.AppRunner(app, access_log=None, shutdown_timeout=SHUTDOWN)
