@@ -143,6 +143,7 @@ def trace(
         rmse_before=runs_before.rmse, rmse_after=runs_after.rmse,
         window_before=runs_before.window_rmse, window_after=runs_after.window_rmse,
         lines=split, formulas=formulas,
+        free_curves=held_out.free_curves(runs_before, runs_after),
         seconds=time.perf_counter() - started,
     )  # fmt: skip
     return replace(result, sentence=sentence(result))

@@ -147,6 +147,21 @@ class Dependence:
 
 
 @dataclass(frozen=True)
+class FreeCurves:
+    """The first seconds of a held-out record: measured, and free runs before and after, SI.
+
+    `time` has shape (n,), so has every channel of `measured`, `before` and `after`.
+    """
+
+    record: str
+    time: Array
+    units: Mapping[str, str]
+    measured: Mapping[str, Array]
+    before: Mapping[str, Array]
+    after: Mapping[str, Array]
+
+
+@dataclass(frozen=True)
 class Trace:
     """The whole result; every error, fit and rmse is of the held-out records, SI and percent.
 
@@ -187,6 +202,7 @@ class Trace:
     window_after: Mapping[str, float] = field(default_factory=dict)
     lines: tuple[SpectralLines, ...] = ()
     formulas: tuple[Formula, ...] = ()
+    free_curves: FreeCurves | None = None
 
     @property
     def tied(self) -> list[tuple[str, str]]:
@@ -207,7 +223,8 @@ class Trace:
 def to_json(result: Trace) -> dict[str, Any]:
     """Return the contract's JSON.
 
-    Added to it are `refused gates size rmse window_rmse noise lines notes sentence seconds`.
+    Added to it are `refused gates size rmse window_rmse noise lines notes sentence seconds`, and
+    `free_run`, to be drawn.
     """
     return {
         "verdict": result.verdict,
@@ -224,6 +241,7 @@ def to_json(result: Trace) -> dict[str, Any]:
         "window_rmse": {
             "before": _numbers(result.window_before), "after": _numbers(result.window_after),
         },
+        "free_run": _free_run(result.free_curves) if result.free_curves else None,
         "parameters": {
             "before": _parameters(result.model_before),
             "after": _parameters(result.model_after),
@@ -281,6 +299,18 @@ def _effect(found: Found) -> dict[str, Any]:
 def _curve(one: Curve) -> dict[str, Any]:
     numbers = {n: [float(v) for v in getattr(one, n)] for n in ("x", "y", "lo", "hi")}
     return {"label": one.label, **numbers, "unit_x": one.unit_x, "unit_y": one.unit_y}
+
+
+def _free_run(one: FreeCurves) -> dict[str, Any]:
+    def numbers(values: Array) -> list[float | None]:
+        return [finite(float(f"{v:.6g}")) for v in values]
+
+    kinds = ("measured", "before", "after")
+    channels = {
+        name: {"unit": one.units[name], **{k: numbers(getattr(one, k)[name]) for k in kinds}}
+        for name in one.measured
+    }
+    return {"record": one.record, "time": numbers(one.time), "channels": channels}
 
 
 def _shot(one: Shot) -> dict[str, Any]:

@@ -12,17 +12,21 @@ from analysis.identify.estimators.nuisance import KAPPA
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.rows import Rows
 from analysis.simulation.model import Model
-from analysis.simulation.validate import validate
+from analysis.simulation.validate import RecordValidation, validate
 from analysis.trace.data.conditioned_record import model_rows, row_residual
 from analysis.trace.data.noise_floor import floors
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.temperature_nuisance import plausible
+from analysis.trace.result import FreeCurves
 from analysis.trace.search.refinement import DesignMatrix, ExactFit, table
 from rig.model.parse import InputError
 from rig.model.records import Run
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
+
+CURVE_SECONDS = 4.0  # of a free run kept to be drawn
+CURVE_POINTS = 400  # of them, about
 
 
 @dataclass(frozen=True)
@@ -123,12 +127,32 @@ def _rms(parts: Sequence[Array]) -> float:
 class FreeRunErrors:
     """Simulations of the held-out records, by channel: mean FIT [%] and RMSE [SI] of free runs.
 
-    `window_rmse` [SI] is of windows restarted from the data; NaN where the model failed.
+    `window_rmse` [SI] is of windows restarted from the data; NaN where the model failed. `first` is
+    the first record whose free run did not fail.
     """
 
     fit: Mapping[str, float]
     rmse: Mapping[str, float]
     window_rmse: Mapping[str, float]
+    first: RecordValidation | None = None
+
+
+def free_curves(before: FreeRunErrors, after: FreeRunErrors) -> FreeCurves | None:
+    """Return the beginning of one held-out record, measured and under both models; None if none."""
+    one, other = before.first, after.first
+    if one is None or other is None or one.record != other.record:
+        return None
+    count = min(round(CURVE_SECONDS / float(one.time[1] - one.time[0])), len(one.time))
+    kept = slice(0, count, max(count // CURVE_POINTS, 1))
+    before_it, after_it = one.simulation.channels(), other.simulation.channels()
+    return FreeCurves(
+        one.record,
+        one.time[kept],
+        one.units,
+        {name: y[kept] for name, y in one.measured.items()},
+        {name: before_it[name][kept] for name in one.measured},
+        {name: after_it[name][kept] for name in one.measured},
+    )
 
 
 def free_runs(
@@ -155,8 +179,7 @@ def _free_runs(holdout: Sequence[Run], model: Model) -> FreeRunErrors:
             windows.setdefault(channel, []).append(r.window_rmse[channel] ** 2)
     return FreeRunErrors(
         {c: float(np.mean(v)) for c, v in sorted(fits.items())},
-        *(
-            {c: float(np.sqrt(np.mean(v))) for c, v in sorted(x.items())}
-            for x in (squares, windows)
-        ),
+        {c: float(np.sqrt(np.mean(v))) for c, v in sorted(squares.items())},
+        {c: float(np.sqrt(np.mean(v))) for c, v in sorted(windows.items())},
+        next((r for r in results if not r.failure), None),
     )
