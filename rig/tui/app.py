@@ -26,7 +26,7 @@ from rig.tui.browse import Browsed
 from rig.tui.canvas import Canvas
 from rig.tui.following.link import Frame, Link, LinkStage, LocalSessions, Sessions
 from rig.tui.following.story import KINDS
-from rig.tui.look import PAGES, Dialog, PlotView, ScreenStyle
+from rig.tui.look import OF_A_RECORDED_RUN, PAGES, Dialog, PlotView, ScreenStyle
 from rig.tui.pages.operation import in_order
 from rig.tui.pages.parts import joints_in
 from rig.tui.pages.whole import compose
@@ -296,7 +296,10 @@ class Monitor(ByHand, App[int]):
 
     def open_page(self, page: str) -> None:
         """Show a page from its beginning."""
-        self.look = replace(self.look, page=page, marked=0, offset=0)
+        back = self.look.page in OF_A_RECORDED_RUN and page in ("runs", *OF_A_RECORDED_RUN)
+        opens = self.look.page == "runs" and page in OF_A_RECORDED_RUN
+        marked = self.look.marked if back or opens else 0
+        self.look = replace(self.look, page=page, marked=marked, offset=0)
         if page == "runs":
             self.look_around()
 
@@ -313,7 +316,11 @@ class Monitor(ByHand, App[int]):
         down = {"up": -1, "down": 1, "pageup": -10, "pagedown": 10, "home": -9999, "end": 9999}
         step = down.get(key, 0)
         joints = len(joints_in(snapshot.channels)) if snapshot else 0
-        if look.page == "log":
+        if look.page == "run trace" and key in ("left", "right"):
+            self.look = replace(look, channel=max(look.channel + (1 if key == "right" else -1), 0))
+        elif look.page == "run trace":
+            self.look = replace(look, offset=max(look.offset + step, 0))
+        elif look.page in ("log", "run log"):
             self.look = replace(look, offset=max(look.offset - step, 0))
         elif look.page == "overview":
             self.look = replace(look, offset=min(max(look.offset + step, 0), max(joints - 1, 0)))
@@ -378,7 +385,8 @@ class Monitor(ByHand, App[int]):
         """Ask what to look for in the log."""
 
         def found(text: str) -> None:
-            self.look = replace(self.look, search=text.strip(), page="log", offset=0)
+            page = self.look.page if self.look.page == "run log" else "log"
+            self.look = replace(self.look, search=text.strip(), page=page, offset=0)
 
         lines = ("Lines that contain the text are kept; an empty text keeps all.",)
         self.ask(Dialog("search", lines, text="", keys="Enter keeps, Esc closes"), found)

@@ -15,6 +15,8 @@ from rig.queue.store import QueueStore
 from rig.runs.listing.index import indexed_runs
 from rig.runs.listing.summary import RunSummary
 from rig.tui.jobs import VerbJob
+from rig.tui.run_log import RunLog
+from rig.tui.run_trace import RunTrace
 
 TABS: Final = ("protocols", "runs", "queue")
 
@@ -23,7 +25,8 @@ TABS: Final = ("protocols", "runs", "queue")
 class Browsed:
     """What was found; `trouble` says in one line what could not be read.
 
-    `job` is the newest verb that was started here, `rig` and `endpoint` what it is started for.
+    `log` and `trace` are those of the run that was opened last. `job` is the newest verb that was
+    started here, `rig` and `endpoint` what it is started for.
     """
 
     folder: Path = Path()
@@ -35,6 +38,8 @@ class Browsed:
     trouble: str = ""
     reading: bool = False
     job: VerbJob | None = None
+    log: RunLog | None = None
+    trace: RunTrace | None = None
     rig: str = ""
     endpoint: str | None = None
 

@@ -25,6 +25,7 @@ PAGES: Final = (
     ("9", "manual", "man"),
     ("0", "runs", "runs"),
 )
+OF_A_RECORDED_RUN: Final = ("run log", "run trace")  # opened from the page of runs
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,17 @@ from __future__ import annotations
 import asyncio
 import re
 import sys
+import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
+from rig.tui.browse import Browsed
+from rig.tui.run_log import read_log
+from rig.tui.run_trace import read_trace
 from tests.tui.glass import Machine, Recorded, endpoint, glass
 from tests.tui.recorded import Bench, followed, past, run, snapshot, tripped
+from tests.tui.stored import run_folder
 
 DOCS = Path(__file__).parents[2] / "docs" / "screen.md"
 _PICTURE = re.compile(
@@ -30,9 +36,19 @@ def machine(*, trip: bool = False) -> Machine:
     return Machine({endpoint(): record})
 
 
+def recorded_run() -> Browsed:
+    """Return what was read of a run that is over: its log and its trace."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = run_folder(Path(folder) / "run")
+        log, trace = read_log(path), read_trace(path)
+    run = Path("runs/2024-05-17-lock-and-excite")
+    return Browsed(log=replace(log, folder=run), trace=replace(trace, folder=run))
+
+
 async def capture(page: str, width: int, height: int, trip: bool = False) -> str:
     """Return a page on a recorded run, trailing blanks cut, braille's blank as a space."""
     async with glass(machine(trip=trip), size=(width, height)) as shown:
+        shown.app.browsed = recorded_run()
         shown.app.open_page(page)
         await shown.watch()
         return "\n".join(line.replace("⠀", " ").rstrip() for line in shown.lines)
@@ -40,8 +56,8 @@ async def capture(page: str, width: int, height: int, trip: bool = False) -> str
 
 def arguments_of(words: Sequence[str]) -> tuple[str, int, int, bool]:
     """Read PAGE WIDTH HEIGHT [--trip]."""
-    page, width, height = [word for word in words if word != "--trip"]
-    return page, int(width), int(height), "--trip" in words
+    *page, width, height = [word for word in words if word != "--trip"]
+    return " ".join(page), int(width), int(height), "--trip" in words
 
 
 def main(words: list[str]) -> None:

@@ -22,7 +22,7 @@ PICTURES = [
 def test_the_page_has_a_picture_of_each_level_and_of_a_trip() -> None:
     names = " ".join(str(picture.id) for picture in PICTURES)
     levels = ("overview", "joint", "channel", "diagnostics", "alarms", "protocol", "estimates")
-    for word in (*levels, "--trip"):
+    for word in (*levels, "run trace", "--trip"):
         assert word in names
 
 

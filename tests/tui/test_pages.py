@@ -11,12 +11,22 @@ from tests.tui.capture import capture
 
 KEPT = Path(__file__).parent / "pictures"
 SIZES = ((80, 24), (120, 40), (200, 60))
-LEVELS = ("overview", "joint", "channel", "diagnostics", "alarms", "protocol", "estimates")
+LEVELS = (
+    "overview",
+    "joint",
+    "channel",
+    "diagnostics",
+    "alarms",
+    "protocol",
+    "estimates",
+    "run log",
+    "run trace",
+)
 ALWAYS = ("EXCITING", "age 0.01 s", "t 0:07", "SPACE STOP", "0 lost", "left 0:32", "q quit")
 
 
 def path(page: str, size: tuple[int, int]) -> Path:
-    return KEPT / f"{page}-{size[0]}x{size[1]}.txt"
+    return KEPT / f"{page.replace(' ', '-')}-{size[0]}x{size[1]}.txt"
 
 
 @pytest.mark.parametrize("size", SIZES)

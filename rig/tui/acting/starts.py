@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import threading
 import webbrowser
 from collections.abc import Callable
@@ -15,8 +17,16 @@ from rig.tui.acting.commands import Commands
 from rig.tui.browse import TABS, Browsed, read_disk
 from rig.tui.jobs import VerbJob, begin, rig_of_run
 from rig.tui.look import Dialog
+from rig.tui.run_log import RunLog, read_log
+from rig.tui.run_trace import STORED, RunTrace, read_trace
 
 KEYS: Final = "↑ ↓ and Enter choose, Esc closes, SPACE stops"
+
+
+def display_here() -> bool:
+    """Whether a browser has a display to open on; one for text would take the terminal."""
+    other = sys.platform in ("darwin", "win32")
+    return other or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
 class Starts(Commands):
@@ -39,7 +49,10 @@ class Starts(Commands):
             found = read_disk(self.browsed)
             # What was started or opened meanwhile stays.
             now = self.browsed
-            self.browsed = replace(found, tab=now.tab, job=now.job, rig=now.rig)
+            self.browsed = replace(
+                now, protocols=found.protocols, runs=found.runs, queue=found.queue,
+                paused=found.paused, trouble=found.trouble, reading=False,
+            )  # fmt: skip
             self.redraw()
 
         threading.Thread(target=read, name="bramah-browse", daemon=True).start()
@@ -79,12 +92,13 @@ class Starts(Commands):
     def _offer_run(self, run: RunSummary) -> None:
         path = str(run.path)
         others = [one for one in self.browsed.runs if one.path != run.path and one.records > 0]
-        report = run.path / "trace.html"
+        report, stored = run.path / "trace.html", run.path / STORED
 
         def against() -> None:
             acts: dict[str, Callable[[], None]] = {}
             for one in others:
-                words = ("trace", path, "--holdout", str(one.path), "--report", str(report))
+                words = ("trace", path, "--holdout", str(one.path), "--report", str(report),
+                         "--json", str(stored))  # fmt: skip
                 acts[one.path.name] = lambda words=words: self._job(words)  # type: ignore[misc]
             if acts:
                 self._offer("trace: held-out records of", acts)
@@ -92,8 +106,10 @@ class Starts(Commands):
                 self.remark = "trace: it needs a second run, of other records, to judge by."
 
         acts: dict[str, Callable[[], None]] = {
+            "read its log": lambda: self._open_log(run.path),
             "identify its parameters": lambda: self._job(("identify", path, "--json", "-")),
             "trace what its model lacks": against,
+            "before and after of its trace": lambda: self._open_trace(run.path),
             "open its report": lambda: self._open(report),
         }
         if run.state == "interrupted":
@@ -101,6 +117,29 @@ class Starts(Commands):
         if run.state == "tripped":
             acts = {"reset the trip that it left": lambda: self._reset_run(run), **acts}
         self._offer(run.path.name, acts)
+
+    def _open_log(self, folder: Path) -> None:
+        """Show the log of a run, read beside the screen."""
+        self.browsed = replace(self.browsed, log=RunLog(folder, reading=True))
+        self.open_page("run log")
+
+        def read() -> None:
+            self.browsed = replace(self.browsed, log=read_log(folder))
+            self.redraw()
+
+        threading.Thread(target=read, name="bramah-log", daemon=True).start()
+
+    def _open_trace(self, folder: Path) -> None:
+        """Show what the trace of a run says, as it was stored."""
+        self.browsed = replace(self.browsed, trace=RunTrace(folder, reading=True))
+        self.open_page("run trace")
+        self.look = replace(self.look, channel=0)
+
+        def read() -> None:
+            self.browsed = replace(self.browsed, trace=read_trace(folder))
+            self.redraw()
+
+        threading.Thread(target=read, name="bramah-trace", daemon=True).start()
 
     def _reset_run(self, run: RunSummary) -> None:
         """Reset the bench that a run tripped, with a reason."""
@@ -123,6 +162,9 @@ class Starts(Commands):
         if self.is_web:  # the browser that shows the screen, not one of the bench's computer
             self.deliver_binary(page, open_method="browser", mime_type="text/html")
             self.remark = f"opened {page} in another tab"
+            return
+        if not display_here():
+            self.remark = f"no display here; the page is {page.absolute()}"
             return
         opened = webbrowser.open(page.absolute().as_uri())
         self.remark = f"opened {page}" if opened else f"no browser here; open {page.absolute()}"

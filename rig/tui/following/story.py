@@ -24,6 +24,7 @@ class EventLine:
 
 
 Said = tuple[str, str, str]  # text, style, kind
+_OWN: Final = ("event", "time", "tick", "t", "parameters")  # of an event, not said with it
 
 
 def tell(last: Snapshot | None, snapshot: Snapshot) -> list[EventLine]:
@@ -97,15 +98,16 @@ def from_events(events: Iterable[Mapping[str, Any]], snapshot: Snapshot) -> list
     found = []
     for event in events:
         tick = event.get("tick")
-        said = _of_event(event)
-        if said is None or not isinstance(tick, int):
+        if not isinstance(tick, int):
             continue
         at = max(snapshot.done_s - (snapshot.tick - tick) / rate, 0.0)
-        found.append(EventLine(at, *said))
+        found.append(EventLine(at, *said_of_event(event)))
     return found
 
 
-def _of_event(event: Mapping[str, Any]) -> Said | None:
+def said_of_event(event: Mapping[str, Any]) -> Said:
+    """Return what an event of a run's log says; one of another kind is said by its fields."""
+
     def get(key: str) -> str:
         return str(event.get(key, ""))
 
@@ -125,4 +127,9 @@ def _of_event(event: Mapping[str, Any]) -> Said | None:
         "controls released": (f"controls released by {get('by')}", PLAIN, "people"),
         "stop": (f"stop: {get('reason')}", STRONG, "people"),
     }
-    return texts.get(get("event"))
+    return texts.get(get("event")) or (_by_its_fields(event), DIM, "protocol")
+
+
+def _by_its_fields(event: Mapping[str, Any]) -> str:
+    fields = (f"{key} {value}" for key, value in event.items() if key not in _OWN)
+    return f"{event.get('event')}  {', '.join(fields)}".strip()

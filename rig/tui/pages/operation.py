@@ -1,13 +1,14 @@
-"""The pages of the run: alarms, protocol, log."""
+"""The pages of the run: alarms, protocol, log; the log of a run on the disk."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from rig.model.alarms.states import Alarm, folded
 from rig.tui.drawing.plot import PlotTrace, draw
-from rig.tui.drawing.rows import Row, beside, block, box, columns, row, wrapped
-from rig.tui.drawing.styles import ASK, ASK_TEXT, DIM, NORMAL, STRONG
+from rig.tui.drawing.rows import Row, beside, block, box, columns, fit, row, wrapped
+from rig.tui.drawing.styles import ASK, ASK_TEXT, DIM, NORMAL, STRONG, WARN_TEXT
 from rig.tui.following.story import EventLine
 from rig.tui.look import PlotView
 from rig.tui.pages.overview import alarm_mark
@@ -138,25 +139,48 @@ def protocol_page(view: PlotView, width: int, height: int) -> list[Row]:
     return block([*head, row(), *_window(steps, at - 1, height - len(head) - 1)], width, height)
 
 
-def filtered(view: PlotView) -> list[EventLine]:
-    """Return the lines of the log that the operator's filter and search keep."""
+def filtered(lines: Sequence[EventLine], view: PlotView) -> list[EventLine]:
+    """Return the lines of a log that the operator's filter and search keep."""
     wanted = view.look.search.lower()
     return [
         line
-        for line in view.newest.story
+        for line in lines
         if view.look.only in ("all", line.kind) and wanted in line.text.lower()
     ]
 
 
 def log_page(view: PlotView, width: int, height: int) -> list[Row]:
-    """Return the log, the newest below; scrolled by whole lines."""
-    lines = filtered(view)
+    """Return the log of the run on the screen."""
+    return log_rows(view.newest.story, view, width, height)
+
+
+def run_log_page(view: PlotView, width: int, height: int) -> list[Row]:
+    """Return the log of a run on the disk, with what is damaged in it."""
+    log = view.browsed.log
+    if log is None:
+        return block([row((" no run was opened", DIM))], width, height)
+    of = [one for one in view.browsed.runs if one.path == log.folder]
+    state = f"  {of[0].state}  {of[0].message}" if of else ""
+    head = [fit(row((f" log of {log.folder}", STRONG), (state, DIM)), width)]
+    if log.reading:
+        return block([*head, row((" reading ...", DIM))], width, height)
+    head += [
+        row(((" ▲ " if k == 0 else "   "), WARN_TEXT), *line)
+        for k, line in enumerate(wrapped(log.trouble, width - 3, WARN_TEXT) if log.trouble else ())
+    ]
+    return [*head, *log_rows(log.lines, view, width, max(height - len(head), 1))]
+
+
+def log_rows(story: Sequence[EventLine], view: PlotView, width: int, height: int) -> list[Row]:
+    """Return lines of a log, the newest below; scrolled by whole lines."""
+    lines = filtered(story, view)
     room = height - 1
     offset = min(view.look.offset, max(len(lines) - room, 0))
     shown_lines = lines[max(len(lines) - room - offset, 0) : len(lines) - offset]
     search = f"  search: {view.look.search}" if view.look.search else ""
     where = f"  {offset} lines back" if offset else ""
-    total = len(view.newest.story)
-    head = row((f" {view.look.only}{search}", STRONG), (f"  {len(lines)} of {total}{where}", DIM))
+    head = row(
+        (f" {view.look.only}{search}", STRONG), (f"  {len(lines)} of {len(story)}{where}", DIM)
+    )
     rows = [row((f"{line.time:10.2f} s  ", DIM), (line.text, line.style)) for line in shown_lines]
     return block([head, *rows], width, height)

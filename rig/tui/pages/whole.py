@@ -8,8 +8,8 @@ from typing import Final
 from rig.tui.drawing.rows import Row, beside, block, box, ends, fit, row, wrapped
 from rig.tui.drawing.styles import ASK, DIM, LEVELS, NORMAL, STRONG, SYMBOLS, WARN_TEXT
 from rig.tui.following.link import LinkStage
-from rig.tui.look import PAGES, PlotView
-from rig.tui.pages import estimates, levels, manual, operation, overview, runs
+from rig.tui.look import OF_A_RECORDED_RUN, PAGES, PlotView
+from rig.tui.pages import estimates, levels, manual, operation, overview, runs, trace
 from rig.tui.units import age_text, clock_text
 from rig.tui.words import VERY_OLD, Freshness, headline, notices, run_time
 
@@ -26,6 +26,12 @@ OF_A_RUN: Final[Mapping[str, Page]] = {
     "log": operation.log_page,
     "estimates": estimates.estimates_page,
 }
+OF_THE_DISK: Final[Mapping[str, Page]] = {  # and what needs no run on the screen
+    "runs": runs.runs_page,
+    "run log": operation.run_log_page,
+    "run trace": trace.run_trace_page,
+    "manual": manual.manual_page,
+}
 KEYS: Final = {
     "overview": "t command  p pause/resume  a answer  k acknowledge  h hold",
     "joint": "←→ joint  + − = span  z zoom  h hold",
@@ -33,6 +39,8 @@ KEYS: Final = {
     "alarms": "↑↓ mark  k acknowledge  r reset",
     "protocol": "t command  p pause/resume  n skip  x abort  a answer",
     "log": "↑↓ scroll  / search  f filter  e end",
+    "run log": "↑↓ scroll  / search  f filter  e end  0 runs",
+    "run trace": "↑↓ scroll  ←→ channel  0 runs",
     "estimates": "",
     "manual": "hold ↑ ↓ jog  ←→ joint  l lock  u unlock  x end",
     "runs": "← → tabs  ↑ ↓ mark  Enter what can be done",
@@ -56,10 +64,9 @@ def compose(view: PlotView, width: int, height: int) -> list[Row]:
 
 
 def _page(view: PlotView, width: int, height: int) -> list[Row]:
-    if view.look.page == "runs":
-        return runs.runs_page(view, width, height)
-    if view.look.page == "manual":
-        return manual.manual_page(view, width, height)
+    always = OF_THE_DISK.get(view.look.page)
+    if always is not None:
+        return always(view, width, height)
     page = OF_A_RUN.get(view.look.page)
     if view.newest.stage is LinkStage.CHOOSING:
         return chooser(view, width, height)
@@ -128,11 +135,12 @@ def _tabs(view: PlotView, width: int) -> Row:
     count = len(view.alarms.alarms)
     fresh = len(view.alarms.unacknowledged)
     line: Row = ()
+    here = "runs" if view.look.page in OF_A_RECORDED_RUN else view.look.page
     for key, name, short in PAGES:
         text = name if width >= 116 else short
         if name == "alarms" and count:
             text += f" {count}{'▲' if fresh else ''}"
-        style = NORMAL if name == view.look.page else WARN_TEXT if text[-1] == "▲" else DIM
+        style = NORMAL if name == here else WARN_TEXT if text[-1] == "▲" else DIM
         line = (*line, (f" {key} {text}{' ' * (width >= 116)}", style))
     return fit(line, width)
 

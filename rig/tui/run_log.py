@@ -1,0 +1,82 @@
+"""The log of a run that has ended, read from its folder for the screen."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from rig.runs.runstate import EVENTS
+from rig.tui.following.story import EventLine, said_of_event
+
+MOST: Final = 20_000  # newest lines that are kept
+LONGEST: Final = 400  # characters of a line
+
+
+@dataclass(frozen=True)
+class RunLog:
+    """The lines of a run's log, oldest first; `trouble` says in one line what is damaged."""
+
+    folder: Path
+    lines: tuple[EventLine, ...] = ()
+    trouble: str = ""
+    reading: bool = False
+
+
+def read_log(folder: Path) -> RunLog:
+    """Read the events of a run; never raises: what cannot be read is said in `trouble`."""
+    path = folder / EVENTS
+    try:
+        raw = path.read_bytes()
+    except FileNotFoundError:
+        return RunLog(folder, trouble=f"{path}: there is no such file, so the run has no log")
+    except OSError as error:
+        return RunLog(folder, trouble=f"{path}: cannot be read: {error.strerror}")
+    found: list[EventLine] = []
+    bad: list[int] = []
+    newest = 0.0
+    lines = raw.splitlines()
+    for number, line in enumerate(lines, 1):
+        event = _event(line)
+        if event is None:
+            bad.append(number)
+            continue
+        newest = _time(event, newest)
+        text, style, kind = said_of_event(event)
+        found.append(EventLine(newest, _printable(text), style, kind))
+    torn = bad == [len(lines)] and not raw.endswith(b"\n")
+    return RunLog(folder, tuple(found[-MOST:]), _trouble(path, bad, len(lines), torn=torn))
+
+
+def _event(line: bytes) -> dict[str, Any] | None:
+    try:
+        entry = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    return entry if isinstance(entry, dict) and "event" in entry else None
+
+
+def _time(event: dict[str, Any], before: float) -> float:
+    """Return when an event was [s since the run began]; the time before where it does not say."""
+    at = event.get("t")
+    known = isinstance(at, int | float) and not isinstance(at, bool) and math.isfinite(at)
+    return float(at) if known and at is not None else before
+
+
+def _printable(text: str) -> str:
+    """Return a text that does nothing to a terminal, whatever a damaged file holds."""
+    flat = " ".join(text.split())
+    return "".join(c if c.isprintable() else "·" for c in flat[:LONGEST])
+
+
+def _trouble(path: Path, bad: list[int], count: int, *, torn: bool) -> str:
+    if torn:
+        return f"{path}: the last line was cut off, as by a kill; what stands before it is shown"
+    if bad:
+        return (
+            f"{path}: {len(bad)} of {count} lines cannot be read, the first is line {bad[0]}; "
+            "expected one JSON object with 'event' a line"
+        )
+    return "" if count else f"{path}: is empty"

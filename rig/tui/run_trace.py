@@ -1,0 +1,135 @@
+"""The stored result of a trace, read for the screen: before and after."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+STORED: Final = "trace.json"  # what `bramah trace --json` wrote, in the run's folder or above it
+
+Numbers = Mapping[str, float | None]
+
+
+class _Stored(BaseModel):
+    """A part of the JSON of a trace; keys that the screen does not show are left out."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+
+class StoredEstimate(_Stored):
+    """A parameter: value, unit, 95 % interval."""
+
+    value: float | None
+    unit: str = ""
+    ci95: tuple[float | None, float | None] = (None, None)
+
+
+class StoredGate(_Stored):
+    """One condition for a name."""
+
+    name: str
+    ok: bool
+    detail: str = ""
+
+
+class StoredEffect(_Stored):
+    """An effect with its place."""
+
+    name: str
+    where: str
+    parameters: Mapping[str, StoredEstimate] = {}
+    removed_fraction: float | None = None
+    gates: tuple[StoredGate, ...] = ()
+
+
+class StoredErrors(_Stored):
+    """Held-out rms of every equation, SI."""
+
+    noise_floor: Numbers
+    before: Numbers
+    after: Numbers
+
+
+class StoredPair(_Stored):
+    """A number by channel, before and after."""
+
+    before: Numbers = {}
+    after: Numbers = {}
+
+
+class StoredCurves(_Stored):
+    """A channel of a free run, SI."""
+
+    unit: str
+    measured: tuple[float | None, ...]
+    before: tuple[float | None, ...]
+    after: tuple[float | None, ...]
+
+
+class StoredFreeRun(_Stored):
+    """The beginning of a held-out record, measured and simulated."""
+
+    record: str
+    time: tuple[float, ...]
+    channels: Mapping[str, StoredCurves]
+
+
+class StoredNext(_Stored):
+    """What to measure next."""
+
+    text: str = ""
+
+
+class StoredTrace(_Stored):
+    """What the screen shows of a trace's JSON."""
+
+    verdict: str
+    sentence: str = ""
+    effects: tuple[StoredEffect, ...] = ()
+    refused: tuple[StoredEffect, ...] = ()
+    error: StoredErrors
+    fit: StoredPair = StoredPair()
+    size: Numbers = {}
+    free_run: StoredFreeRun | None = None
+    next_experiment: StoredNext | None = None
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class RunTrace:
+    """The trace of a run's folder; `trouble` says in one line why there is none."""
+
+    folder: Path
+    path: Path | None = None
+    stored: StoredTrace | None = None
+    trouble: str = ""
+    reading: bool = False
+
+
+def read_trace(folder: Path) -> RunTrace:
+    """Read the trace stored in a run's folder, else beside it; never raises."""
+    places = (folder / STORED, folder.parent / STORED)
+    path = next((place for place in places if place.is_file()), None)
+    if path is None:
+        hint = "`trace what its model lacks` on the page of runs writes it"
+        return RunTrace(folder, trouble=f"{places[0]}: there is no such file; {hint}")
+    try:
+        return RunTrace(folder, path, StoredTrace.model_validate_json(path.read_bytes()))
+    except OSError as error:
+        return RunTrace(folder, path, trouble=f"{path}: cannot be read: {error.strerror}")
+    except ValidationError as error:
+        return RunTrace(folder, path, trouble=f"{path}: {_first(error)}")
+
+
+def _first(error: ValidationError) -> str:
+    """Return what is wrong first, with its key; expected is what `bramah trace --json` writes."""
+    first = error.errors(include_url=False)[0]
+    key = ".".join(str(part) for part in first["loc"])
+    if first["type"] == "json_invalid":
+        return f"is not JSON ({first['msg']}); expected the output of `bramah trace --json`"
+    found = str(first["input"])[:40]
+    return f"{key}: {first['msg']}, found {found}; expected the output of `bramah trace --json`"
