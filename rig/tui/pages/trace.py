@@ -123,7 +123,7 @@ def free_run_rows(stored: StoredTrace, chosen: int, width: int, height: int) -> 
     """Return a channel's error in free runs of the models before and after, on one scale."""
     run = stored.free_run
     if run is None or not run.channels or len(run.time) < 2:
-        text = " No free run is stored with this trace; a trace made anew stores one."
+        text = " No free run is stored: not every parameter is identified, or the trace is older."
         return wrapped(text, width, DIM)
     names = list(run.channels)
     name = names[min(chosen, len(names) - 1)]

@@ -18,6 +18,8 @@ from rig.cli.main import app
 from rig.model.records import Run
 from rig.runs.exchange.fixtures import write_run
 from rig.runs.rigs import load_rig
+from rig.tui.pages.trace import errors_of
+from rig.tui.run_trace import read_trace
 from tests.analysis.carriage import Carriage, moves, record
 from tests.studies.machines import emps as study
 
@@ -56,6 +58,23 @@ def test_both_hidden_effects_are_named_at_their_size(found: Trace) -> None:
     values = {n: e.value for f in found.effects for n, e in f.parameters.items()}
     assert values["Fc1"] == pytest.approx(18.0, rel=0.03)
     assert values["offset1"] == pytest.approx(-4.0, rel=0.03)
+
+
+def test_the_stored_trace_holds_a_free_run_to_be_drawn_and_a_screen_reads_it(
+    found: Trace, tmp_path: Path
+) -> None:
+    (tmp_path / "trace.json").write_text(json.dumps(to_json(found), allow_nan=False))
+    read = read_trace(tmp_path)
+    assert read.trouble == ""
+    assert read.stored is not None
+    assert read.stored.verdict == EXPLAINED
+    assert read.stored.effects[0].where == found.effects[0].where
+    run = read.stored.free_run
+    assert run is not None
+    assert 0 < len(run.time) <= 500
+    before, after = errors_of(run.channels["position_1"])
+    assert abs(before[0]) < 1e-3, "both begin where the carriage was [m]"
+    assert np.sqrt(np.mean(after**2)) < 0.5 * np.sqrt(np.mean(before**2))
 
 
 def test_force_and_free_run_are_far_better_on_records_not_seen(found: Trace) -> None:

@@ -20,8 +20,6 @@ from analysis.trace.result import Trace, to_json
 from rig.model.parse import InputError
 from rig.model.records import Run
 from rig.model.rig import Rig
-from rig.tui.pages.trace import errors_of
-from rig.tui.run_trace import read_trace
 from tests.analysis.trace.hidden import experiment, hardening, pair_of_runs
 
 
@@ -126,23 +124,6 @@ def test_the_result_has_the_contracts_keys(leaking: Trace) -> None:
     assert {"noise_floor", "before", "after"} == set(data["error"])
     assert {"fraction", "depends_on"} <= set(data["unexplained"])
     assert set(data["error"]["after"]) == {"torque_2", "flow_cap_2", "flow_rod_2"}
-
-
-def test_the_stored_trace_holds_a_free_run_to_be_drawn_and_a_screen_reads_it(
-    leaking: Trace, tmp_path: Path
-) -> None:
-    (tmp_path / "trace.json").write_text(json.dumps(to_json(leaking), allow_nan=False))
-    found = read_trace(tmp_path)
-    assert found.trouble == ""
-    assert found.stored is not None
-    assert found.stored.verdict == "explained"
-    assert found.stored.effects[0].where == leaking.effects[0].where
-    run = found.stored.free_run
-    assert run is not None
-    assert 0 < len(run.time) <= 500
-    before, after = errors_of(run.channels["piston_2"])
-    assert abs(before[0]) < 1e-4, "both begin where the arm was [m]"
-    assert np.sqrt(np.mean(after**2)) < 0.5 * np.sqrt(np.mean(before**2))
 
 
 def test_friction_and_a_dead_band_at_once_are_both_named(rig: Rig) -> None:
