@@ -393,7 +393,7 @@ async def test_the_log_is_searched_filtered_and_scrolled() -> None:
         assert "mark 150" not in shown.text
         await shown.press("pageup")
         await shown.press("pageup")
-        assert "20 lines back" in shown.text
+        assert "20 rows back" in shown.text
         assert "mark 199" not in shown.text
         await shown.press("slash")
         for key in "150":

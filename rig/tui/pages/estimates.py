@@ -165,7 +165,7 @@ def _residual(view: PlotView, family: str, width: int, height: int) -> list[Row]
     time, share = np.array(left).reshape(-1, 2).T
     bad = bool(_about_residual(name, left))
     line = row(
-        (f"{share[-1]:.2%}" if len(share) else "–", STRONG),
+        (f"{1e2 * share[-1]:.2g} %" if len(share) else "–", STRONG),
         (f" of it, rms {rms:.2g} {unit}  ", DIM),
         ("▲", WARN_TEXT) if bad else ("", ""),
     )
@@ -189,7 +189,9 @@ def _estimate(view: PlotView, name: str, width: int, height: int) -> list[Row]:
     half = 0.5 * (table[-1, 2] - table[-1, 1])
     share = abs(half / value) if value else nan
     wide = ("▲ wide ", WARN_TEXT) if not share < 0.5 else ("", "")
-    line = row((f"{value:.4g}", STRONG), (f" ± {half:.2g} ({share:.1%}, 95 %)  ", DIM), wide)
+    line = row(
+        (f"{value:.4g}", STRONG), (f" ± {half:.2g} ({1e2 * share:.2g} %, 95 %)  ", DIM), wide
+    )
     power = 3 * math.floor(math.log10(abs(value)) / 3) if value else 0  # the axis has few digits
     title = f"{name}  axis in 1e{power}" if power else name
     scale = 10.0**-power
@@ -208,9 +210,10 @@ def _box(
 ) -> list[Row]:
     """Return a line and the band from `low` to `high`, each (n,), over time in a frame."""
     inner = width - 4
-    span = max(float(time[-1]) if len(time) else 0.0, 1.0)
+    start, stop = (float(time[0]), float(time[-1])) if len(time) else (0.0, 0.0)
+    stop = max(stop, start + 1.0)
     live = view.fresh is Freshness.LIVE
-    trace = PlotTrace(time, low, high, 0.0, span, (None, None), shown(""), live, True)
+    trace = PlotTrace(time, low, high, start, stop, (None, None), shown(""), live, True)
     plot = draw(trace, inner, height - 4)
-    rows = [fit(line, inner), *plot, time_axis(0.0, span, inner)]
+    rows = [fit(line, inner), *plot, time_axis(start, stop, inner)]
     return box(name, rows, width, height, DIM, said_of(view))

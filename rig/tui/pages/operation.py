@@ -172,15 +172,24 @@ def run_log_page(view: PlotView, width: int, height: int) -> list[Row]:
 
 
 def log_rows(story: Sequence[EventLine], view: PlotView, width: int, height: int) -> list[Row]:
-    """Return lines of a log, the newest below; scrolled by whole lines."""
+    """Return lines of a log, wrapped, the newest below; scrolled by rows."""
     lines = filtered(story, view)
     room = height - 1
-    offset = min(view.look.offset, max(len(lines) - room, 0))
-    shown_lines = lines[max(len(lines) - room - offset, 0) : len(lines) - offset]
+    wanted = view.look.offset
+    # A line has a row at least: what is scrolled away above the window need not be wrapped.
+    rows = [line for one in lines[-(room + wanted) :] for line in _log_line(one, width)]
+    offset = min(wanted, max(len(rows) - room, 0))
     search = f"  search: {view.look.search}" if view.look.search else ""
-    where = f"  {offset} lines back" if offset else ""
-    head = row(
-        (f" {view.look.only}{search}", STRONG), (f"  {len(lines)} of {len(story)}{where}", DIM)
-    )
-    rows = [row((f"{line.time:10.2f} s  ", DIM), (line.text, line.style)) for line in shown_lines]
-    return block([head, *rows], width, height)
+    where = f"  {offset} rows back" if offset else ""
+    count = f"  {len(lines)} of {len(story)}{where}"
+    head = row((f" {view.look.only}{search}", STRONG), (count, DIM))
+    shown_rows = rows[max(len(rows) - room - offset, 0) : len(rows) - offset]
+    return block([head, *shown_rows], width, height)
+
+
+def _log_line(line: EventLine, width: int) -> list[Row]:
+    moment = f"{line.time:10.2f} s  "
+    texts = wrapped(line.text, max(width - len(moment), 1), line.style) or [row()]
+    return [
+        row((moment if k == 0 else " " * len(moment), DIM), *text) for k, text in enumerate(texts)
+    ]
