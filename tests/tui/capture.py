@@ -42,7 +42,9 @@ def recorded_run() -> Browsed:
         path = run_folder(Path(folder) / "run")
         log, trace = read_log(path), read_trace(path)
     run = Path("runs/2024-05-17-lock-and-excite")
-    return Browsed(log=replace(log, folder=run), trace=replace(trace, folder=run))
+    return Browsed(
+        log=replace(log, folder=run), trace=replace(trace, folder=run, path=run / "trace.json")
+    )
 
 
 async def capture(page: str, width: int, height: int, trip: bool = False) -> str:

@@ -35,7 +35,7 @@ def trace_json() -> dict[str, Any]:
                 "name": "internal_leakage", "where": "joint 2", "removed_fraction": 0.93,
                 "parameters": {
                     "c_internal_2": {
-                        "value": 2.03e-12, "unit": "m³/(s·Pa)", "std": 2e-14,
+                        "value": 2.03e-12, "unit": "m^3/(s*Pa)", "std": 2e-14,
                         "ci95": [1.99e-12, 2.07e-12],
                     }
                 },

@@ -20,6 +20,7 @@ from rig.tui.look import Dialog
 from rig.tui.run_log import RunLog, read_log
 from rig.tui.run_trace import STORED, RunTrace, read_trace
 
+REPORT: Final = "trace.html"
 KEYS: Final = "↑ ↓ and Enter choose, Esc closes, SPACE stops"
 
 
@@ -92,7 +93,8 @@ class Starts(Commands):
     def _offer_run(self, run: RunSummary) -> None:
         path = str(run.path)
         others = [one for one in self.browsed.runs if one.path != run.path and one.records > 0]
-        report, stored = run.path / "trace.html", run.path / STORED
+        report, stored = run.path / REPORT, run.path / STORED
+        beside = run.path.parent / REPORT  # of a set of runs, as the demo writes it
 
         def against() -> None:
             acts: dict[str, Callable[[], None]] = {}
@@ -110,7 +112,9 @@ class Starts(Commands):
             "identify its parameters": lambda: self._job(("identify", path, "--json", "-")),
             "trace what its model lacks": against,
             "before and after of its trace": lambda: self._open_trace(run.path),
-            "open its report": lambda: self._open(report),
+            "open its report": lambda: self._open(
+                report if report.is_file() or not beside.is_file() else beside
+            ),
         }
         if run.state == "interrupted":
             acts = {"recover what was recorded": lambda: self._job(("recover", path)), **acts}

@@ -29,7 +29,7 @@ def run_trace_page(view: PlotView, width: int, height: int) -> list[Row]:
     found = view.browsed.trace
     if found is None:
         return block([row((" no run was opened", DIM))], width, height)
-    head = [fit(row((f" trace of {found.folder}", STRONG)), width)]
+    head = [fit(row((f" {found.path or found.folder}", STRONG)), width)]
     if found.stored is None:
         said = "reading ..." if found.reading else found.trouble
         style = DIM if found.reading else WARN_TEXT
@@ -87,12 +87,13 @@ def _refused(effect: StoredEffect, width: int) -> list[Row]:
 
 
 def estimate_text(found: StoredEstimate) -> str:
-    """Return a value with half its 95 % interval and its unit."""
+    """Return a value with half its 95 % interval and its unit, as a person writes it."""
     low, high = found.ci95
     if found.value is None:
         return "not identified"
     half = f" ± {0.5 * (high - low):.2g}" if low is not None and high is not None else ""
-    return f"{found.value:.4g}{half} {found.unit}".rstrip()
+    unit = found.unit.replace("*", "·").replace("^2", "²").replace("^3", "³")
+    return f"{found.value:.4g}{half} {unit}".rstrip()
 
 
 def _errors(stored: StoredTrace) -> list[Row]:
