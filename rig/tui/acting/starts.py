@@ -108,13 +108,13 @@ class Starts(Commands):
                 self.remark = "trace: it needs a second run, of other records, to judge by."
 
         acts: dict[str, Callable[[], None]] = {
-            "read its log": lambda: self._open_log(run.path),
             "identify its parameters": lambda: self._job(("identify", path, "--json", "-")),
             "trace what its model lacks": against,
-            "before and after of its trace": lambda: self._open_trace(run.path),
             "open its report": lambda: self._open(
                 report if report.is_file() or not beside.is_file() else beside
             ),
+            "read its log": lambda: self._open_log(run.path),
+            "before and after of its trace": lambda: self._open_trace(run.path),
         }
         if run.state == "interrupted":
             acts = {"recover what was recorded": lambda: self._job(("recover", path)), **acts}
