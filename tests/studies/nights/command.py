@@ -60,7 +60,35 @@ def nights(
         raise WorkError("not every item ended as it must")
 
 
+def unattended(
+    hours: Annotated[float, typer.Option(min=0.01, help="Of the clock.")] = 1.0,
+    seed: Annotated[int, typer.Option(min=0)] = 1,
+    watchdog: Annotated[
+        float | None,
+        typer.Option(help="Of the device [s]; longer on a busy computer.  [default: the rig's]"),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Keep the run here.  [default: a folder that goes]")
+    ] = None,
+    json: JsonOption = None,
+) -> None:
+    """Run a protocol in real time for an hour; measure memory, lost samples and disk.
+
+    Example: python -m tests.studies unattended --hours 1
+    """
+    from tests.studies.nights.unattended import unattended as measure
+    from tests.studies.nights.unattended import unattended_text
+
+    with TemporaryDirectory(prefix="bramah-unattended-") as folder:
+        found = measure(out or Path(folder), hours, seed, watchdog)
+    write_json(json, asdict(found))
+    typer.echo(unattended_text(found))
+    if found.wrong:
+        raise WorkError("the unattended run did not keep what it must")
+
+
 def register(app: typer.Typer) -> None:
     """Add these studies to the command line."""
     app.command()(kills)
     app.command()(nights)
+    app.command()(unattended)
