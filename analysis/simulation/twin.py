@@ -1,4 +1,7 @@
-"""The twin: what the rig's nominal model would do with given commands, before anything moves."""
+"""The twin: what the rig would do with given commands, before anything moves.
+
+Its parameters are the rig's nominal values, or those of an identified model with its effects.
+"""
 
 from __future__ import annotations
 
@@ -77,9 +80,13 @@ def holding_state(rig: Rig, model: Model, piston: Array) -> State:
 
 
 def simulate_commands(
-    rig: Rig, commands: Array, start: Array, locked: Mapping[int, float]
+    rig: Rig,
+    commands: Array,
+    start: Array,
+    locked: Mapping[int, float],
+    model: Model | None = None,
 ) -> dict[str, Array]:
-    """Simulate valve commands (n, N) [V] at the rig's sample rate on the nominal model.
+    """Simulate valve commands (n, N) [V] at the rig's sample rate, on the nominal model by default.
 
     `start` (N,) are the pistons' first positions [m], `locked` maps a 0-based joint to the piston
     position [m] that holds it. Returns `piston speed cap_pressure rod_pressure spool`, each (n, N)
@@ -93,7 +100,8 @@ def simulate_commands(
         raise InputError(f"commands of shape {commands.shape} do not fit a rig of {N} joints")
     held = np.array([i in locked for i in range(N)])
     place = np.array([locked.get(i, float(start[i])) for i in range(N)])
-    model = nominal_model(rig, tuple(Used(term) for term in baseline()))
+    if model is None:
+        model = nominal_model(rig, tuple(Used(term) for term in baseline()))
     state = holding_state(rig, model, place)
     n, rate = len(commands), rig.sample_rate
     spool = np.column_stack(

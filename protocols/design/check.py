@@ -1,9 +1,10 @@
 """Proves a plan against the rig's limits on a twin, before anything moves.
 
-The twin simulates nominal parameters driven by commands; it is passed in, so that protocols and
-analysis stay apart. Centring is idealised: the bias is sought on the twin until the piston no
-longer drifts, and its motion is then judged as if centred to within the offset that the protocol
-allows.
+The twin simulates commands; it is passed in, so that protocols and analysis stay apart. Further
+twins, with parameters within their intervals, widen each predicted range (`widened`), and limits
+are judged on the edge of what they span. Centring is idealised: the bias is sought on the twin
+until the piston no longer drifts, and its motion is then judged as if centred to within the offset
+that the protocol allows.
 """
 
 from __future__ import annotations
@@ -11,12 +12,18 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 
-from protocols.design.check_report import CheckReport, Moment, MotionPrediction, StepCheck
+from protocols.design.check_report import (
+    CheckReport,
+    Moment,
+    MotionPrediction,
+    StepCheck,
+    widened,
+)
 from protocols.engine.centring import Array, follow, under_loop
 from protocols.files.plan import Plan
 from protocols.steps.base import PlannedStep
@@ -57,11 +64,16 @@ class Twin(Protocol):
 
 
 def check(
-    plan: Plan, rig: Rig, twin: Twin, tell: Callable[[float], None] | None = None
+    plan: Plan,
+    rig: Rig,
+    twin: Twin,
+    tell: Callable[[float], None] | None = None,
+    draws: Sequence[Twin] = (),
 ) -> CheckReport:
     """Predict every step on the twin and compare with the rig's limits.
 
-    `tell` hears after each step which share of them is done.
+    `draws` are twins within the uncertainty of `twin`; `tell` hears after each step which share of
+    them is done.
     Raises InputError where the twin cannot follow the commands at all; whether limits are kept
     is in the report.
     """
@@ -70,7 +82,7 @@ def check(
     for step in plan.excitations:
         same = _content(step)  # steps of a sweep or a repetition are often alike
         if same not in seen:
-            seen[same] = check_step(step, rig, twin)
+            seen[same] = check_step(step, rig, twin, draws)
         steps.append(replace(seen[same], step=step.name))
         if tell is not None:
             tell(len(steps) / len(plan.excitations))
@@ -97,9 +109,16 @@ def _timeline(plan: Plan) -> tuple[Moment, ...]:
     return tuple(found)
 
 
-def check_step(step: StepPlan, rig: Rig, twin: Twin) -> StepCheck:
-    """Predict one step; raises InputError where the twin cannot follow it."""
-    return judge_motion(step, rig, *centred(step, rig, twin))
+def check_step(step: StepPlan, rig: Rig, twin: Twin, draws: Sequence[Twin] = ()) -> StepCheck:
+    """Predict one step; raises InputError where the twin, or one of its draws, cannot follow it."""
+    found = _centred(step, rig, twin)
+    central = judge_motion(step, rig, found.biases, found.moved)
+    others = []
+    for draw in draws:
+        # The bench centres whatever it is; from the estimate's biases that takes one or two trials.
+        other = _centred(step, rig, draw, found)
+        others.append(judge_motion(step, rig, other.biases, other.moved))
+    return widened(central, others)
 
 
 def judge_motion(
@@ -113,6 +132,19 @@ def judge_motion(
     return StepCheck(step.name, tuple(lines), {j + 1: v for j, v in biases.items()})
 
 
+@dataclass(frozen=True)
+class _Centred:
+    """Biases [V] that keep the pistons centred, and what was simulated with `tried` from `start`.
+
+    `moved` is the last period's motion; `start` (joints,) are the pistons [m] it began from.
+    """
+
+    biases: dict[int, float]
+    tried: dict[int, float]
+    start: Array
+    moved: Mapping[str, Array]
+
+
 def centred(
     step: StepPlan, rig: Rig, twin: Twin
 ) -> tuple[dict[int, float], Mapping[str, Array]]:  # fmt: skip
@@ -120,23 +152,33 @@ def centred(
 
     Raises InputError where the twin cannot follow, NotCentred where another amplitude may help.
     """
+    found = _centred(step, rig, twin)
+    return found.biases, found.moved
+
+
+def _centred(step: StepPlan, rig: Rig, twin: Twin, near: _Centred | None = None) -> _Centred:
+    """Seek biases as `centred` does; begins with those of `near` where that is stated."""
     rate, joints = rig.sample_rate, len(rig.joints)
     locked = {part.joint: part.piston for part in step.locks}
     biases = {part.joint: 0.0 for part in step.excite}
     start = np.array([locked.get(j, 0.0) for j in range(joints)])
     for part in step.excite:
         start[part.joint] = part.centre
+    if near is not None:
+        biases, start = dict(near.tried), near.start.copy()
     seek = round(SEEK_SECONDS * rate)
     whole = math.ceil(SETTLE_SECONDS * rate / step.period) * step.period + step.period
     for attempt in range(BIAS_TRIES):
-        samples = min(seek, whole) if attempt < 2 else whole
+        samples = min(seek, whole) if attempt < 2 and near is None else whole
+        tried, began = dict(biases), start.copy()
         commands = _commands(step, joints, biases, samples, rate)
         moved = twin(rig, commands, start, locked)
         steady = True
         for part in step.excite:
             steady &= _improve(part, step, rate, commands, moved, biases, start)
         if steady and samples == whole:
-            return biases, {name: values[-step.period :] for name, values in moved.items()}
+            last = {name: values[-step.period :] for name, values in moved.items()}
+            return _Centred(biases, tried, began, last)
     which = ", ".join(str(part.joint + 1) for part in step.excite)
     raise NotCentred(
         f"{step.name}: on the twin joint {which} cannot be centred: after {BIAS_TRIES} biases it "

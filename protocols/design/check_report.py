@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Self
+from typing import Any, Final, Self
 
 from rig.model.parse import InputError
 from rig.model.units import LIMITS, display_unit
+
+NOMINAL: Final = "nominal values"
+SIGMAS: Final = 2.0  # standard deviations from a prediction to the edge that is judged
 
 
 @dataclass(frozen=True)
@@ -15,7 +19,9 @@ class MotionPrediction:
     """One line of the report, like a test sheet: quantity, predicted range, allowed range, unit.
 
     `joint` is 1-based, None for the bench. Only a `binding` line can refuse the plan; the others
-    say where the records will be poorer (a sagging supply, cavitation).
+    say where the records will be poorer (a sagging supply, cavitation). `spread` is the part of the
+    range, below and above, that the uncertainty of the twin's parameters adds; `low` and `high`
+    include it.
     """
 
     quantity: str
@@ -26,6 +32,7 @@ class MotionPrediction:
     allowed_high: float
     unit: str
     binding: bool = True
+    spread: tuple[float, float] = (0.0, 0.0)
 
     @property
     def margin(self) -> float:
@@ -52,6 +59,36 @@ class StepCheck:
         return all(line.ok for line in self.predictions if line.binding)
 
 
+def widened(central: StepCheck, others: Sequence[StepCheck]) -> StepCheck:
+    """Widen each predicted range by two standard deviations of its ends over further twins.
+
+    A standard deviation is the root mean square difference from the central prediction. A range
+    that lies within a fixed end (no flow below zero) keeps it, for there no twin differs.
+    """
+    if not others:
+        return central
+    known = [{(p.quantity, p.joint): p for p in other.predictions} for other in others]
+    lines = []
+    for line in central.predictions:
+        same = [k[name] for k in known if (name := (line.quantity, line.joint)) in k]
+        below, above = (
+            SIGMAS * math.sqrt(sum((end(p) - end(line)) ** 2 for p in same) / max(len(same), 1))
+            for end in (_low, _high)
+        )
+        lines.append(
+            replace(line, low=line.low - below, high=line.high + above, spread=(below, above))
+        )
+    return replace(central, predictions=tuple(lines))
+
+
+def _low(line: MotionPrediction) -> float:
+    return line.low
+
+
+def _high(line: MotionPrediction) -> float:
+    return line.high
+
+
 @dataclass(frozen=True)
 class Moment:
     """A step in the run's course: when it begins, its expected and its longest time [s]."""
@@ -65,7 +102,7 @@ class Moment:
 
 @dataclass(frozen=True)
 class CheckReport:
-    """What a protocol is expected to do on a rig."""
+    """What a protocol is expected to do on a rig; `twin` says whose parameters were simulated."""
 
     protocol: str
     rig: str
@@ -73,6 +110,7 @@ class CheckReport:
     steps: tuple[StepCheck, ...] = field(default=())
     timeline: tuple[Moment, ...] = ()
     scales: Mapping[str, float | None] = field(default_factory=dict)
+    twin: str = NOMINAL
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
@@ -87,7 +125,8 @@ class CheckReport:
         )
         timeline = tuple(Moment(**entry) for entry in data["timeline"])
         return cls(
-            data["protocol"], data["rig"], data["seconds"], steps, timeline, data["scales"]
+            data["protocol"], data["rig"], data["seconds"], steps, timeline, data["scales"],
+            data["twin"],
         )  # fmt: skip
 
     def with_remedies(self, scales: Mapping[str, float | None]) -> Self:
@@ -106,7 +145,7 @@ class CheckReport:
     def refused(self) -> tuple[str, ...]:
         """One line per limit that would be passed."""
         return tuple(
-            _text(check.step, line) + self._begins(check.step) + self._remedy(check.step)
+            _text(check.step, line, self.twin) + self._begins(check.step) + self._remedy(check.step)
             for check in self.steps
             for line in check.predictions
             if line.binding and not line.ok
@@ -116,7 +155,7 @@ class CheckReport:
     def notes(self) -> tuple[str, ...]:
         """One line per expectation that is no limit but will be missed."""
         return tuple(
-            _text(check.step, line)
+            _text(check.step, line, self.twin)
             for check in self.steps
             for line in check.predictions
             if not line.binding and not line.ok
@@ -140,6 +179,7 @@ class CheckReport:
             "rig": self.rig,
             "seconds": self.seconds,
             "ok": self.ok,
+            "twin": self.twin,
             "timeline": [asdict(moment) for moment in self.timeline],
             "scales": dict(self.scales),
             "steps": [
@@ -156,6 +196,7 @@ class CheckReport:
                             "unit": line.unit,
                             "binding": line.binding,
                             "ok": line.ok,
+                            "spread": list(line.spread),
                         }
                         for line in check.predictions
                     ],
@@ -165,13 +206,14 @@ class CheckReport:
         }
 
 
-def _text(step: str, line: MotionPrediction) -> str:
+def _text(step: str, line: MotionPrediction, twin: str) -> str:
     shown = display_unit(line.unit, LIMITS)
     scale, unit = shown.scale, shown.text
     who = "the bench" if line.joint is None else f"joint {line.joint}"
     low, high = scale * line.low, scale * line.high
+    of = "" if twin == NOMINAL else f" ({twin})"
     return (
-        f"{step}, {who}: {line.quantity} {low:.4g} to {high:.4g} {unit} on the twin, allowed "
+        f"{step}, {who}: {line.quantity} {low:.4g} to {high:.4g} {unit} on the twin{of}, allowed "
         f"{scale * line.allowed_low:.4g} to {scale * line.allowed_high:.4g} {unit}"
     )
 
@@ -180,8 +222,9 @@ def _line(data: Mapping[str, Any]) -> MotionPrediction:
     low, high = data["predicted"]
     least, most = data["allowed"]
     return MotionPrediction(
-        data["quantity"], data["joint"], low, high, least, most, data["unit"], data["binding"]
-    )
+        data["quantity"], data["joint"], low, high, least, most, data["unit"], data["binding"],
+        (data["spread"][0], data["spread"][1]),
+    )  # fmt: skip
 
 
 def remedy_text(scale: float | None) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 from protocols.design.check import Twin, check_step
@@ -27,24 +28,25 @@ def resized(step: StepPlan, factor: float) -> StepPlan:
     return replace(step, excite=excite)
 
 
-def passing_scale(step: StepPlan, rig: Rig, twin: Twin) -> float | None:
+def passing_scale(step: StepPlan, rig: Rig, twin: Twin, draws: Sequence[Twin] = ()) -> float | None:
     """Return the largest factor found by which a step's amplitudes keep every limit; None if none.
 
-    Sought by bisection in hundredths below 1: the factor returned was proved on the twin itself.
+    Sought by bisection in hundredths below 1: the factor returned was proved on the twin itself,
+    and on the edge of what its `draws` span.
     """
     passes, fails = 0, PERCENT
     while fails - passes > 1:
         trial = (passes + fails) // 2
-        if _passes(resized(step, trial / PERCENT), rig, twin):
+        if _passes(resized(step, trial / PERCENT), rig, twin, draws):
             passes = trial
         else:
             fails = trial
     return passes / PERCENT if passes else None
 
 
-def _passes(step: StepPlan, rig: Rig, twin: Twin) -> bool:
+def _passes(step: StepPlan, rig: Rig, twin: Twin, draws: Sequence[Twin]) -> bool:
     try:
-        found = check_step(step, rig, twin)
+        found = check_step(step, rig, twin, draws)
     except InputError:
         return False
     return all(line.ok for line in found.predictions if line.binding)

@@ -9,6 +9,8 @@ import typer
 from rig.cli.options import (
     DurationOption,
     JsonOption,
+    ModelOption,
+    NominalOption,
     ProtocolArgument,
     RepeatsOption,
     RigOption,
@@ -18,7 +20,7 @@ from rig.cli.options import (
     WaveSeedOption,
     overridden,
 )
-from rig.cli.output import Countdown, write_json
+from rig.cli.output import Countdown, progress, write_json
 
 
 def check(
@@ -30,6 +32,8 @@ def check(
     wave_seed: WaveSeedOption = None,
     step: StepOption = None,
     set_: SetOption = None,
+    model: ModelOption = None,
+    nominal: NominalOption = False,
     json: JsonOption = None,
 ) -> None:
     """Prove a protocol against the limits on the twin and predict its errors; nothing moves.
@@ -40,16 +44,22 @@ def check(
     from protocols.files.plan import resolve
     from rig.cli.proofs import proved
     from rig.cli.sheets import check_text
+    from rig.cli.twin_choice import twin_source
     from rig.runs.rigs import load_bench
 
     changes = overridden(repeats, duration, amplitude_scale, wave_seed, step, set_)
     bench = load_bench(rig)
     plan = resolve(library.load(protocol, changes.parameters), bench, changes)
-    proof = proved(plan, bench, predict=True, tell=Countdown("checking"))
-    write_json(json, {**proof.report.as_dict(), "identification": proof.prediction})
+    source = twin_source(bench, model, nominal)
+    proof = proved(plan, bench, predict=True, tell=Countdown("checking"), source=source)
+    if proof.warning:
+        progress(proof.twin_text)
+    document = proof.report.as_dict()
+    used = {"model": proof.source.as_dict(), "warning": proof.warning}
+    write_json(json, {**document, **used, "identification": proof.prediction})
     if json != Path("-"):
         known = "\n\nunchanged since it was proved; the kept proof stands" if proof.reused else ""
-        typer.echo(f"{check_text(proof.report)}\n\n{proof.text}{known}")
+        typer.echo(f"{check_text(proof.report)}\n\n{proof.twin_text}\n\n{proof.text}{known}")
     proof.report.require()
 
 

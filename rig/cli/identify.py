@@ -12,7 +12,7 @@ from rig.cli.options import (
     JsonOption,
     RunsArgument,
 )
-from rig.cli.output import Countdown, write_json
+from rig.cli.output import Countdown, progress, write_json
 
 if TYPE_CHECKING:
     from analysis.identify.result import Identification
@@ -161,9 +161,9 @@ def identify(
     from analysis.identify.methods import SearchOptions
     from analysis.identify.result import to_json
     from analysis.regression.rows import FILTERINGS
-    from analysis.simulation.model import save_model
     from rig.cli.render import identification_text, method_text, shapes_text
     from rig.cli.truth_file import read_truth
+    from rig.cli.twin_choice import save_identified
     from rig.model.parse import InputError
 
     if filtering not in FILTERINGS:
@@ -198,7 +198,7 @@ def identify(
         result, document, consistent = make_physical(result)
         more += consistent
     if model is not None:
-        save_model(result.model, model)
+        save_identified(result.model, model, progress)
     write_json(json, document)
     if report is not None:
         from rig.cli.reports import write_identification

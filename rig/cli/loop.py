@@ -93,10 +93,10 @@ def _asked(experiment: Mapping[str, Any]) -> bool:
 
 
 def _show_result(going: Any, json: Path | None, report: Path) -> None:
-    from analysis.simulation.model import save_model
     from analysis.trace.loop_rounds import rounds_json
     from rig.cli.reports import write_loop
     from rig.cli.trace_text import rounds_text
+    from rig.cli.twin_choice import save_identified
 
     if not going.rounds and not going.wanted.out.is_dir():
         return  # ended before anything was taken
@@ -106,7 +106,8 @@ def _show_result(going: Any, json: Path | None, report: Path) -> None:
     if going.rounds:
         report.parent.mkdir(parents=True, exist_ok=True)
         write_loop(report, going.train, going.judge, going.rounds, going.stopped)
-        save_model(going.rounds[-1].result.model_after, going.wanted.out / "model.json")
+        last = going.rounds[-1].result.model_after
+        save_identified(last, going.wanted.out / "model.json", progress)
         if json != Path("-"):
             typer.echo(rounds_text(going.rounds, going.stopped))
             typer.echo(f"report: {report}")

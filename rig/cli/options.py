@@ -56,6 +56,17 @@ JsonOption = Annotated[
     Path | None,
     typer.Option("--json", help="Write the machine-readable result here; - is standard output."),
 ]
+ModelOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--model",
+        help="A model file that the twin takes its parameters from.  "
+        "[default: the last identified one of the rig]",
+    ),
+]
+NominalOption = Annotated[
+    bool, typer.Option("--nominal", help="Prove on the rig file's nominal values instead.")
+]
 RunsArgument = Annotated[list[Path], typer.Argument(help="Run folders.")]
 
 

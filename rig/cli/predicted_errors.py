@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,13 +17,14 @@ from analysis.design.settings import DESIGN
 from analysis.design.twin_records import TwinStep
 from analysis.simulation.twin import simulate_commands
 from drivers.registry import driver_class
-from protocols.design.check import check
+from protocols.design.check import Twin, check
 from protocols.design.check_report import CheckReport
 from protocols.files import library
 from protocols.files.plan import Plan, resolve
 from protocols.files.writer import protocol_text
 from rig.cli.output import progress, table
 from rig.cli.planned import designed_protocol, designed_step, empty_lines, planned_steps
+from rig.cli.twin_choice import TwinParameters
 from rig.model.parse import InputError
 from rig.model.parts import Wire
 from rig.model.rig import Rig
@@ -52,10 +53,10 @@ class ForecastText:
 
 
 def forecast_text(
-    plan: Plan, rig: Rig, tell: Callable[[float], None] | None = None
+    plan: Plan, parameters: TwinParameters, tell: Callable[[float], None] | None = None
 ) -> ForecastText:
     """Check and predict a plan; InputError where the twin cannot follow it."""
-    forecast = of_plan(plan, rig, tell)
+    forecast = of_plan(plan, parameters.rig, tell, parameters.twin, parameters.draws)
     return ForecastText(
         forecast.limits, as_dict(forecast)["identification"], prediction_text(forecast)
     )
@@ -92,13 +93,22 @@ def lateness_text(found: CheckedForecast) -> str:
     )
 
 
-def of_plan(plan: Plan, rig: Rig, tell: Callable[[float], None] | None = None) -> CheckedForecast:
-    """Check and predict a plan; what cannot be predicted is said, the limits stand without it."""
+def of_plan(
+    plan: Plan,
+    rig: Rig,
+    tell: Callable[[float], None] | None = None,
+    twin: Twin = simulate_commands,
+    draws: Sequence[Twin] = (),
+) -> CheckedForecast:
+    """Check and predict a plan; what cannot be predicted is said, the limits stand without it.
+
+    Errors are predicted from the rig's nominal values, for the terms that every model has.
+    """
 
     def part(begin: float, end: float) -> Callable[[float], None] | None:
         return None if tell is None else lambda share: tell(begin + (end - begin) * share)
 
-    limits = check(plan, rig, simulate_commands, part(0.0, CHECKED))
+    limits = check(plan, rig, twin, part(0.0, CHECKED), draws)
     biases = {step.step: step.biases for step in limits.steps}
     if not plan.steps:
         return CheckedForecast(limits, None, "it takes no records of excited joints")
@@ -132,8 +142,8 @@ def prediction_text(found: CheckedForecast) -> str:
         [name, f"{e.nominal:.4g}", percent(e.std), percent(e.half), percent(e.oil)]
         for name, e in p.parameters.items()
     ]
-    header = ["parameter", "nominal [SI]", "std. error %", "± 95 % %", "oil's swing %"]
-    lines = ["predicted from the stated sensor noise, relative to the nominal value:"]
+    header = ["parameter", "value [SI]", "std. error %", "± 95 % %", "oil's swing %"]
+    lines = ["predicted from the stated sensor noise, relative to the value on the twin:"]
     lines.append(table(header, rows))
     for family, (rank, size) in p.rank.items():
         condition = p.condition[family]

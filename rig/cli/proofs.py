@@ -1,8 +1,8 @@
 """Proofs of plans on the twin, kept so that what did not change is not proved again.
 
 A proof is known by the hash of everything that it depends on: the resolved protocol, the rig, the
-source of the twin and of the check, and the versions of the libraries that compute them. It is kept
-in the user's cache folder and with each run.
+model whose parameters the twin has, the source of the twin and of the check, and the versions of
+the libraries that compute them. It is kept in the user's cache folder and with each run.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import logging
 import os
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -23,6 +23,13 @@ from protocols.design.check_report import CheckReport
 from protocols.files.plan import Plan
 from protocols.steps.plans import StepPlan
 from rig.cli.output import write_json
+from rig.cli.twin_choice import (
+    TwinParameters,
+    TwinSource,
+    load_twin,
+    source_text,
+    twin_source,
+)
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 
@@ -37,19 +44,25 @@ _SOURCES = (
     "analysis/signals", "analysis/simulation", "analysis/terms", "analysis/regression",
     "analysis/identify", "analysis/design", "protocols/design", "protocols/files",
     "protocols/language", "protocols/signals", "protocols/steps", "protocols/engine/centring.py",
-    "rig/model", "rig/cli/predicted_errors.py", "rig/cli/planned.py",
+    "rig/model", "rig/cli/predicted_errors.py", "rig/cli/planned.py", "rig/cli/twin_choice.py",
+    "analysis/effects",
 )  # fmt: skip
 _LIBRARIES = ("numpy", "scipy", "numba")
 
 
 @dataclass(frozen=True)
 class PlanProof:
-    """What the twin said of a plan; `prediction` and its `text` are those of the analysis."""
+    """What the twin said of a plan; `prediction` and its `text` are those of the analysis.
+
+    `source` is where the twin's parameters were to come from, `warning` why they did not.
+    """
 
     key: str
     report: CheckReport
     prediction: Mapping[str, Any] | None = None
     text: str = ""
+    source: TwinSource = field(default_factory=TwinSource)
+    warning: str = ""
     reused: bool = False
 
     def as_dict(self) -> dict[str, Any]:
@@ -59,69 +72,94 @@ class PlanProof:
             "report": self.report.as_dict(),
             "prediction": self.prediction,
             "text": self.text,
+            "model": self.source.as_dict(),
+            "warning": self.warning,
         }
+
+    @property
+    def twin_text(self) -> str:
+        """Say whose parameters the twin had, or why not the last identified ones."""
+        if self.warning:
+            return f"WARNING: {self.warning}"
+        drawn = (
+            "" if self.source.path is None else "; limits hold at the edge of its 95 % intervals"
+        )
+        return f"the twin has {source_text(self.source)}{drawn}"
 
     def keep(self, folder: Path) -> None:
         """Write the proof into a run's folder."""
         write_json(folder / NAME, self.as_dict())
 
 
-def proved(plan: Plan, rig: Rig, *, predict: bool = False, tell: Tell | None = None) -> PlanProof:
+def proved(
+    plan: Plan,
+    rig: Rig,
+    *,
+    predict: bool = False,
+    tell: Tell | None = None,
+    source: TwinSource | None = None,
+) -> PlanProof:
     """Return the proof of a plan, from the cache where nothing changed.
 
-    With `predict` also the standard errors to expect; `tell` hears the share that is done. Raises
+    With `predict` also the standard errors to expect; `tell` hears the share that is done. `source`
+    is where the twin's parameters come from (default: the last identified model of the rig). Raises
     InputError where the twin cannot follow; whether limits are kept is in the report.
     """
-    key = proof_key(plan, rig)
+    source = twin_source(rig) if source is None else source
+    key = proof_key(plan, rig, source)
     kept = _from_cache(key)
     if kept is not None and (kept.text or not predict):
-        return kept
+        return replace(kept, source=source)
+    parameters = load_twin(source, rig)
     from protocols.design.check import NotCentred
     from protocols.design.check_report import remedy_text
 
     try:
-        report, prediction, text = _checked(plan, rig, predict, tell)
+        report, prediction, text = _checked(plan, parameters, predict, tell)
     except NotCentred as refused:
-        scale = _passing_scale(refused.step, rig)
+        scale = _passing_scale(refused.step, parameters)
         raise InputError(f"{refused}; {remedy_text(scale)}") from refused
     if not report.ok:
         bad = {check.step for check in report.steps if not check.ok}
         scales = {
-            step.name: _passing_scale(step, rig) for step in plan.excitations if step.name in bad
+            step.name: _passing_scale(step, parameters)
+            for step in plan.excitations
+            if step.name in bad
         }
         report = report.with_remedies(scales)
-    proof = PlanProof(key, report, prediction, text)
+    report = replace(report, twin=parameters.text)
+    proof = PlanProof(key, report, prediction, text, source, parameters.warning)
     _to_cache(proof)
     return proof
 
 
 def _checked(
-    plan: Plan, rig: Rig, predict: bool, tell: Tell | None
+    plan: Plan, parameters: TwinParameters, predict: bool, tell: Tell | None
 ) -> tuple[CheckReport, Mapping[str, Any] | None, str]:
     if predict:
         from rig.cli.predicted_errors import forecast_text
 
-        made = forecast_text(plan, rig, tell)
+        made = forecast_text(plan, parameters, tell)
         return made.limits, made.plain, made.text
-    from analysis.simulation.twin import simulate_commands
     from protocols.design.check import check
 
-    return check(plan, rig, simulate_commands, tell), None, ""
+    report = check(plan, parameters.rig, parameters.twin, tell, parameters.draws)
+    return report, None, ""
 
 
-def _passing_scale(step: StepPlan, rig: Rig) -> float | None:
-    from analysis.simulation.twin import simulate_commands
+def _passing_scale(step: StepPlan, parameters: TwinParameters) -> float | None:
     from protocols.design.remedy import passing_scale
 
-    return passing_scale(step, rig, simulate_commands)
+    return passing_scale(step, parameters.rig, parameters.twin, parameters.draws)
 
 
-def proof_key(plan: Plan, rig: Rig) -> str:
+def proof_key(plan: Plan, rig: Rig, source: TwinSource) -> str:
     """Return the hash of what a proof depends on."""
     parts = (
         plan.protocol.model_dump_json(),
         rig.model_dump_json(exclude={"wire"}),
         f"{rig.wire.kind} {rig.wire.jitter}",  # whether the host keeps the time, and how well
+        source.key,
         _source_digest(),
     )
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
@@ -154,7 +192,9 @@ def _from_cache(key: str) -> PlanProof | None:
         report = CheckReport.from_dict(data["report"])
         if data["key"] != key:
             return None
-        return PlanProof(key, report, data["prediction"], data["text"], reused=True)
+        return PlanProof(
+            key, report, data["prediction"], data["text"], warning=data["warning"], reused=True
+        )
     except (OSError, ValueError, KeyError, TypeError):
         return None
 

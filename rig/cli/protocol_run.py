@@ -25,6 +25,7 @@ from rig.cli.proofs import proved
 from rig.cli.provenance import provenance_of
 from rig.cli.sheets import plan_text
 from rig.cli.space import require_space
+from rig.cli.twin_choice import twin_source
 from rig.model.rig import Rig
 from rig.runs.recorder import Recorder
 from rig.runs.rigs import load_bench
@@ -37,7 +38,10 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class ProtocolJob:
-    """One unattended run: what, where, into which folder."""
+    """One unattended run: what, where, into which folder.
+
+    It is proved on the twin with the parameters of `model`, of the last identified one, or nominal.
+    """
 
     protocol: str
     rig: str
@@ -48,6 +52,8 @@ class ProtocolJob:
     track: bool = False
     memory: float = math.inf
     attended: bool | None = False
+    model: Path | None = None
+    nominal: bool = False
 
 
 def _plan(protocol: str, rig: str, overrides: Overrides) -> tuple[Rig, Plan]:
@@ -119,7 +125,9 @@ def run_protocol(job: ProtocolJob, say: Say) -> Path:
     say(plan_text(plan))
     require_space(plan, rig, job.out)
     say(f"checking {plan.protocol.name} on the twin of {rig.name}")
-    proof = proved(plan, rig, tell=Countdown("checking", say))
+    source = twin_source(rig, job.model, job.nominal)
+    proof = proved(plan, rig, tell=Countdown("checking", say), source=source)
+    say(proof.twin_text)
     proof.report.require()
     for note in proof.report.notes:
         say(f"note: {note}")

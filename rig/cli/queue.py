@@ -16,6 +16,8 @@ from rig.cli.options import (
     DurationOption,
     EndpointOption,
     JsonOption,
+    ModelOption,
+    NominalOption,
     ProtocolArgument,
     RepeatsOption,
     RigOption,
@@ -119,6 +121,8 @@ def add(
     ] = None,
     name: Annotated[str | None, typer.Option(help="As lists show it.")] = None,
     operator: Annotated[str | None, typer.Option(help="Written into the run.")] = None,
+    model: ModelOption = None,
+    nominal: NominalOption = False,
     identify: Annotated[bool, typer.Option(help="Identify from the run when it is done.")] = True,
     queue: QueueOption = None,
     json: JsonOption = None,
@@ -139,7 +143,9 @@ def add(
         ("--repeats", repeats), ("--duration", duration), ("--wave-seed", wave_seed),
         ("--amplitude-scale", None if amplitude_scale == 1.0 else amplitude_scale),
         *(("--step", one) for one in step or ()),
+        ("--model", None if model is None else model.absolute()),
     )  # fmt: skip
+    changed += ("--nominal",) if nominal else ()
     if wanted is not None and after is None:
         raise InputError("--if says what is wanted of an earlier item: name it with --after NUMBER")
     if wanted is not None:
@@ -179,6 +185,8 @@ def add(
         item = store.add(job, priority, prove(job))
     seconds = item.proof.get("seconds")
     length = "" if seconds is None else f", about {seconds / 60.0:.1f} min of the device's time"
+    if item.proof.get("warning"):
+        progress(f"WARNING: {item.proof['warning']}")
     _show(item, json, f"queued{length}; it will run into {item.job.out}")
 
 

@@ -10,7 +10,15 @@ from rig.queue.items import QueueJob
 from rig.queue.processes import BRAMAH, call
 from rig.queue.runner import QueueSettings
 
-_KEPT = ("protocol", "rig", "seconds", "ok")  # of the proof; its pictures belong to `check`
+_KEPT = (
+    "protocol",
+    "rig",
+    "seconds",
+    "ok",
+    "twin",
+    "model",
+    "warning",
+)  # of the proof; its pictures belong to `check`
 
 
 def prove(job: QueueJob) -> dict[str, Any]:

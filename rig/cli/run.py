@@ -10,6 +10,8 @@ import typer
 from rig.cli.options import (
     DurationOption,
     EndpointOption,
+    ModelOption,
+    NominalOption,
     ProtocolArgument,
     RepeatsOption,
     RigOption,
@@ -36,6 +38,8 @@ def run(
     operator: Annotated[
         str | None, typer.Option(help="Written into the run.  [default: you]")
     ] = None,
+    model: ModelOption = None,
+    nominal: NominalOption = False,
     track: Annotated[
         bool, typer.Option("--track", help="Follow b and the flow gains while it runs.")
     ] = False,
@@ -57,7 +61,9 @@ def run(
     from rig.cli.protocol_run import ProtocolJob, run_protocol
 
     changes = overridden(repeats, duration, amplitude_scale, wave_seed, step, set_)
-    job = ProtocolJob(protocol, rig, out, endpoint, changes, operator, track, memory, attended)
+    job = ProtocolJob(
+        protocol, rig, out, endpoint, changes, operator, track, memory, attended, model, nominal
+    )
     folder = run_protocol(job, progress)
     typer.echo(str(folder))
 

@@ -71,8 +71,13 @@ def timeline_text(moments: Sequence[Moment]) -> str:
 
 
 def envelope_text(report: CheckReport) -> str:
-    """Return each predicted range as a picture within its limits, and its margin in words."""
-    lines = ["limits  [  predicted range ===  ]"]
+    """Return each predicted range as a picture within its limits, and its margin in words.
+
+    What the uncertainty of the twin's parameters adds to a range is drawn lighter.
+    """
+    drawn = any(any(line.spread) for step in report.steps for line in step.predictions)
+    of = f", on {report.twin}; within its intervals ---" if drawn else ""
+    lines = [f"limits  [  predicted range ==={of}  ]"]
     for step in report.steps:
         lines.append(f"{step.step}:")
         lines += [
@@ -102,11 +107,14 @@ def margin_text(line: MotionPrediction) -> str:
 def _picture(line: MotionPrediction) -> str:
     """Return the predicted range between the limits; `<` and `>` where it leaves them."""
     span = line.allowed_high - line.allowed_low
-    ends = [(value - line.allowed_low) / span for value in (line.low, line.high)]
-    first, last = (min(_PICTURE - 1, max(0, int(_PICTURE * end))) for end in ends)
-    bar = "." * first + "=" * (last - first + 1) + "." * (_PICTURE - 1 - last)
+    below, above = line.spread
+    edges = (line.low, line.low + below, line.high - above, line.high)
+    ends = [(value - line.allowed_low) / span for value in edges]
+    first, low, high, last = (min(_PICTURE - 1, max(0, int(_PICTURE * end))) for end in ends)
+    bar = "." * first + "-" * (low - first) + "=" * (high - low + 1)
+    bar += "-" * (last - high) + "." * (_PICTURE - 1 - last)
     low_end = "<" if ends[0] < 0.0 else "["
-    right = ">" if ends[1] > 1.0 else "]"
+    right = ">" if ends[-1] > 1.0 else "]"
     return f"{low_end}{bar}{right}"
 
 

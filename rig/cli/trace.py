@@ -41,10 +41,11 @@ def trace(
 
     Example: bramah trace runs/monday --holdout runs/tuesday --report trace.html
     """
-    from analysis.simulation.model import save_model, terms_like
+    from analysis.simulation.model import terms_like
     from analysis.trace.engine import trace as trace_runs
     from analysis.trace.result import to_json
     from rig.cli.trace_text import trace_text
+    from rig.cli.twin_choice import save_identified
     from rig.model.parse import InputError
     from rig.runs.store import load_run, refuse_repeated
 
@@ -64,7 +65,7 @@ def trace(
                         tell=Countdown("tracing"))  # fmt: skip
     write_json(json, to_json(result))
     if model is not None:
-        save_model(result.model_after, model)
+        save_identified(result.model_after, model, progress)
     if report is not None:
         from rig.cli.reports import write_trace
 

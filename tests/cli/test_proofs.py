@@ -17,6 +17,7 @@ from protocols.files.plan import Overrides, Plan, resolve
 from rig.cli import proofs, space
 from rig.cli.proofs import PlanProof, cache_folder, proved
 from rig.cli.protocol_run import ProtocolJob, run_protocol
+from rig.cli.twin_choice import TwinSource
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 from rig.runs.rigs import load_rig
@@ -97,7 +98,7 @@ def test_another_program_or_library_proves_anew(
 ) -> None:
     def key() -> str:
         proofs._source_digest.cache_clear()
-        return proofs.proof_key(short(rig), rig)
+        return proofs.proof_key(short(rig), rig, TwinSource())
 
     before = key()
     with monkeypatch.context() as patch:
