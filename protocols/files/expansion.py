@@ -1,12 +1,15 @@
 """Replacing what is written once by what is meant: parameters, sweeps, includes.
 
 Works on the plain data of a file, so that a parameter may stand for any value. Every step that
-results keeps the lines of the file it came from, so that what is wrong in it is named there.
+results keeps the lines of the file it came from, so that what is wrong in it is named there. What
+is wrong in a step is noted, and the steps after it are read all the same: a person corrects a file
+once, not once for each mistake.
 """
 
 from __future__ import annotations
 
 import itertools
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,7 +17,7 @@ from typing import Any
 
 from protocols.steps import STEPS, kind_of_step
 from protocols.steps.base import Macro
-from rig.model.parse import InputError, Path
+from rig.model.parse import InputError, Path, Problem, Unresolved
 
 MOST_STEPS = 1000
 _REFERENCE = re.compile(r"\$(?P<name>[a-z][a-z0-9_]*)|\$\$")
@@ -53,18 +56,23 @@ class Expander:
     source: str
     lines: Lines
     include: Include
+    problems: list[Problem] = field(default_factory=list)
 
     def steps(self, data: Any, path: Path, scope: Scope) -> list[RawStep]:
-        """Return the steps of a list, expanded; raises InputError naming file, line and key."""
+        """Return the steps of a list, expanded; `problems` gets what is wrong, with its line.
+
+        Raises InputError for more steps than a protocol may have.
+        """
         if not isinstance(data, list):
-            self._refuse(path, f"expected a list of steps, found {type(data).__name__}")
+            self._note(path, f"expected a list of steps, found {type(data).__name__}")
+            return []
         found: list[RawStep] = []
         for index, item in enumerate(data):
             where: Path = (*path, index)
             kind = kind_of_step(item)
             if kind == "set":
                 values = self._values(item, "set", where, scope)
-                scope = scope.changed(substituted(values, scope, self._at(where)))
+                scope = scope.changed(self.substituted(values, (*where, "set"), scope))
             elif kind == "sweep":
                 found += self._sweep(item, where, scope)
             elif kind == "include":
@@ -75,11 +83,38 @@ class Expander:
                 self._too_many(where, len(found))
         return found
 
+    def substituted(self, data: Any, where: Path, scope: Scope) -> Any:
+        """Return plain data with every `$name` replaced; a name that is not known is noted.
+
+        A text that is nothing but a reference becomes the value itself; within a text the value is
+        written out, and `$$` is a dollar.
+        """
+        if isinstance(data, dict):
+            return {k: self.substituted(v, (*where, k), scope) for k, v in data.items()}
+        if isinstance(data, list):
+            return [self.substituted(v, (*where, k), scope) for k, v in enumerate(data)]
+        if not isinstance(data, str) or "$" not in data:
+            return data
+        names = [match["name"] for match in _REFERENCE.finditer(data)]
+        unknown = [name for name in names if name is not None and name not in scope.values]
+        for name in unknown:
+            self._note(where, f"${name}: {unknown_parameter(name, scope.values)}")
+        if unknown:
+            return Unresolved(data)
+
+        def value_of(match: re.Match[str]) -> Any:
+            return "$" if match["name"] is None else scope.values[match["name"]]
+
+        whole = _REFERENCE.fullmatch(data)
+        if whole is not None:
+            return value_of(whole)
+        return _REFERENCE.sub(lambda match: str(value_of(match)), data)
+
     def _plain(self, item: Any, kind: str | None, where: Path, scope: Scope) -> RawStep:
         lines = {(): self._line(where), **self._below(where)}
         nested = isinstance(item, dict) and kind is not None and STEPS[kind].nests
         own = {k: v for k, v in item.items() if k != "steps"} if nested else item
-        data = substituted(own, scope, self._at(where))
+        data = self.substituted(own, where, scope)
         if nested and "steps" in item:
             inner = self.steps(item["steps"], (*where, "steps"), scope)
             data["steps"] = [part.data for part in inner]
@@ -94,7 +129,8 @@ class Expander:
         self._keys(item, "sweep", where)
         rows = self._rows(item["sweep"], where, scope)
         if "steps" not in item:
-            self._refuse(where, "sweep: steps is missing here")
+            self._note(where, "sweep: steps is missing here")
+            return []
         found: list[RawStep] = []
         for number, row in enumerate(rows, start=1):
             inner = self.steps(item["steps"], (*where, "steps"), scope.changed(row, swept=True))
@@ -105,44 +141,53 @@ class Expander:
         return found
 
     def _rows(self, over: Any, where: Path, scope: Scope) -> list[dict[str, Any]]:
-        """Return the value of each parameter, run by run."""
+        """Return the value of each parameter, run by run; a row without any where none is right."""
         place: Path = (*where, "sweep")
         if isinstance(over, dict) and over and all(isinstance(v, list) for v in over.values()):
             self._known(over, place, scope)
-            count = 1
             for name, values in over.items():
                 if not values:
-                    self._refuse((*place, name), f"sweep {name}: an empty list")
-                count *= len(values)
+                    self._note((*place, name), f"sweep {name}: an empty list")
+            full = {name: values for name, values in over.items() if values}
+            count = math.prod(map(len, full.values()))
             if count > MOST_STEPS:
                 self._too_many(where, count)
-            return [dict(zip(over, row, strict=True)) for row in itertools.product(*over.values())]
+            return [dict(zip(full, row, strict=True)) for row in itertools.product(*full.values())]
         if isinstance(over, list) and over and all(isinstance(row, dict) for row in over):
-            for row in over:
-                self._known(row, place, scope)
+            for number, row in enumerate(over):
+                self._known(row, (*place, number), scope)
                 if set(row) != set(over[0]):
-                    self._refuse(place, "sweep: every row must state the same parameters")
+                    text = "sweep: every row must state the same parameters"
+                    self._note((*place, number), text)
             return over
-        self._refuse(
+        self._note(
             place, "sweep: expected lists of values by parameter, or a list of rows of values"
         )
-        raise AssertionError
+        return [{}]
 
     def _included(self, item: Any, where: Path, scope: Scope) -> list[RawStep]:
         self._keys(item, "include", where)
-        data = substituted(item, scope, self._at(where))
-        values = data.get("parameters", {})
-        if not isinstance(data["include"], str) or not isinstance(values, dict):
-            self._refuse(where, "include: expected a name or path, and parameters by name")
+        data = self.substituted(item, where, scope)
+        name, values = data["include"], data.get("parameters", {})
+        if not isinstance(name, str) or not isinstance(values, dict):
+            self._note(where, "include: expected a name or path, and parameters by name")
+            return []
         line = self._line(where)
-        steps = self.include(data["include"], values, line)
+        if isinstance(name, Unresolved):
+            return []
+        try:
+            steps = self.include(name, values, line)
+        except InputError as error:
+            self.problems.append((line, str(error)))
+            return []
         return [RawStep(step, {(): line}, included=True) for step in steps]
 
     def _values(self, item: Any, key: str, where: Path, scope: Scope) -> Mapping[str, Any]:
         self._keys(item, key, where)
         values = item[key]
         if not isinstance(values, dict) or not values:
-            self._refuse(where, f"{key}: expected values by parameter")
+            self._note(where, f"{key}: expected values by parameter")
+            return {}
         self._known(values, (*where, key), scope)
         return dict(values)
 
@@ -152,12 +197,12 @@ class Expander:
         for name in item:
             if name not in kind.model_fields:
                 text = f"{key}.{name}: unknown key; remove it or correct its spelling"
-                self._refuse((*where, name), text)
+                self._note((*where, name), text)
 
     def _known(self, values: Mapping[str, Any], where: Path, scope: Scope) -> None:
         for name in values:
             if name not in scope.values:
-                self._refuse((*where, name), unknown_parameter(name, scope.values))
+                self._note((*where, name), unknown_parameter(name, scope.values))
 
     def _below(self, where: Path) -> dict[Path, int]:
         depth = len(where)
@@ -173,43 +218,18 @@ class Expander:
 
     def _too_many(self, where: Path, count: int) -> None:
         text = f"{count} steps; expected at most {MOST_STEPS} in one protocol"
-        self._refuse(where, text)
-
-    def _refuse(self, where: Path, text: str) -> None:
         raise InputError(f"{self._at(where)}: {text}")
+
+    def _note(self, where: Path, text: str) -> None:
+        problem = (self._line(where), f"{self._at(where)}: {text}")
+        if problem not in self.problems:  # a sweep reads its steps once for each value
+            self.problems.append(problem)
 
 
 def unknown_parameter(name: str, known: Mapping[str, Any]) -> str:
     """Return the refusal of a parameter that the file does not declare."""
     has = " ".join(known) if known else "none; declare them under 'parameters'"
     return f"no parameter {name!r}; the file has: {has}"
-
-
-def substituted(data: Any, scope: Scope, where: str) -> Any:
-    """Return plain data with every `$name` replaced; InputError for a name that is not known.
-
-    A text that is nothing but a reference becomes the value itself; within a text the value is
-    written out, and `$$` is a dollar.
-    """
-    if isinstance(data, dict):
-        return {key: substituted(value, scope, where) for key, value in data.items()}
-    if isinstance(data, list):
-        return [substituted(value, scope, where) for value in data]
-    if not isinstance(data, str) or "$" not in data:
-        return data
-
-    def value_of(match: re.Match[str]) -> Any:
-        name = match["name"]
-        if name is None:
-            return "$"
-        if name not in scope.values:
-            raise InputError(f"{where}: ${name}: {unknown_parameter(name, scope.values)}")
-        return scope.values[name]
-
-    whole = _REFERENCE.fullmatch(data)
-    if whole is not None:
-        return value_of(whole)
-    return _REFERENCE.sub(lambda match: str(value_of(match)), data)
 
 
 def _numbered(step: RawStep, number: int) -> RawStep:

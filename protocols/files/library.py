@@ -14,11 +14,12 @@ from protocols.files.expansion import (
     RawStep,
     Scope,
     made_unique,
-    substituted,
     unknown_parameter,
 )
-from protocols.files.schema import VERSION, Protocol, later_version
-from rig.model.parse import InputError, load_yaml, validate_model
+from protocols.files.schema import INCOMPLETE, VERSION, Protocol, later_version
+from rig.model.parse import InputError, Problem, load_yaml, validate_model
+
+_NOTHING = RawStep({"mark": "in place of steps that could not be read"}, {})
 
 
 def shipped_names() -> tuple[str, ...]:
@@ -97,23 +98,27 @@ def _protocol(
         raise InputError(f"{source}:{lines.get(('version',), 1)}: {later_version(version)}")
     declared = data.get("parameters") or {}
     steps: list[RawStep] = []
+    known: list[Problem] = []
     if isinstance(data.get("steps"), list) and isinstance(declared, dict):
+        expander = Expander(source, lines, _Includes(folder, chain, source))
+        known = expander.problems
         for name in values:
             if name not in declared:
-                raise InputError(f"{source}: {unknown_parameter(name, declared)}")
-        scope = Scope({**declared, **values})
-        expander = Expander(source, lines, _Includes(folder, chain, source))
+                known.append((0, f"{source}: {unknown_parameter(name, declared)}"))
+        scope = Scope({**declared, **{k: v for k, v in values.items() if k in declared}})
         steps = made_unique(expander.steps(data["steps"], ("steps",), scope))
-        head = {key: value for key, value in data.items() if key not in ("steps", "parameters")}
-        data = substituted(
-            {k: v for k, v in head.items() if k not in ("name", "description")}, scope, source
-        ) | {k: v for k, v in head.items() if k in ("name", "description")}
+        if known and not steps:
+            steps = [_NOTHING]
+        plain = {key: data[key] for key in ("name", "description") if key in data}
+        head = {k: v for k, v in data.items() if k not in ("steps", "parameters", *plain)}
+        data = expander.substituted(head, (), scope) | plain
         data["parameters"] = dict(scope.values)
         data["steps"] = [step.data for step in steps]
         lines = {p: line for p, line in lines.items() if p[:1] != ("steps",) or len(p) == 1}
         for number, step in enumerate(steps):
             lines |= {("steps", number, *path): line for path, line in step.lines.items()}
-    made = validate_model(Protocol, data, lines, source, {"folder": folder})
+    context = {"folder": folder, INCOMPLETE: bool(known)}
+    made = validate_model(Protocol, data, lines, source, context, known)
     return made, [step.data for step in steps]
 
 

@@ -17,6 +17,7 @@ from protocols.language.conditions import Condition, parse_condition, require_kn
 from protocols.language.waveforms import Waveform
 from protocols.steps.base import PlannedStep, StepKind
 from protocols.steps.excite import Step
+from protocols.steps.lock import LockStep
 from protocols.steps.parts import CLOSED, END_MAX, Excite, Lock, Place
 from protocols.steps.plans import ExcitePlan, LockPlan, StepPlan
 from protocols.steps.warm_up import WarmUpStep
@@ -198,8 +199,19 @@ class _RigPlanner:
         return found
 
     def nested(self, steps: Sequence[StepKind]) -> tuple[PlannedStep, ...]:
-        """Resolve steps in their order."""
-        return tuple(step.plan(self) for step in steps)
+        """Resolve steps in their order; InputError with a line for each problem of any of them."""
+        found: list[PlannedStep] = []
+        problems: list[str] = []
+        for step in steps:
+            try:
+                found.append(step.plan(self))
+            except InputError as error:
+                problems += str(error).splitlines()
+                if isinstance(step, LockStep):
+                    break  # what follows would lack its joint
+        if problems:
+            raise InputError("\n".join(dict.fromkeys(problems)))
+        return tuple(found)
 
     def locked(self, locks: Sequence[Lock]) -> None:
         """Remember locks for the steps that follow."""

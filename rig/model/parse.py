@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypeVar
 
 import yaml
@@ -82,13 +82,33 @@ def load_yaml(text: str, source: str) -> tuple[Any, dict[Path, int]]:
         loader.dispose()
 
 
+Problem = tuple[int, str]  # the line of a file, and the sentence about what is wrong there
+
+
+class Unresolved(str):
+    """A text that stands for a value which could not be found; what fails for it is no problem."""
+
+    __slots__ = ()
+
+
+def refusal(problems: Iterable[Problem], source: str) -> InputError:
+    """Return the error that states each problem once, in the order of the file, `_MOST` at most."""
+    ordered = [text for _, text in sorted(problems, key=lambda one: one[0])]
+    shown = list(dict.fromkeys(line for text in ordered for line in text.splitlines()))
+    if len(shown) > _MOST:
+        shown[_MOST:] = [f"{source}: and {len(shown) - _MOST} more"]
+    return InputError("\n".join(shown))
+
+
 def _problems(
     error: ValidationError, lines: dict[Path, int], source: str, model: type[BaseModel]
-) -> str:
-    """Return one line per problem, in the order of the file; at most `_MOST` of them."""
-    found: list[tuple[int, str]] = []
+) -> list[Problem]:
+    """Return the problems with their lines."""
+    found: list[Problem] = []
     said: set[tuple[str | int, str]] = set()
     for problem in _causes(error):
+        if isinstance(problem["input"], Unresolved):
+            continue
         path, text = tuple(problem["loc"]), _problem_text(problem)
         # A tagged union puts its tag into the path; drop parts that the file does not have.
         known: Path = ()
@@ -104,12 +124,13 @@ def _problems(
         if lines:
             path = (*known, path[-1]) if problem["type"] == "missing" else known
         line = lines.get(known, 1)
+        if (here := (f"{line} {known[-1:]}", f"{text} {problem['input']!r}")) in said:
+            continue  # a step that a sweep repeats
+        if lines:
+            said.add(here)
         where = ".".join(str(part) for part in path) or model.__name__.lower()
         found.append((line, f"{source}:{line}: {where}: {text}"))
-    shown = [text for _, text in sorted(found, key=lambda one: one[0])]
-    if len(shown) > _MOST:
-        shown[_MOST:] = [f"{source}: and {len(shown) - _MOST} more"]
-    return "\n".join(shown)
+    return found
 
 
 def _causes(error: ValidationError) -> list[ErrorDetails]:
@@ -145,21 +166,26 @@ def validate_model(
     lines: dict[Path, int],
     source: str,
     context: Mapping[str, Any] | None = None,
+    known: Sequence[Problem] = (),
 ) -> Model:
     """Validate loaded YAML as `model`; raises InputError: a line for each of its problems.
 
     Each line names file, line, key, what was found and what was expected.
 
-    `context` is passed to the model's validators beside `FROM_FILE`.
+    `context` is passed to the model's validators beside `FROM_FILE`. `known` are problems that the
+    reader met before: they are stated with the model's own, and with any of them nothing is valid.
     """
     if not isinstance(data, dict):
         raise InputError(f"{source}:1: expected keys and values, found {type(data).__name__}")
     try:
-        return model.model_validate(data, context={**FROM_FILE, **(context or {})})
+        made = model.model_validate(data, context={**FROM_FILE, **(context or {})})
     except ValidationError as error:
-        raise InputError(_problems(error, lines, source, model)) from error
+        raise refusal([*known, *_problems(error, lines, source, model)], source) from error
     except RecursionError as error:
         raise InputError(f"{source}:1: refers to itself (a YAML alias?)") from error
+    if known:
+        raise refusal(known, source)
+    return made
 
 
 def read_quantity(text: Any, si: str, source: str) -> float:

@@ -56,7 +56,7 @@ def test_a_parameter_that_the_file_does_not_have_is_refused() -> None:
     body = "parameters: {amplitude: 0.2 V}\nsteps:\n" + SINE
     with pytest.raises(InputError, match="no parameter 'size'; the file has: amplitude"):
         read(body, size="1 V")
-    with pytest.raises(InputError, match=r"sheet\.yaml:4: \$amplitude: no parameter"):
+    with pytest.raises(InputError, match=r"sheet\.yaml:7: \$amplitude: no parameter"):
         read("steps:\n" + SINE)
     with pytest.raises(InputError, match="expected NAME=VALUE"):
         parsed_values(["amplitude"])
@@ -138,6 +138,53 @@ def test_what_is_wrong_in_an_included_file_names_that_file(tmp_path: Path) -> No
     )
     with pytest.raises(InputError, match=r"inner\.yaml:4: steps\.0\.pause"):
         load(tmp_path / "outer.yaml")
+
+
+def test_all_mistakes_of_a_file_are_listed_at_once(tmp_path: Path) -> None:
+    """In steps, sweeps, `set`, templates and an included file: each with its file and line."""
+    (tmp_path / "inner.yaml").write_text(
+        HEAD + "steps:\n  - pause: 5 V\n  - mark: $who\n", encoding="utf-8"
+    )
+    outer = tmp_path / "outer.yaml"
+    outer.write_text(
+        HEAD + "retry: {times: 99}\nparameters: {amplitude: 0.1 V}\nsteps:\n"
+        "  - set: {size: 1 V}\n"
+        "  - sweep: {amplitude: [], other: [1, 2]}\n"
+        "    steps:\n"
+        "      - {mark: x, colour: red}\n"
+        "      - pause: $rest\n"
+        "  - include: inner.yaml\n"
+        "  - hold: 3 bar\n"
+        "  - jump: 3\n", encoding="utf-8"
+    )  # fmt: skip
+    with pytest.raises(InputError) as caught:
+        load(outer, {"speed": "1 m/s"})
+    said = str(caught.value).replace(f"{tmp_path}/", "").splitlines()
+    for line in (
+        "outer.yaml: no parameter 'speed'",
+        "outer.yaml:3: retry.times",
+        "outer.yaml:6: no parameter 'size'",
+        "outer.yaml:7: sweep amplitude: an empty list",
+        "outer.yaml:7: no parameter 'other'",
+        "outer.yaml:9: steps.0.colour: unknown key",
+        "outer.yaml:10: $rest: no parameter 'rest'",
+        "inner.yaml:4: steps.0.pause",
+        "inner.yaml:5: $who: no parameter 'who'",
+        "outer.yaml:12: steps.",
+        "outer.yaml:13: steps.",
+    ):
+        assert sum(text.startswith(line) for text in said) == 1, (line, said)
+    assert len(said) == 11, said
+
+
+def test_all_that_does_not_fit_a_rig_is_listed_at_once(rig: Rig) -> None:
+    made = read(
+        "steps:\n  - {wait_until: piston_9 > 1 mm, timeout: 1 s}\n"
+        "  - {wait_until: R13 > 1 kg*m^2, timeout: 1 s}\n"
+    )
+    with pytest.raises(InputError) as caught:
+        resolve(made, rig)
+    assert len(str(caught.value).splitlines()) == 2
 
 
 def test_a_file_of_a_later_version_is_refused_in_a_sentence() -> None:
