@@ -39,6 +39,14 @@ class DeviceBusy(DeviceError):
     """Another client has control of the device; this one may only zero its outputs."""
 
 
+@runtime_checkable
+class Doubting(Protocol):
+    """A driver that can say which of its settings makes a channel's values implausible."""
+
+    def doubts(self) -> Mapping[str, str]:
+        """Return a question for each channel in doubt; reads, moves nothing. Raises DeviceError."""
+
+
 @dataclass(frozen=True)
 class DeviceInfo:
     """Who answered: identity, size and clock of the device."""

@@ -19,6 +19,7 @@ from rig.model.rig import Rig
 
 # Nothing moves in a virtual device while it thinks: a busy computer is no danger to it.
 VIRTUAL_PATIENCE: Final = 10.0
+_VERSION = "protocol version"
 _TOLERANCE = 1e-6  # registers hold single precision
 _IDENTITY = struct.Struct(">IHHHfHHII")
 
@@ -48,7 +49,7 @@ def check_identity(data: bytes, rig: Rig, where: str) -> DeviceInfo:
     expected_name = rig.name[: 2 * reg.IDENTITY_NAME.words]
     checks: tuple[tuple[str, object, object, bool], ...] = (
         ("magic number", hex(magic), hex(reg.MAGIC), magic == reg.MAGIC),
-        ("protocol version", version, reg.PROTOCOL_VERSION, version == reg.PROTOCOL_VERSION),
+        (_VERSION, version, reg.PROTOCOL_VERSION, version == reg.PROTOCOL_VERSION),
         ("rig", repr(name), repr(expected_name), name == expected_name),
         ("joints", joints, len(rig.joints), joints == len(rig.joints)),
         ("channels", channels, len(rig.channels), channels == len(rig.channels)),
@@ -61,6 +62,11 @@ def check_identity(data: bytes, rig: Rig, where: str) -> DeviceInfo:
         ("samples per block", samples, layout.samples, samples == layout.samples),
     )
     for what, reported, expected, fits in checks:
+        if not fits and what == _VERSION:
+            raise DeviceError(
+                f"the device at {where} speaks version {reported} of the bench protocol, this "
+                f"program version {expected}; update the older of the two"
+            )
         if not fits:
             raise DeviceError(
                 f"the device at {where} is not the rig described: {what} {reported}, "

@@ -32,6 +32,7 @@ logger = logging.getLogger(__name__)
 SOCKETCAND: Final = "socketcand"
 SLCAN: Final = "slcan"
 _GREETING: Final = b"< hi >"
+_GREETING_SECONDS: Final = 2.0
 _OPENED: Final = b"< ok >"
 _SLICE_SECONDS: Final = 0.05  # how long the receiver waits at a time: closing takes that long
 _OPEN_SECONDS: Final = 5.0  # for an interface to open; some libraries wait for ever
@@ -194,7 +195,7 @@ class CanPort:
         """Refuse what is no socketcand: python-can would wait for its answer for ever."""
         place = self._place
         try:
-            with socket.create_connection((place.host, place.port), _OPEN_SECONDS) as asked:
+            with socket.create_connection((place.host, place.port), _GREETING_SECONDS) as asked:
                 greeting = asked.recv(64)
                 asked.sendall(f"< open {place.channel} >".encode())
                 opened = asked.recv(64) if greeting.startswith(_GREETING) else b""
@@ -203,7 +204,12 @@ class CanPort:
                 f"nobody listens at {place.host}:{place.port} ({error.strerror}); is socketcand "
                 "(or `bramah sim`) running there?"
             ) from error
-        except OSError as error:  # a name that is none, a silent host
+        except TimeoutError as error:
+            raise DeviceLost(
+                f"what listens at {place.host}:{place.port} has not greeted as socketcand does "
+                f"within {_GREETING_SECONDS:g} s; check the port, which another program may have"
+            ) from error
+        except OSError as error:  # a name that is none
             raise DeviceLost(
                 f"no socketcand at {place.host}:{place.port}: {error.strerror or error}"
             ) from error

@@ -11,7 +11,7 @@ import logging
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, ClassVar, Final, Literal
 from urllib.parse import SplitResult
@@ -46,6 +46,7 @@ from drivers.wire_entries import (
     read_entry,
     scale_of,
 )
+from rig.model import channels as ch
 from rig.model.parse import InputError
 from rig.model.parts import Part, Wire
 from rig.model.rig import Rig
@@ -58,6 +59,9 @@ MAX_READ: Final = 125  # registers in one answer: the protocol's own limit
 MAX_WRITE: Final = 123
 _LAST_REGISTER: Final = 0xFFFF
 _NO_WATCHDOG: Final = "none"
+_KEY: Final = "word_order"
+_OTHER: Final = {WordOrder.BIG: WordOrder.LITTLE, WordOrder.LITTLE: WordOrder.BIG}
+_RESOLVED: Final = 1e-7  # of its range: finer than a converter of 20 bits
 
 
 class MapSettings(WireSettings):
@@ -309,8 +313,17 @@ class UnitConnection(ModbusConnection):
 class MappedModule:
     """`drivers.polled.InputsOutputs` over a register map."""
 
-    def __init__(self, settings: MapSettings, found: RegisterMap, timeout: float) -> None:
+    def __init__(
+        self,
+        settings: MapSettings,
+        found: RegisterMap,
+        ranges: Sequence[tuple[float, float]],
+        timeout: float,
+    ) -> None:
+        """Know a map and the range [SI] of every channel's sensor; nothing is opened."""
         self._link = UnitConnection(settings.host, settings.port, settings.unit, timeout)
+        self._unit = settings.unit
+        self._ranges = ranges
         self._who = f"I/O module at {settings.host}:{settings.port}, unit {settings.unit}"
         self._map = found
         self._reads = spans(found.inputs)
@@ -335,13 +348,30 @@ class MappedModule:
     def read(self) -> Array:
         """Return one value [SI] of every channel, in the order of the rig."""
         values = np.empty(len(self._map.inputs))
+        for index, point, data in self._registers():
+            values[index] = point.value(data)
+        return values
+
+    def doubts(self) -> dict[str, str]:
+        """Read once; return the channels that another word order alone makes plausible."""
+        found = {}
+        for index, point, data in self._registers():
+            other = replace(point, order=_OTHER[point.order])
+            low, high = self._ranges[index]
+            if not _plausible(point, data, low, high) and _plausible(other, data, low, high):
+                found[point.name] = (
+                    f"word order? {other.value(data):.5g} with {_KEY}: {other.order}"
+                )
+        return found
+
+    def _registers(self) -> Iterator[tuple[int, Point, bytes]]:
+        """Yield (place among the inputs, point, its registers' bytes)."""
         for span in self._reads:
             with self._explained(str(span)):
                 data = self._link.fetch(span.function, span.address, span.words)
             for index, point in span.points:
                 first = 2 * (point.address - span.address)
-                values[index] = point.value(data[first : first + 2 * point.words])
-        return values
+                yield index, point, data[first : first + 2 * point.words]
 
     def write(self, volts: Array) -> None:
         """Put out one voltage [V] per joint."""
@@ -362,8 +392,8 @@ class MappedModule:
             yield
         except DeviceRefused as refused:
             raise DeviceError(
-                f"{refused}: {registers}; compare address and function in the rig file with the "
-                "module's manual"
+                f"{refused}: {registers} of unit {self._unit}; check `unit`, address and function "
+                "in the rig file against the module's manual"
             ) from refused
 
     def _set_watchdog(self) -> None:
@@ -382,6 +412,16 @@ class MappedModule:
             )
 
 
+def _plausible(point: Point, data: bytes, low: float, high: float) -> bool:
+    """Say whether registers hold a value that a sensor of this range can have shown.
+
+    A float read in the wrong order is of any magnitude: far below what the sensor resolves, too.
+    """
+    number = point.scale * decode_registers(data, point.form, point.order)
+    tiny = 0.0 < abs(number) < _RESOLVED * (high - low)
+    return low <= point.offset + number <= high and not tiny
+
+
 class ModbusMapDriver(PolledDriver):
     """`drivers.base.Driver` over a register map; raises InputError for one that cannot be."""
 
@@ -396,11 +436,19 @@ class ModbusMapDriver(PolledDriver):
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         settings = MapSettings.of(wire)
+        sensors = [rig.sensors.of(ch.kind_of(name)[0]) for name in rig.channels]
+        ranges = [sensor.range for sensor in sensors]
+        self._module = MappedModule(settings, register_map(settings, rig), ranges, wire.timeout)
         super().__init__(
             wire,
             rig,
-            MappedModule(settings, register_map(settings, rig), wire.timeout),
+            self._module,
             accept_no_watchdog=settings.accept_no_watchdog,
             clock=clock,
             sleep=sleep,
         )
+
+    def doubts(self) -> Mapping[str, str]:
+        """Return the channels whose registers may be read in the wrong order, and why."""
+        self._require_open()
+        return self._safely(self._module.doubts)

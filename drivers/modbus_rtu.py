@@ -97,8 +97,14 @@ class RtuConnection(ModbusConnection):
     def _no_answer(self, received: int) -> DeviceError:
         self.settle()
         return AnswerDamaged(
-            f"{received} bytes came from {self.where} that are no whole answer; check cable, baud "
-            "rate and parity"
+            f"no valid frame in {received} bytes from {self.where}: check `baud` "
+            f"({self._at.baud}), `parity` ({self._at.parity}) and the cable"
+        )
+
+    def _never_answered(self) -> str:
+        return (
+            f"not a byte came: check the cable, `device`, `baud` ({self._at.baud}) and that the "
+            "device is on"
         )
 
     def settle(self) -> None:

@@ -63,6 +63,7 @@ class ModbusConnection:
         self._host, self._port, self._timeout = host, port, timeout
         self._client: ModbusTcpClient | ModbusSerialClient | None = None
         self._received = 0
+        self._answered = False  # ever since it was opened
         self._asked = b""
         self._factor = 1.0
         # What the library logs is raised here as well, in words for people.
@@ -76,6 +77,7 @@ class ModbusConnection:
     def open(self) -> None:
         """Connect; raises DeviceLost where nothing listens, DeviceError where it may not be."""
         self.close()
+        self._answered = False
         self._factor = 1.0
         client = self._new_client()
         client.set_max_no_responses(1_000_000)  # when to give up is decided by the driver
@@ -185,6 +187,7 @@ class ModbusConnection:
         return client
 
     def _checked(self, answer: ModbusPDU) -> ModbusPDU:
+        self._answered = True
         if isinstance(answer, ExceptionResponse):
             raise DeviceRefused(
                 f"device at {self.where} refused function {answer.function_code & 0x7F} "
@@ -200,7 +203,15 @@ class ModbusConnection:
             return DeviceLost(f"the device at {self.where} closed the connection")
         if received:
             return self._no_answer(received)
-        return DeviceSilent(f"the device at {self.where} does not answer ({self._timeout:g} s)")
+        text = f"the device at {self.where} does not answer ({self._timeout:g} s)"
+        return DeviceSilent(text if self._answered else f"{text}; {self._never_answered()}")
+
+    def _never_answered(self) -> str:
+        """Return what may be wrong where nothing has ever answered."""
+        return (
+            "something takes connections there, but speaks no Modbus so far: check `port`, which "
+            "another program may have, and the unit's number"
+        )
 
     def _no_answer(self, received: int) -> DeviceError:
         """Return what `received` bytes mean that are no answer; leaves nothing of them behind."""

@@ -43,8 +43,8 @@ class SerialLine:
         came = self._decoder.received - self._received
         if came and not heard:
             return (
-                f"{came} bytes came, none of them a frame: check that both ends use the same "
-                "baud rate and that this is the bench's port"
+                f"no valid frame in {came} bytes: check `baud`, which both ends must have, and "
+                "that this is the bench's port"
             )
         damaged = self._decoder.damaged - self._damaged
         return f"{damaged} frames came damaged: check cable and baud rate" if damaged else ""

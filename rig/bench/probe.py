@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import Driver, SampleBlock
+from drivers.base import Doubting, Driver, SampleBlock
 from rig.bench.settings import BENCH
 from rig.model import channels as ch
 from rig.model.codes import encode_input
@@ -65,11 +65,13 @@ def probe_timed(driver: Driver, rig: Rig) -> tuple[list[Reading], Lateness | Non
                 due = (taken.tick + np.arange(len(taken.data))) / rig.sample_rate
                 late.append((taken.read_at - due)[np.isfinite(taken.read_at)])
         driver.stop()
+        doubts = driver.doubts() if isinstance(driver, Doubting) else {}
     finally:
         driver.close()
     every = np.concatenate(late) if late else np.empty(0)
     timing = Lateness(len(every), float(every.mean()), float(every.std())) if len(every) else None
-    return readings(block, rig), timing
+    found = [replace(one, mark=doubts.get(one.channel, one.mark)) for one in readings(block, rig)]
+    return found, timing
 
 
 def readings(block: SampleBlock, rig: Rig) -> list[Reading]:
