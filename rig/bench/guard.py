@@ -37,8 +37,10 @@ from rig.model.trips import (
     NOISY,
     NOT_FOLLOWING,
     NOTHING_MOVES,
+    SENSOR_DRIFT,
     STALE,
     SUPPLY_LOST,
+    SWAPPED,
     Violation,
 )
 
@@ -58,6 +60,8 @@ ACTIONS: Final = {
     ABOVE_SUPPLY: "pressure_above_supply",
     DRIFTS: "drift_at_rest",
     NOISY: "noisy_sensor",
+    SWAPPED: "swapped_pressures",
+    SENSOR_DRIFT: "drifting_pressure_sensor",
 }
 
 

@@ -22,6 +22,8 @@ NOTHING_MOVES: Final = "nothing moves"
 ABOVE_SUPPLY: Final = "pressure above supply"
 DRIFTS: Final = "drift at rest"
 NOISY: Final = "noisy sensor"
+SWAPPED: Final = "swapped pressures"
+SENSOR_DRIFT: Final = "drifting pressure sensor"
 
 _LARGEST = 1e300  # an end beyond is none
 

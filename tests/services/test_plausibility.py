@@ -14,6 +14,8 @@ from hil_sim.scenario.file import Scenario, parse_scenario
 from protocols.engine import engine
 from protocols.files.library import load
 from protocols.files.plan import Overrides, resolve
+from rig.bench.checks.pressure_sensors import ROW_SECONDS, drifting, swing_ratio
+from rig.bench.checks.settings import GuardSettings
 from rig.bench.guard import EXCITED, FREE, Guard, JointRole
 from rig.bench.session import Bench
 from rig.model.parts import Wire
@@ -77,6 +79,14 @@ FAULTS = [
     ("name: sensor_drift, channel: spool_2, rate: 0.1", "spool does not follow", "spool_2"),
     ("name: sensor_drift, channel: cap_pressure_2, rate: 0.4", "pressure", "cap_pressure_2"),
     ("name: sensor_drift, channel: piston_1, rate: 0.1", "lock", "piston_1"),
+    ("name: sensor_drift, channel: cap_pressure_2, rate: 0.1", "drifting pressure sensor",
+     "cap_pressure_2"),
+    ("name: sensor_drift, channel: rod_pressure_2, rate: 0.05", "drifting pressure sensor",
+     "rod_pressure_2"),
+    ("name: swapped_channels, channel: cap_pressure_1, other: cap_pressure_2",
+     "swapped pressures", "cap_pressure"),
+    ("name: swapped_channels, channel: rod_pressure_2, other: rod_pressure_1",
+     "swapped pressures", "rod_pressure"),
     ("name: sensor_noise, channel: rod_pressure_1, deviation: 0.01", "noisy sensor",
      "rod_pressure_1"),
     ("name: sensor_noise, channel: piston_2, deviation: 0.003", "noisy sensor", "piston_2"),
@@ -184,3 +194,60 @@ def test_what_a_check_does_is_up_to_the_rig_file() -> None:
     for block in blocks_of(driver_of(broken), "sine", BREAKS + 1.0):
         assert guard.check(block) is None
     assert set(guard.warnings) == {("frozen sensor", "spool_2", 2)}
+
+
+@pytest.mark.parametrize("piston", [-0.03, 0.0, 0.03])
+def test_the_pressures_of_a_closed_cylinder_swing_in_the_ratio_of_the_plants_volumes(
+    piston: float,
+) -> None:
+    """The ratio against the oil's own law p = b (V0 / V - 1), for a small stroke of the piston."""
+    part = RIG.joints[0].cylinder
+    moved = 1e-6  # [m]
+    cap_length = part.cap_pipe_volume / part.cap_area + part.stroke / 2 + piston
+    rod_length = part.rod_pipe_volume / part.rod_area + part.stroke / 2 - piston
+    cap = cap_length / (cap_length + moved) - 1.0
+    rod = rod_length / (rod_length - moved) - 1.0
+    assert swing_ratio(RIG, 0, piston) == pytest.approx(-cap / rod, rel=1e-3)
+
+
+def rows_of(force_trend: float, *, period: float = 1.0, ramp: float = 0.0) -> np.ndarray:
+    """Means over 20 ms of a joint on a sine, its cap pressure with a part that grows with time."""
+    t = np.arange(100) * ROW_SECONDS
+    rng = np.random.default_rng(1)
+    rows = np.zeros((100, 2, 4))
+    rows[:, 0, 0] = 0.01 * np.sin(2 * np.pi * t / period) + ramp * t
+    load = 3e6 + 4e7 * rows[:, 0, 0] + 2e5 * np.sign(np.gradient(rows[:, 0, 0]))
+    rod = 1.5e6 + 3e5 * np.cos(2 * np.pi * t / period)
+    cylinder = RIG.joints[0].cylinder
+    rows[:, 0, 2] = rod
+    rows[:, 0, 1] = load + rod * cylinder.rod_area / cylinder.cap_area + force_trend * t / t[-1]
+    rows[:, 0, 1:3] += 1e3 * rng.standard_normal((100, 2))
+    return rows
+
+
+@pytest.mark.parametrize(
+    ("trend", "motion", "channel"),
+    [
+        (1.5e6, {}, True),
+        (-1.5e6, {}, True),
+        (0.3e6, {}, None),
+        (0.0, {}, None),
+        (1.5e6, {"period": 8.0}, None),
+        (1.5e6, {"ramp": 0.02}, None),
+    ],
+    ids=["up", "down", "small", "none", "slow motion", "ramp"],
+)
+def test_a_pressure_that_grows_with_time_alone_is_a_drift_and_one_with_the_motion_is_not(
+    trend: float, motion: dict[str, float], channel: bool | None
+) -> None:
+    found = drifting(RIG, GuardSettings(), 0, rows_of(trend, **motion), ROW_SECONDS)
+    assert (found is None) == (channel is None)
+    if found is not None:
+        assert found.cap
+        assert found.value == pytest.approx(trend, rel=0.15)
+
+
+def test_a_trend_in_both_chambers_is_a_load_and_no_sensor() -> None:
+    rows = rows_of(1.5e6)
+    rows[:, 0, 2] -= np.linspace(0.0, 1.0e6, 100)
+    assert drifting(RIG, GuardSettings(), 0, rows, ROW_SECONDS) is None

@@ -160,6 +160,22 @@ def catalogue(settings: GuardSettings | None = None) -> tuple[CheckText, ...]:
             warn, "A sensor is noisier than the rig file states.",
             "Check shield, earth and plug; correct sensors.*.noise if the value is right.",
         ),
+        CheckText(
+            trips.SWAPPED, "checks.swapped_pressures",
+            f"swing of a closed, locked cylinder {s.swing_factor:g} times off what its other "
+            "chamber's says, and another joint's sensor fits",
+            f"{s.swing_span:g} s window, lasting {s.confirm:g} s", warn,
+            "A pressure sensor seems to be plugged in at another joint's place.",
+            "Compare the plugs of both joints' pressure sensors with the rig file.",
+        ),
+        CheckText(
+            trips.SENSOR_DRIFT, "checks.drifting_pressure_sensor",
+            f"{100 * s.trend:g} % of supply.pressure in {s.trend_span:g} s that no motion "
+            "explains, in one chamber, all other joints locked",
+            f"{s.trend_span:g} s window, lasting {s.confirm:g} s", warn,
+            "A pressure drifts although the motion repeats.",
+            "Check the sensor, its supply voltage and its oil; the force it shows is not real.",
+        ),
     )  # fmt: skip
 
 

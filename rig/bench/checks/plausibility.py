@@ -14,8 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.base import SampleBlock
+from rig.bench.checks import pressure_sensors
 from rig.bench.checks.expected_spool import ExpectedSpool
 from rig.bench.checks.frozen import SWING
+from rig.bench.checks.pressure_sensors import PressureFinding, SlowRows
 from rig.bench.checks.roles import JointRole
 from rig.bench.checks.settings import GuardSettings
 from rig.bench.checks.standing import Key, key_of
@@ -28,7 +30,9 @@ from rig.model.trips import (
     NOISY,
     NOT_FOLLOWING,
     NOTHING_MOVES,
+    SENSOR_DRIFT,
     SUPPLY_LOST,
+    SWAPPED,
     Violation,
 )
 
@@ -64,6 +68,8 @@ class Plausibility:
         sensors = [rig.sensors.of(ch.kind_of(name)[0]) for name in rig.channels]
         codes = np.array([np.ptp(s.range) / ((1 << s.bits) - 1) for s in sensors])
         self._noise = np.maximum([s.noise for s in sensors], codes)
+        self._slow = SlowRows(rate, len(rig.joints), settings.trend_span)
+        self._states = np.column_stack([self._piston, self._cap, self._rod, self._command])
         self.forget()
 
     def forget(self) -> None:
@@ -76,6 +82,7 @@ class Plausibility:
         """Go on after a few lost samples: the spools are where their next command holds them."""
         self._follow()
         self._expected.forget()
+        self._slow.forget()
 
     def restart(self) -> None:
         """Begin a new window: the joints do something else from the next block on."""
@@ -83,6 +90,7 @@ class Plausibility:
         self._parts: list[Array] = []
         self._parts_expected: list[Array] = []
         self._since_look = 0
+        self._slow.forget()
         self._pending: dict[Key, Violation] = {}
 
     def look(self, block: SampleBlock, roles: Roles) -> list[Violation] | None:
@@ -112,6 +120,7 @@ class Plausibility:
         if self._new:
             data = np.concatenate(self._new)
             self._new = []
+            self._slow.add(data[:, self._states])
             self._parts.append(data)
             self._parts_expected.append(self._expected.follow(data[:, self._command]))
 
@@ -128,6 +137,7 @@ class Plausibility:
         yield from self._spools(data, expected, say)
         yield from self._pistons(data, roles, say)
         yield from self._pressures(data, roles, say)
+        yield from self._sensors(data, roles, say)
         yield from self._noisy(data, say)
 
     def _spools(self, data: Array, expected: Array, say: Callable[..., Violation]) -> Iterator[
@@ -162,9 +172,8 @@ class Plausibility:
         for j, (joint, role) in enumerate(zip(self._rig.joints, roles, strict=True)):
             if role.locked:
                 continue  # the band of its lock is watched
-            column, stroke = self._piston[j], joint.cylinder.stroke
-            reach = stroke * (0.5 - settings.stroke_end)
-            inside = bool((np.abs(piston[:, j]) < reach).all())
+            column = self._piston[j]
+            inside = self._within_stroke(data, j)
             still = settings.still_piston * float(self._noise[column])
             if (
                 inside
@@ -197,6 +206,36 @@ class Plausibility:
                     yield say(ABOVE_SUPPLY, column, mean, (-math.inf, top))
                 if driven and peak < least:
                     yield say(EMPTY_CHAMBER, column, peak, (least, math.inf))
+
+    def _sensors(self, data: Array, roles: Roles, say: Callable[..., Violation]) -> Iterator[
+        Violation
+    ]:  # fmt: skip
+        def shown(limit: str, one: PressureFinding) -> Violation:
+            column = (self._cap if one.cap else self._rod)[one.joint]
+            return say(limit, column, one.value, one.allowed)
+
+        excited = [j for j, role in enumerate(roles) if role.excited]
+        held = [j for j, role in enumerate(roles) if role.locked]
+        if len(excited) != 1 or len(excited) + len(held) != len(roles):
+            return  # what a free joint does to the others' loads is not known here
+        rig, settings, slow = self._rig, self._settings, self._slow
+        rows = slow.last(settings.trend_span)
+        if rows is not None:
+            finding = pressure_sensors.drifting(rig, settings, excited[0], rows, slow.seconds)
+            if finding is not None:
+                yield shown(SENSOR_DRIFT, finding)
+        rows = slow.last(settings.swing_span)
+        if rows is None:
+            return
+        shut = (rows[:, :, pressure_sensors.COMMAND] == 0.0).all(axis=0)
+        closed = [j for j in held if shut[j] and self._within_stroke(data, j)]
+        noise = self._noise[[self._cap[0], self._rod[0]]] / math.sqrt(slow.each)
+        for one in pressure_sensors.swapped(rig, settings, closed, rows, noise):
+            yield shown(SWAPPED, one)
+
+    def _within_stroke(self, data: Array, j: int) -> bool:
+        reach = self._rig.joints[j].cylinder.stroke * (0.5 - self._settings.stroke_end)
+        return bool((np.abs(data[:, self._piston[j]]) < reach).all())
 
     def _noisy(self, data: Array, say: Callable[..., Violation]) -> Iterator[Violation]:
         """Estimate each channel's noise from its third difference, in which motion is small.

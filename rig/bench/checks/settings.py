@@ -45,6 +45,20 @@ class GuardSettings:
     drift: float = 0.05  # of limits.speed, mean over the window at zero command; seen: 0.01
     noise: float = 5.0  # times the stated noise; seen: 1.25, by the steps of the converter
 
+    # Swings of a closed cylinder's pressures against each other; sound: within 1.2 of the ratio
+    # that its volumes say, correlated by -0.97; plugs exchanged: 10 times off.
+    swing_span: float = 1.0  # [s]; a period of 1 Hz
+    swing_noise: float = 5.0  # times the noise of a 20 ms mean, deviation; less shows nothing
+    swing_factor: float = 3.0  # off the ratio either way: the sensor is not of this cylinder
+    swing_match: float = 1.5  # off the ratio at most: another joint's sensor is
+    swing_phase: float = 0.9  # least correlation of opposite phase
+    # Force of an excited joint that grows with time and with nothing that moves
+    trend_span: float = 2.0  # [s]; two periods of 1 Hz
+    trend: float = 0.1  # of supply.pressure over the span
+    trend_alone: float = 0.7  # of time's own square that the motion must leave: no slow ramp
+    trend_clear: float = 2.0  # times the residual without it
+    trend_other: float = 0.25  # of the drifting sensor's trend, in the other chamber, at most
+
     # Bands of the bench, where the rig file gives none
     supply_warning: tuple[float, float] = (0.8, 1.15)  # of supply.pressure; seen: 0.97 to 1.01
     oil_warning: float = 2.0  # times oil.temperature_band either way; seen: 1.1

@@ -58,6 +58,8 @@ class CheckActions(Part):
     nothing_moves: Action = "warn"
     pressure_above_supply: Action = "warn"
     drift_at_rest: Action = "warn"
+    swapped_pressures: Action = "warn"
+    drifting_pressure_sensor: Action = "warn"
     noisy_sensor: Action = "warn"
 
 

@@ -1,0 +1,174 @@
+"""Pressure sensors against the physics of their cylinders: two exchanged plugs, a drifting sensor.
+
+Closed cylinder. Behind a shut valve the oil is only compressed, dp_cap/dt = -b A_cap v / V_cap and
+dp_rod/dt = b A_rod v / V_rod (Merritt, Hydraulic Control Systems, 3.1), so that the swings of both
+pressures are in opposite phase and in the ratio A_cap V_rod / (A_rod V_cap), whatever b and v are.
+
+Force. A_cap p_cap - A_rod p_rod is what the load takes: a function of position, speed and
+acceleration while all other joints are held. A part that grows with time alone is none of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.bench.checks.settings import GuardSettings
+from rig.model.rig import Rig
+
+Array = NDArray[np.float64]
+
+ROW_SECONDS = 0.02  # over which samples are averaged for the slow part of the force
+PISTON, CAP, ROD, COMMAND = range(4)
+_SLIP = 0.1  # of the greatest speed: friction has its sign beyond
+
+
+@dataclass(frozen=True)
+class PressureFinding:
+    """A pressure sensor (place among `joints`, cap or rod), what it shows and what was expected."""
+
+    joint: int
+    cap: bool
+    value: float
+    allowed: tuple[float, float]
+
+
+def swing_ratio(rig: Rig, joint: int, piston: float) -> float:
+    """Return the swing of the cap pressure over that of the rod pressure of a closed cylinder.
+
+    `joint` is 0-based, `piston` [m] where it stands.
+    """
+    part = rig.joints[joint].cylinder
+    cap = part.cap_pipe_volume + part.cap_area * (0.5 * part.stroke + piston)
+    rod = part.rod_pipe_volume + part.rod_area * (0.5 * part.stroke - piston)
+    return part.cap_area * rod / (part.rod_area * cap)
+
+
+def swapped(
+    rig: Rig,
+    settings: GuardSettings,
+    closed: Sequence[int],
+    rows: Array,
+    noise: Array,
+) -> Iterator[PressureFinding]:
+    """Find sensors of closed cylinders whose plug is exchanged with one of another joint.
+
+    `closed` are the joints (0-based) locked behind a shut valve, `rows` as of `SlowRows.last`,
+    `noise` (2,) [Pa] of cap and rod pressure in them. Said only where the own sensor does not fit
+    its cylinder and one of another joint does.
+    """
+    x = _detrended(rows[:, :, CAP : ROD + 1])
+    swings = np.sqrt(np.mean(x * x, axis=0))
+    others_far, others_near = settings.swing_factor, settings.swing_match
+    for j in closed:
+        expected = swing_ratio(rig, j, float(rows[:, j, PISTON].mean()))
+        for side, ratio in ((0, expected), (1, 1.0 / expected)):
+            partner = swings[j, 1 - side]
+            if min(swings[j, side] / noise[side], partner / noise[1 - side]) < settings.swing_noise:
+                continue
+            fitting = ratio * partner
+            if fitting / others_far <= swings[j, side] <= fitting * others_far:
+                continue
+            for i in range(len(swings)):
+                for k in range(2):
+                    near = fitting / others_near <= swings[i, k] <= fitting * others_near
+                    if i == j or not near:
+                        continue
+                    together = np.mean(x[:, i, k] * x[:, j, 1 - side]) / (swings[i, k] * partner)
+                    if together < -settings.swing_phase:
+                        bounds = fitting / others_far, fitting * others_far
+                        yield PressureFinding(j, side == 0, float(swings[j, side]), bounds)
+
+
+def drifting(
+    rig: Rig, settings: GuardSettings, joint: int, rows: Array, seconds: float
+) -> PressureFinding | None:
+    """Return which sensor of the one excited joint drifts, all others held, None if none.
+
+    `joint` is 0-based, `rows` as of `SlowRows.last`, `seconds` apart. `value` is the sensor's part
+    that grows with time [Pa], over the rows. A finding needs a motion that time does not explain,
+    a force that it explains, and one chamber alone that shows it.
+    """
+    terms, time = _motion(rows[:, joint, PISTON], seconds)
+    leftover = time - terms @ _fit(terms, time)
+    if leftover @ leftover < settings.trend_alone * (time @ time):
+        return None
+    part = rig.joints[joint].cylinder
+    cap, rod = rows[2:-2, joint, CAP], rows[2:-2, joint, ROD]
+    force = cap - part.rod_area / part.cap_area * rod
+    targets = np.column_stack([force, cap, rod])
+    trends = _fit(np.column_stack([terms, time]), targets)[-1]
+    bound = settings.trend * rig.supply.pressure
+    if abs(trends[0]) < bound:
+        return None
+    rest = force - terms @ _fit(terms, force)
+    explained = rest - leftover * (leftover @ rest) / (leftover @ leftover)
+    if rest @ rest < settings.trend_clear**2 * (explained @ explained):
+        return None
+    size = np.abs(trends[1:])
+    side = int(np.argmax(size))
+    if size[1 - side] > settings.trend_other * size[side]:
+        return None
+    return PressureFinding(joint, side == 0, float(trends[1 + side]), (-bound, bound))
+
+
+class SlowRows:
+    """The last seconds of a bench in means over `ROW_SECONDS`, without most of their noise."""
+
+    def __init__(self, rate: float, joints: int, span: float) -> None:
+        """Keep `span` [s] of samples at `rate` [Hz]."""
+        self._joints = joints
+        self.each = max(1, round(ROW_SECONDS * rate))
+        self.seconds = self.each / rate
+        self._most = round(span / self.seconds)
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin anew: what comes next does not continue what came before."""
+        self._rows: Array = np.empty((0, self._joints, COMMAND + 1))
+        self._begun: Array = self._rows
+
+    def add(self, states: Array) -> None:
+        """Take samples that follow, (n, joints, 4): piston [m], cap, rod [Pa], command [V]."""
+        samples = np.concatenate([self._begun, states])
+        whole = len(samples) // self.each * self.each
+        self._begun = samples[whole:]
+        parts = samples[:whole].reshape(-1, self.each, *samples.shape[1:])
+        rows = np.add.reduce(parts, axis=1) / self.each
+        rows[:, :, COMMAND] = np.abs(parts[:, :, :, COMMAND]).max(axis=1, initial=0.0)
+        self._rows = np.concatenate([self._rows, rows])[-self._most :]
+
+    def last(self, span: float) -> Array | None:
+        """Return the rows of the last `span` [s], (rows, joints, 4), None before there are so many.
+
+        A command is the greatest of its row.
+        """
+        count = round(span / self.seconds)
+        return self._rows[-count:] if count <= len(self._rows) else None
+
+
+def _motion(piston: Array, seconds: float) -> tuple[Array, Array]:
+    """Return what a load's force may follow, (rows - 4, 5), and time from -1/2 to 1/2."""
+    speed = np.gradient(piston, seconds)
+    inner = slice(2, -2)  # differences at the ends are one-sided
+    acceleration = np.gradient(speed, seconds)[inner]
+    speed, piston = speed[inner], piston[inner]
+    sign = np.tanh(speed / max(_SLIP * float(np.abs(speed).max()), 1e-9))
+    terms = np.column_stack([np.ones_like(piston), piston, speed, sign, acceleration])
+    return terms / np.maximum(np.abs(terms).max(axis=0), 1e-12), np.linspace(-0.5, 0.5, len(piston))
+
+
+def _fit(terms: Array, values: Array) -> Array:
+    return np.asarray(np.linalg.lstsq(terms, values, rcond=1e-9)[0], dtype=np.float64)
+
+
+def _detrended(x: Array) -> Array:
+    """Return columns without their straight line, shape (n, ...)."""
+    time = np.arange(len(x)) - 0.5 * (len(x) - 1)
+    centred = x - x.mean(axis=0)
+    slope = np.tensordot(time, centred, 1) / float(time @ time)
+    out: Array = centred - np.multiply.outer(time, slope)
+    return out
