@@ -218,7 +218,7 @@ class MessageStreamDriver:
             if asked % _NOTES_BEFORE_STATUS == 0:
                 self._why_no_block(overdue=self._clock() >= deadline, known=known)
         block = self._ready.popleft()
-        return self._decoder.decode(block.header, reg.pack_header(block.header) + block.samples)
+        return self._decoder.decode_samples(block.header, block.samples)
 
     # -- inside -----------------------------------------------------------------------------
 

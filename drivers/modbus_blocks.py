@@ -14,6 +14,7 @@ from rig.model.rig import Rig
 
 logger = logging.getLogger(__name__)
 
+_ONE = np.uint16(1)
 LATE = 16  # blocks back that a late answer may be of
 
 
@@ -30,13 +31,18 @@ class BlockDecoder:
         self.layout = reg.block_layout(len(rig.channels), len(rig.joints))
         sensors = [rig.sensors.of(ch.kind_of(name)[0]) for name in rig.channels]
         self._names = rig.recorded
-        self._low = np.array([sensor.range[0] for sensor in sensors])
+        low = np.array([sensor.range[0] for sensor in sensors])
         high = np.array([sensor.range[1] for sensor in sensors])
         self._top = np.array([(1 << sensor.bits) - 1 for sensor in sensors])
+        self._almost_top = (self._top - 1).astype(np.uint16)
         self._narrow = bool((self._top < 0xFFFF).any())  # a wider code has no register to be in
-        self._step = (high - self._low) / self._top
-        self._most = np.array([(1 << (j.valve.command_bits - 1)) - 1 for j in rig.joints])
-        self._volt = np.array([j.valve.command_range for j in rig.joints]) / self._most
+        step = (high - low) / self._top
+        most = [(1 << (j.valve.command_bits - 1)) - 1 for j in rig.joints]
+        self._most = np.array(most, dtype=np.int16)
+        self._span = 2 * self._most.astype(np.uint16)
+        volt = np.array([j.valve.command_range for j in rig.joints]) / np.array(most)
+        self._scale = np.concatenate([step, volt])
+        self._offset = np.concatenate([low, np.zeros(len(volt))])
         self._sequence: int | None = None
         self.tick = 0  # of the sample expected next
 
@@ -66,23 +72,29 @@ class BlockDecoder:
             )
 
     def decode(self, header: BlockHeader, answer: bytes) -> SampleBlock:
+        """Return the block in SI of an answer that begins with its header; as `decode_samples`."""
+        return self.decode_samples(header, answer[2 * reg.HEADER_WORDS :])
+
+    def decode_samples(self, header: BlockHeader, samples: bytes) -> SampleBlock:
         """Return the block in SI; raises DeviceError if it is impossible after the last one."""
         sequence, tick = self._follow(header)
-        codes, outputs = reg.unpack_samples(answer[2 * reg.HEADER_WORDS :], self.layout)
+        codes, outputs = reg.unpack_samples(samples, self.layout)
         if self._narrow:
             self._possible(codes > self._top, codes, 0)
-        self._possible(np.abs(outputs.astype(np.int32)) > self._most, outputs, codes.shape[1])
+        # |output| > most, by one comparison: below -most the sum wraps to the largest codes.
+        shifted = (outputs + self._most).view(np.uint16)
+        self._possible(shifted > self._span, outputs, codes.shape[1])
         data = np.empty((self.layout.samples, self.layout.columns))
-        measured = data[:, : self.layout.channels]
-        np.multiply(codes, self._step, out=measured)
-        measured += self._low
-        np.multiply(outputs, self._volt, out=data[:, self.layout.channels :])
+        data[:, : self.layout.channels] = codes
+        data[:, self.layout.channels :] = outputs
+        data *= self._scale  # whole rows: a third of the time of both parts by themselves
+        data += self._offset
         self._sequence, self.tick = sequence, tick + self.layout.samples
         return SampleBlock(
             sequence=sequence,
             tick=tick,
             data=data,
-            saturated=(codes == 0) | (codes == self._top),
+            saturated=codes - _ONE >= self._almost_top,  # 0 wraps to the largest code
             backlog=header.backlog,
             tripped=bool(header.status & Status.TRIPPED),
         )
@@ -106,7 +118,7 @@ class BlockDecoder:
     def _possible(
         self, wrong: np.ndarray[tuple[int, ...], np.dtype[np.bool_]], codes: object, first: int
     ) -> None:
-        if wrong.any():
+        if np.count_nonzero(wrong):
             row, column = np.argwhere(wrong)[0]
             raise DeviceError(
                 f"impossible block: channel {self._names[first + column]} has the converter code "
