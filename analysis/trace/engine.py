@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from analysis.effects.base import Effect, ordered
 from analysis.identify import checks as ck
+from analysis.identify.estimators.nuisance import BulkTemperature
 from analysis.identify.identify import identify
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.simulation.model import Model
@@ -329,6 +330,6 @@ def _extended(
     """Identify everything again together with the effects, their shapes' errors included."""
     if not winner.effects:
         return before
-    every = ordered((*terms, *winner.effects))
-    found = identify(runs, terms=every, estimator="ls", nuisances=False).model
+    plain = [u for u in terms if not isinstance(u.term, BulkTemperature)]
+    found = identify(runs, terms=ordered((*plain, *winner.effects)), estimator="ls").model
     return stripped(widened(train_data, winner.fit, found))

@@ -9,7 +9,7 @@ from analysis.effects.base import Effect, shape_values
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.result import Curve
-from analysis.trace.search.refinement import ExactFit, jacobian, table
+from analysis.trace.search.refinement import ExactFit, tangent
 
 Array = NDArray[np.float64]
 
@@ -39,17 +39,9 @@ def curves_of(data: RegressionData, model: ExactFit, used: Used) -> tuple[Curve,
     return tuple(out)
 
 
-def _covariance(data: RegressionData, model: ExactFit) -> tuple[list[str], Array]:
+def _covariance(data: RegressionData, model: ExactFit) -> tuple[tuple[str, ...], Array]:
     """Return names and covariance of everything free in a model, noise as the floor has it."""
-    rows = table(data, model.terms)
-    names, columns = list(rows.names), [rows.matrix]
-    for used in model.terms:
-        if used.shape and isinstance(used.term, Effect):
-            own, J = jacobian(data, model, used)
-            fresh = [k for k, n in enumerate(own) if n not in names]
-            names += [own[k] for k in fresh]
-            columns.append(J[:, fresh])
-    X = np.column_stack(columns)
+    names, X = tangent(data, model)
     scale = np.linalg.norm(X, axis=0)
     scale[scale == 0] = 1.0
     inverse = np.linalg.pinv((X / scale).T @ (X / scale), rcond=1e-12, hermitian=True)

@@ -24,7 +24,7 @@ from analysis.trace.search import linear_fit
 from analysis.trace.search.hypothesis import Hypothesis, excess_of
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.linear_fit import CandidateColumns, orthonormal
-from analysis.trace.search.refinement import ExactFit, jacobian, table
+from analysis.trace.search.refinement import ExactFit, jacobian, table, tangent
 from analysis.trace.settings import TRACE
 
 Array = NDArray[np.float64]
@@ -245,13 +245,5 @@ def spread(
 
 def others(train_data: RegressionData, model: ExactFit, own: Sequence[str]) -> Array:
     """Return a basis of everything in the model but the named parameters, other shapes included."""
-    rows = table(train_data, model.terms)
-    kept = [k for k, n in enumerate(rows.names) if n not in own]
-    extra = []
-    for other in model.terms:
-        if not other.shape:
-            continue
-        names, J = jacobian(train_data, model, other)
-        picked = [k for k, n in enumerate(names) if n not in own and n not in rows.names]
-        extra.append(J[:, picked])
-    return orthonormal(np.column_stack([rows.matrix[:, kept], *extra]))
+    names, X = tangent(train_data, model)
+    return orthonormal(X[:, [k for k, n in enumerate(names) if n not in own]])

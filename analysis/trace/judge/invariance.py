@@ -16,7 +16,7 @@ from analysis.trace.data.noise_floor import STATED
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.inference import EffectErrors, blocks, others
 from analysis.trace.search.linear_fit import FORM, orthonormal
-from analysis.trace.search.refinement import ExactFit, jacobian, table
+from analysis.trace.search.refinement import ExactFit, contribution, jacobian, table
 from analysis.trace.settings import TRACE
 
 Array = NDArray[np.float64]
@@ -104,7 +104,7 @@ def invariance(
     names, J = jacobian(train_data, model, used)
     base = others(train_data, model, names)
     if isinstance(used.term, Effect) and used.term.free:
-        return _of_whole(train_data, model, used, (J, base), joint)
+        return _of_whole(train_data, model, used, base, joint)
     residual = model.residual
     # A shape such as the presliding distance is the form's, not the effect's size.
     sizes = {c.parameter for c in used.term.coefficients(train_data.rig)}
@@ -124,7 +124,7 @@ def invariance(
         if name in sizes and whole[k] < TRACE.own * float(J_all[:, k] @ J_all[:, k])
     }
     if ridge:
-        out += _of_whole(train_data, model, used, (J, base), joint)
+        out += _of_whole(train_data, model, used, base, joint)
         sizes -= ridge
     for label, mask in subsets(train_data, joint).items():
         if not mask.any():
@@ -160,7 +160,7 @@ def invariance(
 
 
 def _of_whole(
-    train_data: RegressionData, model: ExactFit, used: Used, tangent: tuple[Array, Array],
+    train_data: RegressionData, model: ExactFit, used: Used, base: Array,
     joint: int | None,
 ) -> list[tuple[str, str, float, float]]:  # fmt: skip
     """Return where a whole effect disagrees with itself: the factor by which it would be larger.
@@ -168,8 +168,7 @@ def _of_whole(
     Values of a curve trade places between knots, numbers on a ridge with each other; what must be
     the same everywhere is what they make together.
     """
-    J, base = tangent
-    whole = J @ _amounts(train_data, model, used)
+    whole = contribution(train_data, model, used)
     start = float(np.sum((whole - base @ (base.T @ whole)) ** 2))
     clusters, out = _unmeasured(train_data), []
     for label, mask in subsets(train_data, joint).items():
@@ -190,12 +189,3 @@ def _of_whole(
         ):
             out.append((label, "the whole effect", 1.0 + shift, error))
     return out
-
-
-def _amounts(train_data: RegressionData, model: ExactFit, used: Used) -> Array:
-    """Return by how much each column of an effect's tangent (M, p) makes it what it is (p,)."""
-    found = [model.beta.get(c.parameter, 0.0) for c in used.term.coefficients(train_data.rig)]
-    for shape, value in zip(shapes_of(train_data.rig, used), used.shape, strict=True):
-        if not shape.fixed and shape.given(value):
-            found.append(value if shape.neutral is not None else 0.0)
-    return np.array(found)

@@ -14,13 +14,22 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.effects.base import Effect
 from analysis.identify.estimators.covariance import CovarianceParts, spread
 from analysis.identify.estimators.equations import Pieces, segments
 from analysis.identify.settings import IDENTIFY
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.simulation.model import Model
 from analysis.trace.data.regression_data import RegressionData, Segment
-from analysis.trace.search.refinement import ExactFit, alternatives, jacobian, table
+from analysis.trace.search.linear_fit import VISIBLE
+from analysis.trace.search.refinement import (
+    ExactFit,
+    alternatives,
+    contribution,
+    table,
+    tangent,
+)
+from analysis.trace.settings import TRACE
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -97,24 +106,49 @@ def _labels(conditioned: ConditionedRecord, s: Segment, time: Array, by: str) ->
 
 
 def form_shift(train_data: RegressionData, fit: ExactFit) -> dict[str, float]:
-    """Return how far every coefficient of the rows may be off since an effect's form is not known.
+    """Return how far every coefficient and shape may be off since an effect's form is not known.
 
     Where an effect has another form (`Effect.other_forms`), that is fitted as well. The two differ
     by a shift of each coefficient; of it counts sqrt(E / E'), of the energies E and E' that they
     leave above noise: nothing where the chosen form leaves noise only, all of it where the other
-    is as good.
+    is as good. And an effect may grow otherwise than in proportion, x (1 + e |x| / rms x) in place
+    of its contribution x to the rows: where the rows show such an e beyond noise, the shift counts
+    that it makes.
     """
     noise = len(fit.residual)
     own = max(fit.energy - noise, np.sqrt(2.0 * noise))
-    squares = dict.fromkeys(fit.beta, 0.0)
+    squares = _by_growth(train_data, fit)
     for other in alternatives(train_data, fit):
         left = max(other.energy - noise, np.sqrt(2.0 * noise))
         share = min(1.0, own / left)
         for name, value in other.beta.items():
-            squares[name] = (
-                squares.get(name, 0.0) + share * (value - fit.beta.get(name, value)) ** 2
-            )
+            shift = value - fit.beta.get(name, value)
+            squares[name] = squares.get(name, 0.0) + share * shift**2
     return {name: float(np.sqrt(v)) for name, v in squares.items()}
+
+
+def _by_growth(train_data: RegressionData, fit: ExactFit) -> dict[str, float]:
+    """Return the squares of what effects that grow otherwise shift, by name."""
+    names, X = tangent(train_data, fit)
+    scale = np.linalg.norm(X, axis=0)
+    scale[scale == 0] = 1.0
+    squares = dict.fromkeys(names, 0.0)
+    for used in fit.terms:
+        if not isinstance(used.term, Effect) or used.term.free:
+            continue
+        x = contribution(train_data, fit, used)
+        size = float(np.sqrt(np.mean(x[x != 0.0] ** 2))) if x.any() else 1.0
+        column = x * np.abs(x) / size
+        moved = np.linalg.lstsq(X / scale, column, rcond=1e-6)[0]
+        own = column - X @ (moved / scale)
+        energy = float(own @ own)
+        if energy <= VISIBLE**2 * float(column @ column):
+            continue
+        e = float(own @ fit.residual) / energy
+        if abs(e) * np.sqrt(energy) > TRACE.deviations:
+            for name, shift in zip(names, e * moved / scale, strict=True):
+                squares[name] += float(shift) ** 2
+    return squares
 
 
 def widened(train_data: RegressionData, fit: ExactFit, model: Model) -> Model:
@@ -146,11 +180,8 @@ def widened(train_data: RegressionData, fit: ExactFit, model: Model) -> Model:
 
 def _by_shapes(train_data: RegressionData, fit: ExactFit, X: Array, own: Sequence[str]) -> Array:
     """Return what the shapes' covariance adds to the variance of each coefficient of X (M, k)."""
-    columns = [
-        J[:, [k for k, n in enumerate(names) if n not in own]]
-        for names, J in (jacobian(train_data, fit, u) for u in fit.terms if u.shape)
-    ]
-    shapes = np.column_stack([np.zeros((len(X), 0)), *columns])
+    names, columns = tangent(train_data, fit)
+    shapes = columns[:, [k for k, n in enumerate(names) if n not in own]]
     shapes = shapes[:, np.linalg.norm(shapes, axis=0) > 0]
     if not shapes.shape[1]:
         return np.zeros(X.shape[1])

@@ -291,6 +291,29 @@ def jacobian(data: RegressionData, model: ExactFit, used: Used) -> tuple[tuple[s
     return tuple(names), stack
 
 
+def tangent(data: RegressionData, model: ExactFit) -> tuple[tuple[str, ...], Array]:
+    """Return names and whitened columns (M, p) of all that is free in a model, shapes included."""
+    rows = table(data, model.terms)
+    names, columns = list(rows.names), [rows.matrix]
+    for used in model.terms:
+        if used.shape and isinstance(used.term, Effect):
+            own, J = jacobian(data, model, used)
+            fresh = [k for k, n in enumerate(own) if n not in names]
+            names += [own[k] for k in fresh]
+            columns.append(J[:, fresh])
+    return tuple(names), np.column_stack(columns)
+
+
+def contribution(data: RegressionData, model: ExactFit, used: Used) -> Array:
+    """Return what an effect adds to the whitened rows (M,): its tangent times its own numbers."""
+    _, J = jacobian(data, model, used)
+    amounts = [model.beta.get(c.parameter, 0.0) for c in used.term.coefficients(data.rig)]
+    for shape, value in zip(shapes_of(data.rig, used), used.shape, strict=True):
+        if not shape.fixed and shape.given(value):
+            amounts.append(value if shape.neutral is not None else 0.0)
+    return np.asarray(J @ np.array(amounts))
+
+
 def alternatives(data: RegressionData, found: ExactFit) -> list[ExactFit]:
     """Return the fit with each effect in its other forms, one after another."""
     out = []
