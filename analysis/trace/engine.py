@@ -105,15 +105,12 @@ def trace(
         winner, verdict = hypotheses.empty, CLEAN
     else:
         winner = hypotheses.run(lambda share: done(PREPARED + (COLUMNS - PREPARED) * share))
-        winner = readings.settled(hypotheses, winner, holdout_data)
-        found, winner, verdict, rest = _named(hypotheses, winner, holdout_data, rng)
         free = _unknown(free_mechanisms(rig), known) if free_forms else []
-        drawn = _drawn(hypotheses, free, winner, verdict, holdout_data, rng)
-        if drawn is not None:
-            hypotheses, found, winner, rest = drawn
-            verdict = CONFOUNDED if _tied(found) else EXPLAINED
-        refused = tuple(f for f in found if not gates.stands(f))
-        found = tuple(f for f in found if gates.stands(f))
+        hypotheses, judged_all, winner, verdict, rest = _settled(
+            hypotheses, winner, free, holdout_data, rng
+        )
+        refused = tuple(f for f in judged_all if not gates.stands(f))
+        found = tuple(f for f in judged_all if gates.stands(f))
         notes += _rest_notes(verdict, rest, quiet, bool(found))
     done(JUDGED)
     split = lines(train_data, winner.fit.residual)
@@ -135,6 +132,7 @@ def trace(
         held_out.settled(holdout_data, winner.fit),
     )
     error = held_out.errors(rig, judged, first, last)
+    notes += _missed_held(verdict, error, notes)
     runs_before, runs_after = held_out.free_runs(holdout, before, after)
     result = Trace(
         verdict, found, error.noise, error.before, error.after,
@@ -225,6 +223,58 @@ def _drawn(
     if fewer and (mechanisms(winner) < 2 or within(winner.excess_energy, hypotheses.limits)):
         return None
     return drawn_by_data(hypotheses, free, winner, holdout_data, rng, fewer)
+
+
+def _settled(
+    hypotheses: HypothesisSet, winner: Hypothesis, free: Sequence[Effect],
+    holdout_data: RegressionData, rng: np.random.Generator,
+) -> tuple[HypothesisSet, tuple[Found, ...], Hypothesis, str, list[Rest]]:  # fmt: skip
+    """Judge what the search has found, names first, then free forms.
+
+    Returns the sets tried, what was judged, the set that stands, the verdict and what it leaves.
+    """
+    winner = readings.settled(hypotheses, winner, holdout_data)
+    found, winner, verdict, rest = _named(hypotheses, winner, holdout_data, rng)
+    drawn = _drawn(hypotheses, free, winner, verdict, holdout_data, rng)
+    if drawn is not None:
+        hypotheses, found, winner, rest = drawn
+        verdict = CONFOUNDED if _tied(found) else EXPLAINED
+    elif verdict == UNEXPLAINED:
+        found += _unphysical(hypotheses, holdout_data, rng)
+    return hypotheses, found, winner, verdict, rest
+
+
+def _unphysical(
+    hypotheses: HypothesisSet, holdout_data: RegressionData, rng: np.random.Generator
+) -> tuple[Found, ...]:
+    """Return what physics alone refuses of the simplest set that would leave next to nothing."""
+    near = [o for o in hypotheses.listed.values() if hypotheses.formed(o) and o.effects]
+    near = [o for o in near if hypotheses.physical(o)]
+    if not near:
+        return ()
+    best = min(near, key=lambda o: (o.size[1], o.total))
+    found = gates.judge(hypotheses, best, holdout_data, rng)
+    # What half-samples choose, or what else fits, is no matter where physics refuses.
+    asked = [
+        replace(f, gates=tuple(g for g in f.gates if g.name in (gates.REMOVES, gates.PHYSICAL)))
+        for f in found
+    ]
+    return tuple(replace(f, rivals=()) for f in asked if not gates.stands(f))
+
+
+def _missed_held(verdict: str, error: held_out.Errors, told: Sequence[str]) -> list[str]:
+    """State what an explanation leaves in held-out records where nothing has been said of it."""
+    if verdict not in (EXPLAINED, CONFOUNDED):
+        return []
+    out = []
+    for e, noise in error.noise.items():
+        if error.after[e] > TRACE.told * noise and not any(n.startswith(f"{e}:") for n in told):
+            share = (error.after[e] ** 2 - noise**2) / max(error.before[e] ** 2 - noise**2, 1e-30)
+            out.append(
+                f"{e}: held-out error {error.after[e] / noise:.2f} times the noise floor, "
+                f"{100 * share:.2g} % of the energy that was there, which the named form may miss"
+            )
+    return out
 
 
 def _rest_notes(verdict: str, rest: Sequence[Rest], quiet: bool, found: bool) -> list[str]:

@@ -84,21 +84,24 @@ def _lost(
 
 
 def _richer(hypotheses: HypothesisSet, one: Hypothesis) -> list[Hypothesis]:
-    """Return the sets with a further reading of a mechanism, in the place of one or beside it."""
+    """Return the sets with a further number of a mechanism's law.
+
+    A reading with more coefficients takes the place of one that it includes; one with as many is
+    another part of the same law, and stands beside.
+    """
     rig, sets = hypotheses.stage.rig, dict[frozenset[Key], tuple[Used, ...]]()
     for used in one.effects:
         assert isinstance(used.term, Effect)
+        count = len(used.term.coefficients(rig))
         for effect in hypotheses.effects:
             if not related(effect, used.term) or (effect.name, effect.where) in one.keys:
                 continue
-            fresh = Used(effect, effect.shape_of(rig, ()))
-            beside = (*one.effects, fresh)
-            if used.term.name in effect.includes:
-                _keep(sets, tuple(u for u in beside if u is not used))
-            if len(beside) <= DEEPEST:
-                _keep(sets, beside)
+            kept = [u for u in one.effects if u is not used]
+            own = len(effect.coefficients(rig))
+            if own == count and len(one.effects) < DEEPEST:
+                kept.append(used)
+            elif own <= count:
+                continue
+            effects = (*kept, Used(effect, effect.shape_of(rig, ())))
+            sets[frozenset((u.term.name, u.term.where) for u in effects)] = effects
     return [hypotheses.exact(effects) for effects in sets.values()]
-
-
-def _keep(sets: dict[frozenset[Key], tuple[Used, ...]], effects: tuple[Used, ...]) -> None:
-    sets.setdefault(frozenset((u.term.name, u.term.where) for u in effects), effects)
