@@ -25,6 +25,7 @@ from tests.studies.machines import pendulum_command as pendulum
 from tests.studies.nights import command as nights
 from tests.studies.reproduction import command as reproduction
 from tests.studies.trace import command as trace
+from tests.studies.trace import evidence_command as evidence
 from tests.studies.variants import command as variants
 from tests.studies.wires import command as wires
 
@@ -33,6 +34,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 STUDIES = (
     trace,
+    evidence,
     foreign,
     estimators,
     design,

@@ -1,0 +1,362 @@
+"""Every gate and statistic of the trace, broken one at a time, is noticed by a bench that needs it.
+
+A story holds with all rules; each rule and each fault beside it (`tests.studies.trace.rules`) must
+make it fail. The benches are joint 2 alone with few candidates, searched once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from analysis.trace.data.conditioned_record import conditioned_records
+from analysis.trace.data.regression_data import regression_data
+from analysis.trace.judge import gates, inference
+from analysis.trace.result import Trace
+from analysis.trace.search.refinement import ExactFit, jacobian
+from rig.model.parse import InputError
+from rig.model.records import Run
+from rig.model.rig import Rig
+from tests.analysis.trace import foreign_bench, gate_cases
+from tests.analysis.trace.gate_cases import LEAK, Searched, gate, joined, with_residual
+from tests.analysis.trace.hidden import experiment, hardening, pair_of_runs
+from tests.studies.trace.rules import FAULTS, RULES, by_name, switched_off
+
+Array = NDArray[np.float64]
+MANY: Final = (
+    "internal_leakage", "external_leakage", "spool_offset", "torque_offset", "joint_spring",
+    "tank_pressure", "dead_volume", "sensor_gain",
+)  # fmt: skip
+
+
+class Benches:
+    """Records and searches of the stories, made when first asked for."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.rig = rig
+        self.known: dict[object, object] = {}
+
+    def runs(self, **wrong: float) -> tuple[Run, Run]:
+        """Return training and held-out records of a bench with something wrong."""
+        key = ("runs", *sorted(wrong.items()))
+        if key not in self.known:
+            self.known[key] = pair_of_runs(self.rig, **wrong)
+        return self.known[key]  # type: ignore[return-value]
+
+    def searched(self, runs: tuple[Run, Run], *names: str) -> Searched:
+        """Return the search of a bench's records for named candidates."""
+        key = (*map(id, runs), *names)
+        if key not in self.known:
+            self.known[key] = (gate_cases.searched(self.rig, *runs, *names), runs)
+        return self.known[key][0]  # type: ignore[index, no-any-return]
+
+    def traced(self, runs: tuple[Run, Run], *names: str, free_forms: bool = False) -> Trace:
+        """Return the whole trace, made anew."""
+        return gate_cases.traced(self.rig, runs, *names, free_forms=free_forms)
+
+    def kept(self, key: str, make: Callable[[], tuple[Run, Run]]) -> tuple[Run, Run]:
+        """Return records made once."""
+        if key not in self.known:
+            self.known[key] = make()
+        return self.known[key]  # type: ignore[return-value]
+
+
+@pytest.fixture(scope="module")
+def benches(rig: Rig) -> Benches:
+    return Benches(rig)
+
+
+def noise_names_nothing(b: Benches, memory: float = 0.0, draws: int = 25) -> None:
+    """Of noise, the best of many candidates is significant at 0.05 about once in twenty times."""
+    s = b.searched(b.runs(), *MANY)
+    data, rng = s.hypotheses.stage, np.random.default_rng(3)
+    time = next(iter(data.rows[0].values())).time
+    keep = np.exp(-float(np.median(np.diff(time))) / memory) if memory else 0.0
+    count = 0
+    for _ in range(draws):
+        white = rng.standard_normal(data.residual.shape)
+        noise = lfilter([np.sqrt(1 - keep**2)], [1.0, -keep], white)
+        field = s.hypotheses.field
+        null = inference.null_maximum(field, data, noise, rng)
+        r = noise.mean(axis=0) * 2.0
+        r = r - field.basis @ (field.basis.T @ r)
+        gains = gate_cases.gains(field, r)
+        count += inference.p_value(float(gains.max()), null) <= 0.05
+    assert count <= 0.05 * draws + 3 * np.sqrt(0.05 * 0.95 * draws)
+
+
+def noise_with_a_memory_names_nothing_either(b: Benches) -> None:
+    noise_names_nothing(b, memory=0.2)
+
+
+def a_leak_is_named_alone_and_for_certain(b: Benches) -> None:
+    s = b.searched(b.runs(c_internal=LEAK), "internal_leakage", "torque_offset")
+    (leak,) = s.judged()
+    assert leak.named
+    assert leak.p_value == pytest.approx(1 / 200)
+    assert leak.parameters["c_internal_2"].value == pytest.approx(LEAK, rel=0.01)
+
+
+def a_leak_gone_on_the_held_out_day_is_refused(b: Benches) -> None:
+    s = b.searched(_cured(b), "internal_leakage")
+    assert not gate(s.judged("internal_leakage"), gates.REMOVES)
+
+
+def _cured(b: Benches) -> tuple[Run, Run]:
+    return b.kept("cured", lambda: (b.runs(c_internal=LEAK)[0], b.runs()[1]))
+
+
+def what_training_alone_shows_is_not_explained(b: Benches) -> None:
+    result = b.traced(_cured(b), "internal_leakage")
+    assert (result.verdict, result.effects) == ("unexplained", ())
+
+
+def a_training_record_cannot_judge(b: Benches) -> None:
+    train = b.runs(c_internal=LEAK)[0]
+    try:
+        b.traced((train, replace(train, records=train.records[:1])), "internal_leakage")
+    except InputError as refusal:
+        assert "sample for sample" in str(refusal)  # noqa: PT017  the mutant raises nothing
+    else:
+        raise AssertionError("the training record was taken for a held-out one")
+
+
+def a_name_that_disturbs_another_equation_is_refused(b: Benches) -> None:
+    """Oil leaves the rod's side; a leak between the chambers would take it from the cap's."""
+    s = b.searched(b.runs(c_rod=LEAK), "internal_leakage")
+    (found,) = s.judged("internal_leakage")
+    assert not gate([found], gates.REMOVES)
+    assert found.removed_fraction > 0.5
+
+
+def a_leak_cannot_pump(b: Benches) -> None:
+    s = b.searched(b.runs(c_internal=-0.25 * LEAK), "internal_leakage")
+    assert s.winner.effects == ()
+    assert not gate(s.judged("internal_leakage"), gates.PHYSICAL)
+
+
+def a_leak_of_one_step_alone_is_no_leak(b: Benches) -> None:
+    runs = b.kept("half", lambda: (
+        joined(b.runs(c_internal=LEAK)[0], experiment(b.rig, seed=5, c_internal=0.6 * LEAK)),
+        b.runs(c_internal=LEAK)[1],
+    ))  # fmt: skip
+    s = b.searched(runs, "internal_leakage")
+    assert not gate(s.judged("internal_leakage"), gates.INVARIANT)
+
+
+def what_no_half_of_the_repeats_chooses_is_not_stable(b: Benches) -> None:
+    s = b.searched(b.runs(c_internal=-0.25 * LEAK), "internal_leakage")
+    assert not gate(s.judged("internal_leakage"), gates.STABLE)
+
+
+def what_noise_makes_as_large_is_not_significant(b: Benches) -> None:
+    s = b.searched(b.runs(), "internal_leakage")
+    assert not gate(s.judged("internal_leakage"), gates.SIGNIFICANT)
+
+
+def a_null_and_its_sensors_offset_are_confounded(b: Benches) -> None:
+    result = b.traced(b.runs(u_null=3e-3), "spool_offset")
+    assert result.verdict == "confounded"
+    assert result.tied == [("sensor_offset", "joint 2")]
+
+
+def a_gain_and_a_crosstalk_that_fit_alike_are_confounded(b: Benches) -> None:
+    s = b.searched(b.runs(gain_cap_pressure=1.02), "sensor_gain", "sensor_crosstalk")
+    assert not gate(s.judged(), gates.ALONE)
+
+
+def _hardened(b: Benches) -> tuple[Run, Run]:
+    def made() -> tuple[Run, Run]:
+        train, held_out = b.runs()
+        return hardening(train, 4e6), hardening(held_out, 4e6)
+
+    return b.kept("hardened", made)
+
+
+def what_a_linear_spring_leaves_of_a_cubic_one_is_not_nothing(b: Benches) -> None:
+    s = b.searched(_hardened(b), "joint_spring", "torque_offset")
+    assert [u.term.name for u in s.winner.effects] == ["joint_spring"]
+    assert "of what repeated stays" in s.left_in(s.winner).get("torque_2", "")
+
+
+def a_cubic_spring_is_not_explained_by_a_linear_one(b: Benches) -> None:
+    assert b.traced(_hardened(b), "joint_spring", "torque_offset").verdict == "unexplained"
+
+
+def a_rest_that_a_cube_holds_speaks_against_a_linear_spring(b: Benches) -> None:
+    """It is within what a named form may miss, 1.8 %."""
+
+    def made() -> tuple[Run, Run]:
+        train, held_out = b.runs(k_spring=5.0)
+        return hardening(train, 3.5e5), hardening(held_out, 3.5e5)
+
+    s = b.searched(b.kept("slightly", made), "joint_spring", "torque_offset")
+    assert "piston_2³" in s.vetoes(s.winner)
+
+
+def seals_that_rub_speak_against_no_leak(b: Benches) -> None:
+    """A formula holds their force, in an equation that the leak does not touch."""
+    hidden = foreign_bench.Hidden(2.6, 2.6, leak=LEAK)
+    runs = b.kept("rubbing", lambda: foreign_bench.pair_of_runs(b.rig, hidden))
+    s = b.searched(runs, "internal_leakage")
+    assert s.vetoes(s.winner) == ""
+
+
+def a_quiet_friction_is_named_beside_a_loud_leak(b: Benches) -> None:
+    hidden = foreign_bench.Hidden(2.0, 2.0, leak=LEAK)
+    runs = b.kept("quiet", lambda: foreign_bench.pair_of_runs(b.rig, hidden))
+    s = b.searched(runs, "internal_leakage", "coulomb_friction")
+    assert s.named() == {"internal_leakage", "coulomb_friction"}
+
+
+def twice_the_noise_on_the_held_out_day_is_not_clean(b: Benches) -> None:
+    """Small moves show no drop of the supply, large ones do: 1.75 times the noise floor."""
+    runs = b.kept("sagging", lambda: (
+        experiment(b.rig, rms=0.012, dp_supply=8e4),
+        experiment(b.rig, repeats=2, seed=2, rms=0.04, dp_supply=8e4),
+    ))  # fmt: skip
+    s = b.searched(runs, "supply_sag")
+    assert list(s.left_in(s.hypotheses.empty)) == ["flow_cap_2"]
+
+
+def a_further_number_must_earn_its_place(b: Benches) -> None:
+    s = b.searched(b.runs(c_internal=LEAK), "internal_leakage", "torque_offset")
+    leak, both = s.set_of("internal_leakage"), s.set_of("internal_leakage", "torque_offset")
+    assert both.total < leak.total
+    assert s.hypotheses.best([leak, both]).keys == leak.keys
+
+
+def an_effect_that_takes_nothing_is_dropped(b: Benches) -> None:
+    s = b.searched(b.runs(c_internal=LEAK), "internal_leakage", "torque_offset")
+    both = s.set_of("internal_leakage", "torque_offset")
+    assert s.hypotheses.prune(both).keys == s.set_of("internal_leakage").keys
+
+
+def levels_that_do_not_differ_are_coulomb_friction(b: Benches) -> None:
+    s = gate_cases.searched(b.rig, *b.runs(Fc=60.0), "asymmetric_friction")
+    assert [u.term.name for u in s.winner.effects] == ["coulomb_friction"]
+
+
+def friction_without_a_memory_is_coulomb_friction_too(b: Benches) -> None:
+    hidden = foreign_bench.Hidden(80.0, 80.0, 5e-3)
+    runs = b.kept("memoryless", lambda: foreign_bench.pair_of_runs(b.rig, hidden))
+    s = gate_cases.searched(b.rig, *runs, "coulomb_friction")
+    assert s.vetoes(s.winner) == ""
+
+
+def a_drop_without_a_name_is_drawn_as_a_curve(b: Benches) -> None:
+    hidden = foreign_bench.Hidden(sag=2e6)
+    runs = b.kept("drop", lambda: foreign_bench.pair_of_runs(b.rig, hidden))
+    result = b.traced(runs, free_forms=True)
+    assert [e.name for e in result.effects] == ["supply_curve"]
+
+
+def the_floor_is_the_noise_that_is_there(b: Benches) -> None:
+    terms = b.searched(b.runs(), "internal_leakage").hypotheses.base
+    (train, _) = b.runs()
+    data = regression_data(b.rig, terms, conditioned_records(b.rig, [train]))
+    for s in data.segments:
+        part = data.residual[:, s.where]
+        assert np.sqrt(part.var(axis=0, ddof=1).mean()) == pytest.approx(1.0, rel=0.02)
+
+
+def repeats_that_do_not_differ_make_no_floor_of_nothing(b: Benches) -> None:
+    (train, _) = b.runs()
+    first = train.records[0].channels
+    same = replace(train, records=tuple(replace(r, channels=first) for r in train.records))
+    terms = b.searched(b.runs(), "internal_leakage").hypotheses.base
+    floors = [
+        regression_data(b.rig, terms, conditioned_records(b.rig, [run])).floors
+        for run in (same, train)
+    ]
+    for alike, noisy in zip(*floors, strict=True):
+        assert alike.noise > 0.1 * noisy.noise
+
+
+def the_order_of_the_repeats_changes_nothing(b: Benches) -> None:
+    data = b.searched(b.runs(c_internal=LEAK), "internal_leakage", "torque_offset").hypotheses.stage
+    turned = with_residual(data, data.residual[::-1])
+    assert turned.mean == pytest.approx(data.mean)
+
+
+def intervals_are_as_wide_as_estimates_scatter(b: Benches) -> None:
+    """Over draws of noise the half-width is about twice the deviation of the estimates."""
+    s = b.searched(b.runs(c_internal=LEAK), "internal_leakage", "torque_offset")
+    data, fit, used = s.hypotheses.stage, s.winner.fit, s.winner.effects[0]
+    (name,), column = jacobian(data, fit, used)
+    base = inference.others(data, fit, (name,))
+    own = (column - base @ (base.T @ column))[:, 0]
+    rng, values, halves = np.random.default_rng(1), [], []
+    for _ in range(30):
+        noise = rng.standard_normal(data.residual.shape)
+        mean = noise.mean(axis=0) * 2.0
+        values.append(float(own @ mean / (own @ own)))
+        left = mean - base @ (base.T @ mean) - own * values[-1]
+        drawn = with_residual(data, noise)
+        model = ExactFit(fit.terms, fit.beta, left)
+        errors = inference.spread(drawn, model, used, {name: values[-1]})
+        low, high = gates._parameters(drawn, used, errors, {})[name].ci95
+        halves.append(0.5 * (high - low))
+    assert 1.4 < np.mean(halves) / np.std(values) < 3.2
+
+
+Story = Callable[[Benches], None]
+STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
+    (noise_names_nothing, ("p always 0", "no family")),
+    (noise_with_a_memory_names_nothing_either, ("flips by sample",)),
+    (a_leak_is_named_alone_and_for_certain, ()),
+    (a_leak_gone_on_the_held_out_day_is_refused, ("removes on held-out",)),
+    (what_training_alone_shows_is_not_explained, ("fit records judge",)),
+    (a_training_record_cannot_judge, ("same records pass",)),
+    (a_name_that_disturbs_another_equation_is_refused, ("harm", "harm never seen")),
+    (a_leak_cannot_pump, ("physics",)),
+    (a_leak_of_one_step_alone_is_no_leak, ("invariance", "tolerance x 10")),
+    (what_no_half_of_the_repeats_chooses_is_not_stable, ("stability", "chosen always")),
+    (what_noise_makes_as_large_is_not_significant, ("family-wise p", "p always 0")),
+    (a_null_and_its_sensors_offset_are_confounded, ("twins",)),
+    (a_gain_and_a_crosstalk_that_fit_alike_are_confounded, ("rivals",)),
+    (what_a_linear_spring_leaves_of_a_cubic_one_is_not_nothing,
+     ("training band", "form tolerance x 10")),
+    (a_cubic_spring_is_not_explained_by_a_linear_one, ("nothing is left",)),
+    (a_rest_that_a_cube_holds_speaks_against_a_linear_spring, ("formula in the rest",)),
+    (seals_that_rub_speak_against_no_leak, ("acted",)),
+    (a_quiet_friction_is_named_beside_a_loud_leak, ("further search",)),
+    (twice_the_noise_on_the_held_out_day_is_not_clean, ("held-out band", "held-out floor x 2")),
+    (a_further_number_must_earn_its_place, ("price of numbers",)),
+    (an_effect_that_takes_nothing_is_dropped, ("pruning",)),
+    (levels_that_do_not_differ_are_coulomb_friction, ("simpler effect",)),
+    (friction_without_a_memory_is_coulomb_friction_too, ("second form",)),
+    (a_drop_without_a_name_is_drawn_as_a_curve, ("free forms",)),
+    (the_floor_is_the_noise_that_is_there, ("floor x 0.3", "floor x 3")),
+    (repeats_that_do_not_differ_make_no_floor_of_nothing, ("least floor",)),
+    (the_order_of_the_repeats_changes_nothing, ("first repeat alone",)),
+    (intervals_are_as_wide_as_estimates_scatter, ("intervals x 0.5", "intervals x 3")),
+)  # fmt: skip
+# No bench is known whose answer they change; the study `ablations` counts it on drawn benches.
+NO_BENCH: Final = {"pairs", "materiality", "material never"}
+
+
+@pytest.mark.parametrize(("story", "broken"), STORIES, ids=[s.__name__ for s, _ in STORIES])
+def test_what_a_gate_is_for_holds_and_is_lost_without_it(
+    benches: Benches, story: Story, broken: tuple[str, ...]
+) -> None:
+    story(benches)
+    known = by_name(RULES + FAULTS)
+    for name in broken:
+        with switched_off(known[name]):
+            try:
+                story(benches)
+            except AssertionError:
+                continue
+        pytest.fail(f"nobody notices: {known[name].off}")
+
+
+def test_every_rule_and_fault_has_a_story() -> None:
+    told = {name for _, broken in STORIES for name in broken}
+    assert set(by_name(RULES + FAULTS)) - told == NO_BENCH

@@ -1,0 +1,199 @@
+"""Which rule of the trace changes which answer: each switched off, the same records traced again.
+
+The records' columns and fits are made once and kept for all rules that leave them alone. What
+comes after the verdict (hidden states by shooting, free runs, clues) is left out.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from typing import Any, Final
+
+from analysis.trace import engine
+from analysis.trace.judge import held_out
+from analysis.trace.judge.shooting import Reshaped
+from analysis.trace.result import Trace
+from analysis.trace.search import hypothesis_set
+from rig.model.records import Run
+from tests.studies.foreign.bench import runs_of
+from tests.studies.foreign.cases import Case, case_of
+from tests.studies.foreign.study import answer_of, bounds
+from tests.studies.pages import Section, Table
+from tests.studies.trace.rules import RULES, Rule, switched_off
+
+log = logging.getLogger(__name__)
+
+ALL: Final = "all rules"
+WRONG: Final = ("wrong", "wrong beside unexplained", "false alarm", "partly")
+SETTLED: Final = ("right", "in class", "refused")
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What the trace says of a bench without a rule; plain data."""
+
+    rule: str
+    seed: int
+    label: str
+    kind: str
+    answer: str
+    verdict: str
+    named: tuple[tuple[str, str], ...]
+    loudness: float
+    seconds: float
+
+
+class Kept:
+    """Results of slow functions by their arguments, kept for one bench."""
+
+    def __init__(self) -> None:
+        self.results: dict[Any, Any] = {}
+        self.alive: list[Any] = []  # what keys name by identity must not be freed
+
+    def but(self, name: str) -> Kept:
+        """Return what is kept, without the results of one function."""
+        other = Kept()
+        other.results = {key: value for key, value in self.results.items() if key[0] != name}
+        other.alive = self.alive
+        return other
+
+    def __call__(self, function: Callable[..., Any], key: Callable[..., Any]) -> Any:
+        """Return the function remembering what it returned for a key."""
+
+        def remembered(*arguments: Any, **named: Any) -> Any:
+            at = (function.__name__, key(*arguments))
+            if at not in self.results:
+                self.results[at] = function(*arguments, **named)
+                self.alive.append(arguments)
+            return self.results[at]
+
+        return remembered
+
+
+@contextmanager
+def decisions_only(kept: Kept) -> Iterator[None]:
+    """Trace up to the verdict, columns and fits out of what was `kept`."""
+    changes = (
+        (engine, "conditioned_records",
+         kept(engine.conditioned_records, lambda _, runs, **k: tuple(map(id, runs)))),
+        (engine, "regression_data",
+         kept(engine.regression_data, lambda _, terms, members, beta=None: (terms, id(members)))),
+        (engine, "identify", kept(engine.identify, lambda runs, **k: tuple(map(id, runs)))),
+        (engine, "_extended", lambda runs, terms, winner, before, *_: before),
+        (engine, "reshaped", lambda runs, holdout, after, train, judged, one: Reshaped(one, ())),
+        (engine, "clues_to", lambda *_: ((), ())),
+        (held_out, "free_runs", lambda *_: (held_out.FreeRunErrors({}, {}, {}),) * 2),
+        (hypothesis_set, "refine",
+         kept(hypothesis_set.refine, lambda data, terms, *_: (id(data), terms))),
+        (hypothesis_set, "rebased",
+         kept(hypothesis_set.rebased, lambda data, model: (id(data), id(model)))),
+        (hypothesis_set, "variant_columns",
+         kept(hypothesis_set.variant_columns, lambda data, chosen, *_: (id(data), tuple(chosen)))),
+    )  # fmt: skip
+    with switched_off(Rule("", "", changes)):
+        yield
+
+
+def answers(
+    case: Case, runs: tuple[Run, list[Run]], rules: Sequence[Rule] = RULES
+) -> Iterator[Answer]:
+    """Trace a bench with all rules, then without each."""
+    kept = Kept()
+    every = Rule(ALL, "", ())
+    for rule in (every, *rules):
+        started = time.process_time()
+        with switched_off(rule), decisions_only(kept.but("refine") if rule.refits else kept):
+            found = engine.trace([runs[0]], runs[1], look_ahead=False)
+        yield _answer(case, rule, found, time.process_time() - started)
+
+
+def _answer(case: Case, rule: Rule, found: Trace, seconds: float) -> Answer:
+    named = tuple((e.name, e.where) for e in found.effects)
+    return Answer(
+        rule.name, case.seed, case.label, case.kind,
+        answer_of(case, found.verdict, set(named), set(found.tied)), found.verdict, named,
+        max(f.ratio for f in found.floors), seconds,
+    )  # fmt: skip
+
+
+def perform(seed: int, rules: Sequence[Rule] = RULES) -> list[Answer]:
+    """Make the records of a foreign bench and return its answers without each rule."""
+    case = case_of(seed)
+    return list(answers(case, runs_of(case.bench, seed), rules))
+
+
+def as_json(found: Sequence[Answer]) -> dict[str, Any]:
+    """Return answers as plain data."""
+    return {"answers": [asdict(a) for a in found]}
+
+
+def loaded(_: int, data: Mapping[str, Any]) -> list[Answer]:
+    """Return kept answers."""
+    return [Answer(**{**a, "named": tuple((n, w) for n, w in a["named"])}) for a in data["answers"]]
+
+
+def sections(found: Mapping[int, Sequence[Answer]], command: str) -> list[Section]:
+    """Return the page: a table of rules with changed answers, and every change in words."""
+    rows, changes = [], []
+    for rule in RULES:
+        pairs = [
+            (next(a for a in answers if a.rule == ALL), without)
+            for answers in found.values()
+            for without in answers
+            if without.rule == rule.name
+        ]
+        changed = [(a, b) for a, b in pairs if (a.verdict, a.named) != (b.verdict, b.named)]
+        lost = sum(a.answer in SETTLED and b.answer not in SETTLED for a, b in changed)
+        won = sum(a.answer not in SETTLED and b.answer in SETTLED for a, b in changed)
+        wrong = sum(a.answer not in WRONG and b.answer in WRONG for a, b in changed)
+        cured = sum(a.answer in WRONG and b.answer not in WRONG for a, b in changed)
+        rows.append([
+            rule.name, rule.off,
+            *(str(n) for n in (len(pairs), len(changed), lost, wrong, won, cured)),
+        ])  # fmt: skip
+        changes += [
+            [
+                str(a.seed),
+                a.label,
+                rule.name,
+                f"{a.answer}: {_words(a)}",
+                f"{b.answer}: {_words(b)}",
+            ]
+            for a, b in changed
+        ]
+    base = [next(a for a in answers if a.rule == ALL) for answers in found.values()]
+    settled, wrong = (sum(a.answer in set_of for a in base) for set_of in (SETTLED, WRONG))
+    low, high = bounds(settled, len(base))
+    idle = [row[0] for row in rows if row[3] == "0"]
+    return [
+        Section("", (
+            f"{len(base)} benches of textbook physics (`python -m tests.studies foreign`), drawn "
+            f"by seed, each traced with all rules and again without each of {len(RULES)}. With "
+            f"all rules {settled} answers are right, in class or a right refusal "
+            f"({100 * low:.0f} to {100 * high:.0f} %, 95 %), {wrong} wrong or partial. "
+            "Made by:",
+            f"```sh\n{command}\n```",
+            "*Changed*: verdict or names differ. *Lost*: settled before, not without the rule. "
+            "*Wrong*: a wrong or partial name, or a false alarm, that the rule had kept away. "
+            "*Won* and *cured* are the reverse: what the rule costs.",
+            Table("Answers changed by a rule's absence",
+                  ("rule", "without it", "benches", "changed", "lost", "wrong", "won", "cured"),
+                  rows),
+            "No answer changed here without: " + (", ".join(idle) or "none") + ". On so few "
+            "benches that is no proof that a rule is idle; the tests of the gates "
+            "(`tests/analysis/trace/test_gates.py`) hold a bench for each that needs it.",
+        )),
+        Section("Every change", (
+            Table("With all rules, and without one",
+                  ("seed", "hidden", "without", "all rules", "without it"), changes),
+        )),
+    ]  # fmt: skip
+
+
+def _words(answer: Answer) -> str:
+    named = ", ".join(f"{n} at {w}" for n, w in answer.named) or "nothing named"
+    return f"{answer.verdict}, {named}"

@@ -1,0 +1,78 @@
+"""The studies `ablations`, `isolability` and `baselines`: what carries the trace's answers."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rig.cli.options import JsonOption
+from rig.cli.output import progress, write_json
+from tests.studies.estimators.command import ClusterOption, KeepOption, WorkersOption
+
+if TYPE_CHECKING:
+    from tests.studies.pages import Section
+    from tests.studies.trace.ablations import Answer
+
+PageOption = Annotated[Path | None, typer.Option("--docs", help="Also write the page here.")]
+
+
+def ablations(
+    seed: Annotated[int, typer.Option(min=0, help="First seed; even ones judge.")] = 9000,
+    count: Annotated[int, typer.Option(min=1, help="Of benches.")] = 12,
+    workers: WorkersOption = 1,
+    cluster: ClusterOption = None,
+    json: JsonOption = None,
+    keep: KeepOption = None,
+    docs: PageOption = None,
+) -> None:
+    """Trace foreign benches with every rule and without each, and count changed answers.
+
+    Example: python -m tests.studies ablations --count 2
+    """
+    from tests.studies.pool import Kept, performed
+    from tests.studies.trace.ablations import ALL, as_json, loaded, perform, sections
+
+    def tell(done: int, of: int, job: int, found: list[Answer] | Exception) -> None:
+        if isinstance(found, Exception):
+            progress(f"{done}/{of} seed {job}: no records ({found})")
+            return
+        base = next(a for a in found if a.rule == ALL)
+        others = [a for a in found if (a.verdict, a.named) != (base.verdict, base.named)]
+        seconds = sum(a.seconds for a in found)
+        progress(
+            f"{done}/{of} seed {job} {base.label}: {base.answer}; {len(others)} rules change it, "
+            f"{seconds:.0f} s"
+        )
+
+    kept = Kept(keep, lambda job: f"{job}.json", as_json, loaded) if keep else None
+    work = [seed + 2 * k for k in range(count)]
+    done = performed(work, perform, cluster or workers, tell, kept, left_out=(Exception,))
+    found = dict(sorted(done, key=lambda pair: pair[0]))
+    write_json(json, {str(k): as_json(v) for k, v in found.items()})
+    _show("What each rule of the trace is worth", sections(found, _command(
+        "ablations", {"--seed": seed, "--count": count}, docs)), json, docs)  # fmt: skip
+
+
+def _command(name: str, options: dict[str, int], docs: Path | None) -> str:
+    words = [word for option, value in options.items() for word in (option, str(value))]
+    page = ["--docs", str(docs)] if docs is not None else []
+    return shlex.join(["python", "-m", "tests.studies", name, *words, *page])
+
+
+def _show(title: str, page: Sequence[Section], json: Path | None, docs: Path | None) -> None:
+    """Write the page where asked, and show it on the screen."""
+    from tests.studies import pages
+
+    if docs is not None:
+        pages.write_page(docs, title, page)
+    if json != Path("-"):
+        typer.echo(pages.text(page))
+
+
+def register(app: typer.Typer) -> None:
+    """Add these studies to the command line."""
+    app.command()(ablations)

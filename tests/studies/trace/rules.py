@@ -1,0 +1,207 @@
+"""Rules of the trace's judgement, and how each is switched off or broken.
+
+`RULES` are switched off one at a time by the study `ablations`; `FAULTS` break a rule or a
+statistic, and the tests assert that each of both is noticed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.effects.friction import Friction
+from analysis.effects.measurement import SensorOffset
+from analysis.effects.valve import SpoolOffset
+from analysis.regression import solve
+from analysis.trace import engine, remaining
+from analysis.trace.data import noise_floor, regression_data
+from analysis.trace.judge import gates, inference
+from analysis.trace.search import linear_fit, refinement
+from analysis.trace.search.hypothesis_set import HypothesisSet
+from analysis.trace.settings import TRACE
+
+Array = NDArray[np.float64]
+Change = tuple[Any, str, Any]
+
+
+@dataclass(frozen=True)
+class Rule:
+    """A rule: what its absence means, and the (object, attribute, value) that switch it off.
+
+    `refits`: the fits themselves change, and none may be kept from another rule's trace.
+    """
+
+    name: str
+    off: str
+    changes: tuple[Change, ...]
+    refits: bool = False
+
+
+@contextmanager
+def switched_off(rule: Rule) -> Iterator[None]:
+    """Trace without a rule while the context lasts."""
+    kept: list[Change] = []
+    try:
+        for subject, name, value in rule.changes:
+            kept.append((subject, name, getattr(subject, name)))
+            _put(subject, name, value)
+        yield
+    finally:
+        for subject, name, value in reversed(kept):
+            _put(subject, name, value)
+
+
+def _put(subject: Any, name: str, value: Any) -> None:
+    """Set an attribute, that of the frozen settings too."""
+    if subject is TRACE:
+        object.__setattr__(subject, name, value)
+    else:
+        setattr(subject, name, value)
+
+
+def setting(name: str, value: Any) -> Change:
+    """Return a change of one of the trace's settings."""
+    return TRACE, name, value
+
+
+def _one_candidate(
+    candidates: linear_fit.CandidateColumns, train_data: Any, residual: Array, rng: Any
+) -> Array:
+    """Return the gain of the candidate that stands first under each flip, of no other."""
+    r = inference.flipped(train_data, TRACE.flips, rng, residual)
+    r = r - candidates.basis @ (candidates.basis.T @ r)
+    size = np.maximum(np.diag(candidates.K), 1e-300)
+    first = int(np.argmax(size > linear_fit.VISIBLE**2 * candidates.raw))
+    gain: Array = (candidates.columns[:, first] @ r) ** 2 / size[first]
+    return gain
+
+
+def _single_rows(train_data: Any, *_: Any, **__: Any) -> NDArray[np.int64]:
+    return np.arange(train_data.base.shape[0])
+
+
+def _widths(factor: float) -> Callable[[Any, Any], Array]:
+    true = solve.half_width
+    return lambda std, dof: factor * np.asarray(true(std, dof))
+
+
+def _floors(factor: float) -> Callable[..., list[noise_floor.Floor]]:
+    true = noise_floor.floors
+
+    def scaled(*arguments: Any) -> list[noise_floor.Floor]:
+        return [
+            noise_floor.Floor(
+                f.group, f.equation, factor * f.noise, f.repeatable, f.total, f.count, f.source
+            )
+            for f in true(*arguments)
+        ]
+
+    return scaled
+
+
+def _same_records() -> Callable[..., Any]:
+    """Return a `regression_data` that gives the training records where held-out ones are asked."""
+    true, seen = regression_data.regression_data, {}
+
+    def fitted_again(rig: Any, terms: Any, members: Any, beta: Any = None) -> Any:
+        if beta is None:
+            seen["fitted"] = true(rig, terms, members)
+        return seen["fitted"]
+
+    return fitted_again
+
+
+def _first_repeat(train_data: regression_data.RegressionData) -> Array:
+    """Return the first repeat's residual as if it were the average of all."""
+    weights = np.zeros(train_data.residual.shape[1])
+    for s in train_data.segments:
+        weights[s.where] = np.sqrt(s.repeats)
+    return np.asarray(train_data.residual[0] * weights)
+
+
+RULES: Final = (
+    Rule("removes on held-out", "an effect need not help on held-out records",
+         (setting("removed", -math.inf),)),
+    Rule("harm", "an effect may disturb an equation that was quieter without it",
+         (setting("harm", math.inf),)),
+    Rule("physics", "any sign, size and shape", ((HypothesisSet, "physical", lambda *_: ""),)),
+    Rule("invariance", "a size may differ between steps, halves, directions, speeds",
+         ((gates, "invariance", lambda *_: []),)),
+    Rule("stability", "an effect need not be chosen in half-samples", (setting("chosen", -1.0),)),
+    Rule("family-wise p", "no test against chance", (setting("p_limit", 1.0),)),
+    Rule("rivals", "no other effect counts as tied", ((gates, "_rivals", lambda *_: []),)),
+    Rule("twins", "what is one to the data is not said to be",
+         ((SpoolOffset, "twins", lambda _: ()), (SensorOffset, "twins", lambda _: ()))),
+    Rule("training band", "any share of the training energy may stay",
+         (setting("missed", math.inf),)),
+    Rule("held-out band", "any held-out error may stay", (setting("held_band", math.inf),)),
+    Rule("formula in the rest", "a rest that one formula holds is not asked for",
+         (setting("formula", math.inf),)),
+    Rule("acted", "a formula's rest speaks against any effect, in whichever equation",
+         (setting("acted", math.inf),)),
+    Rule("materiality", "a further effect is always named",
+         ((engine, "_moved", lambda *_: math.inf),)),
+    Rule("further search", "quiet equations are not searched again",
+         ((HypothesisSet, "closer", lambda *_: None),)),
+    Rule("price of numbers", "a further number costs nothing",
+         ((linear_fit, "CHANCE", 0.0), (linear_fit, "AS_GOOD", 1.0), (linear_fit, "ADD_SHARE", 0.0),
+          (refinement, "CHANCE", 0.0)), refits=True),
+    Rule("pruning", "effects that take little are kept",
+         ((HypothesisSet, "prune", lambda _, one: one),)),
+    Rule("simpler effect", "an effect that has become a simpler one is not tried as that",
+         ((HypothesisSet, "_simplified", lambda *_: None),)),
+    Rule("pairs", "no pair is tried from the first board",
+         ((HypothesisSet, "_pairs", lambda *_: []),)),
+    Rule("second form", "an effect is tried in its first form alone",
+         ((Friction, "other_forms", lambda *_: ()),), refits=True),
+    Rule("free forms", "no mechanism without a name", ((engine, "_drawn", lambda *_: None),)),
+)  # fmt: skip
+
+FAULTS: Final = (
+    Rule("p always 0", "every gain is significant",
+         ((inference, "p_value", lambda *_: 0.0),)),
+    Rule("no family", "the null is one candidate's, not the largest of all",
+         ((inference, "null_maximum", _one_candidate),)),
+    Rule("flips by sample", "noise with a memory counts as many independent samples",
+         ((inference, "blocks", _single_rows),)),
+    Rule("chosen always", "every half-sample is said to choose the effect",
+         ((inference, "stability", lambda _, one, __: dict.fromkeys(one.keys, (1.0, {}))),)),
+    Rule("harm never seen", "no equation is said to get worse",
+         ((gates, "_worse", lambda *_: []),)),
+    Rule("held-out floor x 2", "held-out errors of 3 times the floor pass",
+         (setting("held_band", 3.0),)),
+    Rule("form tolerance x 10", "half of what repeated may stay",
+         (setting("missed", 0.5), setting("missed_held", 1.0)),),
+    Rule("floor x 0.3", "the noise is taken for a third", tuple(
+        (module, "floors", _floors(0.3)) for module in (noise_floor, regression_data)), True),
+    Rule("floor x 3", "the noise is taken for three times as large", tuple(
+        (module, "floors", _floors(3.0)) for module in (noise_floor, regression_data)), True),
+    Rule("least floor", "the floor may lie anywhere below the stated noise",
+         ((noise_floor, "LEAST", 0.0),), refits=True),
+    Rule("fit records judge", "the records that were fitted are those that judge",
+         ((engine, "regression_data", _same_records()),), True),
+    Rule("same records pass", "a held-out record may be a training record",
+         ((engine, "_refuse_same", lambda *_: None),)),
+    Rule("first repeat alone", "the average is the first repeat",
+         ((regression_data.RegressionData, "mean", property(_first_repeat)),), True),
+    Rule("intervals x 0.5", "intervals are half as wide", ((gates, "half_width", _widths(0.5)),)),
+    Rule("intervals x 3", "intervals are three times as wide",
+         ((gates, "half_width", _widths(3.0)),)),
+    Rule("tolerance x 10", "a size may differ twofold between parts",
+         (setting("tolerance", 2.0),)),
+    Rule("nothing is left", "whatever stays counts as nothing",
+         ((remaining, "left_over", lambda *_: []), (engine, "left_over", lambda *_: []))),
+    Rule("material never", "a further effect is never material",
+         ((engine, "_moved", lambda *_: 0.0),)),
+)  # fmt: skip
+
+
+def by_name(rules: tuple[Rule, ...]) -> Mapping[str, Rule]:
+    """Return rules by their names."""
+    return {rule.name: rule for rule in rules}
