@@ -57,6 +57,22 @@ def ablations(
         "ablations", {"--seed": seed, "--count": count}, docs)), json, docs)  # fmt: skip
 
 
+def isolability(
+    seed: Annotated[int, typer.Option(min=0, help="Of the records.")] = 9000,
+    docs: PageOption = None,
+) -> None:
+    """Compute which pairs of effects the shipped protocol can separate, from columns and noise.
+
+    Example: python -m tests.studies isolability
+    """
+    from tests.studies.trace.isolability import isolability as matrix_of
+    from tests.studies.trace.isolability import sections, shipped_run
+
+    run = shipped_run(seed)
+    page = sections(matrix_of(run), _command("isolability", {"--seed": seed}, docs), run)
+    _show("Which effects an experiment can separate", page, None, docs)
+
+
 def _command(name: str, options: dict[str, int], docs: Path | None) -> str:
     words = [word for option, value in options.items() for word in (option, str(value))]
     page = ["--docs", str(docs)] if docs is not None else []
@@ -76,3 +92,4 @@ def _show(title: str, page: Sequence[Section], json: Path | None, docs: Path | N
 def register(app: typer.Typer) -> None:
     """Add these studies to the command line."""
     app.command()(ablations)
+    app.command()(isolability)

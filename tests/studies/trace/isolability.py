@@ -1,0 +1,168 @@
+"""Which pairs of effects an experiment can separate, from columns and noise alone.
+
+With every effect a at its smallest size of interest, the whitened change of the rows that it makes
+(noise 1 per row), and P_b the projection off the baseline's columns and those of another effect b,
+ d(a | b) = min over b's shapes of ||P_b a||,
+in standard deviations of the noise: what stays of a when b, at any size and any shape of its grid,
+is fitted in its place. The diagonal has d(a) = ||P a||, without another effect. No answer of the
+trace enters.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.effects.base import Effect
+from analysis.report.plots.style import INK, figure, style, svg
+from analysis.terms import baseline_of
+from analysis.terms.base import Used
+from analysis.trace.data.candidates import Variant, catalogue, variants
+from analysis.trace.data.conditioned_record import conditioned_records
+from analysis.trace.data.regression_data import (
+    RegressionData,
+    VariantColumns,
+    regression_data,
+    variant_columns,
+)
+from analysis.trace.next_experiment.discrimination import smallest
+from analysis.trace.search.linear_fit import orthonormal
+from rig.model.records import Run
+from tests.studies.pages import Picture, Section, Table
+
+Array = NDArray[np.float64]
+
+PROTOCOL: Final = "lock-and-excite-multisine"
+SEEN: Final = 10.0  # standard deviations from which an effect is seen, or told from another
+
+
+@dataclass(frozen=True)
+class Isolability:
+    """Distances (K, K) of K effects in standard deviations of the noise; row: what is there."""
+
+    names: tuple[str, ...]
+    distance: Array
+
+    @property
+    def inseparable(self) -> list[tuple[str, str, float, float]]:
+        """Pairs of which either, seen alone, cannot be told from the other; the larger first."""
+        out = []
+        K = len(self.names)
+        for a in range(K):
+            for b in range(K):
+                alone, beside = self.distance[a, a], self.distance[a, b]
+                if a != b and alone >= SEEN > beside:
+                    out.append((self.names[a], self.names[b], float(alone), float(beside)))
+        return sorted(out, key=lambda row: row[3])
+
+
+def shipped_run(seed: int) -> Run:
+    """Return the records that the demonstration's protocol takes of a clean simulated bench."""
+    from rig.runs.rigs import load_rig
+    from tests.studies.direct_bench import simulated_run
+
+    return simulated_run(load_rig("shinshu-2dof"), PROTOCOL, seed)[0]
+
+
+def isolability(run: Run, joint: int = 2) -> Isolability:
+    """Return the matrix of every named effect at one joint, at the bench or at its sensors."""
+    rig = run.rig
+    terms = tuple(map(Used, baseline_of(rig)))
+    data = regression_data(rig, terms, conditioned_records(rig, [run]))
+    here = [e for e in catalogue(rig) if e.where.startswith(("bench", f"joint {joint}"))]
+    least = {e: found for e in here if (found := _least(data, e)) is not None}
+    changes = {e: change for e, (change, _) in least.items()}
+    grids: dict[Effect, list[Array]] = {e: [columns] for e, (_, columns) in least.items()}
+    for entry in variant_columns(data, variants(rig, list(changes))):
+        if entry.variant.effect in grids:
+            grids[entry.variant.effect].append(entry.columns)
+    base = orthonormal(data.base)
+    own = [_off(base, change) for change in changes.values()]
+    distance = np.zeros((len(own), len(own)))
+    for b, effect in enumerate(changes):
+        bases = [orthonormal(_off(base, columns)) for columns in grids[effect]]
+        for a, change in enumerate(own):
+            left = [np.linalg.norm(_off(basis, change)) for basis in bases]
+            distance[a, b] = np.linalg.norm(change) if a == b else min(left)
+    return Isolability(tuple(f"{e.name} {_short(e)}".strip() for e in changes), distance)
+
+
+def _short(effect: Effect) -> str:
+    words = effect.where.split()
+    return " ".join(words[2:])
+
+
+def _off(basis: Array, columns: Array) -> Array:
+    return np.asarray(columns - basis @ (basis.T @ columns))
+
+
+def _least(data: RegressionData, effect: Effect) -> tuple[Array, Array] | None:
+    """Return the whitened change (M,) of an effect of the smallest size of interest, its columns.
+
+    None where it has no such size, or does not show on these records.
+    """
+    explanation = smallest(effect, data.rig)
+    if explanation is None:
+        return None
+    (used,) = explanation.effects
+    entries: list[VariantColumns] = variant_columns(data, [Variant(effect, used.shape)])
+    if not entries:
+        return None
+    (entry,) = entries
+    sizes = {"": 1.0, **explanation.beta}
+    change = entry.columns @ np.array([sizes.get(n, 0.0) for n in entry.names])
+    return np.asarray(change), entry.columns
+
+
+def picture(found: Isolability) -> str:
+    """Draw the matrix: dark where an effect stands out of the noise beside another."""
+    K = len(found.names)
+    with style():
+        made = figure(0.175 * K + 1.9, 0.175 * K + 2.4)
+        axes = made.add_subplot()
+        shown = np.log10(np.clip(found.distance, 1.0, 1e4))
+        image = axes.imshow(shown, cmap="Blues", vmin=0.0, vmax=4.0, aspect="equal")
+        for a, b in zip(*np.nonzero(found.distance < SEEN), strict=True):
+            alone = found.distance[a, a] >= SEEN
+            axes.plot(b, a, "x" if alone else ".", color="#d55e00" if alone else INK, ms=4)
+        axes.set_xticks(range(K), found.names, rotation=90, fontsize=6)
+        axes.set_yticks(range(K), found.names, fontsize=6)
+        axes.set_xlabel("fitted in its place, at any size")
+        axes.set_ylabel("there, at its smallest size of interest")
+        bar = made.colorbar(image, ax=axes, shrink=0.6)
+        bar.set_ticks([0, 1, 2, 3, 4], labels=["1", "10", "100", "1000", "10 000"])
+        bar.set_label("what stays, standard deviations of noise")
+        made.tight_layout()
+        return str(svg(made, "isolability", "Which effects can be told from which"))
+
+
+def sections(found: Isolability, command: str, run: Run) -> list[Section]:
+    """Return the page: picture, the pairs that cannot be told apart, what is not seen at all."""
+    quiet = [n for k, n in enumerate(found.names) if found.distance[k, k] < SEEN]
+    pairs = found.inseparable
+    K = len(found.names)
+    seen = K - len(quiet)
+    return [
+        Section("", (
+            f"Of {K} effects at joint 2, its sensors or the bench, each at the smallest size of "
+            f"interest, {seen} stand at least {SEEN:g} standard deviations of noise out of what "
+            f"the baseline absorbs ({PROTOCOL}, {len(run.records)} records). Of their "
+            f"{seen * (K - 1)} ordered pairs {len(pairs)} cannot be told apart: what stays when "
+            "the other is fitted in its place is below that. It follows from the "
+            "records' columns and the noise floor by linear algebra; what the trace answers, the "
+            "confusion table of [trace.md](trace.md), cannot be better than this, at this size. "
+            "Larger effects, and other poses, tell more.",
+            "Made by:",
+            f"```sh\n{command}\n```",
+            Picture("matrix.svg", picture(found), "Rows: the effect that is there. Columns: the "
+                    "effect fitted in its place; on the diagonal none. Crosses: seen alone, not "
+                    "told from the other. Dots: not seen at all."),
+            Table("Seen alone, but not told from another (standard deviations of noise)",
+                  ("there", "fitted in its place", "alone", "what stays"),
+                  [[a, b, f"{alone:.0f}", f"{left:.1f}"] for a, b, alone, left in pairs]),
+            "Not seen at their smallest size of interest: " + (", ".join(quiet) or "none") + ".",
+        )),
+    ]  # fmt: skip
