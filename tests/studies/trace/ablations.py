@@ -77,23 +77,21 @@ class Kept:
 @contextmanager
 def decisions_only(kept: Kept) -> Iterator[None]:
     """Trace up to the verdict, columns and fits out of what was `kept`."""
+    remembered: tuple[tuple[Any, str, Callable[..., Any]], ...] = (
+        (engine, "conditioned_records", lambda _, runs, **k: tuple(map(id, runs))),
+        (engine, "regression_data", lambda _, terms, members, beta=None: (terms, id(members))),
+        (engine, "identify", lambda runs, **k: tuple(map(id, runs))),
+        (hypothesis_set, "refine", lambda data, terms, *_: (id(data), terms)),
+        (hypothesis_set, "rebased", lambda data, model: (id(data), id(model))),
+        (hypothesis_set, "variant_columns", lambda data, chosen, *_: (id(data), tuple(chosen))),
+    )
     changes = (
-        (engine, "conditioned_records",
-         kept(engine.conditioned_records, lambda _, runs, **k: tuple(map(id, runs)))),
-        (engine, "regression_data",
-         kept(engine.regression_data, lambda _, terms, members, beta=None: (terms, id(members)))),
-        (engine, "identify", kept(engine.identify, lambda runs, **k: tuple(map(id, runs)))),
+        *((module, name, kept(getattr(module, name), key)) for module, name, key in remembered),
         (engine, "_extended", lambda runs, terms, winner, before, *_: before),
         (engine, "reshaped", lambda runs, holdout, after, train, judged, one: Reshaped(one, ())),
         (engine, "clues_to", lambda *_: ((), ())),
         (held_out, "free_runs", lambda *_: (held_out.FreeRunErrors({}, {}, {}),) * 2),
-        (hypothesis_set, "refine",
-         kept(hypothesis_set.refine, lambda data, terms, *_: (id(data), terms))),
-        (hypothesis_set, "rebased",
-         kept(hypothesis_set.rebased, lambda data, model: (id(data), id(model)))),
-        (hypothesis_set, "variant_columns",
-         kept(hypothesis_set.variant_columns, lambda data, chosen, *_: (id(data), tuple(chosen)))),
-    )  # fmt: skip
+    )
     with switched_off(Rule("", "", changes)):
         yield
 

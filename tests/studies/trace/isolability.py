@@ -10,9 +10,11 @@ trace enters.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import Final
 
+import matplotlib as mpl
 import numpy as np
 from numpy.typing import NDArray
 
@@ -87,12 +89,15 @@ def isolability(run: Run, joint: int = 2) -> Isolability:
         for a, change in enumerate(own):
             left = [np.linalg.norm(_off(basis, change)) for basis in bases]
             distance[a, b] = np.linalg.norm(change) if a == b else min(left)
-    return Isolability(tuple(f"{e.name} {_short(e)}".strip() for e in changes), distance)
+    names = tuple(f"{e.name.replace('_', ' ')} {_short(e)}".strip() for e in changes)
+    return Isolability(names, distance)
 
 
 def _short(effect: Effect) -> str:
+    """Return a place without the joint: a side, a sensor, or the bench."""
     words = effect.where.split()
-    return " ".join(words[2:])
+    rest = words if words[0] == "bench" else words[2:]
+    return f"({' '.join(rest)})" if rest else ""
 
 
 def _off(basis: Array, columns: Array) -> Array:
@@ -120,22 +125,30 @@ def _least(data: RegressionData, effect: Effect) -> tuple[Array, Array] | None:
 def picture(found: Isolability) -> str:
     """Draw the matrix: dark where an effect stands out of the noise beside another."""
     K = len(found.names)
+    steps = np.clip(np.floor(2 * np.log10(np.maximum(found.distance, 1.0))), 0, 8).astype(int)
+    shades = mpl.colormaps["Blues"](np.linspace(0.0, 0.9, 9))
     with style():
-        made = figure(0.175 * K + 1.9, 0.175 * K + 2.4)
+        made = figure(0.175 * K + 2.4, 0.175 * K + 2.2)
         axes = made.add_subplot()
-        shown = np.log10(np.clip(found.distance, 1.0, 1e4))
-        image = axes.imshow(shown, cmap="Blues", vmin=0.0, vmax=4.0, aspect="equal")
+        for row, classes in enumerate(steps):
+            ends = np.flatnonzero(np.diff(classes, prepend=-1, append=-1))
+            for start, stop in itertools.pairwise(ends.tolist()):
+                span = [(start - 0.5, stop - start)]
+                axes.broken_barh(span, (row - 0.5, 1.0), color=shades[classes[start]], lw=0)
         for a, b in zip(*np.nonzero(found.distance < SEEN), strict=True):
             alone = found.distance[a, a] >= SEEN
-            axes.plot(b, a, "x" if alone else ".", color="#d55e00" if alone else INK, ms=4)
+            axes.text(b, a, "×" if alone else "·", color="#d55e00" if alone else INK,
+                      ha="center", va="center_baseline", fontsize=9)  # fmt: skip
+        for k in range(0, 9, 2):
+            axes.plot([], [], "-", color=shades[k], lw=6, label=f"{10 ** (k // 2):,}")
+        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=5, frameon=False,
+                    title="what stays, standard deviations of noise")  # fmt: skip
+        axes.set(xlim=(-0.5, K - 0.5), ylim=(K - 0.5, -0.5), aspect="equal")
         axes.set_xticks(range(K), found.names, rotation=90, fontsize=6)
         axes.set_yticks(range(K), found.names, fontsize=6)
         axes.set_xlabel("fitted in its place, at any size")
         axes.set_ylabel("there, at its smallest size of interest")
-        bar = made.colorbar(image, ax=axes, shrink=0.6)
-        bar.set_ticks([0, 1, 2, 3, 4], labels=["1", "10", "100", "1000", "10 000"])
-        bar.set_label("what stays, standard deviations of noise")
-        made.tight_layout()
+        made.subplots_adjust(left=0.19, right=0.99, bottom=0.2, top=0.93)
         return str(svg(made, "isolability", "Which effects can be told from which"))
 
 
