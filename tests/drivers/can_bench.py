@@ -73,6 +73,11 @@ class SpoiledAdapter:
         return str(self._end.endpoint)
 
     @property
+    def attended(self) -> bool:
+        """Whether a program has the bus open."""
+        return bool(self._end.attended)
+
+    @property
     def free(self) -> bool:
         """Whether somebody listens."""
         return bool(self._end.free)

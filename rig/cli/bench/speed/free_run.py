@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
@@ -24,7 +26,7 @@ from analysis.simulation.synthetic import multisine
 from analysis.simulation.twin import holding_state
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
-from rig.cli.bench.speed import hand_fused
+from rig.cli.bench.speed import cvodes, hand_fused
 from rig.cli.bench.timing import REPEATS, spent_together
 from rig.model.rig import Rig
 
@@ -39,10 +41,11 @@ TOLERANCES: Final = tuple(10.0 ** (-exponent / 4.0) for exponent in range(16, 41
 def free_run_times(rig: Rig, repeats: int = REPEATS) -> dict[str, Any]:
     """Return what a free run of 10 s with both joints moving takes, beside what it is held against.
 
-    `own`, `hand`, `odeint`: processor time of this program, of the same equations and steps written
-    by hand (`hand_fused`), and of scipy's odeint over the same compiled right-hand side at the
-    loosest tolerance at which no state is less exact (largest error over its range, LSODA at rtol
-    1e-12 being the truth). All have the same output: states, pistons, their speeds.
+    `own`, `hand`, `odeint`, `cvodes`: processor time of this program, of the same equations and
+    steps written by hand (`hand_fused`), of scipy's odeint over the same compiled right-hand side,
+    and of CVODES from generated C (with the extra `bench`), both at the loosest tolerance at which
+    no state is less exact (largest error over its range, LSODA at rtol 1e-12 being the truth). All
+    have the same output: states, pistons, their speeds.
     """
     model, drive, start = both_moving(rig)
     ready = compiled(model)
@@ -74,10 +77,10 @@ def free_run_times(rig: Rig, repeats: int = REPEATS) -> dict[str, Any]:
     own = np.hstack((found.q, found.qd, found.p_cap, found.p_rod))
     exact = error(own)
     rtol = next(r for r in TOLERANCES if error(odeint(r)) <= exact)
+    errors = {"odeint_error": error(odeint(rtol))}
     links = [joint.linkage for joint in rig.joints]
 
-    def by_odeint() -> None:
-        states = odeint(rtol)
+    def pistons(states: Array) -> None:
         for i, link in enumerate(links):
             link.piston(states[:, i])
             _ = link.jacobian(states[:, i]) * states[:, 2 + i]
@@ -85,16 +88,24 @@ def free_run_times(rig: Rig, repeats: int = REPEATS) -> dict[str, Any]:
     works: dict[str, Callable[[], object]] = {
         "own": lambda: simulate(ready, drive, start),
         "hand": by_hand,
-        "odeint": by_odeint,
+        "odeint": lambda: pistons(odeint(rtol)),
     }
-    times = spent_together(works, repeats)
+    with TemporaryDirectory(prefix="bramah-cvodes-") as folder:
+        if cvodes.available():
+            inputs = np.column_stack((drive.u, drive.p_s))
+            interpreted = cvodes.solver(p, inputs, drive.rate, SCALE, None)
+            loosest = next(r for r in TOLERANCES if error(interpreted(r, y0)()) <= exact)
+            by_cvodes = cvodes.solver(p, inputs, drive.rate, SCALE, Path(folder))(loosest, y0)
+            errors["cvodes_error"] = error(by_cvodes())
+            works["cvodes"] = lambda: pistons(by_cvodes())
+        times = spent_together(works, repeats)
     return {
         **times,
         "simulated_seconds": t[-1],
         "times_real_time": float(t[-1] / times["own"].least),
         "error": exact,
         "odeint_rtol": rtol,
-        "odeint_error": error(odeint(rtol)),
+        **errors,
         "difference_to_hand": float(np.abs(out[:, :2] - found.q).max()),
         "failure": found.failure,
     }
