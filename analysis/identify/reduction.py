@@ -25,7 +25,7 @@ from analysis.regression.nonlinear import reduced
 from analysis.regression.qr import Accumulator
 from analysis.regression.rows import Filtering, Rows, parameters_of, record_rows
 from analysis.regression.settings import REGRESSION
-from analysis.regression.solve import RowCluster, Solution, merge, solve
+from analysis.regression.solve import RowCluster, Solution, solve
 from analysis.signals.conditioning import Mask, condition, lost_samples
 from analysis.signals.locks import moving_joints
 from analysis.signals.settings import SIGNALS
@@ -229,21 +229,18 @@ def _inspect(rig: Rig, source: Source, stretch: int) -> tuple[int, dict[str, int
 
 
 def clusters_of(reductions: Sequence[RecordReduction], family: str) -> list[RowCluster]:
-    """Return one cluster per record, or one per part where its step has this record only."""
+    """Return the parts of all records, those of a repeat alike in their key.
+
+    Where a step has this record only, its parts stand for repeats and have keys of their own.
+    """
     repeats = repeats_of((reduction.run, reduction.head) for reduction in reductions)
     out: list[RowCluster] = []
     for reduction in reductions:
-        stratum = (reduction.run, reduction.head.step)
-        filled = [(n, R, rows) for n, (R, rows) in enumerate(reduction.parts[family]) if rows]
-        if repeats[stratum] > 1:
-            if filled:
-                whole = merge(R for _, R, _ in filled)
-                rows = sum(rows for *_, rows in filled)
-                out.append(RowCluster(stratum, reduction.head.repeat, whole, rows))
-            continue
-        for n, R, rows in filled:
-            key: Hashable = (reduction.head.repeat, n)
-            out.append(RowCluster(stratum, key, R, rows))
+        stratum, repeat = (reduction.run, reduction.head.step), reduction.head.repeat
+        for n, (R, rows) in enumerate(reduction.parts[family]):
+            if rows:
+                key: Hashable = repeat if repeats[stratum] > 1 else (repeat, n)
+                out.append(RowCluster(stratum, key, R, rows))
     return out
 
 

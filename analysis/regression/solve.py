@@ -30,7 +30,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class RowCluster:
-    """The reduced rows of one independent cluster: a repeat (or a segment of the only repeat)."""
+    """Reduced rows of an independent cluster: a repeat, or a segment of the only repeat.
+
+    Clusters with the same stratum and key are parts of one.
+    """
 
     stratum: Hashable
     key: Hashable
@@ -148,24 +151,24 @@ def _confounded(names: Sequence[str], null: Array) -> dict[str, str]:
     return lost
 
 
-def scores(beta: Array, cluster: RowCluster) -> Array:
-    """Return X'(y - X beta) (k,) of a cluster from its triangle alone."""
+def scores(beta: Array, triangles: Array) -> Array:
+    """Return X'(y - X beta) (c, k) of clusters from their triangles (c, k+1, k+1) alone."""
     k = len(beta)
-    X, y = cluster.triangle[:, :k], cluster.triangle[:, k]
-    return np.asarray(X.T @ (y - X @ beta))
+    X, y = triangles[:, :, :k], triangles[:, :, k]
+    return np.asarray(np.einsum("cmk,cm->ck", X, y - X @ beta))
 
 
 def _clustered(beta: Array, bread: Array, clusters: Sequence[RowCluster]) -> tuple[Array, Array]:
     """Return the stratified cluster covariance (k, k) and Satterthwaite's dof (k,)."""
     k = len(beta)
-    found: dict[tuple[Hashable, Hashable], Array] = {}
-    for cluster in clusters:
-        key = (cluster.stratum, cluster.key)
-        found[key] = found.get(key, np.zeros(k)) + scores(beta, cluster)
-    number = {s: n for n, s in enumerate(dict.fromkeys(stratum for stratum, _ in found))}
-    labels = np.array([number[stratum] for stratum, _ in found], dtype=np.int64)
-    influence = np.array(list(found.values())).reshape(-1, k) @ bread
-    scatter = stratified(labels, influence)
+    labels: dict[tuple[Hashable, Hashable], int] = {}
+    member = [labels.setdefault((c.stratum, c.key), len(labels)) for c in clusters]
+    sums = np.zeros((len(labels), k))
+    triangles = np.array([c.triangle for c in clusters]).reshape(-1, k + 1, k + 1)
+    np.add.at(sums, np.array(member, dtype=np.int64), scores(beta, triangles))
+    number = {s: n for n, s in enumerate(dict.fromkeys(stratum for stratum, _ in labels))}
+    strata = np.array([number[stratum] for stratum, _ in labels], dtype=np.int64)
+    scatter = stratified(strata, sums @ bread)
     return (np.full((k, k), np.nan), np.full(k, np.nan)) if scatter is None else scatter
 
 

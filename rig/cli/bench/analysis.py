@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from analysis.identify.identify import identify
+from analysis.identify.reduction import reduce_rows, solve_reductions
 from analysis.simulation.synthetic import multisine, synthetic_run
-from rig.cli.bench.timing import spent
+from analysis.terms.base import family_of
+from rig.cli.bench.timing import spent, spent_together
 from rig.model.records import Run
 from rig.model.rig import Rig
 
@@ -24,13 +27,29 @@ def bench_run(rig: Rig, repeats: int = 10, seconds: float = 10.0) -> Run:
 def identify_figures(run: Run) -> dict[str, Any]:
     """Return records, seconds of data, rows, identify_seconds in all and solve_seconds of it.
 
-    `twelve` is the processor time of identifying the first twelve records.
+    `twelve` is the processor time of identifying the first twelve records; `solve` that of all
+    values and their covariance from the records' triangles, `lstsq` that of numpy's `lstsq` for
+    the values alone from all rows.
     """
     identify([Run(run.rig, run.records[:1])])  # imports and FFT plans are not the method's
     started = time.perf_counter()
     result = identify([run])
     seconds = time.perf_counter() - started
     twelve = Run(run.rig, run.records[:12])
+    terms = result.model.terms
+    reductions = reduce_rows(run.rig, terms, result.built)
+    rows = [(family_of(name), r) for item in result.built for name, r in item.rows.items()]
+    stacked = [
+        (
+            np.concatenate([r.matrix for of, r in rows if of == family]),
+            np.concatenate([r.rhs for of, r in rows if of == family]),
+        )
+        for family in sorted({of for of, _ in rows})
+    ]
+    works: dict[str, Callable[[], object]] = {
+        "solve": lambda: solve_reductions(run.rig, terms, reductions),
+        "lstsq": lambda: [np.linalg.lstsq(X, y, rcond=None) for X, y in stacked],
+    }
     return {
         "records": len(run.records),
         "data_seconds": sum(r.samples / r.sample_rate for r in run.records),
@@ -38,4 +57,5 @@ def identify_figures(run: Run) -> dict[str, Any]:
         "identify_seconds": seconds,
         "solve_seconds": result.solve_seconds,
         "twelve": spent(lambda: identify([twelve])),
+        **spent_together(works),
     }

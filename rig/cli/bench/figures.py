@@ -67,6 +67,7 @@ def analysis_figures(folder: Path, say: Say) -> list[Figure]:
         Figure("analysis", "records of 10 s", found["records"]),
         Figure("analysis", "load and identify", loading + found["identify_seconds"], "s", 5.0),
         Figure("analysis", "of it the solve", 1e3 * found["solve_seconds"], "ms", 50.0),
+        *beside("analysis", "solve", found["solve"], ("numpy's lstsq", found["lstsq"]), 1.1),
         *beside("analysis", "identify 12 of them", found["twelve"], None, 300.0),
         *free_run_figures(load_rig(RIG)),
     ]
