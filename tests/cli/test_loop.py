@@ -121,6 +121,7 @@ def test_it_stops_where_it_should_and_says_why(
     assert len(going.rounds) == count
 
 
+@pytest.mark.slow
 def test_a_leak_is_traced_over_the_wire_into_folders_of_its_own(tmp_path: Path) -> None:
     protocol, out = tmp_path / "waves.yaml", tmp_path / "monday"
     protocol.write_text(WAVES)

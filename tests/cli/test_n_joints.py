@@ -139,6 +139,7 @@ def wire(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, str]]
         yield tmp_path_factory.mktemp("boom"), endpoint
 
 
+@pytest.mark.slow
 def test_one_joint_goes_from_plan_to_validation_over_the_wire(wire: tuple[Path, str]) -> None:
     folder, endpoint = wire
     rig = ("--rig", "boom-1dof")

@@ -50,6 +50,7 @@ def fast_machine(tmp_path_factory: pytest.TempPathFactory, rig: Rig) -> Path:
     return folder / "run"
 
 
+@pytest.mark.slow
 def test_a_protocol_that_nominal_values_pass_is_refused_once_the_machine_is_identified(
     fast_machine: Path, tmp_path: Path
 ) -> None:

@@ -39,10 +39,15 @@ def traced(rig: Rig, hidden: Hidden, free_forms: bool = True, **measured: Any) -
     ("form", "width"),
     [
         (TANH, 1e-4),
-        (SIGMOID, 5e-3),
         *(
             pytest.param(*variant, marks=pytest.mark.slow)
-            for variant in ((TANH, 1e-3), (TANH, 5e-3), (TANH, 1e-2), (SIGMOID, 1e-3))
+            for variant in (
+                (SIGMOID, 5e-3),
+                (TANH, 1e-3),
+                (TANH, 5e-3),
+                (TANH, 1e-2),
+                (SIGMOID, 1e-3),
+            )
         ),
     ],
 )
@@ -214,9 +219,9 @@ def test_a_leak_by_the_root_of_the_pressure_is_a_curve_and_not_two_names(rig: Ri
             Hidden(), Sensors(("cap_pressure",), lag=3e-3),
             ("sensor_lag", "joint 2 cap"), "lag_cap_pressure_2", 3e-3,
         ),
-        (
+        pytest.param(
             Hidden(play=6e-3), Sensors(),
-            ("spool_hysteresis", "joint 2"), "w_hysteresis_2", 6e-3,
+            ("spool_hysteresis", "joint 2"), "w_hysteresis_2", 6e-3, marks=pytest.mark.slow,
         ),
     ],
 )  # fmt: skip

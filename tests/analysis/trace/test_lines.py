@@ -106,6 +106,7 @@ def test_a_single_sine_is_followed_to_where_the_row_filter_ends() -> None:
         assert one.frequency[-1] > 8.0  # [Hz] of the slowest row filter
 
 
+@pytest.mark.slow
 def test_friction_shows_on_the_empty_odd_lines_and_a_null_on_the_even_ones(rig: Rig) -> None:
     friction = traced(rig, Fc=60)
     (loudest, *_) = friction.lines
