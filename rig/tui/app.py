@@ -410,11 +410,13 @@ class Monitor(ByHand, App[int]):
         """Close the screen and say what becomes of the run."""
         self.exit(code, message=farewell(self.link.frame))
 
-    def stop_answered(self, stop: Stop, answered: bool) -> None:
+    def stop_answered(self, stop: Stop, where: Endpoint | None, answered: bool) -> None:
         """Note what became of a stop; called by the sending thread."""
         # Replacing one attribute needs no lock.
         if self.stop_asked is stop:
-            self.stop_asked = replace(stop, answer=KeyAnswer.TAKEN if answered else KeyAnswer.NONE)
+            missed = KeyAnswer.NOWHERE if where is None else KeyAnswer.NONE
+            answer = KeyAnswer.TAKEN if answered else missed
+            self.stop_asked = replace(stop, endpoint=where, answer=answer)
             self.redraw()
 
     def redraw(self) -> None:

@@ -117,6 +117,11 @@ class Glass:
     def text(self) -> str:
         return "\n".join(self.lines)
 
+    @property
+    def sentences(self) -> str:
+        """The screen as running text: where a long path wraps its sentence does not matter."""
+        return " ".join(self.text.split())
+
 
 @asynccontextmanager
 async def glass(

@@ -83,8 +83,7 @@ async def test_what_a_run_without_a_log_lacks_is_a_sentence(runs: Path) -> None:
     async with office.app.run_test(size=(120, 40)) as pilot:
         shown = Glass(office.app, pilot, office.clock)
         await opened(office, shown, "broken", "read its log")
-        assert "there is no such file" in shown.text
-        assert "events.jsonl" in shown.text
+        assert "events.jsonl: there is no such file" in shown.sentences
         assert "Traceback" not in shown.text
 
 
@@ -154,11 +153,11 @@ async def test_a_trace_that_is_not_there_or_damaged_is_a_sentence(runs: Path) ->
     async with office.app.run_test(size=(120, 40)) as pilot:
         shown = Glass(office.app, pilot, office.clock)
         await opened(office, shown, "broken", "before and after of its trace")
-        assert "there is no such file" in shown.text
-        assert "`trace what its model lacks`" in " ".join(shown.text.split())
+        assert "trace.json: there is no such file" in shown.sentences
+        assert "`trace what its model lacks`" in shown.sentences
         (runs / "monday" / "trace.json").write_text('{"verdict": "clean"}')
         await opened(office, shown, "monday", "before and after of its trace")
-        assert "error: Field required" in " ".join(shown.text.split())
+        assert "error: Field required" in shown.sentences
         assert "Traceback" not in shown.text
 
 

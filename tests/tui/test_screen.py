@@ -194,7 +194,26 @@ async def test_stop_taken_but_not_confirmed_becomes_an_alarm() -> None:
 async def test_stop_without_a_run_claims_nothing() -> None:
     async with glass(Machine()) as shown:
         await shown.press("s")
+        await shown.answered()
+        assert "NOTHING SENT" in shown.text
+
+
+async def test_a_stop_goes_to_the_only_run_that_is_not_shown_yet() -> None:
+    machine = Machine()
+    async with glass(machine) as shown:
+        record = machine.runs[HERE] = running()
+        await shown.press("s")
+        await shown.answered()
+        assert record.commands == ["stop"]
+        assert "shinshu-2dof (process 4711), which is not the run shown: taken" in shown.text
+    machine = Machine()
+    async with glass(machine) as shown:
+        both = [running(), running()]
+        machine.runs = {HERE: both[0], endpoint("press", 4712): both[1]}
+        await shown.press("s")
         await shown.watch()
+        await shown.answered()
+        assert [record.commands for record in both] == [[], []], "which of them was not said"
         assert "NOTHING SENT" in shown.text
 
 

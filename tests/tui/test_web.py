@@ -28,6 +28,7 @@ from tests.tui.web_page import OpenPage, WebServer, page_of, web_server
 __all__ = ["sockets", "start"]  # fixtures: a folder of sockets, and a run that publishes there
 
 PATIENCE = 60.0  # of a test whose processes ought to have acted long ago [s]
+ATTACHED = r"cap +\d\.\d\d MPa"  # the waiting page names a rig, but shows no pressure
 PATHS = (
     "/", "/ws", "/page.js", "/static/js/textual.js", "/static/css/xterm.css",
     "/fonts/DejaVuSans.ttf", "/download/key", "/nowhere",
@@ -169,8 +170,8 @@ async def test_pages_come_and_go_and_every_screen_ends_with_its_page(
     run = start()
     async with page_of(client, server) as page, page_of(client, server) as other:
         await page.resize(120, 40)
-        await page.until(r"cap +\d\.\d\d MPa")
-        await other.until("shinshu-2dof")
+        await page.until(ATTACHED)
+        await other.until(ATTACHED)
         assert len(server.screens()) == 2
         await page.socket.send_json(["beat", "17.5"])
         assert await page.message("beat") == "17.5"
@@ -181,11 +182,11 @@ async def test_pages_come_and_go_and_every_screen_ends_with_its_page(
         os.kill(server.screens()[0], signal.SIGKILL)
         assert "with code -9" in await other.message("ended")
     async with page_of(client, server) as page:
-        await page.until("shinshu-2dof")
+        await page.until(ATTACHED)
     await until(lambda: not server.screens())
     assert run.poll() is None
     async with page_of(client, server) as page:
-        await page.until("shinshu-2dof")
+        await page.until(ATTACHED)
         await page.press(" ")
         await page.until("OUTPUTS ZEROED")
         assert run.wait(PATIENCE) == 0

@@ -6,6 +6,7 @@ import json
 import re
 import signal
 import subprocess
+from codecs import getincrementaldecoder
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from urllib.parse import parse_qs, urlsplit
@@ -15,6 +16,7 @@ import aiohttp
 from tests.cli.bench import LONG, started
 
 ESCAPES = re.compile(r"\x1b(\[[0-9;?$]*[A-Za-z]|\([A-Z])")
+BEGUN = re.compile(r"(\[[0-9;?$]*|\()?")  # of an escape, after its first character
 
 
 class WebServer:
@@ -61,15 +63,18 @@ class OpenPage:
     def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
         self.socket = socket
         self.drawn = ""
-        self.raw = b""
+        self._rest = ""  # the beginning of an escape whose end has not come yet
+        self._decode = getincrementaldecoder("utf-8")("replace").decode
         self.messages: list[list[str]] = []
 
     async def read(self) -> bool:
         """Read one message; False when the server has closed the connection."""
         message = await self.socket.receive()
         if message.type is aiohttp.WSMsgType.BINARY:
-            self.raw += message.data
-            self.drawn = ESCAPES.sub("", self.raw.decode(errors="replace"))
+            whole, escape, begun = (self._rest + self._decode(message.data)).rpartition("\x1b")
+            torn = escape if BEGUN.fullmatch(begun) else ""
+            self._rest = torn + begun if torn else ""
+            self.drawn += ESCAPES.sub("", whole if torn else whole + escape + begun)
         elif message.type is aiohttp.WSMsgType.TEXT:
             self.messages.append(json.loads(message.data))
         else:
@@ -89,7 +94,7 @@ class OpenPage:
         return next(message[1] for message in self.messages if message[0] == kind)
 
     async def press(self, keys: str) -> None:
-        self.raw, self.drawn = b"", ""
+        self.drawn = ""
         await self.socket.send_json(["stdin", keys])
 
     async def resize(self, width: int, height: int) -> None:

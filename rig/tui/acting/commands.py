@@ -15,7 +15,7 @@ from rig.tui.following.link import Frame, Link, LinkStage
 from rig.tui.jobs import VerbJob, begin, rig_of_run
 from rig.tui.look import Dialog, PlotView, ScreenStyle
 from rig.tui.pages.operation import in_order
-from rig.tui.words import KeyAnswer, Stop
+from rig.tui.words import Stop
 
 MOVING: Final = ("homing", "locked", "exciting")  # states in which an abort does not ask first
 
@@ -42,19 +42,16 @@ class Commands:
     ask: Callable[..., None]
     view: Callable[[], PlotView]
     redraw: Callable[[], None]
-    stop_answered: Callable[[Stop, bool], None]
+    stop_answered: Callable[[Stop, Endpoint | None, bool], None]
     alarms_of: Callable[[Frame], AlarmTable]
 
     def act_stop(self) -> None:
-        """Zero the outputs of the run on the screen, or of the one marked in the list."""
+        """Zero the outputs of the run on the screen, marked in the list, or else the only one."""
         frame = self.link.frame
         choosing = frame.stage is LinkStage.CHOOSING
         endpoint = self.marked_session if choosing else frame.endpoint
-        if endpoint is None:
-            self.stop_asked = Stop(self.clock(), None, KeyAnswer.NOWHERE)
-            return
         self.stop_asked = stop = Stop(self.clock(), endpoint)
-        self.link.stop(endpoint, lambda answered: self.stop_answered(stop, answered))
+        self.link.stop(endpoint, lambda where, answered: self.stop_answered(stop, where, answered))
         if choosing:
             self.link.choose(endpoint)
 

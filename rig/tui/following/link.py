@@ -185,11 +185,18 @@ class Link:
         """Attach to this session; None asks the operator to choose again."""
         self._chosen, self._choosing = endpoint, endpoint is None
 
-    def stop(self, endpoint: Endpoint, answered: Callable[[bool], None]) -> None:
-        """Send "stop" at once on a connection and a thread of its own, then report the answer."""
+    def stop(
+        self, endpoint: Endpoint | None, answered: Callable[[Endpoint | None, bool], None]
+    ) -> None:
+        """Send "stop" at once on a connection and a thread of its own, then report the answer.
+
+        Without an endpoint it goes to the only live session: a run that has just begun is not
+        attached yet. `answered` hears which session it went to, None where there is no such one.
+        """
 
         def send() -> None:
-            answered(self._send(endpoint, "stop"))
+            where = endpoint or self._only_session()
+            answered(where, where is not None and self._send(where, "stop"))
 
         threading.Thread(target=send, name="bramah-stop", daemon=True).start()
 
@@ -211,6 +218,14 @@ class Link:
             answered(refusal)
 
         threading.Thread(target=send, name="bramah-ask", daemon=True).start()
+
+    def _only_session(self) -> Endpoint | None:
+        try:
+            live = self._sessions.find()
+        except Exception:  # as in _send
+            log.exception("looking for a session to stop failed")
+            return None
+        return live[0] if len(live) == 1 else None
 
     def _send(self, endpoint: Endpoint, command: str) -> bool:
         try:
