@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 from rig.bench.checks.catalogue import catalogue
@@ -68,9 +68,17 @@ class AlarmLog:
     def _raise(self, alarm: Alarm) -> str:
         self.table = states.raised(self.table, alarm)
         known = self.table.get(alarm.key) or alarm
+        # The table keeps when and with which value an alarm first came; the log says each time.
+        now = replace(
+            alarm,
+            state=known.state,
+            acknowledged=known.acknowledged,
+            cause=known.cause,
+            count=known.count,
+        )
         if not alarm.trips:
             log.warning("warning: %s", alarm.sentence)
-        about = {k: v for k, v in asdict(known).items() if k != "tick"}
+        about = {k: v for k, v in asdict(now).items() if k != "tick"}
         self._on_event("alarm", alarm.tick, {"alarm": alarm.key, **about})
         return alarm.key
 

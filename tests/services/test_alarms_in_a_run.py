@@ -117,6 +117,23 @@ def test_a_value_within_the_dead_band_keeps_its_warning(tmp_path: Path) -> None:
     assert back >= 2400 + 990
 
 
+def test_a_warning_that_comes_again_is_written_down_with_its_present_value(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+
+    def spoil(block: SampleBlock) -> SampleBlock:
+        level = 8.5e6 if block.tick < 1000 else 8.7e6
+        return high_between((300, 600), (2300, 2600), value=level)(block)
+
+    take(run, spoil, 3.0)
+    first, again = [
+        e for e in read_events(run) if e["event"] == "alarm" and e["check"] == "pressure"
+    ]
+    assert (first["value"], first["time"], first["count"]) == (8.5e6, 0.35, 1)
+    assert (again["value"], again["time"], again["count"]) == (8.7e6, 2.35, 2)
+    assert "8.7 MPa at 2.3500 s" in again["sentence"]
+    assert (again["tick"], again["state"]) == (2350, "active")
+
+
 def test_a_screen_sees_the_alarms_and_acknowledges_them(tmp_path: Path) -> None:
     run, screen = tmp_path / "run", Screen()
     driver = FakeDriver(RIG, spoil=high_between((300, 5000)))
