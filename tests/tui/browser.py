@@ -12,8 +12,9 @@ import os
 import shutil
 import subprocess
 import tempfile
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+import time
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -124,9 +125,9 @@ class BrowserTab:
         return png
 
 
-@asynccontextmanager
-async def browser_tab(program: str) -> AsyncIterator[BrowserTab]:
-    """Start a browser with a profile of its own and one tab; killed at the end."""
+@contextmanager
+def browser(program: str) -> Iterator[str]:
+    """Start a browser with a profile of its own, killed at the end; yields where to debug it."""
     with tempfile.TemporaryDirectory(prefix="browser", ignore_cleanup_errors=True) as profile:
         # A container's root has no user namespace for the browser's sandbox.
         rooted = ["--no-sandbox"] if os.geteuid() == 0 else []
@@ -138,18 +139,24 @@ async def browser_tab(program: str) -> AsyncIterator[BrowserTab]:
                 port = Path(profile, "DevToolsActivePort")
                 while not (port.exists() and len(port.read_text().splitlines()) > 1):
                     assert process.poll() is None, f"{program} ended with {process.returncode}"
-                    await asyncio.sleep(0.05)
-                at = f"http://127.0.0.1:{port.read_text().splitlines()[0]}/json/list"
-                async with aiohttp.ClientSession() as client:
-                    async with client.get(at) as answer:
-                        tabs = [tab for tab in await answer.json() if tab["type"] == "page"]
-                    where = tabs[0]["webSocketDebuggerUrl"]
-                    async with client.ws_connect(where, max_msg_size=0) as socket:
-                        tab = BrowserTab(socket)
-                        listening = asyncio.create_task(tab.listen())
-                        try:
-                            yield tab
-                        finally:
-                            listening.cancel()
+                    time.sleep(0.05)
+                yield f"http://127.0.0.1:{port.read_text().splitlines()[0]}"
             finally:
                 process.kill()
+
+
+@asynccontextmanager
+async def browser_tab(address: str) -> AsyncIterator[BrowserTab]:
+    """Open a tab of a browser that runs; closed at the end."""
+    async with aiohttp.ClientSession() as client:
+        async with client.put(f"{address}/json/new?about:blank") as answer:
+            about = await answer.json()
+        async with client.ws_connect(about["webSocketDebuggerUrl"], max_msg_size=0) as socket:
+            tab = BrowserTab(socket)
+            listening = asyncio.create_task(tab.listen())
+            try:
+                yield tab
+            finally:
+                listening.cancel()
+        async with client.get(f"{address}/json/close/{about['id']}") as answer:
+            assert answer.status == 200

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.cli.bench import ENDLESS, LONG, outputs_are_zero, simulated, started
-from tests.tui.browser import NAMES, VARIABLE, BrowserTab, browser_path, browser_tab
+from tests.tui.browser import NAMES, VARIABLE, BrowserTab, browser, browser_path, browser_tab
 from tests.tui.web_page import WebServer, web_server
 
 PROGRAM = browser_path()
@@ -23,23 +23,32 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-@pytest.fixture(autouse=True)
-def sockets(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    with tempfile.TemporaryDirectory(prefix="b", dir="/tmp") as folder:
-        monkeypatch.setenv("XDG_RUNTIME_DIR", folder)
+@pytest.fixture(scope="module", autouse=True)
+def sockets() -> Iterator[None]:
+    with (
+        tempfile.TemporaryDirectory(prefix="b", dir="/tmp") as folder,
+        pytest.MonkeyPatch.context() as patch,
+    ):
+        patch.setenv("XDG_RUNTIME_DIR", folder)
         yield
 
 
-@pytest.fixture
-def server() -> Iterator[WebServer]:
+@pytest.fixture(scope="module")
+def server(sockets: None) -> Iterator[WebServer]:
     with web_server() as served:
         yield served
 
 
-@pytest.fixture
-async def tab() -> AsyncIterator[BrowserTab]:
+@pytest.fixture(scope="module")
+def started_browser() -> Iterator[str]:
     assert PROGRAM is not None
-    async with browser_tab(PROGRAM) as opened:
+    with browser(PROGRAM) as address:
+        yield address
+
+
+@pytest.fixture
+async def tab(started_browser: str) -> AsyncIterator[BrowserTab]:
+    async with browser_tab(started_browser) as opened:
         yield opened
 
 
@@ -88,23 +97,6 @@ async def test_an_operator_watches_a_run_in_a_browser_and_stops_it(
     assert sum(".ttf" in address for address in tab.requested) >= 3
 
 
-@pytest.mark.timeout(2 * LONG)
-async def test_a_page_without_its_server_says_that_its_picture_is_old(
-    server: WebServer, tab: BrowserTab, tmp_path: Path
-) -> None:
-    await tab.open(server.address)
-    await until(tab.terminal, "No protocol is running")
-    await until(tab.notice, "^$")
-    (screen,) = server.screens()
-    os.kill(screen, signal.SIGSTOP)
-    assert "emergency stop" in await until(tab.notice, "STALE: this picture is .* s old")
-    os.kill(screen, signal.SIGCONT)
-    await until(tab.notice, "^$")
-    server.end(signal.SIGKILL)
-    assert "emergency stop" in await until(tab.notice, "DISCONNECTED")
-    await tab.picture(pictures(tmp_path) / "disconnected.png")
-
-
 @pytest.mark.timeout(LONG)
 async def test_keys_reach_the_screen_whatever_was_clicked_and_q_closes_it(
     server: WebServer, tab: BrowserTab
@@ -131,3 +123,23 @@ async def test_the_address_without_its_token_shows_a_sentence(
 ) -> None:
     await tab.open(f"http://{server.host}/")
     await until(lambda: tab.evaluate("document.body?.innerText ?? ''"), "no valid token")
+
+
+# Ends the server that all share, so it comes last.
+@pytest.mark.timeout(2 * LONG)
+async def test_a_page_without_its_server_says_that_its_picture_is_old(
+    server: WebServer, tab: BrowserTab, tmp_path: Path
+) -> None:
+    await tab.open(server.address)
+    await until(tab.terminal, "No protocol is running")
+    await until(tab.notice, "^$")
+    while len(server.screens()) > 1:  # of pages that the tests before have closed
+        await asyncio.sleep(0.02)
+    (screen,) = server.screens()
+    os.kill(screen, signal.SIGSTOP)
+    assert "emergency stop" in await until(tab.notice, "STALE: this picture is .* s old")
+    os.kill(screen, signal.SIGCONT)
+    await until(tab.notice, "^$")
+    server.end(signal.SIGKILL)
+    assert "emergency stop" in await until(tab.notice, "DISCONNECTED")
+    await tab.picture(pictures(tmp_path) / "disconnected.png")

@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AsyncExitStack, suppress
 from pathlib import Path
@@ -41,6 +42,18 @@ OUTSIDE = re.compile(r"""(?:https?:|wss?:|["'(=]\s*)//(?!127\.0\.0\.1[:/])[\w.-]
 async def client() -> AsyncIterator[aiohttp.ClientSession]:
     async with aiohttp.ClientSession() as session:
         yield session
+
+
+@pytest.fixture(scope="module")
+def lasting_server() -> Iterator[WebServer]:
+    """A server for the tests that leave it as it was; no run is to be seen from it."""
+    with (
+        tempfile.TemporaryDirectory(prefix="b", dir="/tmp") as folder,
+        pytest.MonkeyPatch.context() as patch,
+    ):
+        patch.setenv("XDG_RUNTIME_DIR", folder)
+        with web_server() as served:
+            yield served
 
 
 @pytest.fixture
@@ -107,40 +120,42 @@ def test_a_refusal_says_why(
 
 @pytest.mark.timeout(PATIENCE)
 async def test_without_the_token_or_from_elsewhere_nothing_is_served(
-    server: WebServer, client: aiohttp.ClientSession
+    lasting_server: WebServer, client: aiohttp.ClientSession
 ) -> None:
     for path in PATHS:
-        for token in ("", "wrong", server.token[:-1]):
-            async with client.get(server.at(path, token)) as answer:
+        for token in ("", "wrong", lasting_server.token[:-1]):
+            async with client.get(lasting_server.at(path, token)) as answer:
                 assert answer.status == 403, path
-                assert server.token not in await answer.text()
-        for headers in ({"Host": f"bench.example:{server.port}"}, {"Origin": "http://a.example"}):
-            async with client.get(server.at(path), headers=headers) as answer:
+                assert lasting_server.token not in await answer.text()
+        for headers in (
+            {"Host": f"bench.example:{lasting_server.port}"},
+            {"Origin": "http://a.example"},
+        ):
+            async with client.get(lasting_server.at(path), headers=headers) as answer:
                 assert answer.status == 403, (path, headers)
     for origin in ({}, {"Origin": "http://127.0.0.1:1"}, {"Origin": "http://bench.example"}):
         with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
-            await client.ws_connect(server.at("/ws"), headers=origin)
+            await client.ws_connect(lasting_server.at("/ws"), headers=origin)
         assert refused.value.status == 403
-    assert not server.screens()
-    assert server.end(signal.SIGTERM)[0] == 0
+    assert not lasting_server.screens()
 
 
 @pytest.mark.timeout(PATIENCE)
 async def test_page_and_files_name_no_address_elsewhere(
-    server: WebServer, client: aiohttp.ClientSession
+    lasting_server: WebServer, client: aiohttp.ClientSession
 ) -> None:
-    async with client.get(server.at("/")) as answer:
+    async with client.get(lasting_server.at("/")) as answer:
         assert answer.status == 200
         policy = answer.headers["Content-Security-Policy"]
         page = await answer.text()
     assert "default-src 'none'" in policy
-    assert f"connect-src ws://{server.host};" in policy
+    assert f"connect-src ws://{lasting_server.host};" in policy
     inside = re.findall(r'(?:src|href|data-terminal)="([^"]+)"|url\("([^"]+)"\)', page)
     paths = [one or other for one, other in inside if not (one or other).startswith("data:")]
     assert len(paths) == 7
     assert not OUTSIDE.search(page)
     for path in paths:
-        async with client.get(f"http://{server.host}/{path}") as answer:
+        async with client.get(f"http://{lasting_server.host}/{path}") as answer:
             assert answer.status == 200, path
             if ".ttf" not in path:
                 text = re.sub(r"/\*.*?\*/", "", await answer.text(), flags=re.DOTALL)
@@ -148,18 +163,18 @@ async def test_page_and_files_name_no_address_elsewhere(
     for foreign in ('src="//cdn.example/a.js"', "url(https://fonts.example/b)"):
         assert OUTSIDE.search(foreign)
     # Behind a forwarded port the page leads back to where the browser reached it.
-    async with client.get(server.at("/"), headers={"Host": "localhost:9"}) as answer:
+    async with client.get(lasting_server.at("/"), headers={"Host": "localhost:9"}) as answer:
         assert "ws://localhost:9/ws?" in await answer.text()
 
 
 @pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="no list of sockets in /proc")
 @pytest.mark.timeout(PATIENCE)
-def test_it_listens_on_loopback_alone(server: WebServer) -> None:
+def test_it_listens_on_loopback_alone(lasting_server: WebServer) -> None:
     lines = [*Path("/proc/net/tcp").read_text().splitlines()[1:]]
     if Path("/proc/net/tcp6").exists():
         lines += Path("/proc/net/tcp6").read_text().splitlines()[1:]
     at = [line.split()[1] for line in lines if line.split()[3] == "0A"]
-    port = f"{server.port:04X}"
+    port = f"{lasting_server.port:04X}"
     assert [address for address in at if address.endswith(f":{port}")] == [f"0100007F:{port}"]
 
 
@@ -197,9 +212,16 @@ async def test_pages_come_and_go_and_every_screen_ends_with_its_page(
         await until(lambda: all(map(gone, screens)))
 
 
+@pytest.mark.parametrize(
+    "nonsense",
+    [
+        ("{", '["resize", {"width": 1000000, "height": 2}]'),
+        pytest.param(("[]", '["stdin", 7]'), marks=pytest.mark.slow),
+    ],
+)
 @pytest.mark.timeout(PATIENCE)
 async def test_nonsense_from_a_page_ends_that_page_alone(
-    server: WebServer, client: aiohttp.ClientSession
+    server: WebServer, client: aiohttp.ClientSession, nonsense: tuple[str, ...]
 ) -> None:
     with socket.create_connection(("127.0.0.1", server.port)) as raw:
         raw.sendall(b"\x00\xff nonsense\r\n\r\n")
@@ -207,9 +229,9 @@ async def test_nonsense_from_a_page_ends_that_page_alone(
     with socket.create_connection(("127.0.0.1", server.port)) as raw:
         raw.sendall(b"GET /?token=\xff\xfe HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
         assert b" 40" in raw.recv(1 << 12).splitlines()[0]
-    for nonsense in ("{", "[]", '["resize", {"width": 1000000, "height": 2}]', '["stdin", 7]'):
+    for text in nonsense:
         async with page_of(client, server) as page:
-            await page.socket.send_str(nonsense)
+            await page.socket.send_str(text)
             await page.message("ended")
     async with page_of(client, server) as page:
         await page.until("No protocol is running")
@@ -219,18 +241,32 @@ async def test_nonsense_from_a_page_ends_that_page_alone(
 
 @pytest.mark.timeout(PATIENCE)
 async def test_the_fifth_page_is_refused_in_a_sentence(
-    server: WebServer, client: aiohttp.ClientSession
+    lasting_server: WebServer, client: aiohttp.ClientSession
 ) -> None:
     async with AsyncExitStack() as opened:
         for _ in range(4):
-            await opened.enter_async_context(page_of(client, server))
-        await until(lambda: len(server.screens()) == 4)
-        fifth = await opened.enter_async_context(page_of(client, server))
+            await opened.enter_async_context(page_of(client, lasting_server))
+        await until(lambda: len(lasting_server.screens()) == 4)
+        fifth = await opened.enter_async_context(page_of(client, lasting_server))
         assert "close one" in await fifth.message("ended")
 
 
+@pytest.mark.timeout(2 * PATIENCE)
+async def test_a_killed_server_takes_its_screen_along_and_the_run_goes_on(
+    server: WebServer, client: aiohttp.ClientSession, start: Callable[..., subprocess.Popen[bytes]]
+) -> None:
+    run = start()
+    async with page_of(client, server) as page:
+        await page.until(ATTACHED)
+        (screen,) = server.screens()
+        assert server.end(signal.SIGKILL)[0] == -signal.SIGKILL
+        await until(lambda: gone(screen))
+    assert run.poll() is None
+
+
+@pytest.mark.slow
 @pytest.mark.timeout(2 * LONG)
-async def test_a_killed_server_takes_its_screen_along_and_leaves_the_run_complete(
+async def test_a_killed_server_leaves_the_run_of_a_bench_complete(
     sockets: Path, tmp_path: Path, client: aiohttp.ClientSession
 ) -> None:
     protocol, out = tmp_path / "short.yaml", tmp_path / "run"
@@ -258,9 +294,10 @@ async def test_a_killed_server_takes_its_screen_along_and_leaves_the_run_complet
     assert (summary.state, summary.records, summary.lost_samples) == ("done", 1, 0)
 
 
+@pytest.mark.parametrize("killed", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.timeout(2 * PATIENCE)
 async def test_a_screen_that_hangs_outlives_neither_its_page_nor_a_killed_server(
-    client: aiohttp.ClientSession,
+    client: aiohttp.ClientSession, *, killed: bool
 ) -> None:
     hangs = (
         "import time; from textual.app import App\n"
@@ -295,12 +332,10 @@ async def test_a_screen_that_hangs_outlives_neither_its_page_nor_a_killed_server
             async with page_of(client, server) as page:
                 await page.socket.send_json(["beat", "1"])
                 screen = await hang(page)
+                if killed:
+                    process.kill()
+                    await until(lambda: gone(screen))
             await until(lambda: gone(screen))
-            async with page_of(client, server) as page:
-                await page.socket.send_json(["beat", "1"])
-                screen = await hang(page)
-                process.kill()
-                await until(lambda: gone(screen))
         finally:
             process.kill()
             for screen in hanging:
@@ -340,22 +375,33 @@ async def test_a_report_opened_on_the_page_comes_through_the_server_once(
                 assert answer.status == 404
 
 
-def test_wrong_options_and_a_port_in_use_end_in_one_line() -> None:
-    def refused(*words: object) -> tuple[int, str]:
-        ended = bramah("monitor", *words)
-        assert ended.stdout == ""
-        assert ended.stderr.count("\n") == 1, ended.stderr
-        return ended.returncode, ended.stderr
+def refused(*words: object) -> tuple[int, str]:
+    """The exit code and the one line that a wrong call ends with."""
+    ended = bramah("monitor", *words)
+    assert ended.stdout == ""
+    assert ended.stderr.count("\n") == 1, ended.stderr
+    return ended.returncode, ended.stderr
 
+
+def test_a_port_in_use_ends_in_one_line() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         code, said = refused("--web", "--port", port)
-        assert code == 1
-        assert said.startswith(f"bramah: --port {port}: Address already in use")
-    assert refused("--web", "--plain")[0] == 2
-    assert refused("--port", 8000)[0] == 2
-    assert refused("--web", "--port", 70000)[0] == 2
-    assert refused("--web", "--rig", Path(__file__))[0] == 2  # no rig file
+    assert code == 1
+    assert said.startswith(f"bramah: --port {port}: Address already in use")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--web", "--plain"),
+        pytest.param(("--port", 8000), marks=pytest.mark.slow),
+        pytest.param(("--web", "--port", 70000), marks=pytest.mark.slow),
+        pytest.param(("--web", "--rig", Path(__file__)), marks=pytest.mark.slow),  # no rig file
+    ],
+)
+def test_wrong_options_end_in_one_line(words: tuple[object, ...]) -> None:
+    assert refused(*words)[0] == 2
 
 
 def test_without_its_package_the_page_names_the_command_that_installs_it() -> None:
