@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 
 from rig.bench.screens.sockets import Snapshot
-from rig.tui.app import Monitor, automatic_span, farewell
+from rig.tui.app import HELP, Monitor, automatic_span, farewell
 from tests.tui.glass import Glass, Machine, Recorded, endpoint, glass
 from tests.tui.recorded import Bench, followed, past, run, snapshot, stopped, tripped
 
@@ -159,6 +159,14 @@ async def test_a_terminal_too_small_says_the_state_and_still_stops(size: tuple[i
         await shown.press("space")
         await shown.answered()
         assert record.commands == ["stop"]
+
+
+@pytest.mark.parametrize("size", [(80, 24), (120, 40), (200, 60)])
+async def test_the_keys_are_listed_without_a_wrapped_line(size: tuple[int, int]) -> None:
+    async with glass(Machine({HERE: running()}), size) as shown:
+        await shown.press("question_mark")
+        for line in HELP:
+            assert line in shown.text
 
 
 async def test_one_escape_closes_a_question_and_stops_nothing() -> None:
