@@ -21,6 +21,7 @@ from tests.tui.recorded import Bench, followed, past, run, snapshot, tripped
 from tests.tui.stored import run_folder
 
 DOCS = Path(__file__).parents[2] / "docs" / "screen.md"
+PICTURE = DOCS.parent / "images" / "screen.svg"
 _PICTURE = re.compile(
     r"(<!-- python -m tests\.tui\.capture ([^\n]+?) -->\n```\n)(.*?\n)??(```\n)", re.DOTALL
 )
@@ -47,6 +48,15 @@ def recorded_run() -> Browsed:
     )
 
 
+async def drawing() -> str:
+    """Return the overview as an SVG that loads nothing: the reader's own fixed-width font."""
+    async with glass(machine(), size=(120, 36)) as shown:
+        await shown.watch()
+        svg = shown.app.export_screenshot(title="bramah monitor")
+    plain = re.sub(r"\s*(@font-face \{.*?\}|<!--.*?-->)", "", svg, flags=re.DOTALL)
+    return plain.replace("Fira Code", "DejaVu Sans Mono")
+
+
 async def capture(page: str, width: int, height: int, trip: bool = False) -> str:
     """Return a page on a recorded run, trailing blanks cut, braille's blank as a space."""
     async with glass(machine(trip=trip), size=(width, height)) as shown:
@@ -63,7 +73,7 @@ def arguments_of(words: Sequence[str]) -> tuple[str, int, int, bool]:
 
 
 def main(words: list[str]) -> None:
-    """Write a capture to stdout, or all of the page's into it."""
+    """Write a capture to stdout, or all of the page's into it and the README's picture."""
     if words != ["--docs"]:
         sys.stdout.write(asyncio.run(capture(*arguments_of(words))) + "\n")
         return
@@ -72,6 +82,7 @@ def main(words: list[str]) -> None:
         made = asyncio.run(capture(*arguments_of(found[2].split())))
         text = text.replace(found[0], f"{found[1]}{made}\n{found[4]}")
     DOCS.write_text(text, encoding="utf-8")
+    PICTURE.write_text(asyncio.run(drawing()), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import pytest
 
-from tests.tui.capture import arguments_of, capture
+from tests.tui.capture import DOCS, PICTURE, arguments_of, capture, drawing
 
-PAGE = Path(__file__).parents[2] / "docs" / "screen.md"
-PICTURE = re.compile(
+TEXT = re.compile(
     r"<!-- python -m tests\.tui\.capture (?P<words>.+?) -->\n```\n(?P<text>.*?)\n```\n", re.DOTALL
 )
 PICTURES = [
     pytest.param(found["words"], found["text"], id=found["words"])
-    for found in PICTURE.finditer(PAGE.read_text(encoding="utf-8"))
+    for found in TEXT.finditer(DOCS.read_text(encoding="utf-8"))
 ]
 
 
@@ -34,3 +32,13 @@ async def test_the_pictures_in_the_page_are_what_the_command_above_them_makes(
     assert made == text, (
         "docs/screen.md is not up to date: `python -m tests.tui.capture --docs` writes its pictures"
     )
+
+
+async def test_the_readmes_picture_is_the_screen_as_it_is_and_loads_nothing() -> None:
+    svg = await drawing()
+    assert svg == PICTURE.read_text(encoding="utf-8"), (
+        "not up to date: `python -m tests.tui.capture --docs` writes it"
+    )
+    addresses = set(re.findall(r"https?://[^\"' )]+", svg))
+    assert addresses <= {"http://www.w3.org/2000/svg"}
+    assert "url(http" not in svg
