@@ -103,6 +103,10 @@ def test_a_word_that_no_shipped_name_begins_with_is_left_to_the_shells_files() -
 
 def test_the_completion_of_a_shell_is_shown_and_named_after_the_program() -> None:
     code = "from rig.cli.main import run; run(['--show-completion', 'bash'])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    # The shell is named, not looked for among the parents: the tests may have been started by none.
+    named = {**os.environ, "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, env=named
+    )
     assert done.returncode == 0, done.stderr
     assert "complete -o default -F _bramah_completion bramah" in done.stdout

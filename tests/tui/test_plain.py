@@ -90,9 +90,12 @@ def folder() -> Iterator[str]:
 def test_as_a_process_it_ends_with_an_interrupt(folder: str) -> None:
     environment = {**os.environ, "XDG_RUNTIME_DIR": folder}
     words = [sys.executable, "-c", "from rig.cli.main import run; run()", "monitor", "--plain"]
+    # A shell starts what it runs in the background with SIGINT ignored, and children inherit that.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     process = subprocess.Popen(
         words, cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
+    signal.signal(signal.SIGINT, before)
     assert process.stdout is not None
     assert process.stdout.readline() == "NO RUN: waiting for a run\n"
     process.send_signal(signal.SIGINT)
