@@ -198,11 +198,14 @@ tune.
   same input at equal accuracy.
 - **analysis**: 30 records of 10 s taken over the wire, loaded and identified; a free run of
   10 s with both joints moving, beside the same equations and steps written by hand and scipy's
-  odeint over the same compiled equations, at the loosest of tolerances a quarter of a decade apart
-  at which no state is less exact; all with the same output.
+  odeint over the same compiled equations and CVODES over C that CasADi makes of them (with the
+  extra `bench`), at the loosest of tolerances a quarter of a decade apart at which no state is
+  less exact; all with the same output. The solve gives values and covariance of all records from
+  their triangles, lstsq the values from all rows.
 - **growth**: with records, their length, joints and effects; least of five.
 - **run**: lock-and-excite over the wire, beside bare pymodbus that moves as many blocks from the
-  same device; a block's processor time in this process, and wall time, in virtual and real time.
+  same device; a block's processor time in this process, and wall time, in virtual and real time;
+  the wall time of a block of 100 ms into the journal, 1000 times.
 - **seed N**: a simulated bench started, run, identified and validated as in `bramah demo`; FIT
   is compared with every cell of the paper's Table IV.
 - **acquisition**: every channel at 1 kHz in real time over the wire. Lateness is a block's arrival

@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 
 from drivers import make_driver, wire_at
+from drivers.base import SampleBlock
 from protocols.engine import engine
 from protocols.engine.desk import Desk
 from protocols.engine.states import EngineState, StateMachine
@@ -23,12 +24,14 @@ from rig.cli.bench.figure import Figure
 from rig.cli.bench.wire_figures import bare_modbus
 from rig.cli.simulated_bench import simulated_bench
 from rig.model.rig import Rig
+from rig.runs.journal import Journal
 from rig.runs.recorder import Recorder
 from rig.runs.rigs import load_rig
 
 GROUP: Final = "run"
 RIG, PROTOCOL, STEP = "shinshu-2dof", "lock-and-excite", "step1"
 ROUNDS: Final = 5
+JOURNAL_BLOCK, JOURNAL_BLOCKS = 0.1, 1000  # [s], number
 Say = Callable[[str], None]
 
 
@@ -55,7 +58,28 @@ def run_figures(folder: Path, say: Say, seconds: float) -> list[Figure]:
     for number in range(ROUNDS):
         own = _streamed(rig, folder / f"stream-{number}", count)
         pairs.append((own, _bare(rig, count, real_time=True)))
-    return figures + _figures("real time", pairs, 1.6)
+    return [*figures, *_figures("real time", pairs, 1.6), *journal_figures(folder, rig)]
+
+
+def journal_figures(folder: Path, rig: Rig) -> list[Figure]:
+    """Measure the wall time until a block of 100 ms is safe in the journal of a run."""
+    n, measured = round(JOURNAL_BLOCK * rig.sample_rate), len(rig.channels)
+    rng, saturated, times = np.random.default_rng(0), np.zeros((n, measured), dtype=bool), []
+    folder.mkdir(parents=True, exist_ok=True)
+    journal = Journal.create(folder / "journal", rig.recorded, measured, rig.sample_rate)
+    for k in range(JOURNAL_BLOCKS):
+        data = rng.normal(size=(n, len(rig.recorded)))
+        block = SampleBlock(k, k * n, data, saturated, 0, tripped=False)
+        began = time.perf_counter()
+        journal.append(1, block, 0.0)
+        times.append(1e3 * (time.perf_counter() - began))
+    journal.close()
+    name = "a block of 100 ms into the journal"
+    return [
+        Figure(GROUP, f"{name}, median", float(np.median(times)), "ms"),
+        Figure(GROUP, f"{name}, 99 %", float(np.quantile(times, 0.99)), "ms", 5.0),
+        Figure(GROUP, f"{name}, worst", max(times), "ms"),
+    ]
 
 
 def _figures(kind: str, pairs: list[tuple[_Cost, _Cost]], limit: float) -> list[Figure]:
