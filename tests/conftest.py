@@ -5,10 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from rig.bench.latch import STATE_VARIABLE
 
 CACHE_VARIABLE = "BRAMAH_CACHE"
+
+# No test depends on how fast the machine is: an example may take what it takes.
+settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("patient")
 
 
 @pytest.fixture(scope="session", autouse=True)

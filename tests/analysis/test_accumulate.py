@@ -47,7 +47,7 @@ def test_blocks_folded_one_by_one_solve_what_all_rows_at_once_solve() -> None:
     assert abs(R[9, 9]) == pytest.approx(residual, rel=1e-10)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     sizes=st.lists(st.integers(0, 70), min_size=1, max_size=8),
     block=st.integers(1, 64),

@@ -154,7 +154,7 @@ def test_every_effect_can_be_written_out_and_keeps_its_numbers() -> None:
             assert_alike(subject.in_python(seed), subject.term_by_term(seed))
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(st.integers(0, 10**6))
 @pytest.mark.slow
 def test_compiled_with_every_effect_at_once_not_a_bit_differs(seed: int) -> None:

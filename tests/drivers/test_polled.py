@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.base import OFF, DeviceError, DeviceLost, OutputLaw, SampleBlock
@@ -122,7 +122,6 @@ def test_uneven_wakings_are_interpolated_onto_the_grid() -> None:
     assert 0.0 < driver.timing.worst <= 0.004
 
 
-@settings(deadline=None)
 @given(
     late=st.lists(st.floats(0.0, 0.03), min_size=1, max_size=30),
     reading=st.lists(st.floats(0.0, 0.02), min_size=1, max_size=30),

@@ -34,7 +34,7 @@ FILTERED = Scenario.model_validate(
 
 
 @pytest.mark.parametrize("scenario", [Scenario(), FILTERED], ids=["plain", "filtered"])
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     st.lists(
         st.tuples(st.booleans(), st.integers(0, 2), st.integers(1, 300), st.integers(0, 2)),

@@ -19,7 +19,7 @@ def integrate(gain: float, null: float, command: np.ndarray, start: float = 0.0)
     return start + np.cumsum(gain * (command - null)) / RATE
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(gain=gains, null=nulls, seconds=st.floats(0.7, 6.0), seed=st.integers(0, 1000))
 def test_gain_and_null_are_found_from_any_stretch(
     gain: float, null: float, seconds: float, seed: int
@@ -51,7 +51,7 @@ def test_a_command_that_does_not_vary_tells_nothing() -> None:
     assert np.isnan(follow(np.full(5, np.nan), np.zeros(5), RATE).null)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(drift=st.floats(-5e-3, 5e-3), centre=st.floats(-0.01, 0.01), seed=st.integers(0, 99))
 def test_drift_is_what_differs_between_two_periods(drift: float, centre: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -63,7 +63,7 @@ def test_drift_is_what_differs_between_two_periods(drift: float, centre: float, 
     assert seen.ends == pytest.approx(centre + period.mean() + drift * 2.0, abs=1e-5)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(gain=gains, null=nulls, bias=nulls, offset=st.floats(-3e-3, 3e-3))
 def test_one_trim_stops_the_drift_and_takes_out_half_the_offset(
     gain: float, null: float, bias: float, offset: float

@@ -58,7 +58,7 @@ def test_whole_periods_are_whole_and_shortest(cycles: int, samples: int, rate: f
     assert np.gcd(found_cycles, found_samples) == 1
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     seed=st.integers(0, 2**31),
     tilt=st.sampled_from([0.0, 0.5, 1.0]),

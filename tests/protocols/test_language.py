@@ -236,7 +236,7 @@ def test_a_condition_compares_in_si_and_never_by_what_is_unknown() -> None:
     assert not warm.holds({"b.rsd": float("nan")})
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.text(max_size=60))
 def test_any_text_is_a_condition_or_refused_in_one_line(text: str) -> None:
     try:

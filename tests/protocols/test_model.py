@@ -134,7 +134,7 @@ plain = st.recursive(
 )  # fmt: skip
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(plain)
 def test_whatever_a_file_holds_every_problem_is_a_line_that_names_it(content: object) -> None:
     # None of these is a whole protocol: the leaves lack what every one must have.

@@ -246,7 +246,7 @@ def test_asking_without_waiting_for_the_answer_does_not_stall_the_run(folder: Pa
         lambda n: st.tuples(st.just(n), st.integers(1, 60), st.integers(0, 2**31))
     )
 )
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_decimation_keeps_every_peak(case: tuple[int, int, int]) -> None:
     n, buckets, seed = case
     samples = np.random.default_rng(seed).normal(size=(n, 3))

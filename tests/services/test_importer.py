@@ -172,7 +172,7 @@ def test_a_bad_cell_is_named_by_file_column_and_row_of_the_editor(
     st.sampled_from(NAMES),
     st.sampled_from(["", "NaN", "inf", "x", "1e", "--1", "1 2", "#REF!"]),
 )
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_any_bad_cell_anywhere_is_found(tmp_path_factory, row: int, column: str, cell: str) -> None:
     folder = tmp_path_factory.mktemp("cell")
     with pytest.raises(InputError, match=rf"a\.csv:{row}: column '{column}', row {row}"):

@@ -84,7 +84,7 @@ CUTS = st.lists(st.integers(1, N - 1), max_size=12)
 
 
 @given(st.sampled_from(FAULTS), st.integers(0, N - 1), CUTS)
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_one_violating_sample_is_found_wherever_blocks_are_cut(
     fault: Fault, row: int, cuts: list[int]
 ) -> None:
@@ -102,7 +102,7 @@ def test_one_violating_sample_is_found_wherever_blocks_are_cut(
 
 
 @given(st.integers(10, N - 10), CUTS, st.sampled_from(["cap_pressure_2", "piston_1"]))
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 def test_a_jump_within_the_limits_is_a_rate_and_found_across_blocks(
     row: int, cuts: list[int], channel: str
 ) -> None:
@@ -117,7 +117,7 @@ def test_a_jump_within_the_limits_is_a_rate_and_found_across_blocks(
 
 
 @given(st.integers(0, N - 5), CUTS)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_five_saturated_samples_in_a_row_trip_and_four_do_not(row: int, cuts: list[int]) -> None:
     data = quiet_stream()
     marks = np.zeros((N, len(RIG.channels)), dtype=bool)
@@ -188,7 +188,7 @@ def moving(n: int = 600) -> NDArray[np.float64]:
 
 @pytest.mark.parametrize("channel", ["piston_2", "cap_pressure_2", "rod_pressure_2", "spool_2"])
 @given(cuts=CUTS)
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_a_sensor_that_freezes_while_its_joint_moves_trips(channel: str, cuts: list[int]) -> None:
     data = moving()
     guard = Guard(RIG)

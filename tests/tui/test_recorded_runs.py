@@ -106,7 +106,7 @@ def test_a_damaged_log_cannot_command_the_terminal(tmp_path: Path) -> None:
     assert line.text.isprintable()
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(at=st.integers(0, 10_000), byte=st.integers(0, 255), cut=st.integers(0, 10_000))
 def test_whatever_is_damaged_in_log_and_trace_is_said_in_one_line(
     tmp_path: Path, at: int, byte: int, cut: int

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from analysis.effects.edges import edge, opened
@@ -15,7 +15,6 @@ from rig.model.rig import Rig
 ROUNDING = 4e-3  # [V]
 
 
-@settings(deadline=None)  # the first look compiles
 @given(
     st.floats(-1.0, 1.0), st.floats(0.0, 0.1).filter(lambda r: r == 0 or r > 1e-9),
     st.floats(0.0, 10.0),
