@@ -320,10 +320,8 @@ def _named(
         more = hypotheses.closer(winner, {r.equation for r in rest})
         wider = gates.judge(hypotheses, more, holdout_data, rng) if more else ()
         later = left_over(hypotheses, more, holdout_data) if more else rest
-        # What speaks against nothing is named if nothing else fits as well, or if it would move a
-        # parameter of the baseline by much: else it is left alone.
+        # What speaks against nothing is named only if nothing else fits as well.
         needed = any(r.veto for r in rest) or _tied(wider) == _tied(found)
-        needed = needed or (more is not None and _moved(hypotheses, winner, more) > TRACE.material)
         stand = needed and all(map(gates.stands, wider))
         if more is None or len(later) >= len(rest) or not stand:
             break
@@ -333,23 +331,6 @@ def _named(
     if not winner.effects:  # what is left is too little for any effect to be needed
         return refused, winner, CLEAN, rest
     return found, winner, CONFOUNDED if _tied(found) else EXPLAINED, rest
-
-
-def _moved(hypotheses: HypothesisSet, winner: Hypothesis, more: Hypothesis) -> float:
-    """Return the largest relative change of a baseline coefficient between two sets of effects.
-
-    Of coefficients whose rows stand out of the noise (`TRACE.shown`): others may be anything.
-    """
-    before, after = winner.fit.beta, more.fit.beta
-    sizes = np.linalg.norm(hypotheses.stage.base, axis=0)
-    return max(
-        (
-            abs(before[name] / after[name] - 1.0)
-            for name, size in zip(hypotheses.stage.names, sizes, strict=True)
-            if name in before and abs(after.get(name, 0.0)) * size > TRACE.shown
-        ),
-        default=0.0,
-    )
 
 
 def _tied(found: Sequence[Found]) -> bool:

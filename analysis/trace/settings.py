@@ -53,10 +53,6 @@ class TraceSettings:
     """Of an equation's energy before: where more is left no effect acts (tuned)."""
     clue: float = 0.1
     """Of all that is left: an equation with less asks for no clue (tuned)."""
-    material: float = 0.1
-    """Relative change of a baseline parameter that matters to a user (contract)."""
-    shown: float = 30.0
-    """Whitened length of a coefficient's rows, a row's noise being 1: shorter tells little."""
     # Invariance.
     tolerance: float = 0.2
     """Relative disagreement that a catalogue's simpler form may cause (tuned)."""

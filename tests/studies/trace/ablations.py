@@ -183,8 +183,8 @@ def sections(found: Mapping[int, Sequence[Answer]], command: str) -> list[Sectio
                   rows),
             "No answer changed here without: " + (", ".join(idle) or "none") + ". On so few "
             "benches that is no proof that a rule is idle: the tests of the gates "
-            "(`tests/analysis/trace/test_gates.py`) hold a bench that needs it for each but pairs "
-            "and materiality.",
+            "(`tests/analysis/trace/test_gates.py`) hold a bench that needs it for each but "
+            "pairs.",
         )),
         Section("Every change", (
             Table("With all rules, and without one",

@@ -145,8 +145,6 @@ RULES: Final = (
          (setting("formula", math.inf),)),
     Rule("acted", "a formula's rest speaks against any effect, in whichever equation",
          (setting("acted", math.inf),)),
-    Rule("materiality", "a further effect is always named",
-         ((engine, "_moved", lambda *_: math.inf),)),
     Rule("further search", "quiet equations are not searched again",
          ((HypothesisSet, "closer", lambda *_: None),)),
     Rule("price of numbers", "a further number costs nothing",
@@ -197,8 +195,6 @@ FAULTS: Final = (
          (setting("tolerance", 2.0),)),
     Rule("nothing is left", "whatever stays counts as nothing",
          ((remaining, "left_over", lambda *_: []), (engine, "left_over", lambda *_: []))),
-    Rule("material never", "a further effect is never material",
-         ((engine, "_moved", lambda *_: 0.0),)),
 )  # fmt: skip
 
 
