@@ -187,8 +187,8 @@ class HypothesisSet:
 
         def allowed(entry: VariantColumns, coefficients: Array) -> bool:
             own = dict(zip(entry.names, map(float, coefficients), strict=True))
-            low, high = linear_fit.PSEUDO
-            if "" in own and not low <= own[""] <= high:
+            # No lower bound: what is smaller than the grid's first point is fitted exactly later.
+            if not 0.0 <= own.get("", 0.0) <= linear_fit.BEYOND:
                 return False
             for c in entry.variant.effect.coefficients(rig):
                 own.setdefault(c.parameter, 0.0)

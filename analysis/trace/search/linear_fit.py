@@ -31,7 +31,7 @@ VISIBLE = 0.03  # of a column's length must stand out of the baseline's columns
 LARGEST = 4  # effects in a set
 STARTS = 10  # single candidates from which pairs are tried
 MOST_TRIALS = 40  # best entries that are fitted in full
-PSEUDO = (0.3, 3.0)  # coefficient of a pseudo-column (1 if its shape were exact)
+BEYOND = 3.0  # largest size over that of a shape's column; smaller ones are nearer to linear
 
 
 @dataclass(frozen=True)

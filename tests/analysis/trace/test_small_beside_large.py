@@ -1,0 +1,32 @@
+"""An effect smaller than the first point of its shape's grid is found beside a loud leak."""
+
+from __future__ import annotations
+
+import pytest
+
+from rig.model.rig import Rig
+from tests.analysis.trace.gate_cases import LEAK, searched
+from tests.analysis.trace.hidden import pair_of_runs
+
+
+@pytest.mark.parametrize("null", [8e-4, -1e-3])
+def test_a_null_of_a_millivolt_is_found_beside_a_leak(rig: Rig, null: float) -> None:
+    runs = pair_of_runs(rig, c_internal=LEAK, u_null=null)
+    s = searched(rig, *runs, "internal_leakage", "spool_offset", "sensor_lag")
+    sizes = {u.term.name: u.shape for u in s.winner.effects}
+    assert set(sizes) == {"internal_leakage", "spool_offset"}
+    assert sizes["spool_offset"][0] == pytest.approx(null, rel=0.05)
+    assert s.vetoes(s.winner) == ""
+
+
+@pytest.mark.parametrize("gain", [1.005, 1.002, 0.998])
+def test_a_gain_wrong_by_parts_in_a_thousand_is_not_called_crosstalk_of_the_other_chamber(
+    rig: Rig, gain: float
+) -> None:
+    """With one joint the same chamber's cross-talk cannot be told from it, the other's can."""
+    runs = pair_of_runs(rig, c_internal=LEAK, gain_cap_pressure=gain)
+    s = searched(rig, *runs, "internal_leakage", "sensor_gain", "sensor_crosstalk")
+    sizes = {(u.term.name, u.term.where): u.shape for u in s.winner.effects}
+    assert set(sizes) == {("internal_leakage", "joint 2"), ("sensor_gain", "joint 2 cap")}
+    assert sizes["sensor_gain", "joint 2 cap"][0] == pytest.approx(gain, abs=3e-4)
+    assert s.vetoes(s.winner) == ""
