@@ -58,7 +58,7 @@ class BlockDecoder:
             self.tick = tick
 
     def seen(self, header: BlockHeader) -> bool:
-        """Tell whether a block is one of the last few decoded: a late copy of an answer."""
+        """Return whether a block is one of the last few decoded: a late copy of an answer."""
         behind = (self.acknowledge - header.sequence) & 0xFFFF
         return self._sequence is not None and behind <= min(self._sequence, LATE)
 

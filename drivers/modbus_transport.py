@@ -231,7 +231,7 @@ class ModbusConnection:
         return data
 
     def _answers_earlier_request(self, data: bytes) -> bool:
-        """Tell whether what came carries the transaction number of another request."""
+        """Return whether what came carries the transaction number of another request."""
         head = data[: _MBAP.size]
         if len(head) < _MBAP.size:
             return False

@@ -249,7 +249,7 @@ class _Search:
         return fitting, plays
 
     def centrable(self, candidate: Candidate) -> bool:
-        """Tell whether the pistons still follow their commands about as they did at first.
+        """Return whether the pistons still follow their commands about as they did at first.
 
         The bench trims its biases by that gain; excited only near its resonance a joint shows
         none, and could not be kept in its stroke.

@@ -275,7 +275,7 @@ NO_KERNEL: Kernel = _nothing  # of effects that the plant does not feel
 
 
 def open_shapes(rig: Rig, used: Used) -> bool:
-    """Tell whether a term is an effect that is nothing without a shape, and has none.
+    """Return whether a term is an effect that is nothing without a shape, and has none.
 
     A contact's presliding is what data resolve: without one it is dry.
     """

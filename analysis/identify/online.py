@@ -259,7 +259,7 @@ class Tracker:
         self._clock = -np.inf
 
     def _concerns(self, used: Used) -> bool:
-        """Tell whether a term has to do with the families followed."""
+        """Return whether a term has to do with the families followed."""
         prepares = type(used.term).prepare is not Term.prepare
         return prepares or any(
             c.family in self._families for c in used.term.coefficients(self._rig)

@@ -68,7 +68,7 @@ def overlap(rig: Rig, rate: float, filtering: Filtering) -> int:
 
 
 def divisible(filtering: Filtering) -> bool:
-    """Tell whether the filters are finite, so that a record may be read in chunks."""
+    """Return whether the filters are finite, so that a record may be read in chunks."""
     return isinstance(filtering.channels, FirSmoother)
 
 

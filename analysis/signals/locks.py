@@ -61,7 +61,7 @@ def moving_joints(rig: Rig, repeats: Sequence[Record]) -> Mask:
 
 
 def gives(position: Array, rate: float, noise: float) -> bool:
-    """Tell whether a locked position (n,) accelerates visibly above its sensor's noise [m]."""
+    """Return whether a locked position (n,) accelerates visibly above its sensor's noise [m]."""
     band = row_filter(rate, SIGNALS.moving_band)
     if len(position) <= 4 * band.reach:
         return False

@@ -125,7 +125,7 @@ def checksum(data: bytes) -> bytes:
 
 
 def sound(frame: bytes) -> bool:
-    """Tell whether a frame's checksum is right."""
+    """Return whether a frame's checksum is right."""
     return frame[-2:] == checksum(frame[:-2])
 
 

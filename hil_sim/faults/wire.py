@@ -74,7 +74,7 @@ class WireFault(Fault):
         return self.way
 
     def strikes(self, way: str) -> bool:
-        """Tell whether it acts on the frames of a way."""
+        """Return whether it acts on the frames of a way."""
         return self.way in (way, BOTH)
 
     def spoil(self, frame: bytes, rng: np.random.Generator) -> Sequence[Piece]:

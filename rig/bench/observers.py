@@ -53,9 +53,9 @@ class Observers:
             self._notify(lambda one: one.block(block))
 
     def record_begins(self, meta: RecordMeta, start: int, ticks: int | None) -> None:
-        """Tell that a record begins."""
+        """Handle the beginning of a record."""
         self._notify(lambda one: one.record_begins(meta, start, ticks))
 
     def record_ends(self, meta: RecordMeta, start: int, ticks: int, state: str) -> None:
-        """Tell that a record has ended."""
+        """Handle the end of a record."""
         self._notify(lambda one: one.record_ends(meta, start, ticks, state))

@@ -14,7 +14,7 @@ EVERY: Final = 3.0  # [s] between two lines of a countdown, and before its first
 
 
 def progress(message: str) -> None:
-    """Tell the person how the work goes, on standard error."""
+    """Report how far the work is, on standard error."""
     print(message, file=sys.stderr, flush=True)
 
 

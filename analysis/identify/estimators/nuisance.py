@@ -185,7 +185,7 @@ def beliefs(names: Sequence[str], value: Array) -> list[Belief]:
 
 
 def implausible(belief: Belief, beta: Array, covariance: Array) -> bool:
-    """Tell whether the data contradict what is known: something else is in that column."""
+    """Return whether the data contradict what is known: something else is in that column."""
     variance = belief.std**2 + float(belief.h @ covariance @ belief.h)
     return bool(abs(belief.h @ beta) > IDENTIFY.implausible_deviations * np.sqrt(variance))
 

@@ -116,7 +116,7 @@ def _use_first(
 
 
 def _shows(names: tuple[str, ...], stage: StepRows, known: Mapping[str, StageValue]) -> bool:
-    """Tell whether a stage's rows contain anything that is still unknown."""
+    """Return whether a stage's rows contain anything that is still unknown."""
     columns = [i for i, name in enumerate(names) if name not in known]
     return any(np.any(c.triangle[:, columns] != 0.0) for c in stage.clusters)
 

@@ -52,7 +52,7 @@ def conditioned_records(
 
 
 def held(term: Term, conditioned: ConditionedRecord) -> bool:
-    """Tell whether an effect at a joint cannot show because the joint is locked.
+    """Return whether an effect at a joint cannot show because the joint is locked.
 
     A sensor of a locked joint still tells where that joint stands.
     """
@@ -63,13 +63,13 @@ def held(term: Term, conditioned: ConditionedRecord) -> bool:
 
 
 def changes_signals(term: Term) -> bool:
-    """Tell whether a term changes what all terms see, or where the equations hold."""
+    """Return whether a term changes what all terms see, or where the equations hold."""
     kind = type(term)
     return kind.prepare is not Term.prepare or kind.valid is not Term.valid
 
 
 def acts_on(rig: Rig, term: Term, family: str) -> bool:
-    """Tell whether a family's rows need a term: it has columns there, or alters their signals."""
+    """Return whether a family's rows need a term: it has columns there, or alters their signals."""
     if any(c.family == family for c in term.coefficients(rig)):
         return True
     return changes_signals(term) and family in getattr(term, "alters", FAMILIES)

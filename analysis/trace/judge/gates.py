@@ -38,7 +38,7 @@ REMOVES, PHYSICAL, INVARIANT, STABLE, SIGNIFICANT, ALONE = (
 
 
 def stands(found: Found) -> bool:
-    """Tell whether an effect passes every gate but that of rivals, which makes it confounded."""
+    """Return whether an effect passes every gate but that of rivals, which makes it confounded."""
     return all(gate.ok for gate in found.gates if gate.name != ALONE)
 
 
@@ -254,7 +254,7 @@ def _refused_already(
     hypotheses: HypothesisSet, holdout_data: RegressionData, pair: tuple[Effect, Effect],
     others: frozenset[Key], held: Array,
 ) -> bool:  # fmt: skip
-    """Tell whether a rival says no more than a simpler reading of both, which is refused."""
+    """Return whether a rival says no more than a simpler reading of both, which is refused."""
     mine, other = pair
     for name in set(other.includes) & set(mine.includes) if other.where == mine.where else ():
         simple = hypotheses.listed.get(others | {(name, other.where)})
@@ -286,7 +286,7 @@ class _Near:
         return float(np.sqrt(energy / self.energy)) if self.energy > 0 else float("nan")
 
     def near(self, other: Array, tie: float) -> bool:
-        """Tell whether another fit (M,) loses no more than noise, or than `tie` times the rms.
+        """Return whether another fit (M,) loses no more than noise, or than `tie` times the rms.
 
         Of an effect that takes less than is left, what it takes is the measure, not the noise.
         """

@@ -63,7 +63,7 @@ def loss(restricted: Array, richer: Array) -> float:
 
 
 def related(one: Effect, other: Effect) -> bool:
-    """Tell whether one of two effects is a reading of the other's law at the same place."""
+    """Return whether one of two effects is a reading of the other's law at the same place."""
     near = one.name in other.includes or other.name in one.includes
     return near and one.where == other.where
 
@@ -72,7 +72,7 @@ def _lost(
     hypotheses: HypothesisSet, one: Hypothesis, other: Hypothesis, held: Array,
     holdout_data: RegressionData,
 ) -> bool:  # fmt: skip
-    """Tell whether training and held-out records lose by taking `one` for the richer `other`."""
+    """Return whether training and held-out records lose by taking `one` for the richer `other`."""
     gain = one.fit.energy - other.fit.energy
     if gain <= TRACE.deviations**2:
         return False

@@ -82,5 +82,5 @@ def limits(data: RegressionData) -> NoiseBand:
 
 
 def within(excess_energy: dict[str, float], limit: NoiseBand) -> bool:
-    """Tell whether nothing is left above the band in any equation."""
+    """Return whether nothing is left above the band in any equation."""
     return all(value <= limit.band[e] for e, value in excess_energy.items())

@@ -119,7 +119,7 @@ class HypothesisSet:
         return self.exact(tuple(effects.values())) if changed else None
 
     def better(self, one: Hypothesis, other: Hypothesis) -> bool:
-        """Tell whether `one` is to be preferred: much less left, or as little and simpler."""
+        """Return whether `one` is to be preferred: much less left, or as little and simpler."""
         slack = linear_fit.CHANCE * max(1, abs(one.size[1] - other.size[1]))
         if one.size < other.size:
             return one.total <= max(linear_fit.AS_GOOD * other.total, other.total + slack)
@@ -163,11 +163,11 @@ class HypothesisSet:
         return now
 
     def formed(self, one: Hypothesis) -> bool:
-        """Tell whether what is left may be the difference of form between effect and catalogue."""
+        """Return whether the rest may be the difference of form between effect and catalogue."""
         return all(self.negligible(e, residual) for e, residual in one.excess_energy.items())
 
     def negligible(self, equation: str, residual: float) -> bool:
-        """Tell whether so much energy above noise may be left in an equation."""
+        """Return whether so much energy above noise may be left in an equation."""
         allowed = (linear_fit.LEFT / linear_fit.BAND) ** 2 * self.limits.band[equation]
         return residual <= max(allowed, linear_fit.FORM * self.empty.excess_energy[equation])
 
@@ -291,7 +291,7 @@ class HypothesisSet:
         return one
 
     def idle(self, without: Hypothesis, one: Hypothesis) -> bool:
-        """Tell whether the effect that `without` lacks takes too small a share away."""
+        """Return whether the effect that `without` lacks takes too small a share away."""
         drop = without.total - one.total
         return drop < linear_fit.ADD_SHARE * without.total
 

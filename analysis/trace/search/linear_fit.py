@@ -154,7 +154,7 @@ def judged(
 
 
 def in_band(candidates: CandidateColumns, chosen: LinearFit, noise: float) -> bool:
-    """Tell whether what is left of every equation is too little to explain."""
+    """Return whether what is left of every equation is too little to explain."""
     return all(
         excess_energy <= max(candidates.band[e], 4 * noise * np.sqrt(2 * len(candidates.rows[e])))
         for e, excess_energy in chosen.excess_energy.items()
@@ -206,7 +206,7 @@ def _size(candidates: CandidateColumns, choice: LinearFit) -> int:
 
 
 def admissible(candidates: CandidateColumns, choice: LinearFit) -> bool:
-    """Tell whether physics allows every effect of a set at its fitted size."""
+    """Return whether physics allows every effect of a set at its fitted size."""
     return all(
         candidates.admissible(candidates.entries[m], k)
         for m, k in zip(choice.members, choice.coefficients, strict=True)

@@ -66,7 +66,7 @@ class FaultBench:
         return answer
 
     def at_zero(self, patience: float) -> bool:
-        """Tell whether the device's outputs are at zero within `patience` [s]."""
+        """Return whether the device's outputs are at zero within `patience` [s]."""
         deadline = time.monotonic() + patience
         while self.state().driven:
             if time.monotonic() > deadline:

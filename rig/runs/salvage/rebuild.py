@@ -1,4 +1,4 @@
-"""Tell a damaged journal from a whole one, and make a whole one of what a damaged one still holds.
+"""Distinguish damaged journals from whole ones, and rebuild a whole one from what can be read.
 
 A damaged journal's files are read only. What counts as lost: the gaps that the readable blocks
 leave between them (less what was lost on the wire, which the events say), the blocks before the
