@@ -101,12 +101,12 @@ def predict(
     terms: Sequence[Used] | None = None,
     filtering: Filters = default_filtering,
     jitter: float | None = None,
-    tell: Callable[[float], None] | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> Prediction:
     """Predict what identifying these steps on this rig will give.
 
     `jitter` [s] is that of a host-timed device's samples, None where the device has the clock;
-    `tell` hears after each step which share of them is done.
+    `progress` receives after each step which share of them is done.
     Raises InputError for a rig without nominal values and for steps the twin cannot follow.
     """
     used = tuple(terms) if terms is not None else tuple(Used(term) for term in baseline())
@@ -114,8 +114,8 @@ def predict(
     for number, step in enumerate(steps, start=1):
         played.append(play(rig, step))
         parts.append(information(rig, played[-1], used, filtering, moments=True))
-        if tell is not None:
-            tell(number / len(steps))
+        if progress is not None:
+            progress(number / len(steps))
     predicted = combine(rig, used, parts)
     cost = None if jitter is None else lateness_cost(rig, played, used, filtering, jitter)
     if cost is None:

@@ -48,7 +48,7 @@ def coupled(
     bootstrap: int = 0,
     rng: np.random.Generator | None = None,
     nuisances: bool = True,
-    tell: Callable[[float], None] | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> Identification:
     """Identify all parameters of the terms `used` from all records of the runs at once.
 
@@ -67,7 +67,7 @@ def coupled(
         job = EstimationJob(rig, runs, used, built, estimator, bootstrap, rng, nuisances)
         return refine(job, solutions)
 
-    built = build_rows(rig, runs, used, filtering, tell)
+    built = build_rows(rig, runs, used, filtering, progress)
     reductions = reduce_rows(rig, used, built)
     sources = [run.source for run in runs]
     result = conclude(

@@ -35,7 +35,7 @@ def identify(
     rng: np.random.Generator | None = None,
     search: SearchOptions | None = None,
     nuisances: bool = True,
-    tell: Callable[[float], None] | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> Identification:
     """Identify all parameters from all records of the runs at once (the paper's STEP4).
 
@@ -45,10 +45,10 @@ def identify(
     `analysis.identify.estimation.ESTIMATORS` ("auto": least squares, or instruments where noise in
     the regressors biases it and that matters), "plain" the bare solution without nuisances;
     `bootstrap` draws of whole repeats replace the intervals; `rng` is for what is drawn (default:
-    seed 0); without `nuisances` no small effects are fitted beside the terms; `tell` hears which
-    share of the runs the coupled method has worked through. Raises InputError for another method
-    or estimator, for runs of different rigs and for records that cannot be used, naming record
-    and channel.
+    seed 0); without `nuisances` no small effects are fitted beside the terms; `progress` receives
+    the share of the runs that the coupled method has worked through. Raises InputError for
+    another method or estimator, for runs of different rigs and for records that cannot be used,
+    naming record and channel.
     """
     _refuse_method(method)
     _refuse_estimator(estimator, bootstrap)
@@ -56,7 +56,9 @@ def identify(
     used = tuple(terms) if terms is not None else tuple(map(Used, baseline_of(rig)))
     if method != "coupled":
         return identify_by(method, runs, used, filtering, reject_noise, rng, search)
-    return coupled(runs, used, filtering, reject_noise, estimator, bootstrap, rng, nuisances, tell)
+    return coupled(
+        runs, used, filtering, reject_noise, estimator, bootstrap, rng, nuisances, progress
+    )
 
 
 def _refuse_method(method: str) -> None:

@@ -49,11 +49,11 @@ def build_rows(
     runs: Sequence[Run],
     terms: Sequence[Used],
     filtering: Callable[[Record], Filtering] = default_filtering,
-    tell: Callable[[float], None] | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> list[RecordRows]:
     """Return the filtered, decimated rows of every record; raises InputError for a bad one.
 
-    `tell` hears which share of the runs is done.
+    `progress` receives which share of the runs is done.
     """
     ck.refuse_dead_records(rig, runs)
     out: list[RecordRows] = []
@@ -61,8 +61,8 @@ def build_rows(
         for conditioned in condition_runs(rig, [run], filtering):
             rows = record_rows(rig, terms, conditioned.signals, conditioned.filtering)
             out.append(RecordRows(replace(conditioned, run=number), rows))
-        if tell is not None:
-            tell((number + 1) / len(runs))
+        if progress is not None:
+            progress((number + 1) / len(runs))
     return out
 
 

@@ -68,7 +68,7 @@ def trace(
     look_ahead: bool = True,
     terms: Sequence[Used] | None = None,
     free_forms: bool = True,
-    tell: Callable[[float], None] | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> Trace:
     """Say what the baseline lacks on `runs`, name it or refuse to, and judge it on `holdout`.
 
@@ -77,7 +77,7 @@ def trace(
     share no parameter, so that what stays unexplained in one need not hide the other); `look_ahead`
     designs the next experiment; `terms` take the baseline's place: a model's with its effects,
     whose shapes stay as they are; with `free_forms` a mechanism whose curve the data draw may
-    explain what no named effect does; `tell` hears about which share of the work is done. Raises
+    explain what no named effect does; `progress` receives the share of the work done. Raises
     InputError for records of different rigs, without held-out records, with held-out ones that
     are training records, or too short to tell anything.
     """
@@ -94,7 +94,7 @@ def trace(
     holdout_data = regression_data(rig, terms, judged, train_data.beta)
     moving = len({s.equation.rsplit("_", 1)[1] for s in train_data.segments})
     candidates = _unknown(catalogue(rig) if effects is None else effects, known, moving)
-    done = tell or _nobody
+    done = progress or _nobody
     hypotheses = HypothesisSet(train_data, candidates)
     before = stripped(identify(runs, terms=terms, estimator=PLAIN).model)
     notes = _notes(train_data, holdout_data)

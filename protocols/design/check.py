@@ -67,13 +67,13 @@ def check(
     plan: Plan,
     rig: Rig,
     twin: Twin,
-    tell: Callable[[float], None] | None = None,
+    progress: Callable[[float], None] | None = None,
     draws: Sequence[Twin] = (),
 ) -> CheckReport:
     """Predict every step on the twin and compare with the rig's limits.
 
-    `draws` are twins within the uncertainty of `twin`; `tell` hears after each step which share of
-    them is done.
+    `draws` are twins within the uncertainty of `twin`; `progress` receives the
+    share of the steps that is done, after each.
     Raises InputError where the twin cannot follow the commands at all; whether limits are kept
     is in the report.
     """
@@ -84,8 +84,8 @@ def check(
         if same not in seen:
             seen[same] = check_step(step, rig, twin, draws)
         steps.append(replace(seen[same], step=step.name))
-        if tell is not None:
-            tell(len(steps) / len(plan.excitations))
+        if progress is not None:
+            progress(len(steps) / len(plan.excitations))
     return CheckReport(plan.protocol.name, rig.name, plan.seconds, tuple(steps), _timeline(plan))
 
 

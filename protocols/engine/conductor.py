@@ -91,7 +91,7 @@ class Conductor:
         own = self._part.seconds - (self.elapsed - self._part_began)
         return self._left + max(0.0, own)
 
-    def tell(self, step: str, phase: str, repeat: int, repeats: int, message: str) -> None:
+    def report_phase(self, step: str, phase: str, repeat: int, repeats: int, message: str) -> None:
         """Report a phase, and when the run is expected to end."""
         self.bench.status(total_s=self.elapsed + self.left())
         self._on_phase(step, phase, repeat, repeats, message)
@@ -109,7 +109,7 @@ class Conductor:
         if self._skipped(planned.name):
             return
         if not planned.excitations:
-            self.tell(planned.name, planned.step.key.replace("_", " "), 0, 0, planned.title)
+            self.report_phase(planned.name, planned.step.key.replace("_", " "), 0, 0, planned.title)
         planned.step.run(planned, self)
         self._skipped(planned.name)
 
@@ -161,7 +161,7 @@ class Conductor:
         self.session.wait(LOOK)
         if locks:
             targets = {part.joint: part.piston for part in locks}
-            self.tell(planned.name, "place", 0, 0, planned.title)
+            self.report_phase(planned.name, "place", 0, 0, planned.title)
             move(
                 self.session, targets, self._place, self._place.tolerance, SETTLE, planned.name
             )  # fmt: skip
@@ -179,7 +179,7 @@ class Conductor:
         joints = tuple(range(1, self.session.joints + 1))
         ticks = round(seconds * self.session.rate)
         meta = RecordMeta(step=name, repeat=repeat, locked=joints, attributes={"excited": ""})
-        self.tell(name, "record", repeat, repeat, f"{seconds:g} s with every valve closed")
+        self.report_phase(name, "record", repeat, repeat, f"{seconds:g} s with every valve closed")
         first = self.session.now
         with self.bench.record(meta, start_tick=first, ticks=ticks) as record:
             self.session.until(first + ticks)
@@ -198,7 +198,7 @@ class Conductor:
         self.session.wait(LOOK)
         hold = Hold(planned.name, SETTLE, 1.0)
         for part in locks:
-            self.tell(planned.name, "lock", 0, 0, f"joint {part.joint + 1} {part.at}")
+            self.report_phase(planned.name, "lock", 0, 0, f"joint {part.joint + 1} {part.at}")
             lock(self.session, part, self._place, hold)
             self.machine.to(EngineState.LOCKED, f"joint {part.joint + 1} {part.at}")
         self.rest_now("locks are proved")
@@ -224,7 +224,7 @@ class Conductor:
         self.machine.to(EngineState.PROMPTING, question.text)
         self.bench.status(prompt=question.text, answers=list(question.answers))
         choice = f"{question.text} [{'/'.join(question.answers)}]"
-        self.tell("prompt", "prompt", 0, 0, choice)
+        self.report_phase("prompt", "prompt", 0, 0, choice)
         try:
             answer, source = self._answer(question)
         finally:
@@ -247,7 +247,9 @@ class Conductor:
                 if typed.strip() in question.answers:
                     return typed.strip(), "at the terminal"
                 expected = ", ".join(question.answers)
-                self.tell("prompt", "prompt", 0, 0, f"{typed.strip()!r} is no answer: {expected}")
+                self.report_phase(
+                    "prompt", "prompt", 0, 0, f"{typed.strip()!r} is no answer: {expected}"
+                )
         if question.default is None or self.desk.attended:
             raise RunEnded(f"{question.text!r} was not answered within {limit:g} s")
         return question.default, f"the default, after {limit:g} s"
@@ -270,7 +272,7 @@ class Conductor:
                 f" ({seen})" if seen else ""
             )
             self.mark(text)
-            self.tell(planned.name, "repeat", number, rounds, text)
+            self.report_phase(planned.name, "repeat", number, rounds, text)
             if good:
                 return True
         return False
@@ -325,7 +327,7 @@ class Conductor:
         self.rest_now("a pause was asked for")
         wishes.pause = wishes.resume = False
         self.machine.to(EngineState.PAUSED, "until someone resumes")
-        self.tell("pause", "paused", 0, 0, "outputs at zero until someone resumes")
+        self.report_phase("pause", "paused", 0, 0, "outputs at zero until someone resumes")
         began = self.elapsed
         while not wishes.resume and not wishes.skip:
             if self.elapsed - began > self.desk.longest_pause:
@@ -343,7 +345,7 @@ class Conductor:
         wishes.skip = False
         self.rest_now(f"{name} is skipped")
         self.mark(f"{name} was skipped by a person")
-        self.tell(name, "skip", 0, 0, "skipped by a person")
+        self.report_phase(name, "skip", 0, 0, "skipped by a person")
         return True
 
     def _pass(self, seconds: float, done: Callable[[], bool] | None = None) -> bool:

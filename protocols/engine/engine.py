@@ -49,7 +49,7 @@ def run(
     machine.to(EngineState.IDLE, "the plan is proved")
     try:
         _all(plan, conductor)
-        conductor.tell(plan.sequence[-1].name, "done", 0, 0, f"{conductor.records} records")
+        conductor.report_phase(plan.sequence[-1].name, "done", 0, 0, f"{conductor.records} records")
     except SafetyTrip as trip:
         _trip(plan, conductor, trip)
         raise

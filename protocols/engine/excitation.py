@@ -35,7 +35,7 @@ class ExcitationDesk(Protocol):
     def interrupted(self) -> bool:
         """Whether a person asked for a pause, or to skip the step."""
 
-    def tell(self, step: str, phase: str, repeat: int, repeats: int, message: str) -> None:
+    def report_phase(self, step: str, phase: str, repeat: int, repeats: int, message: str) -> None:
         """Hear where the step stands."""
 
 
@@ -61,15 +61,15 @@ class ExcitationRun:
         self._more = dict(attributes or {})
         self.locks: list[JointLock] = []
 
-    def tell(self, phase: str, message: str, repeat: int = 0) -> None:
+    def report_phase(self, phase: str, message: str, repeat: int = 0) -> None:
         """Report a phase."""
         log.info("%s: %s %s", self.step.name, phase, message)
-        self._desk.tell(self.step.name, phase, repeat, self.step.repeats, message)
+        self._desk.report_phase(self.step.name, phase, repeat, self.step.repeats, message)
 
     def run(self) -> bool:
         """Take the records that are not taken yet; False where a person asked to stop earlier."""
         excitation = self._start()
-        self.tell("centre", "open loop; biases are trimmed")
+        self.report_phase("centre", "open loop; biases are trimmed")
         excitation.settle_bias()
         complete = self._records(excitation)
         self._stop(excitation)
@@ -97,12 +97,12 @@ class ExcitationRun:
         self.session.bench.guard(self._roles())
         self._desk.machine.to(EngineState.EXCITING, self.step.name)
         excitation = Playback(self.session, self.step, self.place, self.locks)
-        self.tell("warm-up", "waveforms grow under the position loop")
+        self.report_phase("warm-up", "waveforms grow under the position loop")
         excitation.warm_up(nulls)
         return excitation
 
     def _stop(self, excitation: Playback) -> None:
-        self.tell("stop", "waveforms shrink, valves close")
+        self.report_phase("stop", "waveforms shrink, valves close")
         excitation.stop()
         self._desk.machine.to(EngineState.IDLE, f"{self.step.name}: valves closed")
         self.locks = []
@@ -123,7 +123,7 @@ class ExcitationRun:
     def _place(self) -> dict[int, float]:
         targets = {e.joint: e.centre for e in self.step.excite}
         where = ", ".join(f"joint {j + 1} to {1e3 * s:g} mm" for j, s in targets.items())
-        self.tell("place", where)
+        self.report_phase("place", where)
         self.session.wait(0.01)  # so that the session knows the device's time
         # They are centred again when they move: here half of what that allows is near enough.
         near = 0.5 * min(e.settings.centring.offset for e in self.step.excite)
@@ -136,7 +136,7 @@ class ExcitationRun:
         hold = Hold(self.step.name, self.step.settle, self.step.record / self.session.rate)
         locks = []
         for part in sorted(self.step.locks, key=lambda p: p.at == CLOSED):
-            self.tell("lock", f"joint {part.joint + 1} {_lock_text(part)}")
+            self.report_phase("lock", f"joint {part.joint + 1} {_lock_text(part)}")
             locks.append(lock(self.session, part, self.place, hold))
             self._desk.machine.to(EngineState.LOCKED, f"joint {part.joint + 1} {part.at}")
         return locks
@@ -162,13 +162,15 @@ class ExcitationRun:
                 )
             if self._desk.interrupted:
                 return False
-            self.tell("centre", f"record {repeat} was disturbed and is taken again", repeat)
+            self.report_phase("centre", f"record {repeat} was disturbed and is taken again", repeat)
             excitation.settle_bias()
         return True
 
     def _record(self, excitation: Playback, repeat: int) -> bool:
         """Take one record; False if it was disturbed, and so is none."""
-        self.tell("record", f"record {repeat} of {self._first - 1 + self.step.repeats}", repeat)
+        self.report_phase(
+            "record", f"record {repeat} of {self._first - 1 + self.step.repeats}", repeat
+        )
         first, driven = excitation.at, excitation.joints
         meta = self._meta(repeat)
         with self.session.bench.record(meta, start_tick=first, ticks=self.step.record) as record:
@@ -226,7 +228,9 @@ class ExcitationRun:
             off = look(self.session, held.joint, first, self.session.now).piston - held.piston
             if abs(off) <= RELOCK_SHARE * held.tolerance:
                 continue
-            self.tell("lock", f"joint {held.joint + 1} crept {1e3 * off:.2f} mm; closed anew")
+            self.report_phase(
+                "lock", f"joint {held.joint + 1} crept {1e3 * off:.2f} mm; closed anew"
+            )
             plan = next(part for part in self.step.locks if part.joint == held.joint)
             excitation.hold()
             self.session.bench.guard(self._roles_without(held.joint))

@@ -51,7 +51,7 @@ def check(
     bench = load_bench(rig)
     plan = resolve(library.load(protocol, changes.parameters), bench, changes)
     source = twin_source(bench, model, nominal)
-    proof = proved(plan, bench, predict=True, tell=Countdown("checking"), source=source)
+    proof = proved(plan, bench, predict=True, progress=Countdown("checking"), source=source)
     if proof.warning:
         progress(proof.twin_text)
     document = proof.report.as_dict()

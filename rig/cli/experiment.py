@@ -94,7 +94,7 @@ def run_demo(out: Path, seed: int, repeats: int | None) -> None:
     write_json(folder / "validate.json", validation_json(done.validation))
     progress("tracing what the model lacks, judged on runs that the fit has not seen")
     held_out = (*done.unseen, *done.judged)
-    traced = trace(done.runs, held_out, seed=seed, tell=Countdown("tracing"))
+    traced = trace(done.runs, held_out, seed=seed, progress=Countdown("tracing"))
     write_json(folder / "trace.json", trace_json(traced))
     save_model(traced.model_after, folder / "model.json")
     command = f"bramah demo --out {shlex.quote(str(out))} --seed {seed}"

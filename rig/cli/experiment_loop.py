@@ -115,7 +115,7 @@ class Loop:
         self.say(f"round {number}: tracing {sum(len(r.records) for r in self.train)} records")
         result = trace(
             self.train, self.judge, seed=self.wanted.seed,
-            tell=Countdown(f"round {number}: tracing", self.say),
+            progress=Countdown(f"round {number}: tracing", self.say),
         )  # fmt: skip
         worth = None
         if experiment is not None:

@@ -25,10 +25,10 @@ def _load(folders: Sequence[Path]) -> list[Run]:
     from rig.runs.store import load_run, refuse_repeated
 
     refuse_repeated(folders)
-    tell, loaded = Countdown("loading"), []
+    countdown, loaded = Countdown("loading"), []
     for folder in folders:
         loaded.append(load_run(folder))
-        tell(len(loaded) / len(folders))
+        countdown(len(loaded) / len(folders))
     return loaded
 
 
@@ -186,7 +186,7 @@ def identify(
             bootstrap=bootstrap,
             rng=np.random.default_rng(seed),
             search=SearchOptions(evaluations=evaluations),
-            tell=Countdown("identifying"),
+            progress=Countdown("identifying"),
         )
     shapes = _shapes_in(result)
     document, more = to_json(result), shapes_text(shapes) + method_text(result)

@@ -53,10 +53,10 @@ class ForecastText:
 
 
 def forecast_text(
-    plan: Plan, parameters: TwinParameters, tell: Callable[[float], None] | None = None
+    plan: Plan, parameters: TwinParameters, report: Callable[[float], None] | None = None
 ) -> ForecastText:
     """Check and predict a plan; InputError where the twin cannot follow it."""
-    forecast = of_plan(plan, parameters.rig, tell, parameters.twin, parameters.draws)
+    forecast = of_plan(plan, parameters.rig, report, parameters.twin, parameters.draws)
     return ForecastText(
         forecast.limits, as_dict(forecast)["identification"], prediction_text(forecast)
     )
@@ -96,7 +96,7 @@ def lateness_text(found: CheckedForecast) -> str:
 def of_plan(
     plan: Plan,
     rig: Rig,
-    tell: Callable[[float], None] | None = None,
+    report: Callable[[float], None] | None = None,
     twin: Twin = simulate_commands,
     draws: Sequence[Twin] = (),
 ) -> CheckedForecast:
@@ -106,7 +106,7 @@ def of_plan(
     """
 
     def part(begin: float, end: float) -> Callable[[float], None] | None:
-        return None if tell is None else lambda share: tell(begin + (end - begin) * share)
+        return None if report is None else lambda share: report(begin + (end - begin) * share)
 
     limits = check(plan, rig, twin, part(0.0, CHECKED), draws)
     biases = {step.step: step.biases for step in limits.steps}
@@ -114,7 +114,7 @@ def of_plan(
         return CheckedForecast(limits, None, "it takes no records of excited joints")
     try:
         steps = planned_steps(plan, biases)
-        predicted = predict(rig, steps, jitter=jitter_of(rig), tell=part(CHECKED, 1.0))
+        predicted = predict(rig, steps, jitter=jitter_of(rig), progress=part(CHECKED, 1.0))
         return CheckedForecast(limits, predicted, stated=rig.wire)
     except InputError as error:
         return CheckedForecast(limits, None, str(error))

@@ -35,7 +35,7 @@ from rig.model.rig import Rig
 
 log = logging.getLogger(__name__)
 
-Tell = Callable[[float], None]
+Progress = Callable[[float], None]
 NAME = "proof.json"
 CACHE_VARIABLE = "BRAMAH_CACHE"
 KEPT = 200  # proofs in the cache; the oldest go
@@ -96,12 +96,12 @@ def proved(
     rig: Rig,
     *,
     predict: bool = False,
-    tell: Tell | None = None,
+    progress: Progress | None = None,
     source: TwinSource | None = None,
 ) -> PlanProof:
     """Return the proof of a plan, from the cache where nothing changed.
 
-    With `predict` also the standard errors to expect; `tell` hears the share that is done. `source`
+    With `predict` also the standard errors to expect; `progress` receives the share done. `source`
     is where the twin's parameters come from (default: the last identified model of the rig). Raises
     InputError where the twin cannot follow; whether limits are kept is in the report.
     """
@@ -115,7 +115,7 @@ def proved(
     from protocols.design.check_report import remedy_text
 
     try:
-        report, prediction, text = _checked(plan, parameters, predict, tell)
+        report, prediction, text = _checked(plan, parameters, predict, progress)
     except NotCentred as refused:
         scale = _passing_scale(refused.step, parameters)
         raise InputError(f"{refused}; {remedy_text(scale)}") from refused
@@ -134,16 +134,16 @@ def proved(
 
 
 def _checked(
-    plan: Plan, parameters: TwinParameters, predict: bool, tell: Tell | None
+    plan: Plan, parameters: TwinParameters, predict: bool, progress: Progress | None
 ) -> tuple[CheckReport, Mapping[str, Any] | None, str]:
     if predict:
         from rig.cli.predicted_errors import forecast_text
 
-        made = forecast_text(plan, parameters, tell)
+        made = forecast_text(plan, parameters, progress)
         return made.limits, made.plain, made.text
     from protocols.design.check import check
 
-    report = check(plan, parameters.rig, parameters.twin, tell, parameters.draws)
+    report = check(plan, parameters.rig, parameters.twin, progress, parameters.draws)
     return report, None, ""
 
 

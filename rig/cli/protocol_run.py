@@ -126,7 +126,7 @@ def run_protocol(job: ProtocolJob, say: Say) -> Path:
     require_space(plan, rig, job.out)
     say(f"checking {plan.protocol.name} on the twin of {rig.name}")
     source = twin_source(rig, job.model, job.nominal)
-    proof = proved(plan, rig, tell=Countdown("checking", say), source=source)
+    proof = proved(plan, rig, progress=Countdown("checking", say), source=source)
     say(proof.twin_text)
     proof.report.require()
     for note in proof.report.notes:

@@ -62,7 +62,7 @@ def trace(
     rigs = {run.source: run.rig for run in (*loaded, *judged)}
     known = None if like is None else terms_like(like, rigs)
     result = trace_runs(loaded, judged, seed=seed, families=FAMILIES_OF[equations], terms=known,
-                        tell=Countdown("tracing"))  # fmt: skip
+                        progress=Countdown("tracing"))  # fmt: skip
     write_json(json, to_json(result))
     if model is not None:
         save_identified(result.model_after, model, progress)

@@ -334,6 +334,6 @@ def test_an_identification_tells_which_share_of_the_runs_is_done(
     multisine_run: Run, sine_run: Run
 ) -> None:
     shares: list[float] = []
-    together = identify([multisine_run, sine_run], tell=shares.append)
+    together = identify([multisine_run, sine_run], progress=shares.append)
     assert shares == [0.5, 1.0]
     assert together.rows == identify([multisine_run, sine_run]).rows

@@ -27,18 +27,18 @@ class Clock:
 
 def test_short_work_is_quiet_and_long_work_says_what_is_left() -> None:
     clock, said = Clock(), []
-    tell = Countdown("tracing", said.append, clock)
+    progress = Countdown("tracing", said.append, clock)
     for share in (0.1, 0.2, 0.25):
         clock.now += 0.9
-        tell(share)
+        progress(share)
     assert said == []
     clock.now = 100.0 + 20.0
-    tell(0.25)
-    tell(0.26)
+    progress(0.25)
+    progress(0.26)
     clock.now += EVERY
-    tell(0.5)
+    progress(0.5)
     clock.now += 100.0
-    tell(1.0)
+    progress(1.0)
     assert said == ["tracing: 25 %, about 1:00 left", "tracing: 50 %, about 0:23 left"]
 
 
@@ -60,11 +60,11 @@ def test_a_check_tells_of_each_step(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     rig = load_rig("shinshu-2dof")
     plan = resolve(load("amplitude-sweep"), rig)
     shares: list[float] = []
-    proved(plan, rig, predict=True, tell=shares.append)
+    proved(plan, rig, predict=True, progress=shares.append)
     assert rises(shares)
     assert shares[-1] == 1.0
     assert len(shares) == len(plan.excitations) + len(plan.steps)
-    assert proved(plan, rig, predict=True, tell=shares.clear).reused
+    assert proved(plan, rig, predict=True, progress=shares.clear).reused
 
 
 def test_the_figures_say_which_group_comes_and_what_is_left(

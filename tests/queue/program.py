@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from tests.services.fake_driver import FakeDriver
 
 
-def tell(text: str) -> None:
+def write_line(text: str) -> None:
     sys.stdout.write(text + "\n")
 
 
@@ -89,22 +89,22 @@ def work() -> int:
         if mode == "refuse":
             sys.stderr.write("bramah: step 'step1', joint 2: the piston reaches 80 mm\n")
             return 2
-        tell(json.dumps({"ok": True, "seconds": 1.0}))
+        write_line(json.dumps({"ok": True, "seconds": 1.0}))
     elif verb == "run":
         from rig.cli.errors import guarded
 
         return guarded(lambda: run(mode, int(number)), debug=False)
     elif verb == "identify":
         spread = float(os.environ.get("TEST_STD", "0.001"))
-        tell(json.dumps({"parameters": {"b": {"value": 2.0, "std": spread, "unit": "1/s"}}}))
+        write_line(json.dumps({"parameters": {"b": {"value": 2.0, "std": spread, "unit": "1/s"}}}))
     elif verb == "probe":
         oil = Path(os.environ["TEST_OIL"])  # a reading a line; the last one stays
         readings = oil.read_text().split()
         degrees = float(readings[0])
         oil.write_text("\n".join(readings[1:] or readings))
-        tell(json.dumps([{"channel": "oil_temperature", "mean": degrees}]))
+        write_line(json.dumps([{"channel": "oil_temperature", "mean": degrees}]))
     elif verb == "stop":
-        tell("outputs at zero, confirmed by the device")
+        write_line("outputs at zero, confirmed by the device")
     elif verb == "recover":
         from rig.cli.main import command_line
 

@@ -47,14 +47,15 @@ def performed(
     work: Sequence[Job],
     perform: Callable[[Job], Result],
     workers: Workers,
-    tell: Callable[[int, int, Job, Result | Exception], None],
+    report: Callable[[int, int, Job, Result | Exception], None],
     kept: Kept[Job, Result] | None = None,
     left_out: Errors = (InputError, RuntimeError),
 ) -> Iterator[tuple[Job, Result]]:
     """Perform jobs on `workers`; returns each with its result, in the order they end.
 
-    What was kept comes first and is not done again. `tell` hears how many of how many are done, the
-    job, and its result or the error of the kinds `left_out` that leaves it out; others are raised.
+    What was kept comes first and is not done again. `report` receives how many jobs of how many
+    are done, the job, and its result or the error of the kinds `left_out` that leaves it out;
+    others are raised.
     """
     if kept is not None:
         kept.folder.mkdir(parents=True, exist_ok=True)
@@ -65,7 +66,7 @@ def performed(
         else:
             left.append(job)
     for done, (job, found) in enumerate(_results(left, perform, workers, left_out), start=1):
-        tell(done, len(left), job, found)
+        report(done, len(left), job, found)
         if isinstance(found, Exception):
             continue
         if kept is not None:

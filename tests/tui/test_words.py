@@ -15,7 +15,7 @@ from rig.tui.drawing.bar import bar
 from rig.tui.drawing.rows import Row, width_of
 from rig.tui.following.history import History
 from rig.tui.following.link import Frame, LinkStage
-from rig.tui.following.story import tell
+from rig.tui.following.story import new_lines
 from rig.tui.pages.gauge import gauge
 from rig.tui.units import Band, age_text, band, clock_text, limit, shown
 from rig.tui.words import (
@@ -183,14 +183,14 @@ def test_trouble_in_looking_for_runs_is_shown() -> None:
 
 
 def test_the_log_tells_each_turn_once() -> None:
-    first = [line.text for line in tell(None, VIEW)]
+    first = [line.text for line in new_lines(None, VIEW)]
     assert first[0].startswith("attached to run")
     assert "step1 repeat 1 of 4 excite" in first
-    assert tell(VIEW, snapshot(Bench(), 81)) == []
+    assert new_lines(VIEW, snapshot(Bench(), 81)) == []
     after = replace(VIEW, step="step2", repeat=2, message="on to joint 1", lost_samples=3)
-    texts = [line.text for line in tell(VIEW, after)]
+    texts = [line.text for line in new_lines(VIEW, after)]
     assert texts == ["step2 repeat 2 of 4 excite", "on to joint 1", "3 samples lost (3 in all)"]
-    trip = [line.text for line in tell(VIEW, tripped(VIEW))]
+    trip = [line.text for line in new_lines(VIEW, tripped(VIEW))]
     assert any(text.startswith("TRIP  limit 'pressure'") for text in trip)
     assert "state: running → tripped" in trip
 

@@ -209,19 +209,19 @@ def evidence(data: RegressionData, residual: Array) -> Evidence:
 
 
 def variant_columns(
-    data: RegressionData, chosen: Sequence[Variant], tell: Callable[[float], None] | None = None
+    data: RegressionData, chosen: Sequence[Variant], progress: Callable[[float], None] | None = None
 ) -> list[VariantColumns]:
     """Return the columns of every variant that shows on the board, in the variants' order.
 
-    `tell` hears after each which share of them is done.
+    `progress` receives after each which share of them is done.
     """
     seen = [prepared(data.rig, data.terms, conditioned) for conditioned in data.records]
     with ThreadPoolExecutor(WORKERS) as pool:
         found = []
         for entry in pool.map(lambda v: _entry(data, v, seen), chosen):
             found.append(entry)
-            if tell is not None:
-                tell(len(found) / len(chosen))
+            if progress is not None:
+                progress(len(found) / len(chosen))
     return [entry for entry in found if entry is not None]
 
 

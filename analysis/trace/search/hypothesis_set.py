@@ -136,12 +136,14 @@ class HypothesisSet:
         near = [o for o in allowed if o is least or self.better(o, least)]
         return min(near, key=lambda o: (o.size[1], o.size[0], o.total))
 
-    def run(self, tell: Callable[[float], None] | None = None) -> Hypothesis:
+    def run(self, progress: Callable[[float], None] | None = None) -> Hypothesis:
         """Search: singles and pairs from the first board, then extensions; returns the winner.
 
-        `tell` hears which share of the first board's columns is there.
+        `progress` receives which share of the first board's columns is there.
         """
-        self.found = variant_columns(self.stage, self._variants(self.stage, self.stage.mean), tell)
+        self.found = variant_columns(
+            self.stage, self._variants(self.stage, self.stage.mean), progress
+        )
         field = self.field = self._field(self.stage, self.found)
         r = self.stage.mean
         r = r - field.basis @ (field.basis.T @ r)

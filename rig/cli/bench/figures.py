@@ -150,13 +150,15 @@ def measure(
         "plant": plant_figures,
         "analysis": analysis_figures,
         "stream": stream_figures,
-        "demo": lambda folder, tell: demo_figures(folder, tell, seeds),
-        "growth": lambda _, tell: growth_figures(tell),
-        "run": lambda folder, tell: run_figures(folder, tell, streamed),
-        "acquisition": lambda folder, tell: acquisition_figures(folder, tell, minutes),
-        "wires": lambda _, tell: wire_figures(tell, minutes),
+        "demo": lambda folder, progress: demo_figures(folder, progress, seeds),
+        "growth": lambda _, progress: growth_figures(progress),
+        "run": lambda folder, progress: run_figures(folder, progress, streamed),
+        "acquisition": lambda folder, progress: acquisition_figures(folder, progress, minutes),
+        "wires": lambda _, progress: wire_figures(progress, minutes),
         "faults": fault_figures,
-        "screen": lambda _, tell: screen_figures(tell, min(60.0 * minutes, 30.0), quick=quick),
+        "screen": lambda _, progress: screen_figures(
+            progress, min(60.0 * minutes, 30.0), quick=quick
+        ),
     }
     if only is not None and only not in groups:
         raise InputError(f"--only {only}: expected one of: {' '.join(groups)}")

@@ -20,7 +20,7 @@ from rig.bench.screens.past import PastMinute, PlanLine
 from rig.bench.screens.sockets import Attachment, Endpoint, Snapshot
 from rig.runs.runstate import read_events
 from rig.tui.following.history import EMPTY, History, HistoryWindow
-from rig.tui.following.story import EventLine, from_events, tell
+from rig.tui.following.story import EventLine, from_events, new_lines
 
 log = logging.getLogger(__name__)
 
@@ -271,7 +271,7 @@ class Link:
         quiet = before.snapshot is not None and now - before.received > QUIET
         snapshot = _carried(before.snapshot, snapshot)
         self._history.add(snapshot, after_gap=quiet)
-        lines = tell(before.snapshot, snapshot)
+        lines = new_lines(before.snapshot, snapshot)
         estimates = before.estimates
         if snapshot.estimates and (not estimates or estimates[-1].values != snapshot.estimates):
             point = TrackedPoint(snapshot.done_s, snapshot.estimates, snapshot.residuals)

@@ -27,7 +27,7 @@ Said = tuple[str, str, str]  # text, style, kind
 _OWN: Final = ("event", "time", "tick", "t", "parameters")  # of an event, not said with it
 
 
-def tell(last: Snapshot | None, snapshot: Snapshot) -> list[EventLine]:
+def new_lines(last: Snapshot | None, snapshot: Snapshot) -> list[EventLine]:
     """Return what is new in a snapshot after the one before it (None: it is a run's first)."""
     said: list[Said] = []
     if last is not None and (last.run, last.pid) != (snapshot.run, snapshot.pid):

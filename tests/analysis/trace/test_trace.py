@@ -42,7 +42,7 @@ def shares() -> list[float]:
 @pytest.fixture(scope="module")
 def leaking(rig: Rig, shares: list[float]) -> Trace:
     train, held_out = pair_of_runs(rig, c_internal=2e-12)
-    return trace([train], [held_out], look_ahead=False, tell=shares.append)
+    return trace([train], [held_out], look_ahead=False, progress=shares.append)
 
 
 def test_a_trace_tells_how_far_it_is(leaking: Trace, shares: list[float]) -> None:

@@ -96,10 +96,10 @@ def all_of(
         there = sum(e in kept for e in experiments)
         say(f"{there} of {len(experiments)} experiments are in {folder}")
 
-    def tell(done: int, of: int, e: Experiment, found: dict[str, Trial] | Exception) -> None:
+    def report(done: int, of: int, e: Experiment, found: dict[str, Trial] | Exception) -> None:
         if done % 10 == 0 or done == of:
             say(f"{done} of {of} experiments")
         if isinstance(found, Exception):
             say(f"seed {e.seed} failed and is left out: {found}")
 
-    return performed(experiments, perform, workers, tell, kept)
+    return performed(experiments, perform, workers, report, kept)

@@ -50,7 +50,7 @@ def foreign(
     )
     from tests.studies.pool import Kept, performed
 
-    def tell(done: int, of: int, job: Job, found: Outcome | Exception) -> None:
+    def report(done: int, of: int, job: Job, found: Outcome | Exception) -> None:
         line = f"seed {job.seed}: {found}" if isinstance(found, Exception) else line_of(found)
         progress(f"{done}/{of} {line}")
 
@@ -60,7 +60,7 @@ def foreign(
         for k in range(count)
         for how in ("", *(BETTER if better else ()))
     ]
-    found = dict(performed(work, perform, cluster or workers, tell, kept, left_out=(Exception,)))
+    found = dict(performed(work, perform, cluster or workers, report, kept, left_out=(Exception,)))
     outcomes = [found[job] for job in work if job in found]
     write_json(json, [asdict(o) for o in outcomes])
     typer.echo(text(outcomes))
@@ -89,13 +89,13 @@ def intervals(
     from tests.studies.foreign.intervals import Covered, line_of, loaded, perform, text
     from tests.studies.pool import Kept, performed
 
-    def tell(done: int, of: int, job: tuple[int, str], found: Covered | Exception) -> None:
+    def report(done: int, of: int, job: tuple[int, str], found: Covered | Exception) -> None:
         line = f"seed {job[0]}: {found}" if isinstance(found, Exception) else line_of(found)
         progress(f"{done}/{of} {line}")
 
     kept = Kept(keep, lambda j: f"{j[0]} {j[1]}.json", asdict, loaded) if keep else None
     work = [(seed + stride * k, estimator) for k in range(count)]
-    done = performed(work, perform, cluster or workers, tell, kept, left_out=(Exception,))
+    done = performed(work, perform, cluster or workers, report, kept, left_out=(Exception,))
     outcomes = sorted((o for _, o in done), key=lambda o: o.seed)
     write_json(json, [asdict(o) for o in outcomes])
     typer.echo(text(outcomes))

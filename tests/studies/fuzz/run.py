@@ -34,7 +34,7 @@ class Found:
     wrong: Counter[str] = field(default_factory=Counter)  # errors that may not come, and how often
 
 
-def cases(target: Target, count: int, seed: int, found: Found, tell: Callable[[], None]) -> None:
+def cases(target: Target, count: int, seed: int, found: Found, report: Callable[[], None]) -> None:
     """Read `count` damaged examples of a target; notes what may not happen in `found`."""
     before, said = _size(), time.perf_counter()
     for number in range(count):
@@ -53,7 +53,7 @@ def cases(target: Target, count: int, seed: int, found: Found, tell: Callable[[]
         found.cases += 1
         if now > said + REPORTED:
             found.grown, said = max(0.0, _size() - before), now
-            tell()
+            report()
     found.grown = max(0.0, _size() - before)
     if found.grown > _MEMORY:
         found.wrong[f"grew by {found.grown / 1e6:.0f} MB"] += 1

@@ -52,7 +52,7 @@ def electric_rig() -> ElectricRig:
     return rig
 
 
-def tell(seed: int, slope: float | None, ways: Sequence[str] = tuple(WAYS)) -> ArmStory:
+def arm_story(seed: int, slope: float | None, ways: Sequence[str] = tuple(WAYS)) -> ArmStory:
     """Draw an arm, record it, identify it in every way, judge the full one on new motion."""
     rig, rng = electric_rig(), np.random.default_rng(seed)
     arm = draw_arm(rng, slope)
@@ -82,7 +82,7 @@ def survey(seeds: Sequence[int], progress: Callable[[str], None]) -> SlopeTable:
     errors: dict[str, dict[str, list[float]]] = {way: {} for way in WAYS}
     for seed in seeds:
         progress(f"arm {seed}")
-        story = tell(seed, None)
+        story = arm_story(seed, None)
         truth = story.arm.truth()
         for way, result in story.found.items():
             for name, estimate in result.estimates.items():

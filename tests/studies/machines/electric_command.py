@@ -44,7 +44,7 @@ def electric(
             typer.echo(study.survey_text(found))
         return
     angle = None if slope is None else math.radians(slope)
-    story = study.tell(seed, angle, ("both at once",))
+    story = study.arm_story(seed, angle, ("both at once",))
     result = story.found["both at once"]
     write_json(json, to_json(result))
     if out is not None:

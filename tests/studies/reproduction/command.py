@@ -27,9 +27,9 @@ def reproduce(
 
     Example: python -m tests.studies reproduce --seed 100 --docs docs/reproduction.md
     """
-    from tests.studies.reproduction.story import tell
+    from tests.studies.reproduction.story import write_story
 
-    tell(out, seed, quick, docs, json)
+    write_story(out, seed, quick, docs, json)
 
 
 def register(app: typer.Typer) -> None:

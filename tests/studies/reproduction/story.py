@@ -22,7 +22,7 @@ from tests.studies.reproduction.searches import searches
 TITLE = "The paper's experiment, reproduced"
 
 
-def tell(out: Path, seed: int, quick: bool, docs: Path | None, json: Path | None) -> None:
+def write_story(out: Path, seed: int, quick: bool, docs: Path | None, json: Path | None) -> None:
     """Reproduce into a new folder of `out`; print the tables, write page, figures and JSON."""
     started = time.monotonic()
     scale = QUICK if quick else FULL

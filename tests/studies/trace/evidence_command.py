@@ -36,7 +36,7 @@ def ablations(
     from tests.studies.pool import Kept, performed
     from tests.studies.trace.ablations import ALL, as_json, loaded, perform, sections
 
-    def tell(done: int, of: int, job: int, found: list[Answer] | Exception) -> None:
+    def report(done: int, of: int, job: int, found: list[Answer] | Exception) -> None:
         if isinstance(found, Exception):
             progress(f"{done}/{of} seed {job}: no records ({found})")
             return
@@ -50,7 +50,7 @@ def ablations(
 
     kept = Kept(keep, lambda job: f"{job}.json", as_json, loaded) if keep else None
     work = [seed + 2 * k for k in range(count)]
-    done = performed(work, perform, cluster or workers, tell, kept, left_out=(Exception,))
+    done = performed(work, perform, cluster or workers, report, kept, left_out=(Exception,))
     found = dict(sorted(done, key=lambda pair: pair[0]))
     write_json(json, {str(k): as_json(v) for k, v in found.items()})
     _show("What each rule of the trace is worth", sections(found, _command(

@@ -136,14 +136,14 @@ def all_of(
     With a `folder` every outcome is kept there, and a study that was ended goes on from it.
     """
 
-    def tell(done: int, of: int, case: Case, found: Outcome | Exception) -> None:
+    def report(done: int, of: int, case: Case, found: Outcome | Exception) -> None:
         if isinstance(found, Exception):  # a plant that leaves its limits is no result
             say(f"{done}/{of} {case.label}, seed {case.seed}: no records ({found})")
         else:
             say(f"{done}/{of} {line_of(found)}")
 
     kept = Kept(folder, name_of, asdict, _outcome) if folder else None
-    done = performed(work, perform, workers, tell, kept, left_out=(Exception,))
+    done = performed(work, perform, workers, report, kept, left_out=(Exception,))
     return (outcome for _, outcome in done)
 
 
