@@ -6,8 +6,6 @@ import errno
 import os
 import signal
 import socket
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -34,8 +32,9 @@ from rig.model.rig import Rig
 from rig.model.wire.can_frames import CanFrame, zero_frame
 from rig.model.wire.can_layout import CanLayout, read_layout
 from tests.drivers.bus_node import BusNode
+from tests.drivers.driving_host import driving_host
 from tests.drivers.test_can_frames import own_database
-from tests.drivers.wires import ROOT, device_at
+from tests.drivers.wires import device_at
 from tests.hil_sim.integrator import IntegratorPlant, expected_outputs, seed_rig
 
 PATIENCE = 30.0  # a loaded machine may take long; the assertions do not depend on it
@@ -142,36 +141,11 @@ def test_other_traffic_on_the_bus_changes_nothing(bus: str) -> None:
     driver.close()
 
 
-HOST = """
-import sys
-from drivers.base import OFF, OutputLaw
-from drivers.can_stream import CanStreamDriver
-from rig.model.parts import Wire
-from tests.hil_sim.integrator import seed_rig
-
-wire = Wire(kind="can", bus=sys.argv[1], timeout=20.0, watchdog=float(sys.argv[2]))
-driver = CanStreamDriver(wire, seed_rig())
-driver.connect()
-driver.start()
-driver.apply([OutputLaw(bias=1.0, limit=2.0), OFF])
-while True:
-    if driver.read_block().data[-1, 10] > 0.9:
-        print("driving", flush=True)
-"""
-
-
 @pytest.mark.parametrize("sign", [signal.SIGKILL, signal.SIGSTOP])
 def test_a_host_that_ends_or_stands_still_leaves_outputs_at_zero(sign: signal.Signals) -> None:
     with device_at("realtime", "can") as (_, at):
         place = at.removeprefix("can://")
-        with subprocess.Popen(
-            [sys.executable, "-c", HOST, place, "0.3"],
-            stdout=subprocess.PIPE,
-            text=True,
-            cwd=ROOT,
-        ) as driving:
-            assert driving.stdout is not None
-            assert driving.stdout.readline() == "driving\n"
+        with driving_host("can", "bus", place, 0.3) as driving:
             os.kill(driving.pid, sign)
             watcher = host(at, timeout=PATIENCE)
             watcher._link.open()

@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 import random
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from urllib.parse import urlsplit
@@ -23,9 +21,9 @@ from rig.model.rig import Rig
 from rig.model.wire import serial_messages as msg
 from rig.model.wire.frames import FrameDecoder, WireFrame, encode_frame
 from rig.model.wire.serial_messages import Message
+from tests.drivers.driving_host import driving_host
 from tests.drivers.firmware import firmware_command
 from tests.drivers.serial_lines import BadLine, Loop, port_of, simulator_command
-from tests.drivers.wires import ROOT
 from tests.hil_sim.integrator import SPEED_PER_VOLT, expected_outputs, seed_rig
 
 TIMEOUT = 0.4
@@ -445,23 +443,6 @@ def connected_soon(port: str, **wire: float) -> SerialStreamDriver:
 
 # -- the end of a host, in real time --------------------------------------------------------
 
-HOST = """
-import sys
-from drivers.base import OFF, OutputLaw
-from drivers.serial_stream import SerialStreamDriver
-from rig.model.parts import Wire
-from tests.hil_sim.integrator import seed_rig
-
-wire = Wire(kind="serial", device=sys.argv[1], timeout=20.0, watchdog=float(sys.argv[2]))
-driver = SerialStreamDriver(wire, seed_rig())
-driver.connect()
-driver.start()
-driver.apply([OutputLaw(bias=1.0, limit=2.0), OFF])
-while True:
-    if driver.read_block().data[-1, 10] > 0.9:
-        print("driving", flush=True)
-"""
-
 
 @pytest.mark.parametrize(
     ("sign", "watchdog", "cause"),
@@ -472,15 +453,8 @@ def test_a_host_that_ends_or_stands_still_leaves_outputs_at_zero(
 ) -> None:
     with (
         port_of(command("realtime")) as (_, port),
-        subprocess.Popen(
-            [sys.executable, "-c", HOST, port, str(watchdog)],
-            stdout=subprocess.PIPE,
-            text=True,
-            cwd=ROOT,
-        ) as driving,
+        driving_host("serial", "device", port, watchdog) as driving,
     ):
-        assert driving.stdout is not None
-        assert driving.stdout.readline() == "driving\n"
         os.kill(driving.pid, sign)
         if sign == signal.SIGKILL:
             driving.wait(PATIENCE)
