@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import chdir, nullcontext
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
@@ -48,14 +49,15 @@ def solver(
     equations = {"x": state, "t": t, "ode": rates(state * scale, held(t)) / scale}
     options: dict[str, Any] = {"max_num_steps": MOST_STEPS}
     if folder is not None:
-        compiling = {
-            "compiler": COMPILER, "linker": COMPILER, "flags": ["-O3"], "directory": f"{folder}/",
-        }  # fmt: skip
-        options |= {"jit": True, "compiler": "shell", "jit_options": compiling}
+        # The folder is its caller's, who removes it.
+        compiling = {"compiler": COMPILER, "linker": COMPILER, "flags": ["-O3"], "cleanup": False}
+        options |= {"jit": True, "compiler": "shell", "jit_cleanup": False}
+        options["jit_options"] = compiling
 
     def at(tolerance: float, start: Array) -> Callable[[], Array]:
         chosen = {**options, "abstol": tolerance, "reltol": tolerance}
-        run = ca.integrator("run", "cvodes", equations, 0.0, grid, chosen)
+        with nullcontext() if folder is None else chdir(folder):  # CasADi writes where it stands
+            run = ca.integrator("run", "cvodes", equations, 0.0, grid, chosen)
         return lambda: np.asarray(run(x0=start / scale)["xf"]).T * scale
 
     return at
