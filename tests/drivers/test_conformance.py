@@ -31,12 +31,12 @@ WIRES: dict[str, Callable[[], Subject]] = {
 }
 
 
+FURTHER = ("modbus-rtu", "canopen-408", "can-slcan")
+
+
 @pytest.mark.parametrize(
     "wire",
-    [
-        pytest.param(wire, marks=[pytest.mark.slow] * (wire in ("modbus-rtu", "canopen-408")))
-        for wire in WIRES
-    ],
+    [pytest.param(wire, marks=[pytest.mark.slow] * (wire in FURTHER)) for wire in WIRES],
 )
 def test_a_shipped_driver_conforms_over_a_wire_that_fails(wire: str) -> None:
     subject = WIRES[wire]()

@@ -142,6 +142,7 @@ def test_a_hum_that_begins_with_the_record_is_a_periodic_disturbance(
     assert found["T_sin_2"].value == pytest.approx(1.0, rel=0.03)
 
 
+@pytest.mark.slow
 def test_friction_with_a_cube_of_the_speed_is_a_curve_without_a_name(
     rig: Rig, tmp_path: Path
 ) -> None:

@@ -9,7 +9,7 @@ from tests.analysis.trace.gate_cases import LEAK, searched
 from tests.analysis.trace.hidden import pair_of_runs
 
 
-@pytest.mark.parametrize("null", [8e-4, -1e-3])
+@pytest.mark.parametrize("null", [8e-4, pytest.param(-1e-3, marks=pytest.mark.slow)])
 def test_a_null_of_a_millivolt_is_found_beside_a_leak(rig: Rig, null: float) -> None:
     runs = pair_of_runs(rig, c_internal=LEAK, u_null=null)
     s = searched(rig, *runs, "internal_leakage", "spool_offset", "sensor_lag")
@@ -19,7 +19,9 @@ def test_a_null_of_a_millivolt_is_found_beside_a_leak(rig: Rig, null: float) -> 
     assert s.vetoes(s.winner) == ""
 
 
-@pytest.mark.parametrize("gain", [1.005, 1.002, 0.998])
+@pytest.mark.parametrize(
+    "gain", [1.002, *(pytest.param(gain, marks=pytest.mark.slow) for gain in (1.005, 0.998))]
+)
 def test_a_gain_wrong_by_parts_in_a_thousand_is_not_called_crosstalk_of_the_other_chamber(
     rig: Rig, gain: float
 ) -> None:
