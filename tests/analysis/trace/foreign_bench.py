@@ -155,19 +155,26 @@ def _linkage(q):
 
 
 @njit(cache=True)
-def _command(t, s, wave, bias):
-    u = bias - CENTRING * s
+def _excited(t, wave):
+    """Sum of the lines of the excitation [V]."""
+    u = 0.0
     for row in wave:
         u += row[0] * math.cos(row[1] * t + row[2])
     return u
 
 
 @njit(cache=True)
-def _rates(y, t, q1, par, hidden, wave, bias, held, out):
+def _command(t, s, wave, bias):
+    return bias - CENTRING * s + _excited(t, wave)
+
+
+@njit(cache=True)
+def _rates(y, t, q1, par, hidden, drive, held, out):
+    """Write the rates of `y` [1/s] into `out`; `drive` [V] is excitation and bias at `t`."""
     q, w, cap, rod = y[0], y[1], y[2], y[3]
     s, G = _linkage(q)
     v = G * w
-    u = _opening(_command(t, s, wave, bias), held, hidden)[0]
+    u = _opening(drive - CENTRING * s, held, hidden)[0]
     p_s = _supply(cap, rod, u, par, hidden[SAG])
     out[4] = 0.0
     if hidden[SAG_LAG] > 0.0:
@@ -206,19 +213,28 @@ def _rates(y, t, q1, par, hidden, wave, bias, held, out):
 @njit(cache=True)
 def _integrated(start, steps, q1, par, hidden, wave, bias):
     """States (steps + 1, 5): angle [rad], speed [rad/s], cap and rod pressure, sag [Pa]."""
-    y, out = start.copy(), np.zeros((steps + 1, 5))
+    y, z, out = start.copy(), start.copy(), np.zeros((steps + 1, 5))
     out[0] = y
     a, b, c, d = np.zeros(5), np.zeros(5), np.zeros(5), np.zeros(5)
-    held = _command(0.0, _linkage(y[0])[0], wave, bias)
+    after = bias + _excited(0.0, wave)
+    held = after - CENTRING * _linkage(y[0])[0]
     for k in range(steps):
         t = k * STEP
-        _rates(y, t, q1, par, hidden, wave, bias, held, a)
-        _rates(y + 0.5 * STEP * a, t + 0.5 * STEP, q1, par, hidden, wave, bias, held, b)
-        _rates(y + 0.5 * STEP * b, t + 0.5 * STEP, q1, par, hidden, wave, bias, held, c)
-        _rates(y + STEP * c, t + STEP, q1, par, hidden, wave, bias, held, d)
-        y += STEP / 6.0 * (a + 2.0 * b + 2.0 * c + d)
-        u = _command(t + STEP, _linkage(y[0])[0], wave, bias)
-        held = _opening(u, held, hidden)[1]
+        before, middle = after, bias + _excited(t + 0.5 * STEP, wave)
+        after = bias + _excited(t + STEP, wave)
+        _rates(y, t, q1, par, hidden, before, held, a)
+        for i in range(5):
+            z[i] = y[i] + 0.5 * STEP * a[i]
+        _rates(z, t + 0.5 * STEP, q1, par, hidden, middle, held, b)
+        for i in range(5):
+            z[i] = y[i] + 0.5 * STEP * b[i]
+        _rates(z, t + 0.5 * STEP, q1, par, hidden, middle, held, c)
+        for i in range(5):
+            z[i] = y[i] + STEP * c[i]
+        _rates(z, t + STEP, q1, par, hidden, after, held, d)
+        for i in range(5):
+            y[i] += STEP / 6.0 * (a[i] + 2.0 * b[i] + 2.0 * c[i] + d[i])
+        held = _opening(after - CENTRING * _linkage(y[0])[0], held, hidden)[1]
         out[k + 1] = y
     return out
 
