@@ -11,7 +11,7 @@ from tests.analysis.trace.gate_cases import LEAK, at_joint_2
 from tests.analysis.trace.hidden import experiment, pair_of_runs
 from tests.studies.foreign.cases import case_of
 from tests.studies.pages import Table, text
-from tests.studies.trace import ablations, isolability
+from tests.studies.trace import ablations, baselines, isolability
 from tests.studies.trace.ablations import ALL, Answer, sections
 from tests.studies.trace.rules import RULES, by_name
 from tests.studies.trace.rules import switched_off as without
@@ -86,3 +86,26 @@ def test_what_no_data_can_separate_is_said_to_be_so(matrix: isolability.Isolabil
     at = {name: k for k, name in enumerate(matrix.names)}
     leak, spring = at["internal leakage"], at["joint spring"]
     assert matrix.distance[leak, spring] == pytest.approx(matrix.distance[leak, leak])
+
+
+def test_plain_methods_add_more_than_the_cause_and_the_page_says_how_much(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A leak: stepwise regression finds it, sparse products take its energy without a name."""
+    candidates = at_joint_2(rig, "internal_leakage", "spool_offset")
+    for module in ("analysis.trace.engine", "tests.studies.trace.baselines"):
+        monkeypatch.setattr(f"{module}.catalogue", lambda *_: candidates)
+    monkeypatch.setattr("analysis.trace.engine.free_mechanisms", lambda *_: [])
+    train, held_out = pair_of_runs(rig, c_internal=LEAK)
+    found = baselines.answers(case_of(2), train, [held_out])
+    trace, stepwise, sparse = found
+    leak = ("internal_leakage", "joint 2")
+    assert trace.named == (leak,)
+    assert stepwise.named[0] == leak
+    assert sparse.named == ()
+    assert sparse.terms > len(stepwise.named)
+    assert min(trace.taken, stepwise.taken) > 0.95
+    assert 0.3 < sparse.taken < trace.taken
+    page = text(baselines.sections({2: found}, "the command"))
+    assert "internal_leakage at joint 2" in page
+    assert f"{sparse.terms} products" in page

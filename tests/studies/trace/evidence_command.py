@@ -16,6 +16,7 @@ from tests.studies.estimators.command import ClusterOption, KeepOption, WorkersO
 if TYPE_CHECKING:
     from tests.studies.pages import Section
     from tests.studies.trace.ablations import Answer
+    from tests.studies.trace.baselines import MethodAnswer
 
 PageOption = Annotated[Path | None, typer.Option("--docs", help="Also write the page here.")]
 
@@ -73,6 +74,38 @@ def isolability(
     _show("Which effects an experiment can separate", page, None, docs)
 
 
+def baselines(
+    seed: Annotated[int, typer.Option(min=0, help="First seed; even ones judge.")] = 9000,
+    count: Annotated[int, typer.Option(min=1, help="Of benches.")] = 12,
+    workers: WorkersOption = 1,
+    cluster: ClusterOption = None,
+    json: JsonOption = None,
+    keep: KeepOption = None,
+    docs: PageOption = None,
+) -> None:
+    """Compare the trace with stepwise and sparse regression on foreign benches.
+
+    Example: python -m tests.studies baselines --count 2
+    """
+    from tests.studies.pool import Kept, performed
+    from tests.studies.trace.baselines import as_json, loaded, perform, sections
+
+    def report(done: int, of: int, job: int, found: list[MethodAnswer] | Exception) -> None:
+        if isinstance(found, Exception):
+            progress(f"{done}/{of} seed {job}: no records ({found})")
+            return
+        words = ", ".join(f"{a.method} {a.answer} {100 * a.taken:.0f} %" for a in found)
+        progress(f"{done}/{of} seed {job} {found[0].label}: {words}")
+
+    kept = Kept(keep, lambda job: f"{job}.json", as_json, loaded) if keep else None
+    work = [seed + 2 * k for k in range(count)]
+    done = performed(work, perform, cluster or workers, report, kept, left_out=(Exception,))
+    found = dict(sorted(done, key=lambda pair: pair[0]))
+    write_json(json, {str(k): as_json(v) for k, v in found.items()})
+    _show("The trace beside two plain methods", sections(found, _command(
+        "baselines", {"--seed": seed, "--count": count}, docs)), json, docs)  # fmt: skip
+
+
 def _command(name: str, options: dict[str, int], docs: Path | None) -> str:
     words = [word for option, value in options.items() for word in (option, str(value))]
     page = ["--docs", str(docs)] if docs is not None else []
@@ -93,3 +126,4 @@ def register(app: typer.Typer) -> None:
     """Add these studies to the command line."""
     app.command()(ablations)
     app.command()(isolability)
+    app.command()(baselines)
