@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -52,26 +53,32 @@ class Inertia(Term):
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return the torque columns of every inertia parameter."""
         N = signals.joints
-        rate, acceleration = np.cumsum(signals.qd, axis=1), np.cumsum(signals.qdd, axis=1)
-        weights = inertia_map(N)
+        # Sums over joints run by hand: along an axis of two or three, numpy's take longer.
+        rate, acceleration = _running(signals.qd.T), _running(signals.qdd.T)
+        feels: dict[tuple[int, int], Array] = {(k, k): acceleration[k] for k in range(N)}
+        for k in range(N):
+            for j in range(k + 1, N):
+                turn = signals.theta[:, k] - signals.theta[:, j]
+                c, s = np.cos(turn), np.sin(turn)
+                feels[k, j] = c * acceleration[j] + s * rate[j] ** 2
+                feels[j, k] = c * acceleration[k] - s * rate[k] ** 2
         out: Columns = {equation("torque", i): {} for i in range(N)}
-        for index, coefficient in enumerate(self.coefficients(rig)):
-            on_link = np.zeros_like(rate)
-            for k in range(N):
-                for j in range(N):
-                    if weights[index, k, j]:
-                        turn = signals.theta[:, k] - signals.theta[:, j]
-                        on_link[:, k] += weights[index, k, j] * (
-                            np.cos(turn) * acceleration[:, j] + np.sin(turn) * rate[:, j] ** 2
-                        )
-            on_joint = np.cumsum(on_link[:, ::-1], axis=1)[:, ::-1]
-            for i in range(N):
-                out[equation("torque", i)][coefficient.parameter] = on_joint[:, i]
+        for weights, coefficient in zip(inertia_map(N), self.coefficients(rig), strict=True):
+            on_link = [np.zeros(len(signals.qd)) for _ in range(N)]
+            for k, j in map(tuple, np.argwhere(weights)):
+                on_link[k] += weights[k, j] * feels[k, j]
+            for i, on_joint in enumerate(reversed(_running(on_link[::-1]))):
+                out[equation("torque", i)][coefficient.parameter] = on_joint
         return out
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
         """Return the matrix R, flattened."""
         return chain_matrix(values, len(rig.joints)).ravel()
+
+
+def _running(parts: Iterable[Array]) -> list[Array]:
+    """Return the running sums of arrays (n,): the first, the first two, and so on."""
+    return list(itertools.accumulate(parts))
 
 
 def inertia_map(joints: int) -> Array:
