@@ -14,6 +14,7 @@ noise that they take away.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
@@ -49,6 +50,7 @@ TRACE, STEPWISE, SPARSE = "trace", "stepwise", "sparse"
 MOST: Final = 20  # effects that stepwise regression may hold
 DEGREE: Final = 2  # of the products of variables
 PRICE: Final = 20.0  # energy that a product must take to stay: ten times what noise gives it
+RIDGE: Final = 0.05  # on normalised products, as pysindy has it where nothing is said
 SHOWN: Final = 3  # names in a cell of the table of benches
 RIGHT: Final = ("right", "in class", "refused")
 WRONG: Final = ("wrong", "wrong beside unexplained", "false alarm", "partly")
@@ -180,7 +182,11 @@ def _taken_by_entries(
     pairs = [(entry, by_key[entry.variant.key]) for entry in chosen if entry.variant.key in by_key]
     there = np.column_stack([entry.columns for entry, _ in pairs])
     here = np.column_stack([_as_named(other, entry.names) for entry, other in pairs])
-    return _taken(fitted, there, judging, here)
+    basis = _basis(fitted, ())
+    sizes = _least_squares(
+        there - basis @ (basis.T @ there), fitted.mean - basis @ (basis.T @ fitted.mean)
+    )
+    return _taken(fitted, there, judging, here, sizes)
 
 
 def _as_named(entry: VariantColumns, names: Sequence[str]) -> Array:
@@ -192,21 +198,27 @@ def _as_named(entry: VariantColumns, names: Sequence[str]) -> Array:
     return out
 
 
-def _taken(fitted: RegressionData, there: Array, judging: RegressionData, here: Array) -> float:
-    """Return the share of energy above noise that columns fitted on one side take on the other.
+def _taken(
+    fitted: RegressionData, there: Array, judging: RegressionData, here: Array, sizes: Array
+) -> float:
+    """Return the share of energy above noise that columns of given sizes take on held-out records.
 
-    The baseline's coefficients are fitted anew beside the columns, on the training side.
+    `there` are the columns on the training side, where the baseline's coefficients are fitted anew
+    beside them, `here` those on the held-out side.
     """
-    X = np.column_stack([fitted.base, there])
-    scale = np.linalg.norm(X, axis=0)
-    scale[scale == 0] = 1.0
-    fit = np.linalg.lstsq(X / scale, fitted.mean, rcond=1e-6)[0] / scale
     base = np.zeros((len(judging.mean), len(fitted.names)))
     for k, name in enumerate(fitted.names):
         if name in judging.names:
             base[:, k] = judging.base[:, judging.names.index(name)]
-    after = judging.mean - np.column_stack([base, here]) @ fit
+    moved = _least_squares(fitted.base, fitted.mean - there @ sizes)
+    after = judging.mean - here @ sizes - base @ moved
     return _share(_above(judging, judging.mean), _above(judging, after))
+
+
+def _least_squares(columns: Array, y: Array) -> Array:
+    scale = np.linalg.norm(columns, axis=0)
+    scale[scale == 0] = 1.0
+    return np.asarray(np.linalg.lstsq(columns / scale, y, rcond=1e-6)[0] / scale)
 
 
 def _above(data: RegressionData, left: Array) -> float:
@@ -230,12 +242,14 @@ def _sparse(fitted: RegressionData, judging: RegressionData) -> tuple[float, int
     left = fitted.mean - basis @ (basis.T @ fitted.mean)
     seen = np.linalg.norm(own, axis=0) > 1e-3 * np.linalg.norm(there, axis=0)
     own, there, here = own[:, seen], there[:, seen], here[:, seen]
-    method = STLSQ(threshold=PRICE**0.5, alpha=1e-3, normalize_columns=True, max_iter=50)
-    method.fit(own, left[:, None])
-    stays = np.abs(np.ravel(method.coef_)) > 0.0
-    if not stays.any():
+    method = STLSQ(threshold=PRICE**0.5, alpha=RIDGE, normalize_columns=True, max_iter=50)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # where no product is worth its price
+        method.fit(own, left[:, None])
+    sizes = np.ravel(method.coef_)
+    if not sizes.any():
         return 0.0, 0
-    return _taken(fitted, there[:, stays], judging, here[:, stays]), int(stays.sum())
+    return _taken(fitted, there, judging, here, sizes), int(np.count_nonzero(sizes))
 
 
 def _equations(data: RegressionData) -> list[str]:
