@@ -465,4 +465,6 @@ def _outcome(error: BaseException | None) -> tuple[str, str]:
         return runstate.TRIPPED, str(error)
     if isinstance(error, KeyboardInterrupt):
         return runstate.ABORTED, "stopped by operator (Ctrl-C)"
+    if isinstance(error, DeviceError):  # the folder alone then says that the device ended it
+        return runstate.ABORTED, f"device: {error}"
     return runstate.ABORTED, str(error) or type(error).__name__

@@ -59,24 +59,24 @@ def outcome_of_folder(folder: Path, said: str) -> ItemOutcome:
             return ItemOutcome(
                 it.INTERRUPTED, "its process was killed before anything was recorded"
             )
-        return ItemOutcome(_told(said), f"{said}; {unseen}")
+        return ItemOutcome(_state_of(said), f"{said}; {unseen}")
     state = runstate.read_state(folder)
     if state == runstate.DONE:
         return ItemOutcome(it.DONE, unseen)
     if state == runstate.TRIPPED:
         return ItemOutcome(it.TRIPPED, said or _end_message(folder) or unseen)
     if state == runstate.ABORTED:
-        return ItemOutcome(
-            _told(said), f"{said or _end_message(folder)}; {unseen}".removeprefix("; ")
-        )
+        why = said or _end_message(folder)
+        return ItemOutcome(_state_of(why), f"{why}; {unseen}".removeprefix("; "))
     return ItemOutcome(it.INTERRUPTED, "its process was killed while no runner watched")
 
 
-def _told(said: str) -> str:
-    said = said.removeprefix(f"{UNSURE}; ")
-    if said.startswith(_DEVICE):
+def _state_of(message: str) -> str:
+    """Return the state that a run's last message stands for."""
+    message = message.removeprefix(f"{UNSURE}; ")
+    if message.startswith(_DEVICE):
         return it.LOST
-    return it.STOPPED if said.startswith("stopped") else it.FAILED
+    return it.STOPPED if message.startswith("stopped") else it.FAILED
 
 
 def _end_message(folder: Path) -> str:

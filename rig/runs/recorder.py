@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import re
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -236,8 +236,11 @@ class Recorder:
                 release_ownership(self.folder)
 
     def _finalise(self, journal: Journal, state: str, message: str) -> None:
+        def note(written: Written) -> None:
+            self.event("end", state=state, message=message, records=written.records)
+
         try:
-            written = finalise(journal, self.folder, self.rig.name, state)
+            finalise(journal, self.folder, self.rig.name, state, note)
         except RecordingFailed as error:
             journal.close()
             with suppress(RecordingFailed):
@@ -247,18 +250,26 @@ class Recorder:
             except OSError as problem:
                 log.error("%s: state cannot be written: %s", self.folder, problem)
             raise
-        self.event("end", state=state, message=message, records=written.records)
 
 
-def finalise(journal: Journal, folder: Path, rig_name: str, state: str) -> Written:
-    """Turn a journal into records.h5, set the state, then let the journal go.
+def finalise(
+    journal: Journal,
+    folder: Path,
+    rig_name: str,
+    state: str,
+    note: Callable[[Written], None] | None = None,
+) -> Written:
+    """Turn a journal into records.h5, call `note`, set the state, then let the journal go.
 
-    A journal with damaged blocks is kept beside as `journal.damaged.sqlite`. Raises
-    RecordingFailed; the journal is then untouched.
+    `note` writes why the run ended: a state whose reason is not in the folder yet would leave a
+    process killed at that moment without one. A journal with damaged blocks is kept beside as
+    `journal.damaged.sqlite`. Raises RecordingFailed; the journal is then untouched.
     """
     from rig.runs.archive import write_from_journal  # noqa: PLC0415 - h5py loads slowly
 
     written = write_from_journal(journal, folder, rig_name)
+    if note is not None:
+        note(written)
     try:
         write_state(folder, state)
     except OSError as error:

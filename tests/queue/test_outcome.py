@@ -8,6 +8,7 @@ import pytest
 
 from rig.queue.outcome import outcome_of_folder
 from rig.runs.rigs import load_rig
+from tests.services.children import finish
 from tests.services.fake_driver import FakeDriver
 from tests.services.test_recorder import take
 
@@ -31,3 +32,11 @@ def test_a_lost_device_is_one_also_where_the_outputs_could_not_be_confirmed(
     outcome = outcome_of_folder(folder, last_line)
     assert outcome.state == state
     assert last_line in outcome.reason
+
+
+def test_a_lost_device_is_one_also_where_its_process_was_killed_as_it_ended(tmp_path: Path) -> None:
+    code, _ = finish(tmp_path / "run", "kill at end of a lost device", 5)
+    assert code == -9
+    outcome = outcome_of_folder(tmp_path / "run", "")
+    assert outcome.state == "device lost"
+    assert "does not answer" in outcome.reason

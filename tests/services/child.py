@@ -16,7 +16,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from drivers.base import OutputLaw
+from drivers.base import DeviceLost, OutputLaw
 from rig.bench.screens.sockets import Publisher
 from rig.bench.session import Bench
 from rig.model.trips import OperatorStop, RecordingFailed
@@ -91,6 +91,14 @@ def prepare(mode: str, number: int) -> dict[str, Any]:
             lambda: dying(its_own(journal, "sqlite3"), "connect", 1),
         ]
         starts[number]()
+    elif mode == "kill at end of a lost device":
+        dying(recorder, "write_state", after=True)
+
+        def lose(sequence: int) -> None:
+            if sequence == number:
+                raise DeviceLost("the device does not answer")
+
+        return {"before_block": lose}
     elif mode in ("file limit", "disk full"):
         if mode == "disk full":
             usage = shutil.disk_usage(RUN.parent)._replace(free=0)

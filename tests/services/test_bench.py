@@ -166,7 +166,8 @@ def test_a_device_that_fails_is_zeroed_and_the_failure_passes_through(
     assert driver.calls[driver.calls.index("failed") + 1] == "zero"
     run = load_run(tmp_path / "run", partial=True)
     assert (run.state, run.records[0].samples) == ("aborted", 50)
-    assert read_events(tmp_path / "run")[-1]["message"] == str(error)
+    source = "device: " if isinstance(error, DeviceError) else ""
+    assert read_events(tmp_path / "run")[-1]["message"] == f"{source}{error}"
 
 
 def test_a_device_that_is_gone_for_good_is_tried_but_not_waited_for(
