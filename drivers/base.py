@@ -177,6 +177,18 @@ class Driver(Protocol):
 
 
 @runtime_checkable
+class AsksAhead(Protocol):
+    """A driver that can ask for a block before the one before it has been worked on."""
+
+    def ask_ahead(self) -> None:
+        """Ask for the block that the next `read_block` returns, without waiting; never raises.
+
+        Does nothing in real time, where a block is there when it has been measured. To be called
+        where a `read_block` follows: in virtual time the laws in force hold for that block.
+        """
+
+
+@runtime_checkable
 class LatchesTrip(Protocol):
     """A driver whose device can be left with a latched trip of its own, against any other host."""
 

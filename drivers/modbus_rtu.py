@@ -65,6 +65,8 @@ class _WaitingClient(ModbusSerialClient):
 class RtuConnection(ModbusConnection):
     """A serial line that is opened once and, broken once, stays closed until opened again."""
 
+    pipelines = False  # an answer without a number could be that of any request
+
     def __init__(self, at: RtuSettings, timeout: float) -> None:
         super().__init__(at.device, 0, timeout)
         self.where = at.device

@@ -198,6 +198,14 @@ class ModbusTcpDriver:
         """Stop streaming."""
         self._command(reg.CONTROL_STREAM, reg.STREAM_STOP)
 
+    def ask_ahead(self) -> None:
+        """Ask for the next block of a device in virtual time, which computes it meanwhile."""
+        if self.info is not None and self.info.virtual_time and self._link.pipelines:
+            words = self._acknowledgement()
+            self._link.ask_ahead(
+                reg.CONTROL_ACK.address, words, reg.BLOCK.address, self._layout.words
+            )
+
     def read_block(self) -> SampleBlock:
         """Return the next block, waiting for it; also feeds the device's watchdog."""
         period = self._layout.samples / self._rig.sample_rate
@@ -259,14 +267,20 @@ class ModbusTcpDriver:
         )
 
     def _exchange_once(self) -> bytes:
-        self._heartbeat = (self._heartbeat + 1) & 0xFFFF
-        words = [self._decoder.acknowledge, self._heartbeat]
         try:
+            if self._link.asked_ahead:
+                return self._link.answer_ahead()
+            words = self._acknowledgement()
             return self._link.write_and_read(
                 reg.CONTROL_ACK.address, words, reg.BLOCK.address, self._layout.words
             )
         except DeviceRefused as refused:
             raise self._explained(refused, "block") from refused
+
+    def _acknowledgement(self) -> list[int]:
+        """Return what a request for a block writes: the last one's number, a new heartbeat."""
+        self._heartbeat = (self._heartbeat + 1) & 0xFFFF
+        return [self._decoder.acknowledge, self._heartbeat]
 
     def _status(self) -> bytes:
         first, end = reg.STATUS_SPAN

@@ -6,8 +6,8 @@ import logging
 import socket
 import struct
 from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import Any
+from contextlib import contextmanager, suppress
+from typing import Any, ClassVar
 
 from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 from pymodbus.exceptions import ConnectionException, ModbusException, ModbusIOException
@@ -56,7 +56,13 @@ def answer_classes() -> tuple[type[ModbusPDU], ...]:
 
 
 class ModbusConnection:
-    """A connection that is opened once and, broken once, stays closed until opened again."""
+    """A connection that is opened once and, broken once, stays closed until opened again.
+
+    One request may be under way whose answer nobody waits for yet (`ask_ahead`). Whatever is asked
+    before its answer was taken leaves that answer to be dropped, as a late one.
+    """
+
+    pipelines: ClassVar[bool] = True  # requests are numbered, so that two may be under way
 
     def __init__(self, host: str, port: int, timeout: float) -> None:
         self.where = f"{host}:{port}"
@@ -65,6 +71,8 @@ class ModbusConnection:
         self._received = 0
         self._answered = False  # ever since it was opened
         self._asked = b""
+        self._ahead: ReadWriteMultipleRegistersRequest | None = None
+        self._given_up = -1  # transaction number of a request ahead whose answer nobody wants
         self._factor = 1.0
         # What the library logs is raised here as well, in words for people.
         logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
@@ -129,6 +137,7 @@ class ModbusConnection:
 
     def close(self) -> None:
         """Close the connection if there is one."""
+        self._ahead = None
         client, self._client = self._client, None
         if client is not None:
             client.close()  # type: ignore[no-untyped-call]
@@ -156,13 +165,35 @@ class ModbusConnection:
 
     def write_and_read(self, write_at: int, words: list[int], read_at: int, count: int) -> bytes:
         """Write, then read, in one transaction (function 23)."""
-        request = ReadWriteMultipleRegistersRequest(
-            read_address=read_at,
-            read_count=count,
-            write_address=write_at,
-            write_registers=words,
-        )
-        return self._registers(request, count)
+        return self._registers(_write_and_read(write_at, words, read_at, count), count)
+
+    @property
+    def asked_ahead(self) -> bool:
+        """Whether `answer_ahead` has an answer to wait for."""
+        return self._ahead is not None
+
+    def ask_ahead(self, write_at: int, words: list[int], read_at: int, count: int) -> None:
+        """Send what `write_and_read` sends, and leave the answer to `answer_ahead`; never raises.
+
+        A connection that cannot send says so at the next request.
+        """
+        request = _write_and_read(write_at, words, read_at, count)
+        request.dev_id = 1
+        with suppress(ModbusException, OSError, DeviceLost):
+            self._usable().execute(True, request)
+            self._ahead = request
+
+    def answer_ahead(self) -> bytes:
+        """Return the registers that `ask_ahead` asked for; raises as `write_and_read`."""
+        request, self._ahead = self._ahead, None
+        if request is None:
+            raise ValueError("nothing was asked ahead")
+        client: Any = self._usable()
+        try:
+            answer = client.transaction.sync_get_response(request.dev_id, request.transaction_id)
+            return self._payload(self._checked(answer), request.read_count)
+        except (ModbusException, OSError) as error:
+            raise self._failure(error) from error
 
     def _registers(self, request: ModbusPDU, count: int) -> bytes:
         request.dev_id = 1
@@ -170,6 +201,9 @@ class ModbusConnection:
             answer = self._checked(self._usable().execute(False, request))
         except (ModbusException, OSError) as error:
             raise self._failure(error) from error
+        return self._payload(answer, count)
+
+    def _payload(self, answer: ModbusPDU, count: int) -> bytes:
         payload = answer.payload if isinstance(answer, RawAnswer) else b""
         if len(payload) != 2 * count:
             self.close()  # what else is under way would be taken for the next answer
@@ -184,6 +218,8 @@ class ModbusConnection:
         if client is None or not client.connected:
             raise DeviceLost(f"the connection to the device at {self.where} is closed")
         self._received = 0
+        if self._ahead is not None:
+            self._given_up, self._ahead = self._ahead.transaction_id, None
         return client
 
     def _checked(self, answer: ModbusPDU) -> ModbusPDU:
@@ -225,7 +261,8 @@ class ModbusConnection:
         if sending:
             self._asked = data
         elif self._answers_earlier_request(data):
-            logger.warning("a late answer from %s is dropped", self.where)
+            if _MBAP.unpack_from(data)[0] != self._given_up:
+                logger.warning("a late answer from %s is dropped", self.where)
         else:
             self._received = len(data)
         return data
@@ -237,6 +274,17 @@ class ModbusConnection:
             return False
         transaction, protocol, _ = _MBAP.unpack(head)
         return bool(protocol == 0 and transaction != _MBAP.unpack_from(self._asked)[0])
+
+
+def _write_and_read(
+    write_at: int, words: list[int], read_at: int, count: int
+) -> ReadWriteMultipleRegistersRequest:
+    return ReadWriteMultipleRegistersRequest(
+        read_address=read_at,
+        read_count=count,
+        write_address=write_at,
+        write_registers=words,
+    )
 
 
 def unpack(form: str, data: bytes, offset: int = 0) -> int:

@@ -72,8 +72,11 @@ class BenchSession(Protocol):
     def apply(self, laws: Sequence[OutputLaw], restart: bool = False) -> int:
         """Set all laws; returns the tick from which they hold."""
 
-    def exchange(self) -> SampleBlock:
-        """Read one block, checked and journalled; raises what ends a run, outputs zeroed."""
+    def exchange(self, more: bool = False) -> SampleBlock:
+        """Read one block, checked and journalled; raises what ends a run, outputs zeroed.
+
+        `more` says that another exchange follows with no command between them.
+        """
 
     def guard(self, roles: Sequence[JointRole]) -> None:
         """Say what each joint does, and so which limits hold."""
@@ -129,7 +132,8 @@ class Session:
         """Read blocks until sample `tick` - 1 is in; `watch` is called after each."""
         while self.now < tick:
             self._heed()
-            block = self.bench.exchange()
+            more = tick - self.now > self.bench.info.block_samples
+            block = self.bench.exchange(more)
             self.now = block.tick + len(block.data)
             ticks = np.arange(block.tick, self.now)
             places = self._places(block.tick, self.now)

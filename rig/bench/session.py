@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.base import (
+    AsksAhead,
     DeviceBusy,
     DeviceError,
     DeviceInfo,
@@ -93,6 +94,7 @@ class Bench:
         self._columns = len(rig.recorded)
         self._outputs = Outputs(rig, driver)
         self._driver = driver
+        self._ask_ahead = driver.ask_ahead if isinstance(driver, AsksAhead) else _nothing
         self._clock = clock
         self._guard = Guard(rig, settings)
         self._alarms = AlarmLog(rig, lambda event, tick, about: self.event(event, tick, **about))
@@ -269,14 +271,18 @@ class Bench:
 
     # Samples
 
-    def exchange(self) -> SampleBlock:
+    def exchange(self, more: bool = False) -> SampleBlock:
         """Take one block: check every sample, journal it, show it.
 
+        `more` says that another exchange follows, with no command before it unless something is
+        wrong: in virtual time the device then prepares that block while this one is checked.
         Raises SafetyTrip, OperatorStop, DeviceLost, DeviceError or RecordingFailed, each with the
         outputs zeroed before; a block that trips is journalled all the same.
         """
         self._heed()
         block = self._outputs.safely(self._driver.read_block)
+        if more:
+            self._ask_ahead()
         late = None if self._arrival is None else self._arrival.late(block, self._clock())
         lost = self._outputs.safely(lambda: self._continue(block))
         violation = self._outputs.safely(lambda: self._inspect(block, lost, late))
@@ -395,7 +401,7 @@ class Bench:
         wanted = math.ceil(seconds * rate - 1e-6)
         while passed < wanted:
             before = self._expected
-            block = self.exchange()
+            block = self.exchange(more=wanted - passed > self.info.block_samples)
             passed += len(block.data) if before is None else self.tick - before
             taken.append(block.data)
             if watch is not None:
@@ -450,6 +456,10 @@ class Bench:
                 raise ValueError("exchange a block first, or give start_tick: no tick is known yet")
             start_tick = self._expected
         return RecordHandle(self, what, start_tick, ticks)
+
+
+def _nothing() -> None:
+    pass
 
 
 def _place(recorder: Recorder | None) -> str:

@@ -254,6 +254,71 @@ def test_a_lost_answer_is_asked_for_again_and_no_sample_is_missing(wire: BadWire
     driver.close()
 
 
+def test_blocks_asked_for_ahead_are_those_that_would_have_come(driver: ModbusTcpDriver) -> None:
+    wave = 3.0 * np.sin(2 * np.pi * np.arange(250) / 250)
+    driver.upload(1, wave)
+
+    def played(ahead: bool) -> np.ndarray:
+        driver.start()
+        tick = driver.apply([OFF, OutputLaw(gain=0.5, limit=1.5)], restart=True)
+        blocks = []
+        for _ in range(50):
+            blocks.append(driver.read_block())
+            if ahead:
+                driver.ask_ahead()
+        assert [block.tick - tick for block in blocks] == list(range(0, 500, 10))
+        return np.vstack([block.data for block in blocks])[:, 10:]
+
+    assert np.array_equal(played(ahead=True), played(ahead=False))
+
+
+def test_a_command_before_the_answer_ahead_is_obeyed_and_loses_no_block(
+    driver: ModbusTcpDriver, caplog: pytest.LogCaptureFixture
+) -> None:
+    driver.start()
+    driver.apply([OutputLaw(bias=1.0, limit=2.0), OFF])
+    blocks = [driver.read_block()]
+    driver.ask_ahead()
+    driver.zero_outputs()
+    # One block was measured before the zero arrived: at most two from a bad sample to zero.
+    blocks += [driver.read_block(), driver.read_block()]
+    assert [(block.data[:, 10] > 0.9).all() for block in blocks] == [True, True, False]
+    assert not blocks[2].data[:, 10:].any()
+    driver.ask_ahead()
+    assert driver.trip_cause() is None
+    driver.ask_ahead()
+    tick = driver.apply([OFF, OutputLaw(bias=1.0, limit=2.0)])
+    blocks += [driver.read_block(), driver.read_block()]
+    assert tick == blocks[-1].tick
+    assert [block.tick - blocks[0].tick for block in blocks] == [0, 10, 20, 30, 40]
+    assert not caplog.messages
+
+
+def test_a_lost_answer_ahead_is_asked_for_again(wire: BadWire) -> None:
+    driver = over(wire)
+    driver.start()
+    blocks = [driver.read_block()]
+    wire.fault = "lose one"
+    driver.ask_ahead()
+    blocks += [driver.read_block(), driver.read_block()]
+    assert wire.fault == "pass"
+    assert [block.sequence for block in blocks] == [0, 1, 2]
+    driver.close()
+
+
+def test_nothing_is_asked_ahead_in_real_time() -> None:
+    with device_process("realtime") as (_, port):
+        rig = seed_rig(port=port)
+        driver = ModbusTcpDriver(rig.wire, rig)
+        driver.connect()
+        driver.start()
+        driver.read_block()
+        driver.ask_ahead()
+        assert not driver._link.asked_ahead
+        driver.close()
+
+
+@pytest.mark.parametrize("ahead", [False, True])
 @pytest.mark.parametrize(
     ("fault", "error", "says"),
     [
@@ -266,7 +331,7 @@ def test_a_lost_answer_is_asked_for_again_and_no_sample_is_missing(wire: BadWire
     ],
 )
 def test_a_wire_that_fails_mid_run_is_named_in_time(
-    wire: BadWire, fault: str, error: type[DeviceError], says: str
+    wire: BadWire, fault: str, error: type[DeviceError], says: str, ahead: bool
 ) -> None:
     driver = over(wire)
     driver.start()
@@ -274,6 +339,8 @@ def test_a_wire_that_fails_mid_run_is_named_in_time(
     driver.read_block()
     wire.fault = fault
     began = time.monotonic()
+    if ahead:
+        driver.ask_ahead()
     with pytest.raises(error, match=says) as caught:
         driver.read_block()
     assert time.monotonic() - began < 2 * TIMEOUT + 5.0

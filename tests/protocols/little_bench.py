@@ -141,7 +141,7 @@ class LittleBench:
         self.records.append(Handle(meta, start_tick, ticks, attributes=dict(meta.attributes)))
         return self.records[-1]
 
-    def exchange(self) -> SampleBlock:
+    def exchange(self, more: bool = False) -> SampleBlock:
         while True:
             first = self.tick
             data = np.array([self._sample() for _ in range(BLOCK)])

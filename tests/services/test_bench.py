@@ -260,6 +260,19 @@ def test_whoever_raises_while_a_record_is_open_the_outputs_are_zero_before_it_is
     assert driver.calls[:2] == ["zero", "recorder.end_record"]
 
 
+def test_the_next_block_is_asked_for_ahead_only_where_it_is_surely_wanted() -> None:
+    class Asking(FakeDriver):
+        def ask_ahead(self) -> None:
+            self.calls.append(f"ask ahead of {self.tick}")
+
+    driver = Asking(RIG)
+    with Bench(RIG, driver) as bench:
+        driver.calls.clear()
+        bench.exchange()
+        bench.run_for(0.025)
+        assert driver.calls == ["ask ahead of 20", "ask ahead of 30"]
+
+
 def test_a_watcher_that_raises_finds_the_outputs_at_zero() -> None:
     driver = FakeDriver(RIG)
 

@@ -118,7 +118,7 @@ class DirectBench:
         )  # fmt: skip
         return self.plant.tick
 
-    def exchange(self) -> SampleBlock:
+    def exchange(self, more: bool = False) -> SampleBlock:
         """Let the plant run for one block and return it, decoded."""
         first = self.plant.tick
         inputs, outputs = self.plant.advance(BLOCK, self._laws)
