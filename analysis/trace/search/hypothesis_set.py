@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import logging
 from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +34,7 @@ from analysis.trace.search.hypothesis import (
     parameter_values,
     within,
 )
-from analysis.trace.search.refinement import ExactFit, fit, rebased, refine
+from analysis.trace.search.refinement import ExactFit, fit, jacobian, rebased, refine
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
@@ -241,7 +242,9 @@ class HypothesisSet:
         mask = np.ones(len(now.fit.residual))
         for s in data.segments:
             mask[s.where] = not equations or s.equation in equations
-        field = self._field(data, found, mask)
+        # The set's shapes move too when another effect joins: what they can take is no gain of its.
+        free = [jacobian(self.stage, now.fit, used)[1] for used in now.effects]
+        field = self._field(replace(data, base=np.hstack((data.base, *free))), found, mask)
         r = now.fit.residual * mask
         r = r - field.basis @ (field.basis.T @ r)
         more = linear_fit.options(field, (), r, 1.0)

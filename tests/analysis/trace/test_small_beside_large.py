@@ -32,3 +32,14 @@ def test_a_gain_wrong_by_parts_in_a_thousand_is_not_called_crosstalk_of_the_othe
     assert set(sizes) == {("internal_leakage", "joint 2"), ("sensor_gain", "joint 2 cap")}
     assert sizes["sensor_gain", "joint 2 cap"][0] == pytest.approx(gain, abs=3e-4)
     assert s.vetoes(s.winner) == ""
+
+
+def test_a_spring_is_found_beside_a_gain_that_took_part_of_it(rig: Rig) -> None:
+    """Alone the gain comes out as 1.078: the spring earns its place once the gain may move too."""
+    runs = pair_of_runs(rig, gain_cap_pressure=1.05, k_spring=20.0)
+    s = searched(rig, *runs, "sensor_gain", "sensor_offset", "torque_offset", "joint_spring")
+    assert s.winner.keys == {("sensor_gain", "joint 2 cap"), ("joint_spring", "joint 2")}
+    gain = next(u.shape[0] for u in s.winner.effects if u.term.name == "sensor_gain")
+    assert gain == pytest.approx(1.05, abs=1e-3)
+    assert s.winner.fit.beta["k_spring_2"] == pytest.approx(20.0, rel=0.03)
+    assert s.vetoes(s.winner) == ""
