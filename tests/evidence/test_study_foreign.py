@@ -97,6 +97,13 @@ def test_what_has_no_name_must_be_refused_and_a_clean_bench_left_alone() -> None
     assert answer_of(_case(NONE), "explained", {LEAK}, set()) == "false alarm"
 
 
+def test_the_curve_of_a_leak_whose_form_has_no_name_is_right() -> None:
+    turbulent = Wrong(*LEAK, "turbulent", curve="leakage_curve")
+    curve = {("leakage_curve", "joint 1")}
+    assert answer_of(_case(SINGLE, turbulent), "explained", curve, set()) == "right"
+    assert answer_of(_case(SINGLE, Wrong(*LEAK, "laminar")), "explained", curve, set()) == "wrong"
+
+
 def test_bounds_are_those_of_the_binomial() -> None:
     assert bounds(0, 59)[1] == pytest.approx(0.05, abs=0.001)  # rule of three
     assert bounds(20, 20) == (pytest.approx(0.05 ** (1 / 20)), 1.0)

@@ -14,6 +14,7 @@ from tests.studies.foreign.bench import Bench, Sensor, drawn_rig
 
 NONE, SINGLE, PAIR, OUTSIDE = "none", "single", "pair", "outside"
 STREAM: Final = 29
+DRAWN: Final = ("", "leakage_curve")  # of a laminar leak, of a turbulent one
 MIX: Final = ((NONE, 0.15), (SINGLE, 0.60), (PAIR, 0.15), (OUTSIDE, 0.10))
 
 
@@ -23,7 +24,8 @@ class Wrong:
 
     `also` are names at the same place that may stand beside it (a breakaway sits on a level, a
     curve of its mechanism is right for what has no name), `kin` those that may stand beside
-    `unexplained`: the right mechanism in a form that is too simple.
+    `unexplained`: the right mechanism in a form that is too simple. `curve` is the mechanism's free
+    curve, which is as right as the name where the name's own form is another.
     """
 
     name: str
@@ -35,6 +37,7 @@ class Wrong:
     sizes: Mapping[str, float] = field(default_factory=dict)
     also: tuple[str, ...] = ()
     kin: tuple[str, ...] = ()
+    curve: str = ""
 
 
 @dataclass(frozen=True)
@@ -195,7 +198,7 @@ def _internal(rng: np.random.Generator, i: int) -> Wrong:
     word, form, c = _leak(rng)
     return Wrong("internal_leakage", f"joint {i + 1}", f"{c:.2g} {word}",
                  joint=(i, {"internal": c, "internal_form": form}),
-                 sizes={} if form else {"c_internal": c})  # fmt: skip
+                 sizes={} if form else {"c_internal": c}, curve=DRAWN[form])  # fmt: skip
 
 
 def _external(rng: np.random.Generator, i: int) -> Wrong:
@@ -203,7 +206,7 @@ def _external(rng: np.random.Generator, i: int) -> Wrong:
     side = ("cap", "rod")[int(rng.integers(2))]
     return Wrong("external_leakage", f"joint {i + 1} {side}", f"{c:.2g} {word}",
                  joint=(i, {f"{side}_leak": c, "external_form": form}),
-                 sizes={} if form else {"": c})  # fmt: skip
+                 sizes={} if form else {"": c}, curve=DRAWN[form])  # fmt: skip
 
 
 def _sag(rng: np.random.Generator, i: int) -> Wrong:

@@ -128,6 +128,8 @@ def answer_of(  # noqa: PLR0911  a table of answers
     """Judge an answer: right, in class, quiet, partly, abstained, wrong, false alarm."""
     from analysis.trace.data.candidates import catalogue
 
+    drawn = {(w.curve, w.where): (w.name, w.where) for w in case.hidden if w.curve}
+    named = {drawn.get(key, key) for key in named}
     truth, own = case.truth, named - case.allowed
     known = {e.name for e in catalogue(case.bench.rig)}
     if case.kind == NONE:
