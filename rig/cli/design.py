@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.options import JsonOption, ProtocolArgument, RigOption
+from rig.cli.options import JsonOption, ModelOption, NominalOption, ProtocolArgument, RigOption
 
 
 def design(
@@ -21,23 +21,33 @@ def design(
         int, typer.Option(min=1, max=5000, help="Simulations of a step on the twin.")
     ] = 300,
     seed: Annotated[int, typer.Option(min=0, help="Of the search; the same gives the same.")] = 0,
+    model: ModelOption = None,
+    nominal: NominalOption = False,
     json: JsonOption = None,
 ) -> None:
     """Improve a protocol's multisines for what it identifies worst, within the rig's limits.
 
     Example: bramah design lock-and-excite-multisine --rig shinshu-2dof --criterion b --out b.yaml
     """
-    from rig.cli.output import write_json
+    from rig.cli.output import progress, write_json
     from rig.cli.predicted_errors import design_json, design_protocol, design_text
+    from rig.cli.twin_choice import load_twin, twin_source
+    from rig.runs.rigs import load_bench
 
-    designed = design_protocol(protocol, rig, criterion, budget, seed)
+    bench = load_bench(rig)
+    parameters = load_twin(twin_source(bench, model, nominal), bench)
+    if parameters.warning:
+        progress(parameters.warning)
+    designed = design_protocol(protocol, rig, criterion, budget, seed, parameters)
     out.parent.mkdir(parents=True, exist_ok=True)
     part = out.with_name(out.name + ".part")
     part.write_text(designed.text, encoding="utf-8")
     part.replace(out)
     write_json(json, design_json(designed))
     if json != Path("-"):
-        typer.echo(design_text(designed, out))
+        typer.echo(
+            f"{design_text(designed, out)}\nlimits and errors predicted on: {parameters.text}"
+        )
 
 
 def register(app: typer.Typer) -> None:

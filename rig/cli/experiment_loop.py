@@ -15,7 +15,6 @@ from typing import Any, Final
 
 import yaml
 
-from analysis.simulation.twin import simulate_commands
 from analysis.trace.engine import trace
 from analysis.trace.loop_rounds import Round, achieved
 from analysis.trace.result import CLEAN, EXPLAINED, UNEXPLAINED
@@ -25,6 +24,7 @@ from protocols.files import library
 from protocols.files.plan import Overrides, resolve
 from rig.cli.output import Countdown
 from rig.cli.protocol_run import ProtocolJob, run_protocol
+from rig.cli.twin_choice import load_twin, twin_source
 from rig.model.parse import InputError
 from rig.model.records import Run
 from rig.model.rig import Rig
@@ -147,8 +147,9 @@ class Loop:
 
     def _within(self, path: Path, sizes: Overrides) -> bool:
         try:
-            plan = resolve(library.load(path), self.rig, sizes)
-            return check(plan, self.rig, simulate_commands).ok
+            known = load_twin(twin_source(self.rig), self.rig)
+            plan = resolve(library.load(path), known.rig, sizes)
+            return check(plan, known.rig, known.twin, draws=known.draws).ok
         except InputError as error:
             log.info("%s at %.2f: %s", path, sizes.amplitude_scale, error)
             return False

@@ -28,7 +28,6 @@ from rig.cli.twin_choice import TwinParameters
 from rig.model.parse import InputError
 from rig.model.parts import Wire
 from rig.model.rig import Rig
-from rig.runs.rigs import load_bench
 
 CHECKED = 0.4  # of the time of a check with its prediction, spent on the limits
 
@@ -167,33 +166,40 @@ class Designed:
     after: CheckedForecast
 
 
-def _checker(plan: Plan, rig: Rig) -> Callable[[TwinStep, Mapping[int, Tone]], bool]:
+def _checker(
+    plan: Plan, parameters: TwinParameters
+) -> Callable[[TwinStep, Mapping[int, Tone]], bool]:
     """Return the test that `check` will make of a step in the end, centring from nothing."""
 
     def passes(planned: TwinStep, tones: Mapping[int, Tone]) -> bool:
         alone = {"steps": (designed_step(plan, planned, tones),)}
         try:
-            trial = resolve(plan.protocol.model_copy(update=alone), rig)
-            return check(trial, rig, simulate_commands).ok
+            trial = resolve(plan.protocol.model_copy(update=alone), parameters.rig)
+            return check(trial, parameters.rig, parameters.twin, draws=parameters.draws).ok
         except InputError:
             return False
 
     return passes
 
 
-def design_protocol(protocol: str, rig: str, criterion: str, budget: int, seed: int) -> Designed:
-    """Improve a protocol's multisines; raises InputError where that cannot be done."""
-    bench = load_bench(rig)
+def design_protocol(
+    protocol: str, rig: str, criterion: str, budget: int, seed: int, parameters: TwinParameters
+) -> Designed:
+    """Improve a protocol's multisines; raises InputError where that cannot be done.
+
+    Limits and errors are predicted on the twin that `parameters` hold.
+    """
+    bench = parameters.rig
     plan = resolve(library.load(protocol), bench)
-    before = of_plan(plan, bench)
+    before = of_plan(plan, bench, None, parameters.twin, parameters.draws)
     biases = {step.step: step.biases for step in before.limits.steps}
     design = improve(
         bench, planned_steps(plan, biases), empty_lines(plan), criterion, budget,
-        np.random.default_rng(seed), progress, _checker(plan, bench),
+        np.random.default_rng(seed), progress, _checker(plan, parameters),
     )  # fmt: skip
     better = designed_protocol(plan, design, criterion)
     after_plan = resolve(better, bench)
-    after = of_plan(after_plan, bench)
+    after = of_plan(after_plan, bench, None, parameters.twin, parameters.draws)
     after.limits.require()
     command = (
         f"bramah design {protocol} --rig {rig} --criterion {criterion} --budget {budget} "

@@ -7,11 +7,13 @@ from pathlib import Path
 
 import pytest
 
+from analysis.simulation.model import save_model
 from protocols.files import library
 from protocols.files.plan import resolve
 from rig.cli.main import run
 from rig.runs.rigs import load_rig
 from tests.cli.bench import SHORT
+from tests.cli.test_twin_model import identified
 
 RIG = "shinshu-2dof"
 QUICK = """
@@ -87,6 +89,18 @@ def test_a_designed_protocol_is_a_file_like_any_other(
         assert empty == ours.excite[0].wave.detection_lines
         assert not set(empty) & set(ours.lines)
     assert bramah("check", out, "--rig", RIG) == 0
+
+
+def test_a_design_keeps_the_limits_of_the_machine_that_was_identified(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source, out, fast = tmp_path / "quick.yaml", tmp_path / "b.yaml", tmp_path / "fast.json"
+    source.write_text(QUICK)
+    save_model(identified(load_rig(RIG), 1.3), fast)
+    line = ["design", source, "--rig", RIG, "--criterion", "b", "--budget", 4, "--out", out]
+    assert bramah(*line, "--model", fast) == 0
+    assert f"predicted on: model {fast}" in capsys.readouterr().out
+    assert bramah("check", out, "--rig", RIG, "--model", fast) == 0
 
 
 def test_a_criterion_that_does_not_exist_is_refused(

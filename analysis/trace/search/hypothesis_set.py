@@ -242,9 +242,9 @@ class HypothesisSet:
         mask = np.ones(len(now.fit.residual))
         for s in data.segments:
             mask[s.where] = not equations or s.equation in equations
-        # The set's shapes move too when another effect joins: what they can take is no gain of its.
-        free = [jacobian(self.stage, now.fit, used)[1] for used in now.effects]
-        field = self._field(replace(data, base=np.hstack((data.base, *free))), found, mask)
+        # The set's shapes move too when another effect joins: what they can take is not its gain.
+        moves = [jacobian(self.stage, now.fit, used)[1] for used in now.effects]
+        field = self._field(replace(data, base=np.hstack((data.base, *moves))), found, mask)
         r = now.fit.residual * mask
         r = r - field.basis @ (field.basis.T @ r)
         more = linear_fit.options(field, (), r, 1.0)
