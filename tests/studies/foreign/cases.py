@@ -189,7 +189,7 @@ def _play(rng: np.random.Generator, i: int) -> Wrong:
                  joint=(i, {"play": play}))  # fmt: skip
 
 
-def _leak(rng: np.random.Generator) -> tuple[str, float, float]:
+def _leak(rng: np.random.Generator) -> tuple[str, int, float]:
     form = int(rng.integers(2))
     return ("laminar", "turbulent")[form], form, _size(rng, 2e-13, 4e-12)
 
