@@ -1,6 +1,7 @@
 """What every wire of this project's own protocol shares: identity, waveforms, reasons.
 
-Modbus TCP and the serial line carry the same values (`rig.model.registers`) in other envelopes.
+Modbus TCP and the serial line carry the same values in other envelopes
+(`rig.model.wire.registers`).
 """
 
 from __future__ import annotations
@@ -12,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.base import Array, DeviceError, DeviceInfo, DeviceLost
-from rig.model import registers as reg
-from rig.model.codes import encode_output
-from rig.model.registers import Refusal, TripCause
 from rig.model.rig import Rig
+from rig.model.wire import registers as reg
+from rig.model.wire.codes import encode_output
+from rig.model.wire.registers import Refusal, TripCause
 
 # Nothing moves in a virtual device while it thinks: a busy computer is no danger to it.
 VIRTUAL_PATIENCE: Final = 10.0

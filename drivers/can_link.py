@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 
 from drivers.can_port import CanPort
-from rig.model.registers import BlockLayout
 from rig.model.wire.can_frames import (
     BlockCollector,
     PartCollector,
@@ -15,6 +14,7 @@ from rig.model.wire.can_frames import (
 )
 from rig.model.wire.can_layout import CanLayout
 from rig.model.wire.frames import WireFrame
+from rig.model.wire.registers import BlockLayout
 from rig.model.wire.serial_messages import Message
 
 logger = logging.getLogger(__name__)

@@ -14,10 +14,10 @@ from drivers.base import WireSettings
 from drivers.can_link import CanLine
 from drivers.can_port import SLCAN, SOCKETCAND, BusPlace, CanPort
 from drivers.message_stream import MessageStreamDriver
-from rig.model import registers as reg
 from rig.model.parse import InputError
 from rig.model.parts import Wire
 from rig.model.rig import Rig
+from rig.model.wire import registers as reg
 from rig.model.wire.can_database import database_text
 from rig.model.wire.can_frames import stream_seconds
 from rig.model.wire.can_layout import CanLayout, read_layout

@@ -25,13 +25,13 @@ from drivers.base import Array, DeviceError, DeviceInfo, DeviceLost, OutputLaw, 
 from drivers.can_port import BusPlace, CanPort
 from drivers.polled import PolledDriver
 from rig.model import channels as ch
-from rig.model.codes import decode_input
 from rig.model.parse import InputError
 from rig.model.parts import Wire
 from rig.model.rig import Rig
 from rig.model.wire import cia408
 from rig.model.wire.can_frames import CanFrame
 from rig.model.wire.cia408 import Control, ValveState
+from rig.model.wire.codes import decode_input
 
 logger = logging.getLogger(__name__)
 

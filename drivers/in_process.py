@@ -2,8 +2,8 @@
 
 The object has one method, `advance(ticks, laws)`: it measures, evaluates one `ActiveLaw` per joint
 and holds the output, `ticks` times, and returns what it measured, shape (ticks, channels), and what
-it put out, shape (ticks, joints). Whole numbers are converter codes (`rig.model.codes`), floats are
-SI. Time is virtual: nothing runs while no block is read.
+it put out, shape (ticks, joints). Whole numbers are converter codes (`rig.model.wire.codes`),
+floats are SI. Time is virtual: nothing runs while no block is read.
 
 In a rig file `object: package.module:name` names a callable that takes the rig and returns it;
 naming it runs that module's code.
@@ -34,9 +34,9 @@ from drivers.base import (
 )
 from drivers.law_checks import possible_laws, possible_wave
 from rig.model import channels as ch
-from rig.model.codes import decode_input, decode_output
 from rig.model.parts import Wire
 from rig.model.rig import Rig
+from rig.model.wire.codes import decode_input, decode_output
 
 logger = logging.getLogger(__name__)
 

@@ -17,10 +17,10 @@ from typing import Protocol
 
 from drivers.base import DeviceBusy, DeviceError
 from drivers.bench_protocol import DeviceRefused, DeviceSilent
-from rig.model import registers as reg
-from rig.model.registers import Refusal
+from rig.model.wire import registers as reg
 from rig.model.wire import serial_messages as msg
 from rig.model.wire.frames import FRAME_VERSION, WireFrame
+from rig.model.wire.registers import Refusal
 from rig.model.wire.serial_messages import ANSWER, Message
 
 logger = logging.getLogger(__name__)

@@ -34,11 +34,11 @@ from drivers.bench_protocol import (
 )
 from drivers.message_link import MessageLine, MessageLink, RequestRefused
 from drivers.modbus_blocks import BlockDecoder, unwrap
-from rig.model import registers as reg
 from rig.model.parts import Wire
-from rig.model.registers import Refusal, Status, TripCause
 from rig.model.rig import Rig
+from rig.model.wire import registers as reg
 from rig.model.wire import serial_messages as msg
+from rig.model.wire.registers import Refusal, Status, TripCause
 from rig.model.wire.serial_messages import Message
 
 logger = logging.getLogger(__name__)

@@ -8,9 +8,9 @@ import numpy as np
 
 from drivers.base import DeviceError, DeviceLost, SampleBlock
 from rig.model import channels as ch
-from rig.model import registers as reg
-from rig.model.registers import BlockHeader, Status
 from rig.model.rig import Rig
+from rig.model.wire import registers as reg
+from rig.model.wire.registers import BlockHeader, Status
 
 logger = logging.getLogger(__name__)
 

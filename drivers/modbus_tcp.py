@@ -36,10 +36,10 @@ from drivers.bench_protocol import (
 )
 from drivers.modbus_blocks import BlockDecoder, unwrap
 from drivers.modbus_transport import ModbusConnection, unpack
-from rig.model import registers as reg
 from rig.model.parts import LOCALHOST, PORT, Wire
-from rig.model.registers import Refusal, Status
 from rig.model.rig import Rig
+from rig.model.wire import registers as reg
+from rig.model.wire.registers import Refusal, Status
 
 logger = logging.getLogger(__name__)
 

@@ -13,9 +13,9 @@ from drivers.base import DeviceError, DeviceInfo, WireSettings
 from drivers.message_stream import MessageStreamDriver
 from drivers.serial_link import SerialLine
 from drivers.serial_transport import PySerialTransport, Transport
-from rig.model import registers as reg
 from rig.model.parts import Wire
 from rig.model.rig import Rig
+from rig.model.wire import registers as reg
 from rig.model.wire import serial_messages as msg
 
 

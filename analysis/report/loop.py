@@ -10,9 +10,9 @@ import numpy as np
 from markupsafe import Markup
 
 from analysis.report import format as fm
-from analysis.report import trace_figures
 from analysis.report.identification import Provenance
 from analysis.report.page import page, write
+from analysis.report.plots import trace_plots
 from analysis.report.plots.style import BLUE, CARD, GREY, INK, PALE, figure, note, style, svg
 from analysis.report.trace import body
 from analysis.trace.loop_rounds import Round
@@ -66,7 +66,7 @@ def _round(r: Round, run: Run | None, last: bool) -> dict[str, Any]:
         "sentence": result.sentence,
         "excitation": None if run is None or r.experiment is None else excited(run, r.number),
         # The last one stands below, with everything else about it.
-        "overview": None if last else trace_figures.over_noise(result, f"overnoise{r.number}"),
+        "overview": None if last else trace_plots.over_noise(result, f"overnoise{r.number}"),
         "next": None if following is None else following["text"],
     }  # fmt: skip
 

@@ -9,9 +9,9 @@ from typing import Any
 
 from analysis.effects.base import Effect
 from analysis.report import format as fm
-from analysis.report import trace_figures
 from analysis.report.identification import Provenance
 from analysis.report.page import page, write
+from analysis.report.plots import trace_plots
 from analysis.trace.clues.frequency import FREQUENCY
 from analysis.trace.data.spectral_lines import loudest
 from analysis.trace.result import CLEAN, Found, Trace
@@ -51,7 +51,7 @@ def body(
         "result": result,
         "provenance": provenance or Provenance(),
         "galleries": _pictures(rig, holdout, result),
-        "overview": trace_figures.over_noise(result),
+        "overview": trace_plots.over_noise(result),
         "errors": _errors(result),
         "effects": [_effect(e, f"d{k}") for k, e in enumerate(result.effects)],
         "refused": [_effect(e, f"n{k}") for k, e in enumerate(result.refused)],
@@ -82,7 +82,7 @@ def body(
 
 def _pictures(rig: Rig, holdout: Sequence[Run], result: Trace) -> list[dict[str, Any]]:
     """Return per effect, else per clue, the residual against its variable and in time."""
-    lines = trace_figures.held_out(rig, holdout, result)
+    lines = trace_plots.held_out(rig, holdout, result)
     out: list[dict[str, Any]] = []
 
     def add(effect: Effect | None, variable: str, equation: str, heading: str, key: str) -> None:
@@ -97,7 +97,7 @@ def _pictures(rig: Rig, holdout: Sequence[Run], result: Trace) -> list[dict[str,
         if isinstance(u.term, Effect) and (u.term.name, u.term.where) not in known
     ]
     for k, effect in enumerate(effects):
-        equation = trace_figures.equation_of(effect, rig, result, lines)
+        equation = trace_plots.equation_of(effect, rig, result, lines)
         heading = f"{effect.name.replace('_', ' ')} at {getattr(effect, 'place', effect.where)}"
         add(effect, effect.variable, equation, heading, f"e{k}")
     # A frequency is seen in time and in the lines, not against anything.
@@ -109,22 +109,22 @@ def _pictures(rig: Rig, holdout: Sequence[Run], result: Trace) -> list[dict[str,
 
 
 def _pair(
-    rig: Rig, here: Sequence[trace_figures.ResidualSeries], result: Trace, effect: Effect | None,
+    rig: Rig, here: Sequence[trace_plots.ResidualSeries], result: Trace, effect: Effect | None,
     variable: str, equation: str, key: str, timed: bool,
 ) -> dict[str, Any]:  # fmt: skip
     unit = unit_of_equation(rig, equation)
     noise = result.noise_floor[equation]
     model = result.model_after
     changed = model is not result.model_before
-    x = trace_figures.abscissae(rig, here, effect, variable, equation, model)
+    x = trace_plots.abscissae(rig, here, effect, variable, equation, model)
     label = variable
     if effect is None:
-        label = f"{variable} [{trace_figures.unit_of_variable(rig, variable)}]"
+        label = f"{variable} [{trace_plots.unit_of_variable(rig, variable)}]"
     longest = max(here, key=lambda line: float((line.before**2).mean()))
     return {
         "text": f"{equation}, held-out records; the band is ± one rms of noise, red the mean.",
-        "against": trace_figures.against(x, here, noise, unit, label, f"{key}x", changed),
-        "time": trace_figures.in_time(longest, noise, unit, f"{key}t", changed) if timed else None,
+        "against": trace_plots.against(x, here, noise, unit, label, f"{key}x", changed),
+        "time": trace_plots.in_time(longest, noise, unit, f"{key}t", changed) if timed else None,
         "record": longest.conditioned.record.name,
     }
 
@@ -135,7 +135,7 @@ def _spectra(rig: Rig, result: Trace) -> list[dict[str, Any]]:
     return [
         {
             "text": one.text,
-            "figure": trace_figures.spectrum(
+            "figure": trace_plots.spectrum(
                 one, unit_of_equation(rig, one.equation), f"l{k}", changed
             ),
         }
@@ -160,7 +160,7 @@ def _errors(result: Trace) -> list[tuple[str, ...]]:
 
 def _effect(found: Found, key: str) -> dict[str, Any]:
     return {
-        "curve": trace_figures.curves(found, key) if found.curves else None,
+        "curve": trace_plots.curves(found, key) if found.curves else None,
         "name": found.name.replace("_", " "),
         "where": found.where,
         "values": [(n, quantity(e)) for n, e in found.parameters.items()],

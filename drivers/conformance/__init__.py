@@ -1,7 +1,6 @@
 """What every driver must do, on any wire, as checks that anybody can run (docs/conformance.md)."""
 
 from drivers.conformance.catalogue import ConformanceCheck
-from drivers.conformance.live import live_subject
 from drivers.conformance.random_calls import RandomCallBudget
 from drivers.conformance.runner import (
     CheckVerdict,
@@ -11,7 +10,13 @@ from drivers.conformance.runner import (
     run,
     run_check,
 )
-from drivers.conformance.subject import HEALTHY, Capabilities, DeviceUnderTest, Subject
+from drivers.conformance.subject import (
+    HEALTHY,
+    Capabilities,
+    DeviceUnderTest,
+    Subject,
+    live_subject,
+)
 from drivers.conformance.watched import NotConforming
 
 __all__ = [

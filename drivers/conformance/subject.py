@@ -7,15 +7,18 @@ driver under test; a *fault* is a name for what the wire can be made to do to an
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 
-from drivers.base import Driver
+from drivers.base import DeviceError, Driver
+from drivers.registry import driver_class, make_driver
 from rig.model.rig import Rig
 
 Probe = Callable[[], Sequence[float]]
 Act = Callable[[], None]
+
+_PART = 0.1  # of the smallest command limit, asked for where outputs are allowed
 
 HEALTHY = "pass"  # the fault that is none
 
@@ -73,3 +76,31 @@ class Subject:
     make: Callable[[], AbstractContextManager[DeviceUnderTest]]
     capabilities: Capabilities = Capabilities()
     volts: float = 1.0
+
+
+def live_subject(rig: Rig) -> Subject:
+    """Return the device that the rig's wire reaches as a subject.
+
+    What it is (virtual time, host-timed) is asked of it. Raises InputError for settings that its
+    driver cannot read, DeviceError where it does not answer or has tripped: checks clear no trip
+    of a machine.
+    """
+    driver = make_driver(rig.wire, rig)
+    try:
+        info = driver.connect()
+        tripped = driver.trip_cause()
+    finally:
+        driver.close()
+    if tripped is not None:
+        raise DeviceError(f"the device has tripped ({tripped}); find the cause, then reset it")
+
+    @contextmanager
+    def make() -> Iterator[DeviceUnderTest]:
+        yield DeviceUnderTest(rig, lambda wanted: make_driver(wanted.wire, wanted))
+
+    claims = Capabilities(
+        host_timed=driver_class(rig.wire.kind).host_timed,
+        virtual_time=info.virtual_time,
+    )
+    volts = _PART * min(joint.limits.command for joint in rig.joints)
+    return Subject(rig.wire.kind, make, claims, volts)

@@ -23,10 +23,10 @@ from hil_sim.device.laws import DeviceLaw, LawTable, Refused
 from hil_sim.device.queue import BlockQueue
 from hil_sim.faults.device import ClockDrift, ClockJump, DeviceFault, QueueOverrun, Reboots
 from hil_sim.plant.prefetch import Prefetch, Rewindable
-from rig.model import registers as reg
 from rig.model.parts import WATCHDOG_RANGE
-from rig.model.registers import BlockHeader, Refusal, Status, TripCause
 from rig.model.rig import Rig
+from rig.model.wire import registers as reg
+from rig.model.wire.registers import BlockHeader, Refusal, Status, TripCause
 
 logger = logging.getLogger(__name__)
 

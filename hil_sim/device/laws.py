@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.model import registers as reg
-from rig.model.codes import decode_output
-from rig.model.registers import Refusal
 from rig.model.rig import Rig
+from rig.model.wire import registers as reg
+from rig.model.wire.codes import decode_output
+from rig.model.wire.registers import Refusal
 
 Array = NDArray[np.float64]
 Words = NDArray[np.uint16]

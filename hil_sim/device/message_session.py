@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from hil_sim.device.device import Device
 from hil_sim.device.laws import Refused
 from hil_sim.device.register_map import DeviceRegisters
-from rig.model import registers as reg
-from rig.model.registers import BlockHeader, Refusal, Register, Status
+from rig.model.wire import registers as reg
 from rig.model.wire import serial_messages as msg
 from rig.model.wire.frames import FRAME_VERSION, WireFrame
+from rig.model.wire.registers import BlockHeader, Refusal, Register, Status
 from rig.model.wire.serial_messages import ANSWER, FOR_ANYBODY, WINDOW, Message
 
 logger = logging.getLogger(__name__)

@@ -10,7 +10,7 @@ from pymodbus.pdu import ExceptionResponse, ModbusPDU
 
 from hil_sim.device.laws import Refused
 from hil_sim.device.register_map import DeviceRegisters
-from rig.model.registers import MAX_READ, MAX_WRITE, Refusal
+from rig.model.wire.registers import MAX_READ, MAX_WRITE, Refusal
 
 _EXCEPTIONS = {
     Refusal.NOT_IN_CONTROL: ExcCodes.DEVICE_BUSY,

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.model.registers import BlockLayout, pack_samples
+from rig.model.wire.registers import BlockLayout, pack_samples
 
 Codes = NDArray[np.int64]
 

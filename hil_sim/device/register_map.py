@@ -8,9 +8,9 @@ import numpy as np
 
 from hil_sim.device.device import Device
 from hil_sim.device.laws import Refused, Words
-from rig.model import registers as reg
 from rig.model.parameters import MAX_JOINTS
-from rig.model.registers import Refusal
+from rig.model.wire import registers as reg
+from rig.model.wire.registers import Refusal
 
 _U32 = 0xFFFF_FFFF
 

@@ -26,8 +26,8 @@ from hil_sim.device.register_map import DeviceRegisters
 from hil_sim.device.rtu_server import serve_line
 from hil_sim.device.serial_server import serve_serial
 from hil_sim.faults.device import DeviceFault
-from rig.model import registers as reg
 from rig.model.rig import Rig
+from rig.model.wire import registers as reg
 
 if TYPE_CHECKING:
     from rig.model.wire.can_layout import CanLayout

@@ -273,8 +273,8 @@ def run(
     """Run len(measured) ticks: measure, evaluate the laws, hold the outputs for one period.
 
     In place: state y, spool, rings values and slopes (ring, channels). Out: AD codes (ticks,
-    channels) as `rig.model.codes.encode_input` defines them, DA codes (ticks, joints). `noise` is
-    standard normal, (ticks, channels).
+    channels) as `rig.model.wire.codes.encode_input` defines them, DA codes (ticks, joints). `noise`
+    is standard normal, (ticks, channels).
     """
     n, bench = len(joints), bench_table[0]
     w, k, ends = np.zeros((n + 4, n)), np.zeros((5, len(y))), np.zeros((2, 3, n))

@@ -21,8 +21,8 @@ from hil_sim.plant.sensors import ring_length
 from hil_sim.plant.tables import build
 from hil_sim.scenario.file import Scenario
 from hil_sim.scenario.truth import load_machine
-from rig.model.codes import Array, Codes
 from rig.model.rig import Rig
+from rig.model.wire.codes import Array, Codes
 
 # Longest integration step [s]. plant_bench.accuracy gives 3e-7 of the pressures' range with it
 # (1e-7 at 1/6 ms, 8e-7 at 1/4 ms); the stiffest edge, wide open at an end stop, allows 1/4 ms.

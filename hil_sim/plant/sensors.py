@@ -2,7 +2,8 @@
 
 Channel k of `rig.channels` is converted k skews after the tick (the multiplexer runs ahead of the
 tick: along the tangent of the true signal), and shows the world as it was `delay` before that
-(cubic Hermite through earlier ticks). Then gain, offset, noise, and the code of `rig.model.codes`.
+(cubic Hermite through earlier ticks). Then gain, offset, noise, and the converter code
+(`rig.model.wire.codes`).
 """
 
 from __future__ import annotations

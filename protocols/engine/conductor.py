@@ -10,12 +10,11 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from protocols.engine.desk import Desk
-from protocols.engine.errors import ProtocolAborted, RunEnded
 from protocols.engine.excitation import ExcitationRun
 from protocols.engine.locking import Hold, lock
 from protocols.engine.placing import LOOK, look, move
 from protocols.engine.session import BenchSession, Session
-from protocols.engine.states import EngineState, StateMachine
+from protocols.engine.states import EngineState, ProtocolAborted, RunEnded, StateMachine
 from protocols.files.plan import Plan
 from protocols.language.conditions import ELAPSED, Condition
 from protocols.steps.base import PlannedStep, Question

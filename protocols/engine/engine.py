@@ -14,9 +14,8 @@ from contextlib import suppress
 from drivers.base import DeviceError, DeviceLost
 from protocols.engine.conductor import Conductor
 from protocols.engine.desk import Desk
-from protocols.engine.errors import ProtocolAborted, RunEnded
 from protocols.engine.session import BenchSession
-from protocols.engine.states import EngineState
+from protocols.engine.states import EngineState, ProtocolAborted, RunEnded
 from protocols.files.plan import Plan
 from protocols.steps.base import PlannedStep
 from rig.model.rig import Rig

@@ -6,13 +6,12 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
-from protocols.engine.errors import ProtocolAborted
 from protocols.engine.excited_joint import Driven
 from protocols.engine.locking import Hold, JointLock, give, lock
 from protocols.engine.placing import LOOK, look, move
 from protocols.engine.playback import Playback
 from protocols.engine.session import Session
-from protocols.engine.states import EngineState, StateMachine
+from protocols.engine.states import EngineState, ProtocolAborted, StateMachine
 from protocols.steps.parts import CLOSED, Place
 from protocols.steps.plans import LockPlan, StepPlan
 from rig.bench.guard import EXCITED, FREE, JointRole

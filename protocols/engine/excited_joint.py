@@ -20,7 +20,7 @@ from protocols.engine.centring import (
     recentring,
     trim,
 )
-from protocols.engine.errors import ProtocolAborted
+from protocols.engine.states import ProtocolAborted
 from protocols.steps.parts import OPEN_LOOP, Centring
 from protocols.steps.plans import ExcitePlan
 

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from drivers.base import OFF, OutputLaw
-from protocols.engine.errors import LockFailed
 from protocols.engine.placing import LOOK, STILL, PlacementReading, look, move, position_law
 from protocols.engine.session import Session
+from protocols.engine.states import LockFailed
 from protocols.steps.parts import CLOSED, END_MAX, Place
 from protocols.steps.plans import LockPlan
 

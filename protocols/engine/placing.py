@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from drivers.base import OutputLaw
-from protocols.engine.errors import ProtocolAborted
 from protocols.engine.session import Session
+from protocols.engine.states import ProtocolAborted
 from protocols.steps.parts import Place
 
 log = logging.getLogger(__name__)

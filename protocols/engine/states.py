@@ -1,4 +1,4 @@
-"""The states of a run, and the only ways from one to the next.
+"""The states of a run, the only ways from one to the next, and why a run ends early.
 
     idle        outputs at zero; between two steps
     checking    the plan is proved on the twin; no device is connected
@@ -98,3 +98,28 @@ class StateMachine:
         early, self._early = self._early, []
         for before, after, why in early:
             listener(before, after, why)
+
+
+class ProtocolAborted(Exception):
+    """The bench did not do what the step needs; the message names joint, measured, expected.
+
+    The bench zeroes the outputs on this as on any other end of a run.
+    """
+
+
+class LockFailed(ProtocolAborted):
+    """A joint that was to stand still did not; `joint` is 1-based, lengths in m."""
+
+    def __init__(self, step: str, joint: int, what: str, measured: float, expected: str) -> None:
+        self.step = step
+        self.joint = joint
+        self.measured = measured
+        self.expected = expected
+        super().__init__(
+            f"lock failed in {step}: joint {joint} {what}: piston measured at "
+            f"{1e3 * measured:.2f} mm, expected {expected}"
+        )
+
+
+class RunEnded(ProtocolAborted):
+    """A person, or what stands for one, ended the run; no rule of the protocol goes on after it."""

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from drivers.base import Doubting, Driver, SampleBlock
 from rig.bench.settings import BENCH
 from rig.model import channels as ch
-from rig.model.codes import encode_input
 from rig.model.rig import Rig
+from rig.model.wire.codes import encode_input
 
 GOOD: Final = "ok"
 TIMED_SAMPLES: Final = 100  # of a host-timed device, whose lateness is measured

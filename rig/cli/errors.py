@@ -63,7 +63,7 @@ def _codes() -> tuple[tuple[tuple[type[BaseException], ...], int, Callable[..., 
     Imported when something went wrong: a `--help` needs none of these packages.
     """
     from drivers.base import DeviceBusy, DeviceError
-    from protocols.engine.errors import ProtocolAborted
+    from protocols.engine.states import ProtocolAborted
     from rig.model.parse import InputError
     from rig.model.trips import Latched, OperatorStop, RecordingFailed, SafetyTrip
 

@@ -19,7 +19,7 @@ from analysis.trace.engine import trace
 from analysis.trace.loop_rounds import Round, achieved
 from analysis.trace.result import CLEAN, EXPLAINED, UNEXPLAINED
 from protocols.design.check import check
-from protocols.engine.errors import ProtocolAborted
+from protocols.engine.states import ProtocolAborted
 from protocols.files import library
 from protocols.files.plan import Overrides, resolve
 from rig.cli.output import Countdown

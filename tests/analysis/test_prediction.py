@@ -17,10 +17,10 @@ from analysis.signals.conditioning import condition
 from analysis.terms import baseline
 from analysis.terms.base import Used
 from rig.model import channels as ch
-from rig.model.codes import decode_input, encode_input
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
+from rig.model.wire.codes import decode_input, encode_input
 from tests.analysis.designed_steps import steps
 
 DRAWS = 32

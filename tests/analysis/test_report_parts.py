@@ -14,9 +14,9 @@ from analysis.identify.identify import identify
 from analysis.identify.stacked_rows import RecordRows, build_rows
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.rows import Rows
-from analysis.report import facts, paper, trace_figures
+from analysis.report import facts, paper
 from analysis.report import format as fm
-from analysis.report.plots import arm_plot, record_plots, style
+from analysis.report.plots import arm_plot, record_plots, style, trace_plots
 from analysis.report.residuals import per_repeat, residuals
 from analysis.trace.result import Curve, Found
 from rig.model.parameters import parameter_names
@@ -210,6 +210,6 @@ def test_a_curve_is_drawn_with_its_band_and_its_units() -> None:
         "friction_curve", "joint 1", {}, 0.005, 0.9, (), (), "the piston's velocity",
         mechanism="friction_curve", free=True, curves=lines,
     )  # fmt: skip
-    drawn = str(trace_figures.curves(found, "c0"))
+    drawn = str(trace_plots.curves(found, "c0"))
     for said in ("friction curve with its 95 % band", "velocity [m/s]", "[N]", "out", "back"):
         assert said in drawn

@@ -23,10 +23,10 @@ from protocols.files.writer import protocol_text
 from protocols.steps.plans import StepPlan
 from rig.cli.step_planning import predictor
 from rig.model.channels import kind_of
-from rig.model.codes import decode_input
 from rig.model.parameters import parameter_names
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
+from rig.model.wire.codes import decode_input
 from rig.runs.rigs import load_rig
 from rig.runs.store import load_run
 from tests.cli.bench import bramah, simulated

@@ -16,7 +16,7 @@ from hil_sim.device.device import Device
 from hil_sim.device.message_session import MessageSession
 from hil_sim.device.server import CAN, RTU, SERIAL, TCP
 from hil_sim.link.served import ServedDevice
-from rig.model import registers as reg
+from rig.model.wire import registers as reg
 from rig.runs.rigs import load_rig
 from tests.cli import strange_peers
 from tests.cli.bench import bramah, words

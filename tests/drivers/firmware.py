@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 
 from rig.model import channels as ch
-from rig.model import registers as reg
 from rig.model.rig import Rig
+from rig.model.wire import registers as reg
 from tests.drivers.wires import ROOT
 from tests.hil_sim.integrator import PRESSURE, seed_rig
 

@@ -23,8 +23,8 @@ from drivers.base import (
 )
 from drivers.conformance import HEALTHY, Capabilities, DeviceUnderTest, Subject
 from rig.model import channels as ch
-from rig.model.codes import decode_output, encode_output
 from rig.model.rig import Rig
+from rig.model.wire.codes import decode_output, encode_output
 from tests.hil_sim.integrator import SPEED_PER_VOLT, seed_rig
 
 SAMPLES = 10

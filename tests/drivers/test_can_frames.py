@@ -14,10 +14,8 @@ from cantools.database.can import Database, Message, Signal
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.model import registers as reg
-from rig.model.codes import decode_input, decode_output
 from rig.model.parse import InputError
-from rig.model.registers import BlockHeader, Status
+from rig.model.wire import registers as reg
 from rig.model.wire import serial_messages as msg
 from rig.model.wire.can_database import database_text
 from rig.model.wire.can_frames import (
@@ -32,7 +30,9 @@ from rig.model.wire.can_frames import (
     stream_seconds,
 )
 from rig.model.wire.can_layout import CanLayout, CanMessage, _place, read_layout
+from rig.model.wire.codes import decode_input, decode_output
 from rig.model.wire.frames import MAX_PAYLOAD, WireFrame
+from rig.model.wire.registers import BlockHeader, Status
 from tests.hil_sim.integrator import seed_rig
 
 RIG = seed_rig()

@@ -16,10 +16,10 @@ from drivers.message_stream import MessageStreamDriver
 from hil_sim.device.can.server import layout_of
 from hil_sim.device.can.session import CanSession
 from hil_sim.device.device import Device
-from rig.model import registers as reg
 from rig.model.parts import Wire
 from rig.model.rig import Rig
 from rig.model.wire import can_layout as names
+from rig.model.wire import registers as reg
 from rig.model.wire.can_frames import CanFrame, stream_seconds
 from rig.runs.rigs import load_rig
 from tests.hil_sim.integrator import IntegratorPlant, seed_rig

@@ -27,10 +27,10 @@ from hil_sim.device.device import Device
 from rig.cli.main import run as command
 from rig.model.parse import InputError
 from rig.model.parts import Wire
-from rig.model.registers import TripCause
 from rig.model.rig import Rig
 from rig.model.wire.can_frames import CanFrame, zero_frame
 from rig.model.wire.can_layout import CanLayout, read_layout
+from rig.model.wire.registers import TripCause
 from tests.drivers.bus_node import BusNode
 from tests.drivers.driving_host import driving_host
 from tests.drivers.test_can_frames import own_database

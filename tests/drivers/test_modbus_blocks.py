@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from drivers.base import DeviceError
 from drivers.modbus_blocks import BlockDecoder, unwrap
-from rig.model import registers as reg
-from rig.model.registers import BlockHeader, Status
+from rig.model.wire import registers as reg
+from rig.model.wire.registers import BlockHeader, Status
 from tests.hil_sim.integrator import seed_rig
 
 RIG = seed_rig()

@@ -11,8 +11,8 @@ import pytest
 from drivers import make_driver
 from drivers.base import OFF, DeviceError, DeviceLost, OutputLaw
 from drivers.modbus_tcp import ModbusTcpDriver
-from rig.model.codes import decode_input
 from rig.model.rig import Rig
+from rig.model.wire.codes import decode_input
 from tests.drivers.wires import BadWire, device_process
 from tests.hil_sim.integrator import SPEED_PER_VOLT, expected_outputs, seed_rig
 

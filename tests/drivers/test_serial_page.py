@@ -10,11 +10,11 @@ import pytest
 import drivers.message_link
 from drivers.base import OFF, DeviceError, OutputLaw
 from drivers.serial_stream import SerialStreamDriver
-from rig.model import registers as reg
 from rig.model.parts import Wire
-from rig.model.registers import Refusal
 from rig.model.wire import frames
+from rig.model.wire import registers as reg
 from rig.model.wire import serial_messages as msg
+from rig.model.wire.registers import Refusal
 from rig.model.wire.serial_messages import Message
 from tests.drivers.firmware import FIRMWARE, compile_c
 from tests.drivers.serial_lines import Loop

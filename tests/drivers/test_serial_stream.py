@@ -14,12 +14,12 @@ import pytest
 
 from drivers.base import OFF, DeviceError, DeviceLost, OutputLaw
 from drivers.serial_stream import SerialSettings, SerialStreamDriver
-from rig.model import registers as reg
 from rig.model.parts import Wire
-from rig.model.registers import TripCause
 from rig.model.rig import Rig
+from rig.model.wire import registers as reg
 from rig.model.wire import serial_messages as msg
 from rig.model.wire.frames import FrameDecoder, WireFrame, encode_frame
+from rig.model.wire.registers import TripCause
 from rig.model.wire.serial_messages import Message
 from tests.drivers.driving_host import driving_host
 from tests.drivers.firmware import firmware_command

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from drivers.modbus_blocks import BlockDecoder
-from rig.model import registers as reg
-from rig.model.registers import Refusal, Status, TripCause
+from rig.model.wire import registers as reg
+from rig.model.wire.registers import Refusal, Status, TripCause
 from tests.drivers.wires import device_process
 from tests.hil_sim.integrator import seed_rig
 

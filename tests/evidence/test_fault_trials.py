@@ -9,9 +9,9 @@ import pytest
 
 from drivers.base import DeviceError, DeviceLost
 from hil_sim.faults.base import Fault
-from rig.cli.bench.fault_bench import FaultBench, fault_bench
-from rig.cli.bench.fault_figures import RIG, counted, jobs
-from rig.cli.bench.fault_trials import (
+from rig.cli.bench.faults.bench import FaultBench, fault_bench
+from rig.cli.bench.faults.figures import RIG, counted, jobs
+from rig.cli.bench.faults.trials import (
     Naming,
     TrialOutcome,
     example,

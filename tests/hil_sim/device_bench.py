@@ -11,8 +11,8 @@ import pytest
 from hil_sim.device.device import Device
 from hil_sim.device.laws import Refused
 from hil_sim.device.register_map import DeviceRegisters
-from rig.model import registers as reg
-from rig.model.registers import Refusal
+from rig.model.wire import registers as reg
+from rig.model.wire.registers import Refusal
 from tests.hil_sim.integrator import IntegratorPlant, seed_rig
 
 RIG = seed_rig(watchdog=0.5)

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from hil_sim.device.server import serve
 from rig.model import channels as ch
-from rig.model.codes import decode_output, encode_input, encode_output
 from rig.model.parse import parse_model
 from rig.model.parts import Wire
 from rig.model.rig import Rig
+from rig.model.wire.codes import decode_output, encode_input, encode_output
 
 SPEED_PER_VOLT = 0.02  # [m/(s V)]
 PRESSURE = 2.0e6

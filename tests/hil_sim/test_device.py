@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hil_sim.device.laws import Refused
-from rig.model import registers as reg
-from rig.model.registers import Refusal, Status
+from rig.model.wire import registers as reg
+from rig.model.wire.registers import Refusal, Status
 from tests.hil_sim.device_bench import HOST, OTHER, Bench, expect_refusal
 
 # -- streams --------------------------------------------------------------------------------

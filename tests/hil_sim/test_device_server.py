@@ -15,8 +15,8 @@ import pytest
 from pymodbus.client import ModbusTcpClient
 
 from hil_sim.device.server import EndpointError, serve, warm_up
-from rig.model import registers as reg
-from rig.model.registers import TripCause
+from rig.model.wire import registers as reg
+from rig.model.wire.registers import TripCause
 from tests.drivers.wires import ROOT, device_process
 from tests.hil_sim.integrator import IntegratorPlant, seed_rig
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from rig.model import registers as reg
-from rig.model.registers import Refusal, Status, TripCause
+from rig.model.wire import registers as reg
+from rig.model.wire.registers import Refusal, Status, TripCause
 from tests.hil_sim.device_bench import HOST, OTHER, Bench, expect_refusal
 
 

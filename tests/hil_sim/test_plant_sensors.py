@@ -10,8 +10,8 @@ from hil_sim.plant.kernel_data import record as record_of
 from hil_sim.plant.plant import Law, Plant
 from hil_sim.scenario.file import Scenario
 from rig.model.channels import kind_of
-from rig.model.codes import decode_input, decode_output, encode_output
 from rig.model.rig import Rig
+from rig.model.wire.codes import decode_input, decode_output, encode_output
 from tests.hil_sim.plant_trace import CLOSED, Array, bench, scenario, sine
 
 QUIET = Scenario(noise=0.0)

@@ -12,7 +12,7 @@ from hil_sim.plant.faulty import FaultyPlant
 from hil_sim.plant.plant import Law, Plant
 from hil_sim.plant.prefetch import Prefetch
 from hil_sim.scenario.file import Scenario
-from rig.model import registers as reg
+from rig.model.wire import registers as reg
 from tests.hil_sim.device_bench import Bench
 from tests.hil_sim.integrator import seed_rig
 from tests.hil_sim.plant_trace import CLOSED, bench, sine

@@ -9,9 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.model import channels, codes, linkage
+from rig.model import channels, linkage
 from rig.model.parameters import mechanical_names, parameter_names, parameter_unit
 from rig.model.quantity import parse_quantity
+from rig.model.wire import codes
 
 JOINTS = [(0.11, 0.33, 0.30, 0.0), (0.27, 0.10, 0.30, -math.pi)]
 

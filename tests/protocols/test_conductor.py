@@ -9,9 +9,15 @@ import pytest
 from drivers.base import DeviceLost, OutputLaw
 from protocols.engine.desk import Desk
 from protocols.engine.engine import run
-from protocols.engine.errors import ProtocolAborted, RunEnded
 from protocols.engine.session import Session
-from protocols.engine.states import ENERGISED, WAYS, EngineState, StateMachine
+from protocols.engine.states import (
+    ENERGISED,
+    WAYS,
+    EngineState,
+    ProtocolAborted,
+    RunEnded,
+    StateMachine,
+)
 from protocols.files.library import read_protocol
 from protocols.files.plan import Plan, resolve
 from rig.bench.screens.commands import Command, CommandHolder

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from protocols.engine.engine import run
-from protocols.engine.errors import LockFailed, ProtocolAborted
+from protocols.engine.states import LockFailed, ProtocolAborted
 from protocols.files.plan import Plan, resolve
 from protocols.files.schema import Protocol
 from rig.model.parse import parse_model

@@ -10,7 +10,7 @@ import pytest
 
 from drivers.base import DeviceInfo, OutputLaw, SampleBlock
 from protocols.engine.engine import run
-from protocols.engine.errors import LockFailed
+from protocols.engine.states import LockFailed
 from protocols.files.library import load
 from protocols.files.plan import Overrides, resolve
 from protocols.language.waveforms import Array

@@ -23,9 +23,9 @@ from protocols.files.schema import Protocol
 from rig.bench.guard import JointRole
 from rig.bench.screens.commands import Judge
 from rig.model import channels as ch
-from rig.model.codes import decode_input, decode_output
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
+from rig.model.wire.codes import decode_input, decode_output
 from rig.runs.recorder import RecordMeta
 
 Array = NDArray[np.float64]

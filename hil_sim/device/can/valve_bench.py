@@ -21,11 +21,11 @@ from hil_sim.device.device import PlantInterface
 from hil_sim.device.laws import OFF, DeviceLaw
 from hil_sim.device.lifetime import PARENT_SECONDS, ParentProcess, termination_signals
 from rig.model import channels as ch
-from rig.model.codes import decode_input
 from rig.model.rig import Rig
 from rig.model.wire import cia408
 from rig.model.wire.can_frames import CanFrame
 from rig.model.wire.cia408 import ValveState
+from rig.model.wire.codes import decode_input
 
 logger = logging.getLogger(__name__)
 

@@ -17,7 +17,7 @@ from protocols.files.plan import Overrides
 from rig.cli.bench import plant
 from rig.cli.bench.acquisition import measure_acquisition
 from rig.cli.bench.analysis import identify_figures
-from rig.cli.bench.fault_figures import fault_figures
+from rig.cli.bench.faults.figures import fault_figures
 from rig.cli.bench.figure import Figure
 from rig.cli.bench.screen.figures import screen_figures
 from rig.cli.bench.speed.figures import beside, free_run_figures, plant_over_kernel

@@ -16,9 +16,9 @@ from hil_sim.plant import kernel, kernel_loop
 from hil_sim.plant.kernel_data import record
 from hil_sim.plant.plant import STEP, Law, Plant
 from hil_sim.scenario.file import Scenario
-from rig.model.codes import Array, decode_output
 from rig.model.parse import parse_model
 from rig.model.rig import Rig
+from rig.model.wire.codes import Array, decode_output
 
 PEAK = 1.6  # of the command, either joint [V]
 LINES = (1, 3, 5, 7, 9, 13, 19)  # odd multiples of 0.5 Hz

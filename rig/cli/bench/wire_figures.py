@@ -28,9 +28,9 @@ from rig.bench.session import Bench
 from rig.cli.bench.acquisition import lateness, waited_seconds
 from rig.cli.bench.figure import Figure
 from rig.cli.simulated_bench import simulated_bench
-from rig.model import registers as reg
 from rig.model.parts import WATCHDOG_RANGE, Wire
 from rig.model.rig import Rig
+from rig.model.wire import registers as reg
 from rig.model.wire import serial_messages as msg
 from rig.model.wire.frames import FrameDecoder, WireFrame, encode_frame
 from rig.model.wire.serial_messages import Message

@@ -16,10 +16,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.model.registers import BlockHeader, BlockLayout, Status
 from rig.model.wire import serial_messages as msg
 from rig.model.wire.can_layout import FD_SIZES, SESSION_BITS, CanLayout, CanMessage, CanSignal
 from rig.model.wire.frames import MAX_BODY, WireFrame, decode_body, encode_body
+from rig.model.wire.registers import BlockHeader, BlockLayout, Status
 from rig.model.wire.serial_messages import Message
 
 ZERO_KEY: Final = 0x5A  # the same from every host: two may send it at once and disturb nothing

@@ -4,7 +4,7 @@ docs/wire-serial.md and docs/wire-can.md describe them for people.
 
 Glossary: a *request* is answered, with its number and session; a *note* is not. A *session* is
 the time of one host, named by a number that it draws. Values and codes are those of
-`rig.model.registers`: integers high byte first, floats of single precision.
+`rig.model.wire.registers`: integers high byte first, floats of single precision.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from typing import Final
 
 import numpy as np
 
-from rig.model import registers as reg
-from rig.model.registers import BlockHeader, BlockLayout
+from rig.model.wire import registers as reg
 from rig.model.wire.frames import MAX_ENCODED, MAX_PAYLOAD
+from rig.model.wire.registers import BlockHeader, BlockLayout
 
 ANSWER: Final = 0x80  # added to the type of the request that is answered
 WINDOW: Final = 8  # blocks that the device sends ahead of their acknowledgement

@@ -25,7 +25,7 @@ def faults(
 
     Example: python -m tests.studies faults --docs docs
     """
-    from rig.cli.bench.fault_figures import fault_trials
+    from rig.cli.bench.faults.figures import fault_trials
     from tests.studies.faults import page
 
     parts = {}

@@ -11,9 +11,9 @@ from drivers.base import DeviceLost
 from hil_sim.device.server import TCP
 from hil_sim.faults.device import DeviceFault
 from hil_sim.faults.wire import WireFault
-from rig.cli.bench.fault_bench import fault_bench
-from rig.cli.bench.fault_figures import RIG, counted
-from rig.cli.bench.fault_trials import TrialOutcome, kinds, try_fault, wires
+from rig.cli.bench.faults.bench import fault_bench
+from rig.cli.bench.faults.figures import RIG, counted
+from rig.cli.bench.faults.trials import TrialOutcome, kinds, try_fault, wires
 from rig.cli.bench.figures import text
 from rig.model.trips import SafetyTrip
 from rig.runs.rigs import load_rig

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from rig.model.channels import CAP, PISTON, ROD, SPOOL, SUPPLY, TEMPERATURE, channel
-from rig.model.codes import decode_input, encode_input
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
+from rig.model.wire.codes import decode_input, encode_input
 from rig.runs.rigs import load_rig
 from tests.studies.foreign import plant
 

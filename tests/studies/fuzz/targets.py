@@ -24,13 +24,13 @@ from hil_sim.link.wires import WIRES
 from hil_sim.plant.plant import Plant
 from hil_sim.scenario.file import Scenario, parse_scenario
 from protocols.files.schema import Protocol
-from rig.model import registers as reg
 from rig.model.parse import InputError, parse_model
-from rig.model.registers import BlockHeader, Status
 from rig.model.rig import Rig
 from rig.model.trips import RecordingFailed
+from rig.model.wire import registers as reg
 from rig.model.wire import serial_messages as msg
 from rig.model.wire.frames import FrameDecoder, WireFrame, encode_frame
+from rig.model.wire.registers import BlockHeader, Status
 from rig.model.wire.serial_messages import Message
 from rig.runs import runstate
 from rig.runs.journal import Journal

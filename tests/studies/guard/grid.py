@@ -12,7 +12,7 @@ from hil_sim.plant.faulty import FaultyPlant
 from hil_sim.scenario.file import Scenario, parse_scenario
 from protocols.design.generate import generate
 from protocols.engine import engine
-from protocols.engine.errors import ProtocolAborted
+from protocols.engine.states import ProtocolAborted
 from protocols.files.library import load
 from protocols.files.plan import Overrides, resolve
 from protocols.files.schema import Protocol

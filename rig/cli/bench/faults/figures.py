@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Final
 
 from hil_sim.faults.wire import WireFault
-from rig.cli.bench.fault_bench import fault_bench
-from rig.cli.bench.fault_trials import Naming, TrialOutcome, kinds, try_fault, wires
+from rig.cli.bench.faults.bench import fault_bench
+from rig.cli.bench.faults.trials import Naming, TrialOutcome, kinds, try_fault, wires
 from rig.cli.bench.figure import Figure
 from rig.model.rig import Rig
 from rig.runs.rigs import load_rig

@@ -28,7 +28,7 @@ from hil_sim.link.served import SERVED
 from rig.bench.guard import EXCITED, JointRole
 from rig.bench.latch import BenchState
 from rig.bench.session import Bench
-from rig.cli.bench.fault_bench import SILENCE, FaultBench
+from rig.cli.bench.faults.bench import SILENCE, FaultBench
 from rig.model import channels as ch
 from rig.model.alarms.states import Alarm
 from rig.model.rig import Rig
