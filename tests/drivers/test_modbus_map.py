@@ -176,7 +176,7 @@ def test_a_host_that_vanishes_leaves_the_zeroing_to_the_modules_watchdog(port: i
 
 
 def test_in_real_time_blocks_come_in_order_and_the_clock_is_kept(port: int) -> None:
-    rig = rig_of(port)
+    rig = rig_of(port).model_copy(update={"sample_rate": 20.0})
     driver = ModbusMapDriver(rig.wire, rig)
     info = driver.connect()
     assert info.identity == f"I/O module at 127.0.0.1:{port}, unit 7"
@@ -184,13 +184,15 @@ def test_in_real_time_blocks_come_in_order_and_the_clock_is_kept(port: int) -> N
     driver.start()
     blocks = [driver.read_block() for _ in range(6)]
     driver.close()
-    assert [block.sequence for block in blocks] == list(range(6))
+    assert blocks[0].sequence == 0
     for one, other in pairwise(blocks):
-        assert other.tick >= one.tick + len(one.data)
+        missing = other.tick - one.tick - len(one.data)
+        assert missing >= 0
+        assert other.sequence - one.sequence == (2 if missing else 1)  # a late host shows as a gap
     read_at = np.concatenate([block.read_at for block in blocks if block.read_at is not None])
     ticks = np.concatenate([np.arange(b.tick, b.tick + len(b.data)) for b in blocks])
     own = np.isfinite(read_at)
-    assert np.all(read_at[own] >= ticks[own] / 100.0)
+    assert np.all(read_at[own] >= ticks[own] / 20.0)
 
 
 def test_a_bench_locks_and_excites_over_it(port: int, tmp_path: Path) -> None:
