@@ -231,8 +231,7 @@ def _centred(
         for pole in (1 / (2 * math.pi * bench.filter_hertz) if bench.filter_hertz else 0.0,
                      sensor.lag):  # fmt: skip
             if pole > 0.0:
-                a = math.exp(-plant.STEP / pole)
-                x = lfilter([1 - a], [1, -a], x, zi=[a * x[0]])[0]
+                x = _lagged(x, plant.STEP / pole)
         instant = np.arange(n) / rate + rig.sensors.skew * k - sensor.delay
         x = np.interp(instant, time, x)
         other, share = sensor.crosstalk
@@ -240,6 +239,16 @@ def _centred(
             x = x + share * np.interp(instant, time, true[other])
         out[name] = sensor.gain * x + sensor.offset
     return out
+
+
+def _lagged(x: Array, ratio: float) -> Array:
+    """Return a first-order lag's answer to samples joined by lines; `ratio` is step over lag.
+
+    Exact for such an input: the answer to a ramp is the ramp, one lag late.
+    """
+    keep = math.exp(-ratio)
+    now, before = 1.0 - (1.0 - keep) / ratio, (1.0 - keep) / ratio - keep
+    return np.asarray(lfilter([now, before], [1.0, -keep], x, zi=[(1.0 - now) * x[0]])[0])
 
 
 def _sensed(bench: Bench, clean: Mapping[str, Array], rng: np.random.Generator) -> dict[str, Array]:
