@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import sqlite3
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -19,6 +21,8 @@ from rig.tui.run_log import RunLog
 from rig.tui.run_trace import RunTrace
 
 TABS: Final = ("protocols", "runs", "queue")
+STEPS: Final = re.compile(rb"^steps:", re.MULTILINE)
+READ_AT_MOST: Final = 1_000_000  # [bytes] of a file, to see whether it is a protocol
 
 
 @dataclass(frozen=True)
@@ -71,13 +75,22 @@ def read_disk(before: Browsed) -> Browsed:
                 queue, paused = tuple(store.items()), store.paused
         except (InputError, OSError, sqlite3.Error) as error:
             troubles.append(str(error))
-    own = tuple(sorted(str(path) for path in before.folder.glob("*.protocol.yaml")))
     return replace(
         before,
-        protocols=(*shipped_names(), *own),
+        protocols=(*own_protocols(before.folder), *shipped_names()),
         runs=runs,
         queue=queue,
         paused=paused,
         trouble="; ".join(troubles),
         reading=False,
     )
+
+
+def own_protocols(folder: Path) -> tuple[str, ...]:
+    """Return the protocol files of a folder: YAML with `steps:` on a line that is not indented."""
+    found = []
+    for path in sorted(folder.glob("*.yaml")):
+        with suppress(OSError), path.open("rb") as file:
+            if STEPS.search(file.read(READ_AT_MOST)):
+                found.append(str(path))
+    return tuple(found)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from protocols.files.library import shipped_names
 from rig.queue.items import QueueJob
 from rig.queue.store import QueueStore
 from rig.runs.store import create_run
@@ -120,6 +121,15 @@ def test_a_folder_that_is_not_there_is_a_sentence(tmp_path: Path) -> None:
     assert "nowhere" in found.trouble
     assert "\n" not in found.trouble
     assert found.protocols
+
+
+def test_the_folders_own_protocols_are_listed_before_the_shipped_ones(tmp_path: Path) -> None:
+    (tmp_path / "evening.yaml").write_text("version: 2\nname: evening\nsteps:\n  - hold: 1 s\n")
+    (tmp_path / "arm.yaml").write_text("name: arm\nnote: {steps: none}\n")
+    (tmp_path / "gone.yaml").symlink_to(tmp_path / "nowhere")
+    found = read_disk(Browsed(folder=tmp_path)).protocols
+    assert found[0] == str(tmp_path / "evening.yaml")
+    assert found[1:] == shipped_names()
 
 
 async def test_a_protocol_is_picked_and_checked_and_its_envelopes_are_shown(

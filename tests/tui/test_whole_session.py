@@ -35,7 +35,7 @@ def sockets(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    (tmp_path / "0-short.protocol.yaml").write_text(PROMPTED)
+    (tmp_path / "short.yaml").write_text(PROMPTED)
     return tmp_path
 
 
@@ -70,10 +70,10 @@ class Session:
         return self.app.link.frame.snapshot
 
     async def choose(self, words: str) -> None:
-        """Choose what to do with the protocol of the folder, which is listed last."""
+        """Choose what to do with the protocol of the folder, which is listed first."""
         await self.keys("0")
         await self.until(lambda: not self.app.browsed.reading)
-        await self.keys("end", "enter")
+        await self.keys("home", "enter")
         assert self.app.dialog is not None
         for _ in range(self.app.dialog.choices.index(words)):
             await self.keys("down")
