@@ -110,7 +110,7 @@ async def test_two_operators_one_is_in_command_and_the_other_must_take_over() ->
 async def test_nothing_is_asked_of_a_run_that_is_over() -> None:
     record = running(state="done", engine="safe")
     async with glass(Machine({HERE: record})) as shown:
-        for key in ("p", "t"):
+        for key in ("p", "t", "n", "x"):
             await shown.press(key)
             assert "the run is over (done)" in shown.text
         assert record.asked == []

@@ -58,7 +58,14 @@ class Commands:
     # Commands
 
     def command(self, word: str, value: str = "", done: str = "") -> None:
-        """Send a command to the run; asks before it takes the controls from another screen."""
+        """Send a command to the run, or say why none can be sent."""
+        endpoint = self.link.frame.endpoint
+        if endpoint is not None and self._open_to(word):
+            self.remark = f"{word}: asking ..."
+            self.link.ask(endpoint, word, value, lambda no: self._heard(word, done, no))
+
+    def _open_to(self, word: str) -> bool:
+        """Whether a run is attached that this screen may command; the remark says why not."""
         frame = self.link.frame
         if frame.endpoint is None or frame.snapshot is None:
             self.remark = f"{word}: no run is attached."
@@ -67,13 +74,18 @@ class Commands:
         elif frame.snapshot.holder not in ("", self.me) and word not in ("take", "acknowledge"):
             self.remark = f"{word}: read-only, {frame.snapshot.holder} is in command; t takes over."
         else:
-            self.remark = f"{word}: asking ..."
-            self.link.ask(frame.endpoint, word, value, lambda no: self._heard(word, done, no))
+            return True
+        return False
 
     def _heard(self, word: str, done: str, refusal: str | None) -> None:
         said = done or "taken" if refusal is None else refusal.removeprefix(f"{word}: ")
         self.remark = f"{word}: {said}"
         self.redraw()
+
+    def commanded(self, word: str, text: str) -> None:
+        """Send a command after a yes; without the question where it cannot be sent."""
+        if self._open_to(word):
+            self.confirmed(word, text, lambda: self.command(word))
 
     def confirmed(self, title: str, text: str, act: Callable[[], None]) -> None:
         """Do something after a yes."""
@@ -105,7 +117,7 @@ class Commands:
         snapshot = self.link.frame.snapshot
         if snapshot is not None and snapshot.engine == "paused":
             text = "The bench will move: places and locks are made anew. Resume?"
-            self.confirmed("resume", text, lambda: self.command("resume"))
+            self.commanded("resume", text)
         else:
             self.command("pause", done="taken; it comes at the end of the record")
 
@@ -114,7 +126,7 @@ class Commands:
         snapshot = self.link.frame.snapshot
         step = snapshot.step if snapshot is not None else ""
         text = f"Leave step {step!r} and go on with the next one?"
-        self.confirmed("skip", text, lambda: self.command("skip"))
+        self.commanded("skip", text)
 
     def act_abort(self) -> None:
         """End the run: at once where the bench moves, after a yes where it is at rest."""
@@ -123,7 +135,7 @@ class Commands:
             self.command("abort")
         else:
             text = "Outputs are at zero. End the run for good? What was measured is kept."
-            self.confirmed("abort", text, lambda: self.command("abort"))
+            self.commanded("abort", text)
 
     def act_answer(self) -> None:
         """Answer what the protocol asks."""
