@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, TypeVar
+from textwrap import shorten
+from typing import Any, Final, TypeVar
 
 import yaml
 from pydantic import BaseModel, ValidationError
@@ -100,6 +101,18 @@ def refusal(problems: Iterable[Problem], source: str) -> InputError:
     return InputError("\n".join(shown))
 
 
+# What a file's author would call the types that pydantic names.
+WANTED: Final = {
+    ("model_type", "model_attributes_type", "dict_type", "mapping_type"): "keys and values",
+    ("tuple_type", "list_type"): "a list (each entry after a dash)",
+    ("string_type",): "text",
+    ("bool_type", "bool_parsing"): "true or false",
+    ("int_type", "int_parsing", "int_from_float"): "a whole number",
+    ("float_type", "float_parsing"): "a number",
+}
+FOUND_AT_MOST: Final = 60  # characters of a wrong value that a message repeats
+
+
 def _problems(
     error: ValidationError, lines: dict[Path, int], source: str, model: type[BaseModel]
 ) -> list[Problem]:
@@ -151,7 +164,11 @@ def _problem_text(problem: ErrorDetails) -> str:
         return "unknown key; remove it or correct its spelling"
     if problem["type"] == "missing":
         return "is missing here"
-    return text if problem["type"] == "value_error" else f"{text}, found {problem['input']!r}"
+    if problem["type"] == "value_error":
+        return text
+    text = text.removeprefix("Input should be ")
+    wanted = next((wanted for kind, wanted in WANTED.items() if problem["type"] in kind), text)
+    return f"expected {wanted}, found {shorten(repr(problem['input']), FOUND_AT_MOST)}"
 
 
 def parse_model(model: type[Model], text: str, source: str) -> Model:

@@ -122,7 +122,7 @@ def test_every_error_of_a_file_is_listed_with_line_key_found_and_expected() -> N
         ("gravitas", "gravitas: unknown key"),
         ("flow: 11.7", "supply.flow: 11.7 has no unit; write one beside the number"),
         ("stroke: 75 kg", "cylinder.stroke: unit 'kg' does not measure"),
-        ("bits: 64", "sensors.spool.bits: Input should be less than or equal to 16, found 64"),
+        ("bits: 64", "sensors.spool.bits: expected less than or equal to 16, found 64"),
         ("watchdog: soon", "'soon' is not a number with a unit"),
     ]
     assert len(lines) == len(said), lines  # a cylinder that two joints share is wrong once
