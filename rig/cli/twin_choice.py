@@ -11,7 +11,8 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 _FOLDER = "models"
 _SAVED = "saved"  # in a model's provenance: when its file was written
 _FILE = "file"  # in a model's provenance: where to
+_SIMULATED = "simulated"  # in a model's provenance: whether a run of its was in virtual time
 _HASH_SHOWN = 12  # digits of a checksum that people compare
 
 
@@ -37,6 +39,7 @@ class TwinSource:
     """Where the twin's parameters come from: a model file, or none (nominal values).
 
     `shown` is what people call the file: a kept copy goes by the name it was written to.
+    `simulated`: a run that it was identified from was in virtual time, so on a simulated bench.
     """
 
     path: Path | None = None
@@ -44,6 +47,7 @@ class TwinSource:
     sha256: str = ""
     shown: str = ""
     saved: str = ""
+    simulated: bool = False
 
     @property
     def key(self) -> str:
@@ -54,7 +58,10 @@ class TwinSource:
         """Return it as plain data for JSON, None for nominal values."""
         if self.path is None:
             return None
-        return {"file": self.shown, "sha256": self.sha256, "saved": self.saved}
+        return {
+            "file": self.shown, "sha256": self.sha256, "saved": self.saved,
+            "simulated": self.simulated,
+        }  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -96,7 +103,8 @@ def twin_source(rig: Rig, model: Path | None = None, nominal: bool = False) -> T
     origin = _provenance(raw)
     saved = str(origin.get(_SAVED) or datetime.fromtimestamp(changed, UTC).isoformat())
     shown = str(model if model is not None else origin.get(_FILE) or path)
-    return TwinSource(path, model is not None, hashlib.sha256(raw).hexdigest(), shown, saved)
+    code, simulated = hashlib.sha256(raw).hexdigest(), origin.get(_SIMULATED) is True
+    return TwinSource(path, model is not None, code, shown, saved, simulated)
 
 
 def _provenance(raw: bytes) -> Mapping[str, Any]:
@@ -112,8 +120,9 @@ def source_text(source: TwinSource, now: datetime | None = None) -> str:
     if source.path is None:
         return "the nominal values of the rig file"
     which = "model" if source.asked else "last identified model"
+    of = "of a SIMULATED bench, " if source.simulated else ""
     return (
-        f"the {which} {source.shown} ({_age_text(source.saved, now)} old, SHA-256 "
+        f"the {which} {source.shown} ({of}{_age_text(source.saved, now)} old, SHA-256 "
         f"{source.sha256[:_HASH_SHOWN]})"
     )
 
@@ -179,6 +188,17 @@ def _twin_of(model: Model, rig: Rig, source: TwinSource) -> TwinParameters:
     )
 
 
+def _in_virtual_time(runs: Iterable[str]) -> bool:
+    """Whether any of the runs was taken from a device in virtual time; unknown ones count as no."""
+    from rig.runs.store import read_header
+
+    for folder in runs:
+        with suppress(InputError):
+            if read_header(Path(folder)).virtual_time:
+                return True
+    return False
+
+
 def save_identified(model: Model, path: Path, say: Callable[[str], None]) -> None:
     """Write a model file and keep a copy as the last identified model of its rig.
 
@@ -187,7 +207,11 @@ def save_identified(model: Model, path: Path, say: Callable[[str], None]) -> Non
     from analysis.simulation.model import save_model
     from analysis.simulation.model_draws import unusable
 
-    origin = {_SAVED: datetime.now(UTC).isoformat(timespec="seconds"), _FILE: str(path.absolute())}
+    origin = {
+        _SAVED: datetime.now(UTC).isoformat(timespec="seconds"),
+        _FILE: str(path.absolute()),
+        _SIMULATED: _in_virtual_time(model.provenance.get("runs", ())),
+    }
     dated = replace(model, provenance={**model.provenance, **origin})
     save_model(dated, path)
     if model.rig.electric:

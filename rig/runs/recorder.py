@@ -122,7 +122,9 @@ class Recorder:
     def open(self, info: DeviceInfo) -> None:
         """Make the folder and its journal; the run is `running` from here on."""
         about: Any = self._about
-        store.create_run(self.folder, self.rig, device=info.identity, **about)
+        store.create_run(
+            self.folder, self.rig, device=info.identity, virtual_time=info.virtual_time, **about
+        )
         try:
             self._open_files(info)
         except RecordingFailed:

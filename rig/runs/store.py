@@ -53,6 +53,7 @@ class Header(BaseModel):
     seed: int | None = None
     source: str = ""
     device: str = ""
+    virtual_time: bool = False
     versions: dict[str, str] = {}
     provenance: dict[str, Any] = {}
     rig: Rig
@@ -88,13 +89,15 @@ def create_run(
     operator: str | None = None,
     source: str = "",
     device: str = "",
+    virtual_time: bool = False,
     provenance: Mapping[str, Any] | None = None,
 ) -> Path:
     """Make a run folder in state `running`, owned by this process.
 
     `protocol` is the resolved protocol as plain data, with a `name`; `provenance` what else a
-    reader needs to take the same run again: command, files with checksums, seeds. Raises InputError
-    if the folder is occupied or cannot be made.
+    reader needs to take the same run again: command, files with checksums, seeds. `virtual_time`:
+    the device's clock stood still while nobody read, so it was a simulator. Raises InputError if
+    the folder is occupied or cannot be made.
     """
     refuse_occupied(folder)
     head = {
@@ -105,6 +108,7 @@ def create_run(
         "seed": seed,
         "source": source,
         "device": device,
+        "virtual_time": virtual_time,
         "versions": versions(),
         "provenance": dict(provenance or {}),
         "protocol": None if protocol is None else json.loads(json.dumps(dict(protocol))),

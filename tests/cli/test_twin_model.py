@@ -22,6 +22,7 @@ from rig.cli.twin_choice import kept_model, save_identified, source_text, twin_s
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 from rig.runs.rigs import load_rig
+from rig.runs.store import create_run
 from tests.cli.bench import SHORT, bramah, simulated
 
 RIG = "shinshu-2dof"
@@ -242,6 +243,18 @@ def test_a_model_that_cannot_serve_does_not_replace_the_one_before(
     assert (
         load_model(tmp_path / "vague.json").values["C_pp_1"] > 0
     )  # the file is there all the same
+
+
+def test_a_model_of_a_simulated_bench_is_called_so(rig: Rig, tmp_path: Path) -> None:
+    """Nobody proves a machine on what a simulator was found to be without reading it."""
+    model = identified(rig, 1.0)
+    for virtual_time in (True, False):
+        run = create_run(tmp_path / f"run-{virtual_time}", rig, virtual_time=virtual_time)
+        taken = replace(model, provenance={**model.provenance, "runs": [str(run)]})
+        save_identified(taken, tmp_path / "model.json", str)
+        source = twin_source(rig)
+        assert source.simulated == virtual_time
+        assert ("of a SIMULATED bench" in source_text(source)) == virtual_time
 
 
 def test_the_age_of_a_model_is_stated(rig: Rig, tmp_path: Path) -> None:
