@@ -114,6 +114,8 @@ def trip(limit: str, joint: int | None, channel: str) -> SafetyTrip:
         ("sensor_stuck", trip("frozen sensor", 2, "cap_pressure_2"), Naming.WRONG),
         ("sensor_stuck", DeviceLost("gone"), Naming.WRONG),
         ("sensor_drift", None, Naming.UNNOTICED),
+        ("sensor_drift", trip("stale data", None, ""), Naming.UNKNOWN),
+        ("pump_off", trip("sample gap", None, ""), Naming.UNKNOWN),
         ("valve_stuck", trip("piston", 1, "piston_1"), Naming.NAMED),
         ("pump_off", trip("supply pressure", None, "supply_pressure"), Naming.NAMED),
         ("hose_burst", trip("supply pressure", None, "supply_pressure"), Naming.UNKNOWN),

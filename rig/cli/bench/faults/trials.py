@@ -44,6 +44,7 @@ SHARE: Final = 0.1  # of the frames struck, for `STRIKING` [s]
 BUS_SHARE: Final = 0.01  # on a CAN bus, where a block is some thirty frames
 STRIKING: Final = 1.0
 STALE: Final = "stale data"  # the guard's limit that is one of the wall's clock
+LATE: Final = ("sample gap", STALE)  # limits that a busy computer passes, whatever else is wrong
 _TRIES: Final = 5  # at connecting, on a busy computer
 _AMPLITUDE, _PULL = 0.8, 20.0  # [V], [V/m]
 _LOCK: Final = 2e-3  # [m]
@@ -233,7 +234,8 @@ def _session(
         else:
             outcome.seconds = max(0.0, ended - began[0])
     if outcome.error is None and not isinstance(fault, WireFault):
-        raised = [alarm for alarm in session.alarms.alarms if alarm.time >= fault.at]
+        alarms = session.alarms.alarms
+        raised = [a for a in alarms if a.time >= fault.at and a.check not in LATE]
         outcome.alarm = min(raised, key=lambda alarm: alarm.time, default=None)
         outcome.seconds = outcome.alarm.time - fault.at if outcome.alarm else None
     outcome.blocks = len(collector.blocks)
@@ -279,7 +281,7 @@ def naming(fault: Fault, outcome: TrialOutcome) -> Naming:
 
     A message names a fault of a sensor or of the machine by its channel, joint or supply, one of
     the device or of the wire by saying that it is there. A limit of the machine named for a fault
-    of wire or device is wrong, and so is one of another joint.
+    of wire or device is wrong, and so is one of another joint. Late data are true, and unknown.
     """
     error = outcome.error
     if error is None:
@@ -302,8 +304,7 @@ def _without_end(fault: Fault, outcome: TrialOutcome) -> Naming:
 
 def _of_wire(fault: Fault, error: Exception, trip: SafetyTrip | None) -> Naming:
     if trip is not None:
-        known = trip.limit in (DEVICE, "sample gap", STALE)
-        return Naming.UNKNOWN if known else Naming.WRONG
+        return Naming.UNKNOWN if trip.limit in (DEVICE, *LATE) else Naming.WRONG
     text = str(error)
     if isinstance(fault, Reboots):
         return Naming.NAMED if "restarted" in text else Naming.UNKNOWN
@@ -315,6 +316,8 @@ def _of_wire(fault: Fault, error: Exception, trip: SafetyTrip | None) -> Naming:
 
 
 def _of_machine(fault: Fault, trip: SafetyTrip | Alarm) -> Naming:
+    if isinstance(trip, SafetyTrip) and trip.limit in LATE:
+        return Naming.UNKNOWN
     own = {getattr(fault, key, None) for key in ("channel", "other")} - {None}
     if own:
         return Naming.NAMED if trip.channel in own else Naming.WRONG
