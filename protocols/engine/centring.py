@@ -16,12 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from protocols.engine.settings import ENGINE
 
-RECENTRE = 0.5  # share of the offset taken out within the next record
-RECENTRE_CAP = 0.7  # of the allowed drift: recentring must not look like a drift itself
-TAIL = 0.25  # of a period, over which drift is averaged
-MARGIN = 0.5e-3  # [m] kept from a piston limit
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -78,7 +75,7 @@ def motion(piston: Array, period: int, rate: float) -> Motion:
     quarter of a period, is the drift whatever the waveform.
     """
     last, before = piston[-period:], piston[-2 * period : -period]
-    tail = max(1, round(TAIL * period))
+    tail = max(1, round(ENGINE.drift_tail * period))
     drift = float(np.nanmean(last[-tail:] - before[-tail:])) * rate / period
     return moved_by(last, drift, rate)
 
@@ -91,7 +88,7 @@ def moved_by(last: Array, drift: float, rate: float) -> Motion:
 
 def recentring(moved: Motion, centre: float, seconds: float, cap: float) -> float:
     """Return the drift to ask for [m/s]: half of the offset in `seconds`, at most `cap` [m]."""
-    return -float(np.clip(RECENTRE * (moved.ends - centre), -cap, cap)) / seconds
+    return -float(np.clip(ENGINE.recentre_share * (moved.ends - centre), -cap, cap)) / seconds
 
 
 def free_path(wave: Array, period: int, gain: float, rate: float) -> Array:
@@ -158,4 +155,4 @@ def forecast(
 
 def leaves(expected: BiasForecast, low: float, high: float) -> bool:
     """Say whether the forecast passes a piston limit [m], less a margin."""
-    return expected.low < low + MARGIN or expected.high > high - MARGIN
+    return expected.low < low + ENGINE.limit_margin or expected.high > high - ENGINE.limit_margin

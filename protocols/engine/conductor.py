@@ -11,9 +11,9 @@ import numpy as np
 
 from protocols.engine.desk import Desk
 from protocols.engine.excitation import ExcitationRun
-from protocols.engine.locking import Hold, lock
-from protocols.engine.placing import LOOK, look, move
+from protocols.engine.locking import Hold, lock, look, move
 from protocols.engine.session import BenchSession, Session
+from protocols.engine.settings import ENGINE
 from protocols.engine.states import EngineState, ProtocolAborted, RunEnded, StateMachine
 from protocols.files.plan import Plan
 from protocols.language.conditions import ELAPSED, Condition
@@ -27,9 +27,6 @@ from rig.runs.recorder import RecordMeta
 
 log = logging.getLogger(__name__)
 
-SPARE = 5.0  # [s] of samples remembered beyond a record and the two periods before it
-ESTIMATED = 20.0  # [s] of wall time that the estimator may need for the last record
-SETTLE = 1.0  # [s] at rest before a place is believed, where a step states no time
 
 OnPhase = Callable[[str, str, int, int, str], None]
 
@@ -44,7 +41,7 @@ class Conductor:
         self.desk = desk
         self.records = 0  # complete ones
         keep = max((s.record + 2 * s.period for s in plan.excitations), default=0)
-        keep += round(SPARE * rig.sample_rate)
+        keep += round(ENGINE.spare_seconds * rig.sample_rate)
         self.session = Session(bench, rig, keep, desk.machine, self._heed)
         self._place = plan.place
         self._parts = len(plan.sequence)
@@ -139,7 +136,7 @@ class Conductor:
         """Excite without records until a condition holds; False after `most` seconds."""
         (step,) = planned.excitations
         done = self._judge(condition)
-        self.session.wait(LOOK)
+        self.session.wait(ENGINE.look_seconds)
         left = most
         while not done():
             began = self.elapsed
@@ -157,12 +154,13 @@ class Conductor:
         """Bring joints to their places, close every valve, and record the time."""
         self.machine.to(EngineState.HOMING, planned.title)
         self.session.bench.guard([FREE] * self.session.joints)
-        self.session.wait(LOOK)
+        self.session.wait(ENGINE.look_seconds)
         if locks:
             targets = {part.joint: part.piston for part in locks}
             self.report_phase(planned.name, "place", 0, 0, planned.title)
             move(
-                self.session, targets, self._place, self._place.tolerance, SETTLE, planned.name
+                self.session, targets, self._place, self._place.tolerance,
+                ENGINE.settle_seconds, planned.name
             )  # fmt: skip
         self.machine.to(EngineState.LOCKED, "valves closed")
         self.session.off()
@@ -182,7 +180,7 @@ class Conductor:
         first = self.session.now
         with self.bench.record(meta, start_tick=first, ticks=ticks) as record:
             self.session.until(first + ticks)
-            span = min(round(LOOK * self.session.rate), ticks // 2)
+            span = min(round(ENGINE.look_seconds * self.session.rate), ticks // 2)
             for j in range(self.session.joints):
                 began = look(self.session, j, first, first + span).piston
                 ended = look(self.session, j, first + ticks - span, first + ticks).piston
@@ -194,8 +192,8 @@ class Conductor:
         """Prove that joints can be locked; the steps that follow lock them again."""
         self.machine.to(EngineState.HOMING, planned.title)
         self.session.bench.guard([FREE] * self.session.joints)
-        self.session.wait(LOOK)
-        hold = Hold(planned.name, SETTLE, 1.0)
+        self.session.wait(ENGINE.look_seconds)
+        hold = Hold(planned.name, ENGINE.settle_seconds, 1.0)
         for part in locks:
             self.report_phase(planned.name, "lock", 0, 0, f"joint {part.joint + 1} {part.at}")
             lock(self.session, part, self._place, hold)
@@ -237,7 +235,7 @@ class Conductor:
         limit = self.desk.longest_pause if self.desk.attended else question.timeout
         began = self.elapsed
         while self.elapsed - began < limit:
-            self.session.wait(LOOK)
+            self.session.wait(ENGINE.look_seconds)
             wish = self.desk.control.wishes.answer
             if wish is not None:
                 return wish, "from the screen"
@@ -278,12 +276,12 @@ class Conductor:
 
     def _await_estimates(self) -> None:
         """Let the estimator take in the last record; wall time, because it runs beside the run."""
-        until = time.monotonic() + ESTIMATED
+        until = time.monotonic() + ENGINE.estimate_seconds
         while not self.desk.estimates.complete(self._last_record):
             if time.monotonic() > until:
                 log.warning("the estimator does not keep up; its last estimates count")
                 return
-            self.session.wait(LOOK)
+            self.session.wait(ENGINE.look_seconds)
 
     def mark(self, text: str) -> None:
         """Write a line into the run's log."""
@@ -333,7 +331,7 @@ class Conductor:
                 raise RunEnded(
                     f"paused for longer than {self.desk.longest_pause:g} s; the run is over"
                 )
-            self.session.wait(LOOK)
+            self.session.wait(ENGINE.look_seconds)
         wishes.resume = False
         self.machine.to(EngineState.IDLE, "resumed; places and locks are made anew")
 
@@ -350,7 +348,7 @@ class Conductor:
     def _pass(self, seconds: float, done: Callable[[], bool] | None = None) -> bool:
         """Let time pass at rest; True when `done`, or a person wants to go on; else False."""
         began = self.elapsed
-        self.session.wait(min(LOOK, seconds))
+        self.session.wait(min(ENGINE.look_seconds, seconds))
         while done is None or not done():
             if self.desk.control.wishes.skip:
                 return True
@@ -359,7 +357,7 @@ class Conductor:
             left = seconds - (self.elapsed - began)
             if left <= 0.5 / self.session.rate:
                 return False
-            self.session.wait(min(LOOK, left))
+            self.session.wait(min(ENGINE.look_seconds, left))
         return True
 
     def _judge(self, condition: Condition | None) -> Callable[[], bool]:
@@ -373,7 +371,7 @@ class Conductor:
 
     def _values(self, condition: Condition, began: float) -> Mapping[str, float]:
         found: dict[str, float] = {**self.desk.estimates.values(), ELAPSED: self.elapsed - began}
-        first = max(0, self.session.now - round(LOOK * self.session.rate))
+        first = max(0, self.session.now - round(ENGINE.look_seconds * self.session.rate))
         for name in condition.names:
             if name in self.session.rig.recorded:
                 seen = self.session.channel(name, first, self.session.now)

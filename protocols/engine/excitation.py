@@ -7,10 +7,10 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
 from protocols.engine.excited_joint import Driven
-from protocols.engine.locking import Hold, JointLock, give, lock
-from protocols.engine.placing import LOOK, look, move
+from protocols.engine.locking import Hold, JointLock, give, lock, look, move
 from protocols.engine.playback import Playback
 from protocols.engine.session import Session
+from protocols.engine.settings import ENGINE
 from protocols.engine.states import EngineState, ProtocolAborted, StateMachine
 from protocols.steps.parts import CLOSED, Place
 from protocols.steps.plans import LockPlan, StepPlan
@@ -18,9 +18,6 @@ from rig.bench.guard import EXCITED, FREE, JointRole
 from rig.runs.recorder import RecordMeta
 
 log = logging.getLogger(__name__)
-
-GUARD_SHARE = 2.0  # the bench trips at twice the tolerance at which the engine gives up a lock
-RELOCK_SHARE = 0.5  # of the tolerance; a closed valve that gave more is closed anew
 
 
 class ExcitationDesk(Protocol):
@@ -82,7 +79,7 @@ class ExcitationRun:
         while not good and not self._desk.interrupted:
             if self.session.now - began >= most * self.session.rate:
                 break
-            excitation.keep_on(LOOK)
+            excitation.keep_on(ENGINE.look_seconds)
             good = done()
         self._stop(excitation)
         return good
@@ -115,7 +112,7 @@ class ExcitationRun:
         for part in self.step.excite:
             roles[part.joint] = EXCITED
         for held in self.locks:
-            tolerance = GUARD_SHARE * held.tolerance
+            tolerance = ENGINE.guard_share * held.tolerance
             roles[held.joint] = JointRole(locked_at=held.piston, tolerance=tolerance)
         return roles
 
@@ -225,7 +222,7 @@ class ExcitationRun:
                 continue
             first = self.session.now - self.step.period
             off = look(self.session, held.joint, first, self.session.now).piston - held.piston
-            if abs(off) <= RELOCK_SHARE * held.tolerance:
+            if abs(off) <= ENGINE.relock_share * held.tolerance:
                 continue
             self.report_phase(
                 "lock", f"joint {held.joint + 1} crept {1e3 * off:.2f} mm; closed anew"

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from protocols.engine.centring import (
-    RECENTRE_CAP,
     Array,
     Motion,
     follow,
@@ -20,6 +19,7 @@ from protocols.engine.centring import (
     recentring,
     trim,
 )
+from protocols.engine.settings import ENGINE
 from protocols.engine.states import ProtocolAborted
 from protocols.steps.parts import OPEN_LOOP, Centring
 from protocols.steps.plans import ExcitePlan
@@ -27,9 +27,6 @@ from protocols.steps.plans import ExcitePlan
 log = logging.getLogger(__name__)
 
 AT_REST = Motion(0.0, 0.0, 0.0)
-FASTEST_RETURN = 0.03  # [m/s] by which a piston about to leave its limits is brought back
-SHORTEST_LINE = 100  # samples; a slope through less is noise
-SHORTEST_RETURN = 0.5  # [s] in which it is back
 
 
 @dataclass(frozen=True)
@@ -122,7 +119,7 @@ def trimmed(driven: Driven, moved: Motion, seconds: float, gently: bool) -> Driv
         off = moved.mean - driven.plan.centre
         bias = driven.bias - driven.loop * off - moved.drift / driven.gain
         return replace(driven, bias=bias, moved=moved)
-    cap = RECENTRE_CAP * driven.centring.drift if gently else math.inf
+    cap = ENGINE.recentre_cap * driven.centring.drift if gently else math.inf
     wanted = recentring(moved, driven.plan.centre, seconds, cap)
     bias = trim(driven.bias, moved.drift, wanted, driven.gain)
     return replace(driven, bias=bias, wanted=wanted, moved=moved)
@@ -148,14 +145,14 @@ def corrected(
         return None
     # Another law gave the reference another shape, whose mismatch looks like a drift until a whole
     # period has passed; and its own drift tells nothing of this one.
-    shortest = len(reference) if other_law else max(SHORTEST_LINE, len(reference) // 10)
+    shortest = len(reference) if other_law else max(ENGINE.shortest_line, len(reference) // 10)
     ahead = forecast(reference, seen, horizon, rate, shortest)
     if not leaves(ahead, *limits):
         return None
     rest = len(reference) - len(seen) % len(reference)
     off = float(np.nanmean(reference)) + ahead.shift - driven.plan.centre
-    back = -off / max(SHORTEST_RETURN, rest / rate)
-    back = float(np.clip(back, -FASTEST_RETURN, FASTEST_RETURN))
+    back = -off / max(ENGINE.shortest_return, rest / rate)
+    back = float(np.clip(back, -ENGINE.fastest_return, ENGINE.fastest_return))
     drift = ahead.slope + (0.0 if other_law else driven.moved.drift)
     log.warning(
         "%s: joint %d would reach %.1f..%.1f mm; its bias is corrected at once",

@@ -1,4 +1,7 @@
-"""Locking a joint, and proving from the measured piston that it is locked.
+"""Bringing pistons to a place, locking joints there, and proving from the piston that they are.
+
+The device's position law leaves an error where the valve needs a command to stand still (spool
+offset, leakage, dead band): here the host integrates that error away, slowly.
 
 A lock at an end stop is a steady push against it; a closed valve is zero volts where the piston
 stands. With a spool offset or a leak the piston creeps at zero volts, and no steady command stops
@@ -9,20 +12,95 @@ brought the piston to its place goes on holding it.
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from drivers.base import OFF, OutputLaw
-from protocols.engine.placing import LOOK, STILL, PlacementReading, look, move, position_law
 from protocols.engine.session import Session
-from protocols.engine.states import LockFailed
+from protocols.engine.settings import ENGINE
+from protocols.engine.states import LockFailed, ProtocolAborted
 from protocols.steps.parts import CLOSED, END_MAX, Place
 from protocols.steps.plans import LockPlan
 
 log = logging.getLogger(__name__)
 
-CREEP_SHARE = 0.25  # of the tolerance, that a closed joint may creep during one record
+
+@dataclass(frozen=True)
+class PlacementReading:
+    """Mean piston [m], speed [m/s] and command [V] of one joint over a short time."""
+
+    piston: float
+    speed: float
+    command: float
+
+
+def look(session: Session, joint: int, first: int, last: int) -> PlacementReading:
+    """Return what joint `joint` (0-based) did over ticks [first, last).
+
+    Speed is the difference of the means of the two halves over half the time: unlike the
+    difference of the end samples it averages the sensor's noise.
+    """
+    piston = session.piston(joint, first, last)
+    middle = len(piston) // 2
+    early, late = np.nanmean(piston[:middle]), np.nanmean(piston[middle:])
+    speed = (late - early) / (0.5 * len(piston) / session.rate)
+    command = np.nanmean(session.command(joint, first, last))
+    return PlacementReading(float(np.nanmean(piston)), float(speed), float(command))
+
+
+def position_law(place: Place, target: float, bias: float) -> OutputLaw:
+    """Return the law that brings a piston to `target` [m] with at most `place.limit` volts."""
+    return OutputLaw(
+        bias=bias, position_gain=place.position_gain, setpoint=target, limit=place.limit
+    )
+
+
+def move(
+    session: Session,
+    targets: Mapping[int, float],
+    place: Place,
+    tolerance: float,
+    settle: float,
+    step: str,
+) -> dict[int, float]:
+    """Bring joints (0-based) to their places +- tolerance [m], hold them; returns their nulls [V].
+
+    The null is the command that kept the piston still while it was in place for `settle`
+    seconds; the position laws stay in force. Raises ProtocolAborted after `place.timeout`.
+    """
+    biases = dict.fromkeys(targets, 0.0)
+    session.apply({j: position_law(place, s, 0.0) for j, s in targets.items()})
+    began, still_since = session.now, session.now
+    while True:
+        first = session.wait(ENGINE.look_seconds)
+        seen = {j: look(session, j, first, session.now) for j in targets}
+        late = {j for j in targets if not _in_place(seen[j], targets[j], tolerance)}
+        if late:
+            still_since = session.now
+        elif session.now - still_since >= settle * session.rate:
+            return {j: look(session, j, still_since, session.now).command for j in targets}
+        # Only what no longer moves is off for want of a command; the rest is still on its way.
+        stuck = {j for j in late if abs(seen[j].speed) < ENGINE.rocking_speed}
+        for j in stuck:
+            biases[j] += ENGINE.integral_share * place.position_gain * (targets[j] - seen[j].piston)
+            biases[j] = float(np.clip(biases[j], -place.limit, place.limit))
+        if stuck:
+            session.apply({j: position_law(place, targets[j], biases[j]) for j in stuck})
+        if session.now - began > place.timeout * session.rate:
+            j = min(late, default=min(targets))
+            raise ProtocolAborted(
+                f"{step}: joint {j + 1} did not reach its place within {place.timeout:g} s: "
+                f"piston measured at {1e3 * seen[j].piston:.2f} mm "
+                f"(moving {1e3 * seen[j].speed:.2f} mm/s), "
+                f"expected {1e3 * targets[j]:.2f} mm +- {1e3 * tolerance:g} mm; "
+                "is the pump on, and the valve connected the right way round?"
+            )
+
+
+def _in_place(seen: PlacementReading, target: float, tolerance: float) -> bool:
+    return abs(seen.piston - target) <= tolerance and abs(seen.speed) <= ENGINE.rocking_speed
 
 
 @dataclass(frozen=True)
@@ -63,8 +141,8 @@ def push_to_end(session: Session, plan: LockPlan, place: Place, hold: Hold) -> J
     session.apply({plan.joint: OutputLaw(0.0, push, place.position_gain, plan.piston, place.limit)})
     began, still_since = session.now, session.now
     while session.now - still_since < hold.settle * session.rate:
-        seen = look(session, plan.joint, session.wait(LOOK), session.now)
-        if abs(seen.piston - plan.piston) > plan.tolerance or abs(seen.speed) > STILL:
+        seen = look(session, plan.joint, session.wait(ENGINE.look_seconds), session.now)
+        if abs(seen.piston - plan.piston) > plan.tolerance or abs(seen.speed) > ENGINE.still_speed:
             still_since = session.now
         if session.now - began > place.timeout * session.rate:
             raise LockFailed(
@@ -95,7 +173,7 @@ def close_valve(session: Session, plan: LockPlan, place: Place, hold: Hold) -> J
     seen = _stand(session, joint, OFF, hold)
     creep = abs(seen.speed) * hold.record
     log.info("%s: joint %d closed creeps %.3f mm/s", hold.step, joint + 1, 1e3 * seen.speed)
-    if creep <= CREEP_SHARE * plan.tolerance and _near(seen, plan):
+    if creep <= ENGINE.creep_share * plan.tolerance and _near(seen, plan):
         return JointLock(joint, plan.at, seen.piston, OFF, plan.tolerance)
     law = position_law(place, plan.piston, null)
     log.warning("%s: joint %d creeps with its valve closed; its position loop holds it",

@@ -1,11 +1,11 @@
 """Manual operation: a person moves one joint at a time, and only while a key is held.
 
-A jog holds for HOLD seconds of wall time after the newest press; a terminal repeats a held key
-faster than that, so letting go, a broken link or a dead screen closes the valve. The device's own
-position law drives towards a point inside the joint's limits and slows down before it: it does not
-pass them even if this process dies. A locked joint is held where it stands, and the guard trips
-where it moves by more than the tolerance. Nothing here knows of a protocol: while one runs, the
-device is busy and this session does not begin.
+A jog holds for `ENGINE.jog_hold` seconds of wall time after the newest press; a terminal repeats
+a held key faster than that, so letting go, a broken link or a dead screen closes the valve. The
+device's own position law drives towards a point inside the joint's limits and slows down before it:
+it does not pass them even if this process dies. A locked joint is held where it stands, and the
+guard trips where it moves by more than the tolerance. Nothing here knows of a protocol: while one
+runs, the device is busy and this session does not begin.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ from typing import Final, Protocol
 import numpy as np
 
 from drivers.base import OFF, OutputLaw
-from protocols.engine.placing import position_law
+from protocols.engine.locking import position_law
 from protocols.engine.session import BenchSession
+from protocols.engine.settings import ENGINE
 from protocols.steps.parts import Place
 from rig.bench.guard import FREE, JointRole
 from rig.bench.screens.commands import Command
@@ -28,11 +29,6 @@ from rig.model.rig import Rig
 
 log = logging.getLogger(__name__)
 
-HOLD: Final = 0.25  # of wall time that one press of a key counts [s]
-INSIDE: Final = 0.05  # of the width of a joint's limits that a jog keeps from either of them
-VOLTS: Final = 0.15  # of a jog at most: some 25 mm/s on the seed bench [V]
-TOLERANCE: Final = 2e-3  # by which a locked joint may leave its place [m]
-IDLE: Final = 300.0  # without a command the session ends [s]
 KIND: Final = "manual"  # of the session, as screens see it
 
 
@@ -49,8 +45,8 @@ class Manual:
         rig: Rig,
         clock: Callable[[], float] = time.monotonic,
         *,
-        volts: float = VOLTS,
-        idle_after: float = IDLE,
+        volts: float = ENGINE.jog_volts,
+        idle_after: float = ENGINE.manual_idle,
     ) -> None:
         self._bench, self._rig, self._clock = bench, rig, clock
         self._place = Place()
@@ -92,7 +88,7 @@ class Manual:
         if joint in self._locked:
             return f"jog: joint {joint + 1} is locked; unlock it first"
         low, high = self._rig.joints[joint].limits.piston
-        margin = INSIDE * (high - low)
+        margin = ENGINE.jog_margin * (high - low)
         target = high - margin if words == ["+"] else low + margin
         here = self._piston[joint]
         if np.isfinite(here) and (here >= target if words == ["+"] else here <= target):
@@ -100,7 +96,7 @@ class Manual:
                 f"jog: joint {joint + 1} stands at {1e3 * here:.1f} mm; a jog this way ends at "
                 f"{1e3 * target:.1f} mm"
             )
-        self._jog, self._until = (joint, target), self._clock() + HOLD
+        self._jog, self._until = (joint, target), self._clock() + ENGINE.jog_hold
         return None
 
     def _lock(self, joint: int, words: list[str]) -> str | None:
@@ -146,7 +142,7 @@ class Manual:
             at = self._locked.get(joint)
             if at is not None:
                 laws.append(position_law(self._place, at, 0.0))
-                roles.append(JointRole(locked_at=at, tolerance=TOLERANCE))
+                roles.append(JointRole(locked_at=at, tolerance=ENGINE.manual_tolerance))
                 continue
             moving = self._jog is not None and self._jog[0] == joint
             law = position_law(self._jogging, self._jog[1], 0.0) if moving and self._jog else OFF

@@ -26,17 +26,11 @@ from protocols.engine.excited_joint import (
 )
 from protocols.engine.locking import JointLock, verify
 from protocols.engine.session import Session
+from protocols.engine.settings import ENGINE
 from protocols.steps.parts import Place
 from protocols.steps.plans import FIRM_SECONDS, StepPlan
 
 log = logging.getLogger(__name__)
-
-RAMP_STEP = 0.05  # [s] between two sizes of the growing waveform
-WARM_UPS = 3  # at most; more than one only if the first left the piston off centre
-LOOSER = 0.8  # factor between two position gains while the loop is loosened
-RAMP_DOWN = 0.5  # [s] a moving arm is not stopped by closing its valve at once
-LOOK_AHEAD = 0.1  # [s] between two forecasts
-RELEASED = 0.25  # of the offset allowed: so near its free way a piston is let go
 
 
 class Playback:
@@ -79,7 +73,7 @@ class Playback:
         self._loosen(firm)
         passed = self.session.now - self.start
         self.at = self.start + math.ceil(passed / self.step.period) * self.step.period
-        for _ in range(WARM_UPS):
+        for _ in range(ENGINE.warm_ups):
             self.hold()
             self._advance(self.step.warm_up)
             self._find_biases(self.step.warm_up)
@@ -124,12 +118,12 @@ class Playback:
             if d.loop == 0.0 and self.session.laws[d.joint].position_gain > 0.0
         }
         before = {j: self._off_path(j, path) for j, path in paths.items()}
-        allowed = {d.joint: RELEASED * d.centring.offset for d in self.joints}
+        allowed = {d.joint: ENGINE.released_share * d.centring.offset for d in self.joints}
         if all(abs(off) <= 2 * allowed[j] for j, off in before.items()):
             return
         laws = {d.joint: self._law(d, 1.0, 0.0) for d in self.joints}
         while before and self.session.now < self.at + period:
-            self._go_on(RAMP_STEP)
+            self._go_on(ENGINE.ramp_step)
             for j, off in list(before.items()):
                 now = self._off_path(j, paths[j])
                 if abs(now) <= allowed[j] or now * off < 0.0:
@@ -177,10 +171,10 @@ class Playback:
 
     def stop(self) -> None:
         """Let the waveforms shrink under the firm loop, then close every valve."""
-        sizes = round(RAMP_DOWN / RAMP_STEP)
+        sizes = round(ENGINE.ramp_down / ENGINE.ramp_step)
         for size in range(sizes - 1, -1, -1):
             self._play(size / sizes, self.place.position_gain)
-            self.session.wait(RAMP_STEP)
+            self.session.wait(ENGINE.ramp_step)
         self.session.off()
 
     def _law(self, driven: Driven, scale: float, position_gain: float) -> OutputLaw:
@@ -195,17 +189,17 @@ class Playback:
 
     def _grow(self, loop: float) -> None:
         """Let the waveforms grow to full size."""
-        sizes = max(1, round(self.step.ramp / RAMP_STEP))
+        sizes = max(1, round(self.step.ramp / ENGINE.ramp_step))
         for size in range(1, sizes + 1):
-            self._go_on(RAMP_STEP)
+            self._go_on(ENGINE.ramp_step)
             self._play(size / sizes, loop)
 
     def _loosen(self, firm: float) -> None:
         """Lower the position gain to the slow loop's, no faster than the loop itself settles."""
         loop, loose = firm, self._loose()
         slowest = min(d.gain for d in self.joints)
-        while loop * LOOSER > loose:
-            loop *= LOOSER
+        while loop * ENGINE.looser > loose:
+            loop *= ENGINE.looser
             self._play(loop=loop)
             self._go_on(0.5 / (slowest * loop))
 
@@ -267,7 +261,7 @@ class Playback:
         """
         first, last = self.at, self.at + samples
         while self.at < last:
-            self._advance(min(last - self.at, round(LOOK_AHEAD * self.session.rate)))
+            self._advance(min(last - self.at, round(ENGINE.look_ahead * self.session.rate)))
             if self.at < last and self._correct(first, last):
                 past = (self.at - first) % self.step.period
                 self._advance(self.step.period - past if past else 0)

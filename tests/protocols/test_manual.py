@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from protocols.engine.manual import HOLD, INSIDE, TOLERANCE, VOLTS, Manual
+from protocols.engine.manual import Manual
+from protocols.engine.settings import ENGINE
 from rig.bench.screens.commands import Command
 from rig.runs.rigs import load_rig
 from tests.protocols.little_bench import LittleBench, default_cylinders
@@ -52,8 +53,8 @@ def test_a_joint_moves_while_the_key_is_held_and_stops_when_it_is_let_go() -> No
     moved, volts = hand.piston(1), hand.command(1)
     assert not volts[: round(0.5 * RATE)].any()
     assert (volts[round(0.6 * RATE) : round(1.4 * RATE)] > 0).all()
-    assert volts.max() <= VOLTS
-    let_go = round((1.5 + HOLD + 0.05) * RATE)
+    assert volts.max() <= ENGINE.jog_volts
+    let_go = round((1.5 + ENGINE.jog_hold + 0.05) * RATE)
     assert not volts[let_go:].any(), "no key, no voltage"
     assert moved[let_go] > moved[0] + 1e-3
     assert not hand.command(2).any()
@@ -68,7 +69,7 @@ def test_a_single_press_is_a_nudge() -> None:
     hand.manual.run()
     pushed = np.flatnonzero(hand.command(2)) / RATE
     assert len(pushed)
-    assert pushed[-1] - pushed[0] <= HOLD + 0.03
+    assert pushed[-1] - pushed[0] <= ENGINE.jog_hold + 0.03
     assert hand.piston(2)[-1] < hand.piston(2)[0]
 
 
@@ -79,7 +80,7 @@ def test_a_key_held_for_long_ends_inside_the_limits() -> None:
     hand.press(9.5, "abort")
     hand.manual.run()
     low, high = RIG.joints[0].limits.piston
-    end = high - INSIDE * (high - low)
+    end = high - ENGINE.jog_margin * (high - low)
     assert hand.piston(1).max() <= end + 0.1 * (high - end)
     assert hand.piston(1)[-1] == pytest.approx(end, abs=2e-3)
 
@@ -104,9 +105,9 @@ def test_a_locked_joint_is_held_watched_and_not_jogged() -> None:
         None,
     ]
     assert roles[0].locked
-    assert roles[0].tolerance == TOLERANCE
+    assert roles[0].tolerance == ENGINE.manual_tolerance
     assert not roles[1].locked
-    assert np.ptp(hand.piston(1)) < TOLERANCE
+    assert np.ptp(hand.piston(1)) < ENGINE.manual_tolerance
     assert not any(role.locked for role in hand.bench.roles)
 
 
