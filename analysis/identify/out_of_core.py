@@ -34,15 +34,16 @@ def identify_folders(
     pool: Pool | None = None,
     effects: Sequence[str] = (),
     like: Model | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> Identification:
     """Identify from run folders, of which one record at a time is in memory.
 
     This is `identify` by the coupled method with the estimator "plain", for the other methods and
     estimators go over all rows again and again. The terms are those of the model `like`, or the
     rig's baseline with `effects` (`analysis.terms.with_effects`). With a `pool` each record
-    is reduced in one of its processes, where the folders are read; only triangles come back. Raises
-    InputError as `identify` and `load_run` do, for a model of another rig, and for an effect whose
-    shape is open.
+    is reduced in one of its processes, where the folders are read; only triangles come back.
+    `progress` hears the share of the records that are reduced, 0 to 1. Raises InputError as
+    `identify` and `load_run` do, for a model of another rig, and for an effect whose shape is open.
     """
     workers = pool or Serial()
     heads = list(workers.map(read_run_head, folders, reads=str))
@@ -77,7 +78,11 @@ def identify_folders(
         for first in (first_of_steps(head.records),)
         for record in head.records
     ]
-    reductions = list(workers.map(reduce_task, tasks, reads=path_of))
+    reductions = []
+    for reduction in workers.map(reduce_task, tasks, reads=path_of):
+        reductions.append(reduction)
+        if progress is not None:
+            progress(len(reductions) / len(tasks))
     return conclude(rig, [h.source for h in heads], used, reductions, reject_noise)
 
 

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from rig.model.records import Record, Run
 
 
-def _load(folders: Sequence[Path]) -> list[Run]:
+def load_runs(folders: Sequence[Path]) -> list[Run]:
+    """Load run folders, none of them twice, with the time left where it takes long."""
     from rig.runs.store import load_run, refuse_repeated
 
     refuse_repeated(folders)
@@ -66,8 +67,9 @@ def _streamed(
     # What the folders hold is read by who works on them: they need not exist here.
     with Serial() if cluster is None else DaskCluster(cluster) as pool:
         return identify_folders(
-            [str(run) for run in runs], filtering=filtering, pool=pool, effects=effects, like=model
-        )
+            [str(run) for run in runs], filtering=filtering, pool=pool, effects=effects,
+            like=model, progress=Countdown("identifying"),
+        )  # fmt: skip
 
 
 def _terms(runs: Sequence[Run], effects: Sequence[str], like: Path | None) -> Sequence[Used] | None:
@@ -175,7 +177,7 @@ def identify(
         _refuse_unstreamed("--cluster" if cluster else "--stream", method, estimator, bootstrap)
         result = _streamed(runs, filters, effects or (), like, cluster)
     else:
-        loaded = _load(runs)
+        loaded = load_runs(runs)
         terms = _terms(loaded, effects or (), like)
         result = identify_runs(
             loaded,
@@ -203,7 +205,7 @@ def identify(
     if report is not None:
         from rig.cli.reports import write_identification
 
-        write_identification(report, _load(runs), result)
+        write_identification(report, load_runs(runs), result)
     if json != Path("-"):
         known = None if truth is None else read_truth(truth)
         typer.echo(identification_text(result, known) + more)

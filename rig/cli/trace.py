@@ -44,10 +44,10 @@ def trace(
     from analysis.simulation.model import terms_like
     from analysis.trace.engine import trace as trace_runs
     from analysis.trace.result import to_json
+    from rig.cli.identify import load_runs
     from rig.cli.trace_text import trace_text
     from rig.cli.twin_choice import save_identified
     from rig.model.parse import InputError
-    from rig.runs.store import load_run, refuse_repeated
 
     if not holdout:
         raise InputError(
@@ -56,8 +56,8 @@ def trace(
         )
     if equations not in FAMILIES_OF:
         raise InputError(f"--equations {equations}: expected one of: {' '.join(FAMILIES_OF)}")
-    refuse_repeated([*runs, *holdout])
-    loaded, judged = [load_run(f) for f in runs], [load_run(f) for f in holdout]
+    every = load_runs([*runs, *holdout])
+    loaded, judged = every[: len(runs)], every[len(runs) :]
     progress(f"tracing {sum(len(r.records) for r in loaded)} records")
     rigs = {run.source: run.rig for run in (*loaded, *judged)}
     known = None if like is None else terms_like(like, rigs)

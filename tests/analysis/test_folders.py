@@ -26,7 +26,11 @@ def test_samples_lost_on_the_wire_are_masked_in_both_ways(
 ) -> None:
     holed = with_lost(multisine_run, (3000, 3020), (7000, 7100))
     folder = write_run(tmp_path / "monday", holed)
-    assert_same(identify_folders([str(folder)]), identify([holed], estimator=PLAIN))
+    shares: list[float] = []
+    streamed = identify_folders([str(folder)], progress=shares.append)
+    assert_same(streamed, identify([holed], estimator=PLAIN))
+    n = len(holed.records)  # how far it is, record by record
+    assert shares == [(k + 1) / n for k in range(n)]
 
 
 def test_a_lock_that_gives_is_decided_for_all_repeats_in_both_ways(
