@@ -90,7 +90,7 @@ def test_a_cold_morning_is_judged_though_the_fit_knows_warm_oil_alone(rig: Rig) 
 def test_oil_can_do_only_so_much() -> None:
     beta = {"b": 1e-9}  # 1/b of the rows
     assert plausible(4e-12, beta) == 4e-12  # 0.4 % per kelvin
-    assert plausible(1.0, beta) == pytest.approx(15e-12)
+    assert plausible(1.0, beta) == pytest.approx(15e-12, rel=1e-6, abs=0)
     assert plausible(-1.0, beta) == pytest.approx(-9e-12)
 
 

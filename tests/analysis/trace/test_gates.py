@@ -100,7 +100,7 @@ def a_leak_is_named_alone_and_for_certain(b: Benches) -> None:
     (leak,) = s.judged()
     assert leak.named
     assert leak.p_value == pytest.approx(1 / 200)
-    assert leak.parameters["c_internal_2"].value == pytest.approx(LEAK, rel=0.01)
+    assert leak.parameters["c_internal_2"].value == pytest.approx(LEAK, rel=0.01, abs=0)
 
 
 def a_leak_gone_on_the_held_out_day_is_refused(b: Benches) -> None:

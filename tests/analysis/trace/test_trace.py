@@ -66,7 +66,7 @@ def test_a_leak_is_named_with_place_and_size_and_its_error_falls_to_the_noise(
     assert leaking.verdict == "explained"
     (found,) = leaking.effects
     assert (found.name, found.where) == ("internal_leakage", "joint 2")
-    assert found.parameters["c_internal_2"].value == pytest.approx(2e-12, rel=0.03)
+    assert found.parameters["c_internal_2"].value == pytest.approx(2e-12, rel=0.03, abs=0)
     assert found.removed_fraction > 0.95
     assert found.p_value <= 0.01
     assert leaking.before["flow_cap_2"] > 3 * leaking.noise_floor["flow_cap_2"]
@@ -97,7 +97,7 @@ def test_the_extended_model_lacks_nothing_any_more(rig: Rig, leaking: Trace) -> 
     known = leaking.model_after.terms
     result = trace([train], [held_out], look_ahead=False, terms=known)
     assert result.verdict == "clean"
-    assert result.model_before.values["c_internal_2"] == pytest.approx(2e-12, rel=0.03)
+    assert result.model_before.values["c_internal_2"] == pytest.approx(2e-12, rel=0.03, abs=0)
 
 
 def test_beside_a_known_dead_band_friction_alone_is_new(rig: Rig) -> None:
