@@ -85,6 +85,9 @@ class TraceSettings:
     """Of what held-out windows leave: with less, shapes by shooting are taken (tuned)."""
     no_worse: float = 1.02
     """Times the held-out rms of any equation's rows that these may cost (tuned)."""
+    visible: float = 1e-4
+    """Smallest over largest singular value of unit columns: the noise of where a locked joint
+    stands (10 um of 0.1 m, some thousand samples) makes 1e-6 to 1e-5 (arithmetic)."""
     least_rows: int = 40
     """Rows of an equation in one record (arithmetic)."""
     rivals: int = 4

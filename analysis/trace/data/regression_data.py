@@ -32,6 +32,7 @@ from analysis.trace.data.conditioned_record import (
     row_residual,
 )
 from analysis.trace.data.noise_floor import Floor, Group, floors
+from analysis.trace.settings import TRACE
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 
@@ -117,7 +118,9 @@ def least_squares(rig: Rig, rows: Sequence[Mapping[str, Rows]]) -> dict[str, flo
         scale = np.linalg.norm(X, axis=0)
         scale[scale == 0] = 1.0
         out |= zip(
-            parts[0].names, np.linalg.lstsq(X / scale, y, rcond=1e-6)[0] / scale, strict=True
+            parts[0].names,
+            np.linalg.lstsq(X / scale, y, rcond=TRACE.visible)[0] / scale,
+            strict=True,
         )
     return out
 

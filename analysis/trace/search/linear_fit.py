@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.trace.data.regression_data import RegressionData, VariantColumns
+from analysis.trace.settings import TRACE
 
 Array = NDArray[np.float64]
 Key = tuple[str, str]
@@ -105,7 +106,7 @@ def orthonormal(columns: Array) -> Array:
     scale = np.linalg.norm(columns, axis=0)
     kept = columns[:, scale > 0] / scale[scale > 0]
     U, sigma, _ = np.linalg.svd(kept, full_matrices=False)
-    return np.asarray(U[:, sigma > 1e-6 * sigma[0]]) if len(sigma) else U
+    return np.asarray(U[:, sigma > TRACE.visible * sigma[0]]) if len(sigma) else U
 
 
 def gains(K: Array, c: Array, groups: Sequence[tuple[int, ...]], raw: Array) -> Array:

@@ -31,6 +31,7 @@ from analysis.trace.data.conditioned_record import (
 )
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.search.linear_fit import CHANCE, orthonormal
+from analysis.trace.settings import TRACE
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
@@ -140,7 +141,7 @@ def fit(data: RegressionData, terms: Sequence[Used]) -> ExactFit:
     scale = np.linalg.norm(rows.matrix, axis=0)
     scale[scale == 0] = 1.0
     Q, R = np.linalg.qr(rows.matrix / scale)
-    value = np.linalg.lstsq(R, Q.T @ rows.rhs, rcond=1e-6)[0] / scale
+    value = np.linalg.lstsq(R, Q.T @ rows.rhs, rcond=TRACE.visible)[0] / scale
     beta = dict(zip(rows.names, value, strict=True))
     return ExactFit(tuple(terms), beta, rows.residual(beta))
 
