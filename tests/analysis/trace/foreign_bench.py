@@ -322,7 +322,7 @@ def experiment(
         replace(
             record(rig, clean, f"step1_r{k}", 1000 * seed + k, noise),
             repeat=k,
-            period=4000 if seconds >= 8.0 else 0,
+            period=round(4.0 * rig.sample_rate) if seconds >= 8.0 else 0,
         )
         for k in range(1, repeats + 1)
     )
