@@ -94,3 +94,24 @@ def test_what_is_known_beforehand_narrows_intervals_no_more_than_it_may(known: f
         narrower.append(both.covariance[0, 0] / alone.covariance[0, 0])
     assert 0.92 < np.mean(hits) < 0.98
     assert np.median(narrower) < 0.3
+
+
+def test_what_records_hold_nothing_of_leaves_every_estimate_as_it_is() -> None:
+    """A column of zeros, of a joint that stands: joined in, it made every parameter NaN."""
+    rng = np.random.default_rng(4)
+    t = np.arange(200) / 100.0
+    X = np.column_stack((np.sin(np.pi * t), np.zeros(200)))
+    parts = np.arange(200) // 25
+    blocks = [
+        RepeatBlock(0, "a", r, f"a_r{r}", "flow_cap_1", X, X[:, 0] + 0.1 * rng.standard_normal(200),
+                    t, parts, parts)
+        for r in range(4)
+    ]  # fmt: skip
+    fit = least_squares(blocks)
+    alone = spread([pieces(fit)], fit.inverse)
+    beta, both, inverse = joined(
+        fit.beta, alone, Belief("b", np.array([0.0, 1.0]), 0.1), fit.inverse
+    )
+    assert beta == pytest.approx(fit.beta)
+    assert both.covariance == pytest.approx(alone.covariance)
+    assert inverse == pytest.approx(fit.inverse)

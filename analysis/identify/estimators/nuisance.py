@@ -202,6 +202,8 @@ def joined(
      (I - g h') V (I - g h')' + g s^2 g'  (Joseph's form).
     """
     V, h = spread.covariance, belief.h
+    if h @ inverse @ h <= 0.0:  # a column of zeros: the records hold nothing to join
+        return beta, spread, inverse
     shape = 0.5 * (inverse + inverse.T)
     P = shape * (h @ V @ h) / (h @ shape @ h)
     gain = P @ h / (h @ P @ h + belief.std**2)
