@@ -1,4 +1,4 @@
-"""The same bench told otherwise is the same bench: verdict, name, place and size stay.
+"""Another description of the same bench leaves verdict, name, place and size as they are.
 
 Runs and records come in another order, the sensors are sampled at another rate, the rig file is
 written in other units, the joints change their numbers, a step is added in which nothing moves.
@@ -10,7 +10,6 @@ from __future__ import annotations
 import copy
 import math
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -44,10 +43,9 @@ NAME = {
     "rubbing": ("coulomb_friction", "Fc{}", RUBBING),
 }
 SHIPPED = (Path(rig_package.__file__).parent / "shipped" / "shinshu-2dof.yaml").read_text()
-RATE = 500.0  # [Hz] of the bench that is told otherwise
+RATE = 500.0  # [Hz] of the bench that is described in other ways
 # Sampled all at once: a joint that gets another number is then sampled as before.
 TEXT = SHIPPED.replace("sample_rate: 1 kHz", "sample_rate: 500 Hz").replace("10 us", "0 us")
-Told = Callable[[Run], Run]
 
 
 def parsed(text: str) -> Rig:
@@ -91,7 +89,7 @@ def assert_names(result: Trace, cause: str, where: str) -> None:
 def assert_same(result: Trace, before: Trace, tolerance: float) -> None:
     """Ask for the same verdict, names, sizes, errors and noise, whatever number a joint has.
 
-    A shape that the data hardly tell may also move by a twentieth of its interval.
+    A shape that the data hardly determine may also move by a twentieth of its interval.
     """
     assert result.verdict == before.verdict
     assert [e.name for e in result.effects] == [e.name for e in before.effects]
@@ -248,13 +246,13 @@ def test_a_further_step_in_which_nothing_moves(runs: tuple[Run, Run], as_it_is: 
 
 
 def test_a_joint_said_to_move_that_stands_is_refused(runs: tuple[Run, Run]) -> None:
-    """The records would tell nothing of it: whose mistake it is, only the user can know."""
+    """The records hold nothing of it: whose mistake it is, only the user can know."""
     with pytest.raises(InputError, match=r"'rest_r1', channel 'piston_2': joint 2 is not locked"):
         traced((at_rest(runs[0], (1,)),), runs[1])
 
 
 def test_where_a_joint_stands_by_its_noise_is_no_lever_for_a_weight() -> None:
-    """Aligned, both weights pull alike: their difference is a micrometre's, and tells nothing."""
+    """Aligned, both weights pull alike: their difference is a micrometre's, all of it noise."""
     bench = pair_of_runs(parsed(TEXT), HIDDEN["rubbing"], noise=noise_at(RATE))[0]
     moved = in_changed_places(bench)
     terms = [Used(term) for term in baseline_of(moved.rig)]
