@@ -11,10 +11,11 @@ from analysis.effects.base import Effect
 from analysis.report import format as fm
 from analysis.report.identification import Provenance
 from analysis.report.page import page, write
-from analysis.report.plots import trace_plots
+from analysis.report.plots import place_plot, trace_plots
 from analysis.trace.clues.frequency import FREQUENCY
 from analysis.trace.data.spectral_lines import loudest
-from analysis.trace.result import CLEAN, Found, Trace
+from analysis.trace.result import CLEAN, CONFOUNDED, Found, Trace
+from analysis.trace.settings import TRACE
 from analysis.trace.words import quantity, shot_in_words, unit_of_equation
 from rig.model.records import Run
 from rig.model.rig import Rig
@@ -52,6 +53,7 @@ def body(
         "provenance": provenance or Provenance(),
         "galleries": _pictures(rig, holdout, result),
         "overview": trace_plots.over_noise(result),
+        "places": place_plot.places(result),
         "errors": _errors(result),
         "effects": [_effect(e, f"d{k}") for k, e in enumerate(result.effects)],
         "refused": [_effect(e, f"n{k}") for k, e in enumerate(result.refused)],
@@ -100,8 +102,13 @@ def _pictures(rig: Rig, holdout: Sequence[Run], result: Trace) -> list[dict[str,
         equation = trace_plots.equation_of(effect, rig, result, lines)
         heading = f"{effect.name.replace('_', ' ')} at {getattr(effect, 'place', effect.where)}"
         add(effect, effect.variable, equation, heading, f"e{k}")
-    # A frequency is seen in time and in the lines, not against anything.
-    drawn = [d for d in result.depends_on if d.variable != FREQUENCY][:2]
+    # A frequency is seen in time and in the lines, not against anything; noise moves with nothing.
+    drawn = [
+        d for d in result.depends_on
+        if d.variable != FREQUENCY
+        and (result.verdict != CONFOUNDED
+             or result.after[d.equation] > TRACE.told * result.noise_floor[d.equation])
+    ][:2]  # fmt: skip
     for k, clue in enumerate(drawn):
         heading = f"what is left of {clue.equation} against {clue.variable}"
         add(None, clue.variable, clue.equation, heading, f"c{k}")
@@ -161,6 +168,7 @@ def _errors(result: Trace) -> list[tuple[str, ...]]:
 def _effect(found: Found, key: str) -> dict[str, Any]:
     return {
         "curve": trace_plots.curves(found, key) if found.curves else None,
+        "tried": trace_plots.instead(found, f"{key}r"),
         "name": found.name.replace("_", " "),
         "where": found.where,
         "values": [(n, quantity(e)) for n, e in found.parameters.items()],

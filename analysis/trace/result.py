@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -105,7 +106,8 @@ class Found:
     `removed_fraction` is the share of the repeatable energy on held-out records, in the equations
     that the effect touches, which goes with it, the other effects kept. `shot` is what multiple
     shooting makes of an effect with a hidden state. `mechanism` is where it acts; a `free` one has
-    no name of its own and is what its `curves` say.
+    no name of its own and is what its `curves` say. `left_without` and `left_with` are the held-out
+    rms in the equations it touches without it and with it, the mean of the repeats' noise being 1.
     """
 
     name: str
@@ -120,6 +122,8 @@ class Found:
     mechanism: str = ""
     free: bool = False
     curves: tuple[Curve, ...] = ()
+    left_without: float = math.nan
+    left_with: float = math.nan
 
     @property
     def named(self) -> bool:

@@ -5,6 +5,7 @@ All of held-out records. Grey is before, blue after; the pale band is the noise 
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -22,6 +23,7 @@ from analysis.report.plots.style import (
     GREY,
     INK,
     MODEL,
+    ORANGE,
     PALE,
     figure,
     gapped,
@@ -41,8 +43,9 @@ from analysis.trace.data.conditioned_record import (
 )
 from analysis.trace.data.spectral_lines import CONSTANT, EVEN, EXCITED, ODD, members
 from analysis.trace.data.spectral_lines import SpectralLines as Spectrum
-from analysis.trace.result import Found, Trace
+from analysis.trace.result import Found, Rival, Trace
 from analysis.trace.search.refinement import ExactFit
+from analysis.trace.settings import TRACE
 from analysis.trace.words import loudest
 from rig.model import channels as ch
 from rig.model.channels import kind_of
@@ -53,6 +56,7 @@ Array = NDArray[np.float64]
 
 POINTS = 1500  # dots of a scatter
 SECONDS = 4.0  # of a time trace
+WORDS = 125  # letters of a line across a page
 
 
 @dataclass(frozen=True)
@@ -157,6 +161,67 @@ def curves(found: Found, key: str) -> Markup:
             axes.legend(frameon=False)
         made.tight_layout()
         return svg(made, key, f"{found.name.replace('_', ' ')} with its 95 % band")
+
+
+def instead(found: Found, key: str) -> Markup | None:
+    """Draw what held-out records keep without an effect, with it, and with each rival instead.
+
+    Sorted by what is left, each with the reason why it is named or not. None where nobody knows.
+    """
+    if not (np.isfinite(found.left_without) and np.isfinite(found.left_with)):
+        return None
+    bars = [
+        ("nothing in its place", found.left_without, "", GREY),
+        (_called(found.name, found.where), found.left_with, _verdict(found), BLUE),
+    ]
+    bars += [
+        (_called(r.name, r.where), r.ratio * found.left_with, *_against(r)) for r in found.rivals
+    ]
+    bars.sort(key=lambda bar: bar[1])
+    high = 1.25 * max(2.0, *(bar[1] for bar in bars))
+    low = 0.9 * min(1.0, *(bar[1] for bar in bars))
+    with style():
+        made = figure(0.5 + 0.4 * len(bars), CARD * 2)
+        axes = made.add_subplot()
+        for k, (name, left, why, colour) in enumerate(reversed(bars)):
+            axes.barh(k, left - low, 0.36, left=low, color=colour, lw=0)
+            axes.text(left, k, f" {fm.significant(left)}", va="center", fontsize=7.5)
+            axes.plot([1.0, 1.0], [k - 0.2, k + 0.2], color=INK, lw=0.8, ls="--")
+            said = textwrap.shorten(f"{name}: {why}" if why else name, WORDS, placeholder=" …")
+            axes.annotate(
+                said, (0.0, k + 0.22), xycoords=("axes fraction", "data"), va="bottom", fontsize=7.5
+            )
+        axes.set_xscale("log")
+        axes.set_xlim(low, high)
+        axes.xaxis.set_major_formatter(lambda v, _: f"{v:g}")
+        axes.xaxis.set_minor_formatter(lambda v, _: f"{v:.1g}" if high < 10 * low else "")
+        axes.set_yticks([])
+        axes.grid(visible=False, axis="y")
+        axes.spines["left"].set_visible(False)
+        axes.set_ylim(-0.4, len(bars) - 0.4)
+        axes.set_xlabel("held-out error over the noise of the repeats' mean (dashed)")
+        made.tight_layout()
+        return svg(made, key, f"Held-out error with {found.name.replace('_', ' ')} and its rivals")
+
+
+def _called(name: str, where: str) -> str:
+    return f"{name.replace('_', ' ')} at {where}"
+
+
+def _verdict(found: Found) -> str:
+    """Say that an effect is named, or by which gates it is not."""
+    failed = [f"{g.name}: {g.detail}" for g in found.gates if not g.ok]
+    return f"not named ({'; '.join(failed)})".replace("_", " ") if failed else "named"
+
+
+def _against(rival: Rival) -> tuple[str, str]:
+    """Return why a rival is not named, and its colour."""
+    if rival.tied:
+        return "cannot be told from it", ORANGE
+    if rival.ratio <= TRACE.tie:
+        times = fm.significant(rival.training_ratio)
+        return f"ruled out: training records keep {times} times as much", PALE
+    return f"ruled out: held-out records keep {fm.significant(rival.ratio)} times as much", PALE
 
 
 def in_time(line: ResidualSeries, noise: float, unit: str, key: str, after: bool) -> Markup:
@@ -280,6 +345,6 @@ def equation_of(
 
 
 __all__ = [
-    "ResidualSeries", "abscissae", "against", "equation_of", "held_out", "in_time", "kind_of",
-    "over_noise", "spectrum", "unit_of_variable",
+    "ResidualSeries", "abscissae", "against", "equation_of", "held_out", "in_time", "instead",
+    "kind_of", "over_noise", "spectrum", "unit_of_variable",
 ]  # fmt: skip

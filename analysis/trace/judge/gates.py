@@ -70,7 +70,8 @@ def judge(
             if share < TRACE.chosen and n >= TRACE.rival * sum(others.values())
         }
         rivals = _rivals(hypotheses, winner, key, holdout_data, after, often)
-        removed = _removed(holdout_data, rest, after, _touched(hypotheses, winner, rest))
+        touched = _touched(hypotheses, winner, rest)
+        removed = _removed(holdout_data, rest, after, touched)
         worse = _worse(hypotheses, winner, rest)
         p = inference.p_value(rest.fit.energy - winner.fit.energy, null)
         errors = inference.spread(train_data, winner.fit, used, values)
@@ -98,6 +99,8 @@ def judge(
                 mechanism=used.term.mechanism,
                 free=used.term.free,
                 curves=curves_of(train_data, winner.fit, used),
+                left_without=_rms(holdout_data, held_left(holdout_data, rest.fit), touched),
+                left_with=_rms(holdout_data, after, touched),
             )
         )
     return tuple(out)
@@ -129,6 +132,12 @@ def remaining(
         if r > TRACE.held_band and now[e] > TRACE.missed_held * start[e]
     ]
     return out
+
+
+def _rms(data: RegressionData, residual: Array, equations: Collection[str]) -> float:
+    """Return the rms of whitened residuals (M,) in some equations; NaN where they have no rows."""
+    parts = [residual[s.where] for s in data.segments if s.equation in equations]
+    return float(np.sqrt(np.mean(np.concatenate(parts) ** 2))) if parts else float("nan")
 
 
 def _held_ratio(holdout_data: RegressionData, residual: Array) -> dict[str, float]:

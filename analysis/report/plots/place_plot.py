@@ -1,0 +1,265 @@
+"""A schematic of the machine with the places of named effects marked.
+
+Per joint one column: cylinder with cap and rod chamber, valve, sensors (u spool, s piston, p
+pressure), the joint that it moves; below all of them supply and return line. Electric: drive and
+joint, with their sensors. Marks carry the number of their line in the list beside.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from typing import Any, Final
+
+from markupsafe import Markup
+from matplotlib.patches import Circle, FancyBboxPatch, Polygon, Rectangle
+
+from analysis.effects.base import Effect
+from analysis.report.plots.style import CARD, GREY, INK, MODEL, ORANGE, PALE, figure, style, svg
+from analysis.terms import known
+from analysis.trace.result import Trace
+from rig.model.rig import Rig
+
+Line = tuple[str, str, tuple[str, ...], str]  # effect, place, names of its parameters, colour
+Box = tuple[float, float, float, float]  # left, bottom, right, top in units of the drawing
+
+WIDTH: Final = 10.5  # of a joint's column
+CHAMBERS: Final = ("cap", "rod")
+SENSORS: Final = ("cap sensor", "rod sensor", "piston sensor", "spool sensor")
+# Where in a column the elements are; names without a number belong to the bench.
+HYDRAULIC: Final[dict[str, Box]] = {
+    "cap": (1.2, 6.0, 3.6, 7.4), "piston": (3.6, 5.9, 4.1, 7.5), "rod": (4.1, 6.0, 7.0, 7.4),
+    "joint": (8.2, 6.2, 9.2, 7.2), "valve": (2.6, 3.0, 5.6, 4.2),
+    "cap sensor": (0.3, 4.7, 1.1, 5.5), "rod sensor": (7.1, 4.7, 7.9, 5.5),
+    "piston sensor": (3.45, 8.1, 4.25, 8.9), "spool sensor": (1.2, 3.2, 2.0, 4.0),
+}  # fmt: skip
+ELECTRIC: Final[dict[str, Box]] = {
+    "drive": (1.6, 2.6, 4.2, 4.2), "joint": (6.4, 2.9, 7.4, 3.9),
+    "position sensor": (6.5, 4.6, 7.3, 5.4), "drive sensor": (2.5, 4.9, 3.3, 5.7),
+}  # fmt: skip
+SUPPLY: Final[Box] = (-2.6, 1.5, -1.4, 2.7)
+TANK: Final[Box] = (-2.6, -0.2, -1.4, 0.8)
+SUPPLY_SENSOR: Final[Box] = (-0.9, 2.6, -0.1, 3.4)
+LETTERS: Final = {
+    "cap sensor": "p", "rod sensor": "p", "piston sensor": "s", "spool sensor": "u",
+    "position sensor": "q", "drive sensor": "i", "supply sensor": "p",
+}  # fmt: skip
+# What of a joint is marked for a mechanism that acts there; of the bench, for one that acts there.
+AT_JOINT: Final = {
+    "friction_curve": "piston", "disturbance": "joint", "position_force": "joint",
+    "metering_curve": "valve", "spool_dynamics": "valve", "leakage_curve": "piston",
+}  # fmt: skip
+AT_BENCH: Final = {"supply_curve": "supply", "return_line": "tank", "gravity": "base"}
+
+
+def elements(rig: Rig) -> dict[str, Box]:
+    """Return every element of the drawing that can be marked: name, with the joint's number."""
+    one = ELECTRIC if rig.electric else HYDRAULIC
+    out = {
+        f"{name} {i + 1}": (left + WIDTH * i, bottom, right + WIDTH * i, top)
+        for i in range(len(rig.joints))
+        for name, (left, bottom, right, top) in one.items()
+    }
+    last = out[f"joint {len(rig.joints)}"]
+    out["load"] = (last[2] + 0.6, last[1] - 0.1, last[2] + 1.6, last[3] + 0.1)
+    first = out["drive 1" if rig.electric else "cap 1"]
+    out["base"] = (first[0] - 1.0, first[1], first[0] - 0.5, first[3])
+    if not rig.electric:
+        out |= {"supply": SUPPLY, "tank": TANK, "supply sensor": SUPPLY_SENSOR}
+    return out
+
+
+def marked(rig: Rig, name: str, where: str, parameters: Collection[str] = ()) -> tuple[str, ...]:
+    """Return the elements at which an effect acts; `parameters` tell which sensor it means."""
+    kind = known().get(name)
+    mechanism = kind.mechanism if kind is not None and issubclass(kind, Effect) else ""
+    words = where.split()
+    joints = words[1:2] if words[0] == "joint" else [str(i + 1) for i in range(len(rig.joints))]
+    side = words[2] if len(words) > 2 else ""
+    if kind is not None and mechanism == "sensor":
+        return _sensors(rig, kind, where, joints, " ".join(parameters))
+    if name == "payload":
+        return ("load",)
+    if words[0] == "bench" and mechanism in AT_BENCH:
+        return (AT_BENCH[mechanism],)
+    if side in CHAMBERS:
+        return (f"{side} {joints[0]}",)
+    if words[0] == "bench" or name == "external_leakage":  # the oil of every chamber
+        return tuple(f"{chamber} {i}" for i in joints for chamber in CHAMBERS)
+    element = "joint" if rig.electric else AT_JOINT.get(mechanism, "joint")
+    return (f"{element} {joints[0]}",)
+
+
+def _sensors(
+    rig: Rig, kind: type[Any], where: str, joints: Sequence[str], words: str
+) -> tuple[str, ...]:
+    """Return the sensors that an effect of sensors can mean at a place, or those of `words`."""
+    stated = [
+        side for side in ("supply", *CHAMBERS, "piston", "spool", "pressure") if side in words
+    ]
+    there = [place.split() for place in kind.places(rig) if kind(place).place == where]
+    sides = stated[:1] or ["supply" if place == ["bench"] else place[-1] for place in there]
+    if "supply" in sides:
+        return ("supply sensor",)
+    if "pressure" in sides:
+        sides += CHAMBERS
+    return tuple(f"{s} {i}" for i in joints for s in SENSORS if s.split()[0] in sides)
+
+
+def places(result: Trace) -> Markup | None:
+    """Draw the machine with the named effects' places, and their rivals'; None without any."""
+    lines = lines_of(result)
+    return drawn(result.model_before.rig, lines) if lines else None
+
+
+def lines_of(result: Trace) -> list[Line]:
+    """Return what is marked: the effects, then what the records cannot tell from them."""
+    # A valve's null has for its twin the offset of its own sensor.
+    twins = [twin for e in result.effects for twin in _twins(e.name, e.where)]
+    return [(e.name, e.where, tuple(e.parameters), MODEL) for e in result.effects] + [
+        (name, where, ("spool",) if (name, where) in twins else (), ORANGE)
+        for name, where in result.tied
+    ]
+
+
+def _twins(name: str, where: str) -> tuple[tuple[str, str], ...]:
+    kind = known().get(name)
+    return kind(where).twins() if kind is not None and issubclass(kind, Effect) else ()
+
+
+def drawn(rig: Rig, lines: Sequence[Line]) -> Markup:
+    """Draw the machine and mark the effects (name, place, parameters' names, colour)."""
+    boxes = elements(rig)
+    left = -1.4 if rig.electric else -3.2
+    right = WIDTH * len(rig.joints) + 1.0
+    low, high = (1.8, 6.2) if rig.electric else (-0.5, 9.7)
+    with style():
+        made = figure(0.3 * len(lines) + (CARD * 2) * min((high - low) / (right - left), 0.5),
+                      CARD * 2)  # fmt: skip
+        share = 0.3 * len(lines) / made.get_figheight()
+        axes = made.add_axes((0.01, share, 0.98, 0.99 - share))
+        axes.set_xlim(left, right)
+        axes.set_ylim(low, high)
+        axes.set_aspect("equal")
+        axes.axis("off")
+        for i in range(len(rig.joints)):
+            (_electric if rig.electric else _hydraulic)(axes, WIDTH * i, i + 1)
+        _rest(axes, rig, boxes)
+        taken: dict[str, int] = {}
+        for k, (name, where, parameters, colour) in enumerate(lines):
+            for element in marked(rig, name, where, parameters):
+                _mark(axes, boxes[element], k + 1, colour, taken.setdefault(element, 0), element)
+                taken[element] += 1
+            words = f"{k + 1}  {name.replace('_', ' ')} at {where}"
+            if colour == ORANGE:
+                words += ", which these records cannot tell from it"
+            made.text(
+                0.02, share - 0.3 * (k + 0.7) / made.get_figheight(), words, color=INK, fontsize=9,
+                bbox={"facecolor": colour, "alpha": 0.25, "edgecolor": "none", "pad": 2.0},
+            )  # fmt: skip
+        return svg(made, "places", "Schematic of the machine with the places of the effects marked")
+
+
+def _line(axes: Any, *points: tuple[float, float]) -> None:
+    axes.plot([p[0] for p in points], [p[1] for p in points], color=GREY, lw=1.2, zorder=1)
+
+
+def _sensor(axes: Any, box: Box, letter: str) -> None:
+    middle = (0.5 * (box[0] + box[2]), 0.5 * (box[1] + box[3]))
+    axes.add_patch(Circle(middle, 0.5 * (box[2] - box[0]), fc="white", ec=INK, lw=0.8, zorder=3))
+    axes.text(*middle, letter, ha="center", va="center", fontsize=8, style="italic", zorder=4)
+
+
+def _block(axes: Any, box: Box, words: str, colour: str = "white") -> None:
+    size = (box[2] - box[0], box[3] - box[1])
+    axes.add_patch(Rectangle(box[:2], *size, fc=colour, ec=INK, lw=1.0, zorder=2))
+    axes.text(
+        0.5 * (box[0] + box[2]), 0.5 * (box[1] + box[3]), words, ha="center", va="center",
+        fontsize=8, zorder=4,
+    )  # fmt: skip
+
+
+def _pin(axes: Any, box: Box, number: int) -> None:
+    middle = (0.5 * (box[0] + box[2]), 0.5 * (box[1] + box[3]))
+    axes.add_patch(Circle(middle, 0.5, fc="white", ec=INK, lw=1.4, zorder=3))
+    axes.text(box[2] - 0.05, box[3] + 0.3, f"joint {number}", ha="right", va="bottom", fontsize=8)
+
+
+def _hydraulic(axes: Any, x: float, number: int) -> None:
+    at = {n: (b[0] + x, b[1], b[2] + x, b[3]) for n, b in HYDRAULIC.items()}
+    _line(axes, (x + 1.7, 6.0), (x + 1.7, 5.1), (x + 3.2, 5.1), (x + 3.2, 4.2))
+    _line(axes, (x + 6.5, 6.0), (x + 6.5, 5.1), (x + 5.0, 5.1), (x + 5.0, 4.2))
+    _line(axes, (x + 1.1, 5.1), (x + 1.7, 5.1))
+    _line(axes, (x + 7.1, 5.1), (x + 6.5, 5.1))
+    _line(axes, (x + 2.0, 3.6), (x + 2.6, 3.6))
+    _line(axes, (x + 3.85, 7.5), (x + 3.85, 8.1))
+    _line(axes, (x + 3.2, 3.0), (x + 3.2, 2.1))
+    _line(axes, (x + 5.0, 3.0), (x + 5.0, 0.9))
+    for end, y in ((x + 3.2, 2.1), (x + 5.0, 0.9)):
+        axes.plot(end, y, "o", color=GREY, ms=3)
+    _block(axes, at["cap"], "cap", "#eef1f4")
+    _block(axes, at["rod"], "rod", "#eef1f4")
+    _block(axes, at["piston"], "", PALE)
+    axes.add_patch(Rectangle((x + 7.0, 6.55), 1.2, 0.3, fc="white", ec=INK, lw=1.0, zorder=2))
+    axes.plot([x + 4.1, x + 7.0], [6.7, 6.7], color=PALE, lw=5, zorder=2.5, solid_capstyle="butt")
+    _block(axes, at["valve"], f"valve {number}")
+    _pin(axes, at["joint"], number)
+    for name in SENSORS:
+        _sensor(axes, at[name], LETTERS[name])
+
+
+def _electric(axes: Any, x: float, number: int) -> None:
+    at = {n: (b[0] + x, b[1], b[2] + x, b[3]) for n, b in ELECTRIC.items()}
+    _line(axes, (x + 4.2, 3.4), (x + 6.4, 3.4))
+    _line(axes, (x + 2.9, 4.2), (x + 2.9, 4.9))
+    _line(axes, (x + 6.9, 3.9), (x + 6.9, 4.6))
+    _block(axes, at["drive"], f"drive {number}")
+    _pin(axes, at["joint"], number)
+    for name in ("position sensor", "drive sensor"):
+        _sensor(axes, at[name], LETTERS[name])
+
+
+def _rest(axes: Any, rig: Rig, boxes: dict[str, Box]) -> None:
+    """Draw base, load, supply and tank."""
+    base, load = boxes["base"], boxes["load"]
+    for k in range(5):
+        y = base[1] + (base[3] - base[1]) * k / 5
+        axes.plot([base[0], base[2]], [y, y + 0.3], color=INK, lw=0.6)
+    axes.plot([base[2], base[2]], [base[1], base[3]], color=INK, lw=1.4)
+    _line(axes, (base[2], 0.5 * (base[1] + base[3])), (base[2] + 0.5, 0.5 * (base[1] + base[3])))
+    axes.text(base[0] - 0.3, 0.5 * (base[1] + base[3]), "base", fontsize=8, ha="right", va="center")
+    _line(axes, (load[0] - 0.6, load[1] + 0.6), (load[0], load[1] + 0.6))
+    _block(axes, load, "load", PALE)
+    if rig.electric:
+        return
+    end = WIDTH * (len(rig.joints) - 1)
+    for box, y, reach, words in ((SUPPLY, 2.1, 3.2, "supply"), (TANK, 0.9, 5.0, "tank")):
+        _line(axes, (box[2] if words == "supply" else -2.0, y), (end + reach, y))
+        axes.text(0.2, y + 0.1, words, va="bottom", fontsize=8)
+    axes.add_patch(Circle((-2.0, 2.1), 0.6, fc="white", ec=INK, lw=1.0, zorder=2))
+    axes.add_patch(
+        Polygon([(-1.8, 2.35), (-1.8, 1.85), (-1.4, 2.1)], closed=True, fc=INK, zorder=3)
+    )
+    _line(axes, (-2.0, 0.9), (-2.0, 0.2))
+    axes.plot([-2.6, -2.6, -1.4, -1.4], [0.6, -0.1, -0.1, 0.6], color=INK, lw=1.2)
+    _line(axes, (-0.5, 2.1), (-0.5, 2.6))
+    _sensor(axes, SUPPLY_SENSOR, LETTERS["supply sensor"])
+
+
+def _mark(axes: Any, box: Box, number: int, colour: str, before: int, element: str) -> None:
+    """Ring an element and put the number at its corner, beside those that stand there."""
+    pad = 0.18 + 0.12 * before
+    axes.add_patch(
+        FancyBboxPatch(
+            box[:2], box[2] - box[0], box[3] - box[1], boxstyle=f"round,pad={pad}", zorder=5,
+            fc=colour, alpha=0.18, ec="none",
+        )
+    )  # fmt: skip
+    axes.add_patch(
+        FancyBboxPatch(
+            box[:2], box[2] - box[0], box[3] - box[1], boxstyle=f"round,pad={pad}", zorder=5,
+            fc="none", ec=colour, lw=2.0, gid=f"mark-{number}-{element.replace(' ', '-')}",
+        )
+    )  # fmt: skip
+    at = (box[2] + 0.2 - 0.75 * before, box[3] + 0.25)
+    axes.add_patch(Circle(at, 0.34, fc=colour, ec="white", lw=0.8, zorder=6))
+    axes.text(*at, str(number), color="white", ha="center", va="center", fontsize=8, zorder=7)

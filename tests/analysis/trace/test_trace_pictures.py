@@ -1,0 +1,132 @@
+"""The report's reader sees where an effect is on the machine, and what speaks against rivals."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
+
+import pytest
+
+import rig as rig_package
+from analysis.report.plots import place_plot, trace_plots
+from analysis.report.plots.style import MODEL, ORANGE
+from analysis.trace.data.candidates import catalogue, free_mechanisms
+from analysis.trace.result import Found, Gate, Rival, Trace
+from rig.model.parse import parse_model
+from rig.model.rig import Rig
+
+LEAK = Found(
+    "internal_leakage", "joint 2", {}, 0.005, 0.99,
+    (
+        Rival("spool_offset", "joint 2", 9.4, 8.0, False),
+        Rival("sensor_gain", "joint 2 cap", 1.02, 1.01, True),
+        Rival("external_leakage", "joint 2 rod", 1.05, 1.9, False),
+    ),
+    (Gate("no rival", False, "cannot be told from sensor_gain"),),
+    left_without=27.6, left_with=1.5,
+)  # fmt: skip
+
+
+def shipped(name: str) -> Rig:
+    path = Path(rig_package.__file__).parent / "shipped" / f"{name}.yaml"
+    return parse_model(Rig, path.read_text(), path.name)
+
+
+@pytest.mark.parametrize("name", ["shinshu-2dof", "electric-2dof", "boom-1dof", "digger-3dof"])
+def test_every_place_that_the_catalogue_names_is_marked_in_the_drawing(name: str) -> None:
+    rig = shipped(name)
+    marks = {}
+    for effect in (*catalogue(rig), *free_mechanisms(rig)):
+        names = [c.parameter for c in effect.coefficients(rig)]
+        names += [shape.parameter for shape in effect.shapes(rig)]
+        marks[effect.name, effect.where] = place_plot.marked(rig, effect.name, effect.place, names)
+    assert all(marks.values())
+    assert {spot for own in marks.values() for spot in own} <= set(place_plot.elements(rig))
+    for (_, where), own in marks.items():
+        if where.startswith("joint"):
+            assert {spot.split()[-1] for spot in own} == {where.split()[1]}
+    shown = [key for key in marks if key[0] in ("entrained_air", "sensor_gain", "joint_spring")]
+    lines = [(effect_name, place, (), MODEL) for effect_name, place in shown]
+    drawn = str(place_plot.drawn(rig, lines))
+    for k, (effect_name, place) in enumerate(shown, start=1):
+        found = re.findall(rf'id="places-mark-{k}-([^"]*)"', drawn)
+        wanted = place_plot.marked(rig, effect_name, place)
+        assert sorted(found) == sorted(spot.replace(" ", "-") for spot in wanted)
+        assert f"{k} {effect_name.replace('_', ' ')} at {place}" in " ".join(drawn.split())
+
+
+@pytest.mark.parametrize(
+    ("effect", "where", "parameters", "spots"),
+    [
+        ("internal_leakage", "joint 2", ["c_internal_2"], ("piston 2",)),
+        ("external_leakage", "joint 2 cap", ["c_external_cap_2"], ("cap 2",)),
+        ("valve_deadband", "joint 1", ["w_ahead_1"], ("valve 1",)),
+        ("entrained_air", "bench", ["alpha_air"], ("cap 1", "rod 1", "cap 2", "rod 2")),
+        ("supply_sag", "bench", ["dp_supply"], ("supply",)),
+        ("tank_pressure", "bench", ["p_tank"], ("tank",)),
+        ("base_inclination", "bench", ["inclination"], ("base",)),
+        ("payload", "bench", ["m_payload"], ("load",)),
+        ("sensor_gain", "joint 1", ["gain_spool_1"], ("spool sensor 1",)),
+        ("sensor_gain", "joint 1", ["gain_piston_1"], ("piston sensor 1",)),
+        ("sensor_offset", "bench", ["offset_supply_pressure"], ("supply sensor",)),
+        (
+            "channel_delay", "bench", ["delay_pressure"],
+            ("cap sensor 1", "rod sensor 1", "cap sensor 2", "rod sensor 2"),
+        ),
+    ],
+)  # fmt: skip
+def test_an_effect_is_marked_where_a_mechanic_would_look(
+    rig: Rig, effect: str, where: str, parameters: list[str], spots: tuple[str, ...]
+) -> None:
+    assert place_plot.marked(rig, effect, where, parameters) == spots
+
+
+def test_two_effects_at_one_place_are_both_marked(rig: Rig) -> None:
+    lines = [
+        ("internal_leakage", "joint 2", (), MODEL),
+        ("coulomb_friction", "joint 2", (), ORANGE),
+    ]
+    drawn = str(place_plot.drawn(rig, lines))
+    assert "mark-1" in drawn
+    assert "mark-2" in drawn
+    assert "coulomb friction at joint 2, which these records cannot tell from it" in drawn
+
+
+def test_a_valve_s_null_is_drawn_beside_the_spool_s_own_sensor(rig: Rig) -> None:
+    """They are one to the data; `sensor_offset at joint 2` alone would be the piston's."""
+    null = Found("spool_offset", "joint 2", {}, 0.005, 1.0, (), ())
+    result = SimpleNamespace(
+        model_before=SimpleNamespace(rig=rig), effects=(null,), tied=[("sensor_offset", "joint 2")]
+    )
+    assert place_plot.lines_of(cast(Trace, result)) == [
+        ("spool_offset", "joint 2", (), MODEL),
+        ("sensor_offset", "joint 2", ("spool",), ORANGE),
+    ]
+    assert place_plot.marked(rig, "sensor_offset", "joint 2", ("spool",)) == ("spool sensor 2",)
+    assert place_plot.marked(rig, "sensor_offset", "joint 2") == ("piston sensor 2",)
+    assert "mark-2" in str(place_plot.places(cast(Trace, result)))
+    nothing = SimpleNamespace(model_before=result.model_before, effects=(), tied=[])
+    assert place_plot.places(cast(Trace, nothing)) is None
+
+
+def test_rivals_stand_by_what_they_leave_and_say_why_they_are_not_named() -> None:
+    drawn = str(trace_plots.instead(LEAK, "e0"))
+    said = [re.sub(r"<[^>]+>", "", line) for line in re.findall(r"<text.*?</text>", drawn)]
+    stand = [s for s in said if "joint 2" in s or s == "nothing in its place"]
+    assert [s.partition(":")[0] for s in stand] == [
+        "nothing in its place", "spool offset at joint 2", "external leakage at joint 2 rod",
+        "sensor gain at joint 2 cap", "internal leakage at joint 2",
+    ]  # fmt: skip
+    assert "held-out records keep 9.40 times as much" in stand[1]
+    assert "training records keep 1.90 times as much" in stand[2]
+    assert "cannot be told from it" in stand[3]
+    assert "not named (no rival: cannot be told from sensor gain)" in stand[4]
+    for left in ("27.6", "14.1", "1.58", "1.53", "1.50"):
+        assert f" {left}" in said
+
+
+def test_a_trace_of_before_is_drawn_without_what_nobody_knows() -> None:
+    assert trace_plots.instead(replace(LEAK, left_without=float("nan")), "e0") is None
