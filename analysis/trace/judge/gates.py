@@ -123,9 +123,9 @@ def remaining(
         share = residual / max(hypotheses.empty.excess_energy[e], 1e-30)
         if share > TRACE.missed and not hypotheses.negligible(e, residual):
             times = residual / hypotheses.limits.band[e]
-            out.append(
-                (e, f"{100 * share:.2g} % of what repeated stays, {times:.2g} times the band")
-            )
+            stays = f"{100 * share:.2g} % of what repeated stays"
+            words = stays if share <= 1.0 else "more repeats than before"
+            out.append((e, f"{words}, {times:.2g} times the band"))
     out += [
         (e, f"held-out error {r:.2f} times the noise floor")
         for e, r in ratio.items()
