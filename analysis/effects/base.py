@@ -100,14 +100,16 @@ class Effect(Term):
     `prepare` changes: rows of others need not be built again for another shape. `hydraulic` marks
     what acts on oil, valve or cylinder, and is not for electric joints. `least` and `least_shape`
     are the coefficients and shapes [SI] of the smallest size that a person would want to know of on
-    a bench of some kW at some MPa. `mechanism` is where in the physics it acts; `free` marks a
-    mechanism without a name for its form, whose curve the data draw (see `curve`): no candidate as
-    long as a named effect explains the records. `by_data` says that its points of first look follow
-    from the records (`points`).
+    a bench of some kW at some MPa. `mechanism` is where in the physics it acts, `element` the part
+    of the machine: base, load, supply, tank, or of its joint the joint, piston, valve, chamber or
+    sensor. `free` marks a mechanism without a name for its form, whose curve the data draw (see
+    `curve`): no candidate as long as a named effect explains the records. `by_data` says that its
+    points of first look follow from the records (`points`).
     """
 
     family: ClassVar[str] = ""
     mechanism: ClassVar[str] = ""
+    element: ClassVar[str] = "joint"
     free: ClassVar[bool] = False
     by_data: ClassVar[bool] = False
     least: ClassVar[tuple[float, ...]] = ()

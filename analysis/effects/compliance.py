@@ -43,6 +43,7 @@ class EntrainedAir(Effect):
     """
 
     mechanism: ClassVar[str] = "bulk_modulus_curve"
+    element: ClassVar[str] = "chamber"
     name: ClassVar[str] = "entrained_air"
     least: ClassVar[tuple[float, ...]] = (3e-3,)  # of the volume, at one atmosphere
     hydraulic: ClassVar[bool] = True
@@ -103,6 +104,7 @@ class DeadVolume(Effect):
     """
 
     mechanism: ClassVar[str] = "chamber_volume"
+    element: ClassVar[str] = "chamber"
     name: ClassVar[str] = "dead_volume"
     least_shape: ClassVar[tuple[float, ...]] = (20e-6,)  # [m^3]
     prepares: ClassVar[bool] = True

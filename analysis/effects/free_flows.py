@@ -64,6 +64,7 @@ class MeteringCurve(Effect):
     name: ClassVar[str] = "metering_curve"
     family: ClassVar[str] = "valve"
     mechanism: ClassVar[str] = "metering_curve"
+    element: ClassVar[str] = "valve"
     free: ClassVar[bool] = True
     by_data: ClassVar[bool] = True
     hydraulic: ClassVar[bool] = True
@@ -173,6 +174,7 @@ class LeakageCurve(Effect):
     name: ClassVar[str] = "leakage_curve"
     family: ClassVar[str] = "fluid"
     mechanism: ClassVar[str] = "leakage_curve"
+    element: ClassVar[str] = "piston"
     free: ClassVar[bool] = True
     by_data: ClassVar[bool] = True
     hydraulic: ClassVar[bool] = True
@@ -276,6 +278,7 @@ class BulkModulusCurve(Effect):
     name: ClassVar[str] = "bulk_modulus_curve"
     family: ClassVar[str] = "fluid"
     mechanism: ClassVar[str] = "bulk_modulus_curve"
+    element: ClassVar[str] = "chamber"
     free: ClassVar[bool] = True
     by_data: ClassVar[bool] = True
     hydraulic: ClassVar[bool] = True

@@ -61,6 +61,7 @@ class FrictionCurve(Friction):
 
     name: ClassVar[str] = "friction_curve"
     mechanism: ClassVar[str] = "friction_curve"
+    element: ClassVar[str] = "piston"
     free: ClassVar[bool] = True
     by_data: ClassVar[bool] = True
     variable: ClassVar[str] = "the piston's velocity"

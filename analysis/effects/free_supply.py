@@ -37,6 +37,7 @@ class SupplyCurve(PortEffect):
 
     name: ClassVar[str] = "supply_curve"
     mechanism: ClassVar[str] = "supply_curve"
+    element: ClassVar[str] = "supply"
     free: ClassVar[bool] = True
     by_data: ClassVar[bool] = True
     variable: ClassVar[str] = "the flow drawn from the supply"

@@ -66,6 +66,7 @@ class Friction(Effect):
     """
 
     mechanism: ClassVar[str] = "friction_curve"
+    element: ClassVar[str] = "piston"
     family: ClassVar[str] = "friction"
     per_joint: ClassVar[bool] = True
     stiffens: ClassVar[bool] = False

@@ -35,6 +35,7 @@ UNIT = "m^3/(s*Pa)"
 @dataclass(frozen=True)
 class _Leakage(Effect):
     mechanism: ClassVar[str] = "leakage_curve"
+    element: ClassVar[str] = "piston"
     family: ClassVar[str] = "fluid"
     hydraulic: ClassVar[bool] = True
     per_joint: ClassVar[bool] = True
@@ -97,6 +98,7 @@ class ExternalLeakage(_Leakage):
     """Q = c (p - p_tank) out of one chamber, or of both with one c where `where` names none."""
 
     name: ClassVar[str] = "external_leakage"
+    element: ClassVar[str] = "chamber"
     least: ClassVar[tuple[float, ...]] = (3e-13,)  # [m^3/(s Pa)]
     variable: ClassVar[str] = "the chamber's pressure"
     confounders: ClassVar[tuple[str, ...]] = (

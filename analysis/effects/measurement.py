@@ -35,6 +35,7 @@ class Sensor(Effect):
     """What the three share: the channel, and the way from one channel to all that follows."""
 
     mechanism: ClassVar[str] = "sensor"
+    element: ClassVar[str] = "sensor"
     hydraulic: ClassVar[bool] = True
     family: ClassVar[str] = "measurement"
     stage: ClassVar[int] = SENSOR

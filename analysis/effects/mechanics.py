@@ -42,6 +42,7 @@ class BaseInclination(Effect):
     """
 
     mechanism: ClassVar[str] = "gravity"
+    element: ClassVar[str] = "base"
     name: ClassVar[str] = "base_inclination"
     least_shape: ClassVar[tuple[float, ...]] = (0.017,)  # [rad]
     prepares: ClassVar[bool] = True

@@ -40,6 +40,7 @@ class Payload(Effect):
     """
 
     mechanism: ClassVar[str] = "gravity"
+    element: ClassVar[str] = "load"
     name: ClassVar[str] = "payload"
     family: ClassVar[str] = "mechanics"
     variable: ClassVar[str] = "gravity and inertia alike"

@@ -96,6 +96,7 @@ class SupplySag(PortEffect):
     """
 
     mechanism: ClassVar[str] = "supply_curve"
+    element: ClassVar[str] = "supply"
     name: ClassVar[str] = "supply_sag"
     least_shape: ClassVar[tuple[float, ...]] = (0.2e6, 0.0, 0.0)  # [Pa] at the rated flow
     variable: ClassVar[str] = "the flow drawn from the supply"
@@ -149,6 +150,7 @@ class TankPressure(PortEffect):
     """
 
     mechanism: ClassVar[str] = "return_line"
+    element: ClassVar[str] = "tank"
     name: ClassVar[str] = "tank_pressure"
     least_shape: ClassVar[tuple[float, ...]] = (0.1e6, 0.0)  # [Pa]
     variable: ClassVar[str] = "the pressure left across the edge to the tank"
@@ -215,6 +217,7 @@ class ReturnLine(PortEffect):
 
     name: ClassVar[str] = "return_line"
     mechanism: ClassVar[str] = "return_line"
+    element: ClassVar[str] = "tank"
     least_shape: ClassVar[tuple[float, ...]] = (0.2e6,)  # [Pa] at the rated flow
     variable: ClassVar[str] = "the flow given back to the tank"
     confounders: ClassVar[tuple[str, ...]] = ("tank_pressure", "supply_sag")

@@ -34,6 +34,7 @@ class ValveEffect(Effect):
     """What the valve's effects share: one hydraulic joint, no linear unknown, spool as abscissa."""
 
     mechanism: ClassVar[str] = "metering_curve"
+    element: ClassVar[str] = "valve"
     hydraulic: ClassVar[bool] = True
     family: ClassVar[str] = "valve"
     alters: ClassVar[tuple[str, ...]] = ("fluid",)
@@ -174,6 +175,7 @@ class SpoolLag(ValveEffect):
     """
 
     mechanism: ClassVar[str] = "spool_dynamics"
+    element: ClassVar[str] = "valve"
     name: ClassVar[str] = "spool_lag"
     least_shape: ClassVar[tuple[float, ...]] = (1e-3,)  # [s]
     stage: ClassVar[int] = LAG
@@ -241,6 +243,7 @@ class SpoolHysteresis(ValveEffect):
     name: ClassVar[str] = "spool_hysteresis"
     least_shape: ClassVar[tuple[float, ...]] = (2e-3,)  # [V]
     mechanism: ClassVar[str] = "spool_dynamics"
+    element: ClassVar[str] = "valve"
     stage: ClassVar[int] = LAG
     variable: ClassVar[str] = "the sign of the spool's velocity"
     confounders: ClassVar[tuple[str, ...]] = ("spool_lag", "valve_deadband", "channel_delay")

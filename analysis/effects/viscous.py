@@ -38,6 +38,7 @@ class AsymmetricViscousFriction(Effect):
     """
 
     mechanism: ClassVar[str] = "friction_curve"
+    element: ClassVar[str] = "piston"
     name: ClassVar[str] = "asymmetric_viscous_friction"
     least: ClassVar[tuple[float, ...]] = (50.0, 0.0)  # [N s/m]
     family: ClassVar[str] = "friction"

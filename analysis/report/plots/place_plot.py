@@ -43,12 +43,7 @@ LETTERS: Final = {
     "cap sensor": "p", "rod sensor": "p", "piston sensor": "s", "spool sensor": "u",
     "position sensor": "q", "drive sensor": "i", "supply sensor": "p",
 }  # fmt: skip
-# What of a joint is marked for a mechanism that acts there; of the bench, for one that acts there.
-AT_JOINT: Final = {
-    "friction_curve": "piston", "disturbance": "joint", "position_force": "joint",
-    "metering_curve": "valve", "spool_dynamics": "valve", "leakage_curve": "piston",
-}  # fmt: skip
-AT_BENCH: Final = {"supply_curve": "supply", "return_line": "tank", "gravity": "base"}
+OF_BENCH: Final = ("base", "load", "supply", "tank")  # elements that there is one of
 
 
 def elements(rig: Rig) -> dict[str, Box]:
@@ -71,22 +66,18 @@ def elements(rig: Rig) -> dict[str, Box]:
 def marked(rig: Rig, name: str, where: str, parameters: Collection[str] = ()) -> tuple[str, ...]:
     """Return the elements at which an effect acts; `parameters` tell which sensor it means."""
     kind = known().get(name)
-    mechanism = kind.mechanism if kind is not None and issubclass(kind, Effect) else ""
+    element = kind.element if kind is not None and issubclass(kind, Effect) else "joint"
+    if element in OF_BENCH:
+        return (element,)
     words = where.split()
     joints = words[1:2] if words[0] == "joint" else [str(i + 1) for i in range(len(rig.joints))]
-    side = words[2] if len(words) > 2 else ""
-    if kind is not None and mechanism == "sensor":
+    if kind is not None and element == "sensor":
         return _sensors(rig, kind, where, joints, " ".join(parameters))
-    if name == "payload":
-        return ("load",)
-    if words[0] == "bench" and mechanism in AT_BENCH:
-        return (AT_BENCH[mechanism],)
-    if side in CHAMBERS:
-        return (f"{side} {joints[0]}",)
-    if words[0] == "bench" or name == "external_leakage":  # the oil of every chamber
+    if words[-1] in CHAMBERS:
+        return (f"{words[-1]} {joints[0]}",)
+    if element == "chamber":
         return tuple(f"{chamber} {i}" for i in joints for chamber in CHAMBERS)
-    element = "joint" if rig.electric else AT_JOINT.get(mechanism, "joint")
-    return (f"{element} {joints[0]}",)
+    return (f"{'joint' if rig.electric else element} {joints[0]}",)
 
 
 def _sensors(
