@@ -175,7 +175,9 @@ def measure(
             left = sum(seconds[later] for later in chosen[number:])
             about = f", about {clock_text(left)} left" if left else ""
             say(f"{name}: group {number + 1} of {len(chosen)}{about}")
-            figures += groups[name](Path(folder), say)
+            own = Path(folder) / name  # two groups may name their runs alike
+            own.mkdir()
+            figures += groups[name](own, say)
         return figures
 
 
