@@ -219,9 +219,10 @@ def _observe(body: _Lines, electric: Sequence[bool]) -> None:
             f"pin_a = geometry[{g + eq.PIN_A}]",
             f"pin_c = geometry[{g + eq.PIN_C}]",
             f"beta = x{Q}_{i} + geometry[{g + eq.OFFSET}]",
-            "length = math.sqrt("
-            "pin_a * pin_a + pin_c * pin_c - 2.0 * pin_a * pin_c * math.cos(beta))",
-            f"x{G}_{i} = pin_a * pin_c * math.sin(beta) / length",
+            "cosine = math.cos(beta)",
+            "length = math.sqrt(pin_a * pin_a + pin_c * pin_c - 2.0 * pin_a * pin_c * cosine)",
+            "sine = math.sqrt((1.0 - cosine) * (1.0 + cosine))",
+            f"x{G}_{i} = pin_a * pin_c * sine / length",
             f"x{S}_{i} = length - geometry[{g + eq.MID}]",
             f"x{SD}_{i} = x{G}_{i} * x{QD}_{i}",
             f"x{P_CAP}_{i} = y[{2 * N + i}]",
@@ -265,7 +266,7 @@ def _balance(body: _Lines, electric: Sequence[bool]) -> None:
 
 
 def _solve(body: _Lines, N: int) -> None:
-    """Write M q'' = torques by Cholesky, the rows of held joints replaced by their given q''."""
+    """Write M q'' = torques by L D L', the rows of held joints replaced by their given q''."""
     for i in range(N):
         body.add(f"if held{i}:")
         for j in range(N):
@@ -273,17 +274,15 @@ def _solve(body: _Lines, N: int) -> None:
             body.add(f"    M{j}_{i} = 0.0")
         body.add(f"    M{i}_{i} = 1.0", f"    out{TORQUE}_{i} = qdd{i}")
     for i in range(N):
-        for j in range(i + 1):
-            total = f"M{i}_{j}" + "".join(f" - M{i}_{k} * M{j}_{k}" for k in range(j))
-            body.add(f"total = {total}")
-            if i > j:
-                body.add(f"M{i}_{j} = total / M{j}_{j}")
-            else:
-                body.add("if not total > 0.0:", f"    return {eq.BAD_INERTIA}")
-                body.add(f"M{i}_{i} = math.sqrt(total)")
+        for j in range(i):
+            total = f"M{i}_{j}" + "".join(f" - v{k} * L{j}_{k}" for k in range(j))
+            body.add(f"v{j} = {total}", f"L{i}_{j} = v{j} * inverse{j}")
+        body.add(f"pivot = M{i}_{i}" + "".join(f" - v{k} * L{i}_{k}" for k in range(i)))
+        body.add("if not pivot > 0.0:", f"    return {eq.BAD_INERTIA}")
+        body.add(f"inverse{i} = 1.0 / pivot")
     for i in range(N):
-        total = f"out{TORQUE}_{i}" + "".join(f" - M{i}_{k} * qdd{k}" for k in range(i))
-        body.add(f"qdd{i} = ({total}) / M{i}_{i}")
+        total = f"out{TORQUE}_{i}" + "".join(f" - L{i}_{k} * qdd{k}" for k in range(i))
+        body.add(f"qdd{i} = {total}")
     for i in range(N - 1, -1, -1):
-        total = f"qdd{i}" + "".join(f" - M{k}_{i} * qdd{k}" for k in range(i + 1, N))
-        body.add(f"qdd{i} = ({total}) / M{i}_{i}")
+        total = f"qdd{i} * inverse{i}" + "".join(f" - L{k}_{i} * qdd{k}" for k in range(i + 1, N))
+        body.add(f"qdd{i} = {total}")

@@ -34,6 +34,7 @@ from analysis.simulation.equations import (
     PIN_C,
     RATES_SIGNATURE,
     STROKE,
+    sine_in_triangle,
 )
 from analysis.terms.base import (
     COMP_CAP,
@@ -102,8 +103,9 @@ def _observe(t, y, inputs, rate, locked, geometry, bench, x, q_dd):  # type: ign
         x[THETA, i] = angle
         a, c = geometry[i, PIN_A], geometry[i, PIN_C]
         beta = x[Q, i] + geometry[i, OFFSET]
-        length = math.sqrt(a * a + c * c - 2.0 * a * c * math.cos(beta))
-        x[G, i] = a * c * math.sin(beta) / length
+        cosine = math.cos(beta)
+        length = math.sqrt(a * a + c * c - 2.0 * a * c * cosine)
+        x[G, i] = a * c * sine_in_triangle(cosine) / length
         x[S, i] = length - geometry[i, MID]
         x[SD, i] = x[G, i] * x[QD, i]
         x[P_CAP, i] = y[2 * N + i]
@@ -130,29 +132,31 @@ def _impose(M, load, locked, q_dd):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy")
 def _accelerate(M, load, q_dd):  # type: ignore[no-untyped-def]
-    """Solve M q'' = load by Cholesky, M becoming its factor; False where M is not > 0."""
+    """Solve M q'' = load by M = L D L'; False where M is not > 0.
+
+    M then holds L below its diagonal, 1 / D on it, and D L' above.
+    """
     N = len(load)
     for i in range(N):
-        for j in range(i + 1):
+        pivot = M[i, i]
+        for j in range(i):
             total = M[i, j]
             for k in range(j):
-                total -= M[i, k] * M[j, k]
-            if i > j:
-                M[i, j] = total / M[j, j]
-            elif total > 0.0:
-                M[i, i] = math.sqrt(total)
-            else:
-                return False
+                total -= M[k, i] * M[j, k]
+            M[j, i], M[i, j] = total, total * M[j, j]
+        for j in range(i):
+            pivot -= M[j, i] * M[i, j]
+        if not pivot > 0.0:
+            return False
+        M[i, i] = 1.0 / pivot
     for i in range(N):
-        total = load[i]
+        q_dd[i] = load[i]
         for k in range(i):
-            total -= M[i, k] * q_dd[k]
-        q_dd[i] = total / M[i, i]
+            q_dd[i] -= M[i, k] * q_dd[k]
     for i in range(N - 1, -1, -1):
-        total = q_dd[i]
+        q_dd[i] *= M[i, i]
         for k in range(i + 1, N):
-            total -= M[k, i] * q_dd[k]
-        q_dd[i] = total / M[i, i]
+            q_dd[i] -= M[k, i] * q_dd[k]
     return True
 
 
