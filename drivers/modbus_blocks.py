@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drivers.base import DeviceError, DeviceLost, SampleBlock
 from rig.model import channels as ch
@@ -14,7 +16,11 @@ from rig.model.wire.registers import BlockHeader, Status
 
 logger = logging.getLogger(__name__)
 
+Flags = NDArray[np.bool_]
+Codes = NDArray[np.uint16]
+
 _ONE = np.uint16(1)
+_TRIPPED: Final = int(Status.TRIPPED)  # an operation on a flag takes as long as one on an array
 LATE = 16  # blocks back that a late answer may be of
 
 
@@ -29,20 +35,22 @@ class BlockDecoder:
 
     def __init__(self, rig: Rig) -> None:
         self.layout = reg.block_layout(len(rig.channels), len(rig.joints))
+        self._shape = self.layout.samples, self.layout.columns
         sensors = [rig.sensors.of(ch.kind_of(name)[0]) for name in rig.channels]
         self._names = rig.recorded
         low = np.array([sensor.range[0] for sensor in sensors])
         high = np.array([sensor.range[1] for sensor in sensors])
-        self._top = np.array([(1 << sensor.bits) - 1 for sensor in sensors])
-        self._almost_top = (self._top - 1).astype(np.uint16)
-        self._narrow = bool((self._top < 0xFFFF).any())  # a wider code has no register to be in
-        step = (high - low) / self._top
-        most = [(1 << (j.valve.command_bits - 1)) - 1 for j in rig.joints]
-        self._most = np.array(most, dtype=np.int16)
-        self._span = 2 * self._most.astype(np.uint16)
-        volt = np.array([j.valve.command_range for j in rig.joints]) / np.array(most)
+        top = np.array([(1 << sensor.bits) - 1 for sensor in sensors])
+        step = (high - low) / top
+        most = np.array([(1 << (j.valve.command_bits - 1)) - 1 for j in rig.joints])
+        volt = np.array([j.valve.command_range for j in rig.joints]) / most
+        # An output's code counts from -most; with `most` added all codes count from 0. One below
+        # -most becomes one of the largest, so that a single comparison finds every impossible code.
+        self._shift = np.concatenate([np.zeros(len(top)), most]).astype(np.uint16)
+        self._span = np.concatenate([top, 2 * most]).astype(np.uint16)
+        self._almost_top = (top - 1).astype(np.uint16)
         self._scale = np.concatenate([step, volt])
-        self._offset = np.concatenate([low, np.zeros(len(volt))])
+        self._offset = np.concatenate([low, -(most * volt)])
         self._sequence: int | None = None
         self.tick = 0  # of the sample expected next
 
@@ -78,25 +86,21 @@ class BlockDecoder:
     def decode_samples(self, header: BlockHeader, samples: bytes) -> SampleBlock:
         """Return the block in SI; raises DeviceError if it is impossible after the last one."""
         sequence, tick = self._follow(header)
-        codes, outputs = reg.unpack_samples(samples, self.layout)
-        if self._narrow:
-            self._possible(codes > self._top, codes, 0)
-        # |output| > most, by one comparison: below -most the sum wraps to the largest codes.
-        shifted = (outputs + self._most).view(np.uint16)
-        self._possible(shifted > self._span, outputs, codes.shape[1])
-        data = np.empty((self.layout.samples, self.layout.columns))
-        data[:, : self.layout.channels] = codes
-        data[:, self.layout.channels :] = outputs
-        data *= self._scale  # whole rows: a third of the time of both parts by themselves
+        codes = np.frombuffer(samples, ">u2").reshape(self._shape) + self._shift
+        impossible = codes > self._span
+        if np.count_nonzero(impossible):
+            raise self._impossible(impossible, codes)
+        data = codes * self._scale
         data += self._offset
+        ends = codes[:, : self.layout.channels] - _ONE >= self._almost_top  # 0 wraps to the top
         self._sequence, self.tick = sequence, tick + self.layout.samples
         return SampleBlock(
             sequence=sequence,
             tick=tick,
             data=data,
-            saturated=codes - _ONE >= self._almost_top,  # 0 wraps to the largest code
+            saturated=ends,
             backlog=header.backlog,
-            tripped=bool(header.status & Status.TRIPPED),
+            tripped=bool(header.status & _TRIPPED),
         )
 
     def _follow(self, header: BlockHeader) -> tuple[int, int]:
@@ -115,12 +119,12 @@ class BlockDecoder:
             logger.warning("the device dropped %d blocks before sample %d", lost, tick)
         return last + 1 + lost, tick
 
-    def _possible(
-        self, wrong: np.ndarray[tuple[int, ...], np.dtype[np.bool_]], codes: object, first: int
-    ) -> None:
-        if np.count_nonzero(wrong):
-            row, column = np.argwhere(wrong)[0]
-            raise DeviceError(
-                f"impossible block: channel {self._names[first + column]} has the converter code "
-                f"{np.asarray(codes)[row, column]}, more than its bits can hold"
-            )
+    def _impossible(self, marks: Flags, codes: Codes) -> DeviceError:
+        """Return the error of the first code that is marked."""
+        row, column = np.argwhere(marks)[0]
+        code = codes[row, column] - self._shift[column]
+        signed = code if column < self.layout.channels else code.view(np.int16)
+        return DeviceError(
+            f"impossible block: channel {self._names[column]} has the converter code {signed}, "
+            "more than its bits can hold"
+        )

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import astuple
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
 from urllib.parse import SplitResult
 
 import numpy as np
@@ -42,6 +42,11 @@ from rig.model.wire import registers as reg
 from rig.model.wire.registers import Refusal, Status
 
 logger = logging.getLogger(__name__)
+
+_RETRY: Final = 0.1  # of a block's length, until a block that was not there is asked for again
+_EARLIER: Final = 0.02  # of a block's length, by which each block is asked for earlier
+_BLOCK: Final = int(Status.BLOCK)
+_STREAMING: Final = int(Status.STREAMING)
 
 
 class TcpSettings(WireSettings):
@@ -77,7 +82,7 @@ class ModbusTcpDriver:
         self._layout = reg.block_layout(len(rig.channels), len(rig.joints))
         self._decoder = BlockDecoder(rig)
         self._heartbeat = 0
-        self._arrived: float | None = None
+        self._due: float | None = None  # when the next block can be there [s], by time.monotonic
         self.info: DeviceInfo | None = None
 
     @staticmethod
@@ -192,7 +197,7 @@ class ModbusTcpDriver:
         """Start streaming blocks, sequence and waveform phase anew."""
         self._command(reg.CONTROL_STREAM, reg.STREAM_START)
         self._decoder.restart()
-        self._arrived = None
+        self._due = None
 
     def stop(self) -> None:
         """Stop streaming."""
@@ -209,18 +214,22 @@ class ModbusTcpDriver:
     def read_block(self) -> SampleBlock:
         """Return the next block, waiting for it; also feeds the device's watchdog."""
         period = self._layout.samples / self._rig.sample_rate
-        deadline = time.monotonic() + period + self._wire.timeout
+        now = time.monotonic()
+        if self._due is not None and now < self._due:
+            self._sleep(self._due - now)
+        deadline = now + period + self._wire.timeout
+        at_once = True
         while True:
             answer = self._exchange()
             header = reg.unpack_header(answer)
-            if header.status & Status.BLOCK and self._decoder.seen(header):
+            if header.status & _BLOCK and self._decoder.seen(header):
                 # The device offers no block again that it knows to have arrived: a late answer.
                 logger.warning("block %d came a second time; asking again", header.sequence)
                 self._link.settle()
-            elif header.status & Status.BLOCK:
-                self._arrived = time.monotonic()
+            elif header.status & _BLOCK:
+                self._due = self._next_due(header.backlog, period, at_once=at_once)
                 return self._decoder.decode(header, answer)
-            elif not header.status & Status.STREAMING:
+            elif not header.status & _STREAMING:
                 self._decoder.refuse_restarted(header.tick)
                 raise DeviceError(
                     f"the device at {self._link.where} does not stream "
@@ -232,11 +241,25 @@ class ModbusTcpDriver:
                     f"the device at {self._link.where} answers, but has measured nothing for "
                     f"{self._wire.timeout:g} s"
                 )
-            # Asking is work for both ends: sleep to just before the block is due, then ask often.
-            due = now if self._arrived is None else self._arrived + 0.85 * period
-            self._sleep(max(due - now, 0.1 * period))
+            at_once = False
+            self._sleep(_RETRY * period)
 
     # -- inside -----------------------------------------------------------------------------
+
+    def _next_due(self, backlog: int, period: float, *, at_once: bool) -> float | None:
+        """Return when the next block can be there [s, monotonic], None where it is by now.
+
+        Asking is work for both ends. A block that was there when first asked for may have waited:
+        the next is asked for a little earlier, so that the host finds the device's clock and
+        follows it.
+        """
+        if backlog or (self.info is not None and self.info.virtual_time):
+            return None
+        if not at_once:
+            return time.monotonic() + (1.0 - _EARLIER) * period
+        if self._due is None:  # it may have waited for almost a period
+            return time.monotonic() + _RETRY * period
+        return self._due + (1.0 - _EARLIER) * period
 
     def _exchange(self) -> bytes:
         # Asked again early enough for a lost answer to trip neither watchdog.

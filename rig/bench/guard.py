@@ -76,8 +76,10 @@ class Guard:
         self._rates = rates(rig)
         self._frozen = tuple(Frozen(rig, j) for j in range(len(rig.joints)))
         self._window = max(2, round(self.settings.frozen_after * rig.sample_rate))
-        self._keep = max((rate.window for rate in self._rates), default=0)
-        self._keep = max(self._keep, self._window)
+        self._rate_window = max((rate.window for rate in self._rates), default=0)
+        bounds = [rate.bounds for rate in self._rates] or [np.full(len(rig.recorded), math.inf)]
+        self._steady = rig.alarms.warning_share * np.minimum.reduce(bounds)
+        self._keep = max(self._rate_window, self._window)
         self._saturation = Saturation(rig, self.settings)
         self._plausibility = Plausibility(rig, self.settings)
         warning, trip = bands.delays(rig, self.settings)
@@ -161,18 +163,17 @@ class Guard:
         """
         data = block.data
         last = block.tick + len(data) - 1
-        least, most = np.minimum.reduce(data, axis=0), np.maximum.reduce(data, axis=0)
+        joined = np.concatenate((self._tail, data))
+        recent = joined[-(len(data) + self._rate_window) :]
+        least, most = np.minimum.reduce(recent, axis=0), np.maximum.reduce(recent, axis=0)
         calm = self._tightest.contain(least, most)  # as almost every block is
         trips = [self._band_trip(block, calm)]
-        joined = np.concatenate((self._tail, data))
         self._unbroken = min(self._unbroken, len(self._tail)) + len(data)
-        rows, first = joined[-self._unbroken :], last + 1 - self._unbroken
-        share = self.rig.alarms.warning_share
         with np.errstate(invalid="ignore"):  # inf - inf: the check of bands names it
-            for rate in self._rates:
-                trip, near = rate.find(self.rig, rows, first, len(data), share)
-                trips.append(trip)
-                self._standing.see(near, last)
+            # No difference of two samples is larger than that of the largest and the smallest.
+            steady = np.count_nonzero(most - least <= self._steady) == len(self._steady)
+            if not steady:
+                trips += self._rate_trips(joined[-self._unbroken :], len(data), last)
         measured = data[:, : block.saturated.shape[1]]
         trips.append(self._saturation.find(block.saturated, measured, block.tick))
         trips += self._act(self._frozen_sensors(joined[-self._window :], last), last)
@@ -182,6 +183,16 @@ class Guard:
         self._tail = joined[-self._keep :]
         violations = [violation for violation in trips if violation is not None]
         return min(violations, key=lambda violation: violation.tick, default=None)
+
+    def _rate_trips(self, rows: Array, new: int, last: int) -> list[Violation | None]:
+        """Return what trips by its rate in the last `new` of rows that end at tick `last`."""
+        trips = []
+        for rate in self._rates:
+            first = last + 1 - len(rows)
+            trip, near = rate.find(self.rig, rows, first, new, self.rig.alarms.warning_share)
+            trips.append(trip)
+            self._standing.see(near, last)
+        return trips
 
     def _act(self, found: Sequence[Violation], last: int) -> list[Violation]:
         """Do with each finding what the rig file wants; returns those that trip."""

@@ -10,7 +10,6 @@ import struct
 import zlib
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
-from functools import cache
 from typing import Final
 
 import numpy as np
@@ -183,7 +182,7 @@ class BlockHeader:
 
     sequence: int
     tick: int
-    status: Status
+    status: int  # bits of `Status`
     backlog: int
 
 
@@ -204,12 +203,7 @@ def pack_header(header: BlockHeader) -> bytes:
 def unpack_header(data: bytes) -> BlockHeader:
     """Read a header from the first ten bytes; raises struct.error when there are fewer."""
     sequence, tick, status, backlog = _HEADER.unpack_from(data)
-    return BlockHeader(sequence, tick, _status(status), backlog)
-
-
-@cache
-def _status(bits: int) -> Status:
-    return Status(bits)  # a flag takes longer to make than all the rest of a header
+    return BlockHeader(sequence, tick, status, backlog)
 
 
 def pack_samples(measured: ArrayLike, commands: ArrayLike) -> bytes:
