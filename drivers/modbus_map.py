@@ -210,11 +210,11 @@ def _point(key: str, name: str, entry: _Number, function: int, unit: str) -> Poi
 
 def _refuse_overlap(table: str, points: Sequence[Point]) -> None:
     ordered = sorted(points, key=lambda p: (p.function, p.address))
-    for one, other in pairwise(ordered):
-        if one.function == other.function and other.address < one.end:
+    for point, other in pairwise(ordered):
+        if point.function == other.function and other.address < point.end:
             raise InputError(
                 f"wire: {table}.{other.name}.address: register {other.address} belongs to "
-                f"{table}.{one.name} ({one.form} at {one.address}) as well"
+                f"{table}.{point.name} ({point.form} at {point.address}) as well"
             )
 
 
@@ -316,7 +316,7 @@ class MappedModule:
     def __init__(
         self,
         settings: MapSettings,
-        found: RegisterMap,
+        registers: RegisterMap,
         ranges: Sequence[tuple[float, float]],
         timeout: float,
     ) -> None:
@@ -325,9 +325,9 @@ class MappedModule:
         self._unit = settings.unit
         self._ranges = ranges
         self._who = f"I/O module at {settings.host}:{settings.port}, unit {settings.unit}"
-        self._map = found
-        self._reads = spans(found.inputs)
-        self._writes = spans(found.outputs, MAX_WRITE)
+        self._map = registers
+        self._reads = spans(registers.inputs)
+        self._writes = spans(registers.outputs, MAX_WRITE)
 
     @property
     def watchdog(self) -> float | None:
@@ -354,15 +354,15 @@ class MappedModule:
 
     def doubts(self) -> dict[str, str]:
         """Read once; return the channels that another word order alone makes plausible."""
-        found = {}
+        reasons = {}
         for index, point, data in self._registers():
             other = replace(point, order=_OTHER[point.order])
             low, high = self._ranges[index]
             if not _plausible(point, data, low, high) and _plausible(other, data, low, high):
-                found[point.name] = (
+                reasons[point.name] = (
                     f"word order? {other.value(data):.5g} with {_KEY}: {other.order}"
                 )
-        return found
+        return reasons
 
     def _registers(self) -> Iterator[tuple[int, Point, bytes]]:
         """Yield (place among the inputs, point, its registers' bytes)."""

@@ -114,10 +114,10 @@ def wiring(settings: CardSettings, rig: Rig) -> Wiring:
             raise InputError(
                 f"wire: {used[place]}.channel: {name} is that of {used[names.index(name)]} as well"
             )
-    found = zip(keys, entries, units, strict=True)
+    wired = zip(keys, entries, units, strict=True)
     values = [
         (scale_of(e.scale, unit, f"{k}.scale", "/V"), offset_of(e.offset, unit, f"{k}.offset"))
-        for k, e, unit in found
+        for k, e, unit in wired
     ]
     scales, offsets = np.array(values).T
     return Wiring(
@@ -149,9 +149,9 @@ def _package() -> ModuleType:
 class NidaqmxCard:
     """`drivers.polled.InputsOutputs` over one task of inputs, one of outputs and a watchdog."""
 
-    def __init__(self, found: Wiring, timeout: float) -> None:
+    def __init__(self, lines: Wiring, timeout: float) -> None:
         self._daq = _package()
-        self._wiring, self._timeout = found, timeout
+        self._wiring, self._timeout = lines, timeout
         self._tasks: list[Any] = []
 
     @property
@@ -163,19 +163,19 @@ class NidaqmxCard:
     def open(self) -> str:
         """Make and start the tasks; return the names of the cards."""
         self.close()
-        found = self._wiring
+        wiring = self._wiring
         with self._failing_as_lost(), ExitStack() as undo:
             undo.callback(self.close)
             reading, writing = self._task(), self._task()
-            for channel, volts in zip(found.inputs, found.ranges, strict=True):
+            for channel, volts in zip(wiring.inputs, wiring.ranges, strict=True):
                 reading.ai_channels.add_ai_voltage_chan(channel, min_val=-volts, max_val=volts)
-            for channel, volts in zip(found.outputs, found.output_ranges, strict=True):
+            for channel, volts in zip(wiring.outputs, wiring.output_ranges, strict=True):
                 writing.ao_channels.add_ao_voltage_chan(channel, min_val=-volts, max_val=volts)
             reading.start()
-            if found.watchdog is not None:
-                self._start_watchdog(found.watchdog)
+            if wiring.watchdog is not None:
+                self._start_watchdog(wiring.watchdog)
             undo.pop_all()
-        cards = sorted({name.split("/")[0] for name in (*found.inputs, *found.outputs)})
+        cards = sorted({name.split("/")[0] for name in (*wiring.inputs, *wiring.outputs)})
         return f"DAQ card {' '.join(cards)}"
 
     def read(self) -> Array:

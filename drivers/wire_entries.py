@@ -55,11 +55,11 @@ def outputs_by_joint(model: type[Entry], raw: Mapping[int, Any], rig: Rig) -> tu
     return tuple(read_entry(model, raw[i], f"outputs.{i}") for i in joints)
 
 
-def _complete(table: str, found: Sequence[str], wanted: Sequence[str], about: str) -> None:
-    for name in found:
+def _complete(table: str, given: Sequence[str], wanted: Sequence[str], about: str) -> None:
+    for name in given:
         if name not in wanted:
             raise InputError(f"wire: {table}.{name}: unknown; {about}: {' '.join(wanted)}")
-    missing = [name for name in wanted if name not in found]
+    missing = [name for name in wanted if name not in given]
     if missing:
         raise InputError(f"wire: {table}: nothing stands for: {' '.join(missing)}")
 

@@ -69,10 +69,10 @@ class Plot:
 
 def record(run: Run, name: str) -> Record:
     """Return the record of a run by its name, as `step1_r2`; raises InputError naming those."""
-    for one in run.records:
-        if one.name == name:
-            return one
-    known = " ".join(one.name for one in run.records)
+    for candidate in run.records:
+        if candidate.name == name:
+            return candidate
+    known = " ".join(candidate.name for candidate in run.records)
     raise InputError(f"{run.source or 'the run'}: has no record {name!r}; it has: {known}")
 
 
@@ -92,25 +92,25 @@ def frame(run: Run, name: str) -> DataFrame:
         import pandas  # noqa: PLC0415 - wanted on request alone
     except ImportError as error:
         raise InputError("a table needs pandas: pip install 'bramah[export]'") from error
-    one = record(run, name)
-    index = pandas.Index(one.start + one.time, name="time")
-    made = pandas.DataFrame(dict(one.channels), index=index)
-    made.attrs = {"units": units(run), **one.attributes}
+    taken = record(run, name)
+    index = pandas.Index(taken.start + taken.time, name="time")
+    made = pandas.DataFrame(dict(taken.channels), index=index)
+    made.attrs = {"units": units(run), **taken.attributes}
     return made
 
 
 def plot(run: Run, name: str, channels: Sequence[str] | None = None) -> Plot:
     """Draw channels of a record over its time, a panel each; all of them by default."""
-    one = record(run, name)
-    chosen = list(channels or one.channels)
-    unknown = [channel for channel in chosen if channel not in one.channels]
+    taken = record(run, name)
+    chosen = list(channels or taken.channels)
+    unknown = [channel for channel in chosen if channel not in taken.channels]
     if unknown:
-        known = " ".join(one.channels)
+        known = " ".join(taken.channels)
         raise InputError(f"record {name!r} has no channel {unknown[0]!r}; it has: {known}")
     series = {
-        f"{channel} [{run.rig.unit_of(channel)}]": [one.channels[channel]] for channel in chosen
+        f"{channel} [{run.rig.unit_of(channel)}]": [taken.channels[channel]] for channel in chosen
     }
-    return _panels(one.time, series, name)
+    return _panels(taken.time, series, name)
 
 
 def plot_validation(result: RecordValidation) -> Plot:
@@ -145,20 +145,20 @@ def changed(protocol: Protocol, step: str, changes: Mapping[str, Any]) -> Protoc
     `changes` maps keys of the step, as error messages write them, to values with units:
     ``{"repeats": 2, "excite.0.signal.amplitude": "0.6 V"}``. Raises InputError naming step and key.
     """
-    names = [one.name for one in every_step(protocol.steps) if one.name]
+    names = [part.name for part in every_step(protocol.steps) if part.name]
     if step not in names:
         raise InputError(
             f"protocol {protocol.name!r} has no step {step!r}; it has: {' '.join(names)}"
         )
 
-    def change(one: StepKind) -> StepKind:
-        if one.name != step:
-            return one
-        data = one.model_dump()
+    def change(part: StepKind) -> StepKind:
+        if part.name != step:
+            return part
+        data = part.model_dump()
         for path, value in changes.items():
             _put(data, path, value, step)
         try:
-            return type(one).model_validate(data)
+            return type(part).model_validate(data)
         except ValidationError as error:
             problem = error.errors()[0]
             where = ".".join(map(str, problem["loc"]))

@@ -105,9 +105,9 @@ def lateness_cost(
     shifts, lost = [], []
     for _ in range(DESIGN.late_draws):
         late = {play.step.name: taken_late(play.record, jitter, rng) for play in played}
-        found = _bulk(rig, played, terms, filtering, late)
-        if found is not None:
-            shifts.append(found / even - 1.0)
+        bulk = _bulk(rig, played, terms, filtering, late)
+        if bulk is not None:
+            shifts.append(bulk / even - 1.0)
         first = rig.channels[0]
         lost += [float(np.isnan(record.channels[first]).mean()) for record in late.values()]
     share = float(np.mean(lost))

@@ -84,8 +84,8 @@ class Evidence:
 
     def of_joint(self, joint: int, values: Callable[[Signals], Array]) -> Array:
         """Return values (n,) of all records in which a joint moves."""
-        found = [values(s) for s in self.signals if s.moving is None or s.moving[joint]]
-        return np.concatenate(found) if found else np.zeros(0)
+        parts = [values(s) for s in self.signals if s.moving is None or s.moving[joint]]
+        return np.concatenate(parts) if parts else np.zeros(0)
 
 
 @dataclass(frozen=True)

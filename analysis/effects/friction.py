@@ -300,8 +300,8 @@ class StribeckFriction(Friction):
         force, level = values[name], values.get(f"Fc{self.joint + 1}", 0.0)
         if 0.0 < force < BREAKAWAY * level:
             return f"{name} = {force:.3g} N is {force / level:.1%} of the sliding level"
-        found = beyond(name, force, "N", force_limit(rig, self.joint))
-        return found or Effect.outside(self, rig, shape[:1])
+        too_large = beyond(name, force, "N", force_limit(rig, self.joint))
+        return too_large or Effect.outside(self, rig, shape[:1])
 
 
 @kernel

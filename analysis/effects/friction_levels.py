@@ -111,9 +111,9 @@ class AsymmetricFriction(Friction):
         levels = [values[name] for name in self._names()]
         mean = 0.5 * sum(levels)
         for name, level in zip(self._names(), levels, strict=True):
-            found = beyond(name, level, "N", limit, -DIFFERENCE * abs(mean))
-            if found:
-                return found
+            too_large = beyond(name, level, "N", limit, -DIFFERENCE * abs(mean))
+            if too_large:
+                return too_large
         if self.simpler(rig, values):
             return "the two directions differ by less than a tenth: this is coulomb_friction"
         return ""

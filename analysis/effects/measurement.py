@@ -97,8 +97,8 @@ class Sensor(Effect):
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Undo the distortion in the channel's signal and all that is made of it."""
         if self.shared:
-            for one in self.each(rig):
-                signals = one.prepare(rig, signals, self.shape_of(rig, shape))
+            for channel in self.each(rig):
+                signals = channel.prepare(rig, signals, self.shape_of(rig, shape))
             return signals
         value = self.shape_of(rig, shape)[0]
         if self.where == "bench":
@@ -146,8 +146,8 @@ class Sensor(Effect):
     ) -> dict[str, Array]:
         """Return the channels as a right sensor would have sampled them, each (n,)."""
         out = dict(channels)
-        for one in self.each(rig) if self.shared else ():
-            out = one.correct(rig, out, rate, self.shape_of(rig, shape))
+        for channel in self.each(rig) if self.shared else ():
+            out = channel.correct(rig, out, rate, self.shape_of(rig, shape))
         if self.channel in out:
             value = self.shape_of(rig, shape)[0]
             out[self.channel] = self.undone(out[self.channel], 0, rate, value)
@@ -160,8 +160,8 @@ class Sensor(Effect):
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return the channel, in the rows where it stands first."""
         if self.shared:
-            found = [one.abscissa(rig, signals) for one in self.each(rig)]
-            return {name: x for one in found for name, x in one.items()}
+            parts = [channel.abscissa(rig, signals) for channel in self.each(rig)]
+            return {name: x for channel in parts for name, x in channel.items()}
         if self.where == "bench":
             kinds = ("flow_cap", "flow_rod")
             joints = range(signals.joints)

@@ -190,7 +190,7 @@ def leak_down(rig: Rig, records: Sequence[Record | RecordHead]) -> list[Check]:
     ]
     if not creeps:
         return []
-    speed, creep, joint, head = max(creeps, key=lambda one: one[0])
+    speed, creep, joint, head = max(creeps, key=lambda entry: entry[0])
     seconds = head.samples / head.sample_rate
     ok = speed < IDENTIFY.most_creep
     why = "" if ok else "; oil passes the piston, leaves the joint, or passes a valve at rest"

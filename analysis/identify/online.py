@@ -249,7 +249,7 @@ class Tracker:
         if families is None:  # what needs nothing of the locked joints, where there is such
             families = rig.families[-1:]
         self._rig, self._filtering, self._families = rig, filtering, tuple(families)
-        self._terms = tuple(one for one in used if self._concerns(one))
+        self._terms = tuple(term for term in used if self._concerns(term))
         names = {family: parameters_of(rig, self._terms, family) for family in families}
         self._kept = {family: _Filter(every, memory) for family, every in names.items()}
         self._running = self._kept
@@ -282,8 +282,8 @@ class Tracker:
         """End the record and keep its rows."""
         if self._feed is not None:
             self._fold(self._feed.finish())
-            for one in self._running.values():
-                one.condense()
+            for solution in self._running.values():
+                solution.condense()
         self._kept, self._feed = self._running, None
 
     def discard(self) -> None:
@@ -313,8 +313,8 @@ class Tracker:
 
     def residuals(self) -> dict[str, OnlineResidual]:
         """Return, by family of rows, what the estimates left of the newest chunk before it came."""
-        found = {family: one.residual for family, one in self._running.items()}
-        return {family: left for family, left in found.items() if left is not None}
+        by_family = {family: solution.residual for family, solution in self._running.items()}
+        return {family: left for family, left in by_family.items() if left is not None}
 
 
 def track(tracker: Tracker, record: Record, block: int = 10) -> None:

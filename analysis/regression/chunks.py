@@ -90,10 +90,10 @@ def stretch_rows(
     rate = part.sample_rate
     within = ((own[0] - offset - 0.5) / rate, (own[1] - offset - 0.5) / rate)
     signals = condition(rig, part, filtering.channels, locks.moving, locks.held)
-    found = record_rows(rig, terms, signals, filtering, families, within)
+    stretch = record_rows(rig, terms, signals, filtering, families, within)
     if offset == 0:
-        return found
-    return {name: replace(rows, time=rows.time + offset / rate) for name, rows in found.items()}
+        return stretch
+    return {name: replace(rows, time=rows.time + offset / rate) for name, rows in stretch.items()}
 
 
 def source_rows(

@@ -55,8 +55,8 @@ def predicted_rows(
     moving = np.array([i + 1 not in locked for i in range(len(rig.joints))])
     rows = record_rows(ideal, used, condition(ideal, record, filters.channels, moving), filters)
     stacked: dict[str, list[Array]] = {}
-    for name, one in rows.items():
-        stacked.setdefault(family_of(name), []).append(one.matrix)
+    for name, part in rows.items():
+        stacked.setdefault(family_of(name), []).append(part.matrix)
     return {family: square(np.vstack(parts)) for family, parts in stacked.items()}
 
 

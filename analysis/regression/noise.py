@@ -66,7 +66,7 @@ def record_moments(
     return out
 
 
-def _difference(one: Rows, other: Rows) -> Array:
+def _difference(rows: Rows, other: Rows) -> Array:
     """Return the change of [X y] in the rows that both kept."""
-    _, a, b = np.intersect1d(one.time, other.time, return_indices=True)
-    return np.column_stack((other.matrix[b] - one.matrix[a], other.rhs[b] - one.rhs[a]))
+    _, a, b = np.intersect1d(rows.time, other.time, return_indices=True)
+    return np.column_stack((other.matrix[b] - rows.matrix[a], other.rhs[b] - rows.rhs[a]))

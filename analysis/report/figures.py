@@ -103,23 +103,23 @@ EQUATIONS = {
 }
 
 
-def residuals(found: Sequence[Residual]) -> Gallery:
+def residuals(all_residuals: Sequence[Residual]) -> Gallery:
     """Return one figure per step and equation."""
     return Gallery(
         tuple(
             ReportFigure(
-                record_plots.residual(one, f"res{n}"),
-                f"{one.step}, joint {one.joint}: {equation_text(one)}",
+                record_plots.residual(residual, f"res{n}"),
+                f"{residual.step}, joint {residual.joint}: {equation_text(residual)}",
             )
-            for n, one in enumerate(found[:MOST])
+            for n, residual in enumerate(all_residuals[:MOST])
         ),
-        max(0, len(found) - MOST),
+        max(0, len(all_residuals) - MOST),
     )
 
 
-def equation_text(found: Residual) -> str:
+def equation_text(residual: Residual) -> str:
     """Say in words which equation a residual belongs to."""
-    return EQUATIONS[found.equation.rsplit("_", 1)[0]]
+    return EQUATIONS[residual.equation.rsplit("_", 1)[0]]
 
 
 def comparisons(rig: Rig, validation: Sequence[RecordValidation], runs: Sequence[Run]) -> Gallery:
@@ -174,29 +174,38 @@ class ResidualRow:
     masked: str
 
 
-def residual_rows(found: Sequence[Residual]) -> list[ResidualRow]:
+def residual_rows(residuals: Sequence[Residual]) -> list[ResidualRow]:
     """Return the residual table, ready to be read."""
     out = []
-    for one in found:
-        unit = fm.display_unit(one.unit)
-        share = 100 * one.rms / one.rms_side if one.rms_side else float("nan")
-        scatter = one.scatter if one.repeats > 1 else float("nan")
-        repeatable = one.repeatable if one.repeats > 1 else float("nan")
+    for residual in residuals:
+        unit = fm.display_unit(residual.unit)
+        share = 100 * residual.rms / residual.rms_side if residual.rms_side else float("nan")
+        scatter = residual.scatter if residual.repeats > 1 else float("nan")
+        repeatable = residual.repeatable if residual.repeats > 1 else float("nan")
         out.append(
             ResidualRow(
-                one.step, one.joint, equation_text(one), unit.text,
-                fm.significant(unit.scale * one.rms_side), fm.significant(unit.scale * one.rms),
+                residual.step, residual.joint, equation_text(residual), unit.text,
+                fm.significant(unit.scale * residual.rms_side),
+                fm.significant(unit.scale * residual.rms),
                 fm.percent(share), fm.significant(unit.scale * repeatable),
-                fm.significant(unit.scale * scatter), str(one.rows),
-                fm.percent(100 * one.masked / max(one.rows + one.masked, 1)) if one.masked else "0",
+                fm.significant(unit.scale * scatter), str(residual.rows),
+                _masked_share(residual),
             )
         )  # fmt: skip
     return out
 
 
-def largest_share(found: Sequence[Residual]) -> str:
+def _masked_share(residual: Residual) -> str:
+    if not residual.masked:
+        return "0"
+    return fm.percent(100 * residual.masked / (residual.rows + residual.masked))
+
+
+def largest_share(residuals: Sequence[Residual]) -> str:
     """Return the largest residual relative to its measured side, in words ('' without rows)."""
-    shares = {(r.step, equation_text(r), r.joint): r.rms / r.rms_side for r in found if r.rms_side}
+    shares = {
+        (r.step, equation_text(r), r.joint): r.rms / r.rms_side for r in residuals if r.rms_side
+    }
     if not shares:
         return ""
     step, equation, joint = max(shares, key=lambda key: shares[key])

@@ -149,7 +149,7 @@ def _regression(identification: Identification, rows: Sequence[RecordRows]) -> d
         "residual_rows": figures.residual_rows(residual_sets),
         "residual_figures": figures.residuals(residual_sets),
         "largest_share": figures.largest_share(residual_sets),
-        "single": any(one.repeats < 2 for one in residual_sets),
+        "single": any(residual.repeats < 2 for residual in residual_sets),
         "table3": tables.table_iii(rig.name, identification, scatter),
         "repeats": max((s.repeats for s in scatter.values()), default=0),
     }

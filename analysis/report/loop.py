@@ -75,8 +75,8 @@ def _capital(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
-def _names(found: Any) -> str:
-    return ", ".join(f"{name.replace('_', ' ')} at {where}" for name, where in found) or fm.DASH
+def _names(effects: Any) -> str:
+    return ", ".join(f"{name.replace('_', ' ')} at {where}" for name, where in effects) or fm.DASH
 
 
 def worth(rounds: Sequence[Round]) -> Markup | None:

@@ -69,7 +69,7 @@ def coefficients(
     for family, solution in identification.solutions.items():
         beta = solution.value
         if not np.isfinite(beta).all():
-            parts = [rows for one in per_record for rows in one.family(family)]
+            parts = [rows for record in per_record for rows in record.family(family)]
             X, y = np.vstack([r.matrix for r in parts]), np.concatenate([r.rhs for r in parts])
             beta = least_squares(X, y)
         out[family] = beta
@@ -80,8 +80,8 @@ def residuals(identification: Identification, per_record: Sequence[RecordRows]) 
     """Return the residual of every equation of every (run, step), torque before flows."""
     beta = coefficients(identification, per_record)
     groups: dict[tuple[int, str], list[RecordRows]] = {}
-    for one in per_record:
-        groups.setdefault(one.group, []).append(one)
+    for record in per_record:
+        groups.setdefault(record.group, []).append(record)
     out = []
     for (run, step), members in groups.items():
         names = sorted(members[0].rows, key=_order)
@@ -162,10 +162,10 @@ def per_repeat(
 ) -> dict[str, Scatter]:
     """Identify from every repeat alone, as the paper's Table III does; {} below two repeats."""
     rounds: dict[int, list[RecordRows]] = {}
-    for one in per_record:
-        rounds.setdefault(one.record.repeat, []).append(one)
-    steps = {one.group for one in per_record}
-    whole = [m for m in rounds.values() if {one.group for one in m} == steps]
+    for record in per_record:
+        rounds.setdefault(record.record.repeat, []).append(record)
+    steps = {record.group for record in per_record}
+    whole = [m for m in rounds.values() if {record.group for record in m} == steps]
     if len(whole) < 2:
         return {}
     model = identification.model

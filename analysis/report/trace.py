@@ -141,12 +141,12 @@ def _spectra(rig: Rig, result: Trace) -> list[dict[str, Any]]:
     changed = result.model_after is not result.model_before
     return [
         {
-            "text": one.text,
+            "text": lines.text,
             "figure": trace_plots.spectrum(
-                one, unit_of_equation(rig, one.equation), f"l{k}", changed
+                lines, unit_of_equation(rig, lines.equation), f"l{k}", changed
             ),
         }
-        for k, one in enumerate(loudest(result.lines))
+        for k, lines in enumerate(loudest(result.lines))
     ]
 
 
@@ -165,23 +165,23 @@ def _errors(result: Trace) -> list[tuple[str, ...]]:
     return out
 
 
-def _effect(found: Found, key: str) -> dict[str, Any]:
+def _effect(effect: Found, key: str) -> dict[str, Any]:
     return {
-        "curve": trace_plots.curves(found, key) if found.curves else None,
-        "tried": trace_plots.instead(found, f"{key}r"),
-        "name": found.name.replace("_", " "),
-        "where": found.where,
-        "values": [(n, quantity(e)) for n, e in found.parameters.items()],
-        "p": fm.significant(found.p_value),
-        "removed": fm.significant(100 * found.removed_fraction),
-        "shot": shot_in_words(found),
-        "gates": found.gates,
+        "curve": trace_plots.curves(effect, key) if effect.curves else None,
+        "tried": trace_plots.instead(effect, f"{key}r"),
+        "name": effect.name.replace("_", " "),
+        "where": effect.where,
+        "values": [(n, quantity(e)) for n, e in effect.parameters.items()],
+        "p": fm.significant(effect.p_value),
+        "removed": fm.significant(100 * effect.removed_fraction),
+        "shot": shot_in_words(effect),
+        "gates": effect.gates,
         "rivals": [
             (
                 r.name.replace("_", " "), r.where, fm.significant(r.ratio),
                 fm.significant(r.training_ratio), "cannot be told apart" if r.tied else "ruled out",
             )
-            for r in found.rivals
+            for r in effect.rivals
         ],
     }  # fmt: skip
 
@@ -191,8 +191,12 @@ def _parameters(result: Trace) -> list[tuple[str, ...]]:
         return []
     after = result.model_after.parameters
     out: list[tuple[str, ...]] = []
-    for name, one in result.model_before.parameters.items():
-        if name in after and one.identified and after[name].identified:
-            change = f"{100 * (after[name].value / one.value - 1):+.1f} %" if one.value else fm.DASH
-            out.append((name, quantity(one), quantity(after[name]), change))
+    for name, estimate in result.model_before.parameters.items():
+        if name in after and estimate.identified and after[name].identified:
+            change = (
+                f"{100 * (after[name].value / estimate.value - 1):+.1f} %"
+                if estimate.value
+                else fm.DASH
+            )
+            out.append((name, quantity(estimate), quantity(after[name]), change))
     return out

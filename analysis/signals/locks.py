@@ -55,7 +55,7 @@ def moving_joints(rig: Rig, repeats: Sequence[Record]) -> Mask:
         # Repeats that were not synchronised after all would cancel in the mean.
         moving.append(
             gives(every.mean(axis=0), rate, noise / np.sqrt(len(locked)))
-            or any(gives(one, rate, noise) for one in every)
+            or any(gives(signals, rate, noise) for signals in every)
         )
     return np.array(moving)
 

@@ -210,12 +210,12 @@ def terms_like(path: Path, rigs: Mapping[str, Rig]) -> tuple[Used, ...]:
     return model.terms
 
 
-def rig_difference(one: Rig, other: Rig) -> str:
+def rig_difference(rig: Rig, other: Rig) -> str:
     """Say what differs between two rigs as far as physics is concerned ('' if nothing)."""
-    if one.name != other.name:
-        return f"name {one.name!r} and {other.name!r}"
+    if rig.name != other.name:
+        return f"name {rig.name!r} and {other.name!r}"
     ignored = {"description", "nominal", "wire", "sample_rate"}
-    first, second = (r.model_dump(exclude=ignored) for r in (one, other))
+    first, second = (r.model_dump(exclude=ignored) for r in (rig, other))
     for key, value in first.items():
         if value != second.get(key):
             if key == "joints":

@@ -25,8 +25,8 @@ def pytest_generate_tests(metafunc: Any) -> None:
     """Make one test of each check for each subject of the module; ValueError without any."""
     if FIXTURE not in metafunc.fixturenames:
         return
-    one = getattr(metafunc.module, "SUBJECT", None)
-    subjects: tuple[Subject, ...] = (one,) if one is not None else ()
+    declared = getattr(metafunc.module, "SUBJECT", None)
+    subjects: tuple[Subject, ...] = (declared,) if declared is not None else ()
     subjects = (*subjects, *getattr(metafunc.module, "SUBJECTS", ()))
     if not subjects:
         raise ValueError(f"{metafunc.module.__name__}: {FIXTURE} needs SUBJECT or SUBJECTS")

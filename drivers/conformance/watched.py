@@ -107,11 +107,11 @@ class Watched:
         channels, columns = len(self.rig.channels), len(self.rig.recorded)
         rows = len(block.data)
         require(rows > 0, "read_block returned a block without samples")
-        for name, found, wanted in (
+        for name, actual, wanted in (
             ("data", block.data.shape, (rows, columns)),
             ("saturated", block.saturated.shape, (rows, channels)),
         ):
-            require(found == wanted, f"a block's {name} has shape {found}, expected {wanted}")
+            require(actual == wanted, f"a block's {name} has shape {actual}, expected {wanted}")
         require(block.saturated.dtype == np.bool_, "a block's saturated marks are not booleans")
         require(block.sequence >= 0, f"a block has the sequence number {block.sequence}")
         require(block.tick >= 0, f"a block has the tick {block.tick}")

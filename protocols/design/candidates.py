@@ -31,12 +31,12 @@ REPEATS = 4
 def candidates(rig: Rig) -> tuple[Step, ...]:
     """Return all candidate steps, outermost joint first, with their first amplitude."""
     N = len(rig.joints)
-    found: list[Step] = []
+    steps: list[Step] = []
     for excited in range(N, 0, -1):
         for places in _places(N - excited):
             beyond = tuple(zip(range(excited + 1, N + 1), places, strict=True))
-            found.append(_step(excited, beyond, f"c{len(found) + 1}"))
-    return tuple(found)
+            steps.append(_step(excited, beyond, f"c{len(steps) + 1}"))
+    return tuple(steps)
 
 
 def _places(count: int) -> Iterator[tuple[str, ...]]:

@@ -97,26 +97,26 @@ def _content(step: StepPlan) -> Hashable:
 
 def _timeline(plan: Plan) -> tuple[Moment, ...]:
     """Return when each step begins if every condition comes at once."""
-    found: list[Moment] = []
+    moments: list[Moment] = []
 
     def lay(parts: Sequence[PlannedStep], begins: float) -> None:
         for part in parts:
-            found.append(Moment(part.name, part.title, begins, part.seconds, part.longest))
+            moments.append(Moment(part.name, part.title, begins, part.seconds, part.longest))
             lay(part.nested, begins)
             begins += part.seconds
 
     lay(plan.sequence, 0.0)
-    return tuple(found)
+    return tuple(moments)
 
 
 def check_step(step: StepPlan, rig: Rig, twin: Twin, draws: Sequence[Twin] = ()) -> StepCheck:
     """Predict one step; raises InputError where the twin, or one of its draws, cannot follow it."""
-    found = _centred(step, rig, twin)
-    central = judge_motion(step, rig, found.biases, found.moved)
+    centring = _centred(step, rig, twin)
+    central = judge_motion(step, rig, centring.biases, centring.moved)
     others = []
     for draw in draws:
         # The bench centres whatever it is; from the estimate's biases that takes one or two trials.
-        other = _centred(step, rig, draw, found)
+        other = _centred(step, rig, draw, centring)
         others.append(judge_motion(step, rig, other.biases, other.moved))
     return widened(central, others)
 
@@ -152,8 +152,8 @@ def centred(
 
     Raises InputError where the twin cannot follow, NotCentred where another amplitude may help.
     """
-    found = _centred(step, rig, twin)
-    return found.biases, found.moved
+    centring = _centred(step, rig, twin)
+    return centring.biases, centring.moved
 
 
 def _centred(step: StepPlan, rig: Rig, twin: Twin, near: _Centred | None = None) -> _Centred:

@@ -236,13 +236,13 @@ def remedy_text(scale: float | None) -> str:
 
 def worst(report: CheckReport) -> Sequence[tuple[str, MotionPrediction]]:
     """Return, step by step, the binding line with the least margin as a share of its range."""
-    found = []
+    margins = []
     for entry in report.steps:
         binding = [line for line in entry.predictions if line.binding]
-        found.append(
+        margins.append(
             (
                 entry.step,
                 min(binding, key=lambda p: p.margin / (p.allowed_high - p.allowed_low)),
             )
         )
-    return found
+    return margins

@@ -61,7 +61,8 @@ def generate(rig: Rig, predictor: Predictor, name: str) -> Generated:
         )
     chosen = smallest(pool, predictor.judge_of(rig))
     steps = tuple(
-        one.step.model_copy(update={"name": f"step{n}"}) for n, one in enumerate(chosen, start=1)
+        sized.step.model_copy(update={"name": f"step{n}"})
+        for n, sized in enumerate(chosen, start=1)
     )
     protocol = Protocol(
         name=name,
@@ -85,7 +86,7 @@ def prove(protocol: Protocol, rig: Rig, predictor: Predictor) -> Proof:
         _, moved = centred(planned, rig, predictor.twin)
         rows = predictor.rows(rig, moved, [part.joint + 1 for part in planned.locks])
         done.append(Sized(step, rows))
-        after = judge([one.rows for one in done])
+        after = judge([proof.rows for proof in done])
         reasons.append(Reason(step.name, told(step), _why(before, after), after))
         before = after
     return Proof(
@@ -98,9 +99,9 @@ def _pool(rig: Rig, predictor: Predictor) -> list[Sized]:
     """Return every candidate that the rig bears, as large as it bears it."""
     pool = []
     for seed, step in enumerate(candidates(rig), start=1):
-        found = sized(step, seed, rig, predictor.twin)
-        if found is not None:
-            kept, moved = found
+        step_sized = sized(step, seed, rig, predictor.twin)
+        if step_sized is not None:
+            kept, moved = step_sized
             locked = [lock.joint for lock in kept.lock]
             pool.append(Sized(kept, predictor.rows(rig, moved, locked)))
     return pool
@@ -127,4 +128,4 @@ def _help(done: Sequence[Sized], rig: Rig, predictor: Predictor) -> tuple[str, .
     """Return the steps, in words, that would make the rest identifiable."""
     pool = _pool(rig, predictor)
     more = extended(done, pool, predictor.judge_of(rig))[len(done) :]
-    return tuple(told(one.step) for one in more)
+    return tuple(told(candidate.step) for candidate in more)

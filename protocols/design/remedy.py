@@ -46,7 +46,7 @@ def passing_scale(step: StepPlan, rig: Rig, twin: Twin, draws: Sequence[Twin] = 
 
 def _passes(step: StepPlan, rig: Rig, twin: Twin, draws: Sequence[Twin]) -> bool:
     try:
-        found = check_step(step, rig, twin, draws)
+        checked = check_step(step, rig, twin, draws)
     except InputError:
         return False
-    return all(line.ok for line in found.predictions if line.binding)
+    return all(line.ok for line in checked.predictions if line.binding)

@@ -46,18 +46,22 @@ def extended(start: Sequence[Sized], pool: Sequence[Sized], judge: Judge) -> lis
     chosen = list(start)
     scales = _scales([*start, *pool])
     for _ in pool:
-        rest = [one for one in pool if one not in chosen]
+        rest = [candidate for candidate in pool if candidate not in chosen]
         now = _verdicts(chosen, judge)
         if not complete(now):
             before = _score(chosen, scales)
-            gain = {id(one): _score([*chosen, one], scales) - before for one in rest}
-            best = max(rest, key=lambda one: gain[id(one)] - CLOSED_PRICE * _cost(one))
+            gain = {
+                id(candidate): _score([*chosen, candidate], scales) - before for candidate in rest
+            }
+            best = max(
+                rest, key=lambda candidate: gain[id(candidate)] - CLOSED_PRICE * _cost(candidate)
+            )
             if gain[id(best)] < 1.0:
                 break  # no step shows anything new
         else:
             if worst(now) <= WANTED:
                 break
-            best = min(rest, key=lambda one: worst(_verdicts([*chosen, one], judge)))
+            best = min(rest, key=lambda candidate: worst(_verdicts([*chosen, candidate], judge)))
             if worst(_verdicts([*chosen, best], judge)) > WORTH * worst(now):
                 break
         chosen.append(best)
@@ -75,7 +79,7 @@ def worst(verdicts: Verdicts) -> float:
 
 
 def _verdicts(steps: Sequence[Sized], judge: Judge) -> Verdicts:
-    return judge([one.rows for one in steps])
+    return judge([step.rows for step in steps])
 
 
 def _pruned(chosen: Sequence[Sized], judge: Judge) -> list[Sized]:
@@ -83,8 +87,8 @@ def _pruned(chosen: Sequence[Sized], judge: Judge) -> list[Sized]:
     kept = list(chosen)
     now = _verdicts(kept, judge)
     allowed = max(WANTED, worst(now))
-    for one in sorted(chosen, key=_cost, reverse=True):
-        fewer = [other for other in kept if other is not one]
+    for step in sorted(chosen, key=_cost, reverse=True):
+        fewer = [other for other in kept if other is not step]
         verdicts = _verdicts(fewer, judge)
         same = all(verdicts[family].rank == now[family].rank for family in verdicts)
         if fewer and same and (worst(verdicts) <= allowed or not complete(now)):
@@ -114,20 +118,20 @@ def _badness(steps: Sequence[Sized], judge: Judge) -> float:
     verdicts = _verdicts(steps, judge)
     if not complete(verdicts):
         return float("inf")
-    return float(np.log(worst(verdicts)) - np.log(WORTH) * sum(_cost(one) for one in steps))
+    return float(np.log(worst(verdicts)) - np.log(WORTH) * sum(_cost(step) for step in steps))
 
 
-def _cost(one: Sized) -> int:
+def _cost(step: Sized) -> int:
     """Count the valves closed beyond the excited joint: a lock of oil gives, a stop does not."""
-    excited = min(part.joint for part in one.step.excite)
-    return sum(lock.at == CLOSED and lock.joint > excited for lock in one.step.lock)
+    excited = min(part.joint for part in step.step.excite)
+    return sum(lock.at == CLOSED and lock.joint > excited for lock in step.step.lock)
 
 
 def _scales(steps: Sequence[Sized]) -> dict[str, Array]:
     """Return the columns' norms over all candidates: a measure that no choice changes."""
     return {
         family: np.maximum(
-            np.linalg.norm(np.vstack([one.rows[family] for one in steps]), axis=0), 1e-300
+            np.linalg.norm(np.vstack([step.rows[family] for step in steps]), axis=0), 1e-300
         )
         for family in steps[0].rows
     }
@@ -136,9 +140,11 @@ def _scales(steps: Sequence[Sized]) -> dict[str, Array]:
 def _score(steps: Sequence[Sized], scales: Mapping[str, Array]) -> float:
     total = 0.0
     for family, scale in scales.items():
-        rows = np.vstack([np.zeros((1, len(scale))), *(one.rows[family] / scale for one in steps)])
+        rows = np.vstack(
+            [np.zeros((1, len(scale))), *(step.rows[family] / scale for step in steps)]
+        )
         sigma = np.zeros(len(scale))
-        found = np.linalg.svd(rows, compute_uv=False)
-        sigma[: len(found)] = found
+        singular = np.linalg.svd(rows, compute_uv=False)
+        sigma[: len(singular)] = singular
         total += float(np.sum(np.log(sigma**2 + FLOOR**2)))
     return total

@@ -50,7 +50,7 @@ def sized(step: Step, seed: int, rig: Rig, twin: Twin) -> tuple[Step, Mapping[st
     Where the arm resonates, a multisine of little tilt must stay small: a steeper one is tried
     next, and the largest is taken.
     """
-    found: dict[float, tuple[Step, Mapping[str, Array]]] = {}
+    by_amplitude: dict[float, tuple[Step, Mapping[str, Array]]] = {}
     for tilt in TILTS:
         for size in range(SIZES):
             tried = played(step, AMPLITUDE * SMALLER**size, tilt, seed)
@@ -58,14 +58,14 @@ def sized(step: Step, seed: int, rig: Rig, twin: Twin) -> tuple[Step, Mapping[st
             if moved is not None:
                 signal = tried.excite[0].signal
                 assert isinstance(signal, Multisine)  # as `played` makes them
-                found.setdefault(signal.amplitude, (tried, moved))
+                by_amplitude.setdefault(signal.amplitude, (tried, moved))
                 break
-        if found and max(found) >= MODEST:
+        if by_amplitude and max(by_amplitude) >= MODEST:
             break
-    if not found:
+    if not by_amplitude:
         log.info("left out: %s", told(step))
         return None
-    return found[max(found)]
+    return by_amplitude[max(by_amplitude)]
 
 
 def _kept(line: MotionPrediction, spare: Mapping[str, float]) -> bool:

@@ -370,11 +370,11 @@ class Conductor:
         return holds
 
     def _values(self, condition: Condition, began: float) -> Mapping[str, float]:
-        found: dict[str, float] = {**self.desk.estimates.values(), ELAPSED: self.elapsed - began}
+        values: dict[str, float] = {**self.desk.estimates.values(), ELAPSED: self.elapsed - began}
         first = max(0, self.session.now - round(ENGINE.look_seconds * self.session.rate))
         for name in condition.names:
             if name in self.session.rig.recorded:
                 seen = self.session.channel(name, first, self.session.now)
                 known = seen[np.isfinite(seen)]
-                found[name] = float(np.mean(known)) if len(known) else math.nan
-        return found
+                values[name] = float(np.mean(known)) if len(known) else math.nan
+        return values

@@ -198,21 +198,21 @@ class ExcitationRun:
         self, first: int, driven: Sequence[Driven], excitation: Playback
     ) -> dict[str, str | float | int]:
         """Return what is known of a record only when it has been taken."""
-        found: dict[str, str | float | int] = {}
+        attributes: dict[str, str | float | int] = {}
         last = first + self.step.record
         for held in self.locks:
             j = held.joint + 1
-            found[f"lock_{j}"] = held.at
-            found[f"lock_piston_m_{j}"] = held.piston
-            found[f"lock_gain_v_per_m_{j}"] = held.law.position_gain
-            found[f"lock_give_m_{j}"] = give(self.session, held, first, last)
+            attributes[f"lock_{j}"] = held.at
+            attributes[f"lock_piston_m_{j}"] = held.piston
+            attributes[f"lock_gain_v_per_m_{j}"] = held.law.position_gain
+            attributes[f"lock_give_m_{j}"] = give(self.session, held, first, last)
         for before, after in zip(driven, excitation.joints, strict=True):
             j = before.joint + 1
-            found[f"bias_v_{j}"] = before.bias
-            found[f"position_gain_v_per_m_{j}"] = before.loop
-            found[f"drift_m_{j}"] = after.moved.drift * self.step.record / self.session.rate
-            found[f"centre_m_{j}"] = after.moved.mean
-        return found
+            attributes[f"bias_v_{j}"] = before.bias
+            attributes[f"position_gain_v_per_m_{j}"] = before.loop
+            attributes[f"drift_m_{j}"] = after.moved.drift * self.step.record / self.session.rate
+            attributes[f"centre_m_{j}"] = after.moved.mean
+        return attributes
 
     def _relock(self, excitation: Playback) -> bool:
         """Close a valve anew that let its piston creep; says whether one had to be."""

@@ -275,7 +275,7 @@ class Playback:
 
     def _correct(self, first: int, last: int) -> bool:
         """Correct the biases of pistons about to leave their limits; says whether any was."""
-        found = [
+        measured = [
             corrected(
                 driven,
                 reference,
@@ -288,8 +288,8 @@ class Playback:
             )
             for driven, reference in zip(self.joints, self._references, strict=True)
         ]
-        if not any(found):
+        if not any(measured):
             return False
-        self.joints = tuple(new or old for new, old in zip(found, self.joints, strict=True))
+        self.joints = tuple(new or old for new, old in zip(measured, self.joints, strict=True))
         self._play()
         return True

@@ -66,7 +66,7 @@ class Expander:
         if not isinstance(data, list):
             self._note(path, f"expected a list of steps, found {type(data).__name__}")
             return []
-        found: list[RawStep] = []
+        expanded: list[RawStep] = []
         for index, item in enumerate(data):
             where: Path = (*path, index)
             kind = kind_of_step(item)
@@ -74,14 +74,14 @@ class Expander:
                 values = self._values(item, "set", where, scope)
                 scope = scope.changed(self.substituted(values, (*where, "set"), scope))
             elif kind == "sweep":
-                found += self._sweep(item, where, scope)
+                expanded += self._sweep(item, where, scope)
             elif kind == "include":
-                found += self._included(item, where, scope)
+                expanded += self._included(item, where, scope)
             else:
-                found.append(self._plain(item, kind, where, scope))
-            if len(found) > MOST_STEPS:
-                self._too_many(where, len(found))
-        return found
+                expanded.append(self._plain(item, kind, where, scope))
+            if len(expanded) > MOST_STEPS:
+                self._too_many(where, len(expanded))
+        return expanded
 
     def substituted(self, data: Any, where: Path, scope: Scope) -> Any:
         """Return plain data with every `$name` replaced; a name that is not known is noted.
@@ -131,14 +131,14 @@ class Expander:
         if "steps" not in item:
             self._note(where, "sweep: steps is missing here")
             return []
-        found: list[RawStep] = []
+        repeated: list[RawStep] = []
         for number, row in enumerate(rows, start=1):
             inner = self.steps(item["steps"], (*where, "steps"), scope.changed(row, swept=True))
             total = len(rows) * len(inner)
             if total > MOST_STEPS:
                 self._too_many(where, total)
-            found += [_numbered(step, number) for step in inner]
-        return found
+            repeated += [_numbered(step, number) for step in inner]
+        return repeated
 
     def _rows(self, over: Any, where: Path, scope: Scope) -> list[dict[str, Any]]:
         """Return the value of each parameter, run by run; a row without any where none is right."""
@@ -253,7 +253,7 @@ def _renamed(data: Any, ending: str) -> Any:
 def made_unique(steps: Sequence[RawStep]) -> list[RawStep]:
     """Return the steps, with a number behind names that an included file uses once more."""
     taken = {s.data.get("name") for s in steps if not s.included and isinstance(s.data, dict)}
-    found = []
+    unique = []
     for step in steps:
         data = step.data
         if step.included and isinstance(data, dict) and data.get("name") is not None:
@@ -263,5 +263,5 @@ def made_unique(steps: Sequence[RawStep]) -> list[RawStep]:
                 ending = f"_{number}"
             data = _renamed(data, ending) if ending else data
             taken.add(data["name"])
-        found.append(RawStep(data, step.lines, step.included))
-    return found
+        unique.append(RawStep(data, step.lines, step.included))
+    return unique

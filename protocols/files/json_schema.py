@@ -17,9 +17,9 @@ def protocol_schema() -> dict[str, Any]:
     Numbers may also be references to parameters, which stand in the file as texts.
     """
     made = Protocol.model_json_schema()
-    found: dict[str, Any] = _with_references(made)
-    found["properties"]["version"] = {"type": "integer", "minimum": 1, "maximum": VERSION}
-    return {"$schema": DIALECT, "$id": f"urn:bramah:protocol:{VERSION}", **found}
+    schema: dict[str, Any] = _with_references(made)
+    schema["properties"]["version"] = {"type": "integer", "minimum": 1, "maximum": VERSION}
+    return {"$schema": DIALECT, "$id": f"urn:bramah:protocol:{VERSION}", **schema}
 
 
 def _with_references(node: Any) -> Any:

@@ -50,16 +50,16 @@ def read_protocol(
 
 def parsed_values(settings: Sequence[str]) -> dict[str, Any]:
     """Return the values of `NAME=VALUE` texts as a file would state them; InputError if not so."""
-    found: dict[str, Any] = {}
+    values_by_name: dict[str, Any] = {}
     for setting in settings:
         name, equals, value = setting.partition("=")
         if not equals or not name.strip() or not value.strip():
             raise InputError(f"--set {setting}: expected NAME=VALUE, like amplitude=20mm")
         try:
-            found[name.strip()] = yaml.safe_load(value)
+            values_by_name[name.strip()] = yaml.safe_load(value)
         except yaml.YAMLError as error:
             raise InputError(f"--set {setting}: {value!r} is no value") from error
-    return found
+    return values_by_name
 
 
 def _text(name: str, folder: Path | None) -> tuple[str, str, Path | None]:
@@ -139,5 +139,5 @@ class _Includes:
         return steps
 
 
-def _same_file(one: str, other: str) -> bool:
-    return one == other or Path(one).resolve() == Path(other).resolve()
+def _same_file(path: str, other: str) -> bool:
+    return path == other or Path(path).resolve() == Path(other).resolve()

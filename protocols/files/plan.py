@@ -98,7 +98,7 @@ class Plan:
 
 def every_planned(parts: Sequence[PlannedStep]) -> tuple[PlannedStep, ...]:
     """Return planned steps with those nested in them, in order."""
-    return tuple(one for part in parts for one in (part, *every_planned(part.nested)))
+    return tuple(planned for part in parts for planned in (part, *every_planned(part.nested)))
 
 
 def resolve(protocol: Protocol, rig: Rig, overrides: Overrides | None = None) -> Plan:
@@ -140,12 +140,12 @@ def mapped(
     steps: Sequence[StepKind], change: Callable[[StepKind], StepKind]
 ) -> tuple[StepKind, ...]:  # fmt: skip
     """Return steps with every one of them, nested ones too, replaced by `change`."""
-    found = []
+    mapped_steps = []
     for step in steps:
         inner = getattr(step, "steps", None)
         new = step if inner is None else step.model_copy(update={"steps": mapped(inner, change)})
-        found.append(change(new))
-    return tuple(found)
+        mapped_steps.append(change(new))
+    return tuple(mapped_steps)
 
 
 def _kept(protocol: Protocol, names: Sequence[str] | None) -> tuple[StepKind, ...]:
@@ -192,26 +192,26 @@ class _RigPlanner:
     def condition(self, text: str) -> Condition:
         """Read a condition; InputError where the rig cannot judge it."""
         try:
-            found = parse_condition(text)
-            require_known(found, self._rig)
+            parsed = parse_condition(text)
+            require_known(parsed, self._rig)
         except ValueError as error:
             raise InputError(f"condition: {error}") from error
-        return found
+        return parsed
 
     def nested(self, steps: Sequence[StepKind]) -> tuple[PlannedStep, ...]:
         """Resolve steps in their order; InputError with a line for each problem of any of them."""
-        found: list[PlannedStep] = []
+        planned: list[PlannedStep] = []
         problems: list[str] = []
         for step in steps:
             try:
-                found.append(step.plan(self))
+                planned.append(step.plan(self))
             except InputError as error:
                 problems += str(error).splitlines()
                 if isinstance(step, LockStep):
                     break  # what follows would lack its joint
         if problems:
             raise InputError("\n".join(dict.fromkeys(problems)))
-        return tuple(found)
+        return tuple(planned)
 
     def locked(self, locks: Sequence[Lock]) -> None:
         """Remember locks for the steps that follow."""

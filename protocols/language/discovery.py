@@ -13,12 +13,12 @@ def classes_in(package: ModuleType, base: type) -> tuple[type, ...]:
 
     A class is taken from the module that defines it; names that begin with '_' are left out.
     """
-    found: list[type] = []
+    classes: list[type] = []
     for entry in sorted(pkgutil.iter_modules(package.__path__), key=lambda m: m.name):
         module = importlib.import_module(f"{package.__name__}.{entry.name}")
         for name, item in vars(module).items():
             if not inspect.isclass(item) or name.startswith("_") or item is base:
                 continue
             if issubclass(item, base) and item.__module__ == module.__name__:
-                found.append(item)
-    return tuple(found)
+                classes.append(item)
+    return tuple(classes)

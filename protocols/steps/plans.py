@@ -58,8 +58,8 @@ class StepPlan:
     @property
     def lines(self) -> tuple[int, ...]:
         """The lines any joint excites, as multiples of 1 / the common period."""
-        found = {k * (self.period // e.wave.period) for e in self.excite for k in e.wave.lines}
-        return tuple(sorted(found))
+        harmonics = {k * (self.period // e.wave.period) for e in self.excite for k in e.wave.lines}
+        return tuple(sorted(harmonics))
 
     @property
     def tries(self) -> int:

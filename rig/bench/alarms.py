@@ -90,5 +90,5 @@ class AlarmLog:
         except KeyError as error:
             log.info("%s", error.args[0])
             return
-        for one in seen if key is None else [key]:
-            self._on_event("alarm acknowledged", tick, {"alarm": one})
+        for key_of_alarm in seen if key is None else [key]:
+            self._on_event("alarm acknowledged", tick, {"alarm": key_of_alarm})

@@ -194,12 +194,12 @@ class Guard:
             self._standing.see(near, last)
         return trips
 
-    def _act(self, found: Sequence[Violation], last: int) -> list[Violation]:
+    def _act(self, violations: Sequence[Violation], last: int) -> list[Violation]:
         """Do with each finding what the rig file wants; returns those that trip."""
-        if not found:
+        if not violations:
             return []
-        self._standing.see([v for v in found if self._actions[v.limit] == "warn"], last)
-        return [v for v in found if self._actions[v.limit] == "trip"]
+        self._standing.see([v for v in violations if self._actions[v.limit] == "warn"], last)
+        return [v for v in violations if self._actions[v.limit] == "trip"]
 
     def _band_trip(self, block: SampleBlock, calm: bool) -> Violation | None:
         over = self._outside_trip.over(None if calm else self._trip.outside(block.data))

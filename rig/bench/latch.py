@@ -186,19 +186,19 @@ class BenchState:
     def holder(self) -> Holder | None:
         """Return the living process of this computer that has the bench, None if none is known."""
         try:
-            found = Holder(**json.loads((self.folder / _SESSION).read_text(encoding="utf-8")))
+            owner = Holder(**json.loads((self.folder / _SESSION).read_text(encoding="utf-8")))
         except (OSError, ValueError, TypeError):
             return None
-        return found if runstate.process_alive(found.pid, found.started) else None
+        return owner if runstate.process_alive(owner.pid, owner.started) else None
 
 
-def _note_in_run(found: LatchedTrip, entry: dict[str, Any]) -> None:
+def _note_in_run(trip: LatchedTrip, entry: dict[str, Any]) -> None:
     """Append the reset to the events of the run that tripped, if its folder is still there."""
-    if not found.run or not Path(found.run).is_dir() or found.host != runstate.here():
+    if not trip.run or not Path(trip.run).is_dir() or trip.host != runstate.here():
         return
     fields = {key: entry[key] for key in ("who", "reason")}
     try:
-        events = runstate.EventLog(Path(found.run))
+        events = runstate.EventLog(Path(trip.run))
         events.append("trip cleared", None, fields)
         events.close()
     except RecordingFailed as error:

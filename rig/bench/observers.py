@@ -50,12 +50,12 @@ class Observers:
     def block(self, block: SampleBlock) -> None:
         """Show a block."""
         if self._all:
-            self._notify(lambda one: one.block(block))
+            self._notify(lambda observer: observer.block(block))
 
     def record_begins(self, meta: RecordMeta, start: int, ticks: int | None) -> None:
         """Handle the beginning of a record."""
-        self._notify(lambda one: one.record_begins(meta, start, ticks))
+        self._notify(lambda observer: observer.record_begins(meta, start, ticks))
 
     def record_ends(self, meta: RecordMeta, start: int, ticks: int, state: str) -> None:
         """Handle the end of a record."""
-        self._notify(lambda one: one.record_ends(meta, start, ticks, state))
+        self._notify(lambda observer: observer.record_ends(meta, start, ticks, state))

@@ -39,14 +39,14 @@ class Outputs:
         info = self.driver.connect()
         self._connected = True
         self.driver.zero_outputs()
-        for what, found, wanted in (
+        for what, actual, wanted in (
             ("joints", info.joints, len(self._rig.joints)),
             ("measured channels", info.channels, len(self._rig.channels)),
             ("samples a second", info.sample_rate, self._rig.sample_rate),
         ):
-            if found != wanted:
+            if actual != wanted:
                 raise DeviceError(
-                    f"the device {info.identity!r} has {found:g} {what}, "
+                    f"the device {info.identity!r} has {actual:g} {what}, "
                     f"rig {self._rig.name!r} has {wanted:g}; is it the right rig file?"
                 )
         return info

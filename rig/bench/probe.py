@@ -70,8 +70,11 @@ def probe_timed(driver: Driver, rig: Rig) -> tuple[list[Reading], Lateness | Non
         driver.close()
     every = np.concatenate(late) if late else np.empty(0)
     timing = Lateness(len(every), float(every.mean()), float(every.std())) if len(every) else None
-    found = [replace(one, mark=doubts.get(one.channel, one.mark)) for one in readings(block, rig)]
-    return found, timing
+    marked = [
+        replace(reading, mark=doubts.get(reading.channel, reading.mark))
+        for reading in readings(block, rig)
+    ]
+    return marked, timing
 
 
 def readings(block: SampleBlock, rig: Rig) -> list[Reading]:
@@ -80,14 +83,14 @@ def readings(block: SampleBlock, rig: Rig) -> list[Reading]:
     return [_reading(name, k, block, rig, supply) for k, name in enumerate(rig.channels)]
 
 
-def pressurised(found: list[Reading]) -> list[str]:
+def pressurised(readings: list[Reading]) -> list[str]:
     """Name the chambers and the supply that are still under pressure: `joint 1 cap 3.50 MPa`."""
     out = []
-    for one in found:
-        kind, joint = ch.kind_of(one.channel)
-        if kind in (ch.CAP, ch.ROD, ch.SUPPLY) and one.mean > BENCH.empty_pressure:
+    for reading in readings:
+        kind, joint = ch.kind_of(reading.channel)
+        if kind in (ch.CAP, ch.ROD, ch.SUPPLY) and reading.mean > BENCH.empty_pressure:
             place = "supply" if kind == ch.SUPPLY else f"joint {joint} {kind.split('_')[0]}"
-            out.append(f"{place} {one.mean / 1e6:.2f} MPa")
+            out.append(f"{place} {reading.mean / 1e6:.2f} MPa")
     return out
 
 

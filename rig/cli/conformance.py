@@ -52,7 +52,7 @@ def conformance(
     if json != Path("-"):
         rows = [(result.check, result.verdict.value, result.reason) for result in report.results]
         typer.echo(table(("check", "verdict", "why"), rows))
-    failed = [one.check for one in report.of(CheckVerdict.FAILED)]
+    failed = [failure.check for failure in report.of(CheckVerdict.FAILED)]
     if failed:
         raise WorkError(f"{driver} fails {len(failed)} checks: {', '.join(failed)}")
 

@@ -22,17 +22,17 @@ def make_physical(result: Identification) -> tuple[Identification, dict[str, Any
     return given, document, "\n\n" + physical_text(projection)
 
 
-def physical_text(found: Physical) -> str:
+def physical_text(physical: Physical) -> str:
     """Return every parameter free and at each level, and which level was given out."""
-    header = ["parameter [SI]", "free", *(f"{level.name}" for level in found.levels)]
+    header = ["parameter [SI]", "free", *(f"{level.name}" for level in physical.levels)]
     rows = []
-    for name, free in found.free.items():
+    for name, free in physical.free.items():
         cells = [name, f"{free.value:.5g}"]
-        for level in found.levels:
+        for level in physical.levels:
             value = level.estimates[name].value
             cells.append(f"{value:.5g} ({100 * (value / free.value - 1):+.2f} %)")
         rows.append(cells)
-    level = found.levels[found.given]
-    more = found.levels[found.given + 1 :]
+    level = physical.levels[physical.given]
+    more = physical.levels[physical.given + 1 :]
     why = f"; '{more[0].name}' is rejected by the data" if more else ""
     return f"{table(header, rows)}\ngiven out: '{level.name}'{why}"

@@ -68,9 +68,9 @@ def jitter_of(rig: Rig) -> float | None:
     return DESIGN.jitter if rig.wire.jitter is None else rig.wire.jitter
 
 
-def lateness_text(found: CheckedForecast) -> str:
+def lateness_text(forecast: CheckedForecast) -> str:
     """Return in one line what late samples cost b, and by which assumption."""
-    p, wire = found.prediction, found.stated
+    p, wire = forecast.prediction, forecast.stated
     if p is None or p.lateness is None or wire is None:
         return ""
     cost = p.lateness
@@ -119,12 +119,12 @@ def of_plan(
         return CheckedForecast(limits, None, str(error))
 
 
-def as_dict(found: CheckedForecast) -> dict[str, Any]:
+def as_dict(forecast: CheckedForecast) -> dict[str, Any]:
     """Return the check as plain data, with the prediction, or why there is none."""
-    document: dict[str, Any] = {"impossible": found.why}
-    if found.prediction is not None:
-        document = to_json(found.prediction)
-    return {**found.limits.as_dict(), "identification": document}
+    document: dict[str, Any] = {"impossible": forecast.why}
+    if forecast.prediction is not None:
+        document = to_json(forecast.prediction)
+    return {**forecast.limits.as_dict(), "identification": document}
 
 
 def percent(value: float) -> str:
@@ -132,11 +132,11 @@ def percent(value: float) -> str:
     return f"{100.0 * value:.3g}" if math.isfinite(value) else "—"
 
 
-def prediction_text(found: CheckedForecast) -> str:
+def prediction_text(forecast: CheckedForecast) -> str:
     """Return each parameter's predicted error, conditioning, and what is not determined."""
-    p = found.prediction
+    p = forecast.prediction
     if p is None:
-        return f"standard errors cannot be predicted: {found.why}"
+        return f"standard errors cannot be predicted: {forecast.why}"
     rows = [
         [name, f"{e.nominal:.4g}", percent(e.std), percent(e.half), percent(e.oil)]
         for name, e in p.parameters.items()
@@ -151,7 +151,7 @@ def prediction_text(found: CheckedForecast) -> str:
         lines.append(f"{100 * p.masked_share:.2g} % of the rows would be masked")
     lines += [f"NOT determined {n}: {e.note}" for n, e in p.parameters.items() if e.note]
     lines.append(f"worst known: {p.worst}")
-    lines += [lateness_text(found)] if p.lateness is not None else []
+    lines += [lateness_text(forecast)] if p.lateness is not None else []
     return "\n".join(lines)
 
 
@@ -208,9 +208,9 @@ def design_protocol(
     return Designed(protocol_text(better, f"Made by: {command}"), after_plan, design, before, after)
 
 
-def design_text(found: Designed, out: Path) -> str:
+def design_text(designed: Designed, out: Path) -> str:
     """Return the parameters before and after, and the limits that each step fills."""
-    before, after = found.before.prediction, found.after.prediction
+    before, after = designed.before.prediction, designed.after.prediction
     assert before is not None  # the design itself needed it
     assert after is not None
     rows = []
@@ -219,16 +219,16 @@ def design_text(found: Designed, out: Path) -> str:
         ratio = f"{later.std / e.std:.2f}" if e.std > 0 else "—"
         rows.append([name, percent(e.std), percent(later.std), ratio])
     lines = [table(["parameter", "before %", "after %", "ratio"], rows), ""]
-    for step, (share, limit) in found.design.shares_after.items():
-        was, which = found.design.shares_before[step]
+    for step, (share, limit) in designed.design.shares_after.items():
+        was, which = designed.design.shares_before[step]
         lines.append(f"{limit} at {share:.0%} of its limit (before: {which} at {was:.0%})")
-    lines.append(f"{found.design.tried} trials, {found.design.kept} kept; written to {out}")
+    lines.append(f"{designed.design.tried} trials, {designed.design.kept} kept; written to {out}")
     return "\n".join(lines)
 
 
-def design_json(found: Designed) -> dict[str, Any]:
+def design_json(designed: Designed) -> dict[str, Any]:
     """Return predicted relative standard errors before and after, and the shares of limits."""
-    before, after = found.before.prediction, found.after.prediction
+    before, after = designed.before.prediction, designed.after.prediction
     assert before is not None
     assert after is not None
     return {
@@ -238,8 +238,8 @@ def design_json(found: Designed) -> dict[str, Any]:
         },
         "limits": {
             step: {"limit": limit, "share": share}
-            for step, (share, limit) in found.design.shares_after.items()
+            for step, (share, limit) in designed.design.shares_after.items()
         },
-        "tried": found.design.tried,
-        "kept": found.design.kept,
+        "tried": designed.design.tried,
+        "kept": designed.design.kept,
     }

@@ -28,10 +28,10 @@ def probe(rig: RigOption, endpoint: EndpointOption = None, json: JsonOption = No
 
     described, driver = device_of(rig, endpoint)
     readings, timing = bench.probe_timed(driver, described)
-    write_json(json, [asdict(one) for one in readings])
+    write_json(json, [asdict(reading) for reading in readings])
     if json != Path("-"):
         header = ("channel", "mean", "least", "most", "unit", "codes", "")
-        typer.echo(table(header, [_row(one) for one in readings]))
+        typer.echo(table(header, [_row(reading) for reading in readings]))
     if timing is not None:
         typer.echo(
             f"host-timed: {timing.samples} samples taken {1e3 * timing.mean:.3g} ms late, standard "
@@ -40,14 +40,20 @@ def probe(rig: RigOption, endpoint: EndpointOption = None, json: JsonOption = No
             err=json == Path("-"),
         )
     print_pressure(bench.pressurised(readings), aside=json == Path("-"))
-    odd = [one.channel for one in readings if one.mark != bench.GOOD]
+    odd = [reading.channel for reading in readings if reading.mark != bench.GOOD]
     if odd:
         raise WorkError(f"not plausible: {', '.join(odd)}; look at the last column")
 
 
-def _row(one: Reading) -> tuple[str, ...]:
-    numbers = (f"{value:.5g}" for value in (one.mean, one.low, one.high))
-    return (one.channel, *numbers, one.unit, f"{one.codes[0]}..{one.codes[1]}", one.mark)
+def _row(reading: Reading) -> tuple[str, ...]:
+    numbers = (f"{value:.5g}" for value in (reading.mean, reading.low, reading.high))
+    return (
+        reading.channel,
+        *numbers,
+        reading.unit,
+        f"{reading.codes[0]}..{reading.codes[1]}",
+        reading.mark,
+    )
 
 
 def register(app: typer.Typer) -> None:

@@ -86,8 +86,8 @@ class _Story:
 
     def tracked(self, estimate: str, tracking: Tracking) -> None:
         """Show an estimate beside what the run does, all with their intervals, and residuals."""
-        found = tracking.parameters.items()
-        known = {name: [one["value"], *one["ci95"]] for name, one in found}
+        tracked_values = tracking.parameters.items()
+        known = {name: [interval["value"], *interval["ci95"]] for name, interval in tracked_values}
         message = f"{self._message}; {estimate}"
         self._bench.status(message=message, estimates=known, residuals=tracking.residuals)
 

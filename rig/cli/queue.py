@@ -142,7 +142,7 @@ def add(
     changed = _arguments(
         ("--repeats", repeats), ("--duration", duration), ("--wave-seed", wave_seed),
         ("--amplitude-scale", None if amplitude_scale == 1.0 else amplitude_scale),
-        *(("--step", one) for one in step or ()),
+        *(("--step", step_name) for step_name in step or ()),
         ("--model", None if model is None else model.absolute()),
     )  # fmt: skip
     changed += ("--nominal",) if nominal else ()
@@ -221,7 +221,7 @@ def list_items(
     from rig.queue.items import STATES
     from rig.queue.runner import runner_of
 
-    unknown = [one for one in state or () if one not in STATES]
+    unknown = [word for word in state or () if word not in STATES]
     if unknown:
         raise InputError(f"--state {unknown[0]}: expected one of: {', '.join(STATES)}")
     with _opened(queue) as store:
@@ -260,18 +260,18 @@ def show(item: ItemArgument, queue: QueueOption = None, json: JsonOption = None)
     from rig.queue.runner import log_of
 
     with _opened(queue) as store:
-        found, lines = store.item(item), store.history(item)
-    log = log_of(_path(queue), found)
-    document: dict[str, Any] = found.as_dict()
+        entry, lines = store.item(item), store.history(item)
+    log = log_of(_path(queue), entry)
+    document: dict[str, Any] = entry.as_dict()
     document |= {"history": [asdict(line) for line in lines], "log": str(log)}
     write_json(json, document)
     if json == Path("-"):
         return
-    job = found.job
-    typer.echo(f"item {found.id} {job.name}: {found.state}")
+    job = entry.job
+    typer.echo(f"item {entry.id} {job.name}: {entry.state}")
     facts = {
-        "reason": found.reason, "protocol": job.protocol, "rig": job.rig,
-        "endpoint": job.endpoint, "options": " ".join(job.options), "run": found.run or job.out,
+        "reason": entry.reason, "protocol": job.protocol, "rig": job.rig,
+        "endpoint": job.endpoint, "options": " ".join(job.options), "run": entry.run or job.out,
         "log": str(log) if log.exists() else "",
     }  # fmt: skip
     for key, value in facts.items():
@@ -279,10 +279,10 @@ def show(item: ItemArgument, queue: QueueOption = None, json: JsonOption = None)
             typer.echo(f"  {key:9s} {value}")
     for line in lines:
         typer.echo(f"  {_local(line.time)}  {line.event}{': ' if line.reason else ''}{line.reason}")
-    if found.found.get("parameters"):
+    if entry.found.get("parameters"):
         rows = [
             (name, f"{p['value']:.5g}", f"{p['std']:.2g}" if p.get("std") else "—", p["unit"])
-            for name, p in found.found["parameters"].items()
+            for name, p in entry.found["parameters"].items()
             if p.get("value") is not None
         ]
         typer.echo(table(("parameter", "value", "std", "unit"), rows))

@@ -120,8 +120,8 @@ def _sequential(data: Mapping[str, Any]) -> str:
     """Return every step's own value of every parameter beside E1 and E2, in SI."""
     steps = data["steps"]
     rows = []
-    for name, found in data["per_step"].items():
-        own = {e["step"]: e for e in found}
+    for name, estimates in data["per_step"].items():
+        own = {e["step"]: e for e in estimates}
         apart = data["disagreement"].get(name)
         rows.append(
             [

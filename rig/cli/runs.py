@@ -59,21 +59,23 @@ def runs(
         progress(f"{rebuild_index(folder)} runs in the index of {folder}")
     listed = indexed_runs(folder)
     selected = [
-        one
-        for one in listed
-        if (not state or one.state in state)
-        and (begun is None or (one.created and datetime.fromisoformat(one.created) >= begun))
-        and _named(one.rig, rig)
-        and _named(one.protocol, protocol)
+        entry
+        for entry in listed
+        if (not state or entry.state in state)
+        and (begun is None or (entry.created and datetime.fromisoformat(entry.created) >= begun))
+        and _named(entry.rig, rig)
+        and _named(entry.protocol, protocol)
     ]
-    write_json(json, [{**asdict(one), "path": str(one.path)} for one in selected])
+    write_json(json, [{**asdict(entry), "path": str(entry.path)} for entry in selected])
     if json == Path("-"):
         return
     if not selected:
         progress(f"no runs in {folder}" + (f" that fit, of {len(listed)}" if listed else ""))
         return
     header = ("run", "state", "rig", "protocol", "created", "records", "samples", "lost", "min")
-    typer.echo(table(header, [_row(one) for one in selected], left=("state", "rig", "protocol")))
+    typer.echo(
+        table(header, [_row(entry) for entry in selected], left=("state", "rig", "protocol"))
+    )
     for summary in selected:
         if summary.message:
             typer.echo(f"{summary.path.name}: {summary.message}")
@@ -83,19 +85,19 @@ def _named(name: str, wanted: Names) -> bool:
     return not wanted or any(fnmatchcase(name, pattern) for pattern in wanted)
 
 
-def _row(one: RunSummary) -> tuple[str, ...]:
-    state = f"{one.state}, recovered" if one.recovered else one.state
-    partial = f" +{one.partial}" if one.partial else ""
+def _row(summary: RunSummary) -> tuple[str, ...]:
+    state = f"{summary.state}, recovered" if summary.recovered else summary.state
+    partial = f" +{summary.partial}" if summary.partial else ""
     return (
-        one.path.name,
+        summary.path.name,
         state,
-        one.rig,
-        one.protocol,
-        one.created[:16],
-        f"{one.records}{partial}" if one.records >= 0 else "—",
-        str(one.samples) if one.samples >= 0 else "—",
-        str(one.lost_samples) if one.samples >= 0 else "—",
-        f"{one.seconds / 60.0:.1f}" if one.seconds >= 0 else "—",
+        summary.rig,
+        summary.protocol,
+        summary.created[:16],
+        f"{summary.records}{partial}" if summary.records >= 0 else "—",
+        str(summary.samples) if summary.samples >= 0 else "—",
+        str(summary.lost_samples) if summary.samples >= 0 else "—",
+        f"{summary.seconds / 60.0:.1f}" if summary.seconds >= 0 else "—",
     )
 
 

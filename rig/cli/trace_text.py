@@ -15,10 +15,10 @@ from rig.cli.output import table
 def trace_text(result: Trace) -> str:
     """Return verdict, effects with their gates, errors, what is left, and what to do next."""
     lines = [f"verdict: {result.verdict}", "", result.sentence, ""]
-    for found in result.effects:
-        lines += _effect(found)
-    for found in result.refused:
-        lines += ["fitted best, but not named:", *_effect(found)]
+    for effect in result.effects:
+        lines += _effect(effect)
+    for effect in result.refused:
+        lines += ["fitted best, but not named:", *_effect(effect)]
     rig = result.model_before.rig
     rows = [
         [
@@ -73,7 +73,7 @@ def trace_text(result: Trace) -> str:
     changed = _changed(result)
     if changed:
         lines += [table(["parameter", "before", "after", "change"], changed), ""]
-    lines += [f"lines: {one.text}" for one in loudest(result.lines)]
+    lines += [f"lines: {lines_of_equation.text}" for lines_of_equation in loudest(result.lines)]
     if result.depends_on:
         moves = ", ".join(f"{d.text} ({100 * d.share:.0f} %)" for d in result.depends_on[:4])
         lines.append(f"what is left moves with: {moves} (a clue, not a name)")
@@ -94,16 +94,16 @@ def _share(error: float | None, size: float | None) -> str:
     return f"{100 * error / size:.1f} %" if error is not None and size else ""
 
 
-def _effect(found: Found) -> list[str]:
-    values = ", ".join(f"{n} = {quantity(e)}" for n, e in found.parameters.items())
-    lines = [f"{found.name} at {found.where}: {values}"]
-    if found.shot:
-        lines.append(f"  {shot_in_words(found)}")
-    lines += [f"  {'ok    ' if g.ok else 'NOT OK'} {g.name}: {g.detail}" for g in found.gates]
+def _effect(effect: Found) -> list[str]:
+    values = ", ".join(f"{n} = {quantity(e)}" for n, e in effect.parameters.items())
+    lines = [f"{effect.name} at {effect.where}: {values}"]
+    if effect.shot:
+        lines.append(f"  {shot_in_words(effect)}")
+    lines += [f"  {'ok    ' if g.ok else 'NOT OK'} {g.name}: {g.detail}" for g in effect.gates]
     lines += [
         f"  rival {r.name} at {r.where}: {r.ratio:.2f} times the held-out rms"
         + (" (cannot be told apart)" if r.tied else "")
-        for r in found.rivals
+        for r in effect.rivals
     ]
     return [*lines, ""]
 
@@ -111,11 +111,11 @@ def _effect(found: Found) -> list[str]:
 def _changed(result: Trace) -> list[list[str]]:
     after = result.model_after.parameters
     out = []
-    for name, one in result.model_before.parameters.items():
+    for name, estimate in result.model_before.parameters.items():
         if result.model_after is result.model_before or name not in after:
             continue
-        change = 100 * (after[name].value / one.value - 1) if one.value else math.nan
-        values = (_number(p.value, 4) for p in (one, after[name]))
+        change = 100 * (after[name].value / estimate.value - 1) if estimate.value else math.nan
+        values = (_number(p.value, 4) for p in (estimate, after[name]))
         out.append([name, *values, _percent(change, "+")])
     return out
 

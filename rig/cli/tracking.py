@@ -58,8 +58,8 @@ class TrackingSettings:
 def summary(parameters: Mapping[str, Mapping[str, Any]]) -> str:
     """Return the bulk modulus and the gains in one line, '?' where nothing is known yet."""
     parts = []
-    for name, found in parameters.items():
-        value, (low, high) = found["value"], found["ci95"]
+    for name, estimate in parameters.items():
+        value, (low, high) = estimate["value"], estimate["ci95"]
         scale, unit = (1e-6, " MPa") if name == "b" else (1e7, "")
         text = "?" if value is None else f"{scale * value:.4g}"
         if value is not None and low is not None and high is not None:
@@ -280,7 +280,9 @@ def _reply(socket: zmq.Socket[bytes], kind: str, tracker: Tracker, **more: str) 
     known = {name: estimate_json(e) for name, e in estimates.items()}
     if all(e["value"] is None for e in known.values()):
         known = {}
-    left = {family: [one.rms, one.size] for family, one in tracker.residuals().items()}
+    left = {
+        family: [residual.rms, residual.size] for family, residual in tracker.residuals().items()
+    }
     said = {"kind": kind, "parameters": known, "residuals": left, **more}
     try:
         socket.send_string(json.dumps(said), zmq.NOBLOCK)

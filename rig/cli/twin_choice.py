@@ -109,10 +109,10 @@ def twin_source(rig: Rig, model: Path | None = None, nominal: bool = False) -> T
 
 def _provenance(raw: bytes) -> Mapping[str, Any]:
     try:
-        found = json.loads(raw)["provenance"]
+        provenance = json.loads(raw)["provenance"]
     except (ValueError, KeyError, TypeError, RecursionError):
         return {}  # what is wrong with the file is said when it is loaded as a model
-    return found if isinstance(found, dict) else {}
+    return provenance if isinstance(provenance, dict) else {}
 
 
 def source_text(source: TwinSource, now: datetime | None = None) -> str:

@@ -36,8 +36,8 @@ _Loader.yaml_implicit_resolvers = {
 _Loader.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+0123456789."))
 
 
-def _lines(node: yaml.Node, path: Path, found: dict[Path, int], source: str) -> None:
-    found.setdefault(path, node.start_mark.line + 1)
+def _lines(node: yaml.Node, path: Path, numbers: dict[Path, int], source: str) -> None:
+    numbers.setdefault(path, node.start_mark.line + 1)
     if isinstance(node, yaml.MappingNode):
         seen: set[str] = set()
         for key, value in node.value:
@@ -46,12 +46,12 @@ def _lines(node: yaml.Node, path: Path, found: dict[Path, int], source: str) -> 
             if name in seen:
                 raise InputError(f"{source}:{line}: key {name!r} stands here a second time")
             seen.add(name)
-            found[(*path, name)] = line
-            _lines(value, (*path, name), found, source)
+            numbers[(*path, name)] = line
+            _lines(value, (*path, name), numbers, source)
     elif isinstance(node, yaml.SequenceNode):
         for index, value in enumerate(node.value):
-            found[(*path, index)] = value.start_mark.line + 1
-            _lines(value, (*path, index), found, source)
+            numbers[(*path, index)] = value.start_mark.line + 1
+            _lines(value, (*path, index), numbers, source)
 
 
 def load_yaml(text: str, source: str) -> tuple[Any, dict[Path, int]]:
@@ -94,7 +94,7 @@ class Unresolved(str):
 
 def refusal(problems: Iterable[Problem], source: str) -> InputError:
     """Return the error that states each problem once, in the order of the file, `_MOST` at most."""
-    ordered = [text for _, text in sorted(problems, key=lambda one: one[0])]
+    ordered = [text for _, text in sorted(problems, key=lambda problem: problem[0])]
     shown = list(dict.fromkeys(line for text in ordered for line in text.splitlines()))
     if len(shown) > _MOST:
         shown[_MOST:] = [f"{source}: and {len(shown) - _MOST} more"]
@@ -117,7 +117,7 @@ def _problems(
     error: ValidationError, lines: dict[Path, int], source: str, model: type[BaseModel]
 ) -> list[Problem]:
     """Return the problems with their lines."""
-    found: list[Problem] = []
+    problems: list[Problem] = []
     said: set[tuple[str | int, str]] = set()
     for problem in _causes(error):
         if isinstance(problem["input"], Unresolved):
@@ -142,8 +142,8 @@ def _problems(
         if lines:
             said.add(here)
         where = ".".join(str(part) for part in path) or model.__name__.lower()
-        found.append((line, f"{source}:{line}: {where}: {text}"))
-    return found
+        problems.append((line, f"{source}:{line}: {where}: {text}"))
+    return problems
 
 
 def _causes(error: ValidationError) -> list[ErrorDetails]:

@@ -65,10 +65,10 @@ def map_by_pint(unit: str, si: str) -> tuple[float, float]:
         raise UnitError(f"unknown unit {unit!r}; expected one like {target!r}") from error
     try:
         zero = registry.Quantity(0.0, parsed).to(target).magnitude
-        one = registry.Quantity(1.0, parsed).to(target).magnitude
+        unit_size = registry.Quantity(1.0, parsed).to(target).magnitude
     except Exception as error:  # of another dimension, or one that no conversion exists for
         raise _other_dimension(unit, si) from error
-    return float(one - zero), float(zero)
+    return float(unit_size - zero), float(zero)
 
 
 def to_si(value: float, unit: str, si: str) -> float:

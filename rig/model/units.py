@@ -89,8 +89,8 @@ def linear_map(unit: str, si: str) -> tuple[float, float] | None:
 
 def differs(unit: str, si: str) -> bool:
     """Whether a unit is known here to measure something else than `si`."""
-    found, target = measure(unit.strip()), measure(si.strip())
-    return found is not None and target is not None and found.powers != target.powers
+    given, target = measure(unit.strip()), measure(si.strip())
+    return given is not None and target is not None and given.powers != target.powers
 
 
 def measure(text: str) -> Measure | None:

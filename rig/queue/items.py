@@ -78,38 +78,38 @@ class StartCondition:
 
 
 def _split(text: str, option: str, example: str) -> re.Match[str]:
-    found = _CONDITION.match(text)
-    if found is None:
+    match = _CONDITION.match(text)
+    if match is None:
         raise InputError(f"{option} {text!r}: expected NAME, one of < <= > >=, a number: {example}")
-    return found
+    return match
 
 
 def channel_condition(text: str) -> StartCondition:
     """Read ``oil_temperature > 40 degC``; raises InputError for an unknown channel or unit."""
-    found = _split(text, "--when", "'oil_temperature > 40 degC'")
-    name = found["name"]
+    parts = _split(text, "--when", "'oil_temperature > 40 degC'")
+    name = parts["name"]
     try:
         unit = ch.unit_of(name)
-        if found["part"]:
-            raise ValueError(f"{name}.{found['part']}: a channel has no parts")
-        if unit and not found["unit"]:
-            raise UnitError(f"{found['number']} has no unit; expected one like '1 {unit}'")
-        bound = to_si(float(found["number"]), found["unit"], unit)
+        if parts["part"]:
+            raise ValueError(f"{name}.{parts['part']}: a channel has no parts")
+        if unit and not parts["unit"]:
+            raise UnitError(f"{parts['number']} has no unit; expected one like '1 {unit}'")
+        bound = to_si(float(parts["number"]), parts["unit"], unit)
     except ValueError as error:
         raise InputError(f"--when {text!r}: {error}") from error
-    return StartCondition(text, name, "", found["sign"], bound)
+    return StartCondition(text, name, "", parts["sign"], bound)
 
 
 def result_condition(text: str) -> StartCondition:
     """Read ``b.rsd < 0.5 %`` or ``M1 > 2`` (SI); raises InputError."""
-    found = _split(text, "--if", "'b.rsd < 0.5 %'")
-    part = found["part"] or "value"
-    if part != "rsd" and found["unit"]:
+    parts = _split(text, "--if", "'b.rsd < 0.5 %'")
+    part = parts["part"] or "value"
+    if part != "rsd" and parts["unit"]:
         raise InputError(f"--if {text!r}: a parameter is compared in SI, without a unit")
-    if found["unit"] not in ("", "%"):
-        raise InputError(f"--if {text!r}: the unit is {found['unit']!r}; expected % or none")
-    scale = 0.01 if found["unit"] else 1.0
-    return StartCondition(text, found["name"], part, found["sign"], scale * float(found["number"]))
+    if parts["unit"] not in ("", "%"):
+        raise InputError(f"--if {text!r}: the unit is {parts['unit']!r}; expected % or none")
+    scale = 0.01 if parts["unit"] else 1.0
+    return StartCondition(text, parts["name"], part, parts["sign"], scale * float(parts["number"]))
 
 
 def check_wanted(text: str) -> None:
@@ -226,9 +226,9 @@ class Item:
         return self.job.out if self.attempt == 0 else f"{self.job.out}-{self.attempt + 1}"
 
 
-def result_value(found: Mapping[str, Any], condition: StartCondition) -> float | None:
+def result_value(results: Mapping[str, Any], condition: StartCondition) -> float | None:
     """Return the part of an identified parameter that a condition compares, None if unknown."""
-    entry = found.get("parameters", {}).get(condition.name)
+    entry = results.get("parameters", {}).get(condition.name)
     if not entry or entry.get("value") is None:
         return None
     value, std = float(entry["value"]), entry.get("std")

@@ -49,8 +49,8 @@ def reason_in(text: str) -> str:
     lines = [line.partition(_SAID) for line in text.splitlines()]
     while lines and not lines[-1][1]:
         lines.pop()
-    told = list(takewhile(lambda parts: parts[1], reversed(lines)))
-    said = [reason.replace("\033[0m", "").strip() for _, _, reason in reversed(told)]
+    reason_lines = list(takewhile(lambda parts: parts[1], reversed(lines)))
+    said = [reason.replace("\033[0m", "").strip() for _, _, reason in reversed(reason_lines)]
     return "; ".join(said)
 
 

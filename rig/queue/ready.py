@@ -88,10 +88,10 @@ def judge(item: Item, others: Mapping[int, Item], moment: datetime, read: Readin
 
 def _channel(job: QueueJob, read: Reading) -> Readiness:
     condition = channel_condition(job.when)
-    found = read(job)
-    if isinstance(found, str):
-        return _wait(f"waits for {job.when}; the bench cannot be read: {found}")
-    value = found.get(condition.name)
+    reading = read(job)
+    if isinstance(reading, str):
+        return _wait(f"waits for {job.when}; the bench cannot be read: {reading}")
+    value = reading.get(condition.name)
     if value is None:
         return _wait(f"waits for {job.when}; the bench does not measure {condition.name}")
     if condition.holds(value):

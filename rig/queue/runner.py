@@ -224,13 +224,15 @@ class Runner:
             place = ["--endpoint", job.endpoint] if job.endpoint else []
             words = ["probe", "--rig", job.rig, *place, "--json", "-"]
             answer = self._call(words, self._settings.probe_seconds)
-            found = answer.as_json()
+            readings = answer.as_json()
             means: dict[str, float] | str = answer.reason or (
                 f"`bramah probe` wrote {answer.output[:60]!r}, not a JSON list of channels"
             )
-            if isinstance(found, list):  # also with an implausible channel, which is no reason
+            if isinstance(readings, list):  # also with an implausible channel, which is no reason
                 means = {
-                    one["channel"]: float(one["mean"]) for one in found if one["mean"] is not None
+                    reading["channel"]: float(reading["mean"])
+                    for reading in readings
+                    if reading["mean"] is not None
                 }
             kept = (time.monotonic(), means)
             self._readings[key] = kept
@@ -279,8 +281,8 @@ class Runner:
             child.wait()
             raise
         began = store.is_run(Path(item.run))
-        found = outcome_of(child.returncode, processes.reason_of(path), began=began)
-        return found.asked(asked)
+        outcome = outcome_of(child.returncode, processes.reason_of(path), began=began)
+        return outcome.asked(asked)
 
     def _watch(self, item: Item, over: Callable[[], bool], pid: Callable[[], int | None]) -> str:
         """Wait until a process has ended; returns the state it was asked to end for, or ''."""
@@ -367,9 +369,9 @@ class Runner:
             self._say(f"item {item.id} {item.job.name}: identifying")
             words = ["identify", item.run, "--json", "-"]
             answer = self._call(words, self._settings.identify_seconds)
-            found = answer.as_json() if answer.code == 0 else None
+            result = answer.as_json() if answer.code == 0 else None
             why = answer.reason or "no result"
-            self._queue.keep_found(item.id, found if isinstance(found, dict) else {"error": why})
+            self._queue.keep_found(item.id, result if isinstance(result, dict) else {"error": why})
 
     # What another runner left behind
 

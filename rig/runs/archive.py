@@ -182,8 +182,8 @@ def write_from_journal(journal: Journal, folder: Path, rig_name: str) -> Written
     return Written(len(records), partial, samples, lost, damaged, outside)
 
 
-def _note_saturation(group: h5py.Group, columns: Sequence[str], found: Assembled) -> None:
-    for name, count in zip(columns, found.saturated, strict=False):  # commands do not saturate
+def _note_saturation(group: h5py.Group, columns: Sequence[str], assembled: Assembled) -> None:
+    for name, count in zip(columns, assembled.saturated, strict=False):  # commands do not saturate
         group[name].attrs["saturated_samples"] = int(count)
 
 

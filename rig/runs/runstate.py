@@ -80,10 +80,10 @@ def process_started(pid: int) -> str | None:
 
 def process_alive(pid: int, started: str = "") -> bool:
     """Whether process `pid` lives; with `started`, whether it is still the same one."""
-    found = process_started(pid)
-    if found is None:
+    began = process_started(pid)
+    if began is None:
         return False
-    return not (found and started) or found == started
+    return not (began and started) or began == started
 
 
 def take_ownership(folder: Path) -> None:

@@ -206,14 +206,14 @@ class Monitor(ByHand, App[int]):
         snapshot = frame.snapshot
         if snapshot is None:
             return AlarmTable()
-        found = []
+        alarms = []
         for alarm in snapshot.alarms:
             name = (snapshot.pid, alarm.key)
             if name not in self.reset_alarms:
-                found.append(
+                alarms.append(
                     replace(alarm, acknowledged=True) if name in self.seen_alarms else alarm
                 )
-        return AlarmTable(tuple(found))
+        return AlarmTable(tuple(alarms))
 
     # Keys
 

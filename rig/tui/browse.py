@@ -88,9 +88,9 @@ def read_disk(before: Browsed) -> Browsed:
 
 def own_protocols(folder: Path) -> tuple[str, ...]:
     """Return the protocol files of a folder: YAML with `steps:` on a line that is not indented."""
-    found = []
+    protocols = []
     for path in sorted(folder.glob("*.yaml")):
         with suppress(OSError), path.open("rb") as file:
             if STEPS.search(file.read(READ_AT_MOST)):
-                found.append(str(path))
-    return tuple(found)
+                protocols.append(str(path))
+    return tuple(protocols)

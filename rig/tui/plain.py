@@ -19,11 +19,11 @@ EVERY: Final = 1.0  # [s]
 
 def status_line(frame: Frame, now: float) -> str:
     """Return the state of the bench in one line."""
-    found = headline(frame, now)
+    head = headline(frame, now)
     snapshot = frame.snapshot
     if snapshot is None:
-        return f"{found.word}: {_without(frame)}"
-    parts = [f"{found.word}: {run_time(frame):.1f} s", f"{snapshot.step} {snapshot.phase}".strip()]
+        return f"{head.word}: {_without(frame)}"
+    parts = [f"{head.word}: {run_time(frame):.1f} s", f"{snapshot.step} {snapshot.phase}".strip()]
     if snapshot.repeats > 0:
         parts.append(f"repeat {snapshot.repeat} of {snapshot.repeats}")
     if snapshot.total_s > 0 and not frame.over:

@@ -34,7 +34,7 @@ def read_log(folder: Path) -> RunLog:
         return RunLog(folder, trouble=f"{path}: there is no such file, so the run has no log")
     except OSError as error:
         return RunLog(folder, trouble=f"{path}: cannot be read: {error.strerror}")
-    found: list[EventLine] = []
+    entries: list[EventLine] = []
     bad: list[int] = []
     newest = 0.0
     lines = raw.splitlines()
@@ -45,9 +45,9 @@ def read_log(folder: Path) -> RunLog:
             continue
         newest = _time(event, newest)
         text, style, kind = said_of_event(event)
-        found.append(EventLine(newest, _printable(text), style, kind))
+        entries.append(EventLine(newest, _printable(text), style, kind))
     torn = bad == [len(lines)] and not raw.endswith(b"\n")
-    return RunLog(folder, tuple(found[-MOST:]), _trouble(path, bad, len(lines), torn=torn))
+    return RunLog(folder, tuple(entries[-MOST:]), _trouble(path, bad, len(lines), torn=torn))
 
 
 def _event(line: bytes) -> dict[str, Any] | None:

@@ -131,5 +131,5 @@ def _first(error: ValidationError) -> str:
     key = ".".join(str(part) for part in first["loc"])
     if first["type"] == "json_invalid":
         return f"is not JSON ({first['msg']}); expected the output of `bramah trace --json`"
-    found = str(first["input"])[:40]
-    return f"{key}: {first['msg']}, found {found}; expected the output of `bramah trace --json`"
+    name = str(first["input"])[:40]
+    return f"{key}: {first['msg']}, found {name}; expected the output of `bramah trace --json`"

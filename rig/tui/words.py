@@ -120,7 +120,7 @@ def headline(frame: Frame, now: float) -> Headline:
         (snapshot.engine in ("prompting", "paused"), Headline(snapshot.engine.upper(), "ask")),
     )
     word = snapshot.engine or state
-    return next((found for so, found in cases if so), Headline(word.upper(), "normal"))
+    return next((head for so, head in cases if so), Headline(word.upper(), "normal"))
 
 
 def nearest_margin(frame: Frame) -> Margin | None:
@@ -171,36 +171,38 @@ def run_time(frame: Frame, device_time: float | None = None) -> float:
 
 def notices(frame: Frame, stop: Stop | None, now: float, *, paused: bool) -> list[Notice]:
     """Return what the operator must not miss, the worst first."""
-    found: list[Notice] = []
+    standing: list[Notice] = []
     snapshot = frame.snapshot
     if snapshot is not None and UNSURE in snapshot.message:
-        found.append(Notice("alarm", f"{UNSURE.upper()}: keep away from the machine. {EMERGENCY}"))
+        standing.append(
+            Notice("alarm", f"{UNSURE.upper()}: keep away from the machine. {EMERGENCY}")
+        )
     if snapshot is not None and snapshot.device == LOST:
         became = (
             snapshot.message if frame.over else "looking for it; outputs zeroed by its watchdog"
         )
-        found.append(Notice("alarm", f"DEVICE LOST: {became}"))
+        standing.append(Notice("alarm", f"DEVICE LOST: {became}"))
     if snapshot is not None and snapshot.trip is not None:
-        found.append(Notice("alarm", f"TRIPPED  {trip_text(snapshot.trip)}"))
+        standing.append(Notice("alarm", f"TRIPPED  {trip_text(snapshot.trip)}"))
     if frame.trouble:
-        found.append(Notice("alarm", f"CANNOT REACH RUNS: {frame.trouble}"))
+        standing.append(Notice("alarm", f"CANNOT REACH RUNS: {frame.trouble}"))
     if stop is not None and (stop.endpoint == frame.endpoint or now - stop.at < LINGER):
-        found.append(stop_notice(frame, stop, now))
+        standing.append(stop_notice(frame, stop, now))
     if frame.over:
-        found.append(_ended(frame))
+        standing.append(_ended(frame))
     elif frame.stage is LinkStage.ATTACHED and (age := frame.age(now)) > QUIET:
         level = "alarm" if age > VERY_OLD else "warn"
         what = "what is shown is old" if snapshot else "nothing received yet"
-        found.append(Notice(level, f"NO DATA for {age_text(age)}: {what}"))
+        standing.append(Notice(level, f"NO DATA for {age_text(age)}: {what}"))
     if snapshot is not None and not frame.over and snapshot.prompt:
-        found.append(Notice("ask", f"ANSWER: {snapshot.prompt}  (a answers)"))
+        standing.append(Notice("ask", f"ANSWER: {snapshot.prompt}  (a answers)"))
     elif snapshot is not None and not frame.over and snapshot.engine == "paused":
-        found.append(Notice("ask", "PAUSED: outputs at zero until someone resumes (p)"))
+        standing.append(Notice("ask", "PAUSED: outputs at zero until someone resumes (p)"))
     if snapshot is not None and not frame.over:
-        found += alarm_notices(snapshot)
+        standing += alarm_notices(snapshot)
     if paused:
-        found.append(Notice("warn", "DISPLAY HELD, the run goes on: h shows it live again"))
-    return found
+        standing.append(Notice("warn", "DISPLAY HELD, the run goes on: h shows it live again"))
+    return standing
 
 
 def alarm_notices(snapshot: Snapshot) -> list[Notice]:

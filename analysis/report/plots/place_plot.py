@@ -48,11 +48,11 @@ OF_BENCH: Final = ("base", "load", "supply", "tank")  # elements that there is o
 
 def elements(rig: Rig) -> dict[str, Box]:
     """Return every element of the drawing that can be marked: name, with the joint's number."""
-    one = ELECTRIC if rig.electric else HYDRAULIC
+    table = ELECTRIC if rig.electric else HYDRAULIC
     out = {
         f"{name} {i + 1}": (left + WIDTH * i, bottom, right + WIDTH * i, top)
         for i in range(len(rig.joints))
-        for name, (left, bottom, right, top) in one.items()
+        for name, (left, bottom, right, top) in table.items()
     }
     last = out[f"joint {len(rig.joints)}"]
     out["load"] = (last[2] + 0.6, last[1] - 0.1, last[2] + 1.6, last[3] + 0.1)

@@ -153,16 +153,16 @@ def _unknown_lines(axes: Any, record: Record, spool: Array) -> None:
     note(axes, 0.995, 0.99, "excited lines not stated in the record", GREY)
 
 
-def residual(found: Residual, key: str) -> Markup:
+def residual(shown: Residual, key: str) -> Markup:
     """Draw one equation's residual in time, and its density against the scatter of repeats."""
-    unit = display_unit(found.unit)
+    unit = display_unit(shown.unit)
     with style():
         made = figure(3.3)
         top = made.add_axes((0.15, 0.60, 0.82, 0.32))
         low = made.add_axes((0.15, 0.125, 0.82, 0.31))
-        t, mean = gapped(found.time, unit.scale * found.mean)
-        if found.repeats > 1:
-            _, band = gapped(found.time, unit.scale * found.scatter_band)
+        t, mean = gapped(shown.time, unit.scale * shown.mean)
+        if shown.repeats > 1:
+            _, band = gapped(shown.time, unit.scale * shown.scatter_band)
             top.fill_between(t, mean - band, mean + band, color=SKY, alpha=0.45, linewidth=0)
         top.plot(t, mean, color=BLUE, linewidth=0.8)
         top.axhline(0, color=INK, linewidth=0.5)
@@ -171,35 +171,35 @@ def residual(found: Residual, key: str) -> Markup:
         top.set_ylabel(unit.text)
         top.set_xlabel("time [s]", labelpad=1)
         top.set_title(
-            f"residual; measured side {significant(unit.scale * found.rms_side)} {unit.text} RMS"
+            f"residual; measured side {significant(unit.scale * shown.rms_side)} {unit.text} RMS"
         )
-        what = "mean of repeats, ±1 scatter" if found.repeats > 1 else "the only repeat"
+        what = "mean of repeats, ±1 scatter" if shown.repeats > 1 else "the only repeat"
         note(top, 0.995, 0.99, what, BLUE)
-        _densities(low, found, unit.scale, unit.text)
-        return svg(made, key, f"Residual of one equation of joint {found.joint}, time and spectrum")
+        _densities(low, shown, unit.scale, unit.text)
+        return svg(made, key, f"Residual of one equation of joint {shown.joint}, time and spectrum")
 
 
-def _densities(axes: Any, found: Residual, scale: float, unit: str) -> None:
+def _densities(axes: Any, residual: Residual, scale: float, unit: str) -> None:
     axes.set_yscale("log")
     plain_log(axes.yaxis)
-    axes.plot(found.frequency, scale * found.spectrum, color=BLUE, linewidth=1.0)
+    axes.plot(residual.frequency, scale * residual.spectrum, color=BLUE, linewidth=1.0)
     above = {"va": "bottom", "ha": "left"}
     note(
         axes,
         0.0,
         1.02,
-        "mean of repeats" if found.repeats > 1 else "the only repeat",
+        "mean of repeats" if residual.repeats > 1 else "the only repeat",
         BLUE,
         **above,
     )
-    if found.repeats > 1:
-        axes.plot(found.frequency, scale * found.spectrum_scatter, color=GREY, linewidth=1.0)
-        floor = scale * found.spectrum_scatter / np.sqrt(found.repeats)
-        axes.plot(found.frequency, floor, color=MODEL, linewidth=0.9, linestyle=(0, (4, 2)))
+    if residual.repeats > 1:
+        axes.plot(residual.frequency, scale * residual.spectrum_scatter, color=GREY, linewidth=1.0)
+        floor = scale * residual.spectrum_scatter / np.sqrt(residual.repeats)
+        axes.plot(residual.frequency, floor, color=MODEL, linewidth=0.9, linestyle=(0, (4, 2)))
         note(axes, 0.26, 1.02, "scatter of one repeat", "#6b7280", **above)
         note(axes, 0.59, 1.02, "scatter left in the mean", "#c2410c", **above)
     axes.margins(x=0)
     # The row filter's stop band would take up most of the axis.
-    axes.set_ylim(bottom=max(axes.get_ylim()[0], scale * float(found.spectrum.max()) / SPAN))
+    axes.set_ylim(bottom=max(axes.get_ylim()[0], scale * float(residual.spectrum.max()) / SPAN))
     axes.set_xlabel("frequency [Hz]", labelpad=1)
     axes.set_ylabel(f"{unit}/√Hz")

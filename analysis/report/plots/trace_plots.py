@@ -147,35 +147,35 @@ def against(
         return svg(made, key, f"Residual against {label}, before and after")
 
 
-def curves(found: Found, key: str) -> Markup:
+def curves(effect: Found, key: str) -> Markup:
     """Draw the curves of an effect whose form the data draw, each with its band."""
     with style():
         made = figure(2.4, CARD * 2)
         axes = made.add_subplot()
-        for one, colour in zip(found.curves, (BLUE, MODEL, GREY, INK), strict=False):
-            axes.fill_between(one.x, one.lo, one.hi, color=colour, alpha=0.18, lw=0)
-            axes.plot(one.x, one.y, color=colour, lw=1.6, label=one.label)
-        axes.set_xlabel(f"{found.variable} [{found.curves[0].unit_x}]")
-        axes.set_ylabel(f"[{found.curves[0].unit_y}]")
-        if len(found.curves) > 1:
+        for curve, colour in zip(effect.curves, (BLUE, MODEL, GREY, INK), strict=False):
+            axes.fill_between(curve.x, curve.lo, curve.hi, color=colour, alpha=0.18, lw=0)
+            axes.plot(curve.x, curve.y, color=colour, lw=1.6, label=curve.label)
+        axes.set_xlabel(f"{effect.variable} [{effect.curves[0].unit_x}]")
+        axes.set_ylabel(f"[{effect.curves[0].unit_y}]")
+        if len(effect.curves) > 1:
             axes.legend(frameon=False)
         made.tight_layout()
-        return svg(made, key, f"{found.name.replace('_', ' ')} with its 95 % band")
+        return svg(made, key, f"{effect.name.replace('_', ' ')} with its 95 % band")
 
 
-def instead(found: Found, key: str) -> Markup | None:
+def instead(effect: Found, key: str) -> Markup | None:
     """Draw what held-out records keep without an effect, with it, and with each rival instead.
 
     Sorted by what is left, each with the reason why it is named or not. None where nobody knows.
     """
-    if not (np.isfinite(found.left_without) and np.isfinite(found.left_with)):
+    if not (np.isfinite(effect.left_without) and np.isfinite(effect.left_with)):
         return None
     bars = [
-        ("nothing in its place", found.left_without, "", GREY),
-        (_called(found.name, found.where), found.left_with, _verdict(found), BLUE),
+        ("nothing in its place", effect.left_without, "", GREY),
+        (_called(effect.name, effect.where), effect.left_with, _verdict(effect), BLUE),
     ]
     bars += [
-        (_called(r.name, r.where), r.ratio * found.left_with, *_against(r)) for r in found.rivals
+        (_called(r.name, r.where), r.ratio * effect.left_with, *_against(r)) for r in effect.rivals
     ]
     bars.sort(key=lambda bar: bar[1])
     high = 1.25 * max(2.0, *(bar[1] for bar in bars))
@@ -201,16 +201,16 @@ def instead(found: Found, key: str) -> Markup | None:
         axes.set_ylim(-0.4, len(bars) - 0.4)
         axes.set_xlabel("held-out error over the noise of the repeats' mean (dashed)")
         made.tight_layout()
-        return svg(made, key, f"Held-out error with {found.name.replace('_', ' ')} and its rivals")
+        return svg(made, key, f"Held-out error with {effect.name.replace('_', ' ')} and its rivals")
 
 
 def _called(name: str, where: str) -> str:
     return f"{name.replace('_', ' ')} at {where}"
 
 
-def _verdict(found: Found) -> str:
+def _verdict(effect: Found) -> str:
     """Say that an effect is named, or by which gates it is not."""
-    failed = [f"{g.name}: {g.detail}" for g in found.gates if not g.ok]
+    failed = [f"{g.name}: {g.detail}" for g in effect.gates if not g.ok]
     return f"not named ({'; '.join(failed)})".replace("_", " ") if failed else "named"
 
 
@@ -272,27 +272,27 @@ def over_noise(result: Trace, key: str = "overnoise") -> Markup:
         return svg(made, key, "Held-out error over the noise floor, before and after")
 
 
-def spectrum(one: Spectrum, unit: str, key: str, after: bool) -> Markup:
+def spectrum(shown: Spectrum, unit: str, key: str, after: bool) -> Markup:
     """Draw the lines of a residual by kind, before beside after, over the noise of one repeat."""
-    of = members(one.excited)
+    of = members(shown.excited)
     kinds = (
         ("excited", of[EXCITED], "o", INK, 4.0),
         ("odd, left empty", of[ODD], "s", MODEL, 3.2),
         ("even", of[EVEN] | of[CONSTANT], "^", BLUE, 3.0),
     )
-    noise = np.sqrt(one.noise)
+    noise = np.sqrt(shown.noise)
     low = 0.2 * float(np.median(noise))
-    top = 2.0 * float(np.sqrt(max(one.repeatable.max(), one.noise.max())))
+    top = 2.0 * float(np.sqrt(max(shown.repeatable.max(), shown.noise.max())))
     with style():
         made = figure(2.6, CARD * (2 if after else 1))
         for k, word in enumerate(("before", "after") if after else ("before",)):
             axes = made.add_subplot(1, 2 if after else 1, k + 1)
-            power = one.after if k else one.repeatable
-            axes.fill_between(one.frequency, low, np.maximum(noise, low), color=PALE, lw=0)
+            power = shown.after if k else shown.repeatable
+            axes.fill_between(shown.frequency, low, np.maximum(noise, low), color=PALE, lw=0)
             for label, own, marker, colour, size in kinds:
                 y = np.sqrt(np.maximum(power[own], 0.0))
                 axes.plot(
-                    one.frequency[own], np.where(y > low, y, np.nan), marker, color=colour,
+                    shown.frequency[own], np.where(y > low, y, np.nan), marker, color=colour,
                     ms=size, mew=0, label=label,
                 )  # fmt: skip
             axes.set_yscale("log")

@@ -215,12 +215,12 @@ class _Translation:
         if len(values) != len(targets):
             raise self._refusal(value, f"{len(values)} values for {len(targets)} targets")
         kept_values = []
-        for found in values:
+        for element in values:
             self.temporaries += 1
-            self._line(f"{_C_TYPES[found.kind]} t{self.temporaries} = {found.text};")
-            kept_values.append(CValue(f"t{self.temporaries}", found.kind))
-        for target, found in zip(targets, kept_values, strict=True):
-            self._store(target, found)
+            self._line(f"{_C_TYPES[element.kind]} t{self.temporaries} = {element.text};")
+            kept_values.append(CValue(f"t{self.temporaries}", element.kind))
+        for target, element in zip(targets, kept_values, strict=True):
+            self._store(target, element)
 
     def _store(self, target: ast.expr, value: CValue) -> None:
         if isinstance(target, ast.Name):

@@ -210,9 +210,9 @@ class Plausibility:
     def _sensors(self, data: Array, roles: Roles, say: Callable[..., Violation]) -> Iterator[
         Violation
     ]:  # fmt: skip
-        def shown(limit: str, one: PressureFinding) -> Violation:
-            column = (self._cap if one.cap else self._rod)[one.joint]
-            return say(limit, column, one.value, one.allowed)
+        def shown(limit: str, finding: PressureFinding) -> Violation:
+            column = (self._cap if finding.cap else self._rod)[finding.joint]
+            return say(limit, column, finding.value, finding.allowed)
 
         excited = [j for j, role in enumerate(roles) if role.excited]
         held = [j for j, role in enumerate(roles) if role.locked]
@@ -230,8 +230,8 @@ class Plausibility:
         shut = (rows[:, :, pressure_sensors.COMMAND] == 0.0).all(axis=0)
         closed = [j for j in held if shut[j] and self._within_stroke(data, j)]
         noise = self._noise[[self._cap[0], self._rod[0]]] / math.sqrt(slow.each)
-        for one in pressure_sensors.swapped(rig, settings, closed, rows, noise):
-            yield shown(SWAPPED, one)
+        for swap in pressure_sensors.swapped(rig, settings, closed, rows, noise):
+            yield shown(SWAPPED, swap)
 
     def _within_stroke(self, data: Array, j: int) -> bool:
         reach = self._rig.joints[j].cylinder.stroke * (0.5 - self._settings.stroke_end)

@@ -23,9 +23,9 @@ class Standing:
         self._last: dict[Key, int] = {}
         self.warnings: dict[Key, Violation] = {}
 
-    def see(self, found: Iterable[Violation], now: int) -> None:
+    def see(self, violations: Iterable[Violation], now: int) -> None:
         """Take the violations seen up to tick `now`; what came before keeps its first sample."""
-        for violation in found:
+        for violation in violations:
             key = key_of(violation)
             self.warnings.setdefault(key, violation)
             self._last[key] = now

@@ -126,24 +126,24 @@ class Display:
         return self._bands[1], self._bands[2]
 
     def _limits(self) -> Limits:
-        found: Limits = {}
+        limits_by_channel: Limits = {}
         for name in self._units:
             kind, joint = ch.kind_of(name)
-            found[name] = (None, None)
+            limits_by_channel[name] = (None, None)
             if joint is None:
                 shared = self._rig.limits
                 limit = shared.supply_pressure if kind == ch.SUPPLY else shared.oil_temperature
-                found[name] = limit or (None, None)
+                limits_by_channel[name] = limit or (None, None)
                 continue
             limits = self._rig.joints[joint - 1].limits
             if kind in (ch.CAP, ch.ROD):
-                found[name] = limits.pressure
+                limits_by_channel[name] = limits.pressure
             elif kind == ch.COMMAND:
-                found[name] = (-limits.command, limits.command)
+                limits_by_channel[name] = (-limits.command, limits.command)
             elif kind == ch.PISTON and self._roles:
                 _, *ends = piston_bounds(self._roles[joint - 1], self._rig, joint - 1)
-                found[name] = (ends[0], ends[1])
-        return found
+                limits_by_channel[name] = (ends[0], ends[1])
+        return limits_by_channel
 
     def ended(self, state: str, message: str, *, lost: bool = False) -> None:
         """Publish how the run ended, as soon as the outputs are at zero; `lost` is the device."""

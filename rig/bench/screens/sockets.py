@@ -81,12 +81,14 @@ def _private(folder: Path) -> Path:
     try:
         with suppress(FileExistsError):
             folder.mkdir(mode=0o700)
-        found = folder.lstat()
-        if not stat.S_ISDIR(found.st_mode):
+        status = folder.lstat()
+        if not stat.S_ISDIR(status.st_mode):
             raise AttachError(f"{folder}: is not a folder (a link?); remove it")
-        if found.st_uid != os.getuid():
-            raise AttachError(f"{folder}: belongs to user {found.st_uid}; sockets there are unsafe")
-        if stat.S_IMODE(found.st_mode) != 0o700:
+        if status.st_uid != os.getuid():
+            raise AttachError(
+                f"{folder}: belongs to user {status.st_uid}; sockets there are unsafe"
+            )
+        if stat.S_IMODE(status.st_mode) != 0o700:
             folder.chmod(0o700)
     except OSError as error:
         raise AttachError(f"{folder}: cannot be used for sockets: {error.strerror}") from error
@@ -101,24 +103,24 @@ def _listening(path: Path) -> bool:
     """Whether a process listens at a Unix socket; a file left by a dead one does not."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)
-        found = probe.connect_ex(os.fspath(path))
-    return found in (0, errno.EAGAIN, errno.EINPROGRESS)
+        error = probe.connect_ex(os.fspath(path))
+    return error in (0, errno.EAGAIN, errno.EINPROGRESS)
 
 
 def _sessions(folder: Path) -> list[Endpoint]:
     """Return the live sessions; files of dead ones are removed."""
-    found = []
+    sessions = []
     for pub in sorted(folder.glob("*.pub")):
         match = _FILE.match(pub.name)
         if match is None:
             continue
         cmd = pub.with_suffix(".cmd")
         if process_alive(int(match["pid"])) and _listening(pub):
-            found.append(Endpoint(match["rig"], int(match["pid"]), pub, cmd))
+            sessions.append(Endpoint(match["rig"], int(match["pid"]), pub, cmd))
         else:
             pub.unlink(missing_ok=True)
             cmd.unlink(missing_ok=True)
-    return found
+    return sessions
 
 
 def _pending(socket: zmq.Socket[bytes]) -> bool:
@@ -178,7 +180,7 @@ class Publisher:
 
         `judge` says of every command but "stop" why it is refused, None where it is taken.
         """
-        found: list[Command] = []
+        accepted: list[Command] = []
         for _ in range(_COMMANDS_AT_ONCE):
             try:
                 if not _pending(self._cmd):  # cheaper than an exception
@@ -195,14 +197,14 @@ class Publisher:
             if refusal is not None or command is None:
                 answer["error"] = refusal
             elif command.word != PAST:
-                found.append(command)
+                accepted.append(command)
             elif self.past is not None:
                 header, raw_past = self.past()
                 answer.update(header)
                 frames.append(raw_past)
             with suppress(zmq.ZMQError):
                 self._cmd.send_multipart([json.dumps(answer).encode(), *frames], zmq.NOBLOCK)
-        return found
+        return accepted
 
     @property
     def holder(self) -> str:
@@ -239,8 +241,8 @@ class Attachment:
     @staticmethod
     def find(rig: str | None = None, folder: Path | None = None) -> list[Endpoint]:
         """Return the live sessions (of one rig); raises AttachError for an unsafe folder."""
-        found = _sessions(session_folder() if folder is None else _private(folder))
-        return [e for e in found if rig is None or e.rig == rig[:_MAX_NAME]]
+        sessions = _sessions(session_folder() if folder is None else _private(folder))
+        return [e for e in sessions if rig is None or e.rig == rig[:_MAX_NAME]]
 
     def receive(self, timeout: float) -> Snapshot | None:
         """Return the next snapshot, None after `timeout` [s] without one."""

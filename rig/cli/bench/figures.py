@@ -62,13 +62,13 @@ def analysis_figures(folder: Path, say: Say) -> list[Figure]:
     started = time.perf_counter()
     run = load_run(folder / "thirty" / "identify")
     loading = time.perf_counter() - started
-    found = identify_figures(run)
+    times = identify_figures(run)
     return [
-        Figure("analysis", "records of 10 s", found["records"]),
-        Figure("analysis", "load and identify", loading + found["identify_seconds"], "s", 5.0),
-        Figure("analysis", "of it the solve", 1e3 * found["solve_seconds"], "ms", 50.0),
-        *beside("analysis", "solve", found["solve"], ("numpy's lstsq", found["lstsq"]), 1.1),
-        *beside("analysis", "identify 12 of them", found["twelve"], None, 300.0),
+        Figure("analysis", "records of 10 s", times["records"]),
+        Figure("analysis", "load and identify", loading + times["identify_seconds"], "s", 5.0),
+        Figure("analysis", "of it the solve", 1e3 * times["solve_seconds"], "ms", 50.0),
+        *beside("analysis", "solve", times["solve"], ("numpy's lstsq", times["lstsq"]), 1.1),
+        *beside("analysis", "identify 12 of them", times["twelve"], None, 300.0),
         *free_run_figures(load_rig(RIG)),
     ]
 

@@ -156,9 +156,9 @@ def plant_run(rig: Rig, ticks: int) -> tuple[Array, Array]:
     return np.stack(rows), spool_targets(rig, np.concatenate(codes))
 
 
-def errors(found: Array, true: Array, joints: int) -> dict[str, float]:
+def errors(states: Array, true: Array, joints: int) -> dict[str, float]:
     """Return the largest error of angles and of pressures, each relative to its signal's range."""
-    relative = np.max(np.abs(found - true), axis=0) / np.ptp(true, axis=0)
+    relative = np.max(np.abs(states - true), axis=0) / np.ptp(true, axis=0)
     return {
         "angle_error": float(np.max(relative[:joints])),
         "pressure_error": float(np.max(relative[joints:])),

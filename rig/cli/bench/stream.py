@@ -82,13 +82,13 @@ def row_figures(folder: Path, rows: int = 10_000_000) -> dict[str, float]:
     """
     path = folder / "rows.f64"
     write_rows(path, rows)
-    found = []
+    estimates = []
     for function, repeats in ((streamed, 3), (in_memory, 1)):
         with Processes(1) as pool:
             results = list(pool.map(function, [str(path)] * repeats))
-            found.append(min(results, key=lambda result: float(result["seconds"])))
+            estimates.append(min(results, key=lambda result: float(result["seconds"])))
     path.unlink()
-    stream, whole = found
+    stream, whole = estimates
     off = np.abs(stream["solution"] / whole["solution"] - 1.0).max()
     return {
         "rows": float(stream["rows"]),

@@ -88,9 +88,9 @@ def _put(table: AlarmTable, alarm: Alarm) -> AlarmTable:
     )
 
 
-def related(one: Alarm, other: Alarm) -> bool:
+def related(alarm: Alarm, other: Alarm) -> bool:
     """Say whether two alarms can have to do with each other: one joint, or one of the bench."""
-    return one.joint is None or other.joint is None or one.joint == other.joint
+    return alarm.joint is None or other.joint is None or alarm.joint == other.joint
 
 
 def _first_cause(table: AlarmTable, alarm: Alarm) -> str:
@@ -143,10 +143,10 @@ def acknowledged(table: AlarmTable, key: str | None = None) -> AlarmTable:
     Raises KeyError for an alarm that does not stand.
     """
     keys = [alarm.key for alarm in table.alarms] if key is None else [key]
-    for one in keys:
-        old = table.get(one)
+    for alarm_key in keys:
+        old = table.get(alarm_key)
         if old is None:
-            raise KeyError(f"no alarm {one!r} stands")
+            raise KeyError(f"no alarm {alarm_key!r} stands")
         state = _AFTER_ACKNOWLEDGING.get(old.state, old.state)
         table = _put(table, replace(old, state=state, acknowledged=True))
     return table
@@ -183,7 +183,7 @@ def folded(table: AlarmTable) -> tuple[tuple[Alarm, tuple[Alarm, ...]], ...]:
 
     def urgency(group: tuple[Alarm, tuple[Alarm, ...]]) -> tuple[bool, bool, float]:
         every = (group[0], *group[1])
-        seen = all(one.acknowledged for one in every)
-        return seen, not any(one.trips for one in every), group[0].time
+        seen = all(alarm.acknowledged for alarm in every)
+        return seen, not any(alarm.trips for alarm in every), group[0].time
 
     return tuple(sorted(groups, key=urgency))

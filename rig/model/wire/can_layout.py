@@ -188,15 +188,15 @@ class _Reader:
 
     def one(self, needed: Mapping[str, int]) -> CanMessage:
         """Return the one message that carries all of these signals."""
-        found = [(name, *self._signal(name, bits)) for name, bits in needed.items()]
-        message = found[0][1]
-        for name, other, _ in found:
+        signals = [(name, *self._signal(name, bits)) for name, bits in needed.items()]
+        message = signals[0][1]
+        for name, other, _ in signals:
             if other is not message:
                 raise InputError(
                     f"{self._source}: signal {name} stands in message {other.name}, "
-                    f"{found[0][0]} in {message.name}; expected in one message"
+                    f"{signals[0][0]} in {message.name}; expected in one message"
                 )
-        return self._message(message, [signal for _, _, signal in found])
+        return self._message(message, [signal for _, _, signal in signals])
 
     def parts(self, needed: Mapping[str, int]) -> CanMessage:
         """Return the message whose first byte is this signal; the others carry bytes."""

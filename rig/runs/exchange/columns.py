@@ -29,14 +29,14 @@ def read_table(path: Path, wanted: Iterable[str], needed: Iterable[str]) -> dict
     Raises InputError naming file, column and row; also when one of `needed` is missing.
     """
     if path.suffix.lower() == ".mat":
-        found = _read_mat(path, list(wanted))
+        table = _read_mat(path, list(wanted))
     else:
-        found = _read_csv(path, list(wanted), list(needed))
+        table = _read_csv(path, list(wanted), list(needed))
     for name in needed:
-        if name not in found:
-            raise _missing(path, name, found)
-    _same_length(path, found)
-    return found
+        if name not in table:
+            raise _missing(path, name, table)
+    _same_length(path, table)
+    return table
 
 
 def _missing(path: Path, name: str, has: Iterable[str]) -> InputError:
@@ -136,9 +136,9 @@ def _bad_cell(
             try:
                 float(cell)
             except ValueError:
-                found = f"found {cell[:40]!r}" if cell else "the cell is empty"
+                what = f"found {cell[:40]!r}" if cell else "the cell is empty"
                 return InputError(
-                    f"{path}:{row + 1}: column {names[column]!r}, row {row + 1}: {found}, "
+                    f"{path}:{row + 1}: column {names[column]!r}, row {row + 1}: {what}, "
                     "expected a number"
                 )
     return InputError(f"{path}: cannot be read as numbers: {reason}")
@@ -187,8 +187,8 @@ def _vector(path: Path, name: str, value: Any) -> Array:
     return vector
 
 
-def _same_length(path: Path, found: Mapping[str, Array]) -> None:
-    lengths = {name: len(values) for name, values in found.items()}
+def _same_length(path: Path, table: Mapping[str, Array]) -> None:
+    lengths = {name: len(values) for name, values in table.items()}
     if len(set(lengths.values())) > 1:
         first, *others = lengths
         other = next(name for name in others if lengths[name] != lengths[first])

@@ -62,14 +62,14 @@ def _flat(name: str, values: Array, unit: str) -> list[str]:
     resolution = float(np.diff(np.unique(values)).min())
     if resolution > span / _LEVELS:
         return []
-    found = []
+    flat = []
     for end, distance in (("top", values.max() - values), ("bottom", values - values.min())):
         at = int(np.count_nonzero(distance < 0.5 * resolution))
         near = int(np.count_nonzero(distance <= _NEAR * span))
         if at >= _LEAST and at > _SHARE * near:
             level = values.max() if end == "top" else values.min()
-            found.append(
+            flat.append(
                 f"{name}: {at} of {len(values)} samples are exactly {level:g} {unit}, its {end}; "
                 "is the sensor or its converter clipped?"
             )
-    return found
+    return flat

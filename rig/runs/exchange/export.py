@@ -108,43 +108,43 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def _write_csv(path: Path, one: Sheet) -> None:
+def _write_csv(path: Path, sheet: Sheet) -> None:
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(one.columns)
+        writer.writerow(sheet.columns)
         # Python writes the fewest digits that read back as the same number.
-        writer.writerows(zip(*(c.tolist() for c in one.columns.values()), strict=True))
+        writer.writerows(zip(*(c.tolist() for c in sheet.columns.values()), strict=True))
 
 
-def _write_mat(path: Path, one: Sheet) -> None:
+def _write_mat(path: Path, sheet: Sheet) -> None:
     from scipy.io import savemat  # noqa: PLC0415 - slow to load
 
-    about = {name[:_LONG]: value for name, value in one.about.items()}
-    data = {**one.columns, "about": about, "units": dict(one.units)}
+    about = {name[:_LONG]: value for name, value in sheet.about.items()}
+    data = {**sheet.columns, "about": about, "units": dict(sheet.units)}
     savemat(path, data, long_field_names=True, oned_as="column", do_compression=True)
 
 
-def _write_parquet(path: Path, one: Sheet) -> None:
+def _write_parquet(path: Path, sheet: Sheet) -> None:
     import pyarrow as pa  # noqa: PLC0415 - an extra
     from pyarrow import parquet  # noqa: PLC0415
 
-    fields = [pa.field(n, pa.float64(), metadata={"unit": one.units[n]}) for n in one.columns]
-    about = {name: json.dumps(value) for name, value in one.about.items()}
-    table = pa.table(list(one.columns.values()), schema=pa.schema(fields, metadata=about))
+    fields = [pa.field(n, pa.float64(), metadata={"unit": sheet.units[n]}) for n in sheet.columns]
+    about = {name: json.dumps(value) for name, value in sheet.about.items()}
+    table = pa.table(list(sheet.columns.values()), schema=pa.schema(fields, metadata=about))
     parquet.write_table(table, path)
 
 
-def _write_mf4(path: Path, one: Sheet) -> None:
+def _write_mf4(path: Path, sheet: Sheet) -> None:
     from asammdf import MDF, Signal  # noqa: PLC0415 - an extra, and slow to load
 
-    time = one.columns[TIME]
+    time = sheet.columns[TIME]
     signals = [
-        Signal(samples=values, timestamps=time, name=name, unit=one.units[name])
-        for name, values in one.columns.items()
+        Signal(samples=values, timestamps=time, name=name, unit=sheet.units[name])
+        for name, values in sheet.columns.items()
         if name != TIME
     ]
     with MDF(version="4.10") as file:
-        file.append(signals, comment=json.dumps(dict(one.about)), common_timebase=True)
+        file.append(signals, comment=json.dumps(dict(sheet.about)), common_timebase=True)
         file.save(path)
 
 

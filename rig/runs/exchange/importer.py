@@ -57,8 +57,8 @@ class _Source:
 
     def column(self, channel: str) -> str:
         """Return the name that a channel's column has in the files."""
-        found = self.manifest.columns.get(channel)
-        return channel if found is None or found.column is None else found.column
+        entry = self.manifest.columns.get(channel)
+        return channel if entry is None or entry.column is None else entry.column
 
 
 @dataclass(frozen=True)
@@ -100,18 +100,18 @@ def _read(source: _Source, entry: ManifestRecord) -> _Imported:
     if timed:
         needed.append(TIME)
     columns = _read_columns(source, file, every, needed)
-    found = {}
+    by_channel = {}
     for name, raw in columns.items():
         scale, offset = source.maps.get(name, (1.0, 0.0))
-        found[name] = raw * scale + offset if (scale, offset) != (1.0, 0.0) else raw
-    rate, start = _time_base(source, file, found.pop(TIME, None))
-    samples = len(next(iter(found.values())))
-    delays = {n: c.delay * rate for n, c in source.manifest.columns.items() if n in found}
+        by_channel[name] = raw * scale + offset if (scale, offset) != (1.0, 0.0) else raw
+    rate, start = _time_base(source, file, by_channel.pop(TIME, None))
+    samples = len(next(iter(by_channel.values())))
+    delays = {n: c.delay * rate for n, c in source.manifest.columns.items() if n in by_channel}
     first, last = _common(file, rate, samples, delays)
     for name, delay in delays.items():
-        found[name] = _advanced(found[name], delay, first, last)
+        by_channel[name] = _advanced(by_channel[name], delay, first, last)
     part = _part(entry, file, rate, first, last)
-    channels = {n: found[n][part] for n in every if n in found}
+    channels = {n: by_channel[n][part] for n in every if n in by_channel}
     return _Imported(entry, rate, start + part.start / rate, channels)
 
 
@@ -219,27 +219,27 @@ def _time_base(source: _Source, file: Path, time: Array | None) -> tuple[float, 
 
 
 def _warnings(source: _Source, records: list[_Imported]) -> tuple[str, ...]:
-    found = []
+    warnings = []
     rig = source.rig
     for name in rig.channels:
         lacking = [r.entry.file for r in records if name not in r.channels]
         if lacking:
             more = "" if len(lacking) == len(records) else f" in {len(lacking)} file(s)"
-            found.append(f"{name}: the rig has it, the data does not{more}; imported without")
+            warnings.append(f"{name}: the rig has it, the data does not{more}; imported without")
     for rate in sorted({r.sample_rate for r in records}):
         if abs(rate - rig.sample_rate) > 1e-6 * rig.sample_rate:
-            found.append(f"sampled at {rate:g} Hz, the rig samples at {rig.sample_rate:g} Hz")
+            warnings.append(f"sampled at {rate:g} Hz, the rig samples at {rig.sample_rate:g} Hz")
     for r in records:
         silent = silent_sensors(rig, r.entry.locked, r.channels)
-        found += [f"{r.entry.file}, {sentence}" for sentence in silent]
+        warnings += [f"{r.entry.file}, {sentence}" for sentence in silent]
     lengths: dict[str, set[int]] = {}
     for r in records:
         lengths.setdefault(r.entry.step, set()).add(len(next(iter(r.channels.values()))))
     for step, sizes in lengths.items():
         if len(sizes) > 1:
             few, many = min(sizes), max(sizes)
-            found.append(f"step {step!r}: its repeats have {few} to {many} samples")
-    return tuple(found)
+            warnings.append(f"step {step!r}: its repeats have {few} to {many} samples")
+    return tuple(warnings)
 
 
 def _write(

@@ -84,7 +84,7 @@ def describe(
         "conformsTo": _ref(PROFILE),
         "hasPart": [_ref(part) for part in names],
         "mentions": _ref("#run"),
-        "variableMeasured": [_ref(one["@id"]) for one in variables],
+        "variableMeasured": [_ref(variable["@id"]) for variable in variables],
     }
     graph: list[Entity] = [
         {
@@ -137,7 +137,7 @@ def _file(path: Path) -> Entity:
 def _action(folder: Path, head: RunHead, header: Header, names: list[str]) -> Entity:
     events = read_events(folder)
     failed = head.state != DONE
-    found: Entity = {
+    action: Entity = {
         "@id": "#run",
         "@type": "CreateAction",
         "name": header.provenance.get("command") or f"Run on {header.rig.name}",
@@ -154,8 +154,8 @@ def _action(folder: Path, head: RunHead, header: Header, names: list[str]) -> En
     if failed:
         ends = [e for e in events if e.get("event") in ("trip", "end", "recovered")]
         last = str(ends[-1].get("message", "")) if ends else ""
-        found["error"] = last or (ABORTED if head.state == ABORTED else head.state)
-    return found
+        action["error"] = last or (ABORTED if head.state == ABORTED else head.state)
+    return action
 
 
 def _instrument(header: Header) -> Entity:
@@ -188,21 +188,21 @@ def _software(versions: Mapping[str, str]) -> list[Entity]:
 
 def _variables(head: RunHead, header: Header) -> list[Entity]:
     names = dict.fromkeys(name for record in head.records for name in record.channels)
-    found = []
+    variables = []
     for name in names:
         unit = header.rig.unit_of(name)
-        one: Entity = {
+        variable: Entity = {
             "@id": f"#channel-{name}",
             "@type": "PropertyValue",
             "name": name,
             "unitText": unit or "1",
         }
         if unit in _UNIT_CODES:
-            one["unitCode"] = _UNIT_CODES[unit]
+            variable["unitCode"] = _UNIT_CODES[unit]
         if name in _calibrated(header):
-            one["measurementTechnique"] = _ref(f"#calibration-{name}")
-        found.append(one)
-    return found
+            variable["measurementTechnique"] = _ref(f"#calibration-{name}")
+        variables.append(variable)
+    return variables
 
 
 def _calibrated(header: Header) -> Mapping[str, Any]:
@@ -215,17 +215,17 @@ def _calibrations(header: Header) -> list[Entity]:
             "@id": f"#calibration-{name}",
             "@type": "CreateAction",
             "name": f"Calibration of {name}",
-            "endTime": one.date.isoformat(),
+            "endTime": calibration.date.isoformat(),
             "object": _ref(f"#sensor-{name}"),
-            "description": one.certificate or "no certificate was named",
+            "description": calibration.certificate or "no certificate was named",
         }
-        for name, one in _calibrated(header).items()
+        for name, calibration in _calibrated(header).items()
     ] + [
         {
             "@id": f"#sensor-{name}",
             "@type": "IndividualProduct",
             "name": f"Sensor of {name}",
-            "serialNumber": one.serial,
+            "serialNumber": calibration.serial,
         }
-        for name, one in _calibrated(header).items()
+        for name, calibration in _calibrated(header).items()
     ]

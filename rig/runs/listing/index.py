@@ -104,21 +104,21 @@ def _removed(path: Path) -> bool:
 def _read(db: sqlite3.Connection, folders: list[Path]) -> list[RunSummary]:
     kept = {name: (signature, line) for name, signature, line in
             db.execute("SELECT name, signature, line FROM run")}  # fmt: skip
-    found, fresh = [], []
+    summaries, fresh = [], []
     for folder in folders:
         signature = _signature(folder)
         known = kept.get(folder.name)
         if known is not None and known[0] == signature:
-            found.append(_summary(folder, known[1]))
+            summaries.append(_summary(folder, known[1]))
             continue
         summary = summarise(folder)
-        found.append(summary)
+        summaries.append(summary)
         if summary.state != RUNNING:  # its writer may die without touching a file
             fresh.append((signature, summary))
     gone = set(kept) - {folder.name for folder in folders}
     if fresh or gone:
         _write(db, fresh, gone)
-    return found
+    return summaries
 
 
 def _write(

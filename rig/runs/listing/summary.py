@@ -133,6 +133,6 @@ def run_folders(folder: str | Path) -> list[Path]:
         raise InputError(f"{root}: cannot be read: {error.strerror}") from error
 
 
-def in_order(found: list[RunSummary]) -> list[RunSummary]:
+def in_order(summaries: list[RunSummary]) -> list[RunSummary]:
     """Return summaries oldest first."""
-    return sorted(found, key=lambda s: (s.created, s.path.name))
+    return sorted(summaries, key=lambda s: (s.created, s.path.name))

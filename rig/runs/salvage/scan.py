@@ -169,10 +169,10 @@ def _number(part: Bytes, place: int, payload: int) -> int | None:
     return None
 
 
-def best_marks(found: Sequence[Mark]) -> list[Mark]:
+def best_marks(marks: Sequence[Mark]) -> list[Mark]:
     """Return one version of each mark, the closed one where it is left, in the order of start."""
     best: dict[tuple[int, int, str], Mark] = {}
-    for mark in found:
+    for mark in marks:
         key = (mark.stream, mark.start, str(mark.meta["name"]))
         if key not in best or best[key].state == "open":
             best[key] = mark

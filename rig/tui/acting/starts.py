@@ -47,12 +47,12 @@ class Starts(Commands):
         self.browsed = replace(self.browsed, reading=True, rig=rig)
 
         def read() -> None:
-            found = read_disk(self.browsed)
+            browsed = read_disk(self.browsed)
             # What was started or opened meanwhile stays.
             now = self.browsed
             self.browsed = replace(
-                now, protocols=found.protocols, runs=found.runs, queue=found.queue,
-                paused=found.paused, trouble=found.trouble, reading=False,
+                now, protocols=browsed.protocols, runs=browsed.runs, queue=browsed.queue,
+                paused=browsed.paused, trouble=browsed.trouble, reading=False,
             )  # fmt: skip
             self.redraw()
 
@@ -65,21 +65,21 @@ class Starts(Commands):
 
     def act_enter(self) -> None:
         """Offer what can be done with the marked line."""
-        found = self.browsed
-        if self.look.page != "runs" or not found.lines:
+        browsed = self.browsed
+        if self.look.page != "runs" or not browsed.lines:
             return
-        at = min(self.look.marked, found.lines - 1)
-        if found.name == "protocols":
-            name = found.protocols[at]
+        at = min(self.look.marked, browsed.lines - 1)
+        if browsed.name == "protocols":
+            name = browsed.protocols[at]
             self._offer(name, {
                 "check on the twin": lambda: self._check(name),
                 "start on the bench": lambda: self._start_run(name),
             })  # fmt: skip
-        elif found.name == "runs":
-            self._offer_run(found.runs[at])
+        elif browsed.name == "runs":
+            self._offer_run(browsed.runs[at])
         else:
-            item = found.queue[at]
-            page = found.folder / "night.html"
+            item = browsed.queue[at]
+            page = browsed.folder / "night.html"
             words = ("queue", "page", "--out", str(page))
             self._offer(f"item {item.id} {item.job.name}: {item.state} {item.reason}", {
                 "write the page of the night": lambda: self._job(words),
@@ -92,16 +92,18 @@ class Starts(Commands):
 
     def _offer_run(self, run: RunSummary) -> None:
         path = str(run.path)
-        others = [one for one in self.browsed.runs if one.path != run.path and one.records > 0]
+        others = [
+            other for other in self.browsed.runs if other.path != run.path and other.records > 0
+        ]
         report, stored = run.path / REPORT, run.path / STORED
         beside = run.path.parent / REPORT  # of a set of runs, as the demo writes it
 
         def against() -> None:
             acts: dict[str, Callable[[], None]] = {}
-            for one in others:
-                words = ("trace", path, "--holdout", str(one.path), "--report", str(report),
+            for other in others:
+                words = ("trace", path, "--holdout", str(other.path), "--report", str(report),
                          "--json", str(stored))  # fmt: skip
-                acts[one.path.name] = lambda words=words: self._job(words)  # type: ignore[misc]
+                acts[other.path.name] = lambda words=words: self._job(words)  # type: ignore[misc]
             if acts:
                 self._offer("trace: held-out records of", acts)
             else:

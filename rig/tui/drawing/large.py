@@ -46,9 +46,9 @@ def large(text: str, style: str = "", scale: int = 1) -> list[Row]:
         return [()] * (ROWS * scale)
     dots = [line for line in _bitmap(text) for _ in range(scale)]
     dots += ["." * len(dots[0])] * (2 * ROWS * scale - len(dots))
-    found = []
+    rows = []
     for upper, lower in zip(dots[::2], dots[1::2], strict=True):
         pairs = zip(upper, lower, strict=True)
         cells = "".join(scale * _HALVES[a == "#", b == "#"] for a, b in pairs)
-        found.append(row((cells, style)))
-    return found
+        rows.append(row((cells, style)))
+    return rows

@@ -73,16 +73,16 @@ def fit(line: Row, width: int, style: str = PLAIN) -> Row:
     if have <= width:
         rest = ((" " * (width - have), style),) if have < width else ()
         return line if isinstance(line, Fitted) and not rest else fitted((*line, *rest), width)
-    found: list[Part] = []
+    fitting: list[Part] = []
     left = width - 1
     for text, part_style in line:
         size = cell_len(text)
         if size > left:
-            found.append((set_cell_size(text, left) + "…", part_style))
+            fitting.append((set_cell_size(text, left) + "…", part_style))
             break
-        found.append((text, part_style))
+        fitting.append((text, part_style))
         left -= size
-    return fit(tuple(found), width, style)
+    return fit(tuple(fitting), width, style)
 
 
 def ends(left: Row, right: Row, width: int, style: str = PLAIN) -> Row:
@@ -106,13 +106,13 @@ def beside(blocks: Sequence[tuple[Sequence[Row], int]], height: int, gap: int = 
     filled = [block(rows, width, height) for rows, width in blocks]
     space: Row = ((" " * gap, PLAIN),) if gap else ()
     total = sum(width for _, width in blocks) + gap * (len(blocks) - 1)
-    found = []
+    joined = []
     for parts in zip(*filled, strict=True):
         line: Row = parts[0]
         for part in parts[1:]:
             line = (*line, *space, *part)
-        found.append(fitted(line, total))
-    return found
+        joined.append(fitted(line, total))
+    return joined
 
 
 def box(

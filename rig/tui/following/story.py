@@ -95,14 +95,14 @@ def from_events(events: Iterable[Mapping[str, Any]], snapshot: Snapshot) -> list
     if not snapshot.device_time > 0 or not snapshot.tick:
         return []
     rate = snapshot.tick / snapshot.device_time
-    found = []
+    lines = []
     for event in events:
         tick = event.get("tick")
         if not isinstance(tick, int):
             continue
         at = max(snapshot.done_s - (snapshot.tick - tick) / rate, 0.0)
-        found.append(EventLine(at, *said_of_event(event)))
-    return found
+        lines.append(EventLine(at, *said_of_event(event)))
+    return lines
 
 
 def said_of_event(event: Mapping[str, Any]) -> Said:

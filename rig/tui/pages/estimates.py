@@ -47,7 +47,7 @@ def half_widths(series: Sequence[TrackedPoint], name: str) -> list[tuple[float, 
 
     A parameter that the present step does not excite stays as it is, and says nothing.
     """
-    found: list[tuple[float, float]] = []
+    widths: list[tuple[float, float]] = []
     before: Sequence[float | None] = ()
     for point in series:
         newest = point.values.get(name, ())
@@ -56,25 +56,25 @@ def half_widths(series: Sequence[TrackedPoint], name: str) -> list[tuple[float, 
         before = newest
         value, low, high = newest
         if value and low is not None and high is not None:
-            found.append((point.time, abs(0.5 * (high - low) / value)))
-    return found
+            widths.append((point.time, abs(0.5 * (high - low) / value)))
+    return widths
 
 
 def shares(series: Sequence[TrackedPoint], family: str) -> list[tuple[float, float]]:
     """Return (time [s], residual over the size of the equations) of a family."""
-    found = []
+    parts = []
     for point in series:
         rms, size = point.residuals.get(family, (0.0, 0.0))
         if size > 0.0:
-            found.append((point.time, rms / size))
-    return found
+            parts.append((point.time, rms / size))
+    return parts
 
 
 def warnings_of(series: Sequence[TrackedPoint]) -> list[str]:
     """Return in sentences what speaks against the experiment, the residual first."""
-    found = []
+    warnings = []
     for family in families(series):
-        found += _about_residual(EQUATIONS.get(family, (family, ""))[0], shares(series, family))
+        warnings += _about_residual(EQUATIONS.get(family, (family, ""))[0], shares(series, family))
     for name in series[-1].values if series else ():
         widths = half_widths(series, name)
         if len(widths) < ONLINE.updates:
@@ -82,11 +82,11 @@ def warnings_of(series: Sequence[TrackedPoint]) -> list[str]:
         then, before = widths[(len(widths) - 1) // 2]
         now = widths[-1][1]
         if now > max(ONLINE.wide, ONLINE.shrunk * before):
-            found.append(
+            warnings.append(
                 f"{name}: its interval does not shrink, ±{before:.0%} at {clock_text(then)} and "
                 f"±{now:.0%} now: more amplitude, other lines, or air and play in the way?"
             )
-    return found
+    return warnings
 
 
 def _about_residual(name: str, left: Sequence[tuple[float, float]]) -> list[str]:
@@ -125,7 +125,7 @@ def estimates_page(view: PlotView, width: int, height: int) -> list[Row]:
     """
     series = view.newest.estimates
     newest = series[-1].values if series else {}
-    names = [name for name, found in newest.items() if found[0] is not None]
+    names = [name for name, estimate in newest.items() if estimate[0] is not None]
     if not names:
         text = "Nothing is estimated yet: `bramah run --track` follows b and the flow gains."
         return block(wrapped(f" {text}", width, DIM), width, height)
@@ -182,7 +182,7 @@ def _estimate(view: PlotView, name: str, width: int, height: int) -> list[Row]:
         if name in point.values and point.values[name][0] is not None
     ]
     time = np.array([at for at, _ in points])
-    table = np.array([found for _, found in points])
+    table = np.array([estimate for _, estimate in points])
     low = np.where(np.isnan(table[:, 1]), table[:, 0], table[:, 1])
     high = np.where(np.isnan(table[:, 2]), table[:, 0], table[:, 2])
     value = table[-1, 0]

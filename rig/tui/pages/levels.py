@@ -108,7 +108,7 @@ def diagnostics_page(view: PlotView, width: int, height: int) -> list[Row]:
         ("run folder", snapshot.run or "none"),
         ("sockets", str(frame.endpoint.pub) if frame.endpoint else "–"),
     ]
-    found = columns([[(f" {name}", DIM), *row(what)] for name, what in cells])
+    table = columns([[(f" {name}", DIM), *row(what)] for name, what in cells])
     names = [
         [
             (f" {name}", ""),
@@ -120,8 +120,8 @@ def diagnostics_page(view: PlotView, width: int, height: int) -> list[Row]:
     listed = columns(names)
     if width >= TWO:
         left = max(width // 2, 60)
-        return beside([(found, left), (listed, width - left - 1)], height)
-    return block([*found, row(), *listed][:height], width, height)
+        return beside([(table, left), (listed, width - left - 1)], height)
+    return block([*table, row(), *listed][:height], width, height)
 
 
 def _state_of(view: PlotView, last: float) -> str:

@@ -38,5 +38,5 @@ def manual_page(view: PlotView, width: int, height: int) -> list[Row]:
     room = height - len(head) - len(bars)
     others = [joint, *(other for other in joints if other != joint)][: max(width // 38, 1)]
     each = (width - len(others) + 1) // len(others)
-    boxes = [(joint_box(view, one, each, room), each) for one in sorted(others)]
+    boxes = [(joint_box(view, number, each, room), each) for number in sorted(others)]
     return [*head, *beside(boxes, room), *bars]

@@ -22,11 +22,11 @@ WIDE = 110  # from this width on, details stand beside the list
 
 def in_order(view: PlotView) -> list[tuple[Alarm, bool]]:
     """Return the alarms as listed, each with whether it is a consequence of one above."""
-    found = []
+    ordered = []
     for first, rest in folded(view.alarms):
-        found.append((first, False))
-        found += [(alarm, True) for alarm in rest]
-    return found
+        ordered.append((first, False))
+        ordered += [(alarm, True) for alarm in rest]
+    return ordered
 
 
 def alarms_page(view: PlotView, width: int, height: int) -> list[Row]:
@@ -159,7 +159,7 @@ def run_log_page(view: PlotView, width: int, height: int) -> list[Row]:
     log = view.browsed.log
     if log is None:
         return block([row((" no run was opened", DIM))], width, height)
-    of = [one for one in view.browsed.runs if one.path == log.folder]
+    of = [run for run in view.browsed.runs if run.path == log.folder]
     state = f"  {of[0].state}  {of[0].message}" if of else ""
     head = [fit(row((f" log of {log.folder}", STRONG), (state, DIM)), width)]
     if log.reading:
@@ -177,7 +177,7 @@ def log_rows(story: Sequence[EventLine], view: PlotView, width: int, height: int
     room = height - 1
     wanted = view.look.offset
     # A line has a row at least: what is scrolled away above the window need not be wrapped.
-    rows = [line for one in lines[-(room + wanted) :] for line in _log_line(one, width)]
+    rows = [line for entry in lines[-(room + wanted) :] for line in _log_line(entry, width)]
     offset = min(wanted, max(len(rows) - room, 0))
     search = f"  search: {view.look.search}" if view.look.search else ""
     where = f"  {offset} rows back" if offset else ""

@@ -40,12 +40,12 @@ def overview(view: PlotView, width: int, height: int) -> list[Row]:
 
 
 def _band(
-    found: Headline, margin: Margin | None, view: PlotView, width: int, scale: int
+    headline: Headline, margin: Margin | None, view: PlotView, width: int, scale: int
 ) -> list[Row]:
     """Return the large letters; what is not normal fills the band with its colour."""
     snapshot = view.newest.snapshot
     assert snapshot is not None
-    ground = LEVELS[found.level] if found.level not in ("normal", "ended") else ""
+    ground = LEVELS[headline.level] if headline.level not in ("normal", "ended") else ""
     tiles = []
     if margin is not None and not view.newest.over:
         near = ALARM_TEXT if margin.share < 0 else WARN_TEXT if margin.share < NEAR else STRONG
@@ -55,18 +55,18 @@ def _band(
         tiles.append((left, "left", STRONG))
     sizes = [max(large_width(text, scale), len(caption)) + 2 for text, caption, _ in tiles]
     room = width - sum(sizes) - len(tiles)
-    if room < min(large_width(found.word), width) and found.level == "alarm":
+    if room < min(large_width(headline.word), width) and headline.level == "alarm":
         tiles, sizes, room = [], [], width  # the word matters most
-    fits = next((s for s in (scale, 1) if large_width(found.word, s) + 4 <= room), 0)
+    fits = next((s for s in (scale, 1) if large_width(headline.word, s) + 4 <= room), 0)
     high = ROWS * scale
     style = ground or STRONG
     if fits:
-        letters: list[Row] = large(found.word, style, fits)
+        letters: list[Row] = large(headline.word, style, fits)
     else:
-        letters = [row(), row((" ".join(found.word) if 2 * len(found.word) < room else found.word,
-                               style))]  # fmt: skip
+        spaced = " ".join(headline.word)
+        letters = [row(), row((spaced if len(spaced) + 1 < room else headline.word, style))]
     word = [fit((("  ", style), *line), room, ground) for line in letters]
-    caption = row((f" {found.symbol} {found.word} ", ground or DIM))
+    caption = row((f" {headline.symbol} {headline.word} ", ground or DIM))
     word = [*block(word, room, high, ground), fit(caption, room, ground)]
     blocks: list[tuple[list[Row], int]] = [(word, room)]
     for (text, below, tile_style), size in zip(tiles, sizes, strict=True):

@@ -28,12 +28,12 @@ ROLES: Final = {"locked": "▣ locked", "excited": "≈ excited", "free": "○ f
 
 def joints_in(channels: Iterable[str]) -> dict[int, list[str]]:
     """Return the channels of every joint, joints in order: {1: ["spool_1", ...], ...}."""
-    found: dict[int, list[str]] = {}
+    by_joint: dict[int, list[str]] = {}
     for name in channels:
         match = _JOINT_CHANNEL.match(name)
         if match is not None:
-            found.setdefault(int(match["joint"]), []).append(name)
-    return dict(sorted(found.items()))
+            by_joint.setdefault(int(match["joint"]), []).append(name)
+    return dict(sorted(by_joint.items()))
 
 
 def short_name(kind: str) -> str:

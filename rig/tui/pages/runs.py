@@ -18,22 +18,22 @@ STATES = {"tripped": "■", "unreadable": "✕", "interrupted": "▲", "aborted"
 
 def runs_page(view: PlotView, width: int, height: int) -> list[Row]:
     """Return the open tab with the marked line, and the newest verb's output."""
-    found = view.browsed
+    browsed = view.browsed
     tabs: Row = ((" ", ""),)
     for k, name in enumerate(TABS):
-        tabs = (*tabs, (f" {name} ", NORMAL if k == found.tab else DIM), (" ", ""))
-    reading = " reading ..." if found.reading else ""
-    about = f" in {found.folder.absolute()}   rig {found.rig or '–'}{reading}"
+        tabs = (*tabs, (f" {name} ", NORMAL if k == browsed.tab else DIM), (" ", ""))
+    reading = " reading ..." if browsed.reading else ""
+    about = f" in {browsed.folder.absolute()}   rig {browsed.rig or '–'}{reading}"
     head = [fit((*tabs, (about, DIM)), width)]
-    if found.trouble:
-        head += wrapped(f" {found.trouble}", width, WARN_TEXT)
+    if browsed.trouble:
+        head += wrapped(f" {browsed.trouble}", width, WARN_TEXT)
     lines = _lines(view)
     at = min(view.look.marked, max(len(lines) - 1, 0))
     listed = [
         row(("▸" if k == at else " ", STRONG), *line) for k, line in enumerate(lines)
     ] or [row((" nothing here", DIM))]  # fmt: skip
     room = height - len(head)
-    if found.job is None:
+    if browsed.job is None:
         return block([*head, *_around(listed, at, room)], width, height)
     if width >= WIDE:
         left = width * 2 // 5
@@ -52,20 +52,20 @@ def _around(rows: list[Row], at: int, height: int) -> list[Row]:
 
 
 def _lines(view: PlotView) -> list[Row]:
-    found = view.browsed
-    if found.name == "protocols":
-        return [row(f" {name}") for name in found.protocols]
-    if found.name == "runs":
-        return columns([_run(one) for one in found.runs])
-    return columns([_item(item) for item in found.queue])
+    browsed = view.browsed
+    if browsed.name == "protocols":
+        return [row(f" {name}") for name in browsed.protocols]
+    if browsed.name == "runs":
+        return columns([_run(run) for run in browsed.runs])
+    return columns([_item(item) for item in browsed.queue])
 
 
-def _run(one: RunSummary) -> list[str | Part]:
-    style = ALARM_TEXT if one.state in ("tripped", "unreadable") else ""
-    count = f"{one.records} records" if one.records >= 0 else ""
-    said = one.message if one.state != "done" else ""
-    state = (f"{STATES.get(one.state, '□')} {one.state}", style)
-    return [f" {one.path.name}", state, one.protocol, count, (one.created[:16], DIM), said]
+def _run(run: RunSummary) -> list[str | Part]:
+    style = ALARM_TEXT if run.state in ("tripped", "unreadable") else ""
+    count = f"{run.records} records" if run.records >= 0 else ""
+    said = run.message if run.state != "done" else ""
+    state = (f"{STATES.get(run.state, '□')} {run.state}", style)
+    return [f" {run.path.name}", state, run.protocol, count, (run.created[:16], DIM), said]
 
 
 def _item(item: Item) -> list[str | Part]:
@@ -93,8 +93,8 @@ def _job(view: PlotView, width: int, height: int) -> list[Row]:
 def parameter_rows(parameters: Mapping[str, Any]) -> list[Row]:
     """Return identified parameters with their 95 % intervals, one line each."""
     cells: list[list[str | Part]] = []
-    for name, found in parameters.items():
-        value, (low, high) = found["value"], found["ci95"]
+    for name, estimate in parameters.items():
+        value, (low, high) = estimate["value"], estimate["ci95"]
         if value is None or low is None or high is None:
             cells.append([name, ("not identified", WARN_TEXT)])
             continue
@@ -102,5 +102,7 @@ def parameter_rows(parameters: Mapping[str, Any]) -> list[Row]:
         share = abs(half / value) if value else float("inf")
         wide: Part = ("▲ wide", WARN_TEXT) if share > 0.5 else ("", "")
         text = f"{low:.4g} … {high:.4g}"
-        cells.append([name, (f"{value:.4g}", STRONG), found["unit"], text, f"±{share:.1%}", wide])
+        cells.append(
+            [name, (f"{value:.4g}", STRONG), estimate["unit"], text, f"±{share:.1%}", wide]
+        )
     return columns(cells)

@@ -26,24 +26,24 @@ SYMBOLS: Final = {"clean": "●", "explained": "●", "confounded": "▲", "unex
 
 def run_trace_page(view: PlotView, width: int, height: int) -> list[Row]:
     """Return what the stored trace of a run says."""
-    found = view.browsed.trace
-    if found is None:
+    trace = view.browsed.trace
+    if trace is None:
         return block([row((" no run was opened", DIM))], width, height)
-    head = [fit(row((f" {found.path or found.folder}", STRONG)), width)]
-    if found.stored is None:
-        said = "reading ..." if found.reading else found.trouble
-        style = DIM if found.reading else WARN_TEXT
+    head = [fit(row((f" {trace.path or trace.folder}", STRONG)), width)]
+    if trace.stored is None:
+        said = "reading ..." if trace.reading else trace.trouble
+        style = DIM if trace.reading else WARN_TEXT
         return block([*head, *wrapped(f" {said}", width, style)], width, height)
     room = height - len(head)
     beside_it = width >= WIDE
     left = width * 11 // 20 if beside_it else width
-    text = trace_text_rows(found.stored, left - 1)
+    text = trace_text_rows(trace.stored, left - 1)
     if beside_it:
         right = width - left - 1
-        plots = free_run_rows(found.stored, view.look.channel, right, room)
+        plots = free_run_rows(trace.stored, view.look.channel, right, room)
         text = text[min(view.look.offset, max(len(text) - room, 0)) :]
         return [*head, *beside([(text, left), (plots, right)], room)]
-    text += [row(), *free_run_rows(found.stored, view.look.channel, width, 2 * PLOT + 4)]
+    text += [row(), *free_run_rows(trace.stored, view.look.channel, width, 2 * PLOT + 4)]
     at = min(view.look.offset, max(len(text) - room, 0))
     more = len(text) - room - at
     rows = block(text[at:], width, room)
@@ -86,14 +86,14 @@ def _refused(effect: StoredEffect, width: int) -> list[Row]:
     return wrapped(f"   fitted best, but not named: {name} at {effect.where}{why}", width, DIM)
 
 
-def estimate_text(found: StoredEstimate) -> str:
+def estimate_text(estimate: StoredEstimate) -> str:
     """Return a value with half its 95 % interval and its unit, as a person writes it."""
-    low, high = found.ci95
-    if found.value is None:
+    low, high = estimate.ci95
+    if estimate.value is None:
         return "not identified"
     half = f" ± {0.5 * (high - low):.2g}" if low is not None and high is not None else ""
-    unit = found.unit.replace("*", "·").replace("^2", "²").replace("^3", "³")
-    return f"{found.value:.4g}{half} {unit}".rstrip()
+    unit = estimate.unit.replace("*", "·").replace("^2", "²").replace("^3", "³")
+    return f"{estimate.value:.4g}{half} {unit}".rstrip()
 
 
 def _errors(stored: StoredTrace) -> list[Row]:

@@ -77,10 +77,10 @@ def _page(view: PlotView, width: int, height: int) -> list[Row]:
 
 def too_small(view: PlotView, width: int, height: int) -> list[Row]:
     """Return what a terminal without room for a page still says: the state, and that keys stop."""
-    found = headline(view.newest, view.now)
-    style = LEVELS[found.level]
+    head = headline(view.newest, view.now)
+    style = LEVELS[head.level]
     lines = [
-        row((f"{found.symbol} {found.word}", style)),
+        row((f"{head.symbol} {head.word}", style)),
         row(("SPACE STOPS", STRONG)),
         row((f"{width}x{height}: too small, needs {LEAST[0]}x{LEAST[1]}", "")),
     ]
@@ -93,8 +93,8 @@ def header(view: PlotView, width: int) -> list[Row]:
 
 
 def _who(view: PlotView, width: int) -> Row:
-    found = headline(view.newest, view.now)
-    badge = (f" {found.symbol} {found.word} ", LEVELS[found.level])
+    head = headline(view.newest, view.now)
+    badge = (f" {head.symbol} {head.word} ", LEVELS[head.level])
     snapshot = view.newest.snapshot
     if snapshot is None:
         who = view.newest.endpoint
@@ -148,10 +148,10 @@ def _tabs(view: PlotView, width: int) -> Row:
 def notice_rows(view: PlotView, width: int) -> list[Row]:
     """Return what the operator must not miss, each on its own colour over the whole width."""
     rows: list[Row] = []
-    found = notices(view.newest, view.stop, view.now, paused=view.held)
+    standing = notices(view.newest, view.stop, view.now, paused=view.held)
     if view.look.page == "overview":  # it lists the alarms itself
-        found = [notice for notice in found if not notice.text.startswith("WARNING")]
-    for notice in found:
+        standing = [notice for notice in standing if not notice.text.startswith("WARNING")]
+    for notice in standing:
         style = LEVELS[notice.level]
         lines = wrapped(notice.text, width - 4)
         for k, line in enumerate(lines):

@@ -48,15 +48,15 @@ def fault_trials(folder: Path, least: int, say: Say) -> list[TrialOutcome]:
 
 
 def _on_wire(folder: Path, wire: str, least: int, say: Say) -> list[TrialOutcome]:
-    rig, found = impatient(load_rig(RIG)), []
+    rig, trials = impatient(load_rig(RIG)), []
     chosen = list(jobs(wire, least))
     with fault_bench() as bench:
         for seed, name in chosen:
             place = folder / f"fault-{seed}"
-            found.append(try_fault(bench, rig, wire, name, place, seed, realtime=False))
-            if len(found) % 24 == 0:
-                say(f"faults: {len(found)} of {len(chosen)} on {wire}")
-    return found
+            trials.append(try_fault(bench, rig, wire, name, place, seed, realtime=False))
+            if len(trials) % 24 == 0:
+                say(f"faults: {len(trials)} of {len(chosen)} on {wire}")
+    return trials
 
 
 def fault_figures(folder: Path, say: Say, least: int = LEAST) -> list[Figure]:

@@ -61,8 +61,8 @@ def ages_on_glass(
     for at, piece in drawn:
         text = before + piece  # a line may come in two pieces
         before = text[-_LINE:]
-        for found in _TICK.finditer(text):
-            tick = int(found[1])
+        for match in _TICK.finditer(text):
+            tick = int(match[1])
             if tick > newest:
                 newest = tick
                 seen.append((at, at - (origin + tick / rate)))
@@ -141,8 +141,8 @@ def _lateness_figures(times: RunTimes, phases: list[Phase]) -> list[Figure]:
 
 def _age_figures(times: RunTimes, drawn: list[list[tuple[float, str]]]) -> list[Figure]:
     rate = load_rig(RIG).sample_rate
-    found = [ages_on_glass(one, times.origin, rate) for one in drawn]
-    ages, stays = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    seen_ages = [ages_on_glass(picture, times.origin, rate) for picture in drawn]
+    ages, stays = (np.concatenate(parts) for parts in zip(*seen_ages, strict=True))
     if not len(ages):
         raise WorkError("bench --only screen: no tick was drawn on the page of diagnostics")
     quantile = {share: 1e3 * age_quantile(ages, stays, share) for share in (0.5, 0.99, 1.0)}

@@ -80,25 +80,25 @@ def many_stops(
     A bench that has tripped for want of a processor is left for a new one.
     """
     rng = np.random.default_rng(SEED)
-    found: list[tuple[float, float]] = []
+    delays: list[tuple[float, float]] = []
     failed = 0
     with Screen(runtime) as screen:
-        while len(found) < count:
+        while len(delays) < count:
             with simulated_bench(RIG, seed=SEED, real_time=True) as endpoint, suppress(RunFailed):
-                while len(found) < count:
-                    out = runtime / f"stop-{failed}-{len(found)}"
+                while len(delays) < count:
+                    out = runtime / f"stop-{failed}-{len(delays)}"
                     failed += 1  # until it has not
                     wait = float(rng.uniform(SOON, LATE))
-                    found.append(one_stop(screen, RunPlace(endpoint, runtime, out), wait))
+                    delays.append(one_stop(screen, RunPlace(endpoint, runtime, out), wait))
                     failed -= 1
                     shutil.rmtree(out)
-                    if len(found) % 20 == 0:
-                        say(f"screen: {len(found)} of {count} stops")
+                    if len(delays) % 20 == 0:
+                        say(f"screen: {len(delays)} of {count} stops")
             if failed > FAILURES + FAILURE_SHARE * count:
                 raise WorkError(
                     f"bench --only screen: {failed} runs failed; the machine is too busy"
                 )
-    return found, failed
+    return delays, failed
 
 
 def stop_figures(
@@ -111,8 +111,8 @@ def stop_figures(
     busy = (os.cpu_count() or 1) if busy is None else busy
     say(f"screen: {count} stops by key, in real time, beside {busy} busy processes")
     with busy_cores(busy):
-        found, failed = many_stops(runtime, say, count)
-    acted, late = 1e3 * np.array(found).T
+        delays, failed = many_stops(runtime, say, count)
+    acted, late = 1e3 * np.array(delays).T
     return [
         Figure("screen", f"stops by key, beside {busy} busy processes", count),
         Figure("screen", "runs that failed before their stop", failed),

@@ -37,21 +37,21 @@ def beside(
 
 def free_run_figures(rig: Rig) -> list[Figure]:
     """Measure a free run of 10 s beside what else solves the same equations."""
-    group, found = "analysis", free_run_times(rig)
-    own, hand = found["own"], found["hand"]
+    group, times = "analysis", free_run_times(rig)
+    own, hand = times["own"], times["hand"]
     figures = [
         *beside(group, "free run of 10 s, both joints", own, ("the same by hand", hand), 1.4),
-        Figure(group, "free run", found["times_real_time"], "x real time", 500, True),
-        Figure(group, "difference of the two", found["difference_to_hand"], "rad", 1e-9),
-        Figure(group, "its largest error over a state's range", found["error"]),
+        Figure(group, "free run", times["times_real_time"], "x real time", 500, True),
+        Figure(group, "difference of the two", times["difference_to_hand"], "rad", 1e-9),
+        Figure(group, "its largest error over a state's range", times["error"]),
     ]
     for name, limit in (("odeint", 9.0), ("cvodes", 14.0)):
-        if name in found:
-            other = found[name]
+        if name in times:
+            other = times[name]
             figures += [
                 Figure(group, f"{name}, as exact", 1e3 * other.least, "ms"),
                 Figure(group, f"{name}, median", 1e3 * other.median, "ms"),
-                Figure(group, f"{name}, its error", found[f"{name}_error"]),
+                Figure(group, f"{name}, its error", times[f"{name}_error"]),
                 Figure(
                     group,
                     f"{name} over free run",

@@ -49,7 +49,7 @@ def free_run_times(rig: Rig, repeats: int = REPEATS) -> dict[str, Any]:
     """
     model, drive, start = both_moving(rig)
     ready = compiled(model)
-    found = simulate(ready, drive, start)
+    simulation = simulate(ready, drive, start)
     p = hand_fused.constants(rig, model.values)
     y0 = np.concatenate((start.q, start.qd, start.p_cap, start.p_rod))
     angle, pressure = SIMULATION.angle_tolerance, SIMULATION.pressure_tolerance
@@ -74,7 +74,7 @@ def free_run_times(rig: Rig, repeats: int = REPEATS) -> dict[str, Any]:
     def error(states: Array) -> float:
         return float((np.abs(states - true).max(axis=0) / size).max())
 
-    own = np.hstack((found.q, found.qd, found.p_cap, found.p_rod))
+    own = np.hstack((simulation.q, simulation.qd, simulation.p_cap, simulation.p_rod))
     exact = error(own)
     rtol = next(r for r in TOLERANCES if error(odeint(r)) <= exact)
     errors = {"odeint_error": error(odeint(rtol))}
@@ -106,8 +106,8 @@ def free_run_times(rig: Rig, repeats: int = REPEATS) -> dict[str, Any]:
         "error": exact,
         "odeint_rtol": rtol,
         **errors,
-        "difference_to_hand": float(np.abs(out[:, :2] - found.q).max()),
-        "failure": found.failure,
+        "difference_to_hand": float(np.abs(out[:, :2] - simulation.q).max()),
+        "failure": simulation.failure,
     }
 
 
