@@ -14,7 +14,7 @@ from analysis.report.page import page, write
 from analysis.report.plots import place_plot, trace_plots
 from analysis.trace.clues.frequency import FREQUENCY
 from analysis.trace.data.spectral_lines import loudest
-from analysis.trace.result import CLEAN, CONFOUNDED, Found, Trace
+from analysis.trace.result import CLEAN, CONFOUNDED, JudgedEffect, Trace
 from analysis.trace.settings import TRACE
 from analysis.trace.words import quantity, shot_in_words, unit_of_equation
 from rig.model.records import Run
@@ -107,7 +107,7 @@ def _pictures(rig: Rig, holdout: Sequence[Run], result: Trace) -> list[dict[str,
         d for d in result.depends_on
         if d.variable != FREQUENCY
         and (result.verdict != CONFOUNDED
-             or result.after[d.equation] > TRACE.told * result.noise_floor[d.equation])
+             or result.after[d.equation] > TRACE.noted * result.noise_floor[d.equation])
     ][:2]  # fmt: skip
     for k, clue in enumerate(drawn):
         heading = f"what is left of {clue.equation} against {clue.variable}"
@@ -165,7 +165,7 @@ def _errors(result: Trace) -> list[tuple[str, ...]]:
     return out
 
 
-def _effect(effect: Found, key: str) -> dict[str, Any]:
+def _effect(effect: JudgedEffect, key: str) -> dict[str, Any]:
     return {
         "curve": trace_plots.curves(effect, key) if effect.curves else None,
         "tried": trace_plots.instead(effect, f"{key}r"),

@@ -28,7 +28,7 @@ from analysis.trace.data.temperature_nuisance import stripped, temperature_terms
 from analysis.trace.free_forms import drawn_by_data, mechanisms
 from analysis.trace.judge import gates, held_out, readings
 from analysis.trace.judge.scatter import widened
-from analysis.trace.judge.shooting import reshaped, told
+from analysis.trace.judge.shooting import reshaped, with_shots
 from analysis.trace.next_experiment.proposal import propose
 from analysis.trace.remaining import Rest, clues_to, left_over
 from analysis.trace.result import (
@@ -36,7 +36,7 @@ from analysis.trace.result import (
     CONFOUNDED,
     EXPLAINED,
     UNEXPLAINED,
-    Found,
+    JudgedEffect,
     Trace,
 )
 from analysis.trace.search.hypothesis import Hypothesis, within
@@ -51,7 +51,7 @@ log = logging.getLogger(__name__)
 
 # The other estimators add small faults of sensors of their own accord: here they are candidates.
 PLAIN = "plain"
-# Shares of a trace's time behind it, as measured on six records: told while it goes on.
+# Shares of a trace's time behind it, as measured on six records: reported as progress.
 PREPARED, COLUMNS, JUDGED = 0.1, 0.55, 0.8
 ELSEWHERE = (
     "the training records are met to within the noise, the held-out ones are not: train on "
@@ -100,8 +100,8 @@ def trace(
     notes = _notes(train_data, holdout_data)
     quiet = within(hypotheses.empty.excess_energy, hypotheses.limits)
     if quiet and not gates.remaining(hypotheses, hypotheses.empty, holdout_data):
-        found: tuple[Found, ...] = ()
-        refused: tuple[Found, ...] = ()
+        judged_effects: tuple[JudgedEffect, ...] = ()
+        refused: tuple[JudgedEffect, ...] = ()
         winner, verdict = hypotheses.empty, CLEAN
     else:
         winner = hypotheses.run(lambda share: done(PREPARED + (COLUMNS - PREPARED) * share))
@@ -110,8 +110,8 @@ def trace(
             hypotheses, winner, free, holdout_data, rng
         )
         refused = tuple(f for f in judged_all if not gates.stands(f))
-        found = tuple(f for f in judged_all if gates.stands(f))
-        notes += _rest_notes(verdict, rest, quiet, bool(found))
+        judged_effects = tuple(f for f in judged_all if gates.stands(f))
+        notes += _rest_notes(verdict, rest, quiet, bool(judged_effects))
     done(JUDGED)
     split = lines(train_data, winner.fit.residual)
     moves, formulas = (
@@ -119,14 +119,14 @@ def trace(
         if verdict in (CLEAN, EXPLAINED)
         else clues_to(train_data, holdout_data, winner, split)
     )
-    further = propose(hypotheses, winner, found, verdict, moves) if look_ahead else None
+    further = propose(hypotheses, winner, judged_effects, verdict, moves) if look_ahead else None
     after = _extended(runs, terms, winner, before, train_data)
     again = reshaped(runs, holdout, after, train_data, holdout_data, winner)
     if again.winner is not winner:
         winner = again.winner
         after = _extended(runs, terms, winner, before, train_data)
         split = lines(train_data, winner.fit.residual)
-    found = tuple(told(f, again.shots) for f in found)
+    judged_effects = tuple(with_shots(f, again.shots) for f in judged_effects)
     first, last = (
         held_out.settled(holdout_data, hypotheses.empty.fit),
         held_out.settled(holdout_data, winner.fit),
@@ -135,7 +135,7 @@ def trace(
     notes += _missed_held(verdict, error, notes)
     runs_before, runs_after = held_out.free_runs(holdout, before, after)
     result = Trace(
-        verdict, found, error.noise, error.before, error.after,
+        verdict, judged_effects, error.noise, error.before, error.after,
         runs_before.fit, runs_after.fit, before, after,
         _fraction(hypotheses, winner), moves, further, train_data.floors,
         first, last, tuple(notes), refused=refused, size=error.size,
@@ -171,11 +171,11 @@ def _refuse_same(runs: Sequence[Run], holdout: Sequence[Run]) -> None:
 
 def _digest(record: Record) -> str:
     """Return a digest of a record's samples; what it is called does not matter."""
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for name in sorted(record.channels):
-        found.update(name.encode())
-        found.update(np.ascontiguousarray(record.channels[name], dtype=np.float64).tobytes())
-    return found.hexdigest()
+        digest.update(name.encode())
+        digest.update(np.ascontiguousarray(record.channels[name], dtype=np.float64).tobytes())
+    return digest.hexdigest()
 
 
 def _refuse_short(train_data: RegressionData, train: Sequence[ConditionedRecord]) -> None:
@@ -217,7 +217,7 @@ def _notes(train_data: RegressionData, holdout_data: RegressionData) -> list[str
 def _drawn(
     hypotheses: HypothesisSet, free: Sequence[Effect], winner: Hypothesis, verdict: str,
     holdout_data: RegressionData, rng: np.random.Generator,
-) -> tuple[HypothesisSet, tuple[Found, ...], Hypothesis, list[Rest]] | None:  # fmt: skip
+) -> tuple[HypothesisSet, tuple[JudgedEffect, ...], Hypothesis, list[Rest]] | None:  # fmt: skip
     """Try free mechanisms where no name explains, or only several with more than noise left."""
     fewer = verdict != UNEXPLAINED
     if fewer and (mechanisms(winner) < 2 or within(winner.excess_energy, hypotheses.limits)):
@@ -228,47 +228,49 @@ def _drawn(
 def _settled(
     hypotheses: HypothesisSet, winner: Hypothesis, free: Sequence[Effect],
     holdout_data: RegressionData, rng: np.random.Generator,
-) -> tuple[HypothesisSet, tuple[Found, ...], Hypothesis, str, list[Rest]]:  # fmt: skip
+) -> tuple[HypothesisSet, tuple[JudgedEffect, ...], Hypothesis, str, list[Rest]]:  # fmt: skip
     """Judge what the search has found, names first, then free forms.
 
     Returns the sets tried, what was judged, the set that stands, the verdict and what it leaves.
     """
     winner = readings.settled(hypotheses, winner, holdout_data)
-    found, winner, verdict, rest = _named(hypotheses, winner, holdout_data, rng)
+    effects, winner, verdict, rest = _named(hypotheses, winner, holdout_data, rng)
     drawn = _drawn(hypotheses, free, winner, verdict, holdout_data, rng)
     if drawn is not None:
-        hypotheses, found, winner, rest = drawn
-        verdict = CONFOUNDED if _tied(found) else EXPLAINED
+        hypotheses, effects, winner, rest = drawn
+        verdict = CONFOUNDED if _tied(effects) else EXPLAINED
     elif verdict == UNEXPLAINED:
-        found += _unphysical(hypotheses, holdout_data, rng)
-    return hypotheses, found, winner, verdict, rest
+        effects += _unphysical(hypotheses, holdout_data, rng)
+    return hypotheses, effects, winner, verdict, rest
 
 
 def _unphysical(
     hypotheses: HypothesisSet, holdout_data: RegressionData, rng: np.random.Generator
-) -> tuple[Found, ...]:
+) -> tuple[JudgedEffect, ...]:
     """Return what physics alone refuses of the simplest set that would leave next to nothing."""
     near = [o for o in hypotheses.listed.values() if hypotheses.formed(o) and o.effects]
     near = [o for o in near if hypotheses.physical(o)]
     if not near:
         return ()
     best = min(near, key=lambda o: (o.size[1], o.total))
-    found = gates.judge(hypotheses, best, holdout_data, rng)
+    effects = gates.judge(hypotheses, best, holdout_data, rng)
     # What half-samples choose, or what else fits, is no matter where physics refuses.
     asked = [
         replace(f, gates=tuple(g for g in f.gates if g.name in (gates.REMOVES, gates.PHYSICAL)))
-        for f in found
+        for f in effects
     ]
     return tuple(replace(f, rivals=()) for f in asked if not gates.stands(f))
 
 
-def _missed_held(verdict: str, error: held_out.Errors, told: Sequence[str]) -> list[str]:
+def _missed_held(verdict: str, error: held_out.Errors, failures: Sequence[str]) -> list[str]:
     """State what an explanation leaves in held-out records where nothing has been said of it."""
     if verdict not in (EXPLAINED, CONFOUNDED):
         return []
     out = []
     for e, noise in error.noise.items():
-        if error.after[e] > TRACE.told * noise and not any(n.startswith(f"{e}:") for n in told):
+        if error.after[e] > TRACE.noted * noise and not any(
+            n.startswith(f"{e}:") for n in failures
+        ):
             share = (error.after[e] ** 2 - noise**2) / max(error.before[e] ** 2 - noise**2, 1e-30)
             out.append(
                 f"{e}: held-out error {error.after[e] / noise:.2f} times the noise floor, "
@@ -277,10 +279,10 @@ def _missed_held(verdict: str, error: held_out.Errors, told: Sequence[str]) -> l
     return out
 
 
-def _rest_notes(verdict: str, rest: Sequence[Rest], quiet: bool, found: bool) -> list[str]:
+def _rest_notes(verdict: str, rest: Sequence[Rest], quiet: bool, named: bool) -> list[str]:
     """State what stays, and whether it speaks against what was found."""
     out = [ELSEWHERE] if quiet and verdict == UNEXPLAINED else []
-    if verdict == UNEXPLAINED and (found or quiet):
+    if verdict == UNEXPLAINED and (named or quiet):
         out += [f"{r.equation}: {r.words}" for r in rest if r.veto]
     few = [f"{r.equation}: {r.words}; too little to speak against" for r in rest if not r.veto]
     return out + few
@@ -291,22 +293,22 @@ def _named(
     winner: Hypothesis,
     holdout_data: RegressionData,
     rng: np.random.Generator,
-) -> tuple[tuple[Found, ...], Hypothesis, str, list[Rest]]:
+) -> tuple[tuple[JudgedEffect, ...], Hypothesis, str, list[Rest]]:
     """Put the winner through the gates.
 
     Returns what was judged, the set that stands, the verdict, and the equations that keep more than
     is nothing, each with what it keeps.
     """
-    found: tuple[Found, ...] = ()
-    refused: tuple[Found, ...] = ()
+    effects: tuple[JudgedEffect, ...] = ()
+    refused: tuple[JudgedEffect, ...] = ()
     # What stands beside others may fall without them: judged again until all that is left stands.
     while winner.effects:
-        found = gates.judge(hypotheses, winner, holdout_data, rng)
-        fallen = tuple(f for f in found if not gates.stands(f))
+        effects = gates.judge(hypotheses, winner, holdout_data, rng)
+        fallen = tuple(f for f in effects if not gates.stands(f))
         if not fallen:
             break
         refused += fallen
-        smaller = [u for u, f in zip(winner.effects, found, strict=True) if gates.stands(f)]
+        smaller = [u for u, f in zip(winner.effects, effects, strict=True) if gates.stands(f)]
         if not smaller:
             return (
                 refused,
@@ -321,21 +323,21 @@ def _named(
         wider = gates.judge(hypotheses, more, holdout_data, rng) if more else ()
         later = left_over(hypotheses, more, holdout_data) if more else rest
         # What speaks against nothing is named only if nothing else fits as well.
-        needed = any(r.veto for r in rest) or _tied(wider) == _tied(found)
+        needed = any(r.veto for r in rest) or _tied(wider) == _tied(effects)
         stand = needed and all(map(gates.stands, wider))
         if more is None or len(later) >= len(rest) or not stand:
             break
-        found, winner, rest = wider, more, later
+        effects, winner, rest = wider, more, later
     if any(r.veto for r in rest):
-        return (*found, *refused), winner, UNEXPLAINED, rest
+        return (*effects, *refused), winner, UNEXPLAINED, rest
     if not winner.effects:  # what is left is too little for any effect to be needed
         return refused, winner, CLEAN, rest
-    return found, winner, CONFOUNDED if _tied(found) else EXPLAINED, rest
+    return effects, winner, CONFOUNDED if _tied(effects) else EXPLAINED, rest
 
 
-def _tied(found: Sequence[Found]) -> bool:
+def _tied(effects: Sequence[JudgedEffect]) -> bool:
     """Whether another effect fits as well as one of those found."""
-    return any(r.tied for f in found for r in f.rivals)
+    return any(r.tied for f in effects for r in f.rivals)
 
 
 def _fraction(hypotheses: HypothesisSet, winner: Hypothesis) -> float:
@@ -362,5 +364,5 @@ def _extended(
     if not winner.effects:
         return before
     plain = [u for u in terms if not isinstance(u.term, BulkTemperature)]
-    found = identify(runs, terms=ordered((*plain, *winner.effects)), estimator="ls").model
-    return stripped(widened(train_data, winner.fit, found))
+    model = identify(runs, terms=ordered((*plain, *winner.effects)), estimator="ls").model
+    return stripped(widened(train_data, winner.fit, model))

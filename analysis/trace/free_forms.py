@@ -11,7 +11,7 @@ from analysis.effects.base import Effect
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge import gates
 from analysis.trace.remaining import Rest, left_over
-from analysis.trace.result import Found
+from analysis.trace.result import JudgedEffect
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.hypothesis_set import DEEPEST, HypothesisSet
 
@@ -25,7 +25,7 @@ NEAR = 2.0  # times the least energy left: of sets within it the simplest goes f
 def drawn_by_data(
     hypotheses: HypothesisSet, free: Sequence[Effect], winner: Hypothesis,
     holdout_data: RegressionData, rng: np.random.Generator, fewer: bool = False,
-) -> tuple[HypothesisSet, tuple[Found, ...], Hypothesis, list[Rest]] | None:  # fmt: skip
+) -> tuple[HypothesisSet, tuple[JudgedEffect, ...], Hypothesis, list[Rest]] | None:  # fmt: skip
     """Explain the records with a mechanism whose form the data draw; None where none does.
 
     Returns the sets tried, what was judged, the set that stands and what it leaves. `free` are the
@@ -41,34 +41,45 @@ def drawn_by_data(
     tried: list[Hypothesis] = []
     for start in _starts(wide, winner, fewer):
         for single in wide.extensions(start, free=True):
-            one = single if wide.formed(single) else _with_more(wide, single)
-            less = one.total < LESS * winner.total and mechanisms(one) < mechanisms(winner)
-            if wide.formed(one) and not wide.physical(one) and (less or not fewer):
-                tried.append(wide.prune(one))
-    least = min((one.total for one in tried), default=0.0)
-    first = sorted(tried, key=lambda one: (one.total > NEAR * least, one.size[1], one.total))
-    for one in list({o.keys: o for o in first}.values())[:TRIED]:
-        found = gates.judge(wide, one, holdout_data, rng)
-        rest = left_over(wide, one, holdout_data)
-        failed = [(f.name, g.name, g.detail) for f in found for g in f.gates if not g.ok]
-        log.info("free form %s: %s %s", sorted(one.keys), [r.words for r in rest], failed)
+            hypothesis = single if wide.formed(single) else _with_more(wide, single)
+            less = hypothesis.total < LESS * winner.total and mechanisms(hypothesis) < mechanisms(
+                winner
+            )
+            if wide.formed(hypothesis) and not wide.physical(hypothesis) and (less or not fewer):
+                tried.append(wide.prune(hypothesis))
+    least = min((hypothesis.total for hypothesis in tried), default=0.0)
+    first = sorted(
+        tried,
+        key=lambda hypothesis: (
+            hypothesis.total > NEAR * least,
+            hypothesis.size[1],
+            hypothesis.total,
+        ),
+    )
+    for hypothesis in list({o.keys: o for o in first}.values())[:TRIED]:
+        effects = gates.judge(wide, hypothesis, holdout_data, rng)
+        rest = left_over(wide, hypothesis, holdout_data)
+        failed = [(f.name, g.name, g.detail) for f in effects for g in f.gates if not g.ok]
+        log.info("free form %s: %s %s", sorted(hypothesis.keys), [r.words for r in rest], failed)
         names = {kind.name for kind in wide.effects if not kind.free}
-        named = any(r.tied and r.name in names for f in found if f.free for r in f.rivals)
-        if named or not all(map(gates.stands, found)) or any(r.veto for r in rest):
+        named = any(r.tied and r.name in names for f in effects if f.free for r in f.rivals)
+        if named or not all(map(gates.stands, effects)) or any(r.veto for r in rest):
             continue
-        return wide, found, one, rest
+        return wide, effects, hypothesis, rest
     return None
 
 
-def _with_more(wide: HypothesisSet, one: Hypothesis) -> Hypothesis:
+def _with_more(wide: HypothesisSet, hypothesis: Hypothesis) -> Hypothesis:
     """Return the set with one more effect where equations keep too much, else the set."""
-    loud = {e for e, v in one.excess_energy.items() if not wide.negligible(e, v)}
-    return (wide.closer(one, loud) if len(one.effects) < DEEPEST else None) or one
+    loud = {e for e, v in hypothesis.excess_energy.items() if not wide.negligible(e, v)}
+    return (
+        wide.closer(hypothesis, loud) if len(hypothesis.effects) < DEEPEST else None
+    ) or hypothesis
 
 
-def mechanisms(one: Hypothesis) -> int:
+def mechanisms(hypothesis: Hypothesis) -> int:
     """Count the mechanisms, each at its place, that a set of effects needs."""
-    return len({(u.term.mechanism, u.term.where) for u in one.effects})  # type: ignore[attr-defined]
+    return len({(u.term.mechanism, u.term.where) for u in hypothesis.effects})  # type: ignore[attr-defined]
 
 
 def _starts(wide: HypothesisSet, winner: Hypothesis, fewer: bool) -> list[Hypothesis]:
@@ -82,6 +93,6 @@ def _starts(wide: HypothesisSet, winner: Hypothesis, fewer: bool) -> list[Hypoth
     for used in winner.effects:
         same = (used.term.mechanism, used.term.where)  # type: ignore[attr-defined]
         kept = [u for u in winner.effects if (u.term.mechanism, u.term.where) != same]  # type: ignore[attr-defined]
-        one = wide.exact(kept) if kept else wide.empty
-        out[one.keys] = one
+        start = wide.exact(kept) if kept else wide.empty
+        out[start.keys] = start
     return list(out.values())

@@ -80,21 +80,21 @@ def achieved(
         asked = [_small(q["one"], rig) for q in experiment["questions"]]
         return min(present(q, ground) for q in asked)
     old = regression_data(rig, terms, conditioned_records(rig, before))
-    found = [
+    rounds = [
         _one(old, both, terms, len(before), q["one"], q["other"]) for q in experiment["questions"]
     ]
-    return min(found)
+    return min(rounds)
 
 
 def _one(
     old: RegressionData, both: RegressionData, terms: tuple[Used, ...], index: int,
-    one: Sequence[Mapping[str, Any]], other: Sequence[Mapping[str, Any]],
+    first: Sequence[Mapping[str, Any]], other: Sequence[Mapping[str, Any]],
 ) -> float:  # fmt: skip
     """Return one question's separation: the loudest equation's rms difference per new row."""
     gap = {}
     for train_data in (old, both):
         residual = [
-            refine(train_data, (*terms, *effects_of(side))).residual for side in (one, other)
+            refine(train_data, (*terms, *effects_of(side))).residual for side in (first, other)
         ]
         ends = [excess_of(train_data, part) for part in residual]
         gap[train_data is both] = {e: ends[1][e] - ends[0][e] for e in ends[0]}
@@ -112,8 +112,8 @@ def _one(
     )
 
 
-def _small(one: Sequence[Mapping[str, Any]], rig: Rig) -> OpenQuestion:
-    (used,) = effects_of(one)
+def _small(effects: Sequence[Mapping[str, Any]], rig: Rig) -> OpenQuestion:
+    (used,) = effects_of(effects)
     assert isinstance(used.term, Effect)
     return OpenQuestion(smallest(used.term, rig) or Explanation((used,)), Explanation(), False)
 

@@ -52,13 +52,13 @@ def left_over(
     now, later = rebased(hypotheses.stage, winner.fit), rebased(holdout_data, winner.fit)
     held = held_out.residual(holdout_data, winner.fit)
     for equation in asked:
-        found = formula(now, winner.fit.residual, later, held, equation)
+        expression = formula(now, winner.fit.residual, later, held, equation)
         # A constant is no law of another cause: it is what a form has too little or too much.
-        if found is not None and found.share >= TRACE.formula and found.variables:
+        if expression is not None and expression.share >= TRACE.formula and expression.variables:
             words = f"{100 * seen[equation]:.2g} % of what repeated stays, and a formula holds it"
             loud = winner.excess_energy[equation] > hypotheses.limits.band[equation]
             veto = loud and seen[equation] < TRACE.acted
-            out.append(Rest(equation, f"{words}: {found.text}", veto))
+            out.append(Rest(equation, f"{words}: {expression.text}", veto))
     return [*out, *_missed(hypotheses, winner, out)]
 
 
@@ -104,8 +104,8 @@ def clues_to(
     loud = [e for e in loud if winner.excess_energy[e] > TRACE.clue * total]
     moves = dependence.dependence(now, residual, later, held, loud)
     hum = frequency_clue(split, train_data, residual, holdout_data, held)
-    found = [formula(now, residual, later, held, e) for e in loud]
-    formulas = tuple(one for one in found if one is not None)
+    candidates = [formula(now, residual, later, held, e) for e in loud]
+    formulas = tuple(expression for expression in candidates if expression is not None)
     first = _leading(formulas) if hum is None else [hum]
     there = {d.variable for d in first}
     return (*first, *(d for d in moves if d.variable not in there)), formulas

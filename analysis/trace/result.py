@@ -56,9 +56,9 @@ class Formula:
     def variables(self) -> tuple[str, ...]:
         """The variables of its first monomial that has any, in the order they stand there."""
         for name in self.terms:
-            found = [word for word in _NAME.findall(name) if word != "sign"]
-            if found:
-                return tuple(dict.fromkeys(found))
+            names = [word for word in _NAME.findall(name) if word != "sign"]
+            if names:
+                return tuple(dict.fromkeys(names))
         return ()
 
 
@@ -100,7 +100,7 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class Found:
+class JudgedEffect:
     """An effect with its parameters, evidence and the gates it passed or not.
 
     `removed_fraction` is the share of the repeatable energy on held-out records, in the equations
@@ -181,7 +181,7 @@ class Trace:
     """
 
     verdict: str
-    effects: tuple[Found, ...]
+    effects: tuple[JudgedEffect, ...]
     noise_floor: Mapping[str, float]
     before: Mapping[str, float]
     after: Mapping[str, float]
@@ -198,7 +198,7 @@ class Trace:
     notes: tuple[str, ...] = ()
     sentence: str = ""
     seconds: float = 0.0
-    refused: tuple[Found, ...] = ()
+    refused: tuple[JudgedEffect, ...] = ()
     size: Mapping[str, float] = field(default_factory=dict)
     rmse_before: Mapping[str, float] = field(default_factory=dict)
     rmse_after: Mapping[str, float] = field(default_factory=dict)
@@ -270,66 +270,66 @@ def to_json(result: Trace) -> dict[str, Any]:
             }
             for f in result.floors
         ],
-        "lines": [_lines(one) for one in result.lines],
+        "lines": [_lines(lines) for lines in result.lines],
         "notes": list(result.notes),
         "sentence": result.sentence,
         "seconds": result.seconds,
     }  # fmt: skip
 
 
-def _effect(found: Found) -> dict[str, Any]:
+def _effect(effect: JudgedEffect) -> dict[str, Any]:
     return {
-        "name": found.name,
-        "where": found.where,
-        "mechanism": found.mechanism,
-        "form": FREE if found.free else NAMED,
-        "curve": _curve(found.curves[0]) if found.curves else None,
-        "curves": [_curve(one) for one in found.curves],
-        "parameters": {n: estimate_json(e) for n, e in found.parameters.items()},
-        "p_value": finite(found.p_value),
-        "removed_fraction": finite(found.removed_fraction),
+        "name": effect.name,
+        "where": effect.where,
+        "mechanism": effect.mechanism,
+        "form": FREE if effect.free else NAMED,
+        "curve": _curve(effect.curves[0]) if effect.curves else None,
+        "curves": [_curve(curve) for curve in effect.curves],
+        "parameters": {n: estimate_json(e) for n, e in effect.parameters.items()},
+        "p_value": finite(effect.p_value),
+        "removed_fraction": finite(effect.removed_fraction),
         "rivals": [
             {
                 "name": r.name, "where": r.where, "held_out_ratio": finite(r.ratio),
                 "training_ratio": finite(r.training_ratio), "tied": r.tied,
             }
-            for r in found.rivals
+            for r in effect.rivals
         ],
-        "gates": [{"name": g.name, "ok": g.ok, "detail": g.detail} for g in found.gates],
-        "shooting": _shot(found.shot) if found.shot else None,
+        "gates": [{"name": g.name, "ok": g.ok, "detail": g.detail} for g in effect.gates],
+        "shooting": _shot(effect.shot) if effect.shot else None,
     }  # fmt: skip
 
 
-def _curve(one: Curve) -> dict[str, Any]:
-    numbers = {n: [float(v) for v in getattr(one, n)] for n in ("x", "y", "lo", "hi")}
-    return {"label": one.label, **numbers, "unit_x": one.unit_x, "unit_y": one.unit_y}
+def _curve(curve: Curve) -> dict[str, Any]:
+    numbers = {n: [float(v) for v in getattr(curve, n)] for n in ("x", "y", "lo", "hi")}
+    return {"label": curve.label, **numbers, "unit_x": curve.unit_x, "unit_y": curve.unit_y}
 
 
-def _free_run(one: FreeCurves) -> dict[str, Any]:
+def _free_run(curves: FreeCurves) -> dict[str, Any]:
     def numbers(values: Array) -> list[float | None]:
         return [finite(float(f"{v:.6g}")) for v in values]
 
     kinds = ("measured", "before", "after")
     channels = {
-        name: {"unit": one.units[name], **{k: numbers(getattr(one, k)[name]) for k in kinds}}
-        for name in one.measured
+        name: {"unit": curves.units[name], **{k: numbers(getattr(curves, k)[name]) for k in kinds}}
+        for name in curves.measured
     }
-    return {"record": one.record, "time": numbers(one.time), "channels": channels}
+    return {"record": curves.record, "time": numbers(curves.time), "channels": channels}
 
 
-def _shot(one: Shot) -> dict[str, Any]:
+def _shot(shot: Shot) -> dict[str, Any]:
     return {
-        "parameters": {n: estimate_json(e) for n, e in one.shapes.items()},
-        "windows": one.windows, "settled": one.settled, "taken": one.taken,
-        "held_out_windows": {"rows": finite(one.before), "shooting": finite(one.after)},
+        "parameters": {n: estimate_json(e) for n, e in shot.shapes.items()},
+        "windows": shot.windows, "settled": shot.settled, "taken": shot.taken,
+        "held_out_windows": {"rows": finite(shot.before), "shooting": finite(shot.after)},
     }  # fmt: skip
 
 
-def _lines(one: SpectralLines) -> dict[str, Any]:
+def _lines(lines: SpectralLines) -> dict[str, Any]:
     return {
-        "step": one.group[1], "equation": one.equation, "above_noise": finite(one.loud),
-        "shares": _numbers(one.shares), "shares_after": _numbers(one.shares_after),
-        "text": one.text,
+        "step": lines.group[1], "equation": lines.equation, "above_noise": finite(lines.loud),
+        "shares": _numbers(lines.shares), "shares_after": _numbers(lines.shares_after),
+        "text": lines.text,
     }  # fmt: skip
 
 

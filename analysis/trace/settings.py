@@ -41,7 +41,7 @@ class TraceSettings:
     """The same on held-out records, which may be quieter (tuned)."""
     held_band: float = 1.5
     """Held-out rms over the noise floor, by equation (tuned on clean benches: none is above)."""
-    told: float = 1.3
+    noted: float = 1.3
     """The same, from which an explanation says what stays (contract)."""
     seen: float = 8.0
     """Standard deviations of the noise's own energy from which a rest is asked for a formula."""

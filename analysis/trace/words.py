@@ -8,7 +8,7 @@ import numpy as np
 
 from analysis.simulation.model import Estimate
 from analysis.trace.clues.formula import surest
-from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, Found, Trace
+from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, JudgedEffect, Trace
 from rig.model.rig import Rig
 
 UNITS = {"torque": "N·m", "flow_cap": "m³/s", "flow_rod": "m³/s"}
@@ -39,10 +39,10 @@ def sentence(result: Trace) -> str:
         if result.next_experiment:
             text += f" What would tell: {result.next_experiment['text']}."
         return f"{text} {errors}"
-    found = f"Found so far: {named}. " if named else "No effect of the catalogue is named. "
+    prefix = f"Found so far: {named}. " if named else "No effect of the catalogue is named. "
     clue = ", ".join(d.text for d in result.depends_on[:2])
     return (
-        f"{found}{100 * result.unexplained_fraction:.0f} % of what repeats stays unexplained"
+        f"{prefix}{100 * result.unexplained_fraction:.0f} % of what repeats stays unexplained"
         + (f"; it moves with {clue}" if clue else "")
         + _symmetry(result)
         + _formula(result)
@@ -58,13 +58,13 @@ def _formula(result: Trace) -> str:
 
 def _symmetry(result: Trace) -> str:
     """Say what the lines of the loudest remainder tell of its cause ('' without such lines)."""
-    loud = max(result.lines, key=lambda one: one.loud_after, default=None)
+    loud = max(result.lines, key=lambda lines: lines.loud_after, default=None)
     if loud is None or loud.loud_after < 1.0:
         return ""
     return f"; by its lines in {loud.equation} it is {loud.meaning_after}"
 
 
-def _moves(effects: tuple[Found, ...]) -> str:
+def _moves(effects: tuple[JudgedEffect, ...]) -> str:
     variables = [e.variable for e in effects if e.variable and not _constant(e.variable)]
     if len(variables) < len(effects) and variables:
         variables.append("a constant")
@@ -75,9 +75,9 @@ def _constant(variable: str) -> bool:
     return variable.startswith("nothing")
 
 
-def _effect(found: Found) -> str:
-    values = ", ".join(f"{n} = {quantity(e)}" for n, e in found.parameters.items())
-    return f"{found.name.replace('_', ' ')} at {found.where} ({values})"
+def _effect(effect: JudgedEffect) -> str:
+    values = ", ".join(f"{n} = {quantity(e)}" for n, e in effect.parameters.items())
+    return f"{effect.name.replace('_', ' ')} at {effect.where} ({values})"
 
 
 def quantity(estimate: Estimate) -> str:
@@ -87,16 +87,16 @@ def quantity(estimate: Estimate) -> str:
     return f"{estimate.value:.3g} ± {half:.1g} {unit}".strip()
 
 
-def shot_in_words(found: Found) -> str:
+def shot_in_words(effect: JudgedEffect) -> str:
     """Return what multiple shooting makes of an effect's shapes ('' where it has no such state)."""
-    if found.shot is None:
+    if effect.shot is None:
         return ""
-    one = found.shot
-    values = ", ".join(f"{n} = {quantity(e)}" for n, e in one.shapes.items())
-    which = "taken" if one.taken else "the rows' stay, their interval holds both"
+    shot = effect.shot
+    values = ", ".join(f"{n} = {quantity(e)}" for n, e in shot.shapes.items())
+    which = "taken" if shot.taken else "the rows' stay, their interval holds both"
     judged = "no held-out window tells which is closer"
-    if np.isfinite([one.before, one.after]).all():
-        judged = f"held-out windows {one.before:.2f} → {one.after:.2f} times the sensors' noise"
+    if np.isfinite([shot.before, shot.after]).all():
+        judged = f"held-out windows {shot.before:.2f} → {shot.after:.2f} times the sensors' noise"
     return f"by multiple shooting {values}; {judged}: {which}"
 
 

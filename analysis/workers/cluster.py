@@ -75,8 +75,8 @@ class DaskCluster:
 
     def _workers(self) -> dict[str, Any]:
         # All of them: the default is to list a few.
-        found: dict[str, Any] = self._client.scheduler_info(n_workers=-1)["workers"]
-        return found
+        workers: dict[str, Any] = self._client.scheduler_info(n_workers=-1)["workers"]
+        return workers
 
     def map(
         self, function: Callable[[T], U], items: Iterable[T], reads: Reads[T] | None = None
@@ -106,13 +106,13 @@ class DaskCluster:
     def _holders(self, path: str) -> list[str]:
         """Return the workers that see a path."""
         answers = self._client.run(_exists, path)
-        found = [worker for worker, exists in answers.items() if exists]
-        if not found:
+        holders = [worker for worker, exists in answers.items() if exists]
+        if not holders:
             raise InputError(
                 f"{path}: no worker of the cluster sees it ({len(answers)} asked); give the path "
                 "as the workers see it"
             )
-        return found
+        return holders
 
 
 def _exists(path: str) -> bool:

@@ -309,7 +309,7 @@ class Device:
                 self._drift_by(fault.rate)
                 if fault.until is not None:
                     end = fault.model_copy(update={"at": fault.until, "until": None, "rate": 0.0})
-                    self._faults = sorted([*self._faults, end], key=lambda one: one.at)
+                    self._faults = sorted([*self._faults, end], key=lambda entry: entry.at)
 
     def _silence_allowed(self) -> float:
         seconds = self.watchdog_ms * 1e-3

@@ -49,8 +49,8 @@ class PtyLine:
         self._poll.register(self.fd, events)
         if not self.connected:
             patience = min(patience, _UNPLUGGED_SECONDS)
-        found = self._poll.poll(patience * 1e3 if self.connected else 0)
-        happened = found[0][1] if found else 0
+        ready = self._poll.poll(patience * 1e3 if self.connected else 0)
+        happened = ready[0][1] if ready else 0
         if happened & select.POLLIN:
             self.connected = True
             with suppress(BlockingIOError):

@@ -52,8 +52,8 @@ class TcpLink(FaultyLink):
         port: int = 0,
     ) -> None:
         super().__init__(framing, faults, seed, seconds)
-        found = _ADDRESS.search(target)
-        url = urlsplit(f"//{found.group()}" if found else "")
+        match = _ADDRESS.search(target)
+        url = urlsplit(f"//{match.group()}" if match else "")
         self._target = (str(url.hostname), int(url.port or 0))
         try:
             self._listener = socket.create_server(("127.0.0.1", port))

@@ -76,7 +76,7 @@ def played(step: Step, amplitude: float, tilt: float, seed: int) -> Step:
     return step.model_copy(update={"excite": excite})
 
 
-def told(step: Step) -> str:
+def described(step: Step) -> str:
     """Say a step in words: "excite joint 1; joint 2 at end_min, joint 3 closed"."""
     moving = ", ".join(f"joint {part.joint}" for part in step.excite)
     still = ", ".join(f"joint {lock.joint} {_at(lock)}" for lock in _sorted(step.lock))

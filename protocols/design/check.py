@@ -38,7 +38,7 @@ SEEK_SECONDS = 3.0  # of simulation behind each bias but the last
 RAMP_SECONDS = 1.0  # in which the waveform grows on the twin
 SETTLE_SECONDS = 2.0  # simulated before the period that is judged
 DRIFT_LEFT = 0.2  # of the drift that the protocol allows
-WIDER = 1.05  # swing under the centring loop over the free one: told from there on
+WIDER = 1.05  # swing under the centring loop over the free one: reported from there on
 
 
 class NotCentred(InputError):

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from protocols.design.candidates import candidates, told
+from protocols.design.candidates import candidates, described
 from protocols.design.check import Twin, centred
 from protocols.design.proof import Proof, Reason, Triangles, Verdicts
 from protocols.design.selection import WORTH, Judge, Sized, complete, extended, smallest
@@ -87,7 +87,7 @@ def prove(protocol: Protocol, rig: Rig, predictor: Predictor) -> Proof:
         rows = predictor.rows(rig, moved, [part.joint + 1 for part in planned.locks])
         done.append(Sized(step, rows))
         after = judge([proof.rows for proof in done])
-        reasons.append(Reason(step.name, told(step), _why(before, after), after))
+        reasons.append(Reason(step.name, described(step), _why(before, after), after))
         before = after
     return Proof(
         protocol.name, rig.name, tuple(reasons), before,
@@ -128,4 +128,4 @@ def _help(done: Sequence[Sized], rig: Rig, predictor: Predictor) -> tuple[str, .
     """Return the steps, in words, that would make the rest identifiable."""
     pool = _pool(rig, predictor)
     more = extended(done, pool, predictor.judge_of(rig))[len(done) :]
-    return tuple(told(candidate.step) for candidate in more)
+    return tuple(described(candidate.step) for candidate in more)

@@ -10,7 +10,7 @@ from protocols.engine.centring import Array
 
 
 class ProofPart(Protocol):
-    """A combination of parameters that can be told from the rest."""
+    """A combination of parameters that can be distinguished from the rest."""
 
     @property
     def text(self) -> str:
@@ -58,7 +58,7 @@ class Reason:
     """Why a step is in the set: in words what it does, and the verdicts once it is added."""
 
     step: str
-    told: str
+    description: str
     why: str
     verdicts: Verdicts
 
@@ -91,7 +91,7 @@ class Proof:
             "steps": [
                 {
                     "step": reason.step,
-                    "does": reason.told,
+                    "does": reason.description,
                     "why": reason.why,
                     "rank": {name: v.rank for name, v in reason.verdicts.items()},
                     "condition_number": {name: v.condition for name, v in reason.verdicts.items()},

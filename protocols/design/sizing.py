@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 
-from protocols.design.candidates import AMPLITUDE, played, told
+from protocols.design.candidates import AMPLITUDE, described, played
 from protocols.design.check import Twin, centred, judge_motion
 from protocols.design.check_report import MotionPrediction
 from protocols.engine.centring import Array
@@ -63,7 +63,7 @@ def sized(step: Step, seed: int, rig: Rig, twin: Twin) -> tuple[Step, Mapping[st
         if by_amplitude and max(by_amplitude) >= MODEST:
             break
     if not by_amplitude:
-        log.info("left out: %s", told(step))
+        log.info("left out: %s", described(step))
         return None
     return by_amplitude[max(by_amplitude)]
 

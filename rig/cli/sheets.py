@@ -126,7 +126,7 @@ def proof_text(proof: Proof) -> str:
     """Return one row per step (what it does, rank and condition so far, why), then the verdict."""
     families = list(proof.verdicts)
     rows = [
-        [f"{r.step}: {r.told}", *(_so_far(r.verdicts, family) for family in families), r.why]
+        [f"{r.step}: {r.description}", *(_so_far(r.verdicts, family) for family in families), r.why]
         for r in proof.reasons
     ]
     header = ["step", *(f"{family} rank, cond." for family in families), "why"]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from analysis.trace.data.spectral_lines import loudest
 from analysis.trace.loop_rounds import Round
-from analysis.trace.result import Found, Trace
+from analysis.trace.result import JudgedEffect, Trace
 from analysis.trace.words import quantity, shot_in_words, unit_of_equation
 from rig.cli.output import table
 
@@ -94,7 +94,7 @@ def _share(error: float | None, size: float | None) -> str:
     return f"{100 * error / size:.1f} %" if error is not None and size else ""
 
 
-def _effect(effect: Found) -> list[str]:
+def _effect(effect: JudgedEffect) -> list[str]:
     values = ", ".join(f"{n} = {quantity(e)}" for n, e in effect.parameters.items())
     lines = [f"{effect.name} at {effect.where}: {values}"]
     if effect.shot:

@@ -58,14 +58,14 @@ class Reader:
 
     def __init__(self, say: Callable[[str], None]) -> None:
         self._say = say
-        self._told = 0
+        self._written = 0
         self._next = -float("inf")
         self._last = ""
 
     def read(self, frame: Frame, now: float) -> None:
         """Say what is new in a frame."""
-        fresh = min(frame.told - self._told, len(frame.story))
-        self._told = frame.told
+        fresh = min(frame.total_lines - self._written, len(frame.story))
+        self._written = frame.total_lines
         for what in frame.story[len(frame.story) - fresh :]:
             self._say(f"  at {what.time:.2f} s: {what.text}")
         quiet = frame.over or frame.snapshot is None

@@ -18,7 +18,7 @@ from analysis.report import facts, paper
 from analysis.report import format as fm
 from analysis.report.plots import arm_plot, record_plots, style, trace_plots
 from analysis.report.residuals import per_repeat, residuals
-from analysis.trace.result import Curve, Found
+from analysis.trace.result import Curve, JudgedEffect
 from rig.model.parameters import parameter_names
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
@@ -206,7 +206,7 @@ def test_a_bench_that_is_no_rigid_body_is_told_from_a_bad_identification() -> No
 def test_a_curve_is_drawn_with_its_band_and_its_units() -> None:
     x = np.linspace(0.0, 0.2, 9)
     lines = tuple(Curve(way, x, 80 + x, 70 + x, 90 + x, "m/s", "N") for way in ("out", "back"))
-    found = Found(
+    found = JudgedEffect(
         "friction_curve", "joint 1", {}, 0.005, 0.9, (), (), "the piston's velocity",
         mechanism="friction_curve", free=True, curves=lines,
     )  # fmt: skip

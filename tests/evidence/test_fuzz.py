@@ -10,7 +10,7 @@ import pytest
 
 from tests.studies.fuzz import run
 from tests.studies.fuzz.mutation import damaged
-from tests.studies.fuzz.run import Found, cases, fuzz
+from tests.studies.fuzz.run import FuzzResult, cases, fuzz
 from tests.studies.fuzz.targets import MAKERS, SHARES, Target
 
 FEW = {"rig": 6, "protocol": 8, "scenario": 20, "journal": 5, "archive": 12}
@@ -26,7 +26,7 @@ def _quiet() -> Iterator[None]:
 @pytest.mark.parametrize("key", MAKERS)
 @pytest.mark.filterwarnings("ignore")
 def test_a_reader_of_damaged_bytes_refuses_them_or_reads_them(key: str) -> None:
-    found = Found(key)
+    found = FuzzResult(key)
     cases(MAKERS[key](), FEW.get(key, 600), 1, found, lambda: None)
     assert not found.wrong
     assert found.cases == FEW.get(key, 600)
@@ -53,7 +53,7 @@ def _leaky(data: bytes) -> None:
 def test_an_error_that_nobody_expects_and_a_crash_are_found(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    found = Found("leaky")
+    found = FuzzResult("leaky")
     cases(Target("leaky", (b"0123456789",), _leaky, (ValueError,)), 200, 0, found, lambda: None)
     assert any(what.startswith("IndexError: beyond the end (case ") for what in found.wrong)
     assert found.cases == 200

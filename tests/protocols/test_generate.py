@@ -38,7 +38,7 @@ def part(protocol: Protocol, *names: str) -> Protocol:
 
 
 def test_two_joints_get_the_papers_three_steps(generated: Generated) -> None:
-    assert [reason.told for reason in generated.proof.reasons] == [
+    assert [reason.description for reason in generated.proof.reasons] == [
         "excite joint 2; joint 1 closed at 0 mm",
         "excite joint 1; joint 2 at end_min",
         "excite joint 1; joint 2 at end_max",

@@ -43,7 +43,7 @@ from analysis.trace.data.conditioned_record import (
 )
 from analysis.trace.data.spectral_lines import CONSTANT, EVEN, EXCITED, ODD, members
 from analysis.trace.data.spectral_lines import SpectralLines as Spectrum
-from analysis.trace.result import Found, Rival, Trace
+from analysis.trace.result import JudgedEffect, Rival, Trace
 from analysis.trace.search.refinement import ExactFit
 from analysis.trace.settings import TRACE
 from analysis.trace.words import loudest
@@ -147,7 +147,7 @@ def against(
         return svg(made, key, f"Residual against {label}, before and after")
 
 
-def curves(effect: Found, key: str) -> Markup:
+def curves(effect: JudgedEffect, key: str) -> Markup:
     """Draw the curves of an effect whose form the data draw, each with its band."""
     with style():
         made = figure(2.4, CARD * 2)
@@ -163,7 +163,7 @@ def curves(effect: Found, key: str) -> Markup:
         return svg(made, key, f"{effect.name.replace('_', ' ')} with its 95 % band")
 
 
-def instead(effect: Found, key: str) -> Markup | None:
+def instead(effect: JudgedEffect, key: str) -> Markup | None:
     """Draw what held-out records keep without an effect, with it, and with each rival instead.
 
     Sorted by what is left, each with the reason why it is named or not. None where nobody knows.
@@ -208,7 +208,7 @@ def _called(name: str, where: str) -> str:
     return f"{name.replace('_', ' ')} at {where}"
 
 
-def _verdict(effect: Found) -> str:
+def _verdict(effect: JudgedEffect) -> str:
     """Say that an effect is named, or by which gates it is not."""
     failed = [f"{g.name}: {g.detail}" for g in effect.gates if not g.ok]
     return f"not named ({'; '.join(failed)})".replace("_", " ") if failed else "named"

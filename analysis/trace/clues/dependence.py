@@ -65,21 +65,21 @@ def dependence(
     """
     weight = {e: max(0.0, v) for e, v in excess_of(train, residual).items() if e in equations}
     total = sum(weight.values()) or 1.0
-    found: dict[tuple[str, str], dict[str, float]] = {}
+    shares: dict[tuple[str, str], dict[str, float]] = {}
     for equation in equations:
         sides = side_of(train, residual, equation), side_of(holdout_data, judge_left, equation)
         for key, share in _shares(train.rig, equation, *sides).items():
-            found.setdefault(key, {})[equation] = share
-    sums = {k: sum(s * weight[e] / total for e, s in by.items()) for k, by in found.items()}
+            shares.setdefault(key, {})[equation] = share
+    sums = {k: sum(s * weight[e] / total for e, s in by.items()) for k, by in shares.items()}
     out: list[tuple[float, Dependence]] = []
-    for (name, factor), by in found.items():
+    for (name, factor), by in shares.items():
         share = sums[name, factor]
         parts = [sums.get(part, 0.0) for part in ((name, ""), ("", factor))]
         if share < LEAST or (name and factor and share < max(parts) + MORE):
             continue
         equation = max(by, key=lambda e: by[e])
-        told = 1.0 if factor else _telling(name, equation, sums)
-        out.append((share * told, _dependence(name, factor, share, equation, told)))
+        independence = 1.0 if factor else _telling(name, equation, sums)
+        out.append((share * independence, _dependence(name, factor, share, equation, independence)))
     best: dict[str, Dependence] = {}
     for _, clue in sorted(out, key=lambda pair: -pair[0]):
         best.setdefault(clue.variable, clue)
@@ -87,10 +87,10 @@ def dependence(
 
 
 def _dependence(
-    name: str, factor: str, share: float, equation: str, told: float
+    name: str, factor: str, share: float, equation: str, independence: float
 ) -> Dependence:  # fmt: skip
     if not factor:
-        words = f"{name} by balance" if told == ANSWER else ""
+        words = f"{name} by balance" if independence == ANSWER else ""
         return Dependence(name, share, equation, words=words)
     by = factors(equation)[factor]
     if not name:

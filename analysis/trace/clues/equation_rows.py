@@ -62,8 +62,8 @@ def columns_of(side: EquationRows, made: Sequence[Array]) -> Array:
     stack = []
     for part, columns in zip(side.parts, made, strict=True):
         named = {str(k): columns[:, k] for k in range(columns.shape[1])}
-        found = filtered(named, part.conditioned, part.rows)
-        stack.append(np.column_stack(list(found.values())) * part.weight)
+        clue_columns = filtered(named, part.conditioned, part.rows)
+        stack.append(np.column_stack(list(clue_columns.values())) * part.weight)
     D = np.concatenate(stack)
     return np.asarray(D - side.base @ (side.base.T @ D))
 

@@ -52,13 +52,13 @@ def formula(
     second = side_of(holdout_data, judge_left, equation)
     if first is None or second is None:
         return None
-    names, one, two = _library(train.rig, equation, first, second)
+    names, fitted, checked = _library(train.rig, equation, first, second)
     both = EquationRows((), np.concatenate((first.rest, second.rest)), np.zeros((0, 0)))
-    chosen = _selected(np.concatenate((one, two)), both)
-    share = judged(one[:, chosen], first, two[:, chosen], second) if chosen else 0.0
+    chosen = _selected(np.concatenate((fitted, checked)), both)
+    share = judged(fitted[:, chosen], first, checked[:, chosen], second) if chosen else 0.0
     if share < OFFERED:
         return None
-    values = fitted_to(one[:, chosen], first)
+    values = fitted_to(fitted[:, chosen], first)
     terms = {names[k]: float(v) for k, v in zip(chosen, values, strict=True)}
     if is_balance(equation, terms):
         return None
@@ -82,17 +82,17 @@ def is_balance(equation: str, terms: Mapping[str, float]) -> bool:
 
 
 def _library(
-    rig: Rig, equation: str, one: EquationRows, two: EquationRows
+    rig: Rig, equation: str, fitted: EquationRows, judged: EquationRows
 ) -> tuple[list[str], Array, Array]:  # fmt: skip
     """Return the monomials' names and their columns on either side, what is one left out."""
     joint = int(equation.rsplit("_", 1)[1]) - 1
-    every = [*one.parts, *two.parts]
+    every = [*fitted.parts, *judged.parts]
     travel = max(float(np.ptp(p.conditioned.signals.s[:, joint])) for p in every)
     made = [_monomials(rig, equation, p.seen, joint, travel) for p in every]
     names = list(made[0])
     stacks = [np.column_stack([m[n] for n in names]) for m in made]
-    count = len(one.parts)
-    first, second = columns_of(one, stacks[:count]), columns_of(two, stacks[count:])
+    count = len(fitted.parts)
+    first, second = columns_of(fitted, stacks[:count]), columns_of(judged, stacks[count:])
     both = np.concatenate((first, second))
     size = np.linalg.norm(both, axis=0)
     kept: list[int] = []
@@ -145,11 +145,11 @@ def _selected(columns: Array, side: EquationRows) -> list[int]:
     share = 0.0
     while len(chosen) < min(MOST, columns.shape[1]):
         free = [k for k in range(columns.shape[1]) if k not in chosen]
-        found = {k: _share([*chosen, k], columns, side) for k in free}
-        best = max(free, key=lambda k: found[k])
-        if found[best] < share + ADDS:
+        shares = {k: _share([*chosen, k], columns, side) for k in free}
+        best = max(free, key=lambda k: shares[k])
+        if shares[best] < share + ADDS:
             break
-        chosen, share = [*chosen, best], found[best]
+        chosen, share = [*chosen, best], shares[best]
     for k in list(chosen):
         rest = [j for j in chosen if j != k]
         if rest and _share(rest, columns, side) > share - ADDS:

@@ -30,7 +30,7 @@ STEPS = 41  # of the search, over one line on either side
 
 
 def frequency_clue(
-    found: Sequence[SpectralLines],
+    lines: Sequence[SpectralLines],
     train: RegressionData,
     residual: Array,
     holdout_data: RegressionData,
@@ -40,26 +40,28 @@ def frequency_clue(
 
     `residual` (M,) and `judge_left` are whitened residuals of averaged records, as in `clues`.
     """
-    for one in sorted(found, key=lambda one: -one.loud_after):
-        near = _peak(one) if one.loud_after >= 1.0 else None
+    for equation_lines in sorted(lines, key=lambda equation_lines: -equation_lines.loud_after):
+        near = _peak(equation_lines) if equation_lines.loud_after >= 1.0 else None
         if near is None:
             continue
-        width = one.frequency[1]
+        width = equation_lines.frequency[1]
         tried = np.linspace(near - width, near + width, STEPS)
-        f = max(tried, key=lambda f: _taken(train, residual, one.equation, float(f)))
-        energy = excess_of(holdout_data, judge_left)[one.equation]
-        share = _taken(holdout_data, judge_left, one.equation, float(f)) / max(energy, 1e-300)
+        f = max(tried, key=lambda f: _taken(train, residual, equation_lines.equation, float(f)))
+        energy = excess_of(holdout_data, judge_left)[equation_lines.equation]
+        share = _taken(holdout_data, judge_left, equation_lines.equation, float(f)) / max(
+            energy, 1e-300
+        )
         if energy > 0 and share >= LEAST:
             words = f"a frequency of {f:.3g} Hz"
-            return Dependence(FREQUENCY, min(1.0, share), one.equation, words=words)
+            return Dependence(FREQUENCY, min(1.0, share), equation_lines.equation, words=words)
     return None
 
 
-def _peak(one: SpectralLines) -> float | None:
+def _peak(lines: SpectralLines) -> float | None:
     """Return where [Hz] most of what is left stands, None where it is spread."""
-    power = np.maximum(one.after, 0.0)
+    power = np.maximum(lines.after, 0.0)
     power[0] = 0.0
-    if int(one.excited.sum()) < MANY or not power.any():
+    if int(lines.excited.sum()) < MANY or not power.any():
         return None
     k = int(np.argmax(power))
     if k < FIRST:
@@ -67,7 +69,7 @@ def _peak(one: SpectralLines) -> float | None:
     here = slice(k - BESIDE, k + BESIDE + 1)
     if power[here].sum() < PEAK * power.sum():
         return None
-    return float(np.average(one.frequency[here], weights=power[here]))
+    return float(np.average(lines.frequency[here], weights=power[here]))
 
 
 def _taken(data: RegressionData, residual: Array, equation: str, f: float) -> float:

@@ -138,14 +138,14 @@ def candidate_columns(
         _, here, there = np.intersect1d(before.time, after.time, return_indices=True)
         difference = np.zeros(len(before.rhs))
         difference[here] = row_residual(before, beta)[here] - row_residual(after, beta)[there]
-        found = {"": difference}
+        columns = {"": difference}
         for k, parameter in enumerate(after.names):
             if parameter in own and np.any(after.matrix[:, k]):
-                found[parameter] = np.zeros(len(before.rhs))
-                found[parameter][here] = after.matrix[there, k]
-        found = {key: column for key, column in found.items() if np.any(column)}
-        if found:
-            out[name] = found
+                columns[parameter] = np.zeros(len(before.rhs))
+                columns[parameter][here] = after.matrix[there, k]
+        columns = {key: column for key, column in columns.items() if np.any(column)}
+        if columns:
+            out[name] = columns
     return out
 
 

@@ -111,7 +111,9 @@ def least_squares(rig: Rig, rows: Sequence[Mapping[str, Rows]]) -> dict[str, flo
     """Return the coefficients of stacked rows, equations unweighted, shortest where not unique."""
     out: dict[str, float] = {}
     for kinds in (("torque",), ("flow_cap", "flow_rod")):
-        parts = [r for one in rows for name, r in one.items() if name.rsplit("_", 1)[0] in kinds]
+        parts = [
+            r for record in rows for name, r in record.items() if name.rsplit("_", 1)[0] in kinds
+        ]
         if not parts:
             continue
         X, y = np.concatenate([r.matrix for r in parts]), np.concatenate([r.rhs for r in parts])
@@ -137,18 +139,22 @@ def regression_data(
     split = floors(rig, terms, members, every, beta)
     mean_scenes = averaged(rig, members)
     mean_rows = [model_rows(rig, terms, conditioned) for conditioned in mean_scenes]
-    names = tuple(dict.fromkeys(n for one in mean_rows for r in one.values() for n in r.names))
+    names = tuple(
+        dict.fromkeys(n for record in mean_rows for r in record.values() for n in r.names)
+    )
     noise = {(f.group, f.equation): f.noise for f in split}
     most = max(sum(s.group == conditioned.group for s in members) for conditioned in mean_scenes)
     base, residual, segments, start = [], [], [], 0
     kept_rows: list[dict[str, Rows]] = []
     for conditioned, rows in zip(mean_scenes, mean_rows, strict=True):
-        own = [one for s, one in zip(members, every, strict=True) if s.group == conditioned.group]
+        own = [
+            record for s, record in zip(members, every, strict=True) if s.group == conditioned.group
+        ]
         kept_rows.append({})
         for equation, mean in rows.items():
             time = mean.time
-            for one in own:
-                time = np.intersect1d(time, one[equation].time)
+            for record in own:
+                time = np.intersect1d(time, record[equation].time)
             if len(time) < 5:
                 continue
             cut = _at(mean, time)
@@ -156,8 +162,8 @@ def regression_data(
             sigma = max(noise[conditioned.group, equation], 1e-30)
             base.append(_spread(cut, names) * np.sqrt(len(own)) / sigma)
             table = np.full((most, len(time)), np.nan)
-            for k, one in enumerate(own):
-                table[k] = row_residual(_at(one[equation], time), beta) / sigma
+            for k, record in enumerate(own):
+                table[k] = row_residual(_at(record[equation], time), beta) / sigma
             residual.append(table)
             where = slice(start, start + len(time))
             segments.append(
@@ -220,12 +226,12 @@ def variant_columns(
     """
     seen = [prepared(data.rig, data.terms, conditioned) for conditioned in data.records]
     with ThreadPoolExecutor(WORKERS) as pool:
-        found = []
+        columns = []
         for entry in pool.map(lambda v: _entry(data, v, seen), chosen):
-            found.append(entry)
+            columns.append(entry)
             if progress is not None:
-                progress(len(found) / len(chosen))
-    return [entry for entry in found if entry is not None]
+                progress(len(columns) / len(chosen))
+    return [entry for entry in columns if entry is not None]
 
 
 def _entry(
@@ -238,7 +244,7 @@ def _entry(
         if held(variant.effect, conditioned):
             continue
         rows = data.rows[index]
-        found = candidate_columns(
+        candidate = candidate_columns(
             data.rig,
             data.terms,
             conditioned,
@@ -248,9 +254,9 @@ def _entry(
             variant.used,
         )
         for segment in data.segments:
-            if segment.group == conditioned.group and segment.equation in found:
+            if segment.group == conditioned.group and segment.equation in candidate:
                 touched.add(segment.equation)
-                for name, column in found[segment.equation].items():
+                for name, column in candidate[segment.equation].items():
                     whole = columns.setdefault(name, np.zeros(M))
                     whole[segment.where] += column * np.sqrt(segment.repeats) / segment.noise
     if not columns or not all(np.isfinite(c).all() for c in columns.values()):

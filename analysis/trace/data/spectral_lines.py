@@ -99,20 +99,20 @@ def meaning(shares: Mapping[str, float], own: Mapping[str, float]) -> str:
     moving = 1.0 - shares[CONSTANT]
     if moving < ASYMMETRIC:
         return "a constant"
-    found = []
+    meanings = []
     for kind, least, word in (
         (EVEN, ASYMMETRIC, "asymmetric"),
         (ODD, SYMMETRIC, "a symmetric nonlinearity"),
     ):
         share = shares[kind] / moving
         if share > least and share > OWN * own[kind]:
-            found.append((share, word))
-    if not found:
+            meanings.append((share, word))
+    if not meanings:
         return "linear in the motion"
-    found.sort(reverse=True)
-    if len(found) == 2 and found[1][0] < 0.5 * found[0][0]:
-        return f"mostly {found[0][1]}"
-    return " and ".join(word for _, word in found)
+    meanings.sort(reverse=True)
+    if len(meanings) == 2 and meanings[1][0] < 0.5 * meanings[0][0]:
+        return f"mostly {meanings[0][1]}"
+    return " and ".join(word for _, word in meanings)
 
 
 def lines(data: RegressionData, after: Array) -> tuple[SpectralLines, ...]:
@@ -130,11 +130,12 @@ def lines(data: RegressionData, after: Array) -> tuple[SpectralLines, ...]:
             if s.group == conditioned.group:
                 residual = data.residual[: s.repeats, s.where] * s.noise
                 rest = after[s.where] * s.noise / np.sqrt(s.repeats)
-                found = _of_segment(s, conditioned, rows[s.equation], np.vstack((residual, rest)),
-                                    loud[s.group, s.equation])  # fmt: skip
-                if found is not None:
-                    out.append(found)
-    return tuple(sorted(out, key=lambda one: -one.loud))
+                both = np.vstack((residual, rest))
+                excited = loud[s.group, s.equation]
+                of_segment = _of_segment(s, conditioned, rows[s.equation], both, excited)
+                if of_segment is not None:
+                    out.append(of_segment)
+    return tuple(sorted(out, key=lambda equation_lines: -equation_lines.loud))
 
 
 def _of_segment(
@@ -178,8 +179,8 @@ def _pairs(place: NDArray[np.int64], per: int) -> list[NDArray[np.int64]]:
     at = np.full(int(place[-1]) + 1 + per if len(place) else per, -1)
     at[place] = np.arange(len(place))
     whole = at[: len(at) // per * per].reshape(-1, 2, per // 2).transpose(0, 2, 1)
-    found = [p[(p >= 0).all(axis=1)] for p in whole]
-    return [p for p in found if len(p) >= PRESENT * per / 2]
+    complete = [p[(p >= 0).all(axis=1)] for p in whole]
+    return [p for p in complete if len(p) >= PRESENT * per / 2]
 
 
 def spectrum(phase: Array, series: Array, K: int) -> NDArray[np.complex128]:
@@ -196,8 +197,8 @@ def spectrum(phase: Array, series: Array, K: int) -> NDArray[np.complex128]:
         X = np.sqrt(np.where(number, 2.0, 1.0)) * np.stack((np.cos(angle), np.sin(angle)))
         X = np.concatenate(tuple(X), axis=1)
         weight = X.T @ X / len(phase) + RIDGE * np.eye(X.shape[1])
-        found = np.linalg.solve(weight, X.T @ part.T / len(phase)).T
-        out[:, start::2] = found[:, : len(number)] - 1j * found[:, len(number) :]
+        amplitudes = np.linalg.solve(weight, X.T @ part.T / len(phase)).T
+        out[:, start::2] = amplitudes[:, : len(number)] - 1j * amplitudes[:, len(number) :]
     return out
 
 
@@ -221,11 +222,11 @@ def _shares(power: Array, noise: Array, excited: NDArray[np.bool_]) -> dict[str,
 
 
 def loudest(
-    found: Sequence[SpectralLines], least: float = 1.0, most: int = 3
+    lines: Sequence[SpectralLines], least: float = 1.0, most: int = 3
 ) -> list[SpectralLines]:
     """Return the loudest, one of each equation, where the residual is above its noise."""
     best: dict[str, SpectralLines] = {}
-    for one in found:
-        if one.loud >= least:
-            best.setdefault(one.equation, one)
+    for equation_lines in lines:
+        if equation_lines.loud >= least:
+            best.setdefault(equation_lines.equation, equation_lines)
     return list(best.values())[:most]

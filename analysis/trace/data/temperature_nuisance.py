@@ -77,17 +77,17 @@ def stripped(model: Model) -> Model:
     if term is None or KAPPA not in names:
         return model
     b, kappa = names.index("b"), names.index(KAPPA)
-    found = model.parameters["b"]
+    bulk = model.parameters["b"]
     covariance = model.covariance.copy()
-    if found.identified and term.reference is not None:
+    if bulk.identified and term.reference is not None:
         kelvin = model.rig.oil.temperature - term.reference
-        found, more = _at(found, model.parameters[KAPPA], kelvin)
+        bulk, more = _at(bulk, model.parameters[KAPPA], kelvin)
         covariance[b, b] += more
     kept = [k for k in range(len(names)) if k != kappa]
     return replace(
         model,
         terms=tuple(u for u in model.terms if not isinstance(u.term, BulkTemperature)),
-        parameters={n: found if n == "b" else model.parameters[n] for n in names if n != KAPPA},
+        parameters={n: bulk if n == "b" else model.parameters[n] for n in names if n != KAPPA},
         covariance=covariance[np.ix_(kept, kept)],
     )
 

@@ -23,7 +23,7 @@ from analysis.trace.judge.held_out import residual as held_left
 from analysis.trace.judge.invariance import invariance
 from analysis.trace.judge.readings import loss, related
 from analysis.trace.judge.scatter import NORMAL, form_shift
-from analysis.trace.result import Found, Gate, Rival
+from analysis.trace.result import Gate, JudgedEffect, Rival
 from analysis.trace.search.hypothesis import Hypothesis, excess_of, parameter_values
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import TRACE
@@ -37,9 +37,9 @@ REMOVES, PHYSICAL, INVARIANT, STABLE, SIGNIFICANT, ALONE = (
 )  # fmt: skip
 
 
-def stands(found: Found) -> bool:
+def stands(effect: JudgedEffect) -> bool:
     """Return whether an effect passes every gate but that of rivals, which makes it confounded."""
-    return all(gate.ok for gate in found.gates if gate.name != ALONE)
+    return all(gate.ok for gate in effect.gates if gate.name != ALONE)
 
 
 def judge(
@@ -47,7 +47,7 @@ def judge(
     winner: Hypothesis,
     holdout_data: RegressionData,
     rng: np.random.Generator,
-) -> tuple[Found, ...]:
+) -> tuple[JudgedEffect, ...]:
     """Put every effect of the winner through the gates."""
     train_data = hypotheses.stage
     values = parameter_values(train_data.rig, winner.fit.terms, dict(winner.fit.beta))
@@ -87,7 +87,7 @@ def judge(
             Gate(ALONE, not (tied or twins), _told_apart([*twins, *rivals])),
         )
         out.append(
-            Found(
+            JudgedEffect(
                 used.term.name,
                 _place(used.term),
                 _parameters(train_data, used, errors, shift),
@@ -149,8 +149,8 @@ def _held_ratio(holdout_data: RegressionData, residual: Array) -> dict[str, floa
         floor[s.equation] = floor.get(s.equation, 0.0) + count * s.noise**2
         # Averaging has taken noise out: put back what a single record would show.
         part = residual[s.where]
-        found = float(part @ part) + count * (1 - 1 / s.repeats)
-        energy[s.equation] = energy.get(s.equation, 0.0) + found * s.noise**2
+        excess = float(part @ part) + count * (1 - 1 / s.repeats)
+        energy[s.equation] = energy.get(s.equation, 0.0) + excess * s.noise**2
     return {e: float(np.sqrt(energy[e] / floor[e])) for e in floor}
 
 
@@ -237,24 +237,32 @@ def _rivals(
         )
     )
     out = []
-    for one in hypotheses.listed.values():
-        fresh = [u.term for u in one.effects if (u.term.name, u.term.where) not in winner.keys]
-        if key in one.keys or not others <= one.keys or len(fresh) != 1:
+    for hypothesis in hypotheses.listed.values():
+        fresh = [
+            u.term for u in hypothesis.effects if (u.term.name, u.term.where) not in winner.keys
+        ]
+        if key in hypothesis.keys or not others <= hypothesis.keys or len(fresh) != 1:
             continue
         (other,) = fresh
         assert isinstance(other, Effect)
         assert isinstance(mine, Effect)
-        if one.size[1] > winner.size[1] or related(mine, other) or hypotheses.physical(one):
+        if (
+            hypothesis.size[1] > winner.size[1]
+            or related(mine, other)
+            or hypotheses.physical(hypothesis)
+        ):
             continue
-        held = held_left(holdout_data, one.fit)
+        held = held_left(holdout_data, hypothesis.fit)
         if _refused_already(hypotheses, holdout_data, (mine, other), others, held):
             continue
         ratio = judged.ratio(held)
         tied = judged.near(held, TRACE.tie) and (
-            trained.near(one.fit.residual, TRACE.tie_training) or ratio < TRACE.ahead
+            trained.near(hypothesis.fit.residual, TRACE.tie_training) or ratio < TRACE.ahead
         )
         tied = tied or (other.name, other.where) in often
-        out.append(Rival(other.name, _place(other), ratio, trained.ratio(one.fit.residual), tied))
+        out.append(
+            Rival(other.name, _place(other), ratio, trained.ratio(hypothesis.fit.residual), tied)
+        )
     out.sort(key=lambda r: (not r.tied, r.ratio))
     return out[: TRACE.rivals]
 

@@ -75,7 +75,7 @@ def errors(
     The floor is what does not repeat under the model after: its columns carry the sensors' noise
     into the residual as the baseline's do.
     """
-    one, other = (
+    first, other = (
         [model_rows(rig, model.terms, conditioned) for conditioned in members]
         for model in (before, after)
     )
@@ -92,8 +92,8 @@ def errors(
             e: float(np.sqrt(np.average(np.square(noise[e]), weights=np.maximum(counts[e], 1))))
             for e in sorted(noise)
         },
-        _by_equation(one, lambda rows: rows.rhs),
-        _by_equation(one, lambda rows: row_residual(rows, before.beta)),
+        _by_equation(first, lambda rows: rows.rhs),
+        _by_equation(first, lambda rows: row_residual(rows, before.beta)),
         _by_equation(other, lambda rows: row_residual(rows, after.beta)),
     )
 
@@ -102,20 +102,20 @@ def _by_equation(
     built: Sequence[Mapping[str, Rows]], part: Callable[[Rows], Array]
 ) -> dict[str, float]:
     """Return the rms of a part of every equation's rows over all records."""
-    found: dict[str, list[Array]] = {}
+    collected: dict[str, list[Array]] = {}
     for rows_of in built:
         for equation, rows in rows_of.items():
-            found.setdefault(equation, []).append(part(rows))
-    return {e: _rms(parts) for e, parts in sorted(found.items())}
+            collected.setdefault(equation, []).append(part(rows))
+    return {e: _rms(parts) for e, parts in sorted(collected.items())}
 
 
 def rms_of(holdout_data: RegressionData, model: ExactFit) -> dict[str, float]:
     """Return the rms of every equation's held-out residual, SI, repeats averaged."""
     rest = residual(holdout_data, model)
-    found: dict[str, list[Array]] = {}
+    collected: dict[str, list[Array]] = {}
     for s in holdout_data.segments:
-        found.setdefault(s.equation, []).append(rest[s.where] * s.noise / np.sqrt(s.repeats))
-    return {e: _rms(parts) for e, parts in sorted(found.items())}
+        collected.setdefault(s.equation, []).append(rest[s.where] * s.noise / np.sqrt(s.repeats))
+    return {e: _rms(parts) for e, parts in sorted(collected.items())}
 
 
 def _rms(parts: Sequence[Array]) -> float:
@@ -139,19 +139,19 @@ class FreeRunErrors:
 
 def free_curves(before: FreeRunErrors, after: FreeRunErrors) -> FreeCurves | None:
     """Return the beginning of one held-out record, measured and under both models; None if none."""
-    one, other = before.first, after.first
-    if one is None or other is None or one.record != other.record:
+    first, other = before.first, after.first
+    if first is None or other is None or first.record != other.record:
         return None
-    count = min(round(CURVE_SECONDS / float(one.time[1] - one.time[0])), len(one.time))
+    count = min(round(CURVE_SECONDS / float(first.time[1] - first.time[0])), len(first.time))
     kept = slice(0, count, max(count // CURVE_POINTS, 1))
-    before_it, after_it = one.simulation.channels(), other.simulation.channels()
+    before_it, after_it = first.simulation.channels(), other.simulation.channels()
     return FreeCurves(
-        one.record,
-        one.time[kept],
-        one.units,
-        {name: y[kept] for name, y in one.measured.items()},
-        {name: before_it[name][kept] for name in one.measured},
-        {name: after_it[name][kept] for name in one.measured},
+        first.record,
+        first.time[kept],
+        first.units,
+        {name: y[kept] for name, y in first.measured.items()},
+        {name: before_it[name][kept] for name in first.measured},
+        {name: after_it[name][kept] for name in first.measured},
     )
 
 
@@ -159,8 +159,8 @@ def free_runs(
     holdout: Sequence[Run], before: Model, after: Model
 ) -> tuple[FreeRunErrors, FreeRunErrors]:
     """Return the free runs of both models, driven by the measured spool or drive alone."""
-    one = _free_runs(holdout, before)
-    return one, one if after is before else _free_runs(holdout, after)
+    first = _free_runs(holdout, before)
+    return first, first if after is before else _free_runs(holdout, after)
 
 
 def _free_runs(holdout: Sequence[Run], model: Model) -> FreeRunErrors:

@@ -111,15 +111,15 @@ class Linear:
     residual: Array
 
 
-def linear(train_data: RegressionData, one: Hypothesis) -> Linear:
+def linear(train_data: RegressionData, hypothesis: Hypothesis) -> Linear:
     """Return the tangent of a set: columns of all coefficients and derivatives by the shapes.
 
     A shape that lies at a bound cannot move freely, and counts as fixed.
     """
-    rows = table(train_data, one.fit.terms)
+    rows = table(train_data, hypothesis.fit.terms)
     extra = []
-    for u in one.effects:
-        names, J = jacobian(train_data, one.fit, u)
+    for u in hypothesis.effects:
+        names, J = jacobian(train_data, hypothesis.fit, u)
         fixed = {
             s.parameter
             for s, v in zip(shapes_of(train_data.rig, u), u.shape, strict=True)
@@ -128,7 +128,9 @@ def linear(train_data: RegressionData, one: Hypothesis) -> Linear:
             < s.high - TRACE.edge * (s.high - s.low)
         }
         extra.append(J[:, [k for k, n in enumerate(names) if n in rows.names or n not in fixed]])
-    return Linear(one, orthonormal(np.column_stack([rows.matrix, *extra])), one.fit.residual)
+    return Linear(
+        hypothesis, orthonormal(np.column_stack([rows.matrix, *extra])), hypothesis.fit.residual
+    )
 
 
 def halves(
@@ -202,20 +204,22 @@ def _said(winner: Hypothesis, best: Hypothesis) -> set[Key]:
     }
 
 
-def _refitted(one: Linear, change: Array, weight: Array) -> Array:
+def _refitted(linear: Linear, change: Array, weight: Array) -> Array:
     """Return the weighted residual (M,) of a set fitted again to a half-sample."""
-    r = weight * (one.residual + change)
+    r = weight * (linear.residual + change)
     if np.all(weight == 1.0):
-        return np.asarray(r - one.basis @ (one.basis.T @ r))
-    basis = weight[:, None] * one.basis
+        return np.asarray(r - linear.basis @ (linear.basis.T @ r))
+    basis = weight[:, None] * linear.basis
     inverse = np.linalg.pinv(basis.T @ basis, rcond=1e-10, hermitian=True)
     return np.asarray(r - basis @ (inverse @ (basis.T @ r)))
 
 
 def _again(
-    train_data: RegressionData, one: Hypothesis, residual: Array, noise: float
+    train_data: RegressionData, hypothesis: Hypothesis, residual: Array, noise: float
 ) -> Hypothesis:
-    return Hypothesis(one.effects, one.fit, excess_of(train_data, residual, noise), one.size)
+    return Hypothesis(
+        hypothesis.effects, hypothesis.fit, excess_of(train_data, residual, noise), hypothesis.size
+    )
 
 
 @dataclass(frozen=True)

@@ -62,43 +62,43 @@ def loss(restricted: Array, richer: Array) -> float:
     return float(restricted @ change) / size if size > 0 else 0.0
 
 
-def related(one: Effect, other: Effect) -> bool:
+def related(effect: Effect, other: Effect) -> bool:
     """Return whether one of two effects is a reading of the other's law at the same place."""
-    near = one.name in other.includes or other.name in one.includes
-    return near and one.where == other.where
+    near = effect.name in other.includes or other.name in effect.includes
+    return near and effect.where == other.where
 
 
 def _lost(
-    hypotheses: HypothesisSet, one: Hypothesis, other: Hypothesis, held: Array,
+    hypotheses: HypothesisSet, hypothesis: Hypothesis, other: Hypothesis, held: Array,
     holdout_data: RegressionData,
 ) -> bool:  # fmt: skip
     """Return whether training and held-out records lose by taking `one` for the richer `other`."""
-    gain = one.fit.energy - other.fit.energy
+    gain = hypothesis.fit.energy - other.fit.energy
     if gain <= TRACE.deviations**2:
         return False
-    if len(other.effects) > len(one.effects):
-        price = linear_fit.CHANCE * (other.size[1] - one.size[1])
-        if gain <= max(price, linear_fit.ADD_SHARE * one.total):
+    if len(other.effects) > len(hypothesis.effects):
+        price = linear_fit.CHANCE * (other.size[1] - hypothesis.size[1])
+        if gain <= max(price, linear_fit.ADD_SHARE * hypothesis.total):
             return False
     return loss(held, held_left(holdout_data, other.fit)) > TRACE.deviations
 
 
-def _richer(hypotheses: HypothesisSet, one: Hypothesis) -> list[Hypothesis]:
+def _richer(hypotheses: HypothesisSet, hypothesis: Hypothesis) -> list[Hypothesis]:
     """Return the sets with a further number of a mechanism's law.
 
     A reading with more coefficients takes the place of one that it includes; one with as many is
     another part of the same law, and stands beside.
     """
     rig, sets = hypotheses.stage.rig, dict[frozenset[Key], tuple[Used, ...]]()
-    for used in one.effects:
+    for used in hypothesis.effects:
         assert isinstance(used.term, Effect)
         count = len(used.term.coefficients(rig))
         for effect in hypotheses.effects:
-            if not related(effect, used.term) or (effect.name, effect.where) in one.keys:
+            if not related(effect, used.term) or (effect.name, effect.where) in hypothesis.keys:
                 continue
-            kept = [u for u in one.effects if u is not used]
+            kept = [u for u in hypothesis.effects if u is not used]
             own = len(effect.coefficients(rig))
-            if own == count and len(one.effects) < DEEPEST:
+            if own == count and len(hypothesis.effects) < DEEPEST:
                 kept.append(used)
             elif own <= count:
                 continue

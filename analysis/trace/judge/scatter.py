@@ -65,7 +65,7 @@ def _pieces(train_data: RegressionData, columns: Array, residual: Array, by: str
     """Return scores and information of every step, repeat and group of rows."""
     strata = {g: k for k, g in enumerate(sorted({s.group for s in train_data.segments}))}
     records = {conditioned.group: k for k, conditioned in enumerate(train_data.records)}
-    found: dict[tuple[int, int, int], tuple[Array, Array]] = {}
+    pieces: dict[tuple[int, int, int], tuple[Array, Array]] = {}
     for number, s in enumerate(train_data.segments):
         k = records[s.group]
         time = train_data.rows[k][s.equation].time
@@ -81,12 +81,12 @@ def _pieces(train_data: RegressionData, columns: Array, residual: Array, by: str
             for repeat in range(s.repeats):
                 key = (strata[s.group], repeat, int(part))
                 score = own[here].T @ left[repeat, here]
-                before = found.get(key, (0.0, 0.0))
-                found[key] = (score + before[0], information + before[1])
-    keys = np.array(list(found), dtype=np.int64)
+                before = pieces.get(key, (0.0, 0.0))
+                pieces[key] = (score + before[0], information + before[1])
+    keys = np.array(list(pieces), dtype=np.int64)
     return Pieces(
         keys[:, 0], keys[:, 1], keys[:, 2],
-        np.array([g for g, _ in found.values()]), np.array([a for _, a in found.values()]),
+        np.array([g for g, _ in pieces.values()]), np.array([a for _, a in pieces.values()]),
     )  # fmt: skip
 
 

@@ -25,7 +25,7 @@ from analysis.simulation.model import Estimate, Model
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.held_out import rms_of
-from analysis.trace.result import Found
+from analysis.trace.result import JudgedEffect
 from analysis.trace.search import refinement
 from analysis.trace.search.hypothesis import Hypothesis, excess_of
 from analysis.trace.settings import TRACE
@@ -58,44 +58,46 @@ def reshaped(
         return Reshaped(winner, ())
     shots, after = [], ready
     for effect in hidden_effects(after):
-        found = shot(runs, after, effect)
-        if found is None:
+        shot_effect = shot(runs, after, effect)
+        if shot_effect is None:
             continue
-        other = _with(after.terms, effect, found)
+        other = _with(after.terms, effect, shot_effect)
         before, now = (
             rest_of(holdout, model, effect) for model in (after, replace(after, terms=other))
         )
-        fitted = refinement.fit(train_data, _with(winner.fit.terms, effect, found))
+        fitted = refinement.fit(train_data, _with(winner.fit.terms, effect, shot_effect))
         rows, again = (rms_of(holdout_data, fit) for fit in (winner.fit, fitted))
         better = now < TRACE.closer * before and all(
             again[e] <= TRACE.no_worse * rows[e] for e in rows
         )
-        shots.append(replace(found, before=before, after=now, taken=better and found.settled))
+        shots.append(
+            replace(shot_effect, before=before, after=now, taken=better and shot_effect.settled)
+        )
         if shots[-1].taken:
             winner = replace(
-                winner, effects=_with(winner.effects, effect, found), fit=fitted,
+                winner, effects=_with(winner.effects, effect, shot_effect), fit=fitted,
                 excess_energy=excess_of(train_data, fitted.residual),
             )  # fmt: skip
             after = replace(after, terms=other)
     return Reshaped(winner, tuple(shots))
 
 
-def _with(terms: Sequence[Used], effect: Effect, found: Shot) -> tuple[Used, ...]:
-    shape = tuple(e.value for e in found.shapes.values())
+def _with(terms: Sequence[Used], effect: Effect, shot: Shot) -> tuple[Used, ...]:
+    shape = tuple(e.value for e in shot.shapes.values())
     return tuple(Used(u.term, shape) if u.term == effect else u for u in terms)
 
 
-def told(found: Found, shots: Sequence[Shot]) -> Found:
+def with_shots(judged: JudgedEffect, shots: Sequence[Shot]) -> JudgedEffect:
     """Return an effect with what shooting says of its shapes: taken over, or in the interval."""
-    for one in shots:
-        if (one.name, one.where) == (found.name, found.where):
+    for result in shots:
+        if (result.name, result.where) == (judged.name, judged.where):
             shapes = {
-                name: new if one.taken
-                else _wide(found.parameters[name], new)
-                for name, new in one.shapes.items()
+                name: new if result.taken
+                else _wide(judged.parameters[name], new)
+                for name, new in result.shapes.items()
             }  # fmt: skip
-            return replace(found, parameters={**found.parameters, **shapes}, shot=one)
-    return found
+            return replace(judged, parameters={**judged.parameters, **shapes}, shot=result)
+    return judged
 
 
 def _wide(rows: Estimate, new: Estimate) -> Estimate:

@@ -123,13 +123,15 @@ def calibration(train_data: RegressionData) -> dict[str, float]:
 
     A faster excitation is filtered wider and so is noisier: the stated noise tells by how much.
     """
-    found: dict[str, list[float]] = {}
+    by_family: dict[str, list[float]] = {}
     for conditioned, rows in zip(train_data.records, train_data.rows, strict=True):
         stated = stated_noise(train_data.rig, train_data.terms, conditioned, rows, train_data.beta)
         for floor in train_data.floors:
             if floor.group == conditioned.group and stated.get(floor.equation, 0.0) > 0:
-                found.setdefault(floor.equation, []).append(floor.noise / stated[floor.equation])
-    return {e: float(np.sqrt(np.mean(np.square(v)))) for e, v in found.items()}
+                by_family.setdefault(floor.equation, []).append(
+                    floor.noise / stated[floor.equation]
+                )
+    return {e: float(np.sqrt(np.mean(np.square(v)))) for e, v in by_family.items()}
 
 
 def view(
@@ -189,8 +191,8 @@ class Ground:
 
     def _on_board(self, used: Used) -> dict[str, Array]:
         assert isinstance(used.term, Effect)
-        found = variant_columns(self.stage, [Variant(used.term, used.shape)])
-        return dict(zip(found[0].names, found[0].columns.T, strict=True)) if found else {}
+        columns = variant_columns(self.stage, [Variant(used.term, used.shape)])
+        return dict(zip(columns[0].names, columns[0].columns.T, strict=True)) if columns else {}
 
     def _extended(self, used: Used, before: Mapping[str, Array]) -> dict[str, Array]:
         assert self.seen is not None
@@ -216,9 +218,9 @@ class Ground:
 
     def spans(self, what: Explanation) -> Array:
         """Return what a hypothesis can imitate with: its columns and its shapes' derivatives."""
-        found = [self.base]
+        blocks = [self.base]
         for used in what.effects:
-            found += [c[:, None] for c in self.columns(used).values()]
+            blocks += [c[:, None] for c in self.columns(used).values()]
             for j, shape in enumerate(shapes_of(self.stage.rig, used)):
                 value = used.shape[j]
                 if shape.fixed or not shape.given(value):
@@ -227,8 +229,8 @@ class Ground:
                 near = value + step if value + step <= shape.high else value - step
                 moved = Used(used.term, (*used.shape[:j], near, *used.shape[j + 1 :]))
                 ends = [self.adds(Explanation((u,), what.beta)) for u in (moved, used)]
-                found.append((ends[0] - ends[1])[:, None])
-        return np.column_stack(found)
+                blocks.append((ends[0] - ends[1])[:, None])
+        return np.column_stack(blocks)
 
     def residual(self, true: Explanation, wrong: Explanation) -> Array:
         """Return the residual (m,) that `wrong` leaves where `true` is there, without noise."""
@@ -248,7 +250,7 @@ class Ground:
 def separation(question: OpenQuestion, old: Ground, new: Ground) -> tuple[float, str]:
     """Return what an experiment separates [noise], and in which equation (see the module)."""
     assert new.seen is not None
-    found = []
+    distances = []
     for true, wrong in _ways(question):
         before = old.energy(old.residual(true, wrong))
         after = new.energy(new.residual(true, wrong))
@@ -257,8 +259,8 @@ def separation(question: OpenQuestion, old: Ground, new: Ground) -> tuple[float,
             for e, r in new.seen.rows.items()
         }
         loudest = max(by_equation, key=lambda e: by_equation[e], default="")
-        found.append((by_equation.get(loudest, 0.0), loudest))
-    return min(found)
+        distances.append((by_equation.get(loudest, 0.0), loudest))
+    return min(distances)
 
 
 def present(question: OpenQuestion, old: Ground) -> float:

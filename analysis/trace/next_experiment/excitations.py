@@ -154,9 +154,9 @@ def excitations(
         return
     for setting in settings(rig, records):
         for family in families:
-            found = excitation(rig, setting, family, rng)
-            if found is not None:
-                yield found
+            candidate = excitation(rig, setting, family, rng)
+            if candidate is not None:
+                yield candidate
 
 
 def excitation(
@@ -166,14 +166,14 @@ def excitation(
     tones = {j: _tone(j, family, k, rng) for k, j in enumerate(setting.moving(rig))}
     step = _step(rig, setting, family, tones)
     goal = FILL * family.level
-    found: CandidateExcitation | None = None
+    best: CandidateExcitation | None = None
     try:
         for attempt in range(PLAYS):
             played = play(rig, with_tones(step, tones))
             share = used(rig, played)[0]
             step = played.step
             if share <= 1.05 * goal:
-                found = CandidateExcitation(family, setting, tones, played)
+                best = CandidateExcitation(family, setting, tones, played)
                 if share >= 0.9 * goal:
                     break
             if attempt == 0 and len(tones) == 1:
@@ -182,7 +182,7 @@ def excitation(
             tones = {j: replace(t, spectrum=t.spectrum * factor) for j, t in tones.items()}
     except InputError as error:
         log.info("%s is not possible: %s", family.name, error)
-    return found
+    return best
 
 
 def _flattened(rig: Rig, played: Played, tone: Tone) -> Tone:
@@ -226,40 +226,46 @@ def protocol(
     """Return the protocol file's mapping that runs these steps; `rng` draws other phases."""
     return {
         "name": name,
-        "description": "; ".join(one.text for one in chosen),
+        "description": "; ".join(candidate.text for candidate in chosen),
         "joints": len(rig.joints),
-        "steps": [_as_step(rig, one, k, scale, rng) for k, one in enumerate(chosen, start=1)],
+        "steps": [
+            _as_step(rig, candidate, k, scale, rng) for k, candidate in enumerate(chosen, start=1)
+        ],
     }
 
 
 def _as_step(
-    rig: Rig, one: CandidateExcitation, number: int, scale: float, rng: np.random.Generator | None
+    rig: Rig,
+    candidate: CandidateExcitation,
+    number: int,
+    scale: float,
+    rng: np.random.Generator | None,
 ) -> dict[str, Any]:
     locks = [
         {"joint": j + 1, "at": "closed", "piston": f"{1e3 * p:.6g} mm",
          "tolerance": f"{1e3 * CLOSED_GIVES:g} mm"}
-        for j, p in one.setting.closed.items()
+        for j, p in candidate.setting.closed.items()
     ] + [
         {"joint": j + 1, "at": "end_max" if p > 0 else "end_min",
          "tolerance": f"{1e3 * END_GIVES:g} mm"}
-        for j, p in one.setting.held.items()
+        for j, p in candidate.setting.held.items()
     ]  # fmt: skip
     offset = f"{1e3 * OFFSET:g} mm"
     excite = []
-    for j, tone in one.tones.items():
-        n = one.step.period
+    for j, tone in candidate.tones.items():
+        n = candidate.step.period
         spectrum = tone.spectrum if rng is None else _other_phases(tone, n, rng)
         excite.append(
             {
                 "joint": j + 1,
                 "signal": {
                     "kind": "lines",
-                    "base_frequency": f"{rig.sample_rate / one.step.period:.9g} Hz",
+                    "base_frequency": f"{rig.sample_rate / candidate.step.period:.9g} Hz",
                     "lines": [int(k) for k in tone.lines],
                     "amplitudes": [f"{scale * abs(a):.5g} V" for a in spectrum],
                     "phases": [f"{np.angle(a):.5g} rad" for a in spectrum],
                 },
-                "centre": f"{1e3 * one.step.centres[j]:.6g} mm",
+                "centre": f"{1e3 * candidate.step.centres[j]:.6g} mm",
                 "centring": {
                     "mode": "open-loop",
                     "position_gain": f"{LOOP:g} V/m",
@@ -270,7 +276,7 @@ def _as_step(
             }
         )
     return {
-        "name": f"next{number}_{one.family.name}",
+        "name": f"next{number}_{candidate.family.name}",
         "lock": locks,
         "excite": excite,
         "repeats": REPEATS if rng is None else HELD_OUT_REPEATS,

@@ -34,7 +34,7 @@ from analysis.trace.next_experiment.discrimination import (
     view,
 )
 from analysis.trace.next_experiment.range_extension import LINES, farther, richer
-from analysis.trace.result import CLEAN, CONFOUNDED, UNEXPLAINED, Dependence, Found
+from analysis.trace.result import CLEAN, CONFOUNDED, UNEXPLAINED, Dependence, JudgedEffect
 from analysis.trace.search.hypothesis import Hypothesis, parameter_values
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.linear_fit import BAND
@@ -70,7 +70,7 @@ class ExperimentProposal:
 
 
 def propose(
-    hypotheses: HypothesisSet, winner: Hypothesis, found: Sequence[Found], verdict: str,
+    hypotheses: HypothesisSet, winner: Hypothesis, effects: Sequence[JudgedEffect], verdict: str,
     moves: Sequence[Dependence], families: Sequence[ex.Family] = ex.FAMILIES,
 ) -> Mapping[str, Any] | None:  # fmt: skip
     """Return the next experiment as plain data, None where none promises anything.
@@ -80,7 +80,7 @@ def propose(
     """
     train_data = hypotheses.stage
     old = Ground(train_data)
-    questions = _questions(hypotheses, winner, found, verdict, old)
+    questions = _questions(hypotheses, winner, effects, verdict, old)
     if not questions and not (verdict == UNEXPLAINED and moves):
         return None
     rng = np.random.default_rng(SEED)
@@ -88,11 +88,11 @@ def propose(
     if not tried:
         return _in_words(winner, questions) if verdict == CONFOUNDED else None
     measured = calibration(train_data)
-    views = [view(train_data, one, measured) for one in tried]
+    views = [view(train_data, candidate, measured) for candidate in tried]
     kind = SHOW if verdict == CLEAN else TELL
     best = _choose(questions, tried, views, old)
     if best is not None:
-        return _told(train_data, kind, *best)
+        return _proposal(train_data, kind, *best)
     if verdict == UNEXPLAINED and moves:
         return _explored(train_data, winner, moves, tried, views)
     return None
@@ -101,11 +101,11 @@ def propose(
 def learned(train_data: RegressionData) -> Rig:
     """Return the rig with what the records say of its parameters: a twin that is nearer to it."""
     plain = tuple(map(Used, baseline_of(train_data.rig)))
-    found = parameter_values(train_data.rig, plain, dict(train_data.beta))
+    parameters = parameter_values(train_data.rig, plain, dict(train_data.beta))
     before = train_data.rig.nominal
     likely = {
         name: value
-        for name, value in found.items()
+        for name, value in parameters.items()
         # A parameter that the records hardly move may come out as anything.
         if name in before and 1 / LIKELY < value / before[name] < LIKELY
     }
@@ -113,14 +113,18 @@ def learned(train_data: RegressionData) -> Rig:
 
 
 def _questions(
-    hypotheses: HypothesisSet, winner: Hypothesis, found: Sequence[Found], verdict: str, old: Ground
+    hypotheses: HypothesisSet,
+    winner: Hypothesis,
+    effects: Sequence[JudgedEffect],
+    verdict: str,
+    old: Ground,
 ) -> list[ExperimentProposal]:
     if verdict == CLEAN:
         asked = [OpenQuestion(h, Explanation(), False) for h in _small(hypotheses)]
         answers = [ExperimentProposal(q, present(q, old)) for q in asked]
         return [a for a in answers if a.present < PROMISE]
     if verdict == CONFOUNDED:
-        others = tied_sets(hypotheses, winner, found)
+        others = tied_sets(hypotheses, winner, effects)
         pairs = [OpenQuestion(explanation(winner), explanation(o)) for o in others]
     elif verdict == UNEXPLAINED:
         pairs = _unsettled(hypotheses)
@@ -129,26 +133,28 @@ def _questions(
     return [ExperimentProposal(q, present(q, old)) for q in pairs]
 
 
-def explanation(one: Hypothesis) -> Explanation:
+def explanation(hypothesis: Hypothesis) -> Explanation:
     """Return a fitted set as a hypothesis."""
-    return Explanation(one.effects, one.fit.beta)
+    return Explanation(hypothesis.effects, hypothesis.fit.beta)
 
 
 def tied_sets(
-    hypotheses: HypothesisSet, winner: Hypothesis, found: Sequence[Found]
+    hypotheses: HypothesisSet, winner: Hypothesis, effects: Sequence[JudgedEffect]
 ) -> list[Hypothesis]:
     """Return the sets that the gates could not tell from the winner: one effect exchanged."""
     out = []
-    for effect in found:
+    for effect in effects:
         tied = {(r.name, r.where) for r in effect.rivals if r.tied}
         others = [u for u in winner.effects if _key(u.term) != (effect.name, effect.where)]
-        for one in hypotheses.listed.values():
-            fresh = [u for u in one.effects if u.term not in [w.term for w in winner.effects]]
-            kept = {u.term for u in one.effects} - {u.term for u in fresh}
+        for hypothesis in hypotheses.listed.values():
+            fresh = [
+                u for u in hypothesis.effects if u.term not in [w.term for w in winner.effects]
+            ]
+            kept = {u.term for u in hypothesis.effects} - {u.term for u in fresh}
             if len(fresh) == 1 and _key(fresh[0].term) in tied and kept == {
                 u.term for u in others
             }:  # fmt: skip
-                out.append(one)
+                out.append(hypothesis)
     return out
 
 
@@ -172,8 +178,8 @@ def _unsettled(hypotheses: HypothesisSet) -> list[OpenQuestion]:
 def _small(hypotheses: HypothesisSet) -> list[Explanation]:
     rig = hypotheses.stage.rig
     effects = dict.fromkeys(hypotheses.effects)
-    found = (smallest(effect, rig) for effect in effects)
-    return [h for h in found if h is not None]
+    smallest_sizes = (smallest(effect, rig) for effect in effects)
+    return [h for h in smallest_sizes if h is not None]
 
 
 def _choose(
@@ -203,8 +209,8 @@ def _choose(
         chosen.append(k)
     if not chosen:
         return None
-    told = [a for a in _best(table, chosen) if a.open]
-    return ([tried[k] for k in chosen], told) if told else None
+    answered = [a for a in _best(table, chosen) if a.open]
+    return ([tried[k] for k in chosen], answered) if answered else None
 
 
 def _best(
@@ -226,23 +232,23 @@ def _explored(
     views: Sequence[MeasurementView],
 ) -> Mapping[str, Any] | None:
     """Return the experiment that shows what is unexplained where no record has been yet."""
-    found = farther(train_data, moves, views, MORE) or richer(train_data, moves, tried)
-    if found is None:
+    candidates = farther(train_data, moves, views, MORE) or richer(train_data, moves, tried)
+    if candidates is None:
         return None
     now = loudest(train_data, winner.fit.residual)
     return {
         "kind": COVER,
         "separates": [],
-        "covers": {"variable": found.variable, "times": found.times},
+        "covers": {"variable": candidates.variable, "times": candidates.times},
         "present": now,
-        "predicted": now * (found.times if found.variable != LINES else 1.0),
-        "equation": found.equation,
-        "text": f"{tried[found.index].text}: {found.words}",
-        **_protocols(train_data, [tried[found.index]]),
+        "predicted": now * (candidates.times if candidates.variable != LINES else 1.0),
+        "equation": candidates.equation,
+        "text": f"{tried[candidates.index].text}: {candidates.words}",
+        **_protocols(train_data, [tried[candidates.index]]),
     }
 
 
-def _told(
+def _proposal(
     train_data: RegressionData,
     kind: str,
     chosen: Sequence[ex.CandidateExcitation],
@@ -267,7 +273,7 @@ def _told(
         "present": weakest.present,
         "predicted": weakest.promised,
         "equation": weakest.equation,
-        "text": f"{'; then '.join(one.text for one in chosen)} ({what})",
+        "text": f"{'; then '.join(candidate.text for candidate in chosen)} ({what})",
         **_protocols(train_data, chosen),
     }  # fmt: skip
 
@@ -275,8 +281,8 @@ def _told(
 def _names(answers: Sequence[ExperimentProposal]) -> list[dict[str, str]]:
     """Return names and places of all effects in question, each once."""
     keys = [k for a in answers for h in (a.question.one, a.question.other) for k in h.keys]
-    found = dict.fromkeys((k["name"], k["where"]) for k in keys)
-    return [{"name": name, "where": where} for name, where in found]
+    names = dict.fromkeys((k["name"], k["where"]) for k in keys)
+    return [{"name": name, "where": where} for name, where in names]
 
 
 def _protocols(

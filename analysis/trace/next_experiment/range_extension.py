@@ -49,7 +49,9 @@ def farther(
             if not values:
                 continue
             low, high = np.percentile(np.concatenate(values), [1, 99])
-            reach = [_reach(train_data, one, joint, name, float(low), float(high)) for one in views]
+            reach = [
+                _reach(train_data, view, joint, name, float(low), float(high)) for view in views
+            ]
             k = int(np.argmax(reach))
             if reach[k] >= least:
                 words = f"carries {name} {reach[k]:.1f} times as far, which what is left moves with"
@@ -58,12 +60,17 @@ def farther(
 
 
 def _reach(
-    train_data: RegressionData, one: MeasurementView, joint: int, name: str, low: float, high: float
+    train_data: RegressionData,
+    view: MeasurementView,
+    joint: int,
+    name: str,
+    low: float,
+    high: float,
 ) -> float:
     """Return a variable's range over the records' and a candidate's, over the records' alone."""
-    if joint + 1 in one.conditioned.record.locked:
+    if joint + 1 in view.conditioned.record.locked:
         return 0.0
-    least, most = np.percentile(variables(train_data.rig, one.seen, joint)[name], [1, 99])
+    least, most = np.percentile(variables(train_data.rig, view.seen, joint)[name], [1, 99])
     return float((max(most, high) - min(least, low)) / max(high - low, 1e-30))
 
 
@@ -77,7 +84,9 @@ def richer(
     equation = moves[0].equation
     joint = int(equation.rsplit("_", 1)[1]) - 1
     held = [len(s.record.lines) for s in train_data.records if joint + 1 not in s.record.locked]
-    counts = [len(one.tones[joint].lines) if joint in one.tones else 0 for one in tried]
+    counts = [
+        len(measured.tones[joint].lines) if joint in measured.tones else 0 for measured in tried
+    ]
     if not held or not min(held) or not counts:
         return None
     k = int(np.argmax(counts))

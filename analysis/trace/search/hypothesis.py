@@ -65,8 +65,8 @@ def excess_of(data: RegressionData, residual: Array, noise: float = 1.0) -> dict
     out: dict[str, float] = {}
     for segment in data.segments:
         part = residual[segment.where]
-        found = float(part @ part) - noise * len(part)
-        out[segment.equation] = out.get(segment.equation, 0.0) + found
+        excess = float(part @ part) - noise * len(part)
+        out[segment.equation] = out.get(segment.equation, 0.0) + excess
     return out
 
 

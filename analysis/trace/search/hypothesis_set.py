@@ -57,10 +57,10 @@ class HypothesisSet:
         self.listed: dict[frozenset[Key], Hypothesis] = {}
         self.empty = self._listed((), fit(data, self.base))
 
-    def _listed(self, effects: tuple[Used, ...], found: ExactFit) -> Hypothesis:
+    def _listed(self, effects: tuple[Used, ...], fit: ExactFit) -> Hypothesis:
         rig = self.stage.rig
         return Hypothesis(
-            effects, found, excess_of(self.stage, found.residual), complexity(rig, effects)
+            effects, fit, excess_of(self.stage, fit.residual), complexity(rig, effects)
         )
 
     def widened(self, effects: Sequence[Effect]) -> HypothesisSet:
@@ -78,11 +78,11 @@ class HypothesisSet:
         seen = evidence(data, residual) if any(e.by_data for e in self.effects) else None
         return variants(data.rig, self.effects, seen)
 
-    def physical(self, one: Hypothesis) -> str:
+    def physical(self, hypothesis: Hypothesis) -> str:
         """Say why a set is not physical ('' if it is)."""
         rig = self.stage.rig
-        values = parameter_values(rig, one.fit.terms, dict(one.fit.beta))
-        for used in one.effects:
+        values = parameter_values(rig, hypothesis.fit.terms, dict(hypothesis.fit.beta))
+        for used in hypothesis.effects:
             assert isinstance(used.term, Effect)
             problem = used.term.problem(rig, values, used.shape) or used.term.outside(
                 rig, used.shape
@@ -95,38 +95,40 @@ class HypothesisSet:
         """Return the set refined exactly (once per set of names and places)."""
         key = frozenset((u.term.name, u.term.where) for u in effects)
         if key not in self.listed:
-            found = refine(self.stage, (*self.base, *effects))
-            self.listed[key] = self._listed(found.terms[len(self.base) :], found)
+            fit = refine(self.stage, (*self.base, *effects))
+            self.listed[key] = self._listed(fit.terms[len(self.base) :], fit)
         return self.listed[key]
 
     def tried(self, sets: Sequence[tuple[Used, ...]]) -> list[Hypothesis]:
         """Return the sets refined exactly; one whose effect has become a simpler one, also so."""
         out = [self.exact(effects) for effects in sets]
-        return out + [simpler for one in out if (simpler := self._simplified(one)) is not None]
+        return out + [
+            simpler for hypothesis in out if (simpler := self._simplified(hypothesis)) is not None
+        ]
 
-    def _simplified(self, one: Hypothesis) -> Hypothesis | None:
+    def _simplified(self, hypothesis: Hypothesis) -> Hypothesis | None:
         """Return the set with the simpler effects that its own have become, None where none has."""
         rig = self.stage.rig
-        values = parameter_values(rig, one.fit.terms, dict(one.fit.beta))
+        values = parameter_values(rig, hypothesis.fit.terms, dict(hypothesis.fit.beta))
         effects: dict[Key, Used] = {}
-        for used in one.effects:
+        for used in hypothesis.effects:
             assert isinstance(used.term, Effect)
             term, shape = used.term, used.shape
             if term.simpler(rig, values):
                 term = _effect(term.simpler(rig, values), term.where)
                 shape = term.shape_of(rig, ())
             effects.setdefault((term.name, term.where), Used(term, shape))
-        changed = frozenset(effects) != one.keys
+        changed = frozenset(effects) != hypothesis.keys
         return self.exact(tuple(effects.values())) if changed else None
 
-    def better(self, one: Hypothesis, other: Hypothesis) -> bool:
+    def better(self, hypothesis: Hypothesis, other: Hypothesis) -> bool:
         """Return whether `one` is to be preferred: much less left, or as little and simpler."""
-        slack = linear_fit.CHANCE * max(1, abs(one.size[1] - other.size[1]))
-        if one.size < other.size:
-            return one.total <= max(linear_fit.AS_GOOD * other.total, other.total + slack)
-        if one.size > other.size:
-            return one.total < min(other.total / linear_fit.AS_GOOD, other.total - slack)
-        return one.total < other.total
+        slack = linear_fit.CHANCE * max(1, abs(hypothesis.size[1] - other.size[1]))
+        if hypothesis.size < other.size:
+            return hypothesis.total <= max(linear_fit.AS_GOOD * other.total, other.total + slack)
+        if hypothesis.size > other.size:
+            return hypothesis.total < min(other.total / linear_fit.AS_GOOD, other.total - slack)
+        return hypothesis.total < other.total
 
     def best(self, among: Sequence[Hypothesis]) -> Hypothesis:
         """Return the preferred of several physical sets."""
@@ -165,9 +167,9 @@ class HypothesisSet:
                 return self.completed(now)
         return now
 
-    def formed(self, one: Hypothesis) -> bool:
+    def formed(self, hypothesis: Hypothesis) -> bool:
         """Return whether the rest may be the difference of form between effect and catalogue."""
-        return all(self.negligible(e, residual) for e, residual in one.excess_energy.items())
+        return all(self.negligible(e, residual) for e, residual in hypothesis.excess_energy.items())
 
     def negligible(self, equation: str, residual: float) -> bool:
         """Return whether so much energy above noise may be left in an equation."""
@@ -183,7 +185,7 @@ class HypothesisSet:
         return best if best.effects and self.prune(best).keys == best.keys else now
 
     def _field(
-        self, data: RegressionData, found: Sequence[VariantColumns], mask: Array | None = None
+        self, data: RegressionData, columns: Sequence[VariantColumns], mask: Array | None = None
     ) -> linear_fit.CandidateColumns:
         rig = data.rig
         values = parameter_values(rig, data.terms, dict(data.beta))
@@ -200,7 +202,7 @@ class HypothesisSet:
         def size(entry: VariantColumns) -> int:
             return complexity(rig, [entry.variant.used])[1]
 
-        return linear_fit.project(data, found, size, allowed, mask)
+        return linear_fit.project(data, columns, size, allowed, mask)
 
     def _singles(self, field: linear_fit.CandidateColumns, r: Array) -> list[tuple[Used, ...]]:
         g = linear_fit.gains(field.K, field.columns.T @ r, field.groups, field.raw)
@@ -238,13 +240,13 @@ class HypothesisSet:
         taken = now.keys
         looks = self._variants(data, now.fit.residual)
         looks = [v for v in looks if v.key not in taken and (v.effect.free or not free)]
-        found = variant_columns(data, looks)
+        columns = variant_columns(data, looks)
         mask = np.ones(len(now.fit.residual))
         for s in data.segments:
             mask[s.where] = not equations or s.equation in equations
         # The set's shapes move too when another effect joins: what they can take is not its gain.
         moves = [jacobian(self.stage, now.fit, used)[1] for used in now.effects]
-        field = self._field(replace(data, base=np.hstack((data.base, *moves))), found, mask)
+        field = self._field(replace(data, base=np.hstack((data.base, *moves))), columns, mask)
         r = now.fit.residual * mask
         r = r - field.basis @ (field.basis.T @ r)
         more = linear_fit.options(field, (), r, 1.0)
@@ -266,12 +268,12 @@ class HypothesisSet:
         if len(now.effects) >= DEEPEST:
             return None
 
-        def residual(one: Hypothesis) -> float:
-            return sum(one.excess_energy[e] for e in equations)
+        def residual(hypothesis: Hypothesis) -> float:
+            return sum(hypothesis.excess_energy[e] for e in equations)
 
-        def earned(one: Hypothesis) -> bool:
-            drop, start = residual(now) - residual(one), max(0.0, residual(now))
-            least = linear_fit.CHANCE * (one.size[1] - now.size[1])
+        def earned(hypothesis: Hypothesis) -> bool:
+            drop, start = residual(now) - residual(hypothesis), max(0.0, residual(now))
+            least = linear_fit.CHANCE * (hypothesis.size[1] - now.size[1])
             return drop > max(least, linear_fit.ADD_SHARE * start)
 
         more = [o for o in self.extensions(now, equations) if earned(o) and not self.physical(o)]
@@ -282,27 +284,28 @@ class HypothesisSet:
         near = [o for o in more if residual(o) <= best + slack]
         return min(near, key=lambda o: (o.size[1], residual(o)))
 
-    def prune(self, one: Hypothesis) -> Hypothesis:
+    def prune(self, hypothesis: Hypothesis) -> Hypothesis:
         """Drop effects without which about as little is left."""
-        while len(one.effects) > 1:
+        while len(hypothesis.effects) > 1:
             rest = [
-                self.exact(tuple(u for u in one.effects if u is not used)) for used in one.effects
+                self.exact(tuple(u for u in hypothesis.effects if u is not used))
+                for used in hypothesis.effects
             ]
             rest = [o for o in rest if not self.physical(o)]
-            simpler = [o for o in rest if self.better(o, one) or self.idle(o, one)]
+            simpler = [o for o in rest if self.better(o, hypothesis) or self.idle(o, hypothesis)]
             if not simpler:
                 break
-            one = min(simpler, key=lambda o: o.total)
-        return one
+            hypothesis = min(simpler, key=lambda o: o.total)
+        return hypothesis
 
-    def idle(self, without: Hypothesis, one: Hypothesis) -> bool:
+    def idle(self, without: Hypothesis, hypothesis: Hypothesis) -> bool:
         """Return whether the effect that `without` lacks takes too small a share away."""
-        drop = without.total - one.total
+        drop = without.total - hypothesis.total
         return drop < linear_fit.ADD_SHARE * without.total
 
 
 def _effect(name: str, where: str) -> Effect:
     """Return an effect of the catalogue at a place."""
-    found = make(name, where)
-    assert isinstance(found, Effect)
-    return found
+    effect = make(name, where)
+    assert isinstance(effect, Effect)
+    return effect

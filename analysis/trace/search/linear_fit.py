@@ -71,17 +71,17 @@ class LinearFit:
 
 
 def project(
-    data: RegressionData, found: Sequence[VariantColumns], size: Callable[[VariantColumns], int],
+    data: RegressionData, columns: Sequence[VariantColumns], size: Callable[[VariantColumns], int],
     admissible: Callable[[VariantColumns, Array], bool], mask: Array | None = None,
 ) -> CandidateColumns:  # fmt: skip
     """Project the entries off the stage's own columns; `mask` (M,) switches rows off."""
     keep = np.ones(data.base.shape[0]) if mask is None else mask
     basis = orthonormal(data.base * keep[:, None])
     groups, start = [], 0
-    for entry in found:
+    for entry in columns:
         groups.append(tuple(range(start, start + entry.columns.shape[1])))
         start += entry.columns.shape[1]
-    stack = np.column_stack([e.columns for e in found]) if found else np.zeros((len(keep), 0))
+    stack = np.column_stack([e.columns for e in columns]) if columns else np.zeros((len(keep), 0))
     stack = stack * keep[:, None]
     raw = np.sum(stack**2, axis=0)
     projected = stack - basis @ (basis.T @ stack)
@@ -95,9 +95,9 @@ def project(
             where
         )
     return CandidateColumns(
-        tuple(found), projected, projected.T @ projected, basis, tuple(groups), raw,
+        tuple(columns), projected, projected.T @ projected, basis, tuple(groups), raw,
         {name: np.concatenate(parts) for name, parts in rows.items()}, band,
-        tuple(size(entry) for entry in found), admissible,
+        tuple(size(entry) for entry in columns), admissible,
     )  # fmt: skip
 
 
@@ -240,13 +240,13 @@ def best_pairs(candidates: CandidateColumns, r: Array, count: int) -> list[Linea
     starts: dict[Key, LinearFit] = {}
     for first in _blind(candidates, r):
         starts.setdefault(candidates.entries[first.members[0]].variant.key, first)
-    found: dict[frozenset[Key], LinearFit] = {}
+    pairs: dict[frozenset[Key], LinearFit] = {}
     for first in list(starts.values())[:STARTS]:
         for pair in options(candidates, first.members, r, 1.0)[:3]:
             keys = frozenset(candidates.entries[m].variant.key for m in pair.members)
-            if keys not in found or pair.total < found[keys].total:
-                found[keys] = pair
-    return sorted(found.values(), key=lambda p: p.total)[:count]
+            if keys not in pairs or pair.total < pairs[keys].total:
+                pairs[keys] = pair
+    return sorted(pairs.values(), key=lambda p: p.total)[:count]
 
 
 def _blind(candidates: CandidateColumns, r: Array) -> list[LinearFit]:

@@ -102,7 +102,7 @@ def _rows(
     A term that only has columns has them filtered alone, beside the rows of the others.
     """
     here = [u for u in terms if not held(u.term, conditioned)]
-    found: dict[str, Rows] = {}
+    by_equation: dict[str, Rows] = {}
     for family in conditioned.families:
         acting = [u for u in here if acts_on(data.rig, u.term, family)]
         added = [u for u in acting if isinstance(u.term, Effect) and not changes_signals(u.term)]
@@ -114,8 +114,8 @@ def _rows(
             more = partial(candidate_columns, data.rig, (), own, seen, rows, {}, u)
             columns = _kept(data, (*key, u), more)
             rows = {e: _beside(r, columns.get(e, {})) for e, r in rows.items()}
-        found |= rows
-    return found
+        by_equation |= rows
+    return by_equation
 
 
 def _kept(data: RegressionData, key: Any, make: Callable[[], Any]) -> Any:
@@ -152,33 +152,33 @@ def refine(data: RegressionData, terms: Sequence[Used], steps: int = MOST_STEPS)
     Where an effect has another form, the one that leaves less stays. Then details of forms join,
     one after another, that take more away than chance, and a share of what is left.
     """
-    found = _searched(data, terms, steps)
+    fit = _searched(data, terms, steps)
     for k in range(len(terms)):
-        used = found.terms[k]
+        used = fit.terms[k]
         if used in data.terms or not isinstance(used.term, Effect):
             continue
         for shape in used.term.other_forms(data.rig, used.shape):
-            other = _searched(data, _with(found.terms, used, Used(used.term, shape)), steps)
-            found = other if other.energy < found.energy else found
-        used = found.terms[k]
+            other = _searched(data, _with(fit.terms, used, Used(used.term, shape)), steps)
+            fit = other if other.energy < fit.energy else fit
+        used = fit.terms[k]
         opened = _in_detail(data.rig, used)
-        asked = max(CHANCE, DETAIL * (found.energy - len(found.residual)))
+        asked = max(CHANCE, DETAIL * (fit.energy - len(fit.residual)))
         # Half, since in a straight line a detail promises less than it takes.
-        if opened == used or _promise(data, found, used, opened) < 0.5 * asked:
+        if opened == used or _promise(data, fit, used, opened) < 0.5 * asked:
             continue
-        more = _searched(data, _with(found.terms, used, opened), steps)
-        found = more if found.energy - more.energy > asked else found
-    return found
+        more = _searched(data, _with(fit.terms, used, opened), steps)
+        fit = more if fit.energy - more.energy > asked else fit
+    return fit
 
 
-def _promise(data: RegressionData, found: ExactFit, used: Used, opened: Used) -> float:
+def _promise(data: RegressionData, fit: ExactFit, used: Used, opened: Used) -> float:
     """Return the energy that a term with its details would take, were all linear in them."""
-    column = table(data, _with(found.terms, used, opened)).residual(found.beta) - found.residual
-    absorbed = np.hstack((table(data, found.terms).matrix, jacobian(data, found, used)[1]))
+    column = table(data, _with(fit.terms, used, opened)).residual(fit.beta) - fit.residual
+    absorbed = np.hstack((table(data, fit.terms).matrix, jacobian(data, fit, used)[1]))
     basis = orthonormal(absorbed)
     column = column - basis @ (basis.T @ column)
     size = float(column @ column)
-    return float(column @ found.residual) ** 2 / size if size > 0 else 0.0
+    return float(column @ fit.residual) ** 2 / size if size > 0 else 0.0
 
 
 def _with(terms: Sequence[Used], used: Used, other: Used) -> tuple[Used, ...]:
@@ -206,12 +206,12 @@ def _searched(data: RegressionData, terms: Sequence[Used], steps: int) -> ExactF
             shapes[k][j] = _from_unit(float(value), s)
         return tuple(Used(u.term, tuple(v)) for u, v in zip(terms, shapes, strict=True))
 
-    found = search_shapes(
+    search = search_shapes(
         lambda x: fit(data, at(x)).residual, np.clip(start, 1e-6, 1 - 1e-6), bounds=(0.0, 1.0),
         diff_step=1e-3, xtol=TOLERANCE, ftol=TOLERANCE, gtol=1e-12,
         max_nfev=steps,
     )  # fmt: skip
-    return fit(data, at(found.x))
+    return fit(data, at(search.x))
 
 
 def _free(data: RegressionData, terms: Sequence[Used]) -> list[tuple[int, int, Shape]]:
@@ -315,14 +315,14 @@ def contribution(data: RegressionData, model: ExactFit, used: Used) -> Array:
     return np.asarray(J @ np.array(amounts))
 
 
-def alternatives(data: RegressionData, found: ExactFit) -> list[ExactFit]:
+def alternatives(data: RegressionData, fit: ExactFit) -> list[ExactFit]:
     """Return the fit with each effect in its other forms, one after another."""
     out = []
-    for used in found.terms:
+    for used in fit.terms:
         if used in data.terms or not isinstance(used.term, Effect):
             continue
         for shape in used.term.other_forms(data.rig, used.shape):
-            terms = _with(found.terms, used, Used(used.term, shape))
+            terms = _with(fit.terms, used, Used(used.term, shape))
             out.append(_searched(data, terms, MOST_STEPS))
     return out
 

@@ -33,18 +33,18 @@ def with_shapes(runs: Sequence[Run], terms: Sequence[Used]) -> tuple[Used, ...]:
     data = regression_data(
         rig, (*known, *temperature_terms(known, runs)), conditioned_records(rig, runs)
     )
-    found: tuple[Used, ...] = ()
+    refined: tuple[Used, ...] = ()
     seen = evidence(data, data.mean)
     for used in wanted:
         assert isinstance(used.term, Effect)
         looks = points(used.term, rig, seen)
-        trials = [(*data.terms, *found, Used(used.term, p)) for p in looks]
+        trials = [(*data.terms, *refined, Used(used.term, p)) for p in looks]
         # The least before the search need not be it afterwards: edges that no spool reaches leave
         # little, and nothing to search along.
         near = sorted(trials, key=lambda trial: fit(data, trial).energy)[:STARTS]
-        best = min((refine(data, trial) for trial in near), key=lambda one: one.energy)
-        found = best.terms[len(data.terms) :]
-    shaped = dict(zip(wanted, found, strict=True))
+        best = min((refine(data, trial) for trial in near), key=lambda candidate: candidate.energy)
+        refined = best.terms[len(data.terms) :]
+    shaped = dict(zip(wanted, refined, strict=True))
     return tuple(shaped.get(u, u) for u in terms)
 
 

@@ -120,7 +120,7 @@ class Frame:
     window: HistoryWindow = EMPTY
     speed: float = 1.0  # device seconds per wall second
     story: tuple[EventLine, ...] = ()  # what happened, oldest first, the newest STORY lines of it
-    told: int = 0  # how many lines there have ever been
+    total_lines: int = 0  # how many lines there have ever been
     plan: tuple[PlanLine, ...] = ()
     estimates: tuple[TrackedPoint, ...] = ()  # oldest first
     interval: float = 0.0  # between two snapshots, smoothed [s of wall time]
@@ -283,7 +283,7 @@ class Link:
             received=now if _has_news(before.snapshot, snapshot) else before.received,
             speed=_speed(before, snapshot),
             story=(*before.story, *lines)[-STORY:] if lines else before.story,
-            told=before.told + len(lines),
+            total_lines=before.total_lines + len(lines),
             estimates=estimates,
             interval=_interval(before, snapshot),
             worst_age=max(before.worst_age, snapshot.block_age),
@@ -307,8 +307,8 @@ class Link:
         if first and self._history.begin_with(past) and frame.snapshot.run:
             earlier = from_events(read_events(Path(frame.snapshot.run)), frame.snapshot)
             story = (*earlier, *story)[-STORY:]
-        told = frame.told + len(story) - len(frame.story)
-        self._frame = replace(self._frame, plan=past.plan, story=story, told=told)
+        total_lines = frame.total_lines + len(story) - len(frame.story)
+        self._frame = replace(self._frame, plan=past.plan, story=story, total_lines=total_lines)
 
     def _follow_sessions(self) -> None:
         now = self._clock()
@@ -346,7 +346,7 @@ class Link:
             endpoint,
             received=self._clock(),
             story=kept.story,
-            told=kept.told,
+            total_lines=kept.total_lines,
         )
 
     def _drain(self) -> None:

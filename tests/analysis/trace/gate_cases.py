@@ -16,7 +16,7 @@ from analysis.trace.data.candidates import catalogue
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import RegressionData, regression_data
 from analysis.trace.judge import gates
-from analysis.trace.result import Found, Trace
+from analysis.trace.result import JudgedEffect, Trace
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.linear_fit import VISIBLE, CandidateColumns
@@ -41,7 +41,7 @@ class Searched:
     winner: Hypothesis
     holdout_data: RegressionData
 
-    def judged(self, *names: str, seed: int = 0) -> list[Found]:
+    def judged(self, *names: str, seed: int = 0) -> list[JudgedEffect]:
         """Return the gates' verdict on a set: the winner, or that of the named candidates."""
         one = self.set_of(*names) if names else self.winner
         rng = np.random.default_rng(seed)
@@ -111,6 +111,6 @@ def gains(field: CandidateColumns, r: Array) -> Array:
     return np.array(out)
 
 
-def gate(found: Sequence[Found], name: str) -> bool:
+def gate(found: Sequence[JudgedEffect], name: str) -> bool:
     """Return whether a gate of the first effect holds."""
     return next(g.ok for g in found[0].gates if g.name == name)

@@ -14,11 +14,11 @@ import rig as rig_package
 from analysis.report.plots import place_plot, trace_plots
 from analysis.report.plots.style import MODEL, ORANGE
 from analysis.trace.data.candidates import catalogue, free_mechanisms
-from analysis.trace.result import Found, Gate, Rival, Trace
+from analysis.trace.result import Gate, JudgedEffect, Rival, Trace
 from rig.model.parse import parse_model
 from rig.model.rig import Rig
 
-LEAK = Found(
+LEAK = JudgedEffect(
     "internal_leakage", "joint 2", {}, 0.005, 0.99,
     (
         Rival("spool_offset", "joint 2", 9.4, 8.0, False),
@@ -97,7 +97,7 @@ def test_two_effects_at_one_place_are_both_marked(rig: Rig) -> None:
 
 def test_a_valve_s_null_is_drawn_beside_the_spool_s_own_sensor(rig: Rig) -> None:
     """They are one to the data; `sensor_offset at joint 2` alone would be the piston's."""
-    null = Found("spool_offset", "joint 2", {}, 0.005, 1.0, (), ())
+    null = JudgedEffect("spool_offset", "joint 2", {}, 0.005, 1.0, (), ())
     result = SimpleNamespace(
         model_before=SimpleNamespace(rig=rig), effects=(null,), tied=[("sensor_offset", "joint 2")]
     )

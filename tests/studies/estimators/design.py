@@ -31,7 +31,7 @@ DEFAULT = "ls"  # what `bramah identify` takes unasked: it allows for what the o
 
 
 @dataclass(frozen=True)
-class Found:
+class DesignScatter:
     """One parameter on the benches, relative to the truth.
 
     `std` is the root mean square of the standard errors identified, `scatter`
@@ -50,8 +50,8 @@ class Studied:
     protocol: str
     seeds: int
     predicted: Mapping[str, Expected]
-    steady: Mapping[str, Found]
-    swinging: Mapping[str, Found]
+    steady: Mapping[str, DesignScatter]
+    swinging: Mapping[str, DesignScatter]
 
 
 def study(protocols: Sequence[str], rig: str, first: int, seeds: int, say: Say) -> list[Studied]:
@@ -75,7 +75,7 @@ def study(protocols: Sequence[str], rig: str, first: int, seeds: int, say: Say) 
 
 def _found(
     protocol: str, rig: Rig, seeds: Sequence[int], estimator: str, say: Say
-) -> dict[str, Found]:
+) -> dict[str, DesignScatter]:
     errors: dict[str, list[float]] = {}
     stds: dict[str, list[float]] = {}
     for seed in seeds:
@@ -86,7 +86,7 @@ def _found(
             errors.setdefault(name, []).append(estimate.value / truth[name] - 1.0)
             stds.setdefault(name, []).append(estimate.std / abs(truth[name]))
     return {
-        name: Found(
+        name: DesignScatter(
             float(np.sqrt(np.mean(np.square(stds[name])))),
             float(np.std(values, ddof=1)) if len(values) > 1 else math.nan,
             float(np.mean(values)),

@@ -22,7 +22,7 @@ _MEMORY = 400e6  # [bytes] that a process may grow by
 
 
 @dataclass
-class Found:
+class FuzzResult:
     """What the cases of one target did."""
 
     name: str
@@ -34,7 +34,9 @@ class Found:
     wrong: Counter[str] = field(default_factory=Counter)  # errors that may not come, and how often
 
 
-def cases(target: Target, count: int, seed: int, found: Found, report: Callable[[], None]) -> None:
+def cases(
+    target: Target, count: int, seed: int, found: FuzzResult, report: Callable[[], None]
+) -> None:
     """Read `count` damaged examples of a target; notes what may not happen in `found`."""
     before, said = _size(), time.perf_counter()
     for number in range(count):
@@ -59,14 +61,14 @@ def cases(target: Target, count: int, seed: int, found: Found, report: Callable[
         found.wrong[f"grew by {found.grown / 1e6:.0f} MB"] += 1
 
 
-def fuzz(key: str, count: int, seed: int) -> Found:
+def fuzz(key: str, count: int, seed: int) -> FuzzResult:
     """Run a target's cases in a process; a crash or a hang stands in the result by its case."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
     process = context.Process(target=_work, args=(key, count, seed, theirs), daemon=True)
     process.start()
     theirs.close()
-    found, whole = Found(key), False
+    found, whole = FuzzResult(key), False
     try:
         while ours.poll(LONGEST * 4):  # a busy computer gets some time more
             found, whole = ours.recv()
@@ -88,7 +90,7 @@ def _work(key: str, count: int, seed: int, pipe: Connection) -> None:
     logging.disable(logging.CRITICAL)
     warnings.simplefilter("ignore")
     target = MAKERS[key]()
-    found = Found(target.name)
+    found = FuzzResult(target.name)
     cases(target, count, seed, found, lambda: pipe.send((found, False)))
     pipe.send((found, True))
 
