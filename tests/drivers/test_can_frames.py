@@ -33,6 +33,7 @@ from rig.model.wire.can_layout import CanLayout, CanMessage, _place, read_layout
 from rig.model.wire.codes import decode_input, decode_output
 from rig.model.wire.frames import MAX_PAYLOAD, WireFrame
 from rig.model.wire.registers import BlockHeader, Status
+from tests.hil_sim.block_samples import unpack_samples
 from tests.hil_sim.integrator import seed_rig
 
 RIG = seed_rig()
@@ -140,7 +141,7 @@ def test_any_program_with_the_dbc_file_reads_the_samples(fd: bool) -> None:
     database = cantools.database.load_string(TEXT[fd], "dbc")
     message = block()
     samples = msg.unpack_block(message.payload, BLOCK).samples
-    measured, commands = reg.unpack_samples(samples, BLOCK)
+    measured, commands = unpack_samples(samples, BLOCK)
     row, seen = -1, np.full((BLOCK.samples, BLOCK.columns), np.nan)
     for frame in block_frames(LAYOUT[fd], BLOCK, message):
         found = database.decode_message(frame.identifier, frame.data)

@@ -13,6 +13,7 @@ from hil_sim.device.laws import Refused
 from hil_sim.device.register_map import DeviceRegisters
 from rig.model.wire import registers as reg
 from rig.model.wire.registers import Refusal
+from tests.hil_sim.block_samples import unpack_samples
 from tests.hil_sim.integrator import IntegratorPlant, seed_rig
 
 RIG = seed_rig(watchdog=0.5)
@@ -53,7 +54,7 @@ class Bench:
         words = self.device.layout.words
         data = self.map.read(HOST, reg.BLOCK.address, words)
         assert len(data) == 2 * words
-        _, commands = reg.unpack_samples(data[10:], self.device.layout)
+        _, commands = unpack_samples(data[10:], self.device.layout)
         return reg.unpack_header(data), commands
 
     def status(self, register: reg.Register) -> int:

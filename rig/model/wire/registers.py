@@ -215,14 +215,6 @@ def pack_samples(measured: ArrayLike, commands: ArrayLike) -> bytes:
     return rows.tobytes()
 
 
-def unpack_samples(
-    data: bytes, layout: BlockLayout
-) -> tuple[NDArray[np.uint16], NDArray[np.int16]]:
-    """Return (AD codes (n, channels), DA codes (n, joints)); raises ValueError on a wrong size."""
-    rows = np.frombuffer(data, ">u2").astype(np.uint16).reshape(layout.samples, layout.columns)
-    return rows[:, : layout.channels], rows[:, layout.channels :].view(np.int16)
-
-
 def float_words(values: ArrayLike) -> list[int]:
     """Return two registers per value: IEEE 754 single precision, high word first."""
     return np.asarray(values, dtype=">f4").ravel().view(">u2").tolist()
