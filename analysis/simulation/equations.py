@@ -13,7 +13,6 @@ pressures that stay zero.
 
 from __future__ import annotations
 
-import math
 from typing import Final
 
 from llvmlite import ir  # type: ignore[import-untyped]
@@ -33,12 +32,6 @@ RATES_SIGNATURE = types.int64(
     types.float64, _DOUBLES, _DOUBLES, _DOUBLES, types.int64, types.float64,
     types.CPointer(types.uint8), _DOUBLES, _DOUBLES, types.CPointer(types.int64), _DOUBLES,
 )  # fmt: skip
-
-
-@njit(cache=True, error_model="numpy")
-def sine_in_triangle(cosine):  # type: ignore[no-untyped-def]
-    """Return the sine of a triangle's angle, between 0 and pi: a root is quicker than a sine."""
-    return math.sqrt((1.0 - cosine) * (1.0 + cosine))
 
 
 @intrinsic

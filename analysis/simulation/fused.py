@@ -219,10 +219,9 @@ def _observe(body: _Lines, electric: Sequence[bool]) -> None:
             f"pin_a = geometry[{g + eq.PIN_A}]",
             f"pin_c = geometry[{g + eq.PIN_C}]",
             f"beta = x{Q}_{i} + geometry[{g + eq.OFFSET}]",
-            "cosine = math.cos(beta)",
-            "length = math.sqrt(pin_a * pin_a + pin_c * pin_c - 2.0 * pin_a * pin_c * cosine)",
-            "sine = math.sqrt((1.0 - cosine) * (1.0 + cosine))",
-            f"x{G}_{i} = pin_a * pin_c * sine / length",
+            "length = math.sqrt("
+            "pin_a * pin_a + pin_c * pin_c - 2.0 * pin_a * pin_c * math.cos(beta))",
+            f"x{G}_{i} = pin_a * pin_c * math.sin(beta) / length",
             f"x{S}_{i} = length - geometry[{g + eq.MID}]",
             f"x{SD}_{i} = x{G}_{i} * x{QD}_{i}",
             f"x{P_CAP}_{i} = y[{2 * N + i}]",

@@ -34,7 +34,6 @@ from analysis.simulation.equations import (
     PIN_C,
     RATES_SIGNATURE,
     STROKE,
-    sine_in_triangle,
 )
 from analysis.terms.base import (
     COMP_CAP,
@@ -103,9 +102,8 @@ def _observe(t, y, inputs, rate, locked, geometry, bench, x, q_dd):  # type: ign
         x[THETA, i] = angle
         a, c = geometry[i, PIN_A], geometry[i, PIN_C]
         beta = x[Q, i] + geometry[i, OFFSET]
-        cosine = math.cos(beta)
-        length = math.sqrt(a * a + c * c - 2.0 * a * c * cosine)
-        x[G, i] = a * c * sine_in_triangle(cosine) / length
+        length = math.sqrt(a * a + c * c - 2.0 * a * c * math.cos(beta))
+        x[G, i] = a * c * math.sin(beta) / length
         x[S, i] = length - geometry[i, MID]
         x[SD, i] = x[G, i] * x[QD, i]
         x[P_CAP, i] = y[2 * N + i]

@@ -297,10 +297,10 @@ def _output(geometry, inputs, locked, ys, filled, electric, q, qd, cap, rod, pis
             if electric:
                 continue
             a, c = geometry[i, eq.PIN_A], geometry[i, eq.PIN_C]
-            cosine = math.cos(q[k, i] + geometry[i, eq.OFFSET])
-            length = math.sqrt(a * a + c * c - 2.0 * a * c * cosine)
+            beta = q[k, i] + geometry[i, eq.OFFSET]
+            length = math.sqrt(a * a + c * c - 2.0 * a * c * math.cos(beta))
             piston[k, i] = length - geometry[i, eq.MID]
-            speed[k, i] = a * c * eq.sine_in_triangle(cosine) / length * qd[k, i]
+            speed[k, i] = a * c * math.sin(beta) / length * qd[k, i]
             if not locked[i]:
                 for p in (cap[k, i], rod[k, i]):
                     beyond = beyond or p < 0.0 or p > inputs[k, 0]

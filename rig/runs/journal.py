@@ -127,9 +127,6 @@ class Journal:
             # NORMAL: a kill loses nothing, a power cut at most the blocks since the last sync;
             # FULL would hold up the acquisition by a disk sync for every block.
             db.execute("PRAGMA synchronous=NORMAL")
-            # Nobody reads a journal that is being written: without locks and shared memory a
-            # block takes half of the time.
-            db.execute("PRAGMA locking_mode=EXCLUSIVE")
             if max_pages is not None:
                 db.execute(f"PRAGMA max_page_count={int(max_pages)}")
         except (sqlite3.Error, OSError) as error:

@@ -43,9 +43,8 @@ def _root(drop):  # type: ignore[no-untyped-def]
 @njit(error_model="numpy", inline="always")
 def _linkage(q, squares, product, mid, offset):  # type: ignore[no-untyped-def]
     """Return the piston's place and dl/dq."""
-    cosine = math.cos(q + offset)
-    length = math.sqrt(squares - 2.0 * product * cosine)
-    return length - mid, product * math.sqrt((1.0 - cosine) * (1.0 + cosine)) / length
+    length = math.sqrt(squares - 2.0 * product * math.cos(q + offset))
+    return length - mid, product * math.sin(q + offset) / length
 
 
 @njit(error_model="numpy")
