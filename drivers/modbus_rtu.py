@@ -103,6 +103,10 @@ class RtuConnection(ModbusConnection):
             f"({self._at.baud}), `parity` ({self._at.parity}) and the cable"
         )
 
+    def _mismatch(self, text: str) -> DeviceError:
+        self.settle()  # a late or repeated answer to an earlier request
+        return AnswerDamaged(text)
+
     def _never_answered(self) -> str:
         return (
             f"not a byte came: check the cable, `device`, `baud` ({self._at.baud}) and that the "

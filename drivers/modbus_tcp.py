@@ -111,27 +111,30 @@ class ModbusTcpDriver:
 
     def close(self) -> None:
         """Zero the outputs if the device still answers, then close; never raises."""
-        try:
-            if self._link.is_open:
-                self._command(reg.CONTROL_ZERO, reg.ZERO_NOW)
-                self._command(reg.CONTROL_STREAM, reg.STREAM_STOP)
-        except DeviceError as error:
-            logger.debug("while closing: %s", error)
-        finally:
-            # A device that lost its controller zeroes its outputs by itself.
-            with suppress(OSError):
-                self._link.close()
+        if self._command_before_closing(reg.CONTROL_ZERO, reg.ZERO_NOW):
+            self._command_before_closing(reg.CONTROL_STREAM, reg.STREAM_STOP)
+        # A device that lost its controller zeroes its outputs by itself.
+        with suppress(OSError):
+            self._link.close()
 
     def close_tripped(self) -> None:
         """Zero the outputs, then close while it streams: the device latches a lost host."""
-        try:
-            if self._link.is_open:
-                self._command(reg.CONTROL_ZERO, reg.ZERO_NOW)
-        except DeviceError as error:
-            logger.debug("while closing after a trip: %s", error)
-        finally:
-            with suppress(OSError):
-                self._link.close()
+        self._command_before_closing(reg.CONTROL_ZERO, reg.ZERO_NOW)
+        with suppress(OSError):
+            self._link.close()
+
+    def _command_before_closing(self, register: reg.Register, value: int) -> bool:
+        """Write one command, again where a late or damaged answer met it; says whether it held."""
+        for _ in range(2):
+            if not self._link.is_open:
+                return False
+            try:
+                self._command(register, value)
+            except DeviceError as error:
+                logger.debug("while closing: %s", error)
+            else:
+                return True
+        return False
 
     def zero_outputs(self) -> None:
         """Put every output to zero now; connects anew if need be, zero needs no control."""

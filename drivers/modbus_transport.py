@@ -157,8 +157,7 @@ class ModbusConnection:
         except (ModbusException, OSError) as error:
             raise self._failure(error) from error
         if answer.address != address or len(words) not in (answer.count, len(answer.registers)):
-            self.close()
-            raise DeviceError(
+            raise self._mismatch(
                 f"device at {self.where} confirmed another write than that of "
                 f"{len(words)} registers at 0x{address:04X}"
             )
@@ -206,11 +205,15 @@ class ModbusConnection:
     def _payload(self, answer: ModbusPDU, count: int) -> bytes:
         payload = answer.payload if isinstance(answer, RawAnswer) else b""
         if len(payload) != 2 * count:
-            self.close()  # what else is under way would be taken for the next answer
-            raise DeviceError(
+            raise self._mismatch(
                 f"device at {self.where} answered {len(payload)} bytes, {2 * count} expected"
             )
         return payload
+
+    def _mismatch(self, text: str) -> DeviceError:
+        """Return what a whole answer to another request means; leaves nothing behind it."""
+        self.close()  # what else is under way would be taken for the next answer
+        return DeviceError(text)
 
     def _usable(self) -> ModbusTcpClient | ModbusSerialClient:
         # The library would reconnect by itself, to a device that has tripped meanwhile.

@@ -36,6 +36,7 @@ from tests.hil_sim.integrator import IntegratorPlant, seed_rig
 
 TIMEOUT = 0.5
 STEP = 0.09  # [s] of the device's clock between two polls: less than what it takes for a stall
+SILENCE = 2.0  # [s] of the device's clock until its watchdog acts
 
 
 class Replaced(WireFault):
@@ -106,7 +107,9 @@ class Held:
         self.plant = IntegratorPlant(self.rig)
         self._served: ServedDevice | None = None
         self._passing = False  # time is passed by `silence`
-        device = Device(self.rig, self.plant, realtime=False, clock=self._clock)
+        device = Device(
+            self.rig, self.plant, realtime=False, clock=self._clock, virtual_silence=SILENCE
+        )
         self.served = self._served = ServedDevice(device, wire)
 
     def _clock(self) -> float:
@@ -125,11 +128,11 @@ class Held:
         return self.served.inside(run)
 
     def silence(self) -> None:
-        """Let 11 s of the device's clock pass."""
+        """Let the device's clock pass by more than its watchdog allows."""
 
         def wait() -> None:
             self._passing = True
-            for _ in range(round(11.0 / STEP)):
+            for _ in range(round(1.1 * SILENCE / STEP)):
                 self.now += STEP
                 self.served.device.poll()
             self._passing = False
