@@ -72,6 +72,8 @@ EVERYWHERE: Final[Mapping[str, WireFault]] = {
     "close": LinkClosed(name="link_closed", most=None),
 }
 FLIP = BitsFlipped(name="bits_flipped", most=3)
+# A block is some thirty lines of text, each late by itself: by more, the line carries no block.
+LATE_LINE = FrameLate(name="frame_late", delay=0.002)
 DAMAGED_TEXT = BitsFlipped(name="bits_flipped", bits=3, most=3, past_checksum=True)
 LOST = ("silent", "half closed", "close")
 FAULTS: Final[Mapping[str, Mapping[str, WireFault]]] = {
@@ -82,7 +84,7 @@ FAULTS: Final[Mapping[str, Mapping[str, WireFault]]] = {
     RTU: {**EVERYWHERE, "flip": FLIP},
     SERIAL: {**EVERYWHERE, "flip": FLIP},
     CAN: {**EVERYWHERE, "flip": FLIP},
-    SLCAN: {**EVERYWHERE, "flip": FLIP, "damaged text": DAMAGED_TEXT},
+    SLCAN: {**EVERYWHERE, "late": LATE_LINE, "flip": FLIP, "damaged text": DAMAGED_TEXT},
 }
 # What `make test` tries: on TCP the quickest that between them reach every branch, elsewhere what
 # that wire alone can suffer. `make study NAME=conformance` takes all.
