@@ -12,7 +12,7 @@ from analysis.simulation.model import Estimate, Model
 from analysis.terms import make
 from analysis.terms.base import Used
 from analysis.trace.engine import trace
-from analysis.trace.judge.shooting import told
+from analysis.trace.judge.shooting import with_shots
 from analysis.trace.result import Trace, to_json
 from analysis.trace.words import shot_in_words
 from rig.model.records import Run
@@ -70,10 +70,10 @@ def test_what_the_rows_keep_has_an_interval_that_holds_both(result: Trace) -> No
     assert found.shot is not None
     (name,) = found.shot.shapes
     far = Estimate(0.004, "s", 1e-5, (0.0039, 0.0041))
-    kept = told(found, (replace(found.shot, shapes={name: far}, taken=False),))
+    kept = with_shots(found, (replace(found.shot, shapes={name: far}, taken=False),))
     assert kept.parameters[name].value == found.parameters[name].value
     assert kept.parameters[name].ci95[1] == 0.004
-    taken = told(found, (replace(found.shot, shapes={name: far}, taken=True),))
+    taken = with_shots(found, (replace(found.shot, shapes={name: far}, taken=True),))
     assert taken.parameters[name].ci95 == far.ci95
 
 
