@@ -13,13 +13,10 @@ from analysis.trace.judge import gates
 from analysis.trace.remaining import Rest, left_over
 from analysis.trace.result import JudgedEffect
 from analysis.trace.search.hypothesis import Hypothesis
-from analysis.trace.search.hypothesis_set import DEEPEST, HypothesisSet
+from analysis.trace.search.hypothesis_set import HypothesisSet
+from analysis.trace.settings import SEARCH
 
 log = logging.getLogger(__name__)
-
-TRIED = 4  # free forms that are put through the gates
-LESS = 0.5  # of what several named mechanisms leave: the most that one in their place may
-NEAR = 2.0  # times the least energy left: of sets within it the simplest goes first
 
 
 def drawn_by_data(
@@ -42,21 +39,20 @@ def drawn_by_data(
     for start in _starts(wide, winner, fewer):
         for single in wide.extensions(start, free=True):
             hypothesis = single if wide.formed(single) else _with_more(wide, single)
-            less = hypothesis.total < LESS * winner.total and mechanisms(hypothesis) < mechanisms(
-                winner
-            )
+            simpler = mechanisms(hypothesis) < mechanisms(winner)
+            less = simpler and hypothesis.total < SEARCH.free_energy * winner.total
             if wide.formed(hypothesis) and not wide.physical(hypothesis) and (less or not fewer):
                 tried.append(wide.prune(hypothesis))
     least = min((hypothesis.total for hypothesis in tried), default=0.0)
     first = sorted(
         tried,
         key=lambda hypothesis: (
-            hypothesis.total > NEAR * least,
+            hypothesis.total > SEARCH.free_near * least,
             hypothesis.size[1],
             hypothesis.total,
         ),
     )
-    for hypothesis in list({o.keys: o for o in first}.values())[:TRIED]:
+    for hypothesis in list({o.keys: o for o in first}.values())[: SEARCH.free_tried]:
         effects = gates.judge(wide, hypothesis, holdout_data, rng)
         rest = left_over(wide, hypothesis, holdout_data)
         failed = [(f.name, g.name, g.detail) for f in effects for g in f.gates if not g.ok]
@@ -73,7 +69,7 @@ def _with_more(wide: HypothesisSet, hypothesis: Hypothesis) -> Hypothesis:
     """Return the set with one more effect where equations keep too much, else the set."""
     loud = {e for e, v in hypothesis.excess_energy.items() if not wide.negligible(e, v)}
     return (
-        wide.closer(hypothesis, loud) if len(hypothesis.effects) < DEEPEST else None
+        wide.closer(hypothesis, loud) if len(hypothesis.effects) < SEARCH.deepest else None
     ) or hypothesis
 
 

@@ -16,6 +16,7 @@ from analysis.simulation.model import Estimate, Model, estimate_json, finite
 from analysis.trace.data.noise_floor import Floor
 from analysis.trace.data.spectral_lines import SpectralLines
 from analysis.trace.search.refinement import ExactFit
+from analysis.trace.settings import CLUES
 
 Array = NDArray[np.float64]
 
@@ -25,8 +26,6 @@ CONFOUNDED: Final = "confounded"
 UNEXPLAINED: Final = "unexplained"
 NAMED: Final = "named"
 FREE: Final = "free"
-SURE: Final = 0.9  # share from which a formula goes before free curves
-FEW: Final = 2  # monomials of such a one: three bend to much
 _NAME: Final = re.compile(r"[a-z]+(?:_[a-z]+)*(?:_[0-9]+)?")
 
 
@@ -50,7 +49,11 @@ class Formula:
     @property
     def sure(self) -> bool:
         """Whether it goes before free curves: a few monomials that leave next to nothing."""
-        return self.share >= SURE and len(self.terms) <= FEW and bool(self.variables)
+        return (
+            self.share >= CLUES.sure
+            and len(self.terms) <= CLUES.few_monomials
+            and bool(self.variables)
+        )
 
     @property
     def variables(self) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from typing import Final
 
 @dataclass(frozen=True)
 class TraceSettings:
-    """Numbers without unit are shares or ratios."""
+    """Judging of the effects found; numbers without unit are shares or ratios."""
 
     # Gates of an effect.
     removed: float = 0.5
@@ -92,6 +92,208 @@ class TraceSettings:
     """Rows of an equation in one record (arithmetic)."""
     rivals: int = 4
     """Rivals in a result."""
+    normal: float = 1.96
+    """Half-width of a 95 % interval over the standard error (convention)."""
+    dependent: float = 1e-10
+    """Of the largest eigenvalue: columns with a smaller one depend on each other (arithmetic)."""
+    curve_seconds: float = 4.0
+    """[s] of a free run that are kept to be drawn."""
+    curve_points: int = 400
+    """Of them, about."""
+
+
+@dataclass(frozen=True)
+class DataSettings:
+    """What the records are weighed by, and which columns are offered."""
+
+    least_noise: float = 0.2
+    """Of the noise that the rig file states: a floor measured lower is chance (tuned)."""
+    temperature_span: float = 0.05
+    """[K] between all records: less moves b by a fraction of 0.001 (arithmetic)."""
+    grid_points: int = 24
+    """Of a candidate's shape grid: two shapes of five points each, or one of many."""
+    workers: int = 2
+    """Threads that make columns."""
+    # Spectral lines.
+    line_band: float = 1.2
+    """Band over the row filter's cutoff, where that filter ends (arithmetic)."""
+    period_present: float = 0.7
+    """Of a period's pairs of rows that must be there (tuned)."""
+    lines_per_pair: float = 0.8
+    """A pair gives two numbers and a line has two: fewer lines than pairs (arithmetic)."""
+    line_ridge: float = 1e-2
+    """Of a line's own weight, against what short gaps leave undetermined (arithmetic)."""
+    line_deviations: float = 4.0
+    """Standard deviations of what noise alone puts into a kind of lines (convention)."""
+    asymmetric: float = 0.25
+    """Of the energy, from which an asymmetric nonlinearity is reported (tuned)."""
+    symmetric: float = 0.1
+    """The same of a symmetric one (tuned)."""
+    noted_share: float = 0.005
+    """Of the energy, below which a kind of lines is not reported (tuned)."""
+    velocity_ratio: float = 3.0
+    """Times the velocity's own share of even or odd lines, which no nonlinearity made (tuned)."""
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """Search for the set of effects that explains the residual."""
+
+    band: float = 0.7
+    """Repeatable rms over noise, below which there is nothing to explain (tuned)."""
+    left: float = 1.0
+    """Repeatable rms over noise that an explanation may leave (tuned)."""
+    form: float = 0.02
+    """Of the energy before: what the catalogue's form of an effect may miss of the real (tuned)."""
+    add_share: float = 0.3
+    """Of what is left in the equations an effect touches: less does not earn a place (tuned)."""
+    as_good: float = 1.25
+    """What a simpler candidate may leave over the best, before noise counts (tuned)."""
+    number_price: float = 20.0
+    """Energy that each further free number must take: ten times what noise gives it (tuned)."""
+    visible: float = 0.03
+    """Of a column's length that must stand out of the baseline's columns (arithmetic)."""
+    size_ratio: float = 3.0
+    """Largest size over that of a shape's column; smaller ones are nearer to linear (tuned)."""
+    # How much is tried.
+    largest: int = 4
+    """Effects in a set of the linear search."""
+    deepest: int = 3
+    """Effects in a set found by extension."""
+    starts: int = 10
+    """Single candidates from which pairs are tried."""
+    trials: int = 40
+    """Best entries that are fitted in full."""
+    singles: int = 14
+    """Single candidates refined exactly, best first."""
+    pairs: int = 6
+    """Pairs refined exactly."""
+    extensions: int = 6
+    """Extensions of a set that are refined exactly."""
+    near_gain: float = 0.25
+    """Of the best gain: a single candidate with less is no rival (tuned)."""
+    shape_starts: int = 3
+    """Points of an effect's grid that a search for its shapes begins at."""
+    # Refinement.
+    tolerance: float = 1e-4
+    """Relative change of cost and shapes at which a refinement ends (arithmetic)."""
+    steps: int = 10
+    """Of a refinement, at most."""
+    detail: float = 0.05
+    """Of what is left above noise: less does not earn a detail of the form (tuned)."""
+    remembered: int = 600
+    """Sets of rows kept, of at most about 0.1 MB each."""
+    # Free forms.
+    free_tried: int = 4
+    """Free forms that are put through the gates."""
+    free_energy: float = 0.5
+    """Of what several named mechanisms leave: the most that one in their place may (tuned)."""
+    free_near: float = 2.0
+    """Times the least energy left: of sets within it the simplest goes first (tuned)."""
+
+
+@dataclass(frozen=True)
+class ClueSettings:
+    """What is said of a residual that no effect explains."""
+
+    knots: int = 9
+    """Of a curve of the residual over a variable."""
+    least_share: float = 0.05
+    """Of the held-out energy, below which a variable is no clue (tuned)."""
+    answer_weight: float = 0.3
+    """Weight of a variable that an equation's own balance makes follow what it lacks (tuned)."""
+    spool_weight: float = 0.6
+    """Weight of the spool in a torque: it acts through the pressures (tuned)."""
+    chamber_lead: float = 0.2
+    """By which one chamber's pressure must beat the difference to be no answer (tuned)."""
+    product_gain: float = 0.05
+    """That a product of two variables must take beyond either of them (tuned)."""
+    slow: float = 0.1
+    """Of the rms speed: below it the direction of motion turns gradually."""
+    memory: float = 0.1
+    """Of the largest travel: how far a motion goes before its direction counts."""
+    # Formula.
+    monomials: int = 3
+    """Of a formula, at most."""
+    few_monomials: int = 2
+    """Of a formula that goes before free curves: three bend to much (tuned)."""
+    sure: float = 0.9
+    """Of the energy, from which a formula goes before free curves (tuned)."""
+    monomial_gain: float = 0.05
+    """Of the held-out energy above noise that one more monomial must take (tuned)."""
+    offered: float = 0.5
+    """Of it that a formula must take to be worth reading (tuned)."""
+    alike: float = 0.999
+    """Correlation from which two columns are one (arithmetic)."""
+    # Frequency.
+    many_lines: int = 8
+    """Excited lines: of fewer, most of anything stands in one place (tuned)."""
+    side_lines: int = 1
+    """On either side of the highest: a frequency between two lines stands in both (arithmetic)."""
+    first_line: int = 5
+    """Fewer turns in a period are drift (tuned)."""
+    peak: float = 0.6
+    """Of the power that stands at one frequency (tuned)."""
+    frequency_share: float = 0.5
+    """Of the held-out energy that a sine of it must take (tuned)."""
+    frequency_steps: int = 41
+    """Of the search, over one line on either side."""
+
+
+@dataclass(frozen=True)
+class ExperimentSettings:
+    """The next experiment: what it may do to the machine, and when it is worth doing."""
+
+    fill: float = 0.9
+    """Of the tightest limit that an experiment uses on the twin."""
+    plays: int = 4
+    """On the twin, to find the amplitude."""
+    first_rms: float = 0.1
+    """[V] of the first of them."""
+    phase_draws: int = 40
+    """Sets of random phases, of which the flattest is taken."""
+    phase_rounds: int = 40
+    """Of the search for phases."""
+    seed: int = 0
+    """Of the phases."""
+    at_end: float = 2e-3
+    """[m] from its end: a locked piston so near stands at it."""
+    closed_travel: float = 5e-3
+    """[m] that a joint behind a closed valve may move."""
+    end_travel: float = 2e-3
+    """[m] that a joint at its end may move."""
+    centring_offset: float = 4e-3
+    """[m] that a record's centre may be off."""
+    position_gain: float = 2.0
+    """[V/m] of the loop that centres before the records."""
+    repeats: int = 4
+    """Of each training record."""
+    held_out_amplitude: float = 0.85
+    """Of the training amplitude: what shows at the limits is soon gone below."""
+    held_out_repeats: int = 3
+    """Of each held-out record."""
+    line_ratio: float = 5.0
+    """Lines over those that the records hold."""
+    shape_step: float = 0.02
+    """Of a shape's value, or of its range where it is zero, to differentiate by (arithmetic)."""
+    more: float = 1.3
+    """Times what the records hold already: less is no progress (tuned)."""
+    enough: float = 3.0
+    """Times the noise: more shows no more (convention)."""
+    steps: int = 3
+    """Of an experiment, at most."""
+    worth: float = 0.3
+    """That a further step must add to the sum over questions (tuned)."""
+    near_energy: float = 2.0
+    """Times the energy that the best set leaves: another is still in question (tuned)."""
+    rivals: int = 3
+    """Sets in question."""
+    likely: float = 2.0
+    """Times its nominal value that a parameter may be."""
 
 
 TRACE: Final = TraceSettings()
+DATA: Final = DataSettings()
+SEARCH: Final = SearchSettings()
+CLUES: Final = ClueSettings()
+EXPERIMENT: Final = ExperimentSettings()

@@ -26,19 +26,14 @@ from analysis.trace.clues.variables import factor_of, factors, variables
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.result import Dependence
 from analysis.trace.search.hypothesis import excess_of
+from analysis.trace.settings import CLUES
 from rig.model import channels as ch
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
-KNOTS = 9
-LEAST = 0.05  # share below which a variable is no clue
 # An equation's own balance makes these follow whatever it lacks: they answer and tell nothing.
 ANSWERS = {"torque": ("pressure", ch.DRIVE), "flow": ("velocity",)}
-ANSWER = 0.3  # weight of a variable that only answers
-THROUGH = 0.6  # weight of the spool in a torque: it acts through the pressures
-BEYOND = 0.2  # share by which one chamber's pressure must beat the difference to be no answer
-MORE = 0.05  # share that a product must take beyond either of its parts
 
 
 def hats(v: Array, knots: Array) -> Array:
@@ -75,7 +70,8 @@ def dependence(
     for (name, factor), by in shares.items():
         share = sums[name, factor]
         parts = [sums.get(part, 0.0) for part in ((name, ""), ("", factor))]
-        if share < LEAST or (name and factor and share < max(parts) + MORE):
+        product = name and factor
+        if share < CLUES.least_share or (product and share < max(parts) + CLUES.product_gain):
             continue
         equation = max(by, key=lambda e: by[e])
         independence = 1.0 if factor else _telling(name, equation, sums)
@@ -90,7 +86,7 @@ def _dependence(
     name: str, factor: str, share: float, equation: str, independence: float
 ) -> Dependence:  # fmt: skip
     if not factor:
-        words = f"{name} by balance" if independence == ANSWER else ""
+        words = f"{name} by balance" if independence == CLUES.answer_weight else ""
         return Dependence(name, share, equation, words=words)
     by = factors(equation)[factor]
     if not name:
@@ -110,12 +106,12 @@ def _telling(name: str, equation: str, shares: Mapping[tuple[str, str], float]) 
         ch.channel(ch.ROD, int(number)),
     ):
         difference = shares.get((f"pressure_difference_{number}", ""), 0.0)
-        if shares[name, ""] > difference + BEYOND:
+        if shares[name, ""] > difference + CLUES.chamber_lead:
             return 1.0
     kind = kind.split("_", 1)[0]
     if any(word in name for word in ANSWERS[kind]):
-        return ANSWER
-    return THROUGH if kind == "torque" and name.startswith(ch.SPOOL) else 1.0
+        return CLUES.answer_weight
+    return CLUES.spool_weight if kind == "torque" and name.startswith(ch.SPOOL) else 1.0
 
 
 def _shares(
@@ -164,7 +160,7 @@ def _moves(part: EquationPart, joint: int) -> bool:
 
 
 def _knots(values: Array) -> Array | None:
-    knots = np.unique(np.quantile(values, np.linspace(0.005, 0.995, KNOTS)))
+    knots = np.unique(np.quantile(values, np.linspace(0.005, 0.995, CLUES.knots)))
     if len(knots) < 3 or np.ptp(knots) <= 1e-9 * max(1e-300, float(np.max(np.abs(knots)))):
         return None
     return np.asarray(knots)

@@ -11,7 +11,6 @@ monomials are forces at the piston, times the linkage's G.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,15 +20,11 @@ from analysis.trace.clues.equation_rows import EquationRows, columns_of, fitted_
 from analysis.trace.clues.variables import factor_of
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.result import Formula
+from analysis.trace.settings import CLUES
 from rig.model import channels as ch
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
-
-MOST: Final = 3  # monomials
-ADDS: Final = 0.05  # of the held-out energy above noise that one more must take
-OFFERED: Final = 0.5  # share that a formula must take to be worth reading
-ALIKE: Final = 0.999  # correlation from which two columns are one
 
 
 def surest(formulas: Sequence[Formula]) -> Formula | None:
@@ -56,7 +51,7 @@ def formula(
     both = EquationRows((), np.concatenate((first.rest, second.rest)), np.zeros((0, 0)))
     chosen = _selected(np.concatenate((fitted, checked)), both)
     share = judged(fitted[:, chosen], first, checked[:, chosen], second) if chosen else 0.0
-    if share < OFFERED:
+    if share < CLUES.offered:
         return None
     values = fitted_to(fitted[:, chosen], first)
     terms = {names[k]: float(v) for k, v in zip(chosen, values, strict=True)}
@@ -98,7 +93,7 @@ def _library(
     kept: list[int] = []
     for k in np.flatnonzero(size > 1e-12):
         unit = both[:, k] / size[k]
-        if all(abs(float(unit @ both[:, j])) < ALIKE * size[j] for j in kept):
+        if all(abs(float(unit @ both[:, j])) < CLUES.alike * size[j] for j in kept):
             kept.append(int(k))
     return [names[k] for k in kept], first[:, kept], second[:, kept]
 
@@ -143,16 +138,16 @@ def _selected(columns: Array, side: EquationRows) -> list[int]:
     """Return the columns chosen, in the order they were; none idle."""
     chosen: list[int] = []
     share = 0.0
-    while len(chosen) < min(MOST, columns.shape[1]):
+    while len(chosen) < min(CLUES.monomials, columns.shape[1]):
         free = [k for k in range(columns.shape[1]) if k not in chosen]
         shares = {k: _share([*chosen, k], columns, side) for k in free}
         best = max(free, key=lambda k: shares[k])
-        if shares[best] < share + ADDS:
+        if shares[best] < share + CLUES.monomial_gain:
             break
         chosen, share = [*chosen, best], shares[best]
     for k in list(chosen):
         rest = [j for j in chosen if j != k]
-        if rest and _share(rest, columns, side) > share - ADDS:
+        if rest and _share(rest, columns, side) > share - CLUES.monomial_gain:
             chosen = rest
     return chosen
 

@@ -17,16 +17,11 @@ from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.spectral_lines import SpectralLines
 from analysis.trace.result import Dependence
 from analysis.trace.search.hypothesis import excess_of
+from analysis.trace.settings import CLUES
 
 Array = NDArray[np.float64]
 
 FREQUENCY = "frequency"
-MANY = 8  # excited lines: of fewer, most of anything stands in one place
-BESIDE = 1  # line on either side of the highest: a frequency between two lines stands in both
-FIRST = 5  # line: fewer turns in a period are drift
-PEAK = 0.6  # share of the power that stands there
-LEAST = 0.5  # share of the held-out energy that it must take
-STEPS = 41  # of the search, over one line on either side
 
 
 def frequency_clue(
@@ -45,13 +40,13 @@ def frequency_clue(
         if near is None:
             continue
         width = equation_lines.frequency[1]
-        tried = np.linspace(near - width, near + width, STEPS)
+        tried = np.linspace(near - width, near + width, CLUES.frequency_steps)
         f = max(tried, key=lambda f: _taken(train, residual, equation_lines.equation, float(f)))
         energy = excess_of(holdout_data, judge_left)[equation_lines.equation]
         share = _taken(holdout_data, judge_left, equation_lines.equation, float(f)) / max(
             energy, 1e-300
         )
-        if energy > 0 and share >= LEAST:
+        if energy > 0 and share >= CLUES.frequency_share:
             words = f"a frequency of {f:.3g} Hz"
             return Dependence(FREQUENCY, min(1.0, share), equation_lines.equation, words=words)
     return None
@@ -61,13 +56,13 @@ def _peak(lines: SpectralLines) -> float | None:
     """Return where [Hz] most of what is left stands, None where it is spread."""
     power = np.maximum(lines.after, 0.0)
     power[0] = 0.0
-    if int(lines.excited.sum()) < MANY or not power.any():
+    if int(lines.excited.sum()) < CLUES.many_lines or not power.any():
         return None
     k = int(np.argmax(power))
-    if k < FIRST:
+    if k < CLUES.first_line:
         return None
-    here = slice(k - BESIDE, k + BESIDE + 1)
-    if power[here].sum() < PEAK * power.sum():
+    here = slice(k - CLUES.side_lines, k + CLUES.side_lines + 1)
+    if power[here].sum() < CLUES.peak * power.sum():
         return None
     return float(np.average(lines.frequency[here], weights=power[here]))
 

@@ -9,13 +9,11 @@ from numpy.typing import NDArray
 
 from analysis.effects.contact import contact_state
 from analysis.signals.conditioning import Signals
+from analysis.trace.settings import CLUES
 from rig.model import channels as ch
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
-
-SLOW = 0.1  # of the rms speed: below it the direction of motion turns gradually
-MEMORY = 0.1  # of the largest travel: how far a motion goes before its direction counts
 
 
 @dataclass(frozen=True)
@@ -45,9 +43,9 @@ def factor_of(name: str, signals: Signals, joint: int, travel: float) -> Array:
     if name == "direction":
         speed = signals.sd[:, joint]
         rms = float(np.sqrt(np.mean(speed**2)))
-        return np.asarray(np.tanh(speed / max(SLOW * rms, 1e-12)))
+        return np.asarray(np.tanh(speed / max(CLUES.slow * rms, 1e-12)))
     place = np.ascontiguousarray(signals.s[:, joint])
-    return np.asarray(contact_state(place, max(MEMORY * travel, 1e-12)))
+    return np.asarray(contact_state(place, max(CLUES.memory * travel, 1e-12)))
 
 
 def variables(rig: Rig, signals: Signals, joint: int) -> dict[str, Array]:

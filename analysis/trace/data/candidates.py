@@ -11,9 +11,8 @@ import numpy as np
 from analysis.effects.base import Effect, Evidence, shapes_of
 from analysis.terms import known
 from analysis.terms.base import Used
+from analysis.trace.settings import DATA
 from rig.model.rig import Rig
-
-MOST_POINTS = 24  # of a candidate's shape grid: two shapes of five points each, or one of many
 
 
 @dataclass(frozen=True)
@@ -59,8 +58,8 @@ def points(effect: Effect, rig: Rig, evidence: Evidence | None = None) -> list[t
         return list(effect.points(rig, evidence)) if evidence is not None else []
     axes = [shape.grid for shape in effect.shapes(rig) if not shape.detail]
     grid = list(itertools.product(*axes))
-    if len(grid) > MOST_POINTS:
-        per = max(2, int(MOST_POINTS ** (1 / len(axes))))
+    if len(grid) > DATA.grid_points:
+        per = max(2, int(DATA.grid_points ** (1 / len(axes))))
         thinned = [
             tuple(
                 axis[i] for i in np.unique(np.linspace(0, len(axis) - 1, per).round().astype(int))

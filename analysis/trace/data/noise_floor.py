@@ -25,13 +25,13 @@ from analysis.regression.rows import Rows
 from analysis.signals.conditioning import condition
 from analysis.terms.base import Used
 from analysis.trace.data.conditioned_record import model_rows, row_residual
+from analysis.trace.settings import DATA
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
 REPEATS, PERIODS, STATED = "repeats", "periods", "stated noise"
 Group = tuple[int, str]
-LEAST = 0.2  # of the noise that the rig file states
 NO_ROWS = 1e-30  # SI: where every row is masked nothing is weighed by it
 
 
@@ -86,7 +86,7 @@ def floors(
             table, source = repeats_of(members[indices[0]], parts, residual)
             if table is not None:
                 noise, repeatable = split(table)
-                noise = max(noise, LEAST * stated[equation])
+                noise = max(noise, DATA.least_noise * stated[equation])
                 out.append(Floor(group, equation, noise, repeatable, total, len(table), source))
                 continue
             noise = stated[equation]

@@ -32,15 +32,12 @@ from analysis.trace.data.conditioned_record import (
     row_residual,
 )
 from analysis.trace.data.noise_floor import Floor, Group, floors
-from analysis.trace.settings import TRACE
+from analysis.trace.settings import DATA, TRACE
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
-
-WORKERS = 2
-VISIBLE = 0.02  # share of a column that must survive the projection off the baseline
 
 
 @dataclass(frozen=True)
@@ -225,7 +222,7 @@ def variant_columns(
     `progress` receives after each which share of them is done.
     """
     seen = [prepared(data.rig, data.terms, conditioned) for conditioned in data.records]
-    with ThreadPoolExecutor(WORKERS) as pool:
+    with ThreadPoolExecutor(DATA.workers) as pool:
         columns = []
         for entry in pool.map(lambda v: _entry(data, v, seen), chosen):
             columns.append(entry)

@@ -25,6 +25,7 @@ from analysis.regression.rows import Rows, lines_cutoff
 from analysis.trace.data.conditioned_record import filtered
 from analysis.trace.data.noise_floor import Group
 from analysis.trace.data.regression_data import RegressionData, Segment
+from analysis.trace.settings import DATA
 
 Array = NDArray[np.float64]
 
@@ -34,14 +35,6 @@ WORDS = {
     CONSTANT: "constant", EXCITED: "on excited lines", ODD: "on empty odd ones",
     EVEN: "on even ones",
 }  # fmt: skip
-ABOVE = 1.2  # band over the row filter's cutoff, where that filter ends
-PRESENT = 0.7  # share of a period's pairs of rows that must be there
-LINES_PER_PAIR = 0.8  # each pair gives two numbers and each line has two: fewer than there are
-RIDGE = 1e-2  # of a line's own weight, against what short gaps leave undetermined
-STANDS = 4.0  # times what noise alone puts into a kind of lines, in its standard deviations
-ASYMMETRIC, SYMMETRIC = 0.25, 0.1  # shares from which a nonlinearity is spoken of
-LEAST_TOLD = 0.005  # share below which a kind of lines is not spoken of
-OWN = 3.0  # times the velocity's own share
 
 
 @dataclass(frozen=True)
@@ -77,7 +70,7 @@ class SpectralLines:
         where = ", ".join(
             f"{100 * share:.0f} % {WORDS[kind]}"
             for kind, share in self.shares.items()
-            if share >= LEAST_TOLD
+            if share >= DATA.noted_share
         )
         return f"{self.equation} in {self.group[1]}: {where or 'no line'}: {self.meaning}"
 
@@ -97,15 +90,15 @@ def meaning(shares: Mapping[str, float], own: Mapping[str, float]) -> str:
     if not any(shares.values()):
         return "nothing above the noise"
     moving = 1.0 - shares[CONSTANT]
-    if moving < ASYMMETRIC:
+    if moving < DATA.asymmetric:
         return "a constant"
     meanings = []
     for kind, least, word in (
-        (EVEN, ASYMMETRIC, "asymmetric"),
-        (ODD, SYMMETRIC, "a symmetric nonlinearity"),
+        (EVEN, DATA.asymmetric, "asymmetric"),
+        (ODD, DATA.symmetric, "a symmetric nonlinearity"),
     ):
         share = shares[kind] / moving
-        if share > least and share > OWN * own[kind]:
+        if share > least and share > DATA.velocity_ratio * own[kind]:
             meanings.append((share, word))
     if not meanings:
         return "linear in the motion"
@@ -148,7 +141,8 @@ def _of_segment(
     place = np.rint((rows.time - rows.time[0]) * record.sample_rate / conditioned.filtering.step)
     pairs = _pairs(place.astype(np.int64), per)
     base = record.sample_rate / record.period
-    K = int(min([ABOVE * lines_cutoff(record) / base, *(LINES_PER_PAIR * len(p) for p in pairs)]))
+    beyond = DATA.line_band * lines_cutoff(record) / base
+    K = int(min([beyond, *(DATA.lines_per_pair * len(p) for p in pairs)]))
     if not pairs or highest > K:
         return None
     joint = int(s.equation.rsplit("_", 1)[1]) - 1
@@ -180,7 +174,7 @@ def _pairs(place: NDArray[np.int64], per: int) -> list[NDArray[np.int64]]:
     at[place] = np.arange(len(place))
     whole = at[: len(at) // per * per].reshape(-1, 2, per // 2).transpose(0, 2, 1)
     complete = [p[(p >= 0).all(axis=1)] for p in whole]
-    return [p for p in complete if len(p) >= PRESENT * per / 2]
+    return [p for p in complete if len(p) >= DATA.period_present * per / 2]
 
 
 def spectrum(phase: Array, series: Array, K: int) -> NDArray[np.complex128]:
@@ -196,7 +190,7 @@ def spectrum(phase: Array, series: Array, K: int) -> NDArray[np.complex128]:
         angle = 2 * np.pi * np.outer(phase, number)
         X = np.sqrt(np.where(number, 2.0, 1.0)) * np.stack((np.cos(angle), np.sin(angle)))
         X = np.concatenate(tuple(X), axis=1)
-        weight = X.T @ X / len(phase) + RIDGE * np.eye(X.shape[1])
+        weight = X.T @ X / len(phase) + DATA.line_ridge * np.eye(X.shape[1])
         amplitudes = np.linalg.solve(weight, X.T @ part.T / len(phase)).T
         out[:, start::2] = amplitudes[:, : len(number)] - 1j * amplitudes[:, len(number) :]
     return out
@@ -216,7 +210,7 @@ def _shares(power: Array, noise: Array, excited: NDArray[np.bool_]) -> dict[str,
     for kind, own in members(excited).items():
         total = float(power[own].sum())
         scatter = float(np.sqrt(np.sum(noise[own] ** 2)))
-        sums[kind] = total if total > STANDS * scatter else 0.0
+        sums[kind] = total if total > DATA.line_deviations * scatter else 0.0
     whole = sum(sums.values())
     return {kind: v / whole if whole > 0 else 0.0 for kind, v in sums.items()}
 

@@ -19,11 +19,10 @@ from analysis.identify.settings import IDENTIFY
 from analysis.simulation.model import Estimate, Model
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
+from analysis.trace.settings import DATA
 from rig.model import channels as ch
 from rig.model.records import Run
 from rig.model.rig import Rig
-
-LEAST = 0.05  # [K] between all records: less moves b by a fraction of 0.001
 
 
 def base_terms(rig: Rig, runs: Sequence[Run]) -> tuple[Used, ...]:
@@ -43,7 +42,8 @@ def temperature_terms(
     if "compressibility" not in {used.term.name for used in terms}:
         return ()
     train, holdout_data = (_temperatures(x) for x in (runs, holdout))
-    if not train or not np.ptp([*train, *holdout_data]) >= LEAST:  # nor where one was not measured
+    # Nor where one was not measured: its span is not a number.
+    if not train or not np.ptp([*train, *holdout_data]) >= DATA.temperature_span:
         return ()
     return (Used(BulkTemperature(reference=float(np.mean(train)))),)
 

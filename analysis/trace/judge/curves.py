@@ -10,10 +10,9 @@ from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.result import Curve
 from analysis.trace.search.refinement import ExactFit, tangent
+from analysis.trace.settings import TRACE
 
 Array = NDArray[np.float64]
-
-WIDE = 1.96  # standard errors on either side: 95 %
 
 
 def curves_of(data: RegressionData, model: ExactFit, used: Used) -> tuple[Curve, ...]:
@@ -31,7 +30,7 @@ def curves_of(data: RegressionData, model: ExactFit, used: Used) -> tuple[Curve,
         W = np.column_stack([line.weights[n] for n in here])
         y = W @ np.array([known[n] for n in here])
         spread = W @ covariance[np.ix_(at, at)] * W
-        half = WIDE * np.sqrt(np.maximum(spread.sum(axis=1), 0.0))
+        half = TRACE.normal * np.sqrt(np.maximum(spread.sum(axis=1), 0.0))
         ends = (y - half, y + half)
         if line.reciprocal:
             y, ends = 1.0 / y, (1.0 / ends[1], 1.0 / ends[0])

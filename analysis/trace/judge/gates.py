@@ -22,7 +22,7 @@ from analysis.trace.judge.curves import curves_of
 from analysis.trace.judge.held_out import residual as held_left
 from analysis.trace.judge.invariance import invariance
 from analysis.trace.judge.readings import loss, related
-from analysis.trace.judge.scatter import NORMAL, form_shift
+from analysis.trace.judge.scatter import form_shift
 from analysis.trace.result import Gate, JudgedEffect, Rival
 from analysis.trace.search.hypothesis import Hypothesis, excess_of, parameter_values
 from analysis.trace.search.hypothesis_set import HypothesisSet
@@ -322,7 +322,7 @@ def _parameters(
     units = {c.parameter: c.unit for c in used.term.coefficients(train_data.rig)}
     units |= {s.parameter: s.unit for s in shapes_of(train_data.rig, used)}
     more = np.array([shift.get(name, 0.0) for name in errors.names])
-    half = np.hypot(half_width(errors.std, errors.dof), NORMAL * more)
+    half = np.hypot(half_width(errors.std, errors.dof), TRACE.normal * more)
     std = np.hypot(errors.std, more)
     return {
         name: Estimate(float(v), units.get(name, ""), float(s), (float(v - h), float(v + h)))

@@ -19,14 +19,12 @@ from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.temperature_nuisance import plausible
 from analysis.trace.result import FreeCurves
 from analysis.trace.search.refinement import DesignMatrix, ExactFit, table
+from analysis.trace.settings import TRACE
 from rig.model.parse import InputError
 from rig.model.records import Run
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
-
-CURVE_SECONDS = 4.0  # of a free run kept to be drawn
-CURVE_POINTS = 400  # of them, about
 
 
 @dataclass(frozen=True)
@@ -142,8 +140,8 @@ def free_curves(before: FreeRunErrors, after: FreeRunErrors) -> FreeCurves | Non
     first, other = before.first, after.first
     if first is None or other is None or first.record != other.record:
         return None
-    count = min(round(CURVE_SECONDS / float(first.time[1] - first.time[0])), len(first.time))
-    kept = slice(0, count, max(count // CURVE_POINTS, 1))
+    count = min(round(TRACE.curve_seconds / float(first.time[1] - first.time[0])), len(first.time))
+    kept = slice(0, count, max(count // TRACE.curve_points, 1))
     before_it, after_it = first.simulation.channels(), other.simulation.channels()
     return FreeCurves(
         first.record,

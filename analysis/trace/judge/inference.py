@@ -20,12 +20,11 @@ from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.readings import related
 from analysis.trace.judge.scatter import scatter
-from analysis.trace.search import linear_fit
 from analysis.trace.search.hypothesis import Hypothesis, excess_of
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.linear_fit import CandidateColumns, orthonormal
 from analysis.trace.search.refinement import ExactFit, jacobian, table, tangent
-from analysis.trace.settings import TRACE
+from analysis.trace.settings import SEARCH, TRACE
 
 Array = NDArray[np.float64]
 Key = tuple[str, str]
@@ -83,7 +82,7 @@ def null_maximum(
     r = r - candidates.basis @ (candidates.basis.T @ r)
     c = candidates.columns.T @ r
     diagonal = np.diag(candidates.K)
-    shows = (diagonal > linear_fit.VISIBLE**2 * candidates.raw) & (candidates.raw > 0)
+    shows = (diagonal > SEARCH.visible**2 * candidates.raw) & (candidates.raw > 0)
     best = (
         np.max(c[shows] ** 2 / diagonal[shows, None], axis=0)
         if shows.any()

@@ -15,9 +15,9 @@ from analysis.terms.base import Used
 from analysis.trace.data.noise_floor import STATED
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.inference import EffectErrors, blocks, others
-from analysis.trace.search.linear_fit import FORM, orthonormal
+from analysis.trace.search.linear_fit import orthonormal
 from analysis.trace.search.refinement import ExactFit, contribution, jacobian, table
-from analysis.trace.settings import TRACE
+from analysis.trace.settings import SEARCH, TRACE
 
 Array = NDArray[np.float64]
 
@@ -73,7 +73,7 @@ def _clustered(own: Array, residual: Array, clusters: NDArray[np.int64]) -> floa
 def _larger(model: ExactFit, train_data: RegressionData, used: Used, mask: Array) -> float:
     """Return the energy that the largest other effect has on a subset, 0 if none is larger.
 
-    What its catalogue form misses of it (`FORM`) spills onto a smaller effect's coefficient.
+    What its catalogue form misses of it (`SEARCH.form`) spills onto a smaller effect's coefficient.
     """
     rows = table(train_data, model.terms)
     energy = {}
@@ -146,7 +146,7 @@ def invariance(
             if clusters is not None:
                 rest_of = residual[mask] - B @ (B.T @ residual[mask]) - own * shift
                 error = max(error, _clustered(own, rest_of, clusters[mask]) / size)
-            spill = np.sqrt(FORM * _larger(model, train_data, used, mask) / size)
+            spill = np.sqrt(SEARCH.form * _larger(model, train_data, used, mask) / size)
             # Two levels of one effect are judged by the larger: 2 N beside 100 N is a detail.
             alike = [j for j, n in enumerate(names) if n in sizes and units[n] == units[name]]
             full = float(np.max(np.abs(value.value[alike] - neutral[alike])))

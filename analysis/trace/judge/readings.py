@@ -17,10 +17,9 @@ from analysis.effects.base import Effect
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.held_out import residual as held_left
-from analysis.trace.search import linear_fit
 from analysis.trace.search.hypothesis import Hypothesis, Key
-from analysis.trace.search.hypothesis_set import DEEPEST, HypothesisSet
-from analysis.trace.settings import TRACE
+from analysis.trace.search.hypothesis_set import HypothesisSet
+from analysis.trace.settings import SEARCH, TRACE
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
@@ -44,7 +43,7 @@ def settled(
         if not kept:
             break
         least = min(o.fit.energy for o in kept)
-        near = [o for o in kept if o.fit.energy <= least + linear_fit.CHANCE]
+        near = [o for o in kept if o.fit.energy <= least + SEARCH.number_price]
         best = min(near, key=lambda o: (o.size, o.fit.energy))
         log.info("richer reading: %s for %s", sorted(best.keys), sorted(winner.keys))
         winner = best
@@ -77,8 +76,8 @@ def _lost(
     if gain <= TRACE.deviations**2:
         return False
     if len(other.effects) > len(hypothesis.effects):
-        price = linear_fit.CHANCE * (other.size[1] - hypothesis.size[1])
-        if gain <= max(price, linear_fit.ADD_SHARE * hypothesis.total):
+        price = SEARCH.number_price * (other.size[1] - hypothesis.size[1])
+        if gain <= max(price, SEARCH.add_share * hypothesis.total):
             return False
     return loss(held, held_left(holdout_data, other.fit)) > TRACE.deviations
 
@@ -98,7 +97,7 @@ def _richer(hypotheses: HypothesisSet, hypothesis: Hypothesis) -> list[Hypothesi
                 continue
             kept = [u for u in hypothesis.effects if u is not used]
             own = len(effect.coefficients(rig))
-            if own == count and len(hypothesis.effects) < DEEPEST:
+            if own == count and len(hypothesis.effects) < SEARCH.deepest:
                 kept.append(used)
             elif own <= count:
                 continue

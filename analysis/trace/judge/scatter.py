@@ -21,7 +21,6 @@ from analysis.identify.settings import IDENTIFY
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.simulation.model import Model
 from analysis.trace.data.regression_data import RegressionData, Segment
-from analysis.trace.search.linear_fit import VISIBLE
 from analysis.trace.search.refinement import (
     ExactFit,
     alternatives,
@@ -29,13 +28,11 @@ from analysis.trace.search.refinement import (
     table,
     tangent,
 )
-from analysis.trace.settings import TRACE
+from analysis.trace.settings import SEARCH, TRACE
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-DEPENDENT = 1e-10  # of the largest eigenvalue: columns with a smaller one depend on each other
-NORMAL = 1.96  # half-width of 95 % over the deviation, of what no repeat shows
 PERIOD, STATE, SPEED = "period", "state", "speed"
 
 
@@ -46,7 +43,7 @@ def scatter(train_data: RegressionData, columns: Array, residual: Array) -> Cova
     on each other what the rows determine counts, and every coefficient has its least dof.
     """
     size, V = np.linalg.eigh(columns.T @ columns)
-    determined = V[:, size > DEPENDENT * max(float(size[-1]), 1e-300)]
+    determined = V[:, size > TRACE.dependent * max(float(size[-1]), 1e-300)]
     if determined.shape[1] < len(V):
         k = len(V)
         if not determined.shape[1]:
@@ -142,7 +139,7 @@ def _by_growth(train_data: RegressionData, fit: ExactFit) -> dict[str, float]:
         moved = np.linalg.lstsq(X / scale, column, rcond=1e-6)[0]
         own = column - X @ (moved / scale)
         energy = float(own @ own)
-        if energy <= VISIBLE**2 * float(column @ column):
+        if energy <= SEARCH.visible**2 * float(column @ column):
             continue
         e = float(own @ fit.residual) / energy
         if abs(e) * np.sqrt(energy) > TRACE.deviations:
@@ -171,7 +168,7 @@ def widened(train_data: RegressionData, fit: ExactFit, model: Model) -> Model:
         # The rows may hold the reciprocal: relative sizes are the same.
         relative = np.hypot(np.sqrt(more[k]) / size[k], shift.get(name, 0.0)) / abs(fit.beta[name])
         grown = abs(old.value) * float(relative)
-        half = float(np.hypot(0.5 * (old.ci95[1] - old.ci95[0]), NORMAL * grown))
+        half = float(np.hypot(0.5 * (old.ci95[1] - old.ci95[0]), TRACE.normal * grown))
         std = float(np.hypot(old.std, grown))
         parameters[name] = replace(old, std=std, ci95=(old.value - half, old.value + half))
         covariance[names.index(name), names.index(name)] += grown**2

@@ -38,12 +38,11 @@ from analysis.trace.data.conditioned_record import (
 )
 from analysis.trace.data.noise_floor import stated_noise
 from analysis.trace.data.regression_data import RegressionData, variant_columns
-from analysis.trace.next_experiment.excitations import REPEATS, CandidateExcitation
+from analysis.trace.next_experiment.excitations import CandidateExcitation
+from analysis.trace.settings import EXPERIMENT
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
-
-SHAPE_STEP = 0.02  # of a shape's value, or of its range where it is zero
 
 
 @dataclass(frozen=True)
@@ -115,7 +114,7 @@ class MeasurementView:
 
     def weight(self, equation: str) -> float:
         """Return the factor that whitens an equation's averaged rows."""
-        return float(np.sqrt(REPEATS) / max(self.noise[equation], 1e-30))
+        return float(np.sqrt(EXPERIMENT.repeats) / max(self.noise[equation], 1e-30))
 
 
 def calibration(train_data: RegressionData) -> dict[str, float]:
@@ -225,7 +224,7 @@ class Ground:
                 value = used.shape[j]
                 if shape.fixed or not shape.given(value):
                     continue
-                step = SHAPE_STEP * (abs(value) or shape.high - shape.low)
+                step = EXPERIMENT.shape_step * (abs(value) or shape.high - shape.low)
                 near = value + step if value + step <= shape.high else value - step
                 moved = Used(used.term, (*used.shape[:j], near, *used.shape[j + 1 :]))
                 ends = [self.adds(Explanation((u,), what.beta)) for u in (moved, used)]
@@ -255,7 +254,9 @@ def separation(question: OpenQuestion, old: Ground, new: Ground) -> tuple[float,
         before = old.energy(old.residual(true, wrong))
         after = new.energy(new.residual(true, wrong))
         by_equation = {
-            e: float(np.sqrt(max(0.0, after[e] - before.get(e, 0.0)) / (REPEATS * len(r.rhs))))
+            e: float(
+                np.sqrt(max(0.0, after[e] - before.get(e, 0.0)) / (EXPERIMENT.repeats * len(r.rhs)))
+            )
             for e, r in new.seen.rows.items()
         }
         loudest = max(by_equation, key=lambda e: by_equation[e], default="")

@@ -22,6 +22,7 @@ from analysis.design.limits import Spectrum, forecast_of, used
 from analysis.design.moves import Tone, with_tones
 from analysis.design.twin_records import Played, TwinStep, play
 from analysis.regression.conditioned import ConditionedRecord
+from analysis.trace.settings import EXPERIMENT
 from rig.model import channels as ch
 from rig.model.parse import InputError
 from rig.model.rig import Rig
@@ -29,28 +30,13 @@ from rig.model.rig import Rig
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
-FILL = 0.9  # share of the tightest limit that an experiment uses on the twin
-PLAYS = 4  # on the twin, to find the amplitude
-FLATTEN = 40  # rounds of the search for phases
-FIRST = 0.1  # [V] rms of the first play
-AT_END = 2e-3  # [m] a locked piston so near to its end stands at it
-CLOSED_GIVES = 5e-3  # [m] of a joint behind a closed valve
-END_GIVES = 2e-3  # [m]
-OFFSET = 4e-3  # [m] that a record's centre may be off
-LOOP = 2.0  # [V/m] of the loop that centres before the records
-# Amplitude of the held-out variant. What an experiment brings out at its limits is soon gone below.
-HELD_OUT = 0.85
-REPEATS = 4
-HELD_OUT_REPEATS = 3
-DRAWS = 40  # of its phases
-
 
 @dataclass(frozen=True)
 class Family:
     """Lines from `low` to `high` [Hz] at multiples of `base`, amplitudes f^-tilt.
 
-    `level` is the share of FILL that is used, `centre` the place in the stroke as a share of half
-    of it, `words` what it is for a person.
+    `level` is the share of the `fill` of the settings that is used, `centre` the place in the
+    stroke as a share of half of it, `words` what it is for a person.
     """
 
     name: str
@@ -133,7 +119,7 @@ def settings(rig: Rig, records: Sequence[ConditionedRecord]) -> list[Setting]:
         for joint in conditioned.record.locked:
             piston = float(np.nanmean(conditioned.record.channels[ch.channel(ch.PISTON, joint)]))
             half = 0.5 * rig.joints[joint - 1].cylinder.stroke
-            if half - abs(piston) < AT_END:
+            if half - abs(piston) < EXPERIMENT.at_end:
                 held[joint - 1] = float(np.copysign(half, piston))
             else:
                 closed[joint - 1] = round(piston, 3) + 0.0  # no -0
@@ -165,10 +151,10 @@ def excitation(
     """Return a family in a setting, scaled to its share of the limits; None where impossible."""
     tones = {j: _tone(j, family, k, rng) for k, j in enumerate(setting.moving(rig))}
     step = _step(rig, setting, family, tones)
-    goal = FILL * family.level
+    goal = EXPERIMENT.fill * family.level
     best: CandidateExcitation | None = None
     try:
-        for attempt in range(PLAYS):
+        for attempt in range(EXPERIMENT.plays):
             played = play(rig, with_tones(step, tones))
             share = used(rig, played)[0]
             step = played.step
@@ -187,14 +173,14 @@ def excitation(
 
 def _flattened(rig: Rig, played: Played, tone: Tone) -> Tone:
     known = forecast_of(rig, played, tone.joint, tone.lines)
-    return replace(tone, spectrum=known.flattened(tone.spectrum, FLATTEN)[0])
+    return replace(tone, spectrum=known.flattened(tone.spectrum, EXPERIMENT.phase_rounds)[0])
 
 
 def _tone(joint: int, family: Family, turn: int, rng: np.random.Generator) -> Tone:
     lines = np.arange(round(family.low / family.base), round(family.high / family.base) + 1)
     lines = lines[lines % 2 == 1]
     size = lines.astype(np.float64) ** -family.tilt
-    size *= FIRST * np.sqrt(2) * family.level / np.linalg.norm(size)
+    size *= EXPERIMENT.first_rms * np.sqrt(2) * family.level / np.linalg.norm(size)
     return Tone(joint, lines, size * np.exp(2j * np.pi * rng.random(len(lines))), ())
 
 
@@ -212,10 +198,10 @@ def _step(
         centres=places,
         biases={},
         samples=period,
-        repeats=REPEATS,
-        gives=dict.fromkeys(setting.closed, CLOSED_GIVES),
-        offsets=dict.fromkeys(tones, OFFSET),
-        loops=dict.fromkeys(tones, LOOP),
+        repeats=EXPERIMENT.repeats,
+        gives=dict.fromkeys(setting.closed, EXPERIMENT.closed_travel),
+        offsets=dict.fromkeys(tones, EXPERIMENT.centring_offset),
+        loops=dict.fromkeys(tones, EXPERIMENT.position_gain),
     )
 
 
@@ -243,14 +229,14 @@ def _as_step(
 ) -> dict[str, Any]:
     locks = [
         {"joint": j + 1, "at": "closed", "piston": f"{1e3 * p:.6g} mm",
-         "tolerance": f"{1e3 * CLOSED_GIVES:g} mm"}
+         "tolerance": f"{1e3 * EXPERIMENT.closed_travel:g} mm"}
         for j, p in candidate.setting.closed.items()
     ] + [
         {"joint": j + 1, "at": "end_max" if p > 0 else "end_min",
-         "tolerance": f"{1e3 * END_GIVES:g} mm"}
+         "tolerance": f"{1e3 * EXPERIMENT.end_travel:g} mm"}
         for j, p in candidate.setting.held.items()
     ]  # fmt: skip
-    offset = f"{1e3 * OFFSET:g} mm"
+    offset = f"{1e3 * EXPERIMENT.centring_offset:g} mm"
     excite = []
     for j, tone in candidate.tones.items():
         n = candidate.step.period
@@ -268,7 +254,7 @@ def _as_step(
                 "centre": f"{1e3 * candidate.step.centres[j]:.6g} mm",
                 "centring": {
                     "mode": "open-loop",
-                    "position_gain": f"{LOOP:g} V/m",
+                    "position_gain": f"{EXPERIMENT.position_gain:g} V/m",
                     "drift": offset,
                     "offset": offset,
                     "tries": 6,
@@ -279,14 +265,14 @@ def _as_step(
         "name": f"next{number}_{candidate.family.name}",
         "lock": locks,
         "excite": excite,
-        "repeats": REPEATS if rng is None else HELD_OUT_REPEATS,
+        "repeats": EXPERIMENT.repeats if rng is None else EXPERIMENT.held_out_repeats,
     }
 
 
 def _other_phases(tone: Tone, n: int, rng: np.random.Generator) -> Spectrum:
     """Return the tone's amplitudes with other phases: of some draws the flattest, n samples."""
     size, best, least = np.abs(tone.spectrum), tone.spectrum, np.inf
-    for _ in range(DRAWS):
+    for _ in range(EXPERIMENT.phase_draws):
         spectrum = size * np.exp(2j * np.pi * rng.random(len(size)))
         full = np.zeros((2, n // 2 + 1), dtype=np.complex128)
         full[0, tone.lines], full[1, tone.lines] = spectrum, spectrum / (1j * tone.lines)

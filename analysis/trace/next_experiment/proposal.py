@@ -37,21 +37,13 @@ from analysis.trace.next_experiment.range_extension import LINES, farther, riche
 from analysis.trace.result import CLEAN, CONFOUNDED, UNEXPLAINED, Dependence, JudgedEffect
 from analysis.trace.search.hypothesis import Hypothesis, parameter_values
 from analysis.trace.search.hypothesis_set import HypothesisSet
-from analysis.trace.search.linear_fit import BAND
+from analysis.trace.settings import EXPERIMENT, SEARCH
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
 TELL, COVER, SHOW = "tell apart", "cover", "make visible"
-PROMISE: Final = BAND  # of the noise: less is nothing to explain
-MORE = 1.3  # times what the records hold already
-ENOUGH = 3.0  # times the noise; more tells no more
-STEPS = 3  # of an experiment
-WORTH = 0.3  # that a further step must add to the sum over questions
-NEAR = 2.0  # times the energy that the best set leaves: another is still in question
-RIVALS = 3
-LIKELY = 2.0  # times its nominal value that a parameter may be
-SEED = 0  # of the excitations' phases
+PROMISE: Final = SEARCH.band  # of the noise: less is nothing to explain
 
 
 @dataclass(frozen=True)
@@ -66,7 +58,7 @@ class ExperimentProposal:
     @property
     def open(self) -> bool:
         """Whether the experiment promises an answer that the records do not hold."""
-        return self.promised >= max(PROMISE, MORE * self.present)
+        return self.promised >= max(PROMISE, EXPERIMENT.more * self.present)
 
 
 def propose(
@@ -83,7 +75,7 @@ def propose(
     questions = _questions(hypotheses, winner, effects, verdict, old)
     if not questions and not (verdict == UNEXPLAINED and moves):
         return None
-    rng = np.random.default_rng(SEED)
+    rng = np.random.default_rng(EXPERIMENT.seed)
     tried = list(ex.excitations(learned(train_data), train_data.records, rng, families))
     if not tried:
         return _in_words(winner, questions) if verdict == CONFOUNDED else None
@@ -107,7 +99,7 @@ def learned(train_data: RegressionData) -> Rig:
         name: value
         for name, value in parameters.items()
         # A parameter that the records hardly move may come out as anything.
-        if name in before and 1 / LIKELY < value / before[name] < LIKELY
+        if name in before and 1 / EXPERIMENT.likely < value / before[name] < EXPERIMENT.likely
     }
     return train_data.rig.model_copy(update={"nominal": {**before, **likely}})
 
@@ -169,9 +161,10 @@ def _unsettled(hypotheses: HypothesisSet) -> list[OpenQuestion]:
     if not allowed or allowed[0].total >= hypotheses.empty.total:
         return []
     best = allowed[0]
-    limit = max(NEAR * best.total, best.total + 0.1 * hypotheses.limits.total)
+    limit = max(EXPERIMENT.near_energy * best.total, best.total + 0.1 * hypotheses.limits.total)
     # A set that only adds to the best is not another explanation.
-    near = [o for o in allowed[1:] if o.total <= limit and not best.keys <= o.keys][:RIVALS]
+    near = [o for o in allowed[1:] if o.total <= limit and not best.keys <= o.keys]
+    near = near[: EXPERIMENT.rivals]
     return [OpenQuestion(explanation(best), explanation(o)) for o in near]
 
 
@@ -201,10 +194,10 @@ def _choose(
             ]
         )
     chosen: list[int] = []
-    while len(chosen) < min(STEPS, len(tried)):
+    while len(chosen) < min(EXPERIMENT.steps, len(tried)):
         worth = [_worth(_best(table, [*chosen, k])) for k in range(len(tried))]
         k = int(np.argmax(worth))
-        if worth[k] - (_worth(_best(table, chosen)) if chosen else 0.0) < WORTH:
+        if worth[k] - (_worth(_best(table, chosen)) if chosen else 0.0) < EXPERIMENT.worth:
             break
         chosen.append(k)
     if not chosen:
@@ -221,7 +214,7 @@ def _best(
 
 
 def _worth(answers: Sequence[ExperimentProposal]) -> float:
-    return sum(min(a.promised, ENOUGH) for a in answers if a.open)
+    return sum(min(a.promised, EXPERIMENT.enough) for a in answers if a.open)
 
 
 def _explored(
@@ -232,7 +225,9 @@ def _explored(
     views: Sequence[MeasurementView],
 ) -> Mapping[str, Any] | None:
     """Return the experiment that shows what is unexplained where no record has been yet."""
-    candidates = farther(train_data, moves, views, MORE) or richer(train_data, moves, tried)
+    candidates = farther(train_data, moves, views, EXPERIMENT.more) or richer(
+        train_data, moves, tried
+    )
     if candidates is None:
         return None
     now = loudest(train_data, winner.fit.residual)
@@ -288,10 +283,12 @@ def _names(answers: Sequence[ExperimentProposal]) -> list[dict[str, str]]:
 def _protocols(
     train_data: RegressionData, chosen: Sequence[ex.CandidateExcitation]
 ) -> dict[str, Any]:
-    rng = np.random.default_rng([SEED, 1])
+    rng = np.random.default_rng([EXPERIMENT.seed, 1])
     return {
         "protocol": ex.protocol(train_data.rig, chosen, "next"),
-        "holdout": ex.protocol(train_data.rig, chosen, "next-holdout", ex.HELD_OUT, rng),
+        "holdout": ex.protocol(
+            train_data.rig, chosen, "next-holdout", EXPERIMENT.held_out_amplitude, rng
+        ),
     }
 
 

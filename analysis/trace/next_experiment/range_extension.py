@@ -13,10 +13,10 @@ from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.next_experiment.discrimination import MeasurementView
 from analysis.trace.next_experiment.excitations import CandidateExcitation
 from analysis.trace.result import Dependence
+from analysis.trace.settings import EXPERIMENT
 
 LINES: Final = "lines"
 TIME: Final = "time"  # goes on by itself
-RICHER = 5.0  # times as many lines as the records hold
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def richer(
         return None
     k = int(np.argmax(counts))
     times = counts[k] / max(held)
-    if times < RICHER:
+    if times < EXPERIMENT.line_ratio:
         return None
     words = f"moves joint {joint + 1} by {counts[k]} lines where the records hold {max(held)}"
     return Beyond(k, LINES, times, equation, words)

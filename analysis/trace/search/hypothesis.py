@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
-from analysis.trace.search import linear_fit
 from analysis.trace.search.refinement import ExactFit
+from analysis.trace.settings import SEARCH
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
@@ -71,12 +71,12 @@ def excess_of(data: RegressionData, residual: Array, noise: float = 1.0) -> dict
 
 
 def limits(data: RegressionData) -> NoiseBand:
-    """Return the band of every equation (`linear_fit.BAND` times the noise, and chance)."""
+    """Return the band of every equation (`SEARCH.band` times the noise, and chance)."""
     band: dict[str, float] = {}
     rows: dict[str, int] = {}
     for s in data.segments:
         count = s.where.stop - s.where.start
-        band[s.equation] = band.get(s.equation, 0.0) + linear_fit.BAND**2 * s.repeats * count
+        band[s.equation] = band.get(s.equation, 0.0) + SEARCH.band**2 * s.repeats * count
         rows[s.equation] = rows.get(s.equation, 0) + count
     return NoiseBand({e: max(v, 4 * np.sqrt(2 * rows[e])) for e, v in band.items()})
 

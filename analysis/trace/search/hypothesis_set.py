@@ -35,15 +35,10 @@ from analysis.trace.search.hypothesis import (
     within,
 )
 from analysis.trace.search.refinement import ExactFit, fit, jacobian, rebased, refine
+from analysis.trace.settings import SEARCH
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
-
-SINGLES = 14  # refined exactly, best first
-PAIRS = 6
-NEAR = 0.25  # of the best gain: a single candidate with less is no rival
-NEXT = 6  # extensions of a set that are refined exactly
-DEEPEST = 3  # effects in a set found by extension
 
 
 class HypothesisSet:
@@ -123,11 +118,11 @@ class HypothesisSet:
 
     def better(self, hypothesis: Hypothesis, other: Hypothesis) -> bool:
         """Return whether `one` is to be preferred: much less left, or as little and simpler."""
-        slack = linear_fit.CHANCE * max(1, abs(hypothesis.size[1] - other.size[1]))
+        slack = SEARCH.number_price * max(1, abs(hypothesis.size[1] - other.size[1]))
         if hypothesis.size < other.size:
-            return hypothesis.total <= max(linear_fit.AS_GOOD * other.total, other.total + slack)
+            return hypothesis.total <= max(SEARCH.as_good * other.total, other.total + slack)
         if hypothesis.size > other.size:
-            return hypothesis.total < min(other.total / linear_fit.AS_GOOD, other.total - slack)
+            return hypothesis.total < min(other.total / SEARCH.as_good, other.total - slack)
         return hypothesis.total < other.total
 
     def best(self, among: Sequence[Hypothesis]) -> Hypothesis:
@@ -158,7 +153,7 @@ class HypothesisSet:
             return self.completed(now)
         pairs = self.tried(self._pairs(field, r, singles))
         now = self.prune(self.best([self.empty, *singles, *pairs]))
-        while not within(now.excess_energy, self.limits) and len(now.effects) < DEEPEST:
+        while not within(now.excess_energy, self.limits) and len(now.effects) < SEARCH.deepest:
             grown = self.prune(self.best([now, *self.extensions(now)]))
             if grown.keys == now.keys or grown.total > 0.9 * now.total:
                 break
@@ -173,12 +168,12 @@ class HypothesisSet:
 
     def negligible(self, equation: str, residual: float) -> bool:
         """Return whether so much energy above noise may be left in an equation."""
-        allowed = (linear_fit.LEFT / linear_fit.BAND) ** 2 * self.limits.band[equation]
-        return residual <= max(allowed, linear_fit.FORM * self.empty.excess_energy[equation])
+        allowed = (SEARCH.left / SEARCH.band) ** 2 * self.limits.band[equation]
+        return residual <= max(allowed, SEARCH.form * self.empty.excess_energy[equation])
 
     def completed(self, now: Hypothesis) -> Hypothesis:
         """Add one more effect only if that leaves nothing but noise: else it fits a form."""
-        if within(now.excess_energy, self.limits) or len(now.effects) >= DEEPEST:
+        if within(now.excess_energy, self.limits) or len(now.effects) >= SEARCH.deepest:
             return now
         more = [o for o in self.extensions(now) if within(o.excess_energy, self.limits)]
         best = self.best(more) if more else now
@@ -193,7 +188,7 @@ class HypothesisSet:
         def allowed(entry: VariantColumns, coefficients: Array) -> bool:
             own = dict(zip(entry.names, map(float, coefficients), strict=True))
             # No lower bound: what is smaller than the grid's first point is fitted exactly later.
-            if not 0.0 <= own.get("", 0.0) <= linear_fit.BEYOND:
+            if not 0.0 <= own.get("", 0.0) <= SEARCH.size_ratio:
                 return False
             for c in entry.variant.effect.coefficients(rig):
                 own.setdefault(c.parameter, 0.0)
@@ -207,13 +202,13 @@ class HypothesisSet:
     def _singles(self, field: linear_fit.CandidateColumns, r: Array) -> list[tuple[Used, ...]]:
         g = linear_fit.gains(field.K, field.columns.T @ r, field.groups, field.raw)
         out: dict[Key, tuple[Used, ...]] = {}
-        least = NEAR * float(np.max(g, initial=0.0))
+        least = SEARCH.near_gain * float(np.max(g, initial=0.0))
         for i in map(int, np.argsort(-g)):
             variant = field.entries[i].variant
             if (
                 (g[i] > least or (g[i] > 0 and len(out) < 3))
                 and variant.key not in out
-                and len(out) < SINGLES
+                and len(out) < SEARCH.singles
             ):
                 out[variant.key] = (variant.used,)
         return list(out.values())
@@ -222,10 +217,10 @@ class HypothesisSet:
         self, field: linear_fit.CandidateColumns, r: Array, singles: Sequence[Hypothesis]
     ) -> list[tuple[Used, ...]]:
         chosen = linear_fit.search(field, r)
-        out = [tuple(field.entries[m].variant.used for m in chosen.members[:DEEPEST])]
+        out = [tuple(field.entries[m].variant.used for m in chosen.members[: SEARCH.deepest])]
         out += [
             tuple(field.entries[m].variant.used for m in pair.members)
-            for pair in linear_fit.best_pairs(field, r, PAIRS)
+            for pair in linear_fit.best_pairs(field, r, SEARCH.pairs)
         ]
         return [effects for effects in out if len(effects) > 1]
 
@@ -254,7 +249,7 @@ class HypothesisSet:
         seen: set[Key] = set()
         for trial in more:
             variant = field.entries[trial.members[0]].variant
-            if variant.key not in seen and len(seen) < NEXT:
+            if variant.key not in seen and len(seen) < SEARCH.extensions:
                 seen.add(variant.key)
                 out.append((*now.effects, variant.used))
         return self.tried(out)
@@ -265,7 +260,7 @@ class HypothesisSet:
         What is left of a loud equation, the form of its effect, hides what a quiet one lacks as
         long as all are counted together.
         """
-        if len(now.effects) >= DEEPEST:
+        if len(now.effects) >= SEARCH.deepest:
             return None
 
         def residual(hypothesis: Hypothesis) -> float:
@@ -273,14 +268,14 @@ class HypothesisSet:
 
         def earned(hypothesis: Hypothesis) -> bool:
             drop, start = residual(now) - residual(hypothesis), max(0.0, residual(now))
-            least = linear_fit.CHANCE * (hypothesis.size[1] - now.size[1])
-            return drop > max(least, linear_fit.ADD_SHARE * start)
+            least = SEARCH.number_price * (hypothesis.size[1] - now.size[1])
+            return drop > max(least, SEARCH.add_share * start)
 
         more = [o for o in self.extensions(now, equations) if earned(o) and not self.physical(o)]
         if not more:
             return None
         best = min(map(residual, more))
-        slack = max((linear_fit.AS_GOOD - 1.0) * max(0.0, best), linear_fit.CHANCE)
+        slack = max((SEARCH.as_good - 1.0) * max(0.0, best), SEARCH.number_price)
         near = [o for o in more if residual(o) <= best + slack]
         return min(near, key=lambda o: (o.size[1], residual(o)))
 
@@ -301,7 +296,7 @@ class HypothesisSet:
     def idle(self, without: Hypothesis, hypothesis: Hypothesis) -> bool:
         """Return whether the effect that `without` lacks takes too small a share away."""
         drop = without.total - hypothesis.total
-        return drop < linear_fit.ADD_SHARE * without.total
+        return drop < SEARCH.add_share * without.total
 
 
 def _effect(name: str, where: str) -> Effect:

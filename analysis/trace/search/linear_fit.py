@@ -17,22 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.trace.data.regression_data import RegressionData, VariantColumns
-from analysis.trace.settings import TRACE
+from analysis.trace.settings import SEARCH, TRACE
 
 Array = NDArray[np.float64]
 Key = tuple[str, str]
-
-BAND = 0.7  # repeatable rms over noise, below which there is nothing to explain
-LEFT = 1.0  # repeatable rms over noise that an explanation may leave
-FORM = 0.02  # of the energy before: what the catalogue's form of an effect may miss of the real one
-ADD_SHARE = 0.3  # of what is left in the equations it touches: less does not earn a place
-AS_GOOD = 1.25  # what a simpler candidate may leave over the best, before noise counts
-CHANCE = 20.0  # energy that each further free number must take: ten times what noise gives it
-VISIBLE = 0.03  # of a column's length must stand out of the baseline's columns
-LARGEST = 4  # effects in a set
-STARTS = 10  # single candidates from which pairs are tried
-MOST_TRIALS = 40  # best entries that are fitted in full
-BEYOND = 3.0  # largest size over that of a shape's column; smaller ones are nearer to linear
 
 
 @dataclass(frozen=True)
@@ -91,9 +79,8 @@ def project(
         where = np.arange(segment.where.start, segment.where.stop)
         where = where[keep[where] > 0]
         rows.setdefault(segment.equation, []).append(where)
-        band[segment.equation] = band.get(segment.equation, 0.0) + BAND**2 * segment.repeats * len(
-            where
-        )
+        noise = SEARCH.band**2 * segment.repeats * len(where)
+        band[segment.equation] = band.get(segment.equation, 0.0) + noise
     return CandidateColumns(
         tuple(columns), projected, projected.T @ projected, basis, tuple(groups), raw,
         {name: np.concatenate(parts) for name, parts in rows.items()}, band,
@@ -115,10 +102,10 @@ def gains(K: Array, c: Array, groups: Sequence[tuple[int, ...]], raw: Array) -> 
     for g, group in enumerate(groups):
         if len(group) == 1:
             j = group[0]
-            if K[j, j] > VISIBLE**2 * raw[j] and raw[j] > 0:
+            if K[j, j] > SEARCH.visible**2 * raw[j] and raw[j] > 0:
                 out[g] = c[j] ** 2 / K[j, j]
             continue
-        seen = [j for j in group if K[j, j] > VISIBLE**2 * raw[j] and raw[j] > 0]
+        seen = [j for j in group if K[j, j] > SEARCH.visible**2 * raw[j] and raw[j] > 0]
         if seen:
             index = np.ix_(seen, seen)
             out[g] = c[seen] @ np.linalg.pinv(K[index], rcond=1e-6, hermitian=True) @ c[seen]
@@ -184,10 +171,10 @@ def options(
     g = gains(K, c, candidates.groups, candidates.raw)
     taken = {candidates.entries[m].variant.key for m in members}
     trials: list[LinearFit] = []
-    for i in map(int, np.argsort(-g)[:MOST_TRIALS]):
+    for i in map(int, np.argsort(-g)[: SEARCH.trials]):
         if g[i] <= 0 or candidates.entries[i].variant.key in taken:
             continue
-        if g[i] < ADD_SHARE * touched(candidates, i, now):
+        if g[i] < SEARCH.add_share * touched(candidates, i, now):
             continue
         trial = judged(candidates, (*members, i), r, noise)
         if admissible(candidates, trial):
@@ -195,7 +182,7 @@ def options(
     if not trials:
         return []
     best = min(t.total for t in trials)
-    limit = max(AS_GOOD * best, best + 0.1 * sum(candidates.band.values()))
+    limit = max(SEARCH.as_good * best, best + 0.1 * sum(candidates.band.values()))
     near = sorted(
         (t for t in trials if t.total <= limit), key=lambda t: (_size(candidates, t), t.total)
     )
@@ -223,9 +210,9 @@ def search(candidates: CandidateColumns, r: Array, noise: float = 1.0) -> Linear
     if len(greedy.members) == 1 and in_band(candidates, greedy, noise):
         return greedy
     best, seen = greedy, set[Key]()
-    for first in options(candidates, (), r, noise)[: 3 * STARTS] or _blind(candidates, r):
+    for first in options(candidates, (), r, noise)[: 3 * SEARCH.starts] or _blind(candidates, r):
         key = candidates.entries[first.members[0]].variant.key
-        if key in seen or len(seen) >= STARTS:
+        if key in seen or len(seen) >= SEARCH.starts:
             continue
         seen.add(key)
         for pair in options(candidates, first.members, r, noise)[:1]:
@@ -241,7 +228,7 @@ def best_pairs(candidates: CandidateColumns, r: Array, count: int) -> list[Linea
     for first in _blind(candidates, r):
         starts.setdefault(candidates.entries[first.members[0]].variant.key, first)
     pairs: dict[frozenset[Key], LinearFit] = {}
-    for first in list(starts.values())[:STARTS]:
+    for first in list(starts.values())[: SEARCH.starts]:
         for pair in options(candidates, first.members, r, 1.0)[:3]:
             keys = frozenset(candidates.entries[m].variant.key for m in pair.members)
             if keys not in pairs or pair.total < pairs[keys].total:
@@ -252,13 +239,17 @@ def best_pairs(candidates: CandidateColumns, r: Array, count: int) -> list[Linea
 def _blind(candidates: CandidateColumns, r: Array) -> list[LinearFit]:
     """Return the best single entries although none earns a place alone: a pair may."""
     g = gains(candidates.K, candidates.columns.T @ r, candidates.groups, candidates.raw)
-    return [judged(candidates, (int(i),), r, 1.0) for i in np.argsort(-g)[: 6 * STARTS] if g[i] > 0]
+    return [
+        judged(candidates, (int(i),), r, 1.0)
+        for i in np.argsort(-g)[: 6 * SEARCH.starts]
+        if g[i] > 0
+    ]
 
 
 def grow(candidates: CandidateColumns, members: Sequence[int], r: Array, noise: float) -> LinearFit:
     """Add entries while they earn their place, swapping and dropping earlier ones."""
     now = judged(candidates, members, r, noise)
-    while not in_band(candidates, now, noise) and len(now.members) < LARGEST:
+    while not in_band(candidates, now, noise) and len(now.members) < SEARCH.largest:
         more = options(candidates, now.members, r, noise)
         if not more:
             break
@@ -289,7 +280,7 @@ def prune(candidates: CandidateColumns, chosen: LinearFit, r: Array, noise: floa
     while len(chosen.members) > 1:
         shares = {m: share(candidates, chosen, m, r, noise) for m in chosen.members}
         worst = min(shares, key=lambda m: shares[m])
-        if shares[worst] >= ADD_SHARE:
+        if shares[worst] >= SEARCH.add_share:
             break
         chosen = judged(candidates, tuple(m for m in chosen.members if m != worst), r, noise)
     return chosen

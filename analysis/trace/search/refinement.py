@@ -30,16 +30,11 @@ from analysis.trace.data.conditioned_record import (
     prepared,
 )
 from analysis.trace.data.regression_data import RegressionData
-from analysis.trace.search.linear_fit import CHANCE, orthonormal
-from analysis.trace.settings import TRACE
+from analysis.trace.search.linear_fit import orthonormal
+from analysis.trace.settings import SEARCH, TRACE
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
-
-TOLERANCE = 1e-4
-MOST_STEPS = 10
-DETAIL = 0.05  # of what is left above noise: less does not earn a detail of the form
-REMEMBERED = 600  # families of rows of scenes under a model, at most about 0.1 MB each
 
 
 @dataclass(frozen=True)
@@ -121,7 +116,7 @@ def _rows(
 def _kept(data: RegressionData, key: Any, make: Callable[[], Any]) -> Any:
     """Return what belongs to a key, made where it is not remembered."""
     if key not in data.memo:
-        if len(data.memo) >= REMEMBERED:
+        if len(data.memo) >= SEARCH.remembered:
             data.memo.clear()
         data.memo[key] = make()
     return data.memo[key]
@@ -146,7 +141,7 @@ def fit(data: RegressionData, terms: Sequence[Used]) -> ExactFit:
     return ExactFit(tuple(terms), beta, rows.residual(beta))
 
 
-def refine(data: RegressionData, terms: Sequence[Used], steps: int = MOST_STEPS) -> ExactFit:
+def refine(data: RegressionData, terms: Sequence[Used], steps: int = SEARCH.steps) -> ExactFit:
     """Search the shape parameters that the board's own terms do not have, from where they are.
 
     Where an effect has another form, the one that leaves less stays. Then details of forms join,
@@ -162,7 +157,7 @@ def refine(data: RegressionData, terms: Sequence[Used], steps: int = MOST_STEPS)
             fit = other if other.energy < fit.energy else fit
         used = fit.terms[k]
         opened = _in_detail(data.rig, used)
-        asked = max(CHANCE, DETAIL * (fit.energy - len(fit.residual)))
+        asked = max(SEARCH.number_price, SEARCH.detail * (fit.energy - len(fit.residual)))
         # Half, since in a straight line a detail promises less than it takes.
         if opened == used or _promise(data, fit, used, opened) < 0.5 * asked:
             continue
@@ -208,7 +203,7 @@ def _searched(data: RegressionData, terms: Sequence[Used], steps: int) -> ExactF
 
     search = search_shapes(
         lambda x: fit(data, at(x)).residual, np.clip(start, 1e-6, 1 - 1e-6), bounds=(0.0, 1.0),
-        diff_step=1e-3, xtol=TOLERANCE, ftol=TOLERANCE, gtol=1e-12,
+        diff_step=1e-3, xtol=SEARCH.tolerance, ftol=SEARCH.tolerance, gtol=1e-12,
         max_nfev=steps,
     )  # fmt: skip
     return fit(data, at(search.x))
@@ -323,7 +318,7 @@ def alternatives(data: RegressionData, fit: ExactFit) -> list[ExactFit]:
             continue
         for shape in used.term.other_forms(data.rig, used.shape):
             terms = _with(fit.terms, used, Used(used.term, shape))
-            out.append(_searched(data, terms, MOST_STEPS))
+            out.append(_searched(data, terms, SEARCH.steps))
     return out
 
 

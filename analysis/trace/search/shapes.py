@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Final
 
 from analysis.effects.base import Effect, Shape, open_shapes, shapes_of
 from analysis.identify import checks as ck
@@ -13,10 +12,9 @@ from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import evidence, regression_data
 from analysis.trace.data.temperature_nuisance import temperature_terms
 from analysis.trace.search.refinement import fit, refine
+from analysis.trace.settings import SEARCH
 from rig.model.records import Run
 from rig.model.rig import Rig
-
-STARTS: Final = 3  # points of an effect's grid that are searched from
 
 
 def with_shapes(runs: Sequence[Run], terms: Sequence[Used]) -> tuple[Used, ...]:
@@ -41,7 +39,7 @@ def with_shapes(runs: Sequence[Run], terms: Sequence[Used]) -> tuple[Used, ...]:
         trials = [(*data.terms, *refined, Used(used.term, p)) for p in looks]
         # The least before the search need not be it afterwards: edges that no spool reaches leave
         # little, and nothing to search along.
-        near = sorted(trials, key=lambda trial: fit(data, trial).energy)[:STARTS]
+        near = sorted(trials, key=lambda trial: fit(data, trial).energy)[: SEARCH.shape_starts]
         best = min((refine(data, trial) for trial in near), key=lambda candidate: candidate.energy)
         refined = best.terms[len(data.terms) :]
     shaped = dict(zip(wanted, refined, strict=True))

@@ -19,7 +19,8 @@ from analysis.trace.judge import gates
 from analysis.trace.result import JudgedEffect, Trace
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.hypothesis_set import HypothesisSet
-from analysis.trace.search.linear_fit import VISIBLE, CandidateColumns
+from analysis.trace.search.linear_fit import CandidateColumns
+from analysis.trace.settings import SEARCH
 from rig.model.records import Run
 from rig.model.rig import Rig
 
@@ -105,7 +106,7 @@ def gains(field: CandidateColumns, r: Array) -> Array:
     out = []
     for group in field.groups:
         X = field.columns[:, list(group)]
-        visible = np.linalg.norm(X, axis=0) > VISIBLE * np.sqrt(field.raw[list(group)])
+        visible = np.linalg.norm(X, axis=0) > SEARCH.visible * np.sqrt(field.raw[list(group)])
         X = X[:, visible]
         out.append(r @ X @ np.linalg.lstsq(X, r, rcond=1e-6)[0] if X.shape[1] else 0.0)
     return np.array(out)

@@ -11,8 +11,9 @@ from analysis.simulation.synthetic import multisine, synthetic_run
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from analysis.trace.data.conditioned_record import conditioned_records
-from analysis.trace.data.noise_floor import LEAST, STATED, floors, stated_noise
+from analysis.trace.data.noise_floor import STATED, floors, stated_noise
 from analysis.trace.data.regression_data import regression_data
+from analysis.trace.settings import DATA
 from rig.model.rig import Rig
 
 
@@ -42,7 +43,7 @@ def test_sensors_far_better_than_stated_do_not_make_a_floor_of_nothing(rig: Rig)
     ratios = floor_over_stated(rig, 0.0)
     assert ratios
     for name, ratio in ratios.items():
-        assert ratio == pytest.approx(LEAST, rel=1e-6), name
+        assert ratio == pytest.approx(DATA.least_noise, rel=1e-6), name
 
 
 def test_a_record_whose_rows_are_all_masked_has_the_stated_floor_and_nothing_left(rig: Rig) -> None:

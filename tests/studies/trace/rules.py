@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -22,9 +22,9 @@ from analysis.regression import solve
 from analysis.trace import engine, remaining
 from analysis.trace.data import noise_floor, regression_data
 from analysis.trace.judge import gates, inference
-from analysis.trace.search import linear_fit, refinement
+from analysis.trace.search import linear_fit
 from analysis.trace.search.hypothesis_set import HypothesisSet
-from analysis.trace.settings import TRACE
+from analysis.trace.settings import DATA, SEARCH, TRACE
 
 Array = NDArray[np.float64]
 Change = tuple[Any, str, Any]
@@ -59,7 +59,7 @@ def switched_off(rule: Rule) -> Iterator[None]:
 
 def _put(subject: Any, name: str, value: Any) -> None:
     """Set an attribute, that of the frozen settings too."""
-    if subject is TRACE:
+    if is_dataclass(subject):
         object.__setattr__(subject, name, value)
     else:
         setattr(subject, name, value)
@@ -77,7 +77,7 @@ def _one_candidate(
     r = inference.flipped(train_data, TRACE.flips, rng, residual)
     r = r - candidates.basis @ (candidates.basis.T @ r)
     size = np.maximum(np.diag(candidates.K), 1e-300)
-    first = int(np.argmax(size > linear_fit.VISIBLE**2 * candidates.raw))
+    first = int(np.argmax(size > SEARCH.visible**2 * candidates.raw))
     gain: Array = (candidates.columns[:, first] @ r) ** 2 / size[first]
     return gain
 
@@ -148,8 +148,8 @@ RULES: Final = (
     Rule("further search", "quiet equations are not searched again",
          ((HypothesisSet, "closer", lambda *_: None),)),
     Rule("price of numbers", "a further number costs nothing",
-         ((linear_fit, "CHANCE", 0.0), (linear_fit, "AS_GOOD", 1.0), (linear_fit, "ADD_SHARE", 0.0),
-          (refinement, "CHANCE", 0.0)), refits=True),
+         ((SEARCH, "number_price", 0.0), (SEARCH, "as_good", 1.0), (SEARCH, "add_share", 0.0)),
+         refits=True),
     Rule("pruning", "effects that take little are kept",
          ((HypothesisSet, "prune", lambda _, one: one),)),
     Rule("simpler effect", "an effect that has become a simpler one is not tried as that",
@@ -181,7 +181,7 @@ FAULTS: Final = (
     Rule("floor x 3", "the noise is taken for three times as large", tuple(
         (module, "floors", _floors(3.0)) for module in (noise_floor, regression_data)), True),
     Rule("least floor", "the floor may lie anywhere below the stated noise",
-         ((noise_floor, "LEAST", 0.0),), refits=True),
+         ((DATA, "least_noise", 0.0),), refits=True),
     Rule("fit records judge", "the records that were fitted are those that judge",
          ((engine, "regression_data", _same_records()),), True),
     Rule("same records pass", "a held-out record may be a training record",
