@@ -24,6 +24,7 @@ from can.interfaces.slcan import slcanBus
 from can.interfaces.socketcand import SocketCanDaemonBus
 
 from drivers.base import DeviceError, DeviceLost
+from drivers.settings import DRIVER
 from rig.model.wire.can_frames import CanFrame
 from rig.model.wire.can_layout import EXTENDED
 
@@ -32,13 +33,7 @@ logger = logging.getLogger(__name__)
 SOCKETCAND: Final = "socketcand"
 SLCAN: Final = "slcan"
 _GREETING: Final = b"< hi >"
-_GREETING_SECONDS: Final = 2.0
 _OPENED: Final = b"< ok >"
-_SLICE_SECONDS: Final = 0.05  # how long the receiver waits at a time: closing takes that long
-_OPEN_SECONDS: Final = 5.0  # for an interface to open; some libraries wait for ever
-_SEND_SECONDS: Final = 1.0  # for a place in the adapter's transmit queue
-_FULL_SECONDS: Final = 0.001  # between two tries at a full one
-_MOST_WAITING: Final = 100_000  # frames received and not taken: memory stays bounded
 _ERRORS: Final = (can.CanError, OSError, ValueError, ImportError, NotImplementedError)
 
 
@@ -125,9 +120,9 @@ class CanPort:
         if self._place.interface == SOCKETCAND:
             self._greeted()
         reader = _Reader(self._opened, self._wanted, self._deliver)
-        if not reader.opened.wait(_OPEN_SECONDS):
+        if not reader.opened.wait(DRIVER.can_open):
             reader.end()
-            raise DeviceLost(f"{self.where} did not open within {_OPEN_SECONDS:g} s")
+            raise DeviceLost(f"{self.where} did not open within {DRIVER.can_open:g} s")
         if reader.fault is not None:
             raise self._why_not(reader.fault) from reader.fault
         self._reader = reader
@@ -142,10 +137,10 @@ class CanPort:
             is_fd=frame.fd,
             bitrate_switch=frame.fd,
         )
-        end = time.monotonic() + _SEND_SECONDS
+        end = time.monotonic() + DRIVER.can_send
         while True:
             try:
-                reader.bus.send(message, timeout=_SEND_SECONDS)
+                reader.bus.send(message, timeout=DRIVER.can_send)
             except _ERRORS as error:
                 if not _is_full(error):
                     raise self._gone(error) from error
@@ -155,7 +150,7 @@ class CanPort:
                         f"{self.where} takes no more frames: no other node acknowledges them; "
                         f"check wiring, termination and that the bus runs at {self._bitrate} bit/s"
                     ) from error
-                time.sleep(_FULL_SECONDS)
+                time.sleep(DRIVER.can_full)
             else:
                 return
 
@@ -195,7 +190,7 @@ class CanPort:
         """Refuse what is no socketcand: python-can would wait for its answer for ever."""
         place = self._place
         try:
-            with socket.create_connection((place.host, place.port), _GREETING_SECONDS) as asked:
+            with socket.create_connection((place.host, place.port), DRIVER.can_greeting) as asked:
                 greeting = asked.recv(64)
                 asked.sendall(f"< open {place.channel} >".encode())
                 opened = asked.recv(64) if greeting.startswith(_GREETING) else b""
@@ -207,7 +202,7 @@ class CanPort:
         except TimeoutError as error:
             raise DeviceLost(
                 f"what listens at {place.host}:{place.port} has not greeted as socketcand does "
-                f"within {_GREETING_SECONDS:g} s; check the port, which another program may have"
+                f"within {DRIVER.can_greeting:g} s; check the port, which another program may have"
             ) from error
         except OSError as error:  # a name that is none
             raise DeviceLost(
@@ -315,8 +310,8 @@ class _SlcanBus(slcanBus):
         while True:
             if (text := _first_text(self._buffer)) is not None:
                 return text
-            left = _SLICE_SECONDS if end is None else end - time.monotonic()
-            ready = select.select([port.fileno()], [], [], min(max(left, 0.0), _SLICE_SECONDS))[0]
+            left = DRIVER.can_wait if end is None else end - time.monotonic()
+            ready = select.select([port.fileno()], [], [], min(max(left, 0.0), DRIVER.can_wait))[0]
             if ready:
                 self._buffer.extend(port.read(port.in_waiting or 1))
             elif end is not None and left <= 0.0:
@@ -367,7 +362,7 @@ class _Reader:
         """End the thread and close the bus; one that hangs in a library is left behind."""
         self._ending = True
         if threading.current_thread() is not self._thread:
-            self._thread.join(_OPEN_SECONDS)
+            self._thread.join(DRIVER.can_open)
 
     def _run(self) -> None:
         try:
@@ -379,7 +374,7 @@ class _Reader:
         self.opened.set()
         try:
             while not self._ending:
-                message = self.bus.recv(_SLICE_SECONDS)
+                message = self.bus.recv(DRIVER.can_wait)
                 if message is not None:
                     self._take(message)
         except Exception as error:
@@ -395,7 +390,7 @@ class _Reader:
             self.seen.errors += 1
         elif message.is_remote_frame or key not in self._wanted:
             self.seen.foreign += 1
-        elif self.frames.qsize() >= _MOST_WAITING:
+        elif self.frames.qsize() >= DRIVER.can_frames:
             self.seen.overrun += 1
         else:
             self.seen.kept += 1

@@ -14,6 +14,7 @@ from drivers.base import WireSettings
 from drivers.can_link import CanLine
 from drivers.can_port import SLCAN, SOCKETCAND, BusPlace, CanPort
 from drivers.message_stream import MessageStreamDriver
+from drivers.settings import DRIVER
 from rig.model.parse import InputError
 from rig.model.parts import Wire
 from rig.model.rig import Rig
@@ -22,7 +23,6 @@ from rig.model.wire.can_database import database_text
 from rig.model.wire.can_frames import stream_seconds
 from rig.model.wire.can_layout import CanLayout, read_layout
 
-MOST_LOAD: Final = 0.8  # of the bus, at worst: the rest is for requests and for sending again
 _SLCAN_DATA_RATES: Final = (2_000_000, 5_000_000)
 
 
@@ -123,12 +123,12 @@ def can_layout(settings: CanSettings, rig: Rig) -> CanLayout:
 def _check_load(layout: CanLayout, block: reg.BlockLayout, at: CanSettings, rig: Rig) -> None:
     seconds = stream_seconds(layout, block, at.bitrate, at.data_bitrate or at.bitrate)
     load = seconds * rig.sample_rate / block.samples
-    if load > MOST_LOAD:
+    if load > DRIVER.bus_load:
         faster = "" if layout.fd else ", or CAN FD (data_bitrate)"
-        fits = MOST_LOAD * block.samples / seconds
+        fits = DRIVER.bus_load * block.samples / seconds
         raise InputError(
             f"wire: bitrate: {len(rig.recorded)} values at {rig.sample_rate:g} Hz take "
-            f"{100 * load:.0f} % of a bus of {at.bitrate} bit/s at worst, {100 * MOST_LOAD:.0f} % "
-            f"expected at most: {fits:.0f} Hz fit; choose a lower sample_rate, a higher bitrate"
-            f"{faster}"
+            f"{100 * load:.0f} % of a bus of {at.bitrate} bit/s at worst, "
+            f"{100 * DRIVER.bus_load:.0f} % expected at most: {fits:.0f} Hz fit; "
+            f"choose a lower sample_rate, a higher bitrate{faster}"
         )

@@ -24,6 +24,7 @@ from pydantic import Field, field_validator
 from drivers.base import Array, DeviceError, DeviceInfo, DeviceLost, OutputLaw, WireSettings
 from drivers.can_port import BusPlace, CanPort
 from drivers.polled import PolledDriver
+from drivers.settings import DRIVER
 from rig.model import channels as ch
 from rig.model.parse import InputError
 from rig.model.parts import Wire
@@ -36,8 +37,6 @@ from rig.model.wire.codes import decode_input
 logger = logging.getLogger(__name__)
 
 PACKAGE: Final = "canopen"
-_HEARTBEATS: Final = 5  # within the time after which a node misses its host
-_STATE_SECONDS: Final = 0.5  # for a node to reach a state
 _COMMON: Final = frozenset({ch.SUPPLY, ch.TEMPERATURE})
 
 
@@ -184,7 +183,7 @@ class CanOpenValves:
         self._heartbeat(force=True)
         for word in (Control.DISABLED, Control.DISABLED | Control.RESET, Control.DISABLED):
             self._send(zero, word)
-        end = time.monotonic() + _STATE_SECONDS
+        end = time.monotonic() + DRIVER.state_seconds
         self.read()
         while self.fault() is not None and time.monotonic() < end:
             self.read()
@@ -283,7 +282,7 @@ class CanOpenValves:
     def _heartbeat(self, *, force: bool = False) -> None:
         # From whoever serves the outputs, so that a host that stands still is silent.
         now = self._clock()
-        if force or now - self._beat > self._wire.watchdog / _HEARTBEATS:
+        if force or now - self._beat > self._wire.watchdog / DRIVER.heartbeats:
             state = bytes([cia408.OPERATIONAL])
             self._port.send(CanFrame(cia408.HEARTBEAT_ID + self._at.host, state))
             self._beat = now

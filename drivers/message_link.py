@@ -17,6 +17,7 @@ from typing import Protocol
 
 from drivers.base import DeviceBusy, DeviceError
 from drivers.bench_protocol import DeviceRefused, DeviceSilent
+from drivers.settings import DRIVER
 from rig.model.wire import registers as reg
 from rig.model.wire import serial_messages as msg
 from rig.model.wire.frames import FRAME_VERSION, WireFrame
@@ -26,7 +27,6 @@ from rig.model.wire.serial_messages import ANSWER, Message
 logger = logging.getLogger(__name__)
 
 _NO_SUCH = "it knows no such request, or not of this size"
-_TRIES = 5  # within the time after which a silent device counts as lost
 
 
 class RequestRefused(DeviceRefused):
@@ -140,7 +140,7 @@ class MessageLink:
         end = self._clock() + self._patience
         while (now := self._clock()) < end:
             self._line.send(message)
-            answer = self._awaited(min(end, now + self._timeout / _TRIES))
+            answer = self._awaited(min(end, now + self._timeout / DRIVER.tries))
             if answer is not None:
                 return self._checked(answer, kind, size, about)
         raise DeviceSilent(self._silence())

@@ -34,6 +34,7 @@ from drivers.bench_protocol import (
 )
 from drivers.message_link import MessageLine, MessageLink, RequestRefused
 from drivers.modbus_blocks import BlockDecoder, unwrap
+from drivers.settings import DRIVER
 from rig.model.parts import Wire
 from rig.model.rig import Rig
 from rig.model.wire import registers as reg
@@ -45,8 +46,6 @@ logger = logging.getLogger(__name__)
 
 _STATUS_BYTES = 2 * (reg.STATUS_SPAN[1] - reg.STATUS_SPAN[0])
 _IDENTITY_BYTES = 2 * (reg.IDENTITY_SPAN[1] - reg.IDENTITY_SPAN[0])
-_RESEND_SECONDS = 0.1  # without a block, beyond the time that one takes
-_NOTES_BEFORE_STATUS = 3
 
 
 class MessageStreamDriver:
@@ -201,7 +200,7 @@ class MessageStreamDriver:
             self._why_no_block(overdue=True)
         self._alive()
         period = self._layout.samples / self._rig.sample_rate
-        pause = period + min(_RESEND_SECONDS, self._wire.watchdog / 5)
+        pause = period + min(DRIVER.resend, self._wire.watchdog / 5)
         deadline = self._clock() + period + self._link.patience
         known = ""  # what was wrong with the line before it was waited for in vain
         for asked in count(1):
@@ -215,7 +214,7 @@ class MessageStreamDriver:
                 known = self._link.complaint()
             # The note or the block was lost; the watchdog wants another note in any case.
             self._alive(resend=True)
-            if asked % _NOTES_BEFORE_STATUS == 0:
+            if asked % DRIVER.notes_before_status == 0:
                 self._why_no_block(overdue=self._clock() >= deadline, known=known)
         block = self._ready.popleft()
         return self._decoder.decode_samples(block.header, block.samples)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.base import DeviceError, DeviceLost, SampleBlock
+from drivers.settings import DRIVER
 from rig.model import channels as ch
 from rig.model.rig import Rig
 from rig.model.wire import registers as reg
@@ -21,7 +22,6 @@ Codes = NDArray[np.uint16]
 
 _ONE = np.uint16(1)
 _TRIPPED: Final = int(Status.TRIPPED)  # an operation on a flag takes as long as one on an array
-LATE = 16  # blocks back that a late answer may be of
 
 
 def unwrap(raw: int, near: int, bits: int) -> int:
@@ -68,7 +68,7 @@ class BlockDecoder:
     def seen(self, header: BlockHeader) -> bool:
         """Return whether a block is one of the last few decoded: a late copy of an answer."""
         behind = (self.acknowledge - header.sequence) & 0xFFFF
-        return self._sequence is not None and behind <= min(self._sequence, LATE)
+        return self._sequence is not None and behind <= min(self._sequence, DRIVER.late_blocks)
 
     def refuse_restarted(self, tick: int) -> None:
         """Raise DeviceLost where a device counts `tick` (modulo 2^32) after samples beyond it."""

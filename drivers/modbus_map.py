@@ -39,6 +39,7 @@ from drivers.register_types import (
     encode_registers,
     word_count,
 )
+from drivers.settings import DRIVER
 from drivers.wire_entries import (
     inputs_by_channel,
     offset_of,
@@ -61,7 +62,6 @@ _LAST_REGISTER: Final = 0xFFFF
 _NO_WATCHDOG: Final = "none"
 _KEY: Final = "word_order"
 _OTHER: Final = {WordOrder.BIG: WordOrder.LITTLE, WordOrder.LITTLE: WordOrder.BIG}
-_RESOLVED: Final = 1e-7  # of its range: finer than a converter of 20 bits
 
 
 class MapSettings(WireSettings):
@@ -418,7 +418,7 @@ def _plausible(point: Point, data: bytes, low: float, high: float) -> bool:
     A float read in the wrong order is of any magnitude: far below what the sensor resolves, too.
     """
     number = point.scale * decode_registers(data, point.form, point.order)
-    tiny = 0.0 < abs(number) < _RESOLVED * (high - low)
+    tiny = 0.0 < abs(number) < DRIVER.resolved * (high - low)
     return low <= point.offset + number <= high and not tiny
 
 

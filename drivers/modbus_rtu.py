@@ -24,12 +24,10 @@ from drivers.bench_protocol import AnswerDamaged
 from drivers.modbus_tcp import ModbusTcpDriver
 from drivers.modbus_transport import ModbusConnection
 from drivers.serial_transport import OPENING_ERRORS, why_not_opened
+from drivers.settings import DRIVER
 from rig.model.parts import Wire
 
 logger = logging.getLogger(__name__)
-
-QUIET = 0.05  # [s] without a byte after which nothing more of a late answer is coming
-LONGEST = 1.0  # [s] that a line may keep talking before it counts as garbage
 
 
 class RtuSettings(WireSettings):
@@ -121,16 +119,16 @@ class RtuConnection(ModbusConnection):
         line: Any = self._usable().socket
         began = heard = time.monotonic()
         try:
-            while time.monotonic() - heard < QUIET:
+            while time.monotonic() - heard < DRIVER.quiet:
                 if line.in_waiting:
                     line.read(line.in_waiting)
                     heard = time.monotonic()
-                if heard - began > LONGEST:
+                if heard - began > DRIVER.babble:
                     self.close()
                     raise DeviceLost(
                         f"{self.where} sends without end; does another host talk on it?"
                     )
-                time.sleep(QUIET / 20)
+                time.sleep(DRIVER.quiet / 20)
         except (SerialException, OSError) as error:
             self.close()
             raise DeviceLost(f"the serial line {self.where} is gone: {error}") from error

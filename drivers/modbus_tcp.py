@@ -36,6 +36,7 @@ from drivers.bench_protocol import (
 )
 from drivers.modbus_blocks import BlockDecoder, unwrap
 from drivers.modbus_transport import ModbusConnection, unpack
+from drivers.settings import DRIVER
 from rig.model.parts import LOCALHOST, PORT, Wire
 from rig.model.rig import Rig
 from rig.model.wire import registers as reg
@@ -43,8 +44,6 @@ from rig.model.wire.registers import Refusal, Status
 
 logger = logging.getLogger(__name__)
 
-_RETRY: Final = 0.1  # of a block's length, until a block that was not there is asked for again
-_EARLIER: Final = 0.02  # of a block's length, by which each block is asked for earlier
 _BLOCK: Final = int(Status.BLOCK)
 _STREAMING: Final = int(Status.STREAMING)
 
@@ -245,7 +244,7 @@ class ModbusTcpDriver:
                     f"{self._wire.timeout:g} s"
                 )
             at_once = False
-            self._sleep(_RETRY * period)
+            self._sleep(DRIVER.retry * period)
 
     # -- inside -----------------------------------------------------------------------------
 
@@ -259,10 +258,10 @@ class ModbusTcpDriver:
         if backlog or (self.info is not None and self.info.virtual_time):
             return None
         if not at_once:
-            return time.monotonic() + (1.0 - _EARLIER) * period
+            return time.monotonic() + (1.0 - DRIVER.earlier) * period
         if self._due is None:  # it may have waited for almost a period
-            return time.monotonic() + _RETRY * period
-        return self._due + (1.0 - _EARLIER) * period
+            return time.monotonic() + DRIVER.retry * period
+        return self._due + (1.0 - DRIVER.earlier) * period
 
     def _exchange(self) -> bytes:
         # Asked again early enough for a lost answer to trip neither watchdog.

@@ -19,7 +19,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import astuple, dataclass, replace
-from typing import ClassVar, Final, Protocol, TypeVar
+from typing import ClassVar, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,7 @@ from drivers.base import (
     SampleBlock,
     WireSettings,
 )
+from drivers.settings import DRIVER
 from rig.model import channels as ch
 from rig.model.parse import InputError
 from rig.model.parts import Wire
@@ -42,14 +43,6 @@ from rig.model.wire.resample import LONGEST, Resampler, Row
 
 logger = logging.getLogger(__name__)
 Result = TypeVar("Result")
-
-MAX_BLOCK_SAMPLES: Final = 10
-BLOCK_SECONDS: Final = 0.05  # at low rates a block is shorter, so that limits are checked as soon
-LATE: Final = 0.5  # [periods] after its tick from which on a sample counts as late
-_EARLY: Final = 1e-6  # [periods] that rounding may take from a tick that is due
-_TRIALS: Final = 3  # exchanges at connect, of which the fastest must fit into a period
-_PERIODS_OF_SILENCE: Final = 3  # a watchdog must let at least so many sample periods pass
-_ROUNDING: Final = 1e-9  # of a sensor's range
 
 
 class InputsOutputs(Protocol):
@@ -124,7 +117,7 @@ class PolledDriver:
         self._block_samples = _block_samples(rig.sample_rate)
         sensors = [rig.sensors.of(ch.kind_of(name)[0]) for name in rig.channels]
         low, high = np.array([sensor.range for sensor in sensors], dtype=np.float64).T
-        rounding = _ROUNDING * (high - low)
+        rounding = DRIVER.rounding * (high - low)
         self._low, self._high = low + rounding, high - rounding
         self._ranges = [joint.valve.command_range for joint in rig.joints]
         self._positions = [
@@ -284,7 +277,7 @@ class PolledDriver:
         self._resampler.restart()
         self._sequence, self._block_end = 0, None
         self._written = self._clock()
-        self._last = max(self._last, math.floor(self._periods(self._written) + _EARLY))
+        self._last = max(self._last, math.floor(self._periods(self._written) + DRIVER.early))
         self._laws.restart(self._last + 1)
         values, at = self._take()  # what the first tick is interpolated from
         self._resampler.add(at, values, self._saturated(values))
@@ -343,7 +336,7 @@ class PolledDriver:
         self._timing = replace(
             old,
             served=old.served + 1,
-            late=old.late + (lateness > LATE),
+            late=old.late + (lateness > DRIVER.late),
             worst=max(old.worst, lateness / self._rig.sample_rate),
         )
 
@@ -381,14 +374,14 @@ class PolledDriver:
 
     def _next_tick(self) -> int:
         """Return the tick to serve next: the newest that is due, never one already in a row."""
-        due = math.floor(self._periods(self._clock()) + _EARLY)
+        due = math.floor(self._periods(self._clock()) + DRIVER.early)
         return max(self._last + 1, due)
 
     def _wait(self) -> int:
         while True:
             tick = self._next_tick()
             ahead = tick - self._periods(self._clock())
-            if ahead <= _EARLY:
+            if ahead <= DRIVER.early:
                 return tick
             self._sleep(ahead / self._rig.sample_rate)
 
@@ -430,7 +423,7 @@ class PolledDriver:
     def _prove_speed(self) -> None:
         period = 1.0 / self._rig.sample_rate
         fastest = math.inf
-        for _ in range(_TRIALS):
+        for _ in range(DRIVER.trials):
             before = self._clock()
             self._take()
             self._put(self._volts)
@@ -520,7 +513,7 @@ class _Laws:
 
 
 def _block_samples(rate: float) -> int:
-    return min(MAX_BLOCK_SAMPLES, max(1, round(BLOCK_SECONDS * rate)))
+    return min(DRIVER.block_samples, max(1, round(DRIVER.block_seconds * rate)))
 
 
 def _silence_allowed(wire: Wire, rig: Rig, watchdog: float | None, accepted: bool) -> float:
@@ -536,10 +529,10 @@ def _silence_allowed(wire: Wire, rig: Rig, watchdog: float | None, accepted: boo
             f"promises {wire.watchdog:g} s; shorten the one or lengthen the other"
         )
     allowed = wire.watchdog if watchdog is None else watchdog
-    least = _PERIODS_OF_SILENCE / rig.sample_rate
+    least = DRIVER.silent_periods / rig.sample_rate
     if allowed < least:
         raise InputError(
-            f"wire: watchdog: {allowed:g} s is shorter than {_PERIODS_OF_SILENCE} sample periods "
+            f"wire: watchdog: {allowed:g} s is shorter than {DRIVER.silent_periods} sample periods "
             f"({least:g} s); outputs are written once a period"
         )
     return allowed

@@ -15,10 +15,9 @@ from typing import Protocol
 import serial
 
 from drivers.base import DeviceBusy, DeviceError, DeviceLost
+from drivers.settings import DRIVER
 
 _CHUNK = 65_536
-_WRITE_TIMEOUT = 1.0  # [s]
-_SLICE_SECONDS = 0.02  # how long pyserial waits at a time: reading ends that much late, at most
 _ERRORS: tuple[type[Exception], ...] = (OSError,)  # pyserial's own are OSErrors
 with suppress(ImportError):  # none on Windows
     import termios
@@ -117,8 +116,8 @@ class PySerialTransport:
             self._port = serial.Serial(
                 self._device,
                 self._baud,
-                timeout=_SLICE_SECONDS,
-                write_timeout=_WRITE_TIMEOUT,
+                timeout=DRIVER.serial_wait,
+                write_timeout=DRIVER.serial_write,
                 exclusive=None if shared else True,
             )
         except OPENING_ERRORS as error:
@@ -145,7 +144,7 @@ class PySerialTransport:
             # One wait and one read where the port is a file: pyserial takes twice as many calls.
             while self._file is not None:
                 left = end - time.monotonic()
-                if select.select([self._file], [], [], min(max(left, 0.0), _SLICE_SECONDS))[0]:
+                if select.select([self._file], [], [], min(max(left, 0.0), DRIVER.serial_wait))[0]:
                     return self._taken(port, self._file)
                 if left <= 0.0:
                     return b""

@@ -15,17 +15,13 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 
+from protocols.design.settings import DESIGN
 from protocols.signals.multisine import Multisine
 from protocols.steps.excite import Step
 from protocols.steps.parts import CLOSED, END_MAX, END_MIN, Centring, Excite, Lock
 from rig.model.rig import Rig
 
-ALL_POSES = 3  # joints beyond the excited one, up to which every combination is a candidate
-DISPLACED = 2  # of more joints than that, at most so many stand at an end
-END_TOLERANCE, CLOSED_TOLERANCE = 2e-3, 5e-3  # [m] a closed valve is a spring of oil
 CENTRING = Centring(drift=4e-3, offset=4e-3, tries=6)
-AMPLITUDE = 0.4  # [V] rms to begin with; every step is sized on the twin
-REPEATS = 4
 
 
 def candidates(rig: Rig) -> tuple[Step, ...]:
@@ -42,23 +38,24 @@ def candidates(rig: Rig) -> tuple[Step, ...]:
 def _places(count: int) -> Iterator[tuple[str, ...]]:
     """Yield where `count` joints stand, end stops first."""
     for places in itertools.product((END_MIN, END_MAX, CLOSED), repeat=count):
-        if count <= ALL_POSES or sum(place != CLOSED for place in places) <= DISPLACED:
+        at_ends = sum(place != CLOSED for place in places)
+        if count <= DESIGN.all_poses or at_ends <= DESIGN.displaced:
             yield places
 
 
 def _step(excited: int, beyond: tuple[tuple[int, str], ...], name: str) -> Step:
     closed = tuple(
-        Lock(joint=joint, at=CLOSED, piston=0.0, tolerance=CLOSED_TOLERANCE)
+        Lock(joint=joint, at=CLOSED, piston=0.0, tolerance=DESIGN.closed_tolerance)
         for joint in [*range(1, excited), *(j for j, place in beyond if place == CLOSED)]
     )
     ends = tuple(
-        Lock(joint=joint, at=place, tolerance=END_TOLERANCE)
+        Lock(joint=joint, at=place, tolerance=DESIGN.end_tolerance)
         for joint, place in beyond
         if place != CLOSED
     )
-    signal = multisine(AMPLITUDE, 0)
+    signal = multisine(DESIGN.amplitude, 0)
     excite = Excite(joint=excited, signal=signal, centre=0.0, centring=CENTRING)
-    return Step(name=name, lock=(*closed, *ends), excite=(excite,), repeats=REPEATS)
+    return Step(name=name, lock=(*closed, *ends), excite=(excite,), repeats=DESIGN.repeats)
 
 
 def multisine(amplitude: float, seed: int, tilt: float = 0.4) -> Multisine:

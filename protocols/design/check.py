@@ -24,6 +24,7 @@ from protocols.design.check_report import (
     StepCheck,
     widened,
 )
+from protocols.design.settings import DESIGN
 from protocols.engine.centring import Array, follow, under_loop
 from protocols.files.plan import Plan
 from protocols.steps.base import PlannedStep
@@ -32,13 +33,6 @@ from rig.model.parse import InputError
 from rig.model.rig import Rig
 
 log = logging.getLogger(__name__)
-
-BIAS_TRIES = 6
-SEEK_SECONDS = 3.0  # of simulation behind each bias but the last
-RAMP_SECONDS = 1.0  # in which the waveform grows on the twin
-SETTLE_SECONDS = 2.0  # simulated before the period that is judged
-DRIFT_LEFT = 0.2  # of the drift that the protocol allows
-WIDER = 1.05  # swing under the centring loop over the free one: reported from there on
 
 
 class NotCentred(InputError):
@@ -166,9 +160,9 @@ def _centred(step: StepPlan, rig: Rig, twin: Twin, near: _Centred | None = None)
         start[part.joint] = part.centre
     if near is not None:
         biases, start = dict(near.tried), near.start.copy()
-    seek = round(SEEK_SECONDS * rate)
-    whole = math.ceil(SETTLE_SECONDS * rate / step.period) * step.period + step.period
-    for attempt in range(BIAS_TRIES):
+    seek = round(DESIGN.seek_seconds * rate)
+    whole = math.ceil(DESIGN.settle_seconds * rate / step.period) * step.period + step.period
+    for attempt in range(DESIGN.bias_tries):
         samples = min(seek, whole) if attempt < 2 and near is None else whole
         tried, began = dict(biases), start.copy()
         commands = _commands(step, joints, biases, samples, rate)
@@ -181,8 +175,8 @@ def _centred(step: StepPlan, rig: Rig, twin: Twin, near: _Centred | None = None)
             return _Centred(biases, tried, began, last)
     which = ", ".join(str(part.joint + 1) for part in step.excite)
     raise NotCentred(
-        f"{step.name}: on the twin joint {which} cannot be centred: after {BIAS_TRIES} biases it "
-        "still drifts, or its state ceases to exist (end of the linkage, vacuum); "
+        f"{step.name}: on the twin joint {which} cannot be centred: after {DESIGN.bias_tries} "
+        "biases it still drifts, or its state ceases to exist (end of the linkage, vacuum); "
         "lower the amplitude, or allow more drift",
         step,
     )
@@ -197,7 +191,7 @@ def _improve(
     own = moved["piston"][:, j]
     exists = np.isfinite(own) & (moved.get("valid", np.ones(len(own))) > 0.0)
     good = len(own) if exists.all() else int(np.argmin(exists))
-    begin = round(RAMP_SECONDS * rate) if good > 2 * RAMP_SECONDS * rate else 0
+    begin = round(DESIGN.ramp_seconds * rate) if good > 2 * DESIGN.ramp_seconds * rate else 0
     span = slice(max(begin, good - step.period), good)
     seen = follow(commands[span, j], own[span], rate)
     if not seen.gain > 0.0:
@@ -205,7 +199,7 @@ def _improve(
             f"{step.name}: on the twin joint {j + 1} does not follow its command "
             f"({seen.gain:.3g} m/s per volt); are the rig's nominal parameters right?"
         )
-    allowed = DRIFT_LEFT * part.settings.centring.drift
+    allowed = DESIGN.drift_share * part.settings.centring.drift
     off = float(np.mean(own[span])) - part.centre
     steady = good == len(own) and abs(seen.drift) * step.record / rate <= allowed
     biases[j] = seen.null
@@ -218,7 +212,7 @@ def _commands(
 ) -> Array:
     """Return growing commands (samples, joints) [V] that end with the end of a period."""
     commands = np.zeros((samples, joints))
-    ramp = np.minimum(1.0, np.arange(samples) / (RAMP_SECONDS * rate))
+    ramp = np.minimum(1.0, np.arange(samples) / (DESIGN.ramp_seconds * rate))
     for part in step.excite:
         wave = np.roll(np.resize(part.wave.samples, step.period), samples % step.period)
         commands[:, part.joint] = ramp * (np.resize(wave, samples) + biases[part.joint])
@@ -244,7 +238,7 @@ def _joint_lines(
     wave = np.resize(part.wave.samples, len(piston)) + bias
     pull = loop * max(follow(wave, piston, rig.sample_rate).gain, 1e-6)
     looped = under_loop(piston, pull, rig.sample_rate) + part.centre
-    if np.ptp(looped) > WIDER * np.ptp(piston):
+    if np.ptp(looped) > DESIGN.wider * np.ptp(piston):
         low, high = float(looped.min()) - offset, float(looped.max()) + offset
         lines.append(
             MotionPrediction("piston under the loop", name, low, high, *limits.piston, "m")

@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final, Self
 
+from protocols.design.settings import DESIGN
 from rig.model.parse import InputError
 from rig.model.units import LIMITS, display_unit
 
 NOMINAL: Final = "nominal values"
-SIGMAS: Final = 2.0  # standard deviations from a prediction to the edge that is judged
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,8 @@ def widened(central: StepCheck, others: Sequence[StepCheck]) -> StepCheck:
     for line in central.predictions:
         same = [k[name] for k in known if (name := (line.quantity, line.joint)) in k]
         below, above = (
-            SIGMAS * math.sqrt(sum((end(p) - end(line)) ** 2 for p in same) / max(len(same), 1))
+            DESIGN.sigmas
+            * math.sqrt(sum((end(p) - end(line)) ** 2 for p in same) / max(len(same), 1))
             for end in (_low, _high)
         )
         lines.append(

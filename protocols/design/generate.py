@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from protocols.design.candidates import candidates, described
 from protocols.design.check import Twin, centred
 from protocols.design.proof import Proof, Reason, Triangles, Verdicts
-from protocols.design.selection import WORTH, Judge, Sized, complete, extended, smallest
+from protocols.design.selection import Judge, Sized, complete, extended, smallest
+from protocols.design.settings import DESIGN
 from protocols.design.sizing import sized
 from protocols.engine.centring import Array
 from protocols.files.plan import resolve
@@ -118,7 +119,7 @@ def _why(before: Verdicts, after: Verdicts) -> str:
         if not new and verdict.rank > old.rank:
             more = verdict.rank - old.rank
             words.append(f"{more} more combination{'s' if more > 1 else ''} of {family} parameters")
-        elif old.complete and verdict.condition < WORTH * old.condition:
+        elif old.complete and verdict.condition < DESIGN.worth * old.condition:
             words.append(f"{family} condition {old.condition:.3g} to {verdict.condition:.3g}")
     words = [f"determines {' '.join(learned)}"] * bool(learned) + words
     return "; ".join(words) or "more of what is known already"

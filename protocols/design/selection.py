@@ -15,16 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from protocols.design.proof import Triangles, Verdicts
+from protocols.design.settings import DESIGN
 from protocols.engine.centring import Array
 from protocols.steps.excite import Step
 from protocols.steps.parts import CLOSED
 
 Judge = Callable[[Sequence[Triangles]], Verdicts]
-
-WANTED = 30.0  # condition number; the paper's are 10 to 27
-WORTH = 0.9  # a further step must bring it down to this share
-FLOOR = 1e-3  # of a unit column: what shows less does not show
-CLOSED_PRICE = 3.0  # in log det: a closed valve beyond the excited joint must show so much more
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,15 +50,16 @@ def extended(start: Sequence[Sized], pool: Sequence[Sized], judge: Judge) -> lis
                 id(candidate): _score([*chosen, candidate], scales) - before for candidate in rest
             }
             best = max(
-                rest, key=lambda candidate: gain[id(candidate)] - CLOSED_PRICE * _cost(candidate)
+                rest,
+                key=lambda candidate: gain[id(candidate)] - DESIGN.closed_price * _cost(candidate),
             )
             if gain[id(best)] < 1.0:
                 break  # no step shows anything new
         else:
-            if worst(now) <= WANTED:
+            if worst(now) <= DESIGN.condition:
                 break
             best = min(rest, key=lambda candidate: worst(_verdicts([*chosen, candidate], judge)))
-            if worst(_verdicts([*chosen, best], judge)) > WORTH * worst(now):
+            if worst(_verdicts([*chosen, best], judge)) > DESIGN.worth * worst(now):
                 break
         chosen.append(best)
     return chosen
@@ -86,7 +83,7 @@ def _pruned(chosen: Sequence[Sized], judge: Judge) -> list[Sized]:
     """Drop every step without which as much is determined, and as well as wanted."""
     kept = list(chosen)
     now = _verdicts(kept, judge)
-    allowed = max(WANTED, worst(now))
+    allowed = max(DESIGN.condition, worst(now))
     for step in sorted(chosen, key=_cost, reverse=True):
         fewer = [other for other in kept if other is not step]
         verdicts = _verdicts(fewer, judge)
@@ -107,7 +104,7 @@ def _exchanged(chosen: Sequence[Sized], pool: Sequence[Sized], judge: Judge) -> 
             if other not in now
         ]
         best = min(trials, key=lambda steps: _badness(steps, judge), default=now)
-        if not _badness(best, judge) < _badness(now, judge) + np.log(WORTH):
+        if not _badness(best, judge) < _badness(now, judge) + np.log(DESIGN.worth):
             break
         now = best
     return now
@@ -118,7 +115,9 @@ def _badness(steps: Sequence[Sized], judge: Judge) -> float:
     verdicts = _verdicts(steps, judge)
     if not complete(verdicts):
         return float("inf")
-    return float(np.log(worst(verdicts)) - np.log(WORTH) * sum(_cost(step) for step in steps))
+    return float(
+        np.log(worst(verdicts)) - np.log(DESIGN.worth) * sum(_cost(step) for step in steps)
+    )
 
 
 def _cost(step: Sized) -> int:
@@ -146,5 +145,5 @@ def _score(steps: Sequence[Sized], scales: Mapping[str, Array]) -> float:
         sigma = np.zeros(len(scale))
         singular = np.linalg.svd(rows, compute_uv=False)
         sigma[: len(singular)] = singular
-        total += float(np.sum(np.log(sigma**2 + FLOOR**2)))
+        total += float(np.sum(np.log(sigma**2 + DESIGN.visible**2)))
     return total

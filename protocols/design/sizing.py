@@ -5,9 +5,10 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 
-from protocols.design.candidates import AMPLITUDE, described, played
+from protocols.design.candidates import described, played
 from protocols.design.check import Twin, centred, judge_motion
 from protocols.design.check_report import MotionPrediction
+from protocols.design.settings import DESIGN
 from protocols.engine.centring import Array
 from protocols.files.plan import resolve
 from protocols.files.schema import Protocol
@@ -18,9 +19,6 @@ from rig.model.rig import Rig
 
 log = logging.getLogger(__name__)
 
-SMALLER, SIZES = 0.85, 12  # the amplitude is lowered so, at most so often
-TILTS = (0.4, 0.8, 1.2)
-MODEST = 0.25  # [V] rms below which a steeper multisine is tried
 # Share of a limit's range kept for what the bench does otherwise than the twin.
 SPARE = {"pump flow": 0.03, "cap_pressure (cavitation, supply)": 0.1,
          "rod_pressure (cavitation, supply)": 0.1, "piston": 0.05}  # fmt: skip
@@ -51,16 +49,16 @@ def sized(step: Step, seed: int, rig: Rig, twin: Twin) -> tuple[Step, Mapping[st
     next, and the largest is taken.
     """
     by_amplitude: dict[float, tuple[Step, Mapping[str, Array]]] = {}
-    for tilt in TILTS:
-        for size in range(SIZES):
-            tried = played(step, AMPLITUDE * SMALLER**size, tilt, seed)
+    for tilt in DESIGN.tilts:
+        for size in range(DESIGN.sizes):
+            tried = played(step, DESIGN.amplitude * DESIGN.smaller**size, tilt, seed)
             moved = motion_within(tried, rig, twin)
             if moved is not None:
                 signal = tried.excite[0].signal
                 assert isinstance(signal, Multisine)  # as `played` makes them
                 by_amplitude.setdefault(signal.amplitude, (tried, moved))
                 break
-        if by_amplitude and max(by_amplitude) >= MODEST:
+        if by_amplitude and max(by_amplitude) >= DESIGN.modest:
             break
     if not by_amplitude:
         log.info("left out: %s", described(step))

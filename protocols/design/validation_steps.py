@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from protocols.design.candidates import CENTRING, CLOSED_TOLERANCE
+from protocols.design.candidates import CENTRING
 from protocols.design.check import Twin
-from protocols.design.sizing import SIZES, SMALLER, SPARE, motion_within
+from protocols.design.settings import DESIGN
+from protocols.design.sizing import SPARE, motion_within
 from protocols.files.schema import Protocol
 from protocols.signals.sine import Sine
 from protocols.steps.excite import Step
@@ -12,8 +13,6 @@ from protocols.steps.parts import CLOSED, Excite, Lock
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 
-FREQUENCIES = (1.0, 3.0)  # [Hz] the paper's
-ALONE, TOGETHER = 1.0, 0.7  # [V] peak, to begin with; every step is sized on the twin
 # A slow sine swings as wide as the gain says, and a bench's gain is some percent off the twin's.
 ROOM = {**SPARE, "piston": 0.1}
 
@@ -25,7 +24,7 @@ def validation(rig: Rig, twin: Twin, name: str) -> Protocol:
     """
     N = len(rig.joints)
     steps = []
-    for frequency in FREQUENCIES:
+    for frequency in DESIGN.sine_frequencies:
         for joint in range(N, 0, -1):
             steps.append(_sized(f"joint{joint}_{frequency:g}hz", (joint,), frequency, rig, twin))
         if N > 1:
@@ -40,8 +39,9 @@ def validation(rig: Rig, twin: Twin, name: str) -> Protocol:
 
 
 def _sized(name: str, moving: tuple[int, ...], frequency: float, rig: Rig, twin: Twin) -> Step:
-    for size in range(SIZES):
-        amplitude = (ALONE if len(moving) == 1 else TOGETHER) * SMALLER**size
+    for size in range(DESIGN.sizes):
+        first = DESIGN.sine_alone if len(moving) == 1 else DESIGN.sine_together
+        amplitude = first * DESIGN.smaller**size
         step = _step(name, moving, frequency, float(f"{amplitude:.3g}"), len(rig.joints))
         if motion_within(step, rig, twin, ROOM) is not None:
             return step
@@ -56,7 +56,7 @@ def _step(name: str, moving: tuple[int, ...], hertz: float, volts: float, joints
     return Step(
         name=name,
         lock=tuple(
-            Lock(joint=joint, at=CLOSED, piston=0.0, tolerance=CLOSED_TOLERANCE)
+            Lock(joint=joint, at=CLOSED, piston=0.0, tolerance=DESIGN.closed_tolerance)
             for joint in range(1, joints + 1)
             if joint not in moving
         ),

@@ -11,8 +11,9 @@ import pytest
 
 import drivers.message_link
 from drivers.base import OFF, DeviceError, OutputLaw
-from drivers.can_stream import MOST_LOAD, CanStreamDriver
+from drivers.can_stream import CanStreamDriver
 from drivers.message_stream import MessageStreamDriver
+from drivers.settings import DRIVER
 from hil_sim.device.can.server import layout_of
 from hil_sim.device.can.session import CanSession
 from hil_sim.device.device import Device
@@ -39,7 +40,7 @@ def test_every_signal_stands_on_the_page_with_its_message() -> None:
         for signal in message.signals.values():
             if signal.name not in layout.columns:
                 assert f"`{signal.name}` {signal.bits}" in table[message.name]
-    assert f"more than {100 * MOST_LOAD:.0f} % of the bus" in PAGE
+    assert f"more than {100 * DRIVER.bus_load:.0f} % of the bus" in PAGE
     assert names.SESSION_BITS == 15
 
 

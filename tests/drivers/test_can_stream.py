@@ -382,7 +382,7 @@ def test_a_full_transmit_queue_is_waited_for_but_not_for_ever(
     port.send(CanFrame(1, b"\0"))
     assert full.sent == 1
     full.left = 10**9
-    monkeypatch.setattr("drivers.can_port._SEND_SECONDS", 0.05)
+    monkeypatch.setattr("drivers.DRIVER.can_send", 0.05)
     with pytest.raises(DeviceLost, match=r"no other node acknowledges.*500000 bit/s"):
         port.send(CanFrame(1, b"\0"))
     assert not port.is_open

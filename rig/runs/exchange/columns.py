@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.model.parse import InputError
+from rig.runs.exchange.settings import EXCHANGE
 from rig.runs.files import read_text
 
 Array = NDArray[np.float64]
 
-MAX_FILE = 4 << 30
 _DELIMITERS = (",", ";", "\t")
 
 
@@ -51,7 +51,7 @@ def _missing(path: Path, name: str, has: Iterable[str]) -> InputError:
 
 
 def _read_csv(path: Path, wanted: list[str], needed: list[str]) -> dict[str, Array]:
-    text = read_text(path, "a CSV file with a header row", limit=MAX_FILE)
+    text = read_text(path, "a CSV file with a header row", limit=EXCHANGE.file_bytes)
     lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
     head = next((i for i, line in enumerate(lines) if line.strip()), None)
     if head is None:

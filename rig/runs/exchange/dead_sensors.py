@@ -14,15 +14,11 @@ from numpy.typing import NDArray
 
 from rig.model import channels as ch
 from rig.model.rig import Rig
+from rig.runs.exchange.settings import EXCHANGE
 
 Array = NDArray[np.float64]
 
 _DRIVEN = (ch.SPOOL, ch.DRIVE)  # what a waveform or its limit may hold at one value
-_LEVELS = 500  # of resolution within the range; a coarser channel has flat tops anyway
-_NEAR = 0.02  # of the channel's range, counted from its extreme
-_SHARE = 0.5  # of the samples near an extreme that have its exact value: a parabola has a third
-_LEAST = 10  # samples at one value before it is spoken of
-_END = 1e-3  # of a sensor's range, from its end
 
 
 def silent_sensors(rig: Rig, locked: tuple[int, ...], channels: Mapping[str, Array]) -> list[str]:
@@ -48,7 +44,7 @@ def silent_sensors(rig: Rig, locked: tuple[int, ...], channels: Mapping[str, Arr
 
 def _beyond(rig: Rig, kind: str, name: str, low: float, high: float) -> list[str]:
     ends = rig.sensors.of(kind).range
-    margin = _END * (ends[1] - ends[0])
+    margin = EXCHANGE.end * (ends[1] - ends[0])
     if low > ends[0] + margin and high < ends[1] - margin:
         return []
     return [
@@ -60,13 +56,13 @@ def _beyond(rig: Rig, kind: str, name: str, low: float, high: float) -> list[str
 def _flat(name: str, values: Array, unit: str) -> list[str]:
     span = float(np.ptp(values))
     resolution = float(np.diff(np.unique(values)).min())
-    if resolution > span / _LEVELS:
+    if resolution > span / EXCHANGE.levels:
         return []
     flat = []
     for end, distance in (("top", values.max() - values), ("bottom", values - values.min())):
         at = int(np.count_nonzero(distance < 0.5 * resolution))
-        near = int(np.count_nonzero(distance <= _NEAR * span))
-        if at >= _LEAST and at > _SHARE * near:
+        near = int(np.count_nonzero(distance <= EXCHANGE.near * span))
+        if at >= EXCHANGE.least and at > EXCHANGE.share * near:
             level = values.max() if end == "top" else values.min()
             flat.append(
                 f"{name}: {at} of {len(values)} samples are exactly {level:g} {unit}, its {end}; "

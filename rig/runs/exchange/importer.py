@@ -26,14 +26,12 @@ from rig.runs.exchange.manifest import (
     check_against_rig,
     load_manifest,
 )
+from rig.runs.exchange.settings import EXCHANGE
 from rig.runs.rigs import load_rig
 from rig.runs.runstate import DONE, EventLog, release_ownership, write_state
 
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
-
-_WHOLE = 1e-6  # of a sample: a delay so near to whole samples is one
-_UNEVEN = 0.1  # of the mean step: what rounded time stamps may differ from it
 
 
 @dataclass(frozen=True)
@@ -120,7 +118,7 @@ def _common(
 ) -> tuple[int, int]:  # fmt: skip
     """Return the samples [first, last) that every column has once its delay [samples] is out."""
     least, most = min((0.0, *delays.values())), max((0.0, *delays.values()))
-    first, last = math.ceil(-least - _WHOLE), samples - math.ceil(most - _WHOLE)
+    first, last = math.ceil(-least - EXCHANGE.whole), samples - math.ceil(most - EXCHANGE.whole)
     if last - first < 2:
         name = max(delays, key=lambda n: abs(delays[n]))
         raise InputError(
@@ -134,7 +132,7 @@ def _advanced(values: Array, delay: float, first: int, last: int) -> Array:
     """Return a column (n,) without its delay [samples]; what lies outside [first, last) is 0."""
     whole = round(delay)
     out = np.zeros_like(values)
-    if abs(delay - whole) < _WHOLE:
+    if abs(delay - whole) < EXCHANGE.whole:
         out[first:last] = values[first + whole : last + whole]
         return out
     from scipy.interpolate import make_interp_spline  # noqa: PLC0415 - loads slowly
@@ -201,7 +199,7 @@ def _time_base(source: _Source, file: Path, time: Array | None) -> tuple[float, 
             f"{time[row - 1]:.9g} to {time[row]:.9g} s; expected it to increase"
         )
     step = float(np.median(steps))
-    uneven = np.flatnonzero(np.abs(steps - step) > _UNEVEN * step)
+    uneven = np.flatnonzero(np.abs(steps - step) > EXCHANGE.uneven * step)
     if len(uneven):
         row = int(uneven[0]) + 1
         raise InputError(

@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from rig.model.parse import InputError
 from rig.runs import store
 from rig.runs.archive_reader import open_archive, readable
+from rig.runs.exchange.settings import EXCHANGE
 from rig.runs.runstate import BETWEEN, read_events
 
 log = logging.getLogger(__name__)
 
 NAME: Final = "trip.csv"
-SECONDS: Final = 2.0  # before the offending sample, and after it
 
 
 def write_trip_window(folder: Path) -> Path | None:
@@ -58,7 +58,7 @@ def _around(file: h5py.File, tick: int) -> tuple[list[str], NDArray[np.float64]]
     parts = []
     for group in groups:
         start, rate = int(group.attrs["start_tick"]), float(group.attrs["sample_rate"])
-        reach = round(SECONDS * rate)
+        reach = round(EXCHANGE.trip_seconds * rate)
         ticks = np.arange(start, start + int(group.attrs["ticks"]))
         near = np.flatnonzero((ticks >= tick - reach) & (ticks <= tick + reach))
         if len(near) == 0:

@@ -1,0 +1,51 @@
+"""Thresholds by which protocols are generated, sized and proved on the twin.
+
+Set on the shipped rigs, whose generated protocols are run and identified in tests/protocols and
+tests/cli; *paper* is the method of docs/method.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+
+@dataclass(frozen=True)
+class DesignSettings:
+    """Numbers without unit are shares or counts."""
+
+    # Candidates.
+    all_poses: int = 3  # joints beyond the excited one, up to which every combination is tried
+    displaced: int = 2  # of more joints than that, at most so many stand at an end
+    end_tolerance: float = 2e-3  # [m] of a joint locked at its end
+    closed_tolerance: float = 5e-3  # [m]: a closed valve is a spring of oil
+    amplitude: float = 0.4  # [V] rms to begin with; every step is sized on the twin
+    repeats: int = 4  # of each record
+
+    # Sizing.
+    smaller: float = 0.85  # by which the amplitude is lowered
+    sizes: int = 12  # amplitudes that are tried
+    tilts: tuple[float, ...] = (0.4, 0.8, 1.2)  # exponents of amplitudes f^-tilt
+    modest: float = 0.25  # [V] rms below which a steeper multisine is tried
+
+    sine_frequencies: tuple[float, ...] = (1.0, 3.0)  # [Hz] of the validation steps (paper)
+    sine_alone: float = 1.0  # [V] peak of one moving joint, to begin with
+    sine_together: float = 0.7  # [V] peak of several
+
+    # Selection.
+    condition: float = 30.0  # condition number that is enough; those of the paper are 10 to 27
+    worth: float = 0.9  # of the condition number: a further step must bring it down to this
+    visible: float = 1e-3  # of a unit column: what shows less does not show
+    closed_price: float = 3.0  # in log det: a closed valve beyond the joint must show so much more
+
+    # Proof on the twin.
+    bias_tries: int = 6  # biases that are tried to centre a piston
+    seek_seconds: float = 3.0  # [s] simulated behind each bias but the last
+    ramp_seconds: float = 1.0  # [s] in which the waveform grows
+    settle_seconds: float = 2.0  # [s] simulated before the period that is judged
+    drift_share: float = 0.2  # of the drift that the protocol allows
+    wider: float = 1.05  # swing under the centring loop over the free one, from which it is said
+    sigmas: float = 2.0  # standard deviations from a prediction to the edge that is judged
+
+
+DESIGN: Final = DesignSettings()
