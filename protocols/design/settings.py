@@ -11,7 +11,7 @@ from typing import Final
 
 
 @dataclass(frozen=True)
-class DesignSettings:
+class ProtocolDesignSettings:
     """Numbers without unit are shares or counts."""
 
     # Candidates.
@@ -48,4 +48,4 @@ class DesignSettings:
     sigmas: float = 2.0  # standard deviations from a prediction to the edge that is judged
 
 
-DESIGN: Final = DesignSettings()
+DESIGN: Final = ProtocolDesignSettings()

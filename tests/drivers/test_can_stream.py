@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -21,6 +22,7 @@ from drivers.base import OFF, DeviceBusy, DeviceError, DeviceLost, OutputLaw
 from drivers.can_port import BusPlace, CanPort
 from drivers.can_stream import CanSettings, CanStreamDriver
 from drivers.registry import make_driver, wire_at
+from drivers.settings import DRIVER
 from hil_sim.device.can.adapters import SocketcandServer
 from hil_sim.device.can.server import layout_of, run_device
 from hil_sim.device.device import Device
@@ -382,7 +384,7 @@ def test_a_full_transmit_queue_is_waited_for_but_not_for_ever(
     port.send(CanFrame(1, b"\0"))
     assert full.sent == 1
     full.left = 10**9
-    monkeypatch.setattr("drivers.DRIVER.can_send", 0.05)
+    monkeypatch.setattr("drivers.can_port.DRIVER", replace(DRIVER, can_send=0.05))
     with pytest.raises(DeviceLost, match=r"no other node acknowledges.*500000 bit/s"):
         port.send(CanFrame(1, b"\0"))
     assert not port.is_open

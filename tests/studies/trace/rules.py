@@ -59,7 +59,7 @@ def switched_off(rule: Rule) -> Iterator[None]:
 
 def _put(subject: Any, name: str, value: Any) -> None:
     """Set an attribute, that of the frozen settings too."""
-    if is_dataclass(subject):
+    if is_dataclass(subject) and not isinstance(subject, type):
         object.__setattr__(subject, name, value)
     else:
         setattr(subject, name, value)
