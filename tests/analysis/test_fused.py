@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -29,6 +30,7 @@ from analysis.terms.base import Coefficient, Kernel, Term, Used, kernel
 from analysis.terms.specialise import NotSpecialisable
 from rig.model.rig import Rig
 from rig.runs.rigs import load_rig
+from tests.variants import kept
 
 RIGS = ("boom-1dof", "shinshu-2dof", "digger-3dof", "electric-2dof")
 PLACES = ("bench", "joint 2", "joint 2 cap", "joint 2 piston")
@@ -309,8 +311,13 @@ def test_the_first_use_says_that_it_compiles_and_the_second_does_not(
     np.testing.assert_array_equal(q, same)
 
 
-@pytest.mark.parametrize("victim", ["*.nbc", "*.nbi", "rates.py", "checksums.json"])
-@pytest.mark.parametrize("damage", ["cut", "changed", "gone"])
+@pytest.mark.parametrize(
+    ("damage", "victim"),
+    kept(
+        product(("cut", "changed", "gone"), ("*.nbc", "*.nbi", "rates.py", "checksums.json")),
+        (0, 5, 10, 3),
+    ),
+)
 def test_a_damaged_cache_is_made_again_and_the_numbers_stay(
     cache: Path, caplog: pytest.LogCaptureFixture, victim: str, damage: str
 ) -> None:

@@ -23,6 +23,7 @@ from tests.cli.bench import bramah, words
 from tests.drivers.plain_module import WIRE, module_process
 from tests.drivers.test_modbus_map import rig_text
 from tests.hil_sim.integrator import IntegratorPlant
+from tests.variants import kept
 
 RIG = "shinshu-2dof"
 INPUT, LOST = 2, 4
@@ -111,7 +112,9 @@ def test_a_wrong_baud_rate_is_suspected_where_nothing_that_comes_is_a_frame(wire
     assert " 0 bytes" not in line
 
 
-@pytest.mark.parametrize("endpoint", ["serial://{}", "modbus-rtu://{}", "can://slcan{}"])
+@pytest.mark.parametrize(
+    "endpoint", kept(["serial://{}", "modbus-rtu://{}", "can://slcan{}"], (0,))
+)
 def test_a_port_that_this_user_may_not_open_says_which_group_to_join(endpoint: str) -> None:
     with strange_peers.other_baud_rate() as port:
         Path(port).chmod(0)
@@ -152,7 +155,7 @@ def test_a_wrong_word_order_is_suspected_by_probe(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (("unit: 7", "unit: 8"), ("unit 8", "check `unit`")),
+        pytest.param(("unit: 7", "unit: 8"), ("unit 8", "check `unit`"), marks=pytest.mark.slow),
         (("address: 18", "address: 19"), ("registers 19 to 19 (oil_temperature)", "manual")),
         (("function: 4, address: 18", "function: 3, address: 18"), ("oil_temperature",)),
     ],
@@ -186,10 +189,10 @@ def _newer_messages(patch: pytest.MonkeyPatch) -> None:
     ("wire", "speak"),
     [
         (TCP, _newer_identity),
-        (RTU, _newer_identity),
+        pytest.param(RTU, _newer_identity, marks=pytest.mark.slow),
         (SERIAL, _newer_identity),
         (CAN, _newer_identity),
-        (SERIAL, _newer_messages),
+        pytest.param(SERIAL, _newer_messages, marks=pytest.mark.slow),
         (CAN, _newer_messages),
     ],
 )

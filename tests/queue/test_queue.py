@@ -17,6 +17,7 @@ from rig.queue.processes import reason_in
 from rig.queue.store import QueueStore
 from rig.runs.store import load_run
 from tests.queue.nights import LONG, Night, reset, until
+from tests.variants import kept
 
 
 @pytest.fixture
@@ -235,13 +236,16 @@ def test_one_runner_at_a_time_and_a_dead_one_holds_nothing(night: Night) -> None
 
 @pytest.mark.parametrize(
     ("command", "logged"),
-    [
-        (("sh", "-c", "cat >> {}"), ""),
-        (("sleep", "600"), "took longer"),
-        (("false",), "ended with 1"),
-        (("/no/such/program",), "was not delivered"),
-        (("sh", "-c", "exec <&-; exit 3"), "ended with 3"),
-    ],
+    kept(
+        [
+            (("sh", "-c", "cat >> {}"), ""),
+            (("sleep", "600"), "took longer"),
+            (("false",), "ended with 1"),
+            (("/no/such/program",), "was not delivered"),
+            (("sh", "-c", "exec <&-; exit 3"), "ended with 3"),
+        ],
+        (0, 1),
+    ),
 )
 def test_a_notification_is_delivered_or_costs_the_night_nothing(
     night: Night, caplog: pytest.LogCaptureFixture, command: tuple[str, ...], logged: str

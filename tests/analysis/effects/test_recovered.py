@@ -22,6 +22,7 @@ from rig.model.rig import Rig
 from tests.analysis.effects import one_joint as bench
 from tests.analysis.effects.fitting import Data, fitted, model_of, residual
 from tests.analysis.small_bench import TRUTH
+from tests.variants import every_second
 
 TRAIN, HELD_OUT = (0.03, 1), (0.022, 2)
 
@@ -106,7 +107,7 @@ def floor(rig: Rig) -> dict[str, float]:
     return residual(held_out.rows([]), train.solved([]).values)
 
 
-@pytest.mark.parametrize("case", CASES, ids=IDS)
+@pytest.mark.parametrize("case", every_second(CASES), ids=IDS)
 def test_size_and_shape_come_back_and_nothing_is_left(
     rig: Rig, floor: dict[str, float], case: Case
 ) -> None:
@@ -129,7 +130,7 @@ def test_size_and_shape_come_back_and_nothing_is_left(
 PLANT = [case for case in CASES if not case.name.startswith(("sensor", "channel"))]
 
 
-@pytest.mark.parametrize("case", PLANT, ids=[f"{c.name} {c.where}" for c in PLANT])
+@pytest.mark.parametrize("case", every_second(PLANT), ids=[f"{c.name} {c.where}" for c in PLANT])
 def test_the_model_with_the_effect_follows_the_bench_freely(rig: Rig, case: Case) -> None:
     effect = make(case.name, case.where)
     assert isinstance(effect, Effect)

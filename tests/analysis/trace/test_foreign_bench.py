@@ -79,6 +79,7 @@ def test_a_joint_that_sticks_has_dry_friction_of_one_level_and_no_breakaway(rig:
     assert result.effects[0].parameters["Fc2"].value == pytest.approx(80.0, rel=0.03)
 
 
+@pytest.mark.slow
 def test_breakaway_above_the_sliding_level_is_still_stribeck_friction(rig: Rig) -> None:
     result = traced(rig, Hidden(30.0, 30.0, breakaway=60.0))
     assert result.verdict == "explained"
@@ -90,7 +91,7 @@ def test_breakaway_above_the_sliding_level_is_still_stribeck_friction(rig: Rig) 
     [
         (2.0, {"repeats": 4}),
         pytest.param(2.0, {"repeats": 1}, marks=pytest.mark.slow),
-        (0.7, {"noise": 1 / 3}),
+        pytest.param(0.7, {"noise": 1 / 3}, marks=pytest.mark.slow),
         pytest.param(0.7, {"noise": 1.0}, marks=pytest.mark.slow),
         pytest.param(0.7, {"noise": 3.0}, marks=pytest.mark.slow),
         pytest.param(0.7, {"seconds": 5.0}, marks=pytest.mark.slow),

@@ -139,6 +139,7 @@ def test_friction_and_a_dead_band_at_once_are_both_named(rig: Rig) -> None:
     assert sizes["w_ahead_2"] == pytest.approx(8e-3, rel=0.05)
 
 
+@pytest.mark.slow
 def test_what_only_the_held_out_records_show_is_not_called_clean(rig: Rig) -> None:
     """At a third of the size the supply's line drops a tenth: too little to be seen in training."""
     train = experiment(rig, rms=0.012, dp_supply=4e5)
