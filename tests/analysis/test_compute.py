@@ -186,6 +186,7 @@ def test_the_command_line_works_on_a_cluster(
     assert "C_mm_2" in done.stdout
 
 
+@pytest.mark.slow
 def test_runs_that_only_the_workers_see_are_identified_from_elsewhere(
     scheduler: str, tmp_path: Path, multisine_run: Run
 ) -> None:

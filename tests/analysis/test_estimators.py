@@ -145,6 +145,7 @@ def test_spikes_in_one_record_are_set_aside_by_the_robust_loss(multisine_run: Ru
     assert "'step2_r2'" in said.detail
 
 
+@pytest.mark.slow
 def test_output_error_converges_from_a_start_five_percent_off(multisine_run: Run) -> None:
     # One repeat: what instruments cannot do.
     one = replace(multisine_run, records=tuple(r for r in multisine_run.records if r.repeat == 1))

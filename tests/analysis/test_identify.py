@@ -81,6 +81,7 @@ def test_the_papers_own_filter_is_offered_and_its_bias_is_real(sine_run: Run) ->
     assert "mostly sensor noise" in careful.estimates["M1"].note
 
 
+@pytest.mark.slow
 def test_new_noise_of_the_same_bench_moves_estimates_within_their_intervals(rig: Rig) -> None:
     excitations = bench.default_excitations(4, 0.025)
     first = bench.experiment(rig, excitations, repeats=1, seed=10, scale=0.0)

@@ -155,6 +155,7 @@ def test_an_abort_from_the_screen_is_a_stop_that_keeps_the_records(tmp_path: Pat
     assert [state for state, _ in states(read_events(run))][-1] is EngineState.SAFE
 
 
+@pytest.mark.slow
 def test_a_question_that_nobody_answers_ends_an_unattended_run(tmp_path: Path) -> None:
     sheet = "name: quiz\njoints: 2\nsteps:\n  - prompt: Is it warm?\n    timeout: 20 s\n"
     (tmp_path / "quiz.yaml").write_text(sheet)
@@ -236,6 +237,7 @@ def test_a_budget_of_retries_that_is_used_up_ends_the_run_by_name(tmp_path: Path
     assert load_run(run).records
 
 
+@pytest.mark.slow
 def test_a_device_that_tripped_itself_is_not_taken_up_again(tmp_path: Path) -> None:
     """A cable pulled out trips the device: only a person clears that, whatever the file says."""
     sheet = tmp_path / "again.yaml"

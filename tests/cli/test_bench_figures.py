@@ -15,6 +15,7 @@ from rig.cli.bench.timing import spent_together
 from rig.runs.rigs import load_rig
 
 
+@pytest.mark.slow
 def test_a_free_run_and_its_anchors_solve_the_same_equations_to_the_same_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -150,6 +150,7 @@ def test_one_clock_runs_through_the_whole_evening(evening: Path) -> None:
     assert proof["report"]["ok"]
 
 
+@pytest.mark.slow
 def test_a_trip_follows_the_sheets_rule_and_keeps_what_was_measured(tmp_path: Path) -> None:
     hose = tmp_path / "hose.yaml"
     hose.write_text("faults: [{name: broken_wire, channel: cap_pressure_2, end: high, at: 33 s}]\n")

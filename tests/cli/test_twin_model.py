@@ -94,6 +94,7 @@ def test_a_protocol_that_nominal_values_pass_is_refused_once_the_machine_is_iden
     assert f"model {model}" in shown["reason"]
 
 
+@pytest.mark.slow
 def test_a_run_keeps_which_model_it_was_proved_on(tmp_path: Path, rig: Rig) -> None:
     known = identified(rig, 1.0)
     save_identified(known, tmp_path / "model.json", str)

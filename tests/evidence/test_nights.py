@@ -21,6 +21,7 @@ def test_runs_killed_on_a_real_wire_lose_nothing_and_leave_the_outputs_at_zero(
     assert sum(kill.acknowledged for kill in found) > 0
 
 
+@pytest.mark.slow
 def test_a_queue_with_faults_and_killed_runners_forgets_nothing(tmp_path: Path) -> None:
     found = faulty_queue(tmp_path / "queue", 8, 2, 4)
     assert found.wrong == ()

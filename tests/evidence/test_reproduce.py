@@ -114,6 +114,7 @@ def test_the_page_sets_every_number_beside_the_papers(done: Reproduction) -> Non
     assert sum(counts) == sum(search["lost"].values()) > 0
 
 
+@pytest.mark.slow
 def test_page_figures_and_json_can_be_read_by_other_programs(
     done: Reproduction, tmp_path: Path
 ) -> None:

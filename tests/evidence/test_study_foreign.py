@@ -17,6 +17,7 @@ from tests.studies.foreign.study import Job, Outcome, answer_of, bounds, weakene
 LEAK = ("internal_leakage", "joint 1")
 
 
+@pytest.mark.slow
 def test_without_anything_wrong_it_moves_as_another_integrator_says() -> None:
     """The same machine, typed in elsewhere and integrated by LSODA."""
     rig = small_bench.shinshu()

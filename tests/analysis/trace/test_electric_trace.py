@@ -106,6 +106,7 @@ def test_an_electric_joint_has_no_lever_to_tell_asymmetry_from_an_offset() -> No
     assert "base_inclination" not in arm  # that rig's inclination is a parameter already
 
 
+@pytest.mark.slow
 def test_the_same_command_writes_result_model_and_report(
     two_hidden: tuple[Run, Run], tmp_path: Path
 ) -> None:

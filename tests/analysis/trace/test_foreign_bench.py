@@ -113,6 +113,7 @@ def test_what_vetoes_no_leak_is_clean_without_one(rig: Rig) -> None:
     assert traced(rig, Hidden(2.0, 2.0)).verdict == "clean"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("ahead", "astern"),
     [

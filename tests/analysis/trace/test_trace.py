@@ -102,6 +102,7 @@ def test_the_extended_model_lacks_nothing_any_more(rig: Rig, leaking: Trace) -> 
     assert result.model_before.values["c_internal_2"] == pytest.approx(2e-12, rel=0.03, abs=0)
 
 
+@pytest.mark.slow
 def test_beside_a_known_dead_band_friction_alone_is_new(rig: Rig) -> None:
     train, held_out = pair_of_runs(rig, Fc=60, w_ahead=8e-3, w_astern=8e-3)
     band = Used(make("valve_deadband", "joint 2"), (8e-3, 8e-3, 0.0))
