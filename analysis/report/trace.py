@@ -107,7 +107,7 @@ def _pictures(rig: Rig, holdout: Sequence[Run], result: Trace) -> list[dict[str,
         d for d in result.depends_on
         if d.variable != FREQUENCY
         and (result.verdict != CONFOUNDED
-             or result.after[d.equation] > TRACE.noted * result.noise_floor[d.equation])
+             or result.after[d.equation] > TRACE.noted_ratio * result.noise_floor[d.equation])
     ][:2]  # fmt: skip
     for k, clue in enumerate(drawn):
         heading = f"what is left of {clue.equation} against {clue.variable}"

@@ -268,7 +268,7 @@ def _missed_held(verdict: str, error: held_out.Errors, failures: Sequence[str]) 
         return []
     out = []
     for e, noise in error.noise.items():
-        if error.after[e] > TRACE.noted * noise and not any(
+        if error.after[e] > TRACE.noted_ratio * noise and not any(
             n.startswith(f"{e}:") for n in failures
         ):
             share = (error.after[e] ** 2 - noise**2) / max(error.before[e] ** 2 - noise**2, 1e-30)

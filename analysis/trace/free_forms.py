@@ -69,7 +69,7 @@ def _with_more(wide: HypothesisSet, hypothesis: Hypothesis) -> Hypothesis:
     """Return the set with one more effect where equations keep too much, else the set."""
     loud = {e for e, v in hypothesis.excess_energy.items() if not wide.negligible(e, v)}
     return (
-        wide.closer(hypothesis, loud) if len(hypothesis.effects) < SEARCH.deepest else None
+        wide.closer(hypothesis, loud) if len(hypothesis.effects) < SEARCH.largest_set else None
     ) or hypothesis
 
 

@@ -54,10 +54,14 @@ def left_over(
     for equation in asked:
         expression = formula(now, winner.fit.residual, later, held, equation)
         # A constant is no law of another cause: it is what a form has too little or too much.
-        if expression is not None and expression.share >= TRACE.formula and expression.variables:
+        if (
+            expression is not None
+            and expression.share >= TRACE.formula_share
+            and expression.variables
+        ):
             words = f"{100 * seen[equation]:.2g} % of what repeated stays, and a formula holds it"
             loud = winner.excess_energy[equation] > hypotheses.limits.band[equation]
-            veto = loud and seen[equation] < TRACE.acted
+            veto = loud and seen[equation] < TRACE.unexplained_share
             out.append(Rest(equation, f"{words}: {expression.text}", veto))
     return [*out, *_missed(hypotheses, winner, out)]
 
@@ -86,7 +90,8 @@ def _seen(hypotheses: HypothesisSet, winner: Hypothesis) -> dict[str, float]:
     return {
         e: share
         for e, share in shares.items()
-        if share > TRACE.share and winner.excess_energy[e] > TRACE.seen * np.sqrt(2 * rows[e])
+        if share > TRACE.formula_least_energy
+        and winner.excess_energy[e] > TRACE.visible_deviations * np.sqrt(2 * rows[e])
     }
 
 
@@ -101,7 +106,7 @@ def clues_to(
     now, later = rebased(train_data, winner.fit), rebased(holdout_data, winner.fit)
     loud = [e for e, v in sorted(winner.excess_energy.items(), key=lambda kv: -kv[1]) if v > 0]
     total = sum(winner.excess_energy[e] for e in loud)
-    loud = [e for e in loud if winner.excess_energy[e] > TRACE.clue * total]
+    loud = [e for e in loud if winner.excess_energy[e] > TRACE.clue_share * total]
     moves = dependence.dependence(now, residual, later, held, loud)
     hum = frequency_clue(split, train_data, residual, holdout_data, held)
     candidates = [formula(now, residual, later, held, e) for e in loud]

@@ -16,85 +16,85 @@ class TraceSettings:
     """Judging of the effects found; numbers without unit are shares or ratios."""
 
     # Gates of an effect.
-    removed: float = 0.5
+    least_removed: float = 0.5
     """Of the held-out energy above noise in the equations it touches: a cause takes most."""
-    chosen: float = 0.9
+    least_chosen: float = 0.9
     """Of half-samples of the repeats in which an effect is chosen (convention)."""
-    rival: float = 0.5
+    rival_share: float = 0.5
     """Of the half-samples that choose otherwise: what they choose is a rival (tuned)."""
     p_limit: float = 0.01
     """Family-wise p over all candidates and shapes (convention)."""
-    tie: float = 1.10
+    tie_ratio: float = 1.10
     """Held-out rms of a rival over the best's, below which nothing tells them apart (tuned); of an
     effect that takes less than the noise, the same share of what it takes."""
-    tie_training: float = 1.25
+    tie_ratio_training: float = 1.25
     """The same on training records; a rival that fits these worse has another size (tuned)."""
-    ahead: float = 0.95
+    clear_lead: float = 0.95
     """Held-out rms of a rival over the best's: with less, training records do not count (tuned)."""
-    harm: float = 1.2
+    harm_ratio: float = 1.2
     """Energy above noise in an equation over that before: a cause makes none worse (tuned)."""
     # What may stay.
-    missed: float = 0.05
+    form_share: float = 0.05
     """Of an equation's energy before: what a named form may miss of the real one (tuned: seals of
     LuGre's and Karnopp's law, turbulent leaks)."""
-    missed_held: float = 0.10
+    form_share_held_out: float = 0.10
     """The same on held-out records, which may be quieter (tuned)."""
-    held_band: float = 1.5
+    held_out_band: float = 1.5
     """Held-out rms over the noise floor, by equation (tuned on clean benches: none is above)."""
-    noted: float = 1.3
+    noted_ratio: float = 1.3
     """The same, from which an explanation says what stays (contract)."""
-    seen: float = 8.0
+    visible_deviations: float = 8.0
     """Standard deviations of the noise's own energy from which a rest is asked for a formula."""
-    share: float = 0.005
+    formula_least_energy: float = 0.005
     """Of an equation's energy before: less is not asked for a formula (tuned)."""
-    formula: float = 0.7
+    formula_share: float = 0.7
     """Of the rest: from here on a formula holds it (tuned on hardening springs)."""
-    acted: float = 0.5
+    unexplained_share: float = 0.5
     """Of an equation's energy before: where more is left no effect acts (tuned)."""
-    clue: float = 0.1
+    clue_share: float = 0.1
     """Of all that is left: an equation with less asks for no clue (tuned)."""
     # Invariance.
-    tolerance: float = 0.2
+    invariance_tolerance: float = 0.2
     """Relative disagreement that a catalogue's simpler form may cause (tuned)."""
-    deviations: float = 3.5
+    standard_errors: float = 3.5
     """Standard errors of a subset's own estimate, and of what held-out records lose by a simpler
     reading or a rival (convention: 1 in 2000, some 10 subsets)."""
-    tells: float = 0.12
+    informative_share: float = 0.12
     """Of a column's energy off the others': a subset with less holds its form's tail, not its size
     (tuned: tails of seals reach 0.09, wrong names show from 0.2 on)."""
-    own: float = 0.01
+    separable_share: float = 0.01
     """Of a column's energy that the effect's others cannot make: with less the whole effect is
     judged, not this number (convention: a variance inflation factor of 100)."""
-    power: float = 0.25
+    subset_error: float = 0.25
     """Relative standard error beyond which a subset judges nothing (tuned)."""
     # Chance.
-    flips: int = 199
+    sign_flips: int = 199
     """Sign flips: p not below 0.005 (convention)."""
-    halves: int = 40
+    half_samples: int = 40
     """Half-samples (convention)."""
     enough_repeats: int = 8
     """Repeats from which whole records are flipped: 2^-7 is below `p_limit` (arithmetic)."""
-    block: float = 2.0
+    flip_block: float = 2.0
     """[s] of a block that is flipped as one: twenty times the row filter's memory (arithmetic)."""
-    about_two: float = 1.9
+    least_periods: float = 1.9
     """Periods that a record must hold to be halved by them: the last may be cut short."""
-    edge: float = 1e-3
+    bound_share: float = 1e-3
     """Of its range: a shape nearer to its bound is at it (arithmetic)."""
     # Others.
-    closer: float = 0.99
+    shooting_ratio: float = 0.99
     """Of what held-out windows leave: with less, shapes by shooting are taken (tuned)."""
-    no_worse: float = 1.02
+    shooting_cost: float = 1.02
     """Times the held-out rms of any equation's rows that these may cost (tuned)."""
-    visible: float = 1e-4
+    rank_limit: float = 1e-4
     """Smallest over largest singular value of unit columns: the noise of where a locked joint
     stands (10 um of 0.1 m, some thousand samples) makes 1e-6 to 1e-5 (arithmetic)."""
     least_rows: int = 40
     """Rows of an equation in one record (arithmetic)."""
-    rivals: int = 4
+    most_rivals: int = 4
     """Rivals in a result."""
-    normal: float = 1.96
+    normal_quantile: float = 1.96
     """Half-width of a 95 % interval over the standard error (convention)."""
-    dependent: float = 1e-10
+    dependent_share: float = 1e-10
     """Of the largest eigenvalue: columns with a smaller one depend on each other (arithmetic)."""
     curve_seconds: float = 4.0
     """[s] of a free run that are kept to be drawn."""
@@ -141,13 +141,13 @@ class SearchSettings:
 
     band: float = 0.7
     """Repeatable rms over noise, below which there is nothing to explain (tuned)."""
-    left: float = 1.0
+    residual_limit: float = 1.0
     """Repeatable rms over noise that an explanation may leave (tuned)."""
-    form: float = 0.02
+    form_share: float = 0.02
     """Of the energy before: what the catalogue's form of an effect may miss of the real (tuned)."""
     add_share: float = 0.3
     """Of what is left in the equations an effect touches: less does not earn a place (tuned)."""
-    as_good: float = 1.25
+    simpler_ratio: float = 1.25
     """What a simpler candidate may leave over the best, before noise counts (tuned)."""
     number_price: float = 20.0
     """Energy that each further free number must take: ten times what noise gives it (tuned)."""
@@ -156,19 +156,19 @@ class SearchSettings:
     size_ratio: float = 3.0
     """Largest size over that of a shape's column; smaller ones are nearer to linear (tuned)."""
     # How much is tried.
-    largest: int = 4
+    largest_linear_set: int = 4
     """Effects in a set of the linear search."""
-    deepest: int = 3
+    largest_set: int = 3
     """Effects in a set found by extension."""
-    starts: int = 10
+    pair_starts: int = 10
     """Single candidates from which pairs are tried."""
-    trials: int = 40
+    full_fits: int = 40
     """Best entries that are fitted in full."""
-    singles: int = 14
+    refined_singles: int = 14
     """Single candidates refined exactly, best first."""
-    pairs: int = 6
+    refined_pairs: int = 6
     """Pairs refined exactly."""
-    extensions: int = 6
+    refined_extensions: int = 6
     """Extensions of a set that are refined exactly."""
     near_gain: float = 0.25
     """Of the best gain: a single candidate with less is no rival (tuned)."""
@@ -179,9 +179,9 @@ class SearchSettings:
     """Relative change of cost and shapes at which a refinement ends (arithmetic)."""
     steps: int = 10
     """Of a refinement, at most."""
-    detail: float = 0.05
+    detail_share: float = 0.05
     """Of what is left above noise: less does not earn a detail of the form (tuned)."""
-    remembered: int = 600
+    remembered_rows: int = 600
     """Sets of rows kept, of at most about 0.1 MB each."""
     # Free forms.
     free_tried: int = 4

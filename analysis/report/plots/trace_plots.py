@@ -218,7 +218,7 @@ def _against(rival: Rival) -> tuple[str, str]:
     """Return why a rival is not named, and its colour."""
     if rival.tied:
         return "cannot be told from it", ORANGE
-    if rival.ratio <= TRACE.tie:
+    if rival.ratio <= TRACE.tie_ratio:
         times = fm.significant(rival.training_ratio)
         return f"ruled out: training records keep {times} times as much", PALE
     return f"ruled out: held-out records keep {fm.significant(rival.ratio)} times as much", PALE

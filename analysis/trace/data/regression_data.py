@@ -118,7 +118,7 @@ def least_squares(rig: Rig, rows: Sequence[Mapping[str, Rows]]) -> dict[str, flo
         scale[scale == 0] = 1.0
         out |= zip(
             parts[0].names,
-            np.linalg.lstsq(X / scale, y, rcond=TRACE.visible)[0] / scale,
+            np.linalg.lstsq(X / scale, y, rcond=TRACE.rank_limit)[0] / scale,
             strict=True,
         )
     return out

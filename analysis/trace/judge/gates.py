@@ -67,7 +67,7 @@ def judge(
         often = {
             k
             for k, n in others.items()
-            if share < TRACE.chosen and n >= TRACE.rival * sum(others.values())
+            if share < TRACE.least_chosen and n >= TRACE.rival_share * sum(others.values())
         }
         rivals = _rivals(hypotheses, winner, key, holdout_data, after, often)
         touched = _touched(hypotheses, winner, rest)
@@ -79,10 +79,14 @@ def judge(
         tied = [r for r in rivals if r.tied]
         twins = [Rival(name, where, 1.0, 1.0, True) for name, where in used.term.twins()]
         gates = (
-            Gate(REMOVES, removed >= TRACE.removed and not worse, _taken(removed, worse)),
+            Gate(REMOVES, removed >= TRACE.least_removed and not worse, _taken(removed, worse)),
             Gate(PHYSICAL, not physical, physical or "sign and size are"),
             Gate(INVARIANT, not differing, _differences(differing)),
-            Gate(STABLE, share >= TRACE.chosen or bool(tied), _chosen(share, others, bool(tied))),
+            Gate(
+                STABLE,
+                share >= TRACE.least_chosen or bool(tied),
+                _chosen(share, others, bool(tied)),
+            ),
             Gate(SIGNIFICANT, p <= TRACE.p_limit, f"family-wise p = {p:.3g}"),
             Gate(ALONE, not (tied or twins), _told_apart([*twins, *rivals])),
         )
@@ -121,7 +125,7 @@ def remaining(
     out = []
     for e, residual in winner.excess_energy.items():
         share = residual / max(hypotheses.empty.excess_energy[e], 1e-30)
-        if share > TRACE.missed and not hypotheses.negligible(e, residual):
+        if share > TRACE.form_share and not hypotheses.negligible(e, residual):
             times = residual / hypotheses.limits.band[e]
             stays = f"{100 * share:.2g} % of what repeated stays"
             words = stays if share <= 1.0 else "more repeats than before"
@@ -129,7 +133,7 @@ def remaining(
     out += [
         (e, f"held-out error {r:.2f} times the noise floor")
         for e, r in ratio.items()
-        if r > TRACE.held_band and now[e] > TRACE.missed_held * start[e]
+        if r > TRACE.held_out_band and now[e] > TRACE.form_share_held_out * start[e]
     ]
     return out
 
@@ -192,7 +196,7 @@ def _worse(hypotheses: HypothesisSet, winner: Hypothesis, rest: Hypothesis) -> l
         e
         for e, now in winner.excess_energy.items()
         if not hypotheses.negligible(e, now)
-        and now > TRACE.harm * max(0.0, hypotheses.empty.excess_energy[e])
+        and now > TRACE.harm_ratio * max(0.0, hypotheses.empty.excess_energy[e])
         and now > rest.excess_energy[e]
     ]
 
@@ -256,15 +260,16 @@ def _rivals(
         if _refused_already(hypotheses, holdout_data, (mine, other), others, held):
             continue
         ratio = judged.ratio(held)
-        tied = judged.near(held, TRACE.tie) and (
-            trained.near(hypothesis.fit.residual, TRACE.tie_training) or ratio < TRACE.ahead
+        tied = judged.near(held, TRACE.tie_ratio) and (
+            trained.near(hypothesis.fit.residual, TRACE.tie_ratio_training)
+            or ratio < TRACE.clear_lead
         )
         tied = tied or (other.name, other.where) in often
         out.append(
             Rival(other.name, _place(other), ratio, trained.ratio(hypothesis.fit.residual), tied)
         )
     out.sort(key=lambda r: (not r.tied, r.ratio))
-    return out[: TRACE.rivals]
+    return out[: TRACE.most_rivals]
 
 
 def _refused_already(
@@ -277,7 +282,7 @@ def _refused_already(
         simple = hypotheses.listed.get(others | {(name, other.where)})
         if simple is not None:
             more = loss(held_left(holdout_data, simple.fit), held)
-            return more <= TRACE.deviations
+            return more <= TRACE.standard_errors
     return False
 
 
@@ -310,7 +315,7 @@ class _Near:
         change = other[self.rows] - self.left
         lost = float(change @ (other[self.rows] + self.left))
         share = (tie**2 - 1.0) * min(self.energy, max(self.taken, 0.0))
-        return lost < share or loss(other[self.rows], self.left) <= TRACE.deviations
+        return lost < share or loss(other[self.rows], self.left) <= TRACE.standard_errors
 
 
 def _parameters(
@@ -322,7 +327,7 @@ def _parameters(
     units = {c.parameter: c.unit for c in used.term.coefficients(train_data.rig)}
     units |= {s.parameter: s.unit for s in shapes_of(train_data.rig, used)}
     more = np.array([shift.get(name, 0.0) for name in errors.names])
-    half = np.hypot(half_width(errors.std, errors.dof), TRACE.normal * more)
+    half = np.hypot(half_width(errors.std, errors.dof), TRACE.normal_quantile * more)
     std = np.hypot(errors.std, more)
     return {
         name: Estimate(float(v), units.get(name, ""), float(s), (float(v - h), float(v + h)))
@@ -341,9 +346,9 @@ def _differences(differing: Sequence[tuple[str, str, float, float]]) -> str:
 
 def _chosen(share: float, others: Mapping[Key, int], tied: bool) -> str:
     text = f"chosen in {100 * share:.0f} % of half-samples"
-    if share < TRACE.chosen and tied:
+    if share < TRACE.least_chosen and tied:
         text = f"not asked, for a rival fits as well: {text}"
-    if share < TRACE.chosen and others:
+    if share < TRACE.least_chosen and others:
         most = sorted(others, key=lambda k: -others[k])[:2]
         text += "; else " + ", ".join(f"{name} at {where}" for name, where in most)
     return text

@@ -31,7 +31,7 @@ Key = tuple[str, str]
 
 
 def blocks(
-    train_data: RegressionData, seconds: float = TRACE.block, fewest: float = 3.0
+    train_data: RegressionData, seconds: float = TRACE.flip_block, fewest: float = 3.0
 ) -> NDArray[np.int64]:
     """Return for each row of the board the number of its block within its record (M,).
 
@@ -78,7 +78,7 @@ def null_maximum(
     rng: np.random.Generator,
 ) -> Array:
     """Return the largest gain of any candidate at any shape under each flip (flips,)."""
-    r = flipped(train_data, TRACE.flips, rng, residual)
+    r = flipped(train_data, TRACE.sign_flips, rng, residual)
     r = r - candidates.basis @ (candidates.basis.T @ r)
     c = candidates.columns.T @ r
     diagonal = np.diag(candidates.K)
@@ -86,7 +86,7 @@ def null_maximum(
     best = (
         np.max(c[shows] ** 2 / diagonal[shows, None], axis=0)
         if shows.any()
-        else np.zeros(TRACE.flips)
+        else np.zeros(TRACE.sign_flips)
     )
     for group in candidates.groups:
         j = [k for k in group if shows[k]]
@@ -122,9 +122,9 @@ def linear(train_data: RegressionData, hypothesis: Hypothesis) -> Linear:
         fixed = {
             s.parameter
             for s, v in zip(shapes_of(train_data.rig, u), u.shape, strict=True)
-            if not s.low + TRACE.edge * (s.high - s.low)
+            if not s.low + TRACE.bound_share * (s.high - s.low)
             < v
-            < s.high - TRACE.edge * (s.high - s.low)
+            < s.high - TRACE.bound_share * (s.high - s.low)
         }
         extra.append(J[:, [k for k, n in enumerate(names) if n in rows.names or n not in fixed]])
     return Linear(
@@ -133,7 +133,7 @@ def linear(train_data: RegressionData, hypothesis: Hypothesis) -> Linear:
 
 
 def halves(
-    train_data: RegressionData, rng: np.random.Generator, count: int = TRACE.halves
+    train_data: RegressionData, rng: np.random.Generator, count: int = TRACE.half_samples
 ) -> list[tuple[Array, Array, float]]:
     """Return random half-samples: change (M,) of the averaged residual, weights (M,), noise energy.
 
@@ -141,7 +141,7 @@ def halves(
     others without weight.
     """
     # A part of a period may lack the very speeds that tell two effects apart.
-    numbers = blocks(train_data, fewest=TRACE.about_two)
+    numbers = blocks(train_data, fewest=TRACE.least_periods)
     mean = train_data.mean
     out = []
     for _ in range(count):

@@ -73,7 +73,8 @@ def _clustered(own: Array, residual: Array, clusters: NDArray[np.int64]) -> floa
 def _larger(model: ExactFit, train_data: RegressionData, used: Used, mask: Array) -> float:
     """Return the energy that the largest other effect has on a subset, 0 if none is larger.
 
-    What its catalogue form misses of it (`SEARCH.form`) spills onto a smaller effect's coefficient.
+    What its catalogue form misses of it (`SEARCH.form_share`) spills onto a smaller effect's
+    coefficient.
     """
     rows = table(train_data, model.terms)
     energy = {}
@@ -121,7 +122,7 @@ def invariance(
     ridge = {
         name
         for k, name in enumerate(names)
-        if name in sizes and whole[k] < TRACE.own * float(J_all[:, k] @ J_all[:, k])
+        if name in sizes and whole[k] < TRACE.separable_share * float(J_all[:, k] @ J_all[:, k])
     }
     if ridge:
         out += _of_whole(train_data, model, used, base, joint)
@@ -139,21 +140,25 @@ def invariance(
             own = _alone(J_s, k)
             size = float(own @ own)
             # What hardly acts there tells its form's tail, not its size.
-            if size < TRACE.tells * whole[k] or size <= 0 or not np.isfinite(value.value[k]):
+            if (
+                size < TRACE.informative_share * whole[k]
+                or size <= 0
+                or not np.isfinite(value.value[k])
+            ):
                 continue
             shift = float(own @ residual[mask]) / size
             error = 1.0 / np.sqrt(size)
             if clusters is not None:
                 rest_of = residual[mask] - B @ (B.T @ residual[mask]) - own * shift
                 error = max(error, _clustered(own, rest_of, clusters[mask]) / size)
-            spill = np.sqrt(SEARCH.form * _larger(model, train_data, used, mask) / size)
+            spill = np.sqrt(SEARCH.form_share * _larger(model, train_data, used, mask) / size)
             # Two levels of one effect are judged by the larger: 2 N beside 100 N is a detail.
             alike = [j for j, n in enumerate(names) if n in sizes and units[n] == units[name]]
             full = float(np.max(np.abs(value.value[alike] - neutral[alike])))
-            if error > TRACE.power * full:
+            if error > TRACE.subset_error * full:
                 continue
-            if abs(shift) > spill + TRACE.deviations * np.hypot(
-                error, TRACE.tolerance / TRACE.deviations * full
+            if abs(shift) > spill + TRACE.standard_errors * np.hypot(
+                error, TRACE.invariance_tolerance / TRACE.standard_errors * full
             ):
                 out.append((label, name, float(value.value[k]) + shift, error))
     return out
@@ -177,15 +182,17 @@ def _of_whole(
         B = orthonormal(base[mask])
         own = whole[mask] - B @ (B.T @ whole[mask])
         size = float(own @ own)
-        if size <= TRACE.tells * start or size < 0.01 * float(whole[mask] @ whole[mask]):
+        if size <= TRACE.informative_share * start or size < 0.01 * float(
+            whole[mask] @ whole[mask]
+        ):
             continue
         shift = float(own @ model.residual[mask]) / size
         error = 1.0 / np.sqrt(size)
         if clusters is not None:
             rest = model.residual[mask] - B @ (B.T @ model.residual[mask]) - own * shift
             error = max(error, _clustered(own, rest, clusters[mask]) / size)
-        if error <= TRACE.power and abs(shift) > TRACE.deviations * np.hypot(
-            error, TRACE.tolerance / TRACE.deviations
+        if error <= TRACE.subset_error and abs(shift) > TRACE.standard_errors * np.hypot(
+            error, TRACE.invariance_tolerance / TRACE.standard_errors
         ):
             out.append((label, "the whole effect", 1.0 + shift, error))
     return out

@@ -32,7 +32,7 @@ def settled(
 
     A richer reading takes the place of one that it includes, or stands beside it. It must be
     physical, which asks that its own number is more than a form's tolerance; training and held-out
-    records must lose by the restriction more than `TRACE.deviations` of their noise; and beside a
+    records must lose by the restriction more than `TRACE.standard_errors` of their noise; beside a
     name it must take the share of what is left that a further effect must. Of several that
     leave about as little the one with the fewest numbers stays.
     """
@@ -73,13 +73,13 @@ def _lost(
 ) -> bool:  # fmt: skip
     """Return whether training and held-out records lose by taking `one` for the richer `other`."""
     gain = hypothesis.fit.energy - other.fit.energy
-    if gain <= TRACE.deviations**2:
+    if gain <= TRACE.standard_errors**2:
         return False
     if len(other.effects) > len(hypothesis.effects):
         price = SEARCH.number_price * (other.size[1] - hypothesis.size[1])
         if gain <= max(price, SEARCH.add_share * hypothesis.total):
             return False
-    return loss(held, held_left(holdout_data, other.fit)) > TRACE.deviations
+    return loss(held, held_left(holdout_data, other.fit)) > TRACE.standard_errors
 
 
 def _richer(hypotheses: HypothesisSet, hypothesis: Hypothesis) -> list[Hypothesis]:
@@ -97,7 +97,7 @@ def _richer(hypotheses: HypothesisSet, hypothesis: Hypothesis) -> list[Hypothesi
                 continue
             kept = [u for u in hypothesis.effects if u is not used]
             own = len(effect.coefficients(rig))
-            if own == count and len(hypothesis.effects) < SEARCH.deepest:
+            if own == count and len(hypothesis.effects) < SEARCH.largest_set:
                 kept.append(used)
             elif own <= count:
                 continue

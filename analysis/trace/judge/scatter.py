@@ -43,7 +43,7 @@ def scatter(train_data: RegressionData, columns: Array, residual: Array) -> Cova
     on each other what the rows determine counts, and every coefficient has its least dof.
     """
     size, V = np.linalg.eigh(columns.T @ columns)
-    determined = V[:, size > TRACE.dependent * max(float(size[-1]), 1e-300)]
+    determined = V[:, size > TRACE.dependent_share * max(float(size[-1]), 1e-300)]
     if determined.shape[1] < len(V):
         k = len(V)
         if not determined.shape[1]:
@@ -142,7 +142,7 @@ def _by_growth(train_data: RegressionData, fit: ExactFit) -> dict[str, float]:
         if energy <= SEARCH.visible**2 * float(column @ column):
             continue
         e = float(own @ fit.residual) / energy
-        if abs(e) * np.sqrt(energy) > TRACE.deviations:
+        if abs(e) * np.sqrt(energy) > TRACE.standard_errors:
             for name, shift in zip(names, e * moved / scale, strict=True):
                 squares[name] += float(shift) ** 2
     return squares
@@ -168,7 +168,7 @@ def widened(train_data: RegressionData, fit: ExactFit, model: Model) -> Model:
         # The rows may hold the reciprocal: relative sizes are the same.
         relative = np.hypot(np.sqrt(more[k]) / size[k], shift.get(name, 0.0)) / abs(fit.beta[name])
         grown = abs(old.value) * float(relative)
-        half = float(np.hypot(0.5 * (old.ci95[1] - old.ci95[0]), TRACE.normal * grown))
+        half = float(np.hypot(0.5 * (old.ci95[1] - old.ci95[0]), TRACE.normal_quantile * grown))
         std = float(np.hypot(old.std, grown))
         parameters[name] = replace(old, std=std, ci95=(old.value - half, old.value + half))
         covariance[names.index(name), names.index(name)] += grown**2

@@ -67,8 +67,8 @@ def reshaped(
         )
         fitted = refinement.fit(train_data, _with(winner.fit.terms, effect, shot_effect))
         rows, again = (rms_of(holdout_data, fit) for fit in (winner.fit, fitted))
-        better = now < TRACE.closer * before and all(
-            again[e] <= TRACE.no_worse * rows[e] for e in rows
+        better = now < TRACE.shooting_ratio * before and all(
+            again[e] <= TRACE.shooting_cost * rows[e] for e in rows
         )
         shots.append(
             replace(shot_effect, before=before, after=now, taken=better and shot_effect.settled)

@@ -120,9 +120,9 @@ class HypothesisSet:
         """Return whether `one` is to be preferred: much less left, or as little and simpler."""
         slack = SEARCH.number_price * max(1, abs(hypothesis.size[1] - other.size[1]))
         if hypothesis.size < other.size:
-            return hypothesis.total <= max(SEARCH.as_good * other.total, other.total + slack)
+            return hypothesis.total <= max(SEARCH.simpler_ratio * other.total, other.total + slack)
         if hypothesis.size > other.size:
-            return hypothesis.total < min(other.total / SEARCH.as_good, other.total - slack)
+            return hypothesis.total < min(other.total / SEARCH.simpler_ratio, other.total - slack)
         return hypothesis.total < other.total
 
     def best(self, among: Sequence[Hypothesis]) -> Hypothesis:
@@ -153,7 +153,7 @@ class HypothesisSet:
             return self.completed(now)
         pairs = self.tried(self._pairs(field, r, singles))
         now = self.prune(self.best([self.empty, *singles, *pairs]))
-        while not within(now.excess_energy, self.limits) and len(now.effects) < SEARCH.deepest:
+        while not within(now.excess_energy, self.limits) and len(now.effects) < SEARCH.largest_set:
             grown = self.prune(self.best([now, *self.extensions(now)]))
             if grown.keys == now.keys or grown.total > 0.9 * now.total:
                 break
@@ -168,12 +168,12 @@ class HypothesisSet:
 
     def negligible(self, equation: str, residual: float) -> bool:
         """Return whether so much energy above noise may be left in an equation."""
-        allowed = (SEARCH.left / SEARCH.band) ** 2 * self.limits.band[equation]
-        return residual <= max(allowed, SEARCH.form * self.empty.excess_energy[equation])
+        allowed = (SEARCH.residual_limit / SEARCH.band) ** 2 * self.limits.band[equation]
+        return residual <= max(allowed, SEARCH.form_share * self.empty.excess_energy[equation])
 
     def completed(self, now: Hypothesis) -> Hypothesis:
         """Add one more effect only if that leaves nothing but noise: else it fits a form."""
-        if within(now.excess_energy, self.limits) or len(now.effects) >= SEARCH.deepest:
+        if within(now.excess_energy, self.limits) or len(now.effects) >= SEARCH.largest_set:
             return now
         more = [o for o in self.extensions(now) if within(o.excess_energy, self.limits)]
         best = self.best(more) if more else now
@@ -208,7 +208,7 @@ class HypothesisSet:
             if (
                 (g[i] > least or (g[i] > 0 and len(out) < 3))
                 and variant.key not in out
-                and len(out) < SEARCH.singles
+                and len(out) < SEARCH.refined_singles
             ):
                 out[variant.key] = (variant.used,)
         return list(out.values())
@@ -217,10 +217,10 @@ class HypothesisSet:
         self, field: linear_fit.CandidateColumns, r: Array, singles: Sequence[Hypothesis]
     ) -> list[tuple[Used, ...]]:
         chosen = linear_fit.search(field, r)
-        out = [tuple(field.entries[m].variant.used for m in chosen.members[: SEARCH.deepest])]
+        out = [tuple(field.entries[m].variant.used for m in chosen.members[: SEARCH.largest_set])]
         out += [
             tuple(field.entries[m].variant.used for m in pair.members)
-            for pair in linear_fit.best_pairs(field, r, SEARCH.pairs)
+            for pair in linear_fit.best_pairs(field, r, SEARCH.refined_pairs)
         ]
         return [effects for effects in out if len(effects) > 1]
 
@@ -249,7 +249,7 @@ class HypothesisSet:
         seen: set[Key] = set()
         for trial in more:
             variant = field.entries[trial.members[0]].variant
-            if variant.key not in seen and len(seen) < SEARCH.extensions:
+            if variant.key not in seen and len(seen) < SEARCH.refined_extensions:
                 seen.add(variant.key)
                 out.append((*now.effects, variant.used))
         return self.tried(out)
@@ -260,7 +260,7 @@ class HypothesisSet:
         What is left of a loud equation, the form of its effect, hides what a quiet one lacks as
         long as all are counted together.
         """
-        if len(now.effects) >= SEARCH.deepest:
+        if len(now.effects) >= SEARCH.largest_set:
             return None
 
         def residual(hypothesis: Hypothesis) -> float:
@@ -275,7 +275,7 @@ class HypothesisSet:
         if not more:
             return None
         best = min(map(residual, more))
-        slack = max((SEARCH.as_good - 1.0) * max(0.0, best), SEARCH.number_price)
+        slack = max((SEARCH.simpler_ratio - 1.0) * max(0.0, best), SEARCH.number_price)
         near = [o for o in more if residual(o) <= best + slack]
         return min(near, key=lambda o: (o.size[1], residual(o)))
 

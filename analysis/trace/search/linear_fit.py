@@ -93,7 +93,7 @@ def orthonormal(columns: Array) -> Array:
     scale = np.linalg.norm(columns, axis=0)
     kept = columns[:, scale > 0] / scale[scale > 0]
     U, sigma, _ = np.linalg.svd(kept, full_matrices=False)
-    return np.asarray(U[:, sigma > TRACE.visible * sigma[0]]) if len(sigma) else U
+    return np.asarray(U[:, sigma > TRACE.rank_limit * sigma[0]]) if len(sigma) else U
 
 
 def gains(K: Array, c: Array, groups: Sequence[tuple[int, ...]], raw: Array) -> Array:
@@ -171,7 +171,7 @@ def options(
     g = gains(K, c, candidates.groups, candidates.raw)
     taken = {candidates.entries[m].variant.key for m in members}
     trials: list[LinearFit] = []
-    for i in map(int, np.argsort(-g)[: SEARCH.trials]):
+    for i in map(int, np.argsort(-g)[: SEARCH.full_fits]):
         if g[i] <= 0 or candidates.entries[i].variant.key in taken:
             continue
         if g[i] < SEARCH.add_share * touched(candidates, i, now):
@@ -182,7 +182,7 @@ def options(
     if not trials:
         return []
     best = min(t.total for t in trials)
-    limit = max(SEARCH.as_good * best, best + 0.1 * sum(candidates.band.values()))
+    limit = max(SEARCH.simpler_ratio * best, best + 0.1 * sum(candidates.band.values()))
     near = sorted(
         (t for t in trials if t.total <= limit), key=lambda t: (_size(candidates, t), t.total)
     )
@@ -210,9 +210,11 @@ def search(candidates: CandidateColumns, r: Array, noise: float = 1.0) -> Linear
     if len(greedy.members) == 1 and in_band(candidates, greedy, noise):
         return greedy
     best, seen = greedy, set[Key]()
-    for first in options(candidates, (), r, noise)[: 3 * SEARCH.starts] or _blind(candidates, r):
+    for first in options(candidates, (), r, noise)[: 3 * SEARCH.pair_starts] or _blind(
+        candidates, r
+    ):
         key = candidates.entries[first.members[0]].variant.key
-        if key in seen or len(seen) >= SEARCH.starts:
+        if key in seen or len(seen) >= SEARCH.pair_starts:
             continue
         seen.add(key)
         for pair in options(candidates, first.members, r, noise)[:1]:
@@ -228,7 +230,7 @@ def best_pairs(candidates: CandidateColumns, r: Array, count: int) -> list[Linea
     for first in _blind(candidates, r):
         starts.setdefault(candidates.entries[first.members[0]].variant.key, first)
     pairs: dict[frozenset[Key], LinearFit] = {}
-    for first in list(starts.values())[: SEARCH.starts]:
+    for first in list(starts.values())[: SEARCH.pair_starts]:
         for pair in options(candidates, first.members, r, 1.0)[:3]:
             keys = frozenset(candidates.entries[m].variant.key for m in pair.members)
             if keys not in pairs or pair.total < pairs[keys].total:
@@ -241,7 +243,7 @@ def _blind(candidates: CandidateColumns, r: Array) -> list[LinearFit]:
     g = gains(candidates.K, candidates.columns.T @ r, candidates.groups, candidates.raw)
     return [
         judged(candidates, (int(i),), r, 1.0)
-        for i in np.argsort(-g)[: 6 * SEARCH.starts]
+        for i in np.argsort(-g)[: 6 * SEARCH.pair_starts]
         if g[i] > 0
     ]
 
@@ -249,7 +251,7 @@ def _blind(candidates: CandidateColumns, r: Array) -> list[LinearFit]:
 def grow(candidates: CandidateColumns, members: Sequence[int], r: Array, noise: float) -> LinearFit:
     """Add entries while they earn their place, swapping and dropping earlier ones."""
     now = judged(candidates, members, r, noise)
-    while not in_band(candidates, now, noise) and len(now.members) < SEARCH.largest:
+    while not in_band(candidates, now, noise) and len(now.members) < SEARCH.largest_linear_set:
         more = options(candidates, now.members, r, noise)
         if not more:
             break

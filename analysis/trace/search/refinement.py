@@ -116,7 +116,7 @@ def _rows(
 def _kept(data: RegressionData, key: Any, make: Callable[[], Any]) -> Any:
     """Return what belongs to a key, made where it is not remembered."""
     if key not in data.memo:
-        if len(data.memo) >= SEARCH.remembered:
+        if len(data.memo) >= SEARCH.remembered_rows:
             data.memo.clear()
         data.memo[key] = make()
     return data.memo[key]
@@ -136,7 +136,7 @@ def fit(data: RegressionData, terms: Sequence[Used]) -> ExactFit:
     scale = np.linalg.norm(rows.matrix, axis=0)
     scale[scale == 0] = 1.0
     Q, R = np.linalg.qr(rows.matrix / scale)
-    value = np.linalg.lstsq(R, Q.T @ rows.rhs, rcond=TRACE.visible)[0] / scale
+    value = np.linalg.lstsq(R, Q.T @ rows.rhs, rcond=TRACE.rank_limit)[0] / scale
     beta = dict(zip(rows.names, value, strict=True))
     return ExactFit(tuple(terms), beta, rows.residual(beta))
 
@@ -157,7 +157,7 @@ def refine(data: RegressionData, terms: Sequence[Used], steps: int = SEARCH.step
             fit = other if other.energy < fit.energy else fit
         used = fit.terms[k]
         opened = _in_detail(data.rig, used)
-        asked = max(SEARCH.number_price, SEARCH.detail * (fit.energy - len(fit.residual)))
+        asked = max(SEARCH.number_price, SEARCH.detail_share * (fit.energy - len(fit.residual)))
         # Half, since in a straight line a detail promises less than it takes.
         if opened == used or _promise(data, fit, used, opened) < 0.5 * asked:
             continue

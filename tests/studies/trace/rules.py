@@ -74,7 +74,7 @@ def _one_candidate(
     candidates: linear_fit.CandidateColumns, train_data: Any, residual: Array, rng: Any
 ) -> Array:
     """Return the gain of the candidate that stands first under each flip, of no other."""
-    r = inference.flipped(train_data, TRACE.flips, rng, residual)
+    r = inference.flipped(train_data, TRACE.sign_flips, rng, residual)
     r = r - candidates.basis @ (candidates.basis.T @ r)
     size = np.maximum(np.diag(candidates.K), 1e-300)
     first = int(np.argmax(size > SEARCH.visible**2 * candidates.raw))
@@ -127,28 +127,30 @@ def _first_repeat(train_data: regression_data.RegressionData) -> Array:
 
 RULES: Final = (
     Rule("removes on held-out", "an effect need not help on held-out records",
-         (setting("removed", -math.inf),)),
+         (setting("least_removed", -math.inf),)),
     Rule("harm", "an effect may disturb an equation that was quieter without it",
-         (setting("harm", math.inf),)),
+         (setting("harm_ratio", math.inf),)),
     Rule("physics", "any sign, size and shape", ((HypothesisSet, "physical", lambda *_: ""),)),
     Rule("invariance", "a size may differ between steps, halves, directions, speeds",
          ((gates, "invariance", lambda *_: []),)),
-    Rule("stability", "an effect need not be chosen in half-samples", (setting("chosen", -1.0),)),
+    Rule("stability", "an effect need not be chosen in half-samples",
+         (setting("least_chosen", -1.0),)),
     Rule("family-wise p", "no test against chance", (setting("p_limit", 1.0),)),
     Rule("rivals", "no other effect counts as tied", ((gates, "_rivals", lambda *_: []),)),
     Rule("twins", "what is one to the data is not said to be",
          ((SpoolOffset, "twins", lambda _: ()), (SensorOffset, "twins", lambda _: ()))),
     Rule("training band", "any share of the training energy may stay",
-         (setting("missed", math.inf),)),
-    Rule("held-out band", "any held-out error may stay", (setting("held_band", math.inf),)),
+         (setting("form_share", math.inf),)),
+    Rule("held-out band", "any held-out error may stay", (setting("held_out_band", math.inf),)),
     Rule("formula in the rest", "a rest that one formula holds is not asked for",
-         (setting("formula", math.inf),)),
+         (setting("formula_share", math.inf),)),
     Rule("acted", "a formula's rest speaks against any effect, in whichever equation",
-         (setting("acted", math.inf),)),
+         (setting("unexplained_share", math.inf),)),
     Rule("further search", "quiet equations are not searched again",
          ((HypothesisSet, "closer", lambda *_: None),)),
     Rule("price of numbers", "a further number costs nothing",
-         ((SEARCH, "number_price", 0.0), (SEARCH, "as_good", 1.0), (SEARCH, "add_share", 0.0)),
+         ((SEARCH, "number_price", 0.0), (SEARCH, "simpler_ratio", 1.0),
+          (SEARCH, "add_share", 0.0)),
          refits=True),
     Rule("pruning", "effects that take little are kept",
          ((HypothesisSet, "prune", lambda _, one: one),)),
@@ -173,9 +175,9 @@ FAULTS: Final = (
     Rule("harm never seen", "no equation is said to get worse",
          ((gates, "_worse", lambda *_: []),)),
     Rule("held-out floor x 2", "held-out errors of 3 times the floor pass",
-         (setting("held_band", 3.0),)),
+         (setting("held_out_band", 3.0),)),
     Rule("form tolerance x 10", "half of what repeated may stay",
-         (setting("missed", 0.5), setting("missed_held", 1.0)),),
+         (setting("form_share", 0.5), setting("form_share_held_out", 1.0)),),
     Rule("floor x 0.3", "the noise is taken for a third", tuple(
         (module, "floors", _floors(0.3)) for module in (noise_floor, regression_data)), True),
     Rule("floor x 3", "the noise is taken for three times as large", tuple(
@@ -192,7 +194,7 @@ FAULTS: Final = (
     Rule("intervals x 3", "intervals are three times as wide",
          ((gates, "half_width", _widths(3.0)),)),
     Rule("tolerance x 10", "a size may differ twofold between parts",
-         (setting("tolerance", 2.0),)),
+         (setting("invariance_tolerance", 2.0),)),
     Rule("nothing is left", "whatever stays counts as nothing",
          ((remaining, "left_over", lambda *_: []), (engine, "left_over", lambda *_: []))),
 )  # fmt: skip
