@@ -74,7 +74,7 @@ class Expected:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What an experiment is expected to tell: by parameter, and by family its conditioning.
+    """Half widths expected of an experiment, by parameter, and its conditioning by family.
 
     `covariance` is of the rows' coefficients (1/b), relative to their nominal values. `lateness`
     is what a host-timed device's samples cost b; its interval includes that.

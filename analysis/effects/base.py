@@ -93,8 +93,8 @@ class Effect(Term):
     """A candidate of the trace at one place (`where`); a subclass overrides what it needs.
 
     `variable` names in plain words what the effect's contribution moves with; `confounders` are
-    effects whose columns look alike on poor excitation, `separated_by` the excitation that tells
-    them apart; `includes` names effects that it becomes at a limit of its own numbers. `stage`
+    effects whose columns look alike on poor excitation, `separated_by` an excitation on which
+    they differ; `includes` names effects that it becomes at a limit of its own numbers. `stage`
     orders the terms' `prepare` (see `ordered`): what a sensor distorts is undone first, then comes
     what acts on the spool, in the oil's own order. `alters` names the families of rows that
     `prepare` changes: rows of others need not be built again for another shape. `hydraulic` marks

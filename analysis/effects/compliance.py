@@ -99,7 +99,7 @@ class DeadVolume(Effect):
     """Oil between valve and chamber beyond the rig file's pipe volume: V = V_file + V_dead.
 
     Enters as V_dead dp/dt / b (continuity; Merritt 1967, chapter 3), in proportion to the 1/b
-    that all chambers share: a shape, so that b stays one. One chamber alone is told from a
+    that all chambers share: a shape, so that b stays one. One chamber alone is separated from a
     smaller b by the others; the same in all chambers is not, but for V's change with the piston.
     """
 

@@ -214,7 +214,7 @@ class PositionForce(Effect):
     def _weight(self, rig: Rig, evidence: Evidence, knots: Array) -> Array | None:
         """Return the gauge (K,) that leaves the joint's weight to gravity.
 
-        None where the records tell the weight by itself: a joint below moves too, or stands in
+        None where the records determine the weight by itself: a joint below moves too, or stands in
         several poses, or nothing weighs.
         """
         i = self.joint

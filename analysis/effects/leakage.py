@@ -107,7 +107,7 @@ class ExternalLeakage(_Leakage):
         "sensor_offset",
     )
     separated_by: ClassVar[str] = (
-        "slow motion at two levels of chamber pressure: rod-side rows tell it from internal leakage"
+        "slow motion at two levels of chamber pressure: rod-side rows show which leak it is"
     )
 
     @property

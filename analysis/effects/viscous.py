@@ -32,9 +32,9 @@ class AsymmetricViscousFriction(Effect):
     """F = c_ext s' extending, c_ret s' retracting, beside the joint's Fv q': slopes by direction.
 
     Wipers and lip seals drag less oil one way than the other (Jelali and Kroll 2003). The slope of
-    a direction is its own and Fv G^-2 together; what the records tell well is the difference. On an
-    electric joint G is 1, Fv is the mean slope, and one coefficient dFv, the column |q'|, says the
-    rest.
+    a direction is its own and Fv G^-2 together; what the records determine well is the difference.
+    On an electric joint G is 1, Fv is the mean slope, and one coefficient dFv, the column |q'|,
+    says the rest.
     """
 
     mechanism: ClassVar[str] = "friction_curve"

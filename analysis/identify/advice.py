@@ -77,7 +77,7 @@ def mechanical_help(rig: Rig, lacking: Determined) -> list[str]:
     steps = list(_candidates(rig))
     rows = [_rows(rig, excited, places) for excited, places in steps]
     scale = np.maximum(np.linalg.norm(np.vstack(rows), axis=0), 1e-300)
-    # Each candidate against itself: an outer joint's torques are small, and tell as much.
+    # Each candidate against itself: an outer joint's torques are small, and determine as much.
     rows = [X / np.linalg.norm(X / scale, 2) for X in rows]
     helps = []
     while len(undetermined):

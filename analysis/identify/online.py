@@ -301,7 +301,7 @@ class Tracker:
         return True
 
     def estimates(self) -> dict[str, Estimate]:
-        """Return every parameter followed; NaN until rows tell it, no interval while it is held."""
+        """Return every parameter followed; NaN until rows determine it; no interval while held."""
         solutions = {family: running.solution() for family, running in self._running.items()}
         values, _ = estimates_of(self._rig, self._terms, solutions)
         nothing = (float("nan"), float("nan"))

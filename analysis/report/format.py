@@ -65,7 +65,7 @@ def column_percent(value: float | None, *, signed: bool = False) -> str:
 
 
 def fit(value: float | None) -> str:
-    """Write a FIT ratio as the paper does, one decimal; beyond 10 000 two digits tell enough."""
+    """Write a FIT ratio as the paper does, one decimal; beyond 10 000 two digits suffice."""
     if value is None or not math.isfinite(value):
         return DASH
     return significant(value, 2) if abs(value) >= 9999.5 else _tidy(f"{value:.1f}")

@@ -71,7 +71,7 @@ def aligned_channels(rig: Rig, record: Record) -> dict[str, Array]:
 
     Channel k of the multiplexer is sampled k `skew` after the tick, and a sensor shows the world
     `delay` late: x(t) = measured(t + delay - k skew). Lost samples (NaN) are bridged by a straight
-    line first; `lost_samples` tells where.
+    line first; `lost_samples` states where.
     """
     return {
         name: align(bridged(np.asarray(record.channels[name], dtype=np.float64)), shift)

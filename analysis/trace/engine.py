@@ -79,7 +79,7 @@ def trace(
     whose shapes stay as they are; with `free_forms` a mechanism whose curve the data draw may
     explain what no named effect does; `progress` receives the share of the work done. Raises
     InputError for records of different rigs, without held-out records, with held-out ones that
-    are training records, or too short to tell anything.
+    are training records, or too short to judge by.
     """
     started = time.perf_counter()
     rig = ck.common_rig([*runs, *holdout])

@@ -1,6 +1,6 @@
-"""What stays when a search has ended: whether it is nothing, and what tells it.
+"""What stays when a search has ended: whether it is nothing, and what describes it.
 
-Clues tell it: variables, a frequency, a formula.
+Clues describe it: variables, a frequency, a formula.
 """
 
 from __future__ import annotations

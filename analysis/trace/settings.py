@@ -2,7 +2,7 @@
 
 Origins: *tuned* on benches of odd seeds of `python -m tests.studies foreign` and seeds below 100 of
 `python -m tests.studies trace`, judged on others; *convention* of statistics; *contract* of what
-users rely on; *arithmetic* of what a computer can tell.
+users rely on; *arithmetic* of what a computer can resolve.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class TraceSettings:
     p_limit: float = 0.01
     """Family-wise p over all candidates and shapes (convention)."""
     tie_ratio: float = 1.10
-    """Held-out rms of a rival over the best's, below which nothing tells them apart (tuned); of an
+    """Held-out rms of a rival over the best's, below which they cannot be separated (tuned); of an
     effect that takes less than the noise, the same share of what it takes."""
     tie_ratio_training: float = 1.25
     """The same on training records; a rival that fits these worse has another size (tuned)."""

@@ -57,7 +57,7 @@ def _formula(result: Trace) -> str:
 
 
 def _symmetry(result: Trace) -> str:
-    """Say what the lines of the loudest remainder tell of its cause ('' without such lines)."""
+    """Say what the lines of the loudest remainder show of its cause ('' without such lines)."""
     loud = max(result.lines, key=lambda lines: lines.loud_after, default=None)
     if loud is None or loud.loud_after < 1.0:
         return ""

@@ -33,7 +33,7 @@ IDENTIFY = "lock-and-excite-multisine"
 VALIDATE = "validate"
 RIG = "shinshu-2dof"
 HELD_OUT = Overrides(amplitude_scale=0.7, seed=1007, repeats=2)
-HIDDEN = "worn-seal"  # what the demo's bench hides; the analysis is not told
+HIDDEN = "worn-seal"  # what the demo's bench hides; the analysis does not know
 Say = Callable[[str], None]
 
 

@@ -1,4 +1,4 @@
-"""The `loop` verb's work: run, trace, design what would tell, run that, until nothing is left.
+"""The `loop` verb's work: run, trace, design the next experiment, run it, until nothing is left.
 
 Every run is a folder of its own under one: `run-1`, `holdout-1`, then `run-2` from the protocol
 `next-2.yaml`, and so on; each could be traced again without this. What ends a run (a trip, a lost

@@ -1,4 +1,4 @@
-"""What an experiment will tell: the work of `check`'s second half and of `design`."""
+"""What an experiment will determine: the work of `check`'s second half and of `design`."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ CHECKED = 0.4  # of the time of a check with its prediction, spent on the limits
 
 @dataclass(frozen=True)
 class CheckedForecast:
-    """A protocol's limits on the twin, and what it will tell (None, and why, where unknown)."""
+    """A protocol's limits on the twin, and its expected errors (None, and why, where unknown)."""
 
     limits: CheckReport
     prediction: Prediction | None

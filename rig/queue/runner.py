@@ -333,7 +333,7 @@ class Runner:
         answer = processes.call(self._program, words, self._settings.probe_seconds)
         if answer.code == 0:
             return outcome.adding("outputs confirmed at zero")
-        # Without the phrase that stops the queue: whether this bench answers, the next item tells.
+        # Without the phrase that stops the queue: the next item shows whether this bench answers.
         return outcome.adding(f"outputs left to the watchdog: {answer.reason.replace(UNSURE, '')}")
 
     def _unfinished(self, item: Item) -> bool:

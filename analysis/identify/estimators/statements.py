@@ -85,7 +85,9 @@ def noise_statement(shifts: Sequence[Shift]) -> Check:
         )  # fmt: skip
     worst = max(shifts, key=lambda s: abs(s.relative))
     chance = (
-        ", which would matter but may be chance: more repeats would tell" if worst.material else ""
+        ", which would matter but may be chance: more repeats would show it"
+        if worst.material
+        else ""
     )
     return Check(
         NOISE_CHECK, True,

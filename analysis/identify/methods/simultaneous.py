@@ -2,7 +2,7 @@
 
 The rows and the solve are the coupled method's; only the choice of records differs. All the
 parameters share one excitation, so columns that lock-and-excite keeps apart lie close together:
-the condition number tells by how much, the physical checks whether noise has used the room.
+the condition number states by how much, the physical checks whether noise has used the room.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 Multiple shooting: each record is cut into windows, the state at each window's start is unknown
 too, and sum |measured - simulated|^2 / sigma^2 over piston and chamber pressures of the excited
 joints is least. Noise in the outputs then biases nothing, for no measured output is in a
-regressor. Windows are not tied to each other: what a tie would tell of the parameters is little,
+regressor. Windows are not tied to each other: a tie would add little to the parameters,
 and it would turn what the model gets slowly wrong into bias.
 Gauss and Newton with halved steps, the windows' states eliminated (Schur's complement) each time.
 Intervals: as for the other estimators, with the windows as parts. Source: Bock (1981) and

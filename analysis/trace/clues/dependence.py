@@ -32,7 +32,7 @@ from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
-# An equation's own balance makes these follow whatever it lacks: they answer and tell nothing.
+# An equation's own balance makes these follow whatever it lacks: they answer and are no cause.
 ANSWERS = {"torque": ("pressure", ch.DRIVE), "flow": ("velocity",)}
 
 
@@ -95,7 +95,7 @@ def _dependence(
 
 
 def _telling(name: str, equation: str, shares: Mapping[tuple[str, str], float]) -> float:
-    """Return a variable's weight: what an equation's balance makes follow tells little.
+    """Return a variable's weight: what an equation's balance makes follow counts little.
 
     A torque's balance makes the difference of the pressures follow; one chamber's pressure that
     says much more than the difference follows nothing, its sensor may be what is wrong.

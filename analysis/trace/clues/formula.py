@@ -65,7 +65,7 @@ def is_balance(equation: str, terms: Mapping[str, float]) -> bool:
     """Whether a formula takes both chambers' pressures against each other by one factor.
 
     That is the cylinder's force times the factor: a torque's own balance makes the force follow
-    whatever the torque lacks, and with a factor too it answers and tells nothing.
+    whatever the torque lacks, and with a factor too it answers and is no cause.
     """
     kind, joint = equation.rsplit("_", 1)
     sides = [ch.channel(side, int(joint)) for side in (ch.CAP, ch.ROD)]

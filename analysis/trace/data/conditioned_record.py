@@ -54,7 +54,7 @@ def conditioned_records(
 def held(term: Term, conditioned: ConditionedRecord) -> bool:
     """Return whether an effect at a joint cannot show because the joint is locked.
 
-    A sensor of a locked joint still tells where that joint stands.
+    A sensor of a locked joint still shows where that joint stands.
     """
     where = term.where
     if not where.startswith("joint ") or getattr(term, "stage", None) == SENSOR:

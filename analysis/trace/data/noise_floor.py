@@ -39,7 +39,7 @@ NO_ROWS = 1e-30  # SI: where every row is masked nothing is weighed by it
 class Floor:
     """The split of one equation's residual in one group of records, SI.
 
-    `source` says what the noise was told from; `count` repeats or periods stand behind it.
+    `source` says what the noise was computed from; `count` repeats or periods stand behind it.
     """
 
     group: Group

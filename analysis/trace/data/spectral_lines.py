@@ -151,7 +151,7 @@ def _of_segment(
     spectra = np.stack([spectrum(place[p[:, 0]] / per, series[:, p], K) for p in pairs])
     single = spectra[:, :-2].reshape(-1, K + 1)  # periods of one repeat are repeats too
     n = len(single)
-    # A single one does not tell its own noise: the floor's, spread evenly.
+    # The noise of a single one is unknown: the floor's, spread evenly.
     noise = single.var(axis=0, ddof=1) if n > 1 else np.full(K + 1, s.noise**2 / (K + 1))
     excited = np.isin(np.arange(K + 1), record.lines)
     own = np.abs(spectra[:, -1].mean(axis=0)) ** 2

@@ -1,7 +1,7 @@
 """Naming gates: significance is not naming, so a name must pass all of these.
 
-A deterministic misfit makes every correlated candidate significant. What tells the cause from its
-look-alikes is that it works on records of another excitation, at a physical size, with the same
+A deterministic misfit makes every correlated candidate significant. The cause differs from its
+look-alikes in that it works on records of another excitation, at a physical size, with the same
 coefficient everywhere, whichever repeats are taken, and better than anything else.
 """
 

@@ -140,7 +140,7 @@ def halves(
     Halves of the repeats of every step; of a step with one repeat, halves of its blocks, the
     others without weight.
     """
-    # A part of a period may lack the very speeds that tell two effects apart.
+    # A part of a period may lack the very speeds that separate two effects.
     numbers = blocks(train_data, fewest=TRACE.least_periods)
     mean = train_data.mean
     out = []

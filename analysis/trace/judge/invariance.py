@@ -139,7 +139,7 @@ def invariance(
                 continue
             own = _alone(J_s, k)
             size = float(own @ own)
-            # What hardly acts there tells its form's tail, not its size.
+            # What hardly acts there shows its form's tail, not its size.
             if (
                 size < TRACE.informative_share * whole[k]
                 or size <= 0

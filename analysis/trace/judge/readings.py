@@ -1,7 +1,7 @@
 """Readings of one mechanism: whether the simpler name loses more than noise and its form may.
 
 A name is a restriction of its mechanism's law: one level of dry friction where the law has two, no
-breakaway, no line behind the tank. The energy that a fit leaves cannot tell whether a restriction
+breakaway, no line behind the tank. The energy that a fit leaves cannot show whether a restriction
 holds, for its scatter grows with all rows; what the number set to nothing would change in the
 held-out rows is one direction in them, along which noise is one.
 """

@@ -83,8 +83,8 @@ def smallest(effect: Effect, rig: Rig) -> Explanation | None:
 
 @dataclass(frozen=True)
 class OpenQuestion:
-    """What an experiment is to tell: `one` or `other`; `both_ways` unless `one` is only wanted
-    visible against `other`.
+    """Which of `one` and `other` an experiment is to show; `both_ways` unless `one` is only
+    wanted visible against `other`.
     """
 
     one: Explanation
@@ -120,7 +120,7 @@ class MeasurementView:
 def calibration(train_data: RegressionData) -> dict[str, float]:
     """Return, by equation, the measured noise over what the rig's stated sensor noise would make.
 
-    A faster excitation is filtered wider and so is noisier: the stated noise tells by how much.
+    A faster excitation is filtered wider and so is noisier: the stated noise gives by how much.
     """
     by_family: dict[str, list[float]] = {}
     for conditioned, rows in zip(train_data.records, train_data.rows, strict=True):

@@ -1,7 +1,7 @@
-"""Which experiment to run next, or none: what survives, what would tell, on which excitation.
+"""Which experiment to run next, or none: what survives, what separates it, on which excitation.
 
 `confounded`: the excitation on which the best set and its tied rivals differ most. `unexplained`:
-the one that tells the sets which leave least apart, else the one that carries a variable which the
+the one that separates the sets which leave least, else the one that carries a variable which the
 rest moves with farthest beyond the records, else one of many more lines than they hold. `clean`:
 the one on which effects of an interesting size that these records could not have shown would stand
 out. An experiment is only offered where it promises more than noise and clearly more than the
@@ -133,7 +133,7 @@ def explanation(hypothesis: Hypothesis) -> Explanation:
 def tied_sets(
     hypotheses: HypothesisSet, winner: Hypothesis, effects: Sequence[JudgedEffect]
 ) -> list[Hypothesis]:
-    """Return the sets that the gates could not tell from the winner: one effect exchanged."""
+    """Return the sets that the gates could not separate from the winner: one effect exchanged."""
     out = []
     for effect in effects:
         tied = {(r.name, r.where) for r in effect.rivals if r.tied}

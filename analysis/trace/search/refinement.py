@@ -225,7 +225,7 @@ def _on_the_right_side(
 ) -> tuple[Used, ...]:
     """Return the terms with every free shape on the side of its neutral value that leaves less.
 
-    Of a column the first look tells the size, not the sign; and from the wrong side a search runs
+    A column's first fit gives the size, not the sign; and from the wrong side a search runs
     away to the bound, not through the neutral value.
     """
     terms, least = tuple(terms), np.nan
