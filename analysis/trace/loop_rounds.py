@@ -20,8 +20,8 @@ from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import RegressionData, regression_data
 from analysis.trace.data.temperature_nuisance import base_terms
 from analysis.trace.next_experiment.discrimination import (
+    ComparisonRows,
     Explanation,
-    Ground,
     OpenQuestion,
     present,
     smallest,
@@ -76,9 +76,9 @@ def achieved(
     terms = base_terms(rig, [*before, new])
     both = regression_data(rig, terms, conditioned_records(rig, [*before, new]))
     if experiment["kind"] == SHOW:
-        ground = Ground(both)
+        rows = ComparisonRows(both)
         asked = [_small(q["one"], rig) for q in experiment["questions"]]
-        return min(present(q, ground) for q in asked)
+        return min(present(q, rows) for q in asked)
     old = regression_data(rig, terms, conditioned_records(rig, before))
     rounds = [
         _one(old, both, terms, len(before), q["one"], q["other"]) for q in experiment["questions"]

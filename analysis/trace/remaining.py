@@ -49,7 +49,7 @@ def left_over(
     asked = [equation for equation in seen if equation not in known]
     if not asked:
         return [*out, *_missed(hypotheses, winner, out)]
-    now, later = rebased(hypotheses.stage, winner.fit), rebased(holdout_data, winner.fit)
+    now, later = rebased(hypotheses.train_data, winner.fit), rebased(holdout_data, winner.fit)
     held = held_out.residual(holdout_data, winner.fit)
     for equation in asked:
         expression = formula(now, winner.fit.residual, later, held, equation)
@@ -81,7 +81,7 @@ def _missed(hypotheses: HypothesisSet, winner: Hypothesis, known: Sequence[Rest]
 def _seen(hypotheses: HypothesisSet, winner: Hypothesis) -> dict[str, float]:
     """Return the share that stays, by equation, where it stands out of the noise's own energy."""
     rows: dict[str, int] = {}
-    for s in hypotheses.stage.segments:
+    for s in hypotheses.train_data.segments:
         rows[s.equation] = rows.get(s.equation, 0) + s.where.stop - s.where.start
     shares = {
         e: v / max(hypotheses.empty.excess_energy[e], 1e-30)

@@ -1,4 +1,4 @@
-"""The board: averaged records, their whitened residuals, and every candidate's columns on them.
+"""Regression data: averaged records, their whitened residuals, every candidate's columns on them.
 
 Repeats of one excitation are averaged channel by channel; the average's rows carry the columns,
 and each repeat keeps its own residual. So 12 records of 10 s become a table of a few thousand
@@ -42,7 +42,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Segment:
-    """Rows of one equation of one group on the board: `rows[where]`, of `repeats` records."""
+    """Rows of one equation of one group: `rows[where]`, of `repeats` records."""
 
     group: Group
     equation: str
@@ -193,7 +193,7 @@ def _spread(rows: Rows, names: Sequence[str]) -> Array:
 
 @dataclass(frozen=True)
 class VariantColumns:
-    """A variant on the board: its whitened columns (M, c), named, and the equations it touches."""
+    """A variant's whitened columns (M, c) with their names, and the equations that it touches."""
 
     variant: Variant
     names: tuple[str, ...]
@@ -202,9 +202,9 @@ class VariantColumns:
 
 
 def evidence(data: RegressionData, residual: Array) -> Evidence:
-    """Return what the board's records offer effects that look at the data first.
+    """Return what the records offer effects that look at the data first.
 
-    `residual` (M,) is what a model leaves on the board.
+    `residual` (M,) is what a model leaves.
     """
     left: list[dict[str, tuple[Array, Array]]] = []
     for conditioned, rows in zip(data.records, data.rows, strict=True):
@@ -217,7 +217,7 @@ def evidence(data: RegressionData, residual: Array) -> Evidence:
 def variant_columns(
     data: RegressionData, chosen: Sequence[Variant], progress: Callable[[float], None] | None = None
 ) -> list[VariantColumns]:
-    """Return the columns of every variant that shows on the board, in the variants' order.
+    """Return the columns of every variant that shows in the data, in the variants' order.
 
     `progress` receives after each which share of them is done.
     """

@@ -49,7 +49,7 @@ def judge(
     rng: np.random.Generator,
 ) -> tuple[JudgedEffect, ...]:
     """Put every effect of the winner through the gates."""
-    train_data = hypotheses.stage
+    train_data = hypotheses.train_data
     values = parameter_values(train_data.rig, winner.fit.terms, dict(winner.fit.beta))
     null = inference.null_maximum(
         hypotheses.field, train_data, _noise_like(train_data, winner.fit.residual), rng
@@ -237,7 +237,7 @@ def _rivals(
         _Near(data, equations, left, without)
         for data, left, without in (
             (holdout_data, after, held_left(holdout_data, rest.fit)),
-            (hypotheses.stage, winner.fit.residual, rest.fit.residual),
+            (hypotheses.train_data, winner.fit.residual, rest.fit.residual),
         )
     )
     out = []

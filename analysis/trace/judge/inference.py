@@ -33,7 +33,7 @@ Key = tuple[str, str]
 def blocks(
     train_data: RegressionData, seconds: float = TRACE.flip_block, fewest: float = 3.0
 ) -> NDArray[np.int64]:
-    """Return for each row of the board the number of its block within its record (M,).
+    """Return for each row the number of its block within its record (M,).
 
     A block is a period of a record that holds the `fewest` of them.
     """
@@ -168,7 +168,7 @@ def stability(
     hypotheses: HypothesisSet, winner: Hypothesis, rng: np.random.Generator
 ) -> dict[Key, tuple[float, dict[Key, int]]]:
     """Return, by effect, in which share of half-samples it is chosen, and who else was."""
-    train_data = hypotheses.stage
+    train_data = hypotheses.train_data
     near = sorted(hypotheses.listed.values(), key=lambda o: o.total)
     near = [o for o in near if not hypotheses.physical(o)][:12]
     if winner.keys not in [o.keys for o in near]:

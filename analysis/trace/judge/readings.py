@@ -88,7 +88,7 @@ def _richer(hypotheses: HypothesisSet, hypothesis: Hypothesis) -> list[Hypothesi
     A reading with more coefficients takes the place of one that it includes; one with as many is
     another part of the same law, and stands beside.
     """
-    rig, sets = hypotheses.stage.rig, dict[frozenset[Key], tuple[Used, ...]]()
+    rig, sets = hypotheses.train_data.rig, dict[frozenset[Key], tuple[Used, ...]]()
     for used in hypothesis.effects:
         assert isinstance(used.term, Effect)
         count = len(used.term.coefficients(rig))

@@ -138,8 +138,8 @@ def view(
 ) -> MeasurementView:
     """Build the rows of an excitation as the trace would of its record.
 
-    `measured` is the board's `calibration`; of other equations nothing can be said: their joint
-    has never moved.
+    `measured` is the training data's `calibration`; of other equations nothing can be said: their
+    joint has never moved.
     """
     rig = ideal(train_data.rig)
     record = excitation.played.record
@@ -155,8 +155,8 @@ def view(
     )
 
 
-class Ground:
-    """Whitened rows on which hypotheses are compared: the board's, then those of a view if any.
+class ComparisonRows:
+    """Whitened rows on which hypotheses are compared: of the training data, then of a view if any.
 
     `base` (m, k) holds the baseline's columns, `equation` (m,) each row's equation.
     """
@@ -165,9 +165,9 @@ class Ground:
         self,
         train_data: RegressionData,
         seen: MeasurementView | None = None,
-        old: Ground | None = None,
+        old: ComparisonRows | None = None,
     ) -> None:
-        self.stage, self.seen, self._old = train_data, seen, old
+        self.train_data, self.seen, self._old = train_data, seen, old
         self._known: dict[Used, dict[str, Array]] = {}
         label = np.empty(train_data.base.shape[0], dtype=object)
         for s in train_data.segments:
@@ -190,7 +190,7 @@ class Ground:
 
     def _on_board(self, used: Used) -> dict[str, Array]:
         assert isinstance(used.term, Effect)
-        columns = variant_columns(self.stage, [Variant(used.term, used.shape)])
+        columns = variant_columns(self.train_data, [Variant(used.term, used.shape)])
         return dict(zip(columns[0].names, columns[0].columns.T, strict=True)) if columns else {}
 
     def _extended(self, used: Used, before: Mapping[str, Array]) -> dict[str, Array]:
@@ -198,7 +198,7 @@ class Ground:
         new = self.seen.columns(used)
         out = {}
         for name in dict.fromkeys([*before, *(n for c in new.values() for n in c)]):
-            parts = [before.get(name, np.zeros(self.stage.base.shape[0]))]
+            parts = [before.get(name, np.zeros(self.train_data.base.shape[0]))]
             for equation, rows in self.seen.rows.items():
                 column = new.get(equation, {}).get(name, np.zeros(len(rows.rhs)))
                 parts.append(column * self.seen.weight(equation))
@@ -211,7 +211,7 @@ class Ground:
         for used in what.effects:
             for name, column in self.columns(used).items():
                 # The baseline's own parameters, which some effects have columns of, are free.
-                if name not in self.stage.names:
+                if name not in self.train_data.names:
                     total += column * (what.beta.get(name, 0.0) if name else 1.0)
         return total
 
@@ -220,7 +220,7 @@ class Ground:
         blocks = [self.base]
         for used in what.effects:
             blocks += [c[:, None] for c in self.columns(used).values()]
-            for j, shape in enumerate(shapes_of(self.stage.rig, used)):
+            for j, shape in enumerate(shapes_of(self.train_data.rig, used)):
                 value = used.shape[j]
                 if shape.fixed or not shape.given(value):
                     continue
@@ -246,7 +246,9 @@ class Ground:
         }
 
 
-def separation(question: OpenQuestion, old: Ground, new: Ground) -> tuple[float, str]:
+def separation(
+    question: OpenQuestion, old: ComparisonRows, new: ComparisonRows
+) -> tuple[float, str]:
     """Return what an experiment separates [noise], and in which equation (see the module)."""
     assert new.seen is not None
     distances = []
@@ -264,9 +266,11 @@ def separation(question: OpenQuestion, old: Ground, new: Ground) -> tuple[float,
     return min(distances)
 
 
-def present(question: OpenQuestion, old: Ground) -> float:
+def present(question: OpenQuestion, old: ComparisonRows) -> float:
     """Return the same figure [noise] of the records already taken: their loudest segment's."""
-    return min(loudest(old.stage, old.residual(true, wrong)) for true, wrong in _ways(question))
+    return min(
+        loudest(old.train_data, old.residual(true, wrong)) for true, wrong in _ways(question)
+    )
 
 
 def loudest(train_data: RegressionData, residual: Array) -> float:

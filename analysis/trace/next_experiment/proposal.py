@@ -22,8 +22,8 @@ from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.next_experiment import excitations as ex
 from analysis.trace.next_experiment.discrimination import (
+    ComparisonRows,
     Explanation,
-    Ground,
     MeasurementView,
     OpenQuestion,
     calibration,
@@ -70,8 +70,8 @@ def propose(
     `protocol` and `holdout` are what a protocol file holds; `present` and `predicted` are the
     weakest question's separation in units of one record's noise.
     """
-    train_data = hypotheses.stage
-    old = Ground(train_data)
+    train_data = hypotheses.train_data
+    old = ComparisonRows(train_data)
     questions = _questions(hypotheses, winner, effects, verdict, old)
     if not questions and not (verdict == UNEXPLAINED and moves):
         return None
@@ -109,7 +109,7 @@ def _questions(
     winner: Hypothesis,
     effects: Sequence[JudgedEffect],
     verdict: str,
-    old: Ground,
+    old: ComparisonRows,
 ) -> list[ExperimentProposal]:
     if verdict == CLEAN:
         asked = [OpenQuestion(h, Explanation(), False) for h in _small(hypotheses)]
@@ -169,7 +169,7 @@ def _unsettled(hypotheses: HypothesisSet) -> list[OpenQuestion]:
 
 
 def _small(hypotheses: HypothesisSet) -> list[Explanation]:
-    rig = hypotheses.stage.rig
+    rig = hypotheses.train_data.rig
     effects = dict.fromkeys(hypotheses.effects)
     smallest_sizes = (smallest(effect, rig) for effect in effects)
     return [h for h in smallest_sizes if h is not None]
@@ -179,14 +179,14 @@ def _choose(
     asked: Sequence[ExperimentProposal],
     tried: Sequence[ex.CandidateExcitation],
     views: Sequence[MeasurementView],
-    old: Ground,
+    old: ComparisonRows,
 ) -> tuple[list[ex.CandidateExcitation], list[ExperimentProposal]] | None:
     """Return the steps that answer most, and what they promise; None if they promise nothing."""
     if not asked:
         return None
     table: list[list[ExperimentProposal]] = []
     for seen in views:
-        new = Ground(old.stage, seen, old)
+        new = ComparisonRows(old.train_data, seen, old)
         table.append(
             [
                 ExperimentProposal(a.question, a.present, *separation(a.question, old, new))

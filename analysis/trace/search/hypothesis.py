@@ -40,7 +40,7 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class NoiseBand:
-    """Energy that counts as nothing, by equation, on a stage."""
+    """Energy that counts as nothing, by equation."""
 
     band: dict[str, float]
 
@@ -61,7 +61,7 @@ def parameter_values(rig: Rig, terms: Sequence[Used], beta: dict[str, float]) ->
 
 
 def excess_of(data: RegressionData, residual: Array, noise: float = 1.0) -> dict[str, float]:
-    """Return the energy above noise that a residual (M,) has in each equation of a stage."""
+    """Return the energy above noise that a residual (M,) has in each equation."""
     out: dict[str, float] = {}
     for segment in data.segments:
         part = residual[segment.where]

@@ -1,7 +1,7 @@
-"""The shortlist: sets of effects fitted exactly, found by the search on the board.
+"""Sets of effects fitted exactly, found by a linear search on the regression data.
 
-The board's columns are first-order; a set found there is refined exactly and, where something is
-left, extended from a new board that has the set among its terms. Every set fitted on the way stays
+The columns searched are first-order; a set found there is refined exactly and, where something is
+left, extended from data that have the set among their terms. Every set fitted on the way stays
 on the list: the rivals of the winner come from it.
 """
 
@@ -42,40 +42,42 @@ log = logging.getLogger(__name__)
 
 
 class HypothesisSet:
-    """Sets of effects on one stage, fitted exactly once each."""
+    """Sets of effects on the same training data, fitted exactly once each."""
 
-    def __init__(self, data: RegressionData, effects: Sequence[Effect]) -> None:
-        self.stage = data
-        self.base = tuple(data.terms)
+    def __init__(self, train_data: RegressionData, effects: Sequence[Effect]) -> None:
+        self.train_data = train_data
+        self.base = tuple(train_data.terms)
         self.effects = tuple(effects)
-        self.limits = limits(data)
+        self.limits = limits(train_data)
         self.listed: dict[frozenset[Key], Hypothesis] = {}
-        self.empty = self._listed((), fit(data, self.base))
+        self.empty = self._listed((), fit(train_data, self.base))
 
     def _listed(self, effects: tuple[Used, ...], fit: ExactFit) -> Hypothesis:
-        rig = self.stage.rig
+        rig = self.train_data.rig
         return Hypothesis(
-            effects, fit, excess_of(self.stage, fit.residual), complexity(rig, effects)
+            effects, fit, excess_of(self.train_data, fit.residual), complexity(rig, effects)
         )
 
     def widened(self, effects: Sequence[Effect]) -> HypothesisSet:
         """Return the sets with more candidates beside those that were searched already."""
         wide = copy.copy(self)
         wide.effects = tuple(effects)
-        more = variant_columns(self.stage, wide._variants(self.stage, self.stage.mean))
+        more = variant_columns(
+            self.train_data, wide._variants(self.train_data, self.train_data.mean)
+        )
         wide.found = [*self.found, *more]
-        wide.field = self._field(self.stage, wide.found)
+        wide.field = self._field(self.train_data, wide.found)
         wide.effects = (*self.effects, *effects)
         return wide
 
     def _variants(self, data: RegressionData, residual: Array) -> list[Variant]:
-        """Return the candidates' points of first look on a board that leaves a residual (M,)."""
+        """Return the candidates' points of first look on data that leave a residual (M,)."""
         seen = evidence(data, residual) if any(e.by_data for e in self.effects) else None
         return variants(data.rig, self.effects, seen)
 
     def physical(self, hypothesis: Hypothesis) -> str:
         """Say why a set is not physical ('' if it is)."""
-        rig = self.stage.rig
+        rig = self.train_data.rig
         values = parameter_values(rig, hypothesis.fit.terms, dict(hypothesis.fit.beta))
         for used in hypothesis.effects:
             assert isinstance(used.term, Effect)
@@ -90,7 +92,7 @@ class HypothesisSet:
         """Return the set refined exactly (once per set of names and places)."""
         key = frozenset((u.term.name, u.term.where) for u in effects)
         if key not in self.listed:
-            fit = refine(self.stage, (*self.base, *effects))
+            fit = refine(self.train_data, (*self.base, *effects))
             self.listed[key] = self._listed(fit.terms[len(self.base) :], fit)
         return self.listed[key]
 
@@ -103,7 +105,7 @@ class HypothesisSet:
 
     def _simplified(self, hypothesis: Hypothesis) -> Hypothesis | None:
         """Return the set with the simpler effects that its own have become, None where none has."""
-        rig = self.stage.rig
+        rig = self.train_data.rig
         values = parameter_values(rig, hypothesis.fit.terms, dict(hypothesis.fit.beta))
         effects: dict[Key, Used] = {}
         for used in hypothesis.effects:
@@ -135,15 +137,15 @@ class HypothesisSet:
         return min(near, key=lambda o: (o.size[1], o.size[0], o.total))
 
     def run(self, progress: Callable[[float], None] | None = None) -> Hypothesis:
-        """Search: singles and pairs from the first board, then extensions; returns the winner.
+        """Search: singles and pairs beside the baseline, then extensions; returns the winner.
 
-        `progress` receives which share of the first board's columns is there.
+        `progress` receives which share of the first columns is there.
         """
         self.found = variant_columns(
-            self.stage, self._variants(self.stage, self.stage.mean), progress
+            self.train_data, self._variants(self.train_data, self.train_data.mean), progress
         )
-        field = self.field = self._field(self.stage, self.found)
-        r = self.stage.mean
+        field = self.field = self._field(self.train_data, self.found)
+        r = self.train_data.mean
         r = r - field.basis @ (field.basis.T @ r)
         singles = self.tried(self._singles(field, r))
         now = self.prune(self.best([self.empty, *singles]))
@@ -227,11 +229,11 @@ class HypothesisSet:
     def extensions(
         self, now: Hypothesis, equations: Collection[str] = (), free: bool = False
     ) -> list[Hypothesis]:
-        """Return sets with one more effect, found on a board that has the set in its model.
+        """Return sets with one more effect, found on data that have the set in their model.
 
         With `equations` the search looks at these alone, with `free` at free mechanisms alone.
         """
-        data = rebased(self.stage, now.fit)
+        data = rebased(self.train_data, now.fit)
         taken = now.keys
         looks = self._variants(data, now.fit.residual)
         looks = [v for v in looks if v.key not in taken and (v.effect.free or not free)]
@@ -240,7 +242,7 @@ class HypothesisSet:
         for s in data.segments:
             mask[s.where] = not equations or s.equation in equations
         # The set's shapes move too when another effect joins: what they can take is not its gain.
-        moves = [jacobian(self.stage, now.fit, used)[1] for used in now.effects]
+        moves = [jacobian(self.train_data, now.fit, used)[1] for used in now.effects]
         field = self._field(replace(data, base=np.hstack((data.base, *moves))), columns, mask)
         r = now.fit.residual * mask
         r = r - field.basis @ (field.basis.T @ r)

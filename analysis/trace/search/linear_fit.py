@@ -62,7 +62,7 @@ def project(
     data: RegressionData, columns: Sequence[VariantColumns], size: Callable[[VariantColumns], int],
     admissible: Callable[[VariantColumns, Array], bool], mask: Array | None = None,
 ) -> CandidateColumns:  # fmt: skip
-    """Project the entries off the stage's own columns; `mask` (M,) switches rows off."""
+    """Project the entries off the data's own columns; `mask` (M,) switches rows off."""
     keep = np.ones(data.base.shape[0]) if mask is None else mask
     basis = orthonormal(data.base * keep[:, None])
     groups, start = [], 0

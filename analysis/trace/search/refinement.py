@@ -39,7 +39,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class DesignMatrix:
-    """Whitened rows of a model on a board: matrix (M, k) of `names`, right side (M,)."""
+    """Whitened rows of a model on regression data: matrix (M, k) of `names`, right side (M,)."""
 
     names: tuple[str, ...]
     matrix: Array
@@ -52,7 +52,7 @@ class DesignMatrix:
 
 @dataclass(frozen=True)
 class ExactFit:
-    """A model with shapes found: terms, the rows' coefficients, residual (M,) on the board."""
+    """A model with shapes found: terms, the rows' coefficients, residual (M,)."""
 
     terms: tuple[Used, ...]
     beta: Mapping[str, float]
@@ -65,7 +65,7 @@ class ExactFit:
 
 
 def table(data: RegressionData, terms: Sequence[Used]) -> DesignMatrix:
-    """Return the whitened rows of a model on the stage's averaged records and instants.
+    """Return the whitened rows of a model on the averaged records and instants.
 
     Instants that the model masks become zero rows.
     """
@@ -131,7 +131,7 @@ def _beside(rows: Rows, columns: Mapping[str, Array]) -> Rows:
 
 
 def fit(data: RegressionData, terms: Sequence[Used]) -> ExactFit:
-    """Solve a model's coefficients on the board, shapes as they are."""
+    """Solve a model's coefficients on regression data, shapes as they are."""
     rows = table(data, terms)
     scale = np.linalg.norm(rows.matrix, axis=0)
     scale[scale == 0] = 1.0
@@ -142,7 +142,7 @@ def fit(data: RegressionData, terms: Sequence[Used]) -> ExactFit:
 
 
 def refine(data: RegressionData, terms: Sequence[Used], steps: int = SEARCH.steps) -> ExactFit:
-    """Search the shape parameters that the board's own terms do not have, from where they are.
+    """Search the shape parameters that the data's own terms do not have, from where they are.
 
     Where an effect has another form, the one that leaves less stays. Then details of forms join,
     one after another, that take more away than chance, and a share of what is left.
@@ -323,7 +323,7 @@ def alternatives(data: RegressionData, fit: ExactFit) -> list[ExactFit]:
 
 
 def rebased(data: RegressionData, model: ExactFit) -> RegressionData:
-    """Return the stage with a fitted model in place of its own."""
+    """Return regression data with a fitted model in place of their own."""
     rows = table(data, model.terms)
     built = []
     for conditioned, before in zip(data.records, data.rows, strict=True):

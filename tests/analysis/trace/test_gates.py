@@ -75,7 +75,7 @@ def benches(rig: Rig) -> Benches:
 def noise_names_nothing(b: Benches, memory: float = 0.0, draws: int = 20) -> None:
     """Of noise, the best of many candidates is significant at 0.05 about once in twenty times."""
     s = b.searched(b.runs(), *MANY)
-    data, rng = s.hypotheses.stage, np.random.default_rng(3)
+    data, rng = s.hypotheses.train_data, np.random.default_rng(3)
     time = next(iter(data.rows[0].values())).time
     keep = np.exp(-float(np.median(np.diff(time))) / memory) if memory else 0.0
     count = 0
@@ -280,7 +280,9 @@ def repeats_that_do_not_differ_make_no_floor_of_nothing(b: Benches) -> None:
 
 
 def the_order_of_the_repeats_changes_nothing(b: Benches) -> None:
-    data = b.searched(b.runs(c_internal=LEAK), "internal_leakage", "torque_offset").hypotheses.stage
+    data = b.searched(
+        b.runs(c_internal=LEAK), "internal_leakage", "torque_offset"
+    ).hypotheses.train_data
     turned = with_residual(data, data.residual[::-1])
     assert turned.mean == pytest.approx(data.mean)
 
@@ -288,7 +290,7 @@ def the_order_of_the_repeats_changes_nothing(b: Benches) -> None:
 def intervals_are_as_wide_as_estimates_scatter(b: Benches) -> None:
     """Over draws of noise the half-width is about twice the deviation of the estimates."""
     s = b.searched(b.runs(c_internal=LEAK), "internal_leakage", "torque_offset")
-    data, fit, used = s.hypotheses.stage, s.winner.fit, s.winner.effects[0]
+    data, fit, used = s.hypotheses.train_data, s.winner.fit, s.winner.effects[0]
     (name,), column = jacobian(data, fit, used)
     base = inference.others(data, fit, (name,))
     own = (column - base @ (base.T @ column))[:, 0]

@@ -13,8 +13,8 @@ from analysis.trace.data.candidates import catalogue
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import RegressionData, regression_data
 from analysis.trace.next_experiment.discrimination import (
+    ComparisonRows,
     Explanation,
-    Ground,
     OpenQuestion,
     calibration,
     loudest,
@@ -53,13 +53,13 @@ def sine() -> tuple[Rig, RegressionData]:
 
 
 @cache
-def grounds(family: str = "fast") -> tuple[Ground, Ground]:
+def rows_of_both(family: str = "fast") -> tuple[ComparisonRows, ComparisonRows]:
     rig, train_data = sine()
     chosen = next(f for f in FAMILIES if f.name == family)
     found = excitation(rig, settings(rig, train_data.records)[0], chosen, np.random.default_rng(1))
     assert found is not None
-    old = Ground(train_data)
-    return old, Ground(train_data, view(train_data, found, calibration(train_data)), old)
+    old = ComparisonRows(train_data)
+    return old, ComparisonRows(train_data, view(train_data, found, calibration(train_data)), old)
 
 
 def test_how_the_joints_stood_is_read_from_the_records() -> None:
@@ -68,7 +68,7 @@ def test_how_the_joints_stood_is_read_from_the_records() -> None:
 
 
 def test_what_an_explanation_can_imitate_is_no_separation() -> None:
-    old, new = grounds()
+    old, new = rows_of_both()
     half = Explanation(LEAK.effects, {"c_internal_2": 5e-13})
     assert separation(OpenQuestion(LEAK, half), old, new)[0] < 1e-3
     # Against the baseline alone the same leak stands out far above the noise.
@@ -77,7 +77,7 @@ def test_what_an_explanation_can_imitate_is_no_separation() -> None:
 
 def test_the_separation_is_the_rms_that_stands_out_of_the_new_rows() -> None:
     """By hand: whiten, project with a QR of one's own, count energy per row and repeat."""
-    old, new = grounds()
+    old, new = rows_of_both()
     question = OpenQuestion(AIR, LEAK, False)
     assert new.seen is not None
     energy = []
@@ -98,18 +98,18 @@ def test_the_separation_is_the_rms_that_stands_out_of_the_new_rows() -> None:
 
 
 def test_air_hardly_shows_on_the_sine_and_shows_on_fast_lines() -> None:
-    old, new = grounds()
+    old, new = rows_of_both()
     question = OpenQuestion(AIR, Explanation(), False)
     assert present(question, old) < 0.5
     assert separation(question, old, new)[0] > 2 * present(question, old)
-    _, small = grounds("small")
+    _, small = rows_of_both("small")
     assert separation(question, old, small)[0] < separation(question, old, new)[0]
 
 
 def test_faster_lines_are_noisier_than_the_sine_and_it_is_foreseen() -> None:
-    old, new = grounds()
+    old, new = rows_of_both()
     assert new.seen is not None
-    floor = {f.equation: f.noise for f in old.stage.floors}
+    floor = {f.equation: f.noise for f in old.train_data.floors}
     assert all(new.seen.noise[e] > 1.5 * floor[e] for e in new.seen.rows)
 
 

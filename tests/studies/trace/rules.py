@@ -156,7 +156,7 @@ RULES: Final = (
          ((HypothesisSet, "prune", lambda _, one: one),)),
     Rule("simpler effect", "an effect that has become a simpler one is not tried as that",
          ((HypothesisSet, "_simplified", lambda *_: None),)),
-    Rule("pairs", "no pair is tried from the first board",
+    Rule("pairs", "no pair is tried beside the baseline",
          ((HypothesisSet, "_pairs", lambda *_: []),)),
     Rule("second form", "an effect is tried in its first form alone",
          ((Friction, "other_forms", lambda *_: ()),), refits=True),
