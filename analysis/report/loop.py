@@ -26,7 +26,7 @@ def write_loop_report(
     path: Path, train: Sequence[Run], holdout: Sequence[Run], rounds: Sequence[Round], stopped: str,
     provenance: Provenance | None = None,
 ) -> None:  # fmt: skip
-    """Write the whole story as one HTML file; raises InputError where it cannot be written."""
+    """Write all rounds as one HTML file; raises InputError where it cannot be written."""
     write(path, render(train, holdout, rounds, stopped, provenance))
 
 
@@ -34,7 +34,7 @@ def render(
     train: Sequence[Run], holdout: Sequence[Run], rounds: Sequence[Round], stopped: str,
     provenance: Provenance | None = None,
 ) -> str:  # fmt: skip
-    """Return the story as HTML text: `train[k]` are the records of round k."""
+    """Return the report as HTML text: `train[k]` are the records of round k."""
     last = rounds[-1]
     context = body(holdout, last.result, provenance)
     more = {

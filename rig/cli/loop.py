@@ -16,7 +16,9 @@ from rig.cli.output import progress, write_json
 
 def loop(
     rig: RigOption,
-    out: Annotated[Path, typer.Option(help="A folder for the runs and the story, made if needed.")],
+    out: Annotated[
+        Path, typer.Option(help="A folder for the runs and the report, made if needed.")
+    ],
     endpoint: EndpointOption = None,
     unattended: Annotated[
         bool, typer.Option("--unattended", help="Run designed experiments without asking.")
@@ -40,7 +42,7 @@ def loop(
     ] = None,
     json: JsonOption = None,
     report: Annotated[
-        Path | None, typer.Option(help="The whole story.  [default: OUT/loop.html]")
+        Path | None, typer.Option(help="The report of all rounds.  [default: OUT/loop.html]")
     ] = None,
     operator: Annotated[
         str | None, typer.Option(help="Written into the runs.  [default: you]")

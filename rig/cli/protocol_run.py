@@ -61,8 +61,8 @@ def _plan(protocol: str, rig: str, overrides: Overrides) -> tuple[Rig, Plan]:
     return bench, resolve(library.load(protocol, overrides.parameters), bench, overrides)
 
 
-class _Story:
-    """Tells the phases of a run to the person, to the run's log and to any screen."""
+class _PhaseReport:
+    """Reports the phases of a run to the person, the run's log and any screen."""
 
     def __init__(self, bench: Bench, say: Say) -> None:
         self._bench, self._say = bench, say
@@ -145,15 +145,15 @@ def run_protocol(job: ProtocolJob, say: Say) -> Path:
         bench = stack.enter_context(Bench(rig, make_driver(wire, rig), recorder, publisher))
         bench.recorded_after = plan.protocol.on_trip.record
         proof.keep(job.out)
-        story = _Story(bench, say)
+        report = _PhaseReport(bench, say)
         bench.describe([PlanLine(part.name, part.title, part.seconds) for part in plan.sequence])
         desk = Desk(machine=desk_machine, terminal=terminal_lines(job.attended))
         if tracking is not None:
             followed = tracking  # for the closure: it is not None
-            tracking.subscribe(story.note, lambda text: story.tracked(text, followed))
+            tracking.subscribe(report.note, lambda text: report.tracked(text, followed))
             bench.observers.add(tracking)
             desk = replace(desk, estimates=TrackedEstimates(tracking))
-        engine.run(plan, rig, bench, story.phase, desk)
+        engine.run(plan, rig, bench, report.phase, desk)
     return job.out
 
 

@@ -24,8 +24,8 @@ from rig.model.alarms.states import AlarmTable
 from rig.tui.acting.manual import ByHand
 from rig.tui.browse import Browsed
 from rig.tui.canvas import Canvas
+from rig.tui.following.event_lines import KINDS
 from rig.tui.following.link import Frame, Link, LinkStage, LocalSessions, Sessions
-from rig.tui.following.story import KINDS
 from rig.tui.look import OF_A_RECORDED_RUN, PAGES, Dialog, PlotView, ScreenStyle
 from rig.tui.pages.operation import in_order
 from rig.tui.pages.parts import joints_in

@@ -64,9 +64,9 @@ class Reader:
 
     def read(self, frame: Frame, now: float) -> None:
         """Say what is new in a frame."""
-        fresh = min(frame.total_lines - self._written, len(frame.story))
+        fresh = min(frame.total_lines - self._written, len(frame.event_lines))
         self._written = frame.total_lines
-        for what in frame.story[len(frame.story) - fresh :]:
+        for what in frame.event_lines[len(frame.event_lines) - fresh :]:
             self._say(f"  at {what.time:.2f} s: {what.text}")
         quiet = frame.over or frame.snapshot is None
         line = status_line(frame, now)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from rig.runs.runstate import EVENTS
-from rig.tui.following.story import EventLine, said_of_event
+from rig.tui.following.event_lines import EventLine, said_of_event
 
 MOST: Final = 20_000  # newest lines that are kept
 LONGEST: Final = 400  # characters of a line

@@ -14,8 +14,8 @@ from rig.model import channels as ch
 from rig.model.alarms.states import AlarmState, AlarmTable, folded
 from rig.tui.drawing.rows import Row
 from rig.tui.drawing.styles import ALARM, ALARM_TEXT, DIM, STALE, STRONG, SYMBOLS, WARN_TEXT
+from rig.tui.following.event_lines import trip_text
 from rig.tui.following.link import ENDED_STATES, QUIET, Frame, LinkStage
-from rig.tui.following.story import trip_text
 from rig.tui.units import Band, age_text, band, limit, shown
 
 VERY_OLD: Final = 3.0  # from here on old data is red instead of yellow [s]

@@ -86,12 +86,12 @@ class Search:
         self, windows: Windows, low: Array | None = None, high: Array | None = None
     ) -> None:
         self.windows, self.low, self.high = windows, low, high
-        self.names, self.stretches = windows.names, windows.stretches
+        self.names, self.placed = windows.names, windows.placed
 
     def run(self, theta: Array) -> OutputErrorFit:
         """Search from theta (k,); parameters that no window depends on keep their values."""
         theta = theta[: len(self.names)]
-        starts = [self.windows.measured_start(s) for s in self.stretches]
+        starts = [self.windows.measured_start(s) for s in self.placed]
         sigma = self.windows.sigma()
         reduced = self.windows.linearised(theta, starts, sigma)
         rounds, moved = 0, np.inf
@@ -122,8 +122,8 @@ class Search:
             new_theta = np.clip(theta + size * step, self.low, self.high)
             taken = new_theta - theta
             new_starts = [
-                s if r is None else self.windows.moved(stretch, s, size * r.offset - r.back @ taken)
-                for stretch, s, r in zip(self.stretches, starts, reduced, strict=True)
+                s if r is None else self.windows.moved(window, s, size * r.offset - r.back @ taken)
+                for window, s, r in zip(self.placed, starts, reduced, strict=True)
             ]
             new = self.windows.linearised(new_theta, new_starts, sigma)
             lost = sum(a is None and b is not None for a, b in zip(new, reduced, strict=True))
@@ -155,7 +155,7 @@ class Search:
         out = {}
         for stratum, old in sigma.items():
             residuals = [
-                r.residual for s, r in zip(self.stretches, reduced, strict=True)
+                r.residual for s, r in zip(self.placed, reduced, strict=True)
                 if r is not None and s.stratum == stratum
             ]  # fmt: skip
             out[stratum] = (
@@ -167,7 +167,7 @@ class Search:
         self, theta: Array, reduced: Sequence[Reduced | None], rounds: int, moved: float
     ) -> OutputErrorFit:
         _, inverse = self._step(theta, reduced)
-        pairs = [(s, r) for s, r in zip(self.stretches, reduced, strict=True) if r is not None]
+        pairs = [(s, r) for s, r in zip(self.placed, reduced, strict=True) if r is not None]
         pieces = Pieces(
             np.array([s.stratum for s, _ in pairs]),
             np.array([s.repeat for s, _ in pairs]),
@@ -184,7 +184,7 @@ class Search:
         error = CovarianceParts(
             covariance, error.dof * np.minimum(grown, 1e6) ** 2, error.systematic
         )
-        failed = len(self.stretches) - len(pairs)
+        failed = len(self.placed) - len(pairs)
         settled = moved < 1.0
         detail = (
             f"{len(pairs)} windows of {IDENTIFY.window:g} s, {rounds} rounds from least squares, "

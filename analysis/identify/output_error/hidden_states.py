@@ -85,7 +85,7 @@ def completed(runs: Sequence[Run], model: Model) -> Model | None:
 def shot(runs: Sequence[Run], model: Model, effect: Effect) -> Shot | None:
     """Search an effect's shapes by multiple shooting; None where no window can be simulated."""
     bounds = {s.parameter: s for s in _shapes(model, effect)}
-    try:  # there may be no stretch without a lost sample or a sensor at its end
+    try:  # there may be no window without a lost sample or a sensor at its end
         windows = _windows(runs, model, effect, _free(model, effect))
         theta = _theta(windows, model)
         low, high = np.full(len(theta), -np.inf), np.full(len(theta), np.inf)
@@ -103,7 +103,7 @@ def shot(runs: Sequence[Run], model: Model, effect: Effect) -> Shot | None:
         value, std = float(search.value[k]), float(np.sqrt(search.spread.covariance[k, k]))
         ends = (value - float(half[k]), value + float(half[k]))
         shapes[name] = Estimate(value, shape.unit, std, ends)
-    return Shot(effect.name, effect.where, shapes, len(windows.stretches), search.check.ok)
+    return Shot(effect.name, effect.where, shapes, len(windows.placed), search.check.ok)
 
 
 def rest_of(runs: Sequence[Run], model: Model, effect: Effect) -> float:
@@ -114,7 +114,7 @@ def rest_of(runs: Sequence[Run], model: Model, effect: Effect) -> float:
     """
     try:
         windows = _windows(runs, model, effect, frozenset())
-        starts = [windows.measured_start(s) for s in windows.stretches]
+        starts = [windows.measured_start(s) for s in windows.placed]
         reduced = windows.linearised(_theta(windows, model), starts, windows.sigma())
     except (InputError, np.linalg.LinAlgError) as error:
         log.info("%s is not judged by windows: %s", effect.name, error)

@@ -15,14 +15,14 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Stretch:
+class PlacedWindow:
     """One window ready to shoot: inputs, measured outputs (points, 3 F), its place in the data."""
 
     record: int
     stratum: int
     repeat: int
     part: int
-    window: ShootingWindow
+    shooting: ShootingWindow
     measured: Array
 
 

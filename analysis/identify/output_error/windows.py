@@ -17,7 +17,7 @@ from analysis.identify.output_error.shooting import (
     parts_of,
     shoot,
 )
-from analysis.identify.output_error.window_data import Nudged, Reduced, Stretch, WindowSource
+from analysis.identify.output_error.window_data import Nudged, PlacedWindow, Reduced, WindowSource
 from analysis.identify.settings import IDENTIFY
 from analysis.regression.conditioned import condition_runs
 from analysis.signals.conditioning import Mask
@@ -60,7 +60,7 @@ class Windows:
         )
         self.names = (*names, nu.KAPPA) if self.warm else names
         self.sources: list[WindowSource] = []
-        self.stretches: list[Stretch] = []
+        self.placed: list[PlacedWindow] = []
         self._idle: dict[int, set[int]] = {}
         self._cut(runs)
 
@@ -87,11 +87,11 @@ class Windows:
             )
             for part, first in enumerate(chosen):
                 at = first + SAMPLES_PER_STEP * every * np.arange(points)
-                self.stretches.append(
-                    Stretch(len(self.sources) - 1, strata[one.group], record.repeat, part,
+                self.placed.append(
+                    PlacedWindow(len(self.sources) - 1, strata[one.group], record.repeat, part,
                              ShootingWindow(first, points), measured[at])
                 )  # fmt: skip
-        if not self.stretches:
+        if not self.placed:
             raise InputError(
                 f"no record holds {IDENTIFY.window:g} s without a clipped sensor or a lost sample: "
                 "output error has nothing to simulate; use --estimator ls"
@@ -129,26 +129,26 @@ class Windows:
             (sensors.chamber_pressure.range, sensors.chamber_pressure.bits))]  # fmt: skip
         floor = np.array([steps[0], steps[1], steps[1]]) / np.sqrt(12)
         out = {}
-        for s in self.stretches:
+        for s in self.placed:
             free = int((~self.sources[s.record].locked).sum())
             out[s.stratum] = np.repeat(np.maximum(base, floor), free)
         return out
 
-    def measured_start(self, stretch: Stretch) -> Array:
+    def measured_start(self, window: PlacedWindow) -> Array:
         """Return a window's first state [q, q', p_cap, p_rod] as measured, (4 N,)."""
-        source = self.sources[stretch.record]
-        s, k = source.signals, stretch.window.first
+        source = self.sources[window.record]
+        s, k = source.signals, window.shooting.first
         return np.concatenate((s.q[k], s.qd[k], s.p_cap[k], s.p_rod[k]))
 
-    def _state_places(self, stretch: Stretch) -> NDArray[np.int64]:
-        locked = self.sources[stretch.record].locked
+    def _state_places(self, window: PlacedWindow) -> NDArray[np.int64]:
+        locked = self.sources[window.record].locked
         free = np.flatnonzero(~locked)
         return np.concatenate([kind * len(locked) + free for kind in range(4)])
 
-    def moved(self, stretch: Stretch, start: Array, change: Array) -> Array:
+    def moved(self, window: PlacedWindow, start: Array, change: Array) -> Array:
         """Return a first state with the free joints' part changed."""
         moved = start.copy()
-        moved[self._state_places(stretch)] += change
+        moved[self._state_places(window)] += change
         return moved
 
     def _nudged(self, theta: Array, source: WindowSource) -> Nudged:
@@ -186,52 +186,52 @@ class Windows:
         ready = [self._nudged(theta, source) for source in self.sources]
 
         def shot(k: int) -> Reduced | None:
-            stretch = self.stretches[k]
-            return self._window(stretch, starts[k], sigma[stretch.stratum], ready[stretch.record])
+            window = self.placed[k]
+            return self._window(window, starts[k], sigma[window.stratum], ready[window.record])
 
         # A record's first window shows which parameters move nothing in it; once that is known,
         # windows need not wait for one another.
         reductions = {}
-        for k, stretch in enumerate(self.stretches):
-            if stretch.record not in self._idle:
+        for k, window in enumerate(self.placed):
+            if window.record not in self._idle:
                 reductions[k] = shot(k)
-        rest = [k for k in range(len(self.stretches)) if k not in reductions]
+        rest = [k for k in range(len(self.placed)) if k not in reductions]
         with ThreadPoolExecutor(IDENTIFY.window_workers) as pool:
             reductions |= zip(rest, pool.map(shot, rest), strict=True)
-        return [reductions[k] for k in range(len(self.stretches))]
+        return [reductions[k] for k in range(len(self.placed))]
 
     def _window(
-        self, stretch: Stretch, start: Array, sigma: Array, nudged: Nudged
+        self, window: PlacedWindow, start: Array, sigma: Array, nudged: Nudged
     ) -> Reduced | None:
         """Shoot one window with every nudge and eliminate its start."""
         ready, nudges = nudged.ready, nudged.sizes
-        source = self.sources[stretch.record]
-        places = self._state_places(stretch)
+        source = self.sources[window.record]
+        places = self._state_places(window)
         free = len(places) // 4
         state_nudges = np.repeat(IDENTIFY.start_steps, free)
-        active = self._active(stretch.record)
+        active = self._active(window.record)
         y0 = np.zeros((1 + len(places) + len(active), len(start) + ready.hidden))
         y0[:, : len(start)] = start
         for row, (place, nudge) in enumerate(zip(places, state_nudges, strict=True), start=1):
             y0[row, place] += nudge
         chosen = np.concatenate((np.zeros(1 + len(places), dtype=np.int64), 1 + active))
         if y0.shape[1] > len(start):
-            first = stretch.window.first
+            first = window.shooting.first
             y0[:, len(start) :] = [nudged.hidden[k][first] for k in chosen]
         states = shoot(
             ready, np.ascontiguousarray(nudged.pars[chosen]), y0, source.inputs,
-            source.signals.rate, source.locked, stretch.window, self.every, self.parts,
+            source.signals.rate, source.locked, window.shooting, self.every, self.parts,
         )  # fmt: skip
         if states is None:
             return None
         outputs = self._outputs(states, source.locked) / sigma
-        residual = stretch.measured / sigma - outputs[0]
+        residual = window.measured / sigma - outputs[0]
         change = (outputs[1:] - outputs[0]).reshape(len(outputs) - 1, -1)
         Js = (change[: len(places)] / state_nudges[:, None]).T
         J = np.zeros((Js.shape[0], len(nudges)))
         J[:, active] = (change[len(places) :] / nudges[active, None]).T
-        if stretch.record not in self._idle:
-            self._idle[stretch.record] = {int(k) for k in active if not J[:, k].any()}
+        if window.record not in self._idle:
+            self._idle[window.record] = {int(k) for k in active if not J[:, k].any()}
         r = residual.ravel()
         # Project the window's start out by QR of its sensitivities.
         Q, R = np.linalg.qr(Js)

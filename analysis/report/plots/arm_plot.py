@@ -89,8 +89,8 @@ def arm(rig: Rig) -> Markup:
     """Draw the arm at mid-stroke, each joint's two ends as ghosts, and where the tip can be."""
     q = middle(rig)
     with style():
-        made = figure(4.2, CARD)
-        axes = made.add_axes((0.02, 0.02, 0.96, 0.96))
+        canvas = figure(4.2, CARD)
+        axes = canvas.add_axes((0.02, 0.02, 0.96, 0.96))
         axes.set_aspect("equal")
         axes.axis("off")
         tips = reach(rig)
@@ -108,7 +108,7 @@ def arm(rig: Rig) -> Markup:
         _limits(axes, np.vstack((tips, at.joints, at.inner, at.outer)))
         _scale_bar(axes)
         label = f"Side view of an arm of {len(rig.joints)} joints with its cylinders at mid-stroke"
-        return svg(made, "rig", label)
+        return svg(canvas, "rig", label)
 
 
 def _tip_region(axes: Any, rig: Rig, tips: Array) -> None:

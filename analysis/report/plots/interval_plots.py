@@ -26,9 +26,9 @@ def against_reference(
         if e.identified and reference.get(name)
     }
     with style():
-        made = figure(0.75 + ROW * len(names))
-        axes = made.add_axes((0.13, 0.42 / made.get_figheight(), 0.84,
-                              1 - 0.62 / made.get_figheight()))  # fmt: skip
+        canvas = figure(0.75 + ROW * len(names))
+        axes = canvas.add_axes((0.13, 0.42 / canvas.get_figheight(), 0.84,
+                              1 - 0.62 / canvas.get_figheight()))  # fmt: skip
         limit = _limit([max(abs(v) for v in row if np.isfinite(v)) for row in rows.values()])
         axes.axvline(0.0, color=INK, linewidth=0.8)
         for y, name in enumerate(names):
@@ -41,7 +41,7 @@ def against_reference(
         axes.set_xlim(-limit, limit)
         axes.set_xlabel(f"deviation from {kind} [%]")
         axes.set_title("estimate and 95 % interval")
-        return svg(made, "par-ref", f"Deviation of every parameter from its {kind} value")
+        return svg(canvas, "par-ref", f"Deviation of every parameter from its {kind} value")
 
 
 def _limit(extents: list[float]) -> float:
@@ -84,9 +84,9 @@ def interval_widths(estimates: Mapping[str, Estimate]) -> Markup:
     widths = [relative_half_width(e) for e in estimates.values()]
     shown = [w for w in widths if np.isfinite(w) and w > 0]
     with style():
-        made = figure(0.75 + ROW * len(names))
-        axes = made.add_axes((0.13, 0.42 / made.get_figheight(), 0.84,
-                              1 - 0.62 / made.get_figheight()))  # fmt: skip
+        canvas = figure(0.75 + ROW * len(names))
+        axes = canvas.add_axes((0.13, 0.42 / canvas.get_figheight(), 0.84,
+                              1 - 0.62 / canvas.get_figheight()))  # fmt: skip
         low = min(shown, default=0.1) / 2
         axes.set_xscale("log")
         for y, width in enumerate(widths):
@@ -101,7 +101,7 @@ def interval_widths(estimates: Mapping[str, Estimate]) -> Markup:
         axes.set_xlabel("half of the 95 % interval, relative to the value [%]")
         axes.set_title("how well each is determined")
         axes.xaxis.set_major_formatter(lambda v, _: f"{v:g}")
-        return svg(made, "par-ci", "Relative half width of every parameter's 95 % interval")
+        return svg(canvas, "par-ci", "Relative half width of every parameter's 95 % interval")
 
 
 def relative_half_width(estimate: Estimate) -> float:

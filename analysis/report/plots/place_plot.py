@@ -124,10 +124,10 @@ def drawn(rig: Rig, lines: Sequence[Line]) -> Markup:
     right = WIDTH * len(rig.joints) + 1.0
     low, high = (1.8, 6.2) if rig.electric else (-0.5, 9.7)
     with style():
-        made = figure(0.3 * len(lines) + (CARD * 2) * min((high - low) / (right - left), 0.5),
+        canvas = figure(0.3 * len(lines) + (CARD * 2) * min((high - low) / (right - left), 0.5),
                       CARD * 2)  # fmt: skip
-        share = 0.3 * len(lines) / made.get_figheight()
-        axes = made.add_axes((0.01, share, 0.98, 0.99 - share))
+        share = 0.3 * len(lines) / canvas.get_figheight()
+        axes = canvas.add_axes((0.01, share, 0.98, 0.99 - share))
         axes.set_xlim(left, right)
         axes.set_ylim(low, high)
         axes.set_aspect("equal")
@@ -143,11 +143,14 @@ def drawn(rig: Rig, lines: Sequence[Line]) -> Markup:
             words = f"{k + 1}  {name.replace('_', ' ')} at {where}"
             if colour == ORANGE:
                 words += ", which these records cannot tell from it"
-            made.text(
-                0.02, share - 0.3 * (k + 0.7) / made.get_figheight(), words, color=INK, fontsize=9,
+            canvas.text(
+                0.02, share - 0.3 * (k + 0.7) / canvas.get_figheight(), words,
+                color=INK, fontsize=9,
                 bbox={"facecolor": colour, "alpha": 0.25, "edgecolor": "none", "pad": 2.0},
             )  # fmt: skip
-        return svg(made, "places", "Schematic of the machine with the places of the effects marked")
+        return svg(
+            canvas, "places", "Schematic of the machine with the places of the effects marked"
+        )
 
 
 def _line(axes: Any, *points: tuple[float, float]) -> None:

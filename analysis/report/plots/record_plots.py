@@ -76,9 +76,9 @@ def excitation(rig: Rig, record: Record, joint: int, key: str) -> Markup:
     command = record.channels.get(ch.channel(ch.COMMAND, joint))
     shown = slice(0, int(min(record.samples, SHOWN_SECONDS * record.sample_rate)))
     with style():
-        made = figure(3.7)
-        top = made.add_axes((0.13, 0.60, 0.84, 0.33))
-        low = made.add_axes((0.13, 0.115, 0.84, 0.33))
+        canvas = figure(3.7)
+        top = canvas.add_axes((0.13, 0.60, 0.84, 0.33))
+        low = canvas.add_axes((0.13, 0.115, 0.84, 0.33))
         if command is not None:
             top.plot(
                 *thin(record.time[shown], np.asarray(command)[shown]), color=SKY, linewidth=2.2
@@ -92,23 +92,23 @@ def excitation(rig: Rig, record: Record, joint: int, key: str) -> Markup:
         if command is not None:
             note(top, 0.005, 0.99, "command", BLUE, ha="left")
         _spectrum(low, record, spool)
-        return svg(made, key, f"Excitation of joint {joint} in time and frequency")
+        return svg(canvas, key, f"Excitation of joint {joint} in time and frequency")
 
 
 def electric_excitation(rig: Rig, record: Record, joint: int, key: str) -> Markup:
     """Draw drive and position of one electric joint in time."""
     shown = slice(0, int(min(record.samples, ELECTRIC_SECONDS * record.sample_rate)))
     with style():
-        made = figure(3.7)
+        canvas = figure(3.7)
         for place, kind in enumerate((ch.DRIVE, ch.POSITION)):
-            axes = made.add_axes((0.15, 0.60 - 0.485 * place, 0.82, 0.33))
+            axes = canvas.add_axes((0.15, 0.60 - 0.485 * place, 0.82, 0.33))
             name = ch.channel(kind, joint)
             x = bridged(np.asarray(record.channels[name]))
             axes.plot(*thin(record.time[shown], x[shown]), color=INK, linewidth=0.7)
             axes.margins(x=0, y=0.12)
             axes.set_ylabel(f"{kind} [{rig.unit_of(name)}]")
             axes.set_xlabel("time [s]", labelpad=1)
-        return svg(made, key, f"Drive and position of joint {joint} in time")
+        return svg(canvas, key, f"Drive and position of joint {joint} in time")
 
 
 def _spectrum(axes: Any, record: Record, spool: Array) -> None:
@@ -157,9 +157,9 @@ def residual(shown: Residual, key: str) -> Markup:
     """Draw one equation's residual in time, and its density against the scatter of repeats."""
     unit = display_unit(shown.unit)
     with style():
-        made = figure(3.3)
-        top = made.add_axes((0.15, 0.60, 0.82, 0.32))
-        low = made.add_axes((0.15, 0.125, 0.82, 0.31))
+        canvas = figure(3.3)
+        top = canvas.add_axes((0.15, 0.60, 0.82, 0.32))
+        low = canvas.add_axes((0.15, 0.125, 0.82, 0.31))
         t, mean = gapped(shown.time, unit.scale * shown.mean)
         if shown.repeats > 1:
             _, band = gapped(shown.time, unit.scale * shown.scatter_band)
@@ -176,7 +176,9 @@ def residual(shown: Residual, key: str) -> Markup:
         what = "mean of repeats, ±1 scatter" if shown.repeats > 1 else "the only repeat"
         note(top, 0.995, 0.99, what, BLUE)
         _densities(low, shown, unit.scale, unit.text)
-        return svg(made, key, f"Residual of one equation of joint {shown.joint}, time and spectrum")
+        return svg(
+            canvas, key, f"Residual of one equation of joint {shown.joint}, time and spectrum"
+        )
 
 
 def _densities(axes: Any, residual: Residual, scale: float, unit: str) -> None:

@@ -87,9 +87,9 @@ def style() -> Iterator[None]:
 
 def figure(height: float, width: float = CARD) -> Figure:
     """Return an empty figure of the given size [in] that no global list knows."""
-    made = Figure(figsize=(width, height))
-    FigureCanvasSVG(made)
-    return made
+    canvas = Figure(figsize=(width, height))
+    FigureCanvasSVG(canvas)
+    return canvas
 
 
 def thin(x: Array, y: Array, points: int = POINTS) -> tuple[Array, Array]:
@@ -118,10 +118,10 @@ _LONG = re.compile(r"-?\d+\.\d{3,}")
 _FONT = re.compile(r"font:\s*(?:(\d+)\s+)?([\d.]+)px '[^;\"]*'")
 
 
-def svg(made: Figure, key: str, label: str) -> Markup:
+def svg(canvas: Figure, key: str, label: str) -> Markup:
     """Return the figure as an inline <svg>: `key` keeps its ids apart, `label` is read aloud."""
     buffer = io.StringIO()
-    made.savefig(
+    canvas.savefig(
         buffer, format="svg",
         metadata={"Date": None, "Creator": None, "Format": None, "Type": None},
     )  # fmt: skip

@@ -128,9 +128,9 @@ def against(
     top = 1.1 * max(float(np.quantile(np.abs(parts[0][1]), 0.995)), 2.5 * noise)
     kept = np.linspace(0, len(x) - 1, min(POINTS, len(x))).astype(int)
     with style():
-        made = figure(2.5, CARD * (2 if after else 1))
+        canvas = figure(2.5, CARD * (2 if after else 1))
         for k, (word, y) in enumerate(parts):
-            axes = made.add_subplot(1, len(parts), k + 1)
+            axes = canvas.add_subplot(1, len(parts), k + 1)
             axes.axhspan(-noise, noise, color=PALE, alpha=0.7, lw=0)
             colour = BLUE if k else GREY
             axes.plot(x[kept], y[kept], ".", color=colour, ms=2.2, alpha=0.5, mew=0)
@@ -143,15 +143,15 @@ def against(
                 axes.set_ylabel(f"residual [{unit}]")
             rms = float(np.sqrt(np.mean(y**2)))
             note(axes, 0.98, 0.98, f"{word}: {fm.significant(rms)} {unit} rms", INK)
-        made.tight_layout()
-        return svg(made, key, f"Residual against {label}, before and after")
+        canvas.tight_layout()
+        return svg(canvas, key, f"Residual against {label}, before and after")
 
 
 def curves(effect: JudgedEffect, key: str) -> Markup:
     """Draw the curves of an effect whose form the data draw, each with its band."""
     with style():
-        made = figure(2.4, CARD * 2)
-        axes = made.add_subplot()
+        canvas = figure(2.4, CARD * 2)
+        axes = canvas.add_subplot()
         for curve, colour in zip(effect.curves, (BLUE, MODEL, GREY, INK), strict=False):
             axes.fill_between(curve.x, curve.lo, curve.hi, color=colour, alpha=0.18, lw=0)
             axes.plot(curve.x, curve.y, color=colour, lw=1.6, label=curve.label)
@@ -159,8 +159,8 @@ def curves(effect: JudgedEffect, key: str) -> Markup:
         axes.set_ylabel(f"[{effect.curves[0].unit_y}]")
         if len(effect.curves) > 1:
             axes.legend(frameon=False)
-        made.tight_layout()
-        return svg(made, key, f"{effect.name.replace('_', ' ')} with its 95 % band")
+        canvas.tight_layout()
+        return svg(canvas, key, f"{effect.name.replace('_', ' ')} with its 95 % band")
 
 
 def instead(effect: JudgedEffect, key: str) -> Markup | None:
@@ -181,8 +181,8 @@ def instead(effect: JudgedEffect, key: str) -> Markup | None:
     high = 1.25 * max(2.0, *(bar[1] for bar in bars))
     low = 0.9 * min(1.0, *(bar[1] for bar in bars))
     with style():
-        made = figure(0.5 + 0.4 * len(bars), CARD * 2)
-        axes = made.add_subplot()
+        canvas = figure(0.5 + 0.4 * len(bars), CARD * 2)
+        axes = canvas.add_subplot()
         for k, (name, left, why, colour) in enumerate(reversed(bars)):
             axes.barh(k, left - low, 0.36, left=low, color=colour, lw=0)
             axes.text(left, k, f" {fm.significant(left)}", va="center", fontsize=7.5)
@@ -200,8 +200,10 @@ def instead(effect: JudgedEffect, key: str) -> Markup | None:
         axes.spines["left"].set_visible(False)
         axes.set_ylim(-0.4, len(bars) - 0.4)
         axes.set_xlabel("held-out error over the noise of the repeats' mean (dashed)")
-        made.tight_layout()
-        return svg(made, key, f"Held-out error with {effect.name.replace('_', ' ')} and its rivals")
+        canvas.tight_layout()
+        return svg(
+            canvas, key, f"Held-out error with {effect.name.replace('_', ' ')} and its rivals"
+        )
 
 
 def _called(name: str, where: str) -> str:
@@ -230,8 +232,8 @@ def in_time(line: ResidualSeries, noise: float, unit: str, key: str, after: bool
     middle = 0.5 * (t[0] + t[-1])
     shown = (t >= middle - 0.5 * SECONDS) & (t <= middle + 0.5 * SECONDS)
     with style():
-        made = figure(2.1, CARD * 2)
-        axes = made.add_subplot()
+        canvas = figure(2.1, CARD * 2)
+        axes = canvas.add_subplot()
         axes.axhspan(-noise, noise, color=PALE, alpha=0.7, lw=0)
         axes.plot(*gapped(t[shown], line.before[shown]), color=GREY, lw=1.1)
         note(axes, 0.99, 0.97, "before", GREY)
@@ -240,16 +242,16 @@ def in_time(line: ResidualSeries, noise: float, unit: str, key: str, after: bool
             note(axes, 0.99, 0.84, "after", BLUE)
         axes.set_xlabel("time in the record [s]")
         axes.set_ylabel(f"residual [{unit}]")
-        made.tight_layout()
-        return svg(made, key, "Held-out residual in time, before and after")
+        canvas.tight_layout()
+        return svg(canvas, key, "Held-out residual in time, before and after")
 
 
 def over_noise(result: Trace, key: str = "overnoise") -> Markup:
     """Draw every equation's held-out error over its noise floor, before and after."""
     names = list(result.before)
     with style():
-        made = figure(0.5 + 0.32 * len(names), CARD * 2)
-        axes = made.add_subplot()
+        canvas = figure(0.5 + 0.32 * len(names), CARD * 2)
+        axes = canvas.add_subplot()
         for k, name in enumerate(reversed(names)):
             floor = result.noise_floor.get(name, np.nan)
             a, b = result.before[name] / floor, result.after.get(name, np.nan) / floor
@@ -268,8 +270,8 @@ def over_noise(result: Trace, key: str = "overnoise") -> Markup:
         axes.set_yticks(range(len(names)), list(reversed(names)))
         axes.set_ylim(-0.6, len(names) - 0.4)
         axes.set_xlabel("held-out error over the noise floor (grey before, blue after)")
-        made.tight_layout()
-        return svg(made, key, "Held-out error over the noise floor, before and after")
+        canvas.tight_layout()
+        return svg(canvas, key, "Held-out error over the noise floor, before and after")
 
 
 def spectrum(shown: Spectrum, unit: str, key: str, after: bool) -> Markup:
@@ -284,9 +286,9 @@ def spectrum(shown: Spectrum, unit: str, key: str, after: bool) -> Markup:
     low = 0.2 * float(np.median(noise))
     top = 2.0 * float(np.sqrt(max(shown.repeatable.max(), shown.noise.max())))
     with style():
-        made = figure(2.6, CARD * (2 if after else 1))
+        canvas = figure(2.6, CARD * (2 if after else 1))
         for k, word in enumerate(("before", "after") if after else ("before",)):
-            axes = made.add_subplot(1, 2 if after else 1, k + 1)
+            axes = canvas.add_subplot(1, 2 if after else 1, k + 1)
             power = shown.after if k else shown.repeatable
             axes.fill_between(shown.frequency, low, np.maximum(noise, low), color=PALE, lw=0)
             for label, own, marker, colour, size in kinds:
@@ -303,8 +305,8 @@ def spectrum(shown: Spectrum, unit: str, key: str, after: bool) -> Markup:
                 axes.set_ylabel(f"repeats, rms per line [{unit}]")
                 axes.legend(loc="lower left", fontsize=7, ncols=3, handletextpad=0.2, frameon=False)
             note(axes, 0.98, 0.98, word, INK)
-        made.tight_layout()
-        return svg(made, key, "Lines of the residual, before and after")
+        canvas.tight_layout()
+        return svg(canvas, key, "Lines of the residual, before and after")
 
 
 _BINS = 24
@@ -326,11 +328,11 @@ def unit_of_variable(rig: Rig, name: str) -> str:
     """Return a variable's SI unit for an axis."""
     stem = name.rsplit("_", 1)[0]
     way = rig.unit_of(ch.channel(rig.position_kind, 1))
-    made = {
+    units = {
         "velocity": f"{way}/s", "acceleration": f"{way}/s²", "pressure_difference": "Pa",
         "time": "s",
     }  # fmt: skip
-    return made[stem] if stem in made else rig.unit_of(name)
+    return units[stem] if stem in units else rig.unit_of(name)
 
 
 def equation_of(

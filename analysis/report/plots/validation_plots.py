@@ -45,8 +45,8 @@ def comparison(
         (ch.ROD, "rod pressure / p_s", 1.0 / rig.supply.pressure),
     )
     with style():
-        made = figure(4.7)
-        grid = made.subplots(
+        canvas = figure(4.7)
+        grid = canvas.subplots(
             4, 1, sharex=True,
             gridspec_kw={"left": 0.13, "right": 0.975, "top": 0.955, "bottom": 0.085,
                          "hspace": 0.42, "height_ratios": (0.7, 1, 1, 1)},
@@ -79,4 +79,4 @@ def comparison(
         grid[-1].set_xlabel("time [s]", labelpad=1)
         if result.failure and real < part.stop:
             note(grid[1], 0.995, 1.0, "the model's state ceased to exist", MODEL)
-        return svg(made, key, f"Measured and simulated channels of joint {joint}")
+        return svg(canvas, key, f"Measured and simulated channels of joint {joint}")

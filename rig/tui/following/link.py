@@ -19,8 +19,8 @@ from rig.bench.screens.commands import Command, own_command
 from rig.bench.screens.past import PastMinute, PlanLine
 from rig.bench.screens.sockets import Attachment, Endpoint, Snapshot
 from rig.runs.runstate import read_events
+from rig.tui.following.event_lines import EventLine, from_events, new_lines
 from rig.tui.following.history import EMPTY, History, HistoryWindow
-from rig.tui.following.story import EventLine, from_events, new_lines
 
 log = logging.getLogger(__name__)
 
@@ -28,7 +28,7 @@ FRAME: Final = 1 / 10  # shortest time between two frames [s]
 POLL: Final = 0.1  # longest wait for a snapshot [s]
 LOOK: Final = 0.5  # between looks for a session while none is attached [s]
 QUIET: Final = 0.5  # a run silent for this long is stale, and it is asked whether it still is [s]
-STORY: Final = 2000  # lines kept
+KEPT_LINES: Final = 2000  # of the event log, and of estimates
 ANSWERED: Final = 1.0  # time for a run to say what it did lately [s]
 ENDED_STATES: Final = frozenset({"done", "aborted", "tripped", "interrupted"})
 
@@ -119,7 +119,7 @@ class Frame:
     received: float = 0.0
     window: HistoryWindow = EMPTY
     speed: float = 1.0  # device seconds per wall second
-    story: tuple[EventLine, ...] = ()  # what happened, oldest first, the newest STORY lines of it
+    event_lines: tuple[EventLine, ...] = ()  # oldest first, the newest KEPT_LINES of them
     total_lines: int = 0  # how many lines there have ever been
     plan: tuple[PlanLine, ...] = ()
     estimates: tuple[TrackedPoint, ...] = ()  # oldest first
@@ -275,14 +275,16 @@ class Link:
         estimates = before.estimates
         if snapshot.estimates and (not estimates or estimates[-1].values != snapshot.estimates):
             point = TrackedPoint(snapshot.done_s, snapshot.estimates, snapshot.residuals)
-            estimates = (*estimates, point)[-STORY:]
+            estimates = (*estimates, point)[-KEPT_LINES:]
         # The window follows at the frame rate; what is said in words follows every snapshot.
         self._frame = replace(
             before,
             snapshot=snapshot,
             received=now if _has_news(before.snapshot, snapshot) else before.received,
             speed=_speed(before, snapshot),
-            story=(*before.story, *lines)[-STORY:] if lines else before.story,
+            event_lines=(*before.event_lines, *lines)[-KEPT_LINES:]
+            if lines
+            else before.event_lines,
             total_lines=before.total_lines + len(lines),
             estimates=estimates,
             interval=_interval(before, snapshot),
@@ -303,12 +305,14 @@ class Link:
         past = self._source.past(ANSWERED)
         if past is None:
             return
-        story = frame.story
+        event_lines = frame.event_lines
         if first and self._history.begin_with(past) and frame.snapshot.run:
             earlier = from_events(read_events(Path(frame.snapshot.run)), frame.snapshot)
-            story = (*earlier, *story)[-STORY:]
-        total_lines = frame.total_lines + len(story) - len(frame.story)
-        self._frame = replace(self._frame, plan=past.plan, story=story, total_lines=total_lines)
+            event_lines = (*earlier, *event_lines)[-KEPT_LINES:]
+        total_lines = frame.total_lines + len(event_lines) - len(frame.event_lines)
+        self._frame = replace(
+            self._frame, plan=past.plan, event_lines=event_lines, total_lines=total_lines
+        )
 
     def _follow_sessions(self) -> None:
         now = self._clock()
@@ -345,7 +349,7 @@ class Link:
             kept.sessions,
             endpoint,
             received=self._clock(),
-            story=kept.story,
+            event_lines=kept.event_lines,
             total_lines=kept.total_lines,
         )
 

@@ -9,7 +9,7 @@ from rig.model.alarms.states import Alarm, folded
 from rig.tui.drawing.plot import PlotTrace, draw
 from rig.tui.drawing.rows import Row, beside, block, box, columns, fit, row, wrapped
 from rig.tui.drawing.styles import ASK, ASK_TEXT, DIM, NORMAL, STRONG, WARN_TEXT
-from rig.tui.following.story import EventLine
+from rig.tui.following.event_lines import EventLine
 from rig.tui.look import PlotView
 from rig.tui.pages.overview import alarm_mark
 from rig.tui.units import clock_text, limit, shown
@@ -151,7 +151,7 @@ def filtered(lines: Sequence[EventLine], view: PlotView) -> list[EventLine]:
 
 def log_page(view: PlotView, width: int, height: int) -> list[Row]:
     """Return the log of the run on the screen."""
-    return log_rows(view.newest.story, view, width, height)
+    return log_rows(view.newest.event_lines, view, width, height)
 
 
 def run_log_page(view: PlotView, width: int, height: int) -> list[Row]:
@@ -171,9 +171,11 @@ def run_log_page(view: PlotView, width: int, height: int) -> list[Row]:
     return [*head, *log_rows(log.lines, view, width, max(height - len(head), 1))]
 
 
-def log_rows(story: Sequence[EventLine], view: PlotView, width: int, height: int) -> list[Row]:
+def log_rows(
+    event_lines: Sequence[EventLine], view: PlotView, width: int, height: int
+) -> list[Row]:
     """Return lines of a log, wrapped, the newest below; scrolled by rows."""
-    lines = filtered(story, view)
+    lines = filtered(event_lines, view)
     room = height - 1
     wanted = view.look.offset
     # A line has a row at least: what is scrolled away above the window need not be wrapped.
@@ -181,7 +183,7 @@ def log_rows(story: Sequence[EventLine], view: PlotView, width: int, height: int
     offset = min(wanted, max(len(rows) - room, 0))
     search = f"  search: {view.look.search}" if view.look.search else ""
     where = f"  {offset} rows back" if offset else ""
-    count = f"  {len(lines)} of {len(story)}{where}"
+    count = f"  {len(lines)} of {len(event_lines)}{where}"
     head = row((f" {view.look.only}{search}", STRONG), (count, DIM))
     shown_rows = rows[max(len(rows) - room - offset, 0) : len(rows) - offset]
     return block([head, *shown_rows], width, height)
