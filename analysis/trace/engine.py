@@ -248,7 +248,7 @@ def _unphysical(
     hypotheses: HypothesisSet, holdout_data: RegressionData, rng: np.random.Generator
 ) -> tuple[JudgedEffect, ...]:
     """Return what physics alone refuses of the simplest set that would leave next to nothing."""
-    near = [o for o in hypotheses.listed.values() if hypotheses.formed(o) and o.effects]
+    near = [o for o in hypotheses.fitted.values() if hypotheses.formed(o) and o.effects]
     near = [o for o in near if hypotheses.physical(o)]
     if not near:
         return ()

@@ -52,7 +52,7 @@ def judge(
     train_data = hypotheses.train_data
     values = parameter_values(train_data.rig, winner.fit.terms, dict(winner.fit.beta))
     null = inference.null_maximum(
-        hypotheses.field, train_data, _noise_like(train_data, winner.fit.residual), rng
+        hypotheses.candidates, train_data, _noise_like(train_data, winner.fit.residual), rng
     )
     steady = inference.stability(hypotheses, winner, rng)
     after = held_left(holdout_data, winner.fit)
@@ -241,7 +241,7 @@ def _rivals(
         )
     )
     out = []
-    for hypothesis in hypotheses.listed.values():
+    for hypothesis in hypotheses.fitted.values():
         fresh = [
             u.term for u in hypothesis.effects if (u.term.name, u.term.where) not in winner.keys
         ]
@@ -279,7 +279,7 @@ def _refused_already(
     """Return whether a rival says no more than a simpler reading of both, which is refused."""
     mine, other = pair
     for name in set(other.includes) & set(mine.includes) if other.where == mine.where else ():
-        simple = hypotheses.listed.get(others | {(name, other.where)})
+        simple = hypotheses.fitted.get(others | {(name, other.where)})
         if simple is not None:
             more = loss(held_left(holdout_data, simple.fit), held)
             return more <= TRACE.standard_errors

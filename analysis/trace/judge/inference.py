@@ -169,7 +169,7 @@ def stability(
 ) -> dict[Key, tuple[float, dict[Key, int]]]:
     """Return, by effect, in which share of half-samples it is chosen, and who else was."""
     train_data = hypotheses.train_data
-    near = sorted(hypotheses.listed.values(), key=lambda o: o.total)
+    near = sorted(hypotheses.fitted.values(), key=lambda o: o.total)
     near = [o for o in near if not hypotheses.physical(o)][:12]
     if winner.keys not in [o.keys for o in near]:
         near.append(winner)

@@ -138,7 +138,7 @@ def tied_sets(
     for effect in effects:
         tied = {(r.name, r.where) for r in effect.rivals if r.tied}
         others = [u for u in winner.effects if _key(u.term) != (effect.name, effect.where)]
-        for hypothesis in hypotheses.listed.values():
+        for hypothesis in hypotheses.fitted.values():
             fresh = [
                 u for u in hypothesis.effects if u.term not in [w.term for w in winner.effects]
             ]
@@ -156,7 +156,7 @@ def _key(term: Any) -> tuple[str, str]:
 
 def _unsettled(hypotheses: HypothesisSet) -> list[OpenQuestion]:
     """Return the best set against the others that leave about as little, and against none."""
-    allowed = [o for o in hypotheses.listed.values() if o.effects and not hypotheses.physical(o)]
+    allowed = [o for o in hypotheses.fitted.values() if o.effects and not hypotheses.physical(o)]
     allowed.sort(key=lambda o: o.total)
     if not allowed or allowed[0].total >= hypotheses.empty.total:
         return []

@@ -49,10 +49,10 @@ class HypothesisSet:
         self.base = tuple(train_data.terms)
         self.effects = tuple(effects)
         self.limits = limits(train_data)
-        self.listed: dict[frozenset[Key], Hypothesis] = {}
-        self.empty = self._listed((), fit(train_data, self.base))
+        self.fitted: dict[frozenset[Key], Hypothesis] = {}
+        self.empty = self._hypothesis((), fit(train_data, self.base))
 
-    def _listed(self, effects: tuple[Used, ...], fit: ExactFit) -> Hypothesis:
+    def _hypothesis(self, effects: tuple[Used, ...], fit: ExactFit) -> Hypothesis:
         rig = self.train_data.rig
         return Hypothesis(
             effects, fit, excess_of(self.train_data, fit.residual), complexity(rig, effects)
@@ -65,8 +65,8 @@ class HypothesisSet:
         more = variant_columns(
             self.train_data, wide._variants(self.train_data, self.train_data.mean)
         )
-        wide.found = [*self.found, *more]
-        wide.field = self._field(self.train_data, wide.found)
+        wide.columns = [*self.columns, *more]
+        wide.candidates = self._candidate_columns(self.train_data, wide.columns)
         wide.effects = (*self.effects, *effects)
         return wide
 
@@ -91,10 +91,10 @@ class HypothesisSet:
     def exact(self, effects: Sequence[Used]) -> Hypothesis:
         """Return the set refined exactly (once per set of names and places)."""
         key = frozenset((u.term.name, u.term.where) for u in effects)
-        if key not in self.listed:
+        if key not in self.fitted:
             fit = refine(self.train_data, (*self.base, *effects))
-            self.listed[key] = self._listed(fit.terms[len(self.base) :], fit)
-        return self.listed[key]
+            self.fitted[key] = self._hypothesis(fit.terms[len(self.base) :], fit)
+        return self.fitted[key]
 
     def tried(self, sets: Sequence[tuple[Used, ...]]) -> list[Hypothesis]:
         """Return the sets refined exactly; one whose effect has become a simpler one, also so."""
@@ -141,19 +141,19 @@ class HypothesisSet:
 
         `progress` receives which share of the first columns is there.
         """
-        self.found = variant_columns(
+        self.columns = variant_columns(
             self.train_data, self._variants(self.train_data, self.train_data.mean), progress
         )
-        field = self.field = self._field(self.train_data, self.found)
+        candidates = self.candidates = self._candidate_columns(self.train_data, self.columns)
         r = self.train_data.mean
-        r = r - field.basis @ (field.basis.T @ r)
-        singles = self.tried(self._singles(field, r))
+        r = r - candidates.basis @ (candidates.basis.T @ r)
+        singles = self.tried(self._singles(candidates, r))
         now = self.prune(self.best([self.empty, *singles]))
         if within(now.excess_energy, self.limits):
             return now
         if self.formed(now):
             return self.completed(now)
-        pairs = self.tried(self._pairs(field, r, singles))
+        pairs = self.tried(self._pairs(candidates, r, singles))
         now = self.prune(self.best([self.empty, *singles, *pairs]))
         while not within(now.excess_energy, self.limits) and len(now.effects) < SEARCH.largest_set:
             grown = self.prune(self.best([now, *self.extensions(now)]))
@@ -181,7 +181,7 @@ class HypothesisSet:
         best = self.best(more) if more else now
         return best if best.effects and self.prune(best).keys == best.keys else now
 
-    def _field(
+    def _candidate_columns(
         self, data: RegressionData, columns: Sequence[VariantColumns], mask: Array | None = None
     ) -> linear_fit.CandidateColumns:
         rig = data.rig
@@ -201,12 +201,14 @@ class HypothesisSet:
 
         return linear_fit.project(data, columns, size, allowed, mask)
 
-    def _singles(self, field: linear_fit.CandidateColumns, r: Array) -> list[tuple[Used, ...]]:
-        g = linear_fit.gains(field.K, field.columns.T @ r, field.groups, field.raw)
+    def _singles(self, candidates: linear_fit.CandidateColumns, r: Array) -> list[tuple[Used, ...]]:
+        g = linear_fit.gains(
+            candidates.K, candidates.columns.T @ r, candidates.groups, candidates.raw
+        )
         out: dict[Key, tuple[Used, ...]] = {}
         least = SEARCH.near_gain * float(np.max(g, initial=0.0))
         for i in map(int, np.argsort(-g)):
-            variant = field.entries[i].variant
+            variant = candidates.entries[i].variant
             if (
                 (g[i] > least or (g[i] > 0 and len(out) < 3))
                 and variant.key not in out
@@ -216,13 +218,15 @@ class HypothesisSet:
         return list(out.values())
 
     def _pairs(
-        self, field: linear_fit.CandidateColumns, r: Array, singles: Sequence[Hypothesis]
+        self, candidates: linear_fit.CandidateColumns, r: Array, singles: Sequence[Hypothesis]
     ) -> list[tuple[Used, ...]]:
-        chosen = linear_fit.search(field, r)
-        out = [tuple(field.entries[m].variant.used for m in chosen.members[: SEARCH.largest_set])]
+        chosen = linear_fit.search(candidates, r)
+        out = [
+            tuple(candidates.entries[m].variant.used for m in chosen.members[: SEARCH.largest_set])
+        ]
         out += [
-            tuple(field.entries[m].variant.used for m in pair.members)
-            for pair in linear_fit.best_pairs(field, r, SEARCH.refined_pairs)
+            tuple(candidates.entries[m].variant.used for m in pair.members)
+            for pair in linear_fit.best_pairs(candidates, r, SEARCH.refined_pairs)
         ]
         return [effects for effects in out if len(effects) > 1]
 
@@ -243,14 +247,16 @@ class HypothesisSet:
             mask[s.where] = not equations or s.equation in equations
         # The set's shapes move too when another effect joins: what they can take is not its gain.
         moves = [jacobian(self.train_data, now.fit, used)[1] for used in now.effects]
-        field = self._field(replace(data, base=np.hstack((data.base, *moves))), columns, mask)
+        candidates = self._candidate_columns(
+            replace(data, base=np.hstack((data.base, *moves))), columns, mask
+        )
         r = now.fit.residual * mask
-        r = r - field.basis @ (field.basis.T @ r)
-        more = linear_fit.options(field, (), r, 1.0)
+        r = r - candidates.basis @ (candidates.basis.T @ r)
+        more = linear_fit.options(candidates, (), r, 1.0)
         out: list[tuple[Used, ...]] = []
         seen: set[Key] = set()
         for trial in more:
-            variant = field.entries[trial.members[0]].variant
+            variant = candidates.entries[trial.members[0]].variant
             if variant.key not in seen and len(seen) < SEARCH.refined_extensions:
                 seen.add(variant.key)
                 out.append((*now.effects, variant.used))

@@ -50,7 +50,7 @@ class Searched:
 
     def set_of(self, *names: str) -> Hypothesis:
         """Return the fitted set of the named candidates, each at its first look."""
-        entries = [v.variant for v in self.hypotheses.found]
+        entries = [v.variant for v in self.hypotheses.columns]
         return self.hypotheses.exact(
             [next(v.used for v in entries if v.effect.name == name) for name in names]
         )
@@ -101,12 +101,12 @@ def with_residual(data: RegressionData, residual: Array) -> RegressionData:
     return replace(data, residual=residual)
 
 
-def gains(field: CandidateColumns, r: Array) -> Array:
+def gains(candidates: CandidateColumns, r: Array) -> Array:
     """Return the energy that each entry takes from a projected residual (M,), by least squares."""
     out = []
-    for group in field.groups:
-        X = field.columns[:, list(group)]
-        visible = np.linalg.norm(X, axis=0) > SEARCH.visible * np.sqrt(field.raw[list(group)])
+    for group in candidates.groups:
+        X = candidates.columns[:, list(group)]
+        visible = np.linalg.norm(X, axis=0) > SEARCH.visible * np.sqrt(candidates.raw[list(group)])
         X = X[:, visible]
         out.append(r @ X @ np.linalg.lstsq(X, r, rcond=1e-6)[0] if X.shape[1] else 0.0)
     return np.array(out)

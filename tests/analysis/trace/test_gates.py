@@ -82,11 +82,11 @@ def noise_names_nothing(b: Benches, memory: float = 0.0, draws: int = 20) -> Non
     for _ in range(draws):
         white = rng.standard_normal(data.residual.shape)
         noise = lfilter([np.sqrt(1 - keep**2)], [1.0, -keep], white)
-        field = s.hypotheses.field
-        null = inference.null_maximum(field, data, noise, rng)
+        candidates = s.hypotheses.candidates
+        null = inference.null_maximum(candidates, data, noise, rng)
         r = noise.mean(axis=0) * 2.0
-        r = r - field.basis @ (field.basis.T @ r)
-        gains = gate_cases.gains(field, r)
+        r = r - candidates.basis @ (candidates.basis.T @ r)
+        gains = gate_cases.gains(candidates, r)
         count += inference.p_value(float(gains.max()), null) <= 0.05
     assert count <= 0.05 * draws + 3 * np.sqrt(0.05 * 0.95 * draws)
 
