@@ -17,7 +17,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,10 @@ CREATE TABLE mark (
     id INTEGER PRIMARY KEY, stream INTEGER NOT NULL, start INTEGER NOT NULL, ticks INTEGER,
     state TEXT NOT NULL, meta TEXT NOT NULL);
 """
+
+
+# What the archive asks of every record's description.
+RECORD_KEYS: Final = frozenset(("name", "step", "repeat", "locked", "period", "lines"))
 
 
 @dataclass(frozen=True)

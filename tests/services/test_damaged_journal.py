@@ -155,6 +155,18 @@ def test_a_database_without_its_first_page_is_read_all_the_same(run: Path) -> No
     assert (report.records, report.missing) == (3, 0)
 
 
+def test_a_record_whose_description_lost_a_key_stands_outside_of_records(run: Path) -> None:
+    path = run / "journal.sqlite"
+    raw = path.read_bytes()
+    assert raw.count(b'"locked"') > 0
+    path.write_bytes(raw.replace(b'"locked"', b'"l#cked"'))
+    report = recover(run)
+    assert "what a record is cannot be read" in report.message
+    assert report.missing == 0
+    assert report.damaged is not None
+    assert assert_only_what_was_measured(run) == BLOCKS * 10
+
+
 def test_the_command_ends_with_1_where_a_journal_was_damaged(run: Path) -> None:
     path = run / "journal.sqlite"
     raw = path.read_bytes()

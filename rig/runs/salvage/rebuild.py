@@ -20,7 +20,7 @@ import numpy as np
 from drivers.base import SampleBlock
 from rig.model.rig import Rig
 from rig.runs.files import sync_folder
-from rig.runs.journal import Block, Journal, Mark, decode_row
+from rig.runs.journal import RECORD_KEYS, Block, Journal, Mark, decode_row
 from rig.runs.runstate import read_events
 from rig.runs.salvage.scan import best_marks, block_rows, marks, raw_bytes
 
@@ -73,13 +73,15 @@ def _open(path: Path) -> sqlite3.Connection:
 
 def _check_rows(journal: Journal, db: sqlite3.Connection, rig: Rig) -> str | tuple[int, int]:
     """Return what is wrong with the rows, or the newest block as (stream, tick)."""
-    if journal.meta("columns") != list(rig.recorded):
-        return "its columns are not those of the run's rig"
-    if journal.meta("measured") != len(rig.channels):
-        return "its count of sensors is not that of the run's rig"
-    if journal.meta("sample_rate") != rig.sample_rate:
-        return "its sample rate is not that of the run's rig"
-    journal.marks()
+    for key, value, what in (
+        ("columns", list(rig.recorded), "its columns are not those"),
+        ("measured", len(rig.channels), "its count of sensors is not that"),
+        ("sample_rate", rig.sample_rate, "its sample rate is not that"),
+    ):
+        if journal.meta(key) != value:
+            return f"{what} of the run's rig"
+    if not all(RECORD_KEYS.issubset(mark.meta) for mark in journal.marks()):
+        return "what a record is cannot be read"
     newest, count = (-1, -1), 0
     for _, block in journal.blocks():
         if block is None:
