@@ -48,7 +48,12 @@ CREATE TABLE mark (
 
 
 # What the archive asks of every record's description.
-RECORD_KEYS: Final = frozenset(("name", "step", "repeat", "locked", "period", "lines"))
+_DESCRIPTION: Final = frozenset(("name", "step", "repeat", "locked", "period", "lines"))
+
+
+def describes_record(meta: Any) -> bool:
+    """Return whether what was read as a mark's description has every key of a record's."""
+    return isinstance(meta, dict) and _DESCRIPTION.issubset(meta)
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ import numpy as np
 from drivers.base import SampleBlock
 from rig.model.rig import Rig
 from rig.runs.files import sync_folder
-from rig.runs.journal import RECORD_KEYS, Block, Journal, Mark, decode_row
+from rig.runs.journal import Block, Journal, Mark, decode_row, describes_record
 from rig.runs.runstate import read_events
 from rig.runs.salvage.scan import best_marks, block_rows, marks, raw_bytes
 
@@ -80,7 +80,7 @@ def _check_rows(journal: Journal, db: sqlite3.Connection, rig: Rig) -> str | tup
     ):
         if journal.meta(key) != value:
             return f"{what} of the run's rig"
-    if not all(RECORD_KEYS.issubset(mark.meta) for mark in journal.marks()):
+    if not all(describes_record(mark.meta) for mark in journal.marks()):
         return "what a record is cannot be read"
     newest, count = (-1, -1), 0
     for _, block in journal.blocks():

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.runs.journal import RECORD_KEYS, Mark
+from rig.runs.journal import Mark, describes_record
 
 Bytes = NDArray[np.uint8]
 Like = Callable[[list[Bytes]], Any]  # to a mask, one flag per place
@@ -66,7 +66,7 @@ def marks(raw: Bytes) -> Iterator[Mark]:
         _, stream, start, ticks, state, text = row.values
         try:
             meta = json.loads(text)
-            known = isinstance(meta, dict) and RECORD_KEYS.issubset(meta)
+            known = describes_record(meta)
         except (ValueError, TypeError):
             continue
         if known and state in _STATES and isinstance(stream, int) and isinstance(start, int):
