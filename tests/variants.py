@@ -7,10 +7,8 @@ from typing import Any
 
 import pytest
 
-Variants = list[Any]
 
-
-def kept(cases: Iterable[Any], which: Iterable[int]) -> Variants:
+def kept(cases: Iterable[Any], which: Iterable[int]) -> list[Any]:
     """Return the cases as parameters: those at the places `which` run each time, others are slow.
 
     A case of several parameters is a tuple.
@@ -19,7 +17,7 @@ def kept(cases: Iterable[Any], which: Iterable[int]) -> Variants:
     return [case if place in places else _slow(case) for place, case in enumerate(cases)]
 
 
-def every_second(cases: Iterable[Any]) -> Variants:
+def every_second(cases: Iterable[Any]) -> list[Any]:
     """Return the cases as parameters: every second one runs each time, the others are slow."""
     cases = list(cases)
     return kept(cases, range(0, len(cases), 2))

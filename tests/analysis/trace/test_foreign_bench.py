@@ -114,14 +114,7 @@ def test_what_vetoes_no_leak_is_clean_without_one(rig: Rig) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("ahead", "astern"),
-    [
-        (20.0, 90.0),
-        pytest.param(300.0, 100.0, marks=pytest.mark.slow),
-        pytest.param(60.0, 0.0, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize(("ahead", "astern"), [(20.0, 90.0), (300.0, 100.0), (60.0, 0.0)])
 def test_slopes_by_direction_are_asymmetric_viscous_friction(
     rig: Rig, ahead: float, astern: float
 ) -> None:
