@@ -259,15 +259,8 @@ class Conductor:
             if condition.estimates:
                 self._await_estimates()
             good = self._judge(condition)()
-            seen = ", ".join(
-                f"{name} {value:.4g}"
-                for name, value in self.desk.estimates.values().items()
-                if name in condition.names
-            )
             verdict = "holds" if good else "does not hold"
-            text = f"{condition.text} {verdict} after round {number}" + (
-                f" ({seen})" if seen else ""
-            )
+            text = f"{condition.text} {verdict} after round {number}: {self.readings(condition)}"
             self.mark(text)
             self.report_phase(planned.name, "repeat", number, rounds, text)
             if good:
@@ -368,6 +361,10 @@ class Conductor:
             return condition is None or condition.holds(self._values(condition, began))
 
         return holds
+
+    def readings(self, condition: Condition) -> str:
+        """Return the present values of what a condition compares, with units."""
+        return condition.readings(self._values(condition, self.elapsed))
 
     def _values(self, condition: Condition, began: float) -> Mapping[str, float]:
         values: dict[str, float] = {**self.desk.estimates.values(), ELAPSED: self.elapsed - began}

@@ -22,6 +22,7 @@ from rig.model import channels as ch
 from rig.model.parameters import parameter_names, parameter_unit
 from rig.model.quantity import UnitError, parse_quantity
 from rig.model.rig import Rig
+from rig.model.units import READINGS, display_unit
 
 ELAPSED = "elapsed"
 RSD = ".rsd"
@@ -72,6 +73,12 @@ class Condition:
         """Say whether it holds for `values` in SI by name."""
         return any(all(c.holds(values) for c in group) for group in self.alternatives)
 
+    def readings(self, values: Mapping[str, float]) -> str:
+        """Return what it compares, in an operator's units: 'oil_temperature 38.2 °C'."""
+        names = [name for name in self.names if name != ELAPSED]
+        seen = [_reading(name, values.get(name, math.nan)) for name in names]
+        return ", ".join(seen) or "it compares the time alone"
+
 
 def parse_condition(text: str) -> Condition:
     """Read a condition; raises ValueError that says which part is wrong and what was expected."""
@@ -112,6 +119,15 @@ def _comparison(text: str) -> Comparison:
     except UnitError as error:
         raise ValueError(f"{text.strip()!r}: {error}") from error
     return Comparison(name, match["op"], value)
+
+
+def _reading(name: str, value: float) -> str:
+    if not math.isfinite(value):
+        return f"{name} unknown"
+    if name.endswith(RSD):
+        return f"{name} {100.0 * value:.3g} %"
+    shown = display_unit(_unit(name), READINGS)
+    return f"{name} {shown.scale * value:.4g} {shown.text}".rstrip()
 
 
 def _is_channel(name: str) -> bool:

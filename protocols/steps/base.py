@@ -104,6 +104,9 @@ class Actions(Protocol):
     def wait(self, condition: Condition, most: float) -> bool:
         """Rest until a condition holds; False after `most` seconds."""
 
+    def readings(self, condition: Condition) -> str:
+        """Return the present values of what a condition compares, with units."""
+
     def ask(self, question: Question) -> str:
         """Ask a person, outputs at zero; returns the answer."""
 

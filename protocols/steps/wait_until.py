@@ -28,4 +28,5 @@ class WaitStep(StepKind):
         """Wait."""
         assert planned.condition is not None
         if not actions.wait(planned.condition, self.timeout):
-            actions.fail(f"{planned.condition.text} did not come within {self.timeout:g} s")
+            seen = actions.readings(planned.condition)
+            actions.fail(f"{planned.condition.text} did not come within {self.timeout:g} s: {seen}")

@@ -37,5 +37,7 @@ class WarmUpStep(StepKind):
 
     def run(self, planned: PlannedStep, actions: Actions) -> None:
         """Move until it is warm."""
+        assert planned.condition is not None
         if not actions.excite_until(planned, planned.condition, self.timeout):
-            actions.fail(f"{self.warm_up} did not come within {self.timeout:g} s of moving")
+            seen = actions.readings(planned.condition)
+            actions.fail(f"{self.warm_up} did not come within {self.timeout:g} s of moving: {seen}")

@@ -236,6 +236,14 @@ def test_a_condition_compares_in_si_and_never_by_what_is_unknown() -> None:
     assert not warm.holds({"b.rsd": float("nan")})
 
 
+def test_the_values_a_condition_compares_are_shown_in_an_operators_units() -> None:
+    condition = parse_condition("oil_temperature > 40 degC and piston_1 < 2 cm or b.rsd < 2 %")
+    values = {"oil_temperature": 38.24, "piston_1": 0.0251}
+    assert condition.readings(values) == "oil_temperature 38.24 °C, piston_1 25.1 mm, b.rsd unknown"
+    timed = parse_condition("elapsed > 2 min")
+    assert timed.readings({"elapsed": 3.0}) == "it compares the time alone"
+
+
 @settings(max_examples=300)
 @given(st.text(max_size=60))
 def test_any_text_is_a_condition_or_refused_in_one_line(text: str) -> None:
