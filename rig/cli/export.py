@@ -95,9 +95,9 @@ def _write_units(run: Path, out: Path, path: Path | None) -> Path:
     model = _model_of(run, path)
     source = run.name if path is None else path.name
     about = f"{model.rig.name}, identified: {source}"
-    progress("compiling for Linux and Windows (a minute the first time)")
+    progress("Linux and Windows, FMI 2 and 3: about a minute the first time")
     try:
-        files = write_fmus(model, out, model.rig.name, about, TARGETS)
+        files = write_fmus(model, out, model.rig.name, about, TARGETS, progress)
     except CompilationError as error:
         raise WorkError(str(error)) from error
     progress(" ".join(file.name for file in files))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+import itertools
 import logging
 import re
 import subprocess
@@ -11,7 +12,7 @@ import sys
 import tempfile
 import uuid
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -62,11 +63,13 @@ def write_fmus(
     name: str,
     about: str,
     targets: Sequence[Target] = TARGETS,
+    progress: Callable[[str], None] = logger.info,
 ) -> list[Path]:
     """Write NAME-fmi2.fmu and NAME-fmi3.fmu of an identified model; return the files.
 
     Each holds a library for every target and the C sources; no Python is needed where it runs.
-    `about` says in a line what the model was identified from. Raises InputError where a parameter
+    `about` says in a line what the model was identified from; `progress` is called with a line
+    before each library is compiled. Raises InputError where a parameter
     is not identified or a term has no translation into C, CompilationError where the compiler
     fails.
     """
@@ -74,8 +77,14 @@ def write_fmus(
     identifier = identifier if identifier[:1].isalpha() else f"m_{identifier}"
     folder.mkdir(parents=True, exist_ok=True)
     files = []
+    steps = itertools.count(1)
+
+    def announce(version: int, target: Target) -> None:
+        total = len(VERSIONS) * len(targets)
+        progress(f"compiling {next(steps)} of {total}: FMI {version} for {target.name}")
+
     for version in VERSIONS:
-        content = _content(model, identifier, about, version, targets)
+        content = _content(model, identifier, about, version, targets, announce)
         files.append(folder / f"{name}-fmi{version}.fmu")
         with zipfile.ZipFile(files[-1], "w") as archive:
             for place, data in content.items():
@@ -85,7 +94,12 @@ def write_fmus(
 
 
 def _content(
-    model: Model, identifier: str, about: str, version: int, targets: Sequence[Target]
+    model: Model,
+    identifier: str,
+    about: str,
+    version: int,
+    targets: Sequence[Target],
+    announce: Callable[[int, Target], None],
 ) -> dict[str, bytes]:
     """Return the unit's files by place in the archive."""
     variables = unit_variables(model)
@@ -105,6 +119,7 @@ def _content(
     if version == 3:
         content["sources/buildDescription.xml"] = build_description(identifier).encode()
     for target in targets:
+        announce(version, target)
         folder = target.folders[VERSIONS.index(version)]
         library = _compiled(sources, f"fmi{version}.c", target.name)
         content[f"binaries/{folder}/{identifier}.{target.ending}"] = library
@@ -126,7 +141,6 @@ def _compiled(sources: dict[str, str], main: str, target: str) -> bytes:
             sys.executable, "-m", COMPILER, "cc", "-std=c99", "-O2", "-shared", "-fPIC", "-s",
             "-fvisibility=hidden", "-target", target, "-o", "library", main, "-lm",
         ]  # fmt: skip
-        logger.info("compiling for %s", target)
         try:
             done = subprocess.run(
                 command, cwd=folder, capture_output=True, text=True, timeout=SECONDS, check=False

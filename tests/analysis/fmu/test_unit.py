@@ -254,7 +254,9 @@ def test_the_identified_parameters_can_be_read(unit: Unit, model: Model) -> None
 def test_the_same_model_makes_the_same_file(
     model: Model, units: Sequence[Path], tmp_path: Path
 ) -> None:
-    again = write_fmus(model, tmp_path, "arm", "a test", targets=(LINUX,))
+    said: list[str] = []
+    again = write_fmus(model, tmp_path, "arm", "a test", targets=(LINUX,), progress=said.append)
+    assert [line.split(":")[0] for line in said] == ["compiling 1 of 2", "compiling 2 of 2"]
     assert [f.read_bytes() for f in again] == [f.read_bytes() for f in units]
 
 
