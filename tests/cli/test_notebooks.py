@@ -33,6 +33,7 @@ def executed(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[s
     return space
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_from_a_run_to_a_model_that_knows_the_worn_seal(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -54,7 +55,6 @@ def test_from_a_run_to_a_model_that_knows_the_worn_seal(
     assert (tmp_path / "model.json").exists()
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_a_step_is_changed_and_its_records_taken_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

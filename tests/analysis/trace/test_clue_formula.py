@@ -56,6 +56,7 @@ def test_a_spring_that_goes_with_the_cube_is_read_off_with_its_stiffness(sprung:
     assert found.share > 0.95
 
 
+@pytest.mark.slow
 def test_drag_by_the_square_of_the_speed_is_read_off(quiet: tuple[Run, Run]) -> None:
     train, held_out = (dragged(run, 6.0e4) for run in quiet)
     result = trace([train], [held_out], catalogue(train.rig, FEW), look_ahead=False)
