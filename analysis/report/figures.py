@@ -13,13 +13,12 @@ from analysis.report import format as fm
 from analysis.report.machine import steps
 from analysis.report.plots import arm_plot, interval_plots, record_plots, validation_plots
 from analysis.report.residuals import Residual
+from analysis.report.settings import REPORT
 from analysis.report.tables import joints_of
 from analysis.simulation.validate import RecordValidation
 from rig.model import channels as ch
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
-
-MOST = 18  # figures of one kind: the tables hold the rest
 
 
 @dataclass(frozen=True)
@@ -90,9 +89,9 @@ def excitations(rig: Rig, runs: Sequence[Run]) -> Gallery:
                 f"{step.name}, joint {joint}",
                 f"record {step.records[0].name}",
             )
-            for n, (step, joint) in enumerate(wanted[:MOST])
+            for n, (step, joint) in enumerate(wanted[: REPORT.most_figures])
         ),
-        max(0, len(wanted) - MOST),
+        max(0, len(wanted) - REPORT.most_figures),
     )
 
 
@@ -111,9 +110,9 @@ def residuals(all_residuals: Sequence[Residual]) -> Gallery:
                 record_plots.residual(residual, f"res{n}"),
                 f"{residual.step}, joint {residual.joint}: {equation_text(residual)}",
             )
-            for n, residual in enumerate(all_residuals[:MOST])
+            for n, residual in enumerate(all_residuals[: REPORT.most_figures])
         ),
-        max(0, len(all_residuals) - MOST),
+        max(0, len(all_residuals) - REPORT.most_figures),
     )
 
 
@@ -132,7 +131,7 @@ def comparisons(rig: Rig, validation: Sequence[RecordValidation], runs: Sequence
         for result, record in first.values() for joint in joints_of(result)
     ]  # fmt: skip
     figures = []
-    for n, (result, record, joint) in enumerate(wanted[:MOST]):
+    for n, (result, record, joint) in enumerate(wanted[: REPORT.most_figures]):
         part = validation_plots.shown_part(result)
         seconds = (part.stop - part.start) / result.simulation.rate
         whole = len(result.time) / result.simulation.rate
@@ -143,7 +142,7 @@ def comparisons(rig: Rig, validation: Sequence[RecordValidation], runs: Sequence
             text += f"; {result.failure}"
         svg = validation_plots.comparison(rig, result, record, joint, f"val{n}")
         figures.append(ReportFigure(svg, f"{result.record}, joint {joint}", text))
-    return Gallery(tuple(figures), max(0, len(wanted) - MOST))
+    return Gallery(tuple(figures), max(0, len(wanted) - REPORT.most_figures))
 
 
 def paired(

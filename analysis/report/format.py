@@ -11,6 +11,7 @@ import re
 from dataclasses import replace
 from pathlib import PurePosixPath
 
+from analysis.report.settings import REPORT
 from rig.model import units
 from rig.model.parameters import GAIN_SIGNS
 from rig.model.units import DisplayUnit, typeset
@@ -18,7 +19,6 @@ from rig.model.units import DisplayUnit, typeset
 DASH = "—"
 MINUS = "−"
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-MAX_DIGITS = 6  # no measurement here is worth more
 
 
 def display_unit(si: str) -> DisplayUnit:
@@ -76,7 +76,7 @@ def decimals(value: float, half_width: float) -> int:
     if value == 0 or not math.isfinite(value):
         return 2
     leading = math.floor(math.log10(abs(value)))
-    least, most = 2 - leading, MAX_DIGITS - 1 - leading
+    least, most = 2 - leading, REPORT.most_digits - 1 - leading
     if not math.isfinite(half_width) or half_width <= 0:
         return max(least, 0)
     place = math.floor(math.log10(half_width))

@@ -84,8 +84,8 @@ def worth(rounds: Sequence[Round]) -> Markup | None:
     if len(rounds) < 2:
         return None
     with style():
-        made = figure(2.3, CARD * 2)
-        axes = made.add_subplot(1, 2, 1)
+        canvas = figure(2.3, CARD * 2)
+        axes = canvas.add_subplot(1, 2, 1)
         for r in rounds[1:]:
             if r.predicted is not None:
                 axes.bar(r.number - 0.18, r.predicted, 0.32, color=PALE, edgecolor=GREY, lw=0.6)
@@ -98,7 +98,7 @@ def worth(rounds: Sequence[Round]) -> Markup | None:
         axes.set_xlabel("round")
         axes.set_ylabel("separation over noise")
         note(axes, 0.02, 0.98, "pale promised, blue achieved", INK, ha="left")
-        axes = made.add_subplot(1, 2, 2)
+        axes = canvas.add_subplot(1, 2, 2)
         numbers = [r.number for r in rounds]
         before = [r.result.worst(r.result.before) for r in rounds]
         axes.plot(numbers, before, "o-", color=GREY)
@@ -109,8 +109,8 @@ def worth(rounds: Sequence[Round]) -> Markup | None:
         axes.set_xlabel("round")
         axes.set_ylabel("worst held-out error over noise")
         note(axes, 0.98, 0.98, "grey without, blue with what was found", INK)
-        made.tight_layout()
-        return svg(made, "worth", "What each experiment promised and brought, by round")
+        canvas.tight_layout()
+        return svg(canvas, "worth", "What each experiment promised and brought, by round")
 
 
 def excited(run: Run, number: int) -> Markup | None:
@@ -121,9 +121,9 @@ def excited(run: Run, number: int) -> Markup | None:
     if not steps:
         return None
     with style():
-        made = figure(2.0, CARD * 2)
+        canvas = figure(2.0, CARD * 2)
         for k, record in enumerate(steps.values(), start=1):
-            axes = made.add_subplot(1, len(steps), k)
+            axes = canvas.add_subplot(1, len(steps), k)
             moving = [j for j in range(1, len(run.rig.joints) + 1) if j not in record.locked]
             n = record.period or record.samples
             t = np.arange(n) / record.sample_rate
@@ -134,5 +134,5 @@ def excited(run: Run, number: int) -> Markup | None:
             if k == 1:
                 axes.set_ylabel("piston [mm]")
             note(axes, 0.98, 0.98, "joint " + " and ".join(map(str, moving)), INK)
-        made.tight_layout()
-        return svg(made, f"excited{number}", "Pistons in a period of each step")
+        canvas.tight_layout()
+        return svg(canvas, f"excited{number}", "Pistons in a period of each step")

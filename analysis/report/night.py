@@ -170,8 +170,8 @@ def _timeline(items: Sequence[NightItem]) -> Markup | None:
         return None
     begin = min(item.started for item in shown if item.started)
     with style():
-        made = figure(0.7 + 0.19 * len(shown), CARD * 2)
-        axes = made.add_subplot(1, 1, 1)
+        canvas = figure(0.7 + 0.19 * len(shown), CARD * 2)
+        axes = canvas.add_subplot(1, 1, 1)
         for k, item in enumerate(shown):
             assert item.started is not None
             start_minute = (item.started - begin).total_seconds() / 60.0
@@ -184,8 +184,8 @@ def _timeline(items: Sequence[NightItem]) -> Markup | None:
         axes.set_xlabel(f"minutes since {_clock(begin)}")
         axes.set_ylabel("item")
         axes.grid(visible=False, axis="y")
-        made.tight_layout()
-        return svg(made, "timeline", "When each item ran")
+        canvas.tight_layout()
+        return svg(canvas, "timeline", "When each item ran")
 
 
 def _identified(items: Sequence[NightItem]) -> dict[str, list[NightItem]]:
@@ -245,9 +245,9 @@ def _drift_plot(rig: str, items: Sequence[NightItem], names: Sequence[str]) -> M
     assert begin is not None
     rows = -(-len(names) // _COLUMNS)
     with style():
-        made = figure(1.35 * rows + 0.35, CARD * 2)
+        canvas = figure(1.35 * rows + 0.35, CARD * 2)
         for k, name in enumerate(names, start=1):
-            axes = made.add_subplot(rows, _COLUMNS, k)
+            axes = canvas.add_subplot(rows, _COLUMNS, k)
             shown = [item for item in items if name in item.parameters]
             hours = np.array([_hours(begin, item) for item in shown])
             values = np.array([item.parameters[name].value for item in shown])
@@ -263,9 +263,9 @@ def _drift_plot(rig: str, items: Sequence[NightItem], names: Sequence[str]) -> M
                 axes.set_xlabel("time [h]")
             if (k - 1) % _COLUMNS == 0:
                 axes.set_ylabel("change [%]")
-        made.tight_layout()
+        canvas.tight_layout()
         key = "drift" + "".join(c for c in rig if c.isalnum())
-        return svg(made, key, "Every parameter over the night, in percent of its first value")
+        return svg(canvas, key, "Every parameter over the night, in percent of its first value")
 
 
 def _hours(begin: datetime, item: NightItem) -> float:

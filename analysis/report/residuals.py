@@ -19,11 +19,11 @@ from analysis.identify.stacked_rows import RecordRows
 from analysis.regression.least_squares import least_squares
 from analysis.regression.rows import Rows
 from analysis.regression.solve import RowCluster, solve, triangle
+from analysis.report.settings import REPORT
 from analysis.terms.base import FAMILIES, family_of, inverted
 
 Array = NDArray[np.float64]
 
-SPECTRUM_SECONDS = 4.0  # Welch segment: resolves 0.5 Hz with Hann's window
 KINDS = ("torque", "flow_cap", "flow_rod")
 
 
@@ -141,7 +141,7 @@ def _density(t: Array, x: Array) -> tuple[Array, Array]:
     filled = np.zeros(int(place[-1]) + 1)
     filled[place] = x
     share = len(x) / len(filled)
-    length = min(len(filled), max(8, round(SPECTRUM_SECONDS / step)))
+    length = min(len(filled), max(8, round(REPORT.spectrum_seconds / step)))
     frequency, power = welch(filled, 1.0 / step, nperseg=length, detrend=False)
     return np.asarray(frequency[1:]), np.asarray(np.sqrt(power[1:] / share))
 

@@ -27,11 +27,10 @@ from analysis.report.plots.style import (
     style,
     svg,
 )
+from analysis.report.settings import REPORT
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
-GRID = 9  # positions per joint in the tip's reach
-MAX_CONFIGURATIONS = 5000
 
 
 @dataclass(frozen=True)
@@ -77,7 +76,7 @@ def middle(rig: Rig) -> Array:
 def reach(rig: Rig) -> Array:
     """Return tip positions [m] over the whole stroke of every joint, shape (m, 2)."""
     N = len(rig.joints)
-    per_joint = max(2, min(GRID, int(MAX_CONFIGURATIONS ** (1 / N))))
+    per_joint = max(2, min(REPORT.reach_grid, int(REPORT.reach_poses ** (1 / N))))
     axes = [
         joint.linkage.angle(np.linspace(-0.5, 0.5, per_joint) * joint.cylinder.stroke)
         for joint in rig.joints

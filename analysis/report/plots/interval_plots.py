@@ -9,10 +9,10 @@ import numpy as np
 from markupsafe import Markup
 
 from analysis.report.plots.style import BLUE, GREY, INK, MODEL, PALE, figure, style, svg
+from analysis.report.settings import REPORT
 from analysis.simulation.model import Estimate
 
 ROW = 0.2  # [in] per parameter
-CAP = 12.0  # the axis ends here, in multiples of the upper quartile: one wild row hides no other
 
 
 def against_reference(
@@ -48,7 +48,7 @@ def _limit(extents: list[float]) -> float:
     if not extents:
         return 1.0
     quartile = float(np.quantile(extents, 0.75))
-    return float(1.12 * min(max(extents), CAP * quartile) or 1e-3)
+    return float(1.12 * min(max(extents), REPORT.interval_span * quartile) or 1e-3)
 
 
 def _whisker(axes: Any, y: int, row: list[float], limit: float) -> None:

@@ -28,17 +28,13 @@ from analysis.report.plots.style import (
     thin,
 )
 from analysis.report.residuals import Residual
+from analysis.report.settings import REPORT
 from analysis.signals.filters import bridged
 from rig.model import channels as ch
 from rig.model.records import Record
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
-
-SHOWN_SECONDS = 10.0
-ELECTRIC_SECONDS = 15.0  # an electric joint moves slowly
-SPAN = 500.0  # of a residual spectrum, largest over smallest
-FEWEST_LINES = 10  # of the period's multiples that a spectrum shows: a sine's harmonics too
 
 
 @dataclass(frozen=True)
@@ -61,7 +57,7 @@ def line_spectrum(record: Record, x: Array) -> LineSpectrum | None:
         return None
     whole = x[: periods * record.period]
     spectrum = 2.0 * np.abs(np.fft.rfft(whole)) / len(whole)
-    shown = max(round(1.35 * max(record.lines)), FEWEST_LINES)
+    shown = max(round(1.35 * max(record.lines)), REPORT.fewest_lines)
     k = np.arange(1, min(shown, record.period // 2) + 1)
     return LineSpectrum(
         k * record.sample_rate / record.period, spectrum[k * periods],
@@ -74,7 +70,7 @@ def excitation(rig: Rig, record: Record, joint: int, key: str) -> Markup:
     gain = rig.joints[joint - 1].valve.spool_gain
     spool = bridged(np.asarray(record.channels[ch.channel(ch.SPOOL, joint)]))
     command = record.channels.get(ch.channel(ch.COMMAND, joint))
-    shown = slice(0, int(min(record.samples, SHOWN_SECONDS * record.sample_rate)))
+    shown = slice(0, int(min(record.samples, REPORT.record_seconds * record.sample_rate)))
     with style():
         canvas = figure(3.7)
         top = canvas.add_axes((0.13, 0.60, 0.84, 0.33))
@@ -97,7 +93,7 @@ def excitation(rig: Rig, record: Record, joint: int, key: str) -> Markup:
 
 def electric_excitation(rig: Rig, record: Record, joint: int, key: str) -> Markup:
     """Draw drive and position of one electric joint in time."""
-    shown = slice(0, int(min(record.samples, ELECTRIC_SECONDS * record.sample_rate)))
+    shown = slice(0, int(min(record.samples, REPORT.electric_seconds * record.sample_rate)))
     with style():
         canvas = figure(3.7)
         for place, kind in enumerate((ch.DRIVE, ch.POSITION)):
@@ -202,6 +198,7 @@ def _densities(axes: Any, residual: Residual, scale: float, unit: str) -> None:
         note(axes, 0.59, 1.02, "scatter left in the mean", "#c2410c", **above)
     axes.margins(x=0)
     # The row filter's stop band would take up most of the axis.
-    axes.set_ylim(bottom=max(axes.get_ylim()[0], scale * float(residual.spectrum.max()) / SPAN))
+    least = scale * float(residual.spectrum.max()) / REPORT.spectrum_span
+    axes.set_ylim(bottom=max(axes.get_ylim()[0], least))
     axes.set_xlabel("frequency [Hz]", labelpad=1)
     axes.set_ylabel(f"{unit}/√Hz")

@@ -21,6 +21,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 from numpy.typing import NDArray
 
+from analysis.report.settings import REPORT
+
 Array = NDArray[np.float64]
 
 # Okabe and Ito's palette, told apart by every common kind of colour vision; the model is a
@@ -36,7 +38,6 @@ PALE: Final = "#d5d9de"
 JOINT_COLOURS: Final = (BLUE, GREEN, ORANGE, "#cc79a7", SKY)
 
 CARD: Final = 4.6  # [in] width of a figure that stands two abreast on a desk, alone on a phone
-POINTS: Final = 700  # of a trace in a card: more than its pixels
 
 _STYLE: Final[dict[str, Any]] = {
     "svg.fonttype": "none",
@@ -92,7 +93,7 @@ def figure(height: float, width: float = CARD) -> Figure:
     return canvas
 
 
-def thin(x: Array, y: Array, points: int = POINTS) -> tuple[Array, Array]:
+def thin(x: Array, y: Array, points: int = REPORT.line_points) -> tuple[Array, Array]:
     """Return at most about `points` of the trace (n,), (n,): each stretch's lowest and highest.
 
     Keeping both extremes in their order shows spikes and noise that a stride would lose.

@@ -31,6 +31,7 @@ from analysis.report.plots.style import (
     style,
     svg,
 )
+from analysis.report.settings import REPORT
 from analysis.simulation.model import Model
 from analysis.terms.base import family_of
 from analysis.trace.clues.variables import variables
@@ -54,8 +55,6 @@ from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
-POINTS = 1500  # dots of a scatter
-SECONDS = 4.0  # of a time trace
 WORDS = 125  # letters of a line across a page
 
 
@@ -126,7 +125,7 @@ def against(
     if after:
         parts.append(("after", np.concatenate([line.after for line in lines])))
     top = 1.1 * max(float(np.quantile(np.abs(parts[0][1]), 0.995)), 2.5 * noise)
-    kept = np.linspace(0, len(x) - 1, min(POINTS, len(x))).astype(int)
+    kept = np.linspace(0, len(x) - 1, min(REPORT.scatter_points, len(x))).astype(int)
     with style():
         canvas = figure(2.5, CARD * (2 if after else 1))
         for k, (word, y) in enumerate(parts):
@@ -229,8 +228,7 @@ def _against(rival: Rival) -> tuple[str, str]:
 def in_time(line: ResidualSeries, noise: float, unit: str, key: str, after: bool) -> Markup:
     """Draw a few seconds of the residual before and after."""
     t = line.rows.time
-    middle = 0.5 * (t[0] + t[-1])
-    shown = (t >= middle - 0.5 * SECONDS) & (t <= middle + 0.5 * SECONDS)
+    shown = np.abs(t - 0.5 * (t[0] + t[-1])) <= 0.5 * REPORT.effect_seconds
     with style():
         canvas = figure(2.1, CARD * 2)
         axes = canvas.add_subplot()
@@ -309,13 +307,11 @@ def spectrum(shown: Spectrum, unit: str, key: str, after: bool) -> Markup:
         return svg(canvas, key, "Lines of the residual, before and after")
 
 
-_BINS = 24
-
-
 def binned(x: Array, y: Array) -> dict[str, Array]:
     """Return mean and quartiles of y in bins of equally many x."""
     order = np.argsort(x)
-    parts = [p for p in np.array_split(order, min(_BINS, max(1, len(x) // 5))) if len(p)]
+    count = min(REPORT.scatter_means, max(1, len(x) // 5))
+    parts = [p for p in np.array_split(order, count) if len(p)]
     return {
         "x": np.array([x[p].mean() for p in parts]),
         "mean": np.array([y[p].mean() for p in parts]),

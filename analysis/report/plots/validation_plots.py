@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from analysis.report.format import fit
 from analysis.report.plots.style import GREY, INK, MODEL, figure, note, style, svg, thin
+from analysis.report.settings import REPORT
 from analysis.simulation.validate import RecordValidation
 from rig.model import channels as ch
 from rig.model.records import Record
@@ -20,15 +21,12 @@ from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
-SHOWN_SECONDS = 4.0  # the paper's window; the end of a free run, where drift has collected
-POINTS = 500
-
 
 def shown_part(result: RecordValidation) -> slice:
     """Return the samples that are drawn: the last four seconds, or the whole of a short record."""
     n = len(result.time)
     rate = result.simulation.rate
-    return slice(max(0, n - round(SHOWN_SECONDS * rate)), n)
+    return slice(max(0, n - round(REPORT.free_run_seconds * rate)), n)
 
 
 def comparison(
@@ -51,10 +49,10 @@ def comparison(
             gridspec_kw={"left": 0.13, "right": 0.975, "top": 0.955, "bottom": 0.085,
                          "hspace": 0.42, "height_ratios": (0.7, 1, 1, 1)},
         )  # fmt: skip
-        name = ch.channel(ch.SPOOL, joint)
+        name, points = ch.channel(ch.SPOOL, joint), REPORT.free_run_points
         if record is not None and name in record.channels:
             spool = np.asarray(record.channels[name])[part]
-            grid[0].plot(*thin(t, spool, POINTS), color=INK, linewidth=0.8)
+            grid[0].plot(*thin(t, spool, points), color=INK, linewidth=0.8)
         grid[0].set_title("spool [V], measured, drives the model")
         for axes, (kind, title, scale) in zip(grid[1:], panels, strict=True):
             name = ch.channel(kind, joint)
@@ -62,12 +60,12 @@ def comparison(
                 note(axes, 0.5, 0.5, "not measured", GREY, ha="center")
                 continue
             axes.plot(
-                *thin(t, scale * result.measured[name][part], POINTS), color=INK, linewidth=2.2
+                *thin(t, scale * result.measured[name][part], points), color=INK, linewidth=2.2
             )
             end = min(real, part.stop)
             if end > part.start:
                 inside = slice(part.start, end)
-                axes.plot(*thin(result.time[inside], scale * model[name][inside], POINTS),
+                axes.plot(*thin(result.time[inside], scale * model[name][inside], points),
                           color=MODEL, linewidth=0.9)  # fmt: skip
             axes.set_title(f"{title} · FIT {fit(result.fit[name])} %")
         note(grid[1], 0.005, 1.0, "measured", INK, ha="left")
