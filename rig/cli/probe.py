@@ -11,6 +11,7 @@ import typer
 from rig.cli.device import device_of, print_pressure
 from rig.cli.options import EndpointOption, JsonOption, RigOption
 from rig.cli.output import table, write_json
+from rig.model.units import READINGS, display_unit
 
 if TYPE_CHECKING:
     from rig.bench.probe import Reading
@@ -46,11 +47,12 @@ def probe(rig: RigOption, endpoint: EndpointOption = None, json: JsonOption = No
 
 
 def _row(reading: Reading) -> tuple[str, ...]:
-    numbers = (f"{value:.5g}" for value in (reading.mean, reading.low, reading.high))
+    unit = display_unit(reading.unit, READINGS)
+    values = (reading.mean, reading.low, reading.high)
     return (
         reading.channel,
-        *numbers,
-        reading.unit,
+        *(f"{unit.scale * value:.5g}" for value in values),
+        unit.text,
         f"{reading.codes[0]}..{reading.codes[1]}",
         reading.mark,
     )

@@ -8,6 +8,7 @@ from typing import Any
 
 from analysis.effects.base import Shape
 from analysis.identify.result import Identification
+from analysis.report.format import column_percent
 from analysis.simulation.model import Estimate
 from analysis.simulation.validate import RecordValidation
 from rig.cli.output import table
@@ -21,8 +22,12 @@ def _shown(estimate: Estimate) -> tuple[float, str]:
     return unit.scale, typeset(unit.text)
 
 
-def _percent(value: float, digits: int = 2) -> str:
-    return f"{value:.{digits}f} %" if math.isfinite(value) else "—"
+def _share(percent: float) -> str:
+    return f"{column_percent(percent)} %" if math.isfinite(percent) else "—"
+
+
+def _percent(value: float) -> str:
+    return f"{value:.1f} %" if math.isfinite(value) else "—"
 
 
 def parameter_table(
@@ -38,12 +43,12 @@ def parameter_table(
         else:
             low, high = estimate.ci95
             half = 50.0 * (high - low) / abs(estimate.value)
-            row = [name, f"{scale * estimate.value:.4g}", _percent(half), unit]
+            row = [name, f"{scale * estimate.value:#.4g}", _share(half), unit]
         if truth is not None:
             known = truth.get(name, math.nan)
             row += [
-                f"{scale * known:.4g}" if math.isfinite(known) else "—",
-                _percent(100.0 * (estimate.value / known - 1.0)) if known else "—",
+                f"{scale * known:#.4g}" if math.isfinite(known) else "—",
+                _share(100.0 * (estimate.value / known - 1.0)) if known else "—",
             ]
         rows.append(row)
     return table(header + ([] if truth is None else ["truth", "error"]), rows)
@@ -86,7 +91,7 @@ def validation_text(results: Sequence[RecordValidation]) -> str:
             rows.append(
                 [
                     f"{result.record} {name}",
-                    _percent(fit, 1),
+                    _percent(fit),
                     f"{unit.scale * result.rmse[name]:.3g}",
                     f"{unit.scale * result.window_rmse[name]:.3g}",
                     unit.text,

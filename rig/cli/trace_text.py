@@ -10,6 +10,7 @@ from analysis.trace.loop_rounds import Round
 from analysis.trace.result import JudgedEffect, Trace
 from analysis.trace.words import quantity, shot_in_words, unit_of_equation
 from rig.cli.output import table
+from rig.model.units import RESIDUALS, display_unit
 
 
 def trace_text(result: Trace) -> str:
@@ -35,24 +36,7 @@ def trace_text(result: Trace) -> str:
         ),
         "",
     ]
-    fits = [
-        [
-            name,
-            _percent(before),
-            _percent(result.fit_after.get(name, math.nan)),
-            *(
-                _number(errors.get(name, math.nan))
-                for errors in (
-                    result.rmse_before,
-                    result.rmse_after,
-                    result.window_before,
-                    result.window_after,
-                )
-            ),
-            rig.unit_of(name),
-        ]
-        for name, before in result.fit_before.items()
-    ]
+    fits = [_free_run(result, name) for name in result.fit_before]
     if fits:
         lines += [
             table(
@@ -122,6 +106,20 @@ def _changed(result: Trace) -> list[list[str]]:
 
 def _percent(value: float, sign: str = "") -> str:
     return f"{value:{sign}.1f} %" if math.isfinite(value) else "—"
+
+
+def _free_run(result: Trace, channel: str) -> list[str]:
+    """Return a channel's row: FIT and errors of the model before and after, and their unit."""
+    unit = display_unit(result.model_before.rig.unit_of(channel), RESIDUALS)
+    errors = (
+        result.rmse_before, result.rmse_after, result.window_before, result.window_after,
+    )  # fmt: skip
+    return [
+        channel,
+        *(_percent(fit.get(channel, math.nan)) for fit in (result.fit_before, result.fit_after)),
+        *(_number(unit.scale * error.get(channel, math.nan)) for error in errors),
+        unit.text,
+    ]
 
 
 def _number(value: float, digits: int = 3) -> str:
