@@ -39,6 +39,9 @@ def test_probe_shows_every_channel_with_its_codes_and_moves_nothing(
     low, high = found["piston_1"]["codes"]
     assert low <= 32768 <= high or abs(low - 32768) < 200  # mid-stroke is the middle of 16 bits
     assert "still under pressure: joint 1 cap" in shown.stdout
+    supply = next(line for line in shown.stdout.splitlines() if line.startswith("supply_pressure"))
+    assert float(supply.split()[1]) == pytest.approx(7.0, rel=0.02)
+    assert " MPa " in supply
 
 
 def test_a_program_reads_json_alone_while_chambers_are_under_pressure(endpoint: str) -> None:

@@ -15,6 +15,7 @@ from analysis.trace.data.candidates import catalogue
 from analysis.trace.engine import trace
 from analysis.trace.result import CLEAN, EXPLAINED, Trace, to_json
 from rig.cli.main import app
+from rig.cli.trace_text import trace_text
 from rig.model.records import Run
 from rig.runs.exchange.fixtures import write_run
 from rig.runs.rigs import load_rig
@@ -81,6 +82,9 @@ def test_force_and_free_run_are_far_better_on_records_not_seen(found: Trace) -> 
     assert found.before["torque_1"] / found.size["torque_1"] > 0.05
     assert found.after["torque_1"] < 0.2 * found.before["torque_1"]
     assert found.rmse_after["position_1"] < 0.05 * found.rmse_before["position_1"]
+    (row,) = [line for line in trace_text(found).splitlines() if line.startswith("position_1 ")]
+    assert row.endswith(" mm")
+    assert float(row.split()[5]) == pytest.approx(1e3 * found.rmse_before["position_1"], rel=0.01)
     told = to_json(found)
     assert told["rmse"]["after"]["position_1"] == found.rmse_after["position_1"]
     windows = told["window_rmse"]
