@@ -8,7 +8,7 @@ from typing import Any
 
 from analysis.effects.base import Shape
 from analysis.identify.result import Identification
-from analysis.report.format import column_percent
+from analysis.report.format import MINUS, column_percent
 from analysis.simulation.model import Estimate
 from analysis.simulation.validate import RecordValidation
 from rig.cli.output import table
@@ -23,7 +23,8 @@ def _shown(estimate: Estimate) -> tuple[float, str]:
 
 
 def _share(percent: float) -> str:
-    return f"{column_percent(percent)} %" if math.isfinite(percent) else "—"
+    text = column_percent(percent).replace(MINUS, "-")  # as everywhere in a terminal
+    return f"{text} %" if math.isfinite(percent) else "—"
 
 
 def _percent(value: float) -> str:
