@@ -67,12 +67,13 @@ class ExactFit:
 def table(data: RegressionData, terms: Sequence[Used]) -> DesignMatrix:
     """Return the whitened rows of a model on the averaged records and instants.
 
-    Instants that the model masks become zero rows.
+    Of instants that the model masks stays what the data's own model leaves of them, so that no
+    effect explains rows by moving its signals out of the model's domain.
     """
     built = [_rows(data, terms, conditioned) for conditioned in data.records]
     names = tuple(dict.fromkeys(c.parameter for u in terms for c in u.term.coefficients(data.rig)))
     M = data.base.shape[0]
-    X, y = np.zeros((M, len(names))), np.zeros(M)
+    X, y = np.zeros((M, len(names))), data.mean.copy()
     index = {conditioned.group: k for k, conditioned in enumerate(data.records)}
     for segment in data.segments:
         k = index[segment.group]

@@ -47,3 +47,13 @@ def test_a_contact_stiffens_in_the_model_where_it_does_on_the_bench_and_else_say
     distance, *more = refinement.refine(train_data, (*train_data.terms, friction)).terms[-1].shape
     assert distance == pytest.approx(150e-6, rel=0.15)
     assert more == ([pytest.approx(stiffening, rel=0.25)] if stiffening else [])
+
+
+def test_an_effect_explains_no_instant_that_it_takes_out_of_the_models_domain(rig: Rig) -> None:
+    """With its sensor's offset beyond the supply's pressure no flow of a chamber can be judged."""
+    records = conditioned_records(rig, [bench.run(rig, bench.Wrong.of(Fc=80), 0.03, 1)])
+    train_data = regression_data(rig, tuple(map(Used, baseline())), records)
+    outside = Used(make("sensor_offset", "joint 2 cap"), (-8e6,))
+    found = refinement.fit(train_data, (*train_data.terms, outside))
+    (flow,) = [s.where for s in train_data.segments if s.equation == "flow_cap_2"]
+    assert found.residual[flow] == pytest.approx(train_data.mean[flow])
