@@ -77,7 +77,14 @@ def text(outcomes: Sequence[Covered]) -> str:
                      f"{100 * low:.0f} to {100 * high:.0f} %", middle])  # fmt: skip
     names = list(dict.fromkeys(n for o in outcomes for n in o.ratio))
     each = [[n, f"{sum(abs(o.ratio[n]) <= 1 for o in outcomes)} of {len(outcomes)}"] for n in names]
-    head = ["spool's path", "benches", "hold", "share", "95 % bounds", "half-width, median"]
+    head = [
+        "spool's path",
+        "benches",
+        "hold",
+        "share",
+        "one-sided 95 % bounds",
+        "half-width, median",
+    ]
     return table(head, rows) + "\n\n" + table(["parameter", "hold"], each)
 
 

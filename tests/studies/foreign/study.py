@@ -188,6 +188,8 @@ def text(outcomes: Sequence[Outcome]) -> str:
     rows = []
     for kind in dict.fromkeys(o.kind for o in outcomes):
         for word, chosen in ((kind, outcomes), (f"{kind}, loud", loud)):
+            if kind == NONE and chosen is loud:
+                continue
             here = [o for o in chosen if o.kind == kind]
             count = Counter(o.answer for o in here)
             rows.append([word, str(len(here)), *(str(count[c] or "") for c in columns)])
@@ -210,7 +212,7 @@ def text(outcomes: Sequence[Outcome]) -> str:
     wrong = [line_of(o) for o in outcomes if o.answer.startswith(("wrong", "false", "partly"))]
     return "\n\n".join((
         table(["kind", "cases", *columns], rows),
-        table(["pooled", "count", "share", "95 % bounds"], pooled),
+        table(["pooled", "count", "share", "one-sided 95 % bounds"], pooled),
         "every wrong or partial name:\n" + ("\n".join(wrong) or "none"),
     ))  # fmt: skip
 
