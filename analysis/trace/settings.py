@@ -34,10 +34,10 @@ class TraceSettings:
     harm_ratio: float = 1.2
     """Energy above noise in an equation over that before: a cause makes none worse (tuned)."""
     # What may stay.
-    form_share: float = 0.05
+    training_share: float = 0.05
     """Of an equation's energy before: what a named form may miss of the real one (tuned: seals of
     LuGre's and Karnopp's law, turbulent leaks)."""
-    form_share_held_out: float = 0.10
+    held_out_share: float = 0.10
     """The same on held-out records, which may be quieter (tuned)."""
     held_out_band: float = 1.5
     """Held-out rms over the noise floor, by equation (tuned on clean benches: none is above)."""

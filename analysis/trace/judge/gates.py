@@ -125,7 +125,7 @@ def remaining(
     out = []
     for e, residual in winner.excess_energy.items():
         share = residual / max(hypotheses.empty.excess_energy[e], 1e-30)
-        if share > TRACE.form_share and not hypotheses.negligible(e, residual):
+        if share > TRACE.training_share and not hypotheses.negligible(e, residual):
             times = residual / hypotheses.limits.band[e]
             stays = f"{100 * share:.2g} % of what repeated stays"
             words = stays if share <= 1.0 else "more repeats than before"
@@ -133,7 +133,7 @@ def remaining(
     out += [
         (e, f"held-out error {r:.2f} times the noise floor")
         for e, r in ratio.items()
-        if r > TRACE.held_out_band and now[e] > TRACE.form_share_held_out * start[e]
+        if r > TRACE.held_out_band and now[e] > TRACE.held_out_share * start[e]
     ]
     return out
 

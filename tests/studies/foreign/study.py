@@ -206,9 +206,11 @@ def text(outcomes: Sequence[Outcome]) -> str:
         ("intervals of the baseline that hold, right answers",
          *_sum(o.parameter_hits for o in outcomes if o.answer == "right")),
     ):  # fmt: skip
-        low, high = bounds(hits, of)
-        share = f"{100 * hits / of:.0f} %" if of else "-"
-        pooled.append([word, f"{hits} of {of}", share, f"{100 * low:.0f} to {100 * high:.0f} %"])
+        if not of:
+            continue
+        low, high = (100 * bound for bound in bounds(hits, of))
+        share = f"{100 * hits / of:.0f} %"
+        pooled.append([word, f"{hits} of {of}", share, f"{low:.0f} to {high:.0f} %"])
     wrong = [line_of(o) for o in outcomes if o.answer.startswith(("wrong", "false", "partly"))]
     return "\n\n".join((
         table(["kind", "cases", *columns], rows),

@@ -140,7 +140,7 @@ RULES: Final = (
     Rule("twins", "what is one to the data is not said to be",
          ((SpoolOffset, "twins", lambda _: ()), (SensorOffset, "twins", lambda _: ()))),
     Rule("training band", "any share of the training energy may stay",
-         (setting("form_share", math.inf),)),
+         (setting("training_share", math.inf),)),
     Rule("held-out band", "any held-out error may stay", (setting("held_out_band", math.inf),)),
     Rule("formula in the rest", "a rest that one formula holds is not asked for",
          (setting("formula_share", math.inf),)),
@@ -177,7 +177,7 @@ FAULTS: Final = (
     Rule("held-out floor x 2", "held-out errors of 3 times the floor pass",
          (setting("held_out_band", 3.0),)),
     Rule("form tolerance x 10", "half of what repeated may stay",
-         (setting("form_share", 0.5), setting("form_share_held_out", 1.0)),),
+         (setting("training_share", 0.5), setting("held_out_share", 1.0)),),
     Rule("floor x 0.3", "the noise is taken for a third", tuple(
         (module, "floors", _floors(0.3)) for module in (noise_floor, regression_data)), True),
     Rule("floor x 3", "the noise is taken for three times as large", tuple(
