@@ -21,7 +21,7 @@ from analysis.terms import baseline_of
 from analysis.terms.base import FAMILIES, Used
 from analysis.trace.data.candidates import catalogue, free_mechanisms
 from analysis.trace.data.conditioned_record import conditioned_records
-from analysis.trace.data.noise_floor import STATED
+from analysis.trace.data.noise_floor import NEIGHBOURS, PERIODS, REPEATS, STATED
 from analysis.trace.data.regression_data import RegressionData, regression_data
 from analysis.trace.data.spectral_lines import lines
 from analysis.trace.data.temperature_nuisance import stripped, temperature_terms
@@ -109,7 +109,11 @@ def trace(
         hypotheses, judged_all, winner, verdict, rest = _settled(
             hypotheses, winner, free, holdout_data, rng
         )
-        refused = tuple(f for f in judged_all if not gates.stands(f))
+        refused = tuple(
+            sorted(
+                (f for f in judged_all if not gates.stands(f)), key=lambda f: -f.removed_fraction
+            )
+        )
         judged_effects = tuple(f for f in judged_all if gates.stands(f))
         notes += _rest_notes(verdict, rest, quiet, bool(judged_effects))
     done(JUDGED)
@@ -195,15 +199,17 @@ def _refuse_short(train_data: RegressionData, train: Sequence[ConditionedRecord]
 def _notes(train_data: RegressionData, holdout_data: RegressionData) -> list[str]:
     """State where the evidence is weaker than it should be."""
     out = []
-    single = sorted({f.group[1] for f in train_data.floors if f.count < 2})
+    sources = {f.source for f in train_data.floors}
+    single = sorted({f.group[1] for f in train_data.floors if f.source == STATED})
     if single:
         out.append(
             f"one repeat of {' '.join(single)} and no whole periods to compare: the noise floor is "
             "the rig file's stated sensor noise; noise that the file does not state would pass "
             "for model error, so nothing is named with full confidence"
         )
-    elif any(f.source != "repeats" for f in train_data.floors):
-        out.append("one repeat per step: the noise floor comes from periods within the record")
+    elif sources != {REPEATS}:
+        where = PERIODS if PERIODS in sources else NEIGHBOURS
+        out.append(f"one repeat per step: the noise floor comes from {where} within the record")
     few = min((f.count for f in train_data.floors if f.count > 1), default=0)
     if 0 < few < 4:
         out.append(

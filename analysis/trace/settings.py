@@ -108,6 +108,18 @@ class DataSettings:
 
     least_noise: float = 0.2
     """Of the noise that the rig file states: a floor measured lower is chance (tuned)."""
+    # Noise by neighbouring states.
+    pair_apart: float = 0.5
+    """[s] between the two rows of a pair: the row filter's memory is a tenth of a second."""
+    pair_distance: float = 0.2
+    """Between their states, in standard deviations of each: beyond it a residual that changes with
+    the state passes for noise (tuned: EMPS 0.01, crane 0.1, multisines of one period 0.5)."""
+    nearest_pairs: float = 0.33
+    """Of the rows: the nearest pairs, whose differences count (tuned)."""
+    least_pairs: int = 40
+    """Pairs: a noise by fewer is uncertain by more than a tenth (arithmetic)."""
+    neighbours_asked: int = 64
+    """Rows nearest to a row, among which one far enough away in time is looked for."""
     temperature_span: float = 0.05
     """[K] between all records: less moves b by a fraction of 0.001 (arithmetic)."""
     grid_points: int = 24

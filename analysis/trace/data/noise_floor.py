@@ -3,12 +3,15 @@
 With n repeats r_k(t) of one excitation,
  noise^2 = mean_t var_k r_k (ddof 1),   repeatable^2 = mean_t (mean_k r_k)^2 - noise^2 / n.
 A record that is the only repeat of its step is cut into its periods, which repeat one another as
-records do. Where there is neither, the rig's stated sensor noise, put through the same rows,
-stands in: that sees no noise that the rig file does not state, and is said to be weaker.
+records do. Where there is neither, but the motion comes back to states x where it was before,
+ noise^2 = mean 1/2 (r(x') - r(x))^2 over the nearest pairs of states
+(a difference estimator: Rice 1984; Evans and Jones 2002). Where the motion does not come back, the
+rig's stated sensor noise, put through the same rows, stands in: that holds no noise that the rig
+file does not state, and a note says so.
 
-The floor lies no lower than `LEAST` of the stated noise: with sensors so much better than their
-data sheet (or simulated without noise) repeats tell apart what no bench would ask about, and a
-clean one would never be clean.
+The floor lies no lower than `DATA.least_noise` of the stated noise: with sensors so much better
+than their data sheet (or simulated without noise) repeats separate what no bench would ask about,
+and a clean one would never be clean.
 """
 
 from __future__ import annotations
@@ -18,6 +21,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.noise import disturbed
@@ -30,7 +34,7 @@ from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
-REPEATS, PERIODS, STATED = "repeats", "periods", "stated noise"
+REPEATS, PERIODS, NEIGHBOURS, STATED = "repeats", "periods", "neighbouring states", "stated noise"
 Group = tuple[int, str]
 NO_ROWS = 1e-30  # SI: where every row is masked nothing is weighed by it
 
@@ -89,10 +93,47 @@ def floors(
                 noise = max(noise, DATA.least_noise * stated[equation])
                 out.append(Floor(group, equation, noise, repeatable, total, len(table), source))
                 continue
-            noise = stated[equation]
+            noise, source = stated[equation], STATED
+            if len(parts) == 1:
+                near = neighbours(members[indices[0]], parts[0], residual[0])
+                if near is not None:
+                    noise, source = max(near, DATA.least_noise * noise), NEIGHBOURS
             rest = float(np.sqrt(max(0.0, total**2 - noise**2)))
-            out.append(Floor(group, equation, noise, rest, total, 1, STATED))
+            out.append(Floor(group, equation, noise, rest, total, 1, source))
     return out
+
+
+def neighbours(conditioned: ConditionedRecord, rows: Rows, residual: Array) -> float | None:
+    """Return the noise (rms, SI) of a residual (m,) by pairs of rows at neighbouring states.
+
+    A state is position, velocity, spool (or drive) and pressures of every moving joint, each over
+    its standard deviation. None where the nearest pairs are too few or too far apart.
+    """
+    if len(rows.time) < DATA.least_pairs:
+        return None
+    x = _states(conditioned, rows)
+    count = min(len(x), DATA.neighbours_asked)
+    distance, other = cKDTree(x).query(x, k=count)
+    apart = np.abs(rows.time[other] - rows.time[:, None]) > DATA.pair_apart
+    first = np.argmax(apart, axis=1)  # the nearest neighbour that is no close predecessor
+    here = np.flatnonzero(apart.any(axis=1))
+    d = distance[here, first[here]] ** 2
+    half = 0.5 * (residual[other[here, first[here]]] - residual[here]) ** 2
+    nearest = np.argsort(d)[: int(DATA.nearest_pairs * len(x))]
+    if len(nearest) < DATA.least_pairs or d[nearest[-1]] > DATA.pair_distance**2:
+        return None
+    return float(np.sqrt(np.mean(half[nearest])))
+
+
+def _states(conditioned: ConditionedRecord, rows: Rows) -> Array:
+    """Return the moving joints' states (m, k) at the instants of rows, each of unit deviation."""
+    signals, rate = conditioned.signals, conditioned.record.sample_rate
+    at = np.rint(rows.time * rate).astype(int).clip(0, len(signals.t) - 1)
+    joints = signals.excited if signals.moving is None else signals.moving
+    kinds = (signals.q, signals.qd, signals.u, signals.p_cap, signals.p_rod)
+    columns = np.column_stack([kind[np.ix_(at, joints)] for kind in kinds])
+    spread = columns.std(axis=0)
+    return np.asarray(columns[:, spread > 0] / spread[spread > 0])
 
 
 def repeats_of(

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from analysis.effects.base import Effect, shapes_of
 from analysis.terms.base import Used
-from analysis.trace.data.noise_floor import STATED
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.inference import EffectErrors, blocks, others
 from analysis.trace.search.linear_fit import orthonormal
@@ -52,11 +51,11 @@ def subsets(train_data: RegressionData, joint: int | None) -> dict[str, Array]:
 
 
 def _unmeasured(train_data: RegressionData) -> NDArray[np.int64] | None:
-    """Return the block of every row (M,) where some floor is the stated noise alone, else None.
+    """Return the block of every row (M,), None where all steps have repeats or periods.
 
-    Then nobody has measured the noise, and what is left has to stand for it, block by block.
+    Else what is left has to stand for the noise, block by block.
     """
-    if all(floor.source != STATED for floor in train_data.floors):
+    if all(floor.count > 1 for floor in train_data.floors):
         return None
     numbers = blocks(train_data)
     for k, s in enumerate(train_data.segments):

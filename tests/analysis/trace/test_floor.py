@@ -7,14 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from analysis.effects.friction import CoulombFriction
 from analysis.simulation.synthetic import multisine, synthetic_run
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from analysis.trace.data.conditioned_record import conditioned_records
-from analysis.trace.data.noise_floor import STATED, floors, stated_noise
+from analysis.trace.data.noise_floor import NEIGHBOURS, REPEATS, STATED, Floor, floors, stated_noise
 from analysis.trace.data.regression_data import regression_data
 from analysis.trace.settings import DATA
+from rig.model.records import Run
 from rig.model.rig import Rig
+from rig.runs.rigs import load_rig
+from tests.analysis.carriage import Carriage, moves, record
 
 
 def floor_over_stated(rig: Rig, noise: float) -> dict[str, float]:
@@ -62,3 +66,30 @@ def test_a_record_whose_rows_are_all_masked_has_the_stated_floor_and_nothing_lef
     for floor in floors(rig, terms, train_data.records, none, train_data.beta):
         assert (floor.total, floor.repeatable, floor.source) == (0.0, 0.0, STATED)
         assert floor.noise > 0.0
+
+
+def to_and_fro(turns: int, repeats: int = 1) -> Run:
+    """Return a carriage's records, its drive ten times as noisy as its rig file states."""
+    rig, rng = load_rig("emps"), np.random.default_rng(1)
+    reference = np.tile(moves(rig.sample_rate, 4.0, 0.05, 0.25), turns)
+    noise = 10.0 * rig.sensors.drive.noise
+    records = []
+    for repeat in range(1, repeats + 1):
+        one = record(rig, Carriage(), reference, rng, "moves", repeat)
+        drive = one.channels["drive_1"] + noise * rng.standard_normal(one.samples)
+        records.append(replace(one, channels={**one.channels, "drive_1": drive}))
+    return Run(rig, tuple(records))
+
+
+def floor_of(run: Run) -> Floor:
+    terms = (*map(Used, baseline_of(run.rig)), Used(CoulombFriction("joint 1"), (1e-5, 0.0, 0.0)))
+    (floor,) = regression_data(run.rig, terms, conditioned_records(run.rig, [run])).floors
+    return floor
+
+
+def test_a_motion_that_comes_back_shows_noise_that_the_rig_file_does_not_state() -> None:
+    """Nobody says that the reference repeats; its states do."""
+    once, thrice, known = (floor_of(to_and_fro(*n)) for n in ((1,), (3,), (1, 4)))
+    assert (once.source, thrice.source, known.source) == (STATED, NEIGHBOURS, REPEATS)
+    assert once.noise < 0.3 * known.noise
+    assert thrice.noise == pytest.approx(known.noise, rel=0.35)
