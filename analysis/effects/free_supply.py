@@ -1,4 +1,4 @@
-"""Supply pressure that is lost over the drawn flow, in a form that the data draw."""
+"""Drop of the supply pressure over the drawn flow, as a free curve."""
 
 from __future__ import annotations
 

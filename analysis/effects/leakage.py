@@ -52,7 +52,8 @@ class _Leakage(Effect):
 class InternalLeakage(_Leakage):
     """Q = c (p_cap - p_rod) past the piston, out of the cap side and into the rod side.
 
-    Hides in the bulk modulus: 2e-12 m^3/(s Pa) make b of the seed bench 9 to 16 % too large.
+    Without it the bulk modulus is biased: 2e-12 m^3/(s Pa) make b of the seed bench 9 to 16 % too
+    large.
     """
 
     name: ClassVar[str] = "internal_leakage"
