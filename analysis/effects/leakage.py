@@ -66,7 +66,7 @@ class InternalLeakage(_Leakage):
         "sensor_offset",
     )
     separated_by: ClassVar[str] = (
-        "a load that drives the pressures far apart while the piston stands or creeps"
+        "a load that drives the pressures far apart while the piston rests or creeps"
     )
 
     @property

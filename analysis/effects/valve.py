@@ -123,7 +123,7 @@ class ValveDeadband(ValveEffect):
 
 @dataclass(frozen=True)
 class SpoolOffset(ValveEffect):
-    """The edges' null lies at u0 of the LVDT: opening u - u0 (Merritt 1967, chapter 5, "null").
+    """The edges' null is at u0 of the LVDT: opening u - u0 (Merritt 1967, chapter 5, "null").
 
     Without it the gains of the two directions are biased with opposite signs (5 mV: 7 to 9 % on the
     seed bench).
