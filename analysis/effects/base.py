@@ -2,7 +2,7 @@
 
 An effect is one more term (`analysis.terms.base`): it may change the signals that all terms see
 (`prepare`), add columns to rows, and contribute in simulation. Linear coefficients come from least
-squares; at most two shape parameters are searched within physical bounds.
+squares; few shape parameters are searched within physical bounds.
 """
 
 from __future__ import annotations

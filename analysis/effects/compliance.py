@@ -1,4 +1,4 @@
-"""Effects on the oil's stiffness: free air, and volume that the rig file does not know."""
+"""Effects on the oil's stiffness: free air, and volume that the rig file does not state."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class EntrainedAir(Effect):
 
     1/b_eff = 1/b + alpha p0 / (p + p0)^2, p gauge: an isothermal gas (Merritt 1967, chapter 2;
     Wylie and Streeter 1993, with polytropic exponent 1: bubbles of less than a
-    millimetre keep the oil's temperature). Linear in alpha.
+    millimetre have the oil's temperature). Linear in alpha.
     """
 
     mechanism: ClassVar[str] = "bulk_modulus_curve"

@@ -1,4 +1,4 @@
-"""A torque that repeats at one frequency, whatever the joint does."""
+"""A torque at one frequency, independent of the joint's motion."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ FINE: Final = 4  # frequencies looked at within one over the record's length
 class PeriodicDisturbance(Effect):
     """Torque T_sin sin(2 pi f t) + T_cos cos(2 pi f t) on the joint, t since the record began.
 
-    An eccentric, a hum, a controller's dither that begins with the record (Fourier; one line). What
-    has another phase in every repeat does not repeat: to the trace it is noise.
+    An eccentric, a hum, a controller's dither that begins with the record (one Fourier line). With
+    another phase in every repeat it does not repeat, and is noise to the trace.
     """
 
     mechanism: ClassVar[str] = "disturbance"
@@ -45,7 +45,7 @@ class PeriodicDisturbance(Effect):
     variable: ClassVar[str] = "time, at one frequency"
     confounders: ClassVar[tuple[str, ...]] = ("torque_offset", "joint_spring")
     separated_by: ClassVar[str] = (
-        "another excitation: what the joint's own motion causes goes with it, this does not"
+        "another excitation: effects of the joint's motion change with it, this does not"
     )
     per_joint: ClassVar[bool] = True
     by_data: ClassVar[bool] = True

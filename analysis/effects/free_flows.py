@@ -1,6 +1,6 @@
-"""Flows whose form the data draw: metering edges over the spool, leakage, the oil's softness.
+"""Flows as free curves: metering edges over the spool, leakage, compressibility of the oil.
 
-Named effects are restrictions of these; what none of them is, is the curve itself.
+Named effects are special cases of these curves.
 """
 
 from __future__ import annotations
@@ -180,7 +180,9 @@ class LeakageCurve(Effect):
     hydraulic: ClassVar[bool] = True
     variable: ClassVar[str] = "the pressure across the leak"
     confounders: ClassVar[tuple[str, ...]] = ("metering_curve", "underlap_leakage")
-    separated_by: ClassVar[str] = "a load that drives the pressures far apart while little moves"
+    separated_by: ClassVar[str] = (
+        "a load that drives the pressures far apart while the piston hardly moves"
+    )
     per_joint: ClassVar[bool] = True
     where: str = "joint 1"
 
@@ -270,7 +272,7 @@ class LeakageCurve(Effect):
 
 @dataclass(frozen=True)
 class BulkModulusCurve(Effect):
-    """1/b_eff = 1/b + f(p): the oil's softness over its pressure, f a curve.
+    """1/b_eff = 1/b + f(p): the oil's compressibility over its pressure, f a curve.
 
     f is zero at the highest pressure of the records, where b is the whole modulus.
     """

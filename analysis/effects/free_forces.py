@@ -1,6 +1,6 @@
-"""Forces at the piston whose form the data draw: over speed by direction, over position.
+"""Forces at the piston as free curves: over speed by direction, over position.
 
-Named effects are restrictions of these; what none of them is, is the curve itself.
+Named effects are special cases of these curves.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ LEVEL: Final = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0, 0]], dtype=np.f
 class FrictionCurve(Friction):
     """F_f = z f(|s'|) + |z| g(|s'|): friction over speed, f shared by both directions.
 
-    z is the contact's state (`contact`), f and g are curves (`curve`); g is what extending holds
-    more than retracting. On an electric joint the slope of f over the records' speeds is Fv.
+    z is the contact's state (`contact`), f and g are curves (`curve`); g is the extra
+    friction of extending. On an electric joint the slope of f over the records' speeds is Fv.
     """
 
     name: ClassVar[str] = "friction_curve"
@@ -166,8 +166,8 @@ class PositionForce(Effect):
     """F = f(s) against extension: a force over the piston's position, f a curve (`curve`).
 
     One of its values follows from the others, by weights (`gauge`) that come with the knots. Where
-    records show one pose of the joints below, a weight is a force over position too, and the curve
-    is what the weight does not explain; elsewhere it is without its shortest wave.
+    the records have one pose of the joints below, gravity is a force over position too, and the
+    curve is what gravity does not explain; elsewhere its shortest wave is left out.
     """
 
     name: ClassVar[str] = "position_force"

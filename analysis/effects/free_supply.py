@@ -1,4 +1,4 @@
-"""Supply pressure that is lost over the drawn flow, in a form that the data draw."""
+"""Drop of the supply pressure over the drawn flow, as a free curve."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ LOOKS: Final = (0.05, 0.2)  # of the supply pressure, lost at the pump's flow, o
 class SupplyCurve(PortEffect):
     """The valves see p_s - f(Q): the supply's drop over the flow drawn, f a curve with f(0) = 0.
 
-    Its values at the knots stand under the orifices' roots: they are shapes.
+    Its values at the knots are inside the orifices' roots, so that they are shapes.
     """
 
     name: ClassVar[str] = "supply_curve"

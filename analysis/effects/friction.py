@@ -1,6 +1,6 @@
-"""Dry friction of a cylinder's seals, in four forms that all act as a force on the piston.
+"""Dry friction of a cylinder's seals, in four forms that act as a force on the piston.
 
-Torque row of joint i (friction stands with the load): ... + G F_f = G F. Every form is a level
+Torque row of joint i (friction is on the load's side): ... + G F_f = G F. Every form is a level
 [N] times the state z of the seal's contact (`contact`), -1 <= z <= 1, which turns over within a
 presliding distance d of travel after each reversal (Dahl 1968; Jelali and Kroll 2003), the sooner
 the faster it is (stiffening k; of rubber: Ferry 1980):
@@ -189,7 +189,7 @@ def force_unit(rig: Rig, joint: int) -> str:
 class CoulombFriction(Friction):
     """F_f = Fc z: dry friction of one level (Coulomb 1785; the contact's state z, see the module).
 
-    Hides in the viscous friction: 80 N on the seed bench make Fv2 110 % too large.
+    Without it the viscous friction is biased: 80 N on the seed bench make Fv2 110 % too large.
     """
 
     name: ClassVar[str] = "coulomb_friction"
@@ -202,7 +202,7 @@ class CoulombFriction(Friction):
         "pressure_dependent_friction",
     )
     separated_by: ClassVar[str] = (
-        "two amplitudes of one frequency: its torque stays, that of viscous friction doubles"
+        "two amplitudes of one frequency: its torque is the same, that of viscous friction doubles"
     )
 
     @property
@@ -231,8 +231,8 @@ class StribeckFriction(Friction):
 
     The level e = exp(-(s'/vs)^2) falls off over the Stribeck speed vs (shape); w builds up to it
     at a contact stiffness that does not depend on it (Dahl 1968): dw/ds = (sign(s') - w / e) / d.
-    Alone it is the part that vanishes with speed; with `coulomb_friction` beside it it is the whole
-    Stribeck curve.
+    Alone it is the part that vanishes with speed; together with `coulomb_friction` it is the
+    whole Stribeck curve.
     """
 
     name: ClassVar[str] = "stribeck_friction"

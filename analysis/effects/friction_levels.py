@@ -1,4 +1,4 @@
-"""Dry friction whose level depends on the direction of motion, or on what the seals hold back.
+"""Dry friction whose level depends on the direction of motion or on the chamber pressures.
 
 The contact's law is that of `contact`, with a level that changes along the path.
 """
@@ -39,14 +39,14 @@ DIFFERENCE: Final = 0.1  # of the mean level: with less between directions it is
 
 @dataclass(frozen=True)
 class AsymmetricFriction(Friction):
-    """F_f = F_ext a - F_ret r: seals that hold differently either way.
+    """F_f = F_ext a - F_ret r: friction levels that differ by direction.
 
-    Each level builds up over its own presliding distance while the piston moves its way and falls
-    off over the other's while it moves back (the contact's law of the module, direction by
-    direction): extending da/ds = (1 - a)/d_ext, dr/ds = -r/d_ext; retracting, over the travel |s|,
-    da = -a/d_ret, dr = (1 - r)/d_ret. Source: Jelali and Kroll 2003 (levels by direction).
-    On an electric joint no lever tells it from `coulomb_friction` at (F_ext + F_ret)/2 with a
-    `torque_offset` of (F_ext - F_ret)/2: wherever it slides they are the same, and named are those.
+    Each level builds up over its presliding distance while the piston moves in its direction, and
+    decays over the other's while it moves back (the law of `contact`, by direction): extending
+    da/ds = (1 - a)/d_ext, dr/ds = -r/d_ext; retracting, over the travel |s|, da = -a/d_ret,
+    dr = (1 - r)/d_ret. Source: Jelali and Kroll 2003 (levels by direction).
+    On an electric joint, which has no lever arm, it equals `coulomb_friction` of (F_ext + F_ret)/2
+    with a `torque_offset` of (F_ext - F_ret)/2 wherever it slides, and is named as those.
     """
 
     hydraulic: ClassVar[bool] = True
@@ -56,7 +56,7 @@ class AsymmetricFriction(Friction):
     confounders: ClassVar[tuple[str, ...]] = ("coulomb_friction", "torque_offset")
     includes: ClassVar[tuple[str, ...]] = ("coulomb_friction",)  # where both levels are equal
     separated_by: ClassVar[str] = (
-        "motion about several places of the stroke: an offset torque does not go with G"
+        "motion about several places of the stroke: an offset torque does not change with G"
     )
 
     @property
@@ -127,7 +127,7 @@ class AsymmetricFriction(Friction):
 
 @dataclass(frozen=True)
 class PressureDependentFriction(Friction):
-    """F_f = k w: seals pressed on by the oil (Jelali and Kroll 2003).
+    """F_f = k w: seals pressed on by the chamber pressures (Jelali and Kroll 2003).
 
     k [m^2] is the friction coefficient times the seals' area under pressure. w [Pa] builds up to
     the load p_cap + p_rod at a contact stiffness that does not depend on it, only on speed

@@ -52,7 +52,8 @@ class _Leakage(Effect):
 class InternalLeakage(_Leakage):
     """Q = c (p_cap - p_rod) past the piston, out of the cap side and into the rod side.
 
-    Hides in the bulk modulus: 2e-12 m^3/(s Pa) make b of the seed bench 9 to 16 % too large.
+    Without it the bulk modulus is biased: 2e-12 m^3/(s Pa) make b of the seed bench 9 to 16 % too
+    large.
     """
 
     name: ClassVar[str] = "internal_leakage"
@@ -65,7 +66,7 @@ class InternalLeakage(_Leakage):
         "sensor_offset",
     )
     separated_by: ClassVar[str] = (
-        "a load that drives the pressures far apart while the piston stands or creeps"
+        "a load that drives the pressures far apart while the piston rests or creeps"
     )
 
     @property

@@ -1,12 +1,12 @@
 """Effects of measurement: a channel that is late or lags, a wrong gain, an offset, cross-talk.
 
-They transform data, not the model: `prepare` undoes them in the signals, and the plant's equations
-hold between what is left. `correct` does the same to sampled channels, so that a simulation is
-compared with what a right sensor would have shown.
+They transform the data, not the model: `prepare` undoes them in the signals, and the plant's
+equations hold between the corrected signals. `correct` does the same to sampled channels, so that
+a simulation is compared with what a correct sensor would have shown.
 
 `where` is `joint I cap|rod` for a chamber's pressure, `joint I piston|spool` for those sensors
 (reported as `joint I`: the parameter's name says which), and `bench` for the supply pressure. What
-all channels of a kind share stands at `bench pressure|piston|spool` (reported as `bench`).
+all channels of a kind share has the place `bench pressure|piston|spool` (reported as `bench`).
 Source: each is the first-order model of a sensor, tau y' + y = gain x(t - delay) + offset.
 """
 
@@ -258,7 +258,7 @@ class SensorLag(Late):
 
 @dataclass(frozen=True)
 class SensorCrosstalk(Sensor):
-    """reading of one chamber's pressure = p + k times the other chamber's: wires side by side."""
+    """reading of one chamber's pressure = p + k times the other chamber's (electrical coupling)."""
 
     name: ClassVar[str] = "sensor_crosstalk"
     least_shape: ClassVar[tuple[float, ...]] = (0.01,)
@@ -268,7 +268,9 @@ class SensorCrosstalk(Sensor):
         "sensor_offset",
         "pressure_dependent_friction",
     )
-    separated_by: ClassVar[str] = "loads at which one chamber's pressure moves and the other stands"
+    separated_by: ClassVar[str] = (
+        "loads at which one chamber's pressure changes and the other does not"
+    )
     where: str = "joint 1 cap"
 
     @classmethod
@@ -326,7 +328,7 @@ class SensorGain(Sensor):
 
     def absorbed(self, rig: Rig) -> str:
         """Say that the flow gains take up a spool's."""
-        return "the flow gains take a spool's gain up completely" if self.side == "spool" else ""
+        return "the flow gains absorb a spool's gain completely" if self.side == "spool" else ""
 
     def shape_names(self) -> tuple[str, ...]:
         """Name the gain."""
@@ -345,8 +347,8 @@ class SensorGain(Sensor):
 class SensorOffset(Sensor):
     """reading = x + offset, in the channel's unit.
 
-    Of a spool's LVDT it is the null's offset to the data, and stands there under that name
-    (`spool_offset`); it is offered for all other channels.
+    Of a spool's LVDT it is the same as the null's offset, and is listed under that name
+    (`spool_offset`); it is a candidate for all other channels.
     """
 
     name: ClassVar[str] = "sensor_offset"

@@ -105,7 +105,7 @@ def _inclination(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untype
 class JointSpring(Effect):
     """Torque k (q - rest) back to the rest angle (a hose, a counterweight's spring): Hooke.
 
-    The rest angle is a shape; where the records cannot fix it, mid-stroke is as good.
+    The rest angle is a shape; where the records do not determine it, mid-stroke is used.
     """
 
     mechanism: ClassVar[str] = "position_force"
@@ -115,8 +115,8 @@ class JointSpring(Effect):
     variable: ClassVar[str] = "the joint's angle"
     confounders: ClassVar[tuple[str, ...]] = ("torque_offset", "base_inclination")
     separated_by: ClassVar[str] = (
-        "slow motion over the whole stroke at two poses of the other joints: gravity goes with the "
-        "absolute angle, the spring with the joint's own"
+        "slow motion over the whole stroke at two poses of the other joints: gravity "
+        "depends on the absolute angle, the spring on the joint's angle"
     )
     per_joint: ClassVar[bool] = True
     where: str = "joint 1"
@@ -197,7 +197,8 @@ class TorqueOffset(Effect):
         "sensor_offset",
     )
     separated_by: ClassVar[str] = (
-        "slow motion over the whole stroke: gravity, spring and a pressure's offset change with it"
+        "slow motion over the whole stroke: torques of gravity, a spring and a pressure's offset "
+        "change with it"
     )
     per_joint: ClassVar[bool] = True
     where: str = "joint 1"

@@ -61,7 +61,7 @@ class Payload(Effect):
 
     def absorbed(self, rig: Rig) -> str:
         """Say that the baseline's M, R and W take it all."""
-        return "M, R and W of one run take a payload up completely; compare with a run without it"
+        return "M, R and W of one run absorb a payload completely; compare with a run without it"
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return m [kg]."""

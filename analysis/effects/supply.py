@@ -1,4 +1,4 @@
-"""Effects on the pressures at the valves' ports: a supply that sags, a return under pressure.
+"""Effects on the pressures at the valves' ports: supply sag, return pressure.
 
 Both follow the flow that all valves together take or give. The rows have that flow from the
 chambers' continuity, A s' + V p' / b with the rig's nominal b (the correction of a correction; left
@@ -84,13 +84,13 @@ def port_flow(rig: Rig, signals: Signals, drawn: bool) -> Array:
 
 @dataclass(frozen=True)
 class SupplySag(PortEffect):
-    """The valves see less than the supply: p_s - dp r (r^3 + r_t^3)^(1/3), r = Q / Q_pump.
+    """The valves see a lower pressure: p_s - dp r (r^3 + r_t^3)^(1/3), r = Q / Q_pump.
 
-    Where the rig measures its supply, what can be missing is the line between sensor and valves:
-    laminar below the share r_t of the pump's flow, turbulent above (Merritt 1967, chapter 3; the
-    two asymptotes joined as in Churchill and Usagi 1972). Where it does not, pump or relief valve
-    give way nearly in proportion to the flow. A sudden demand is met by the oil V_supply between
-    sensor and valves, or an accumulator as soft as that, until the line follows:
+    Where the rig measures its supply, this is the line between sensor and valves: laminar below
+    the share r_t of the pump's flow, turbulent above (Merritt 1967, chapter 3; the two asymptotes
+    joined as in Churchill and Usagi 1972). Where it does not, the pressure of pump or relief valve
+    falls nearly in proportion to the flow. A sudden demand is met by the oil V_supply between
+    sensor and valves, or an accumulator of equal capacity, until the line follows:
     dQ/dt = (Q_drawn - Q) b / (V_supply d dp/dQ); the simulation leaves that out.
     dp, r_t and V_supply are shapes.
     """
@@ -102,7 +102,7 @@ class SupplySag(PortEffect):
     variable: ClassVar[str] = "the flow drawn from the supply"
     confounders: ClassVar[tuple[str, ...]] = ("tank_pressure", "sensor_gain", "sensor_offset")
     separated_by: ClassVar[str] = (
-        "two amplitudes, one and both joints at once: the drop goes with the whole bench's flow"
+        "two amplitudes, one and both joints at once: the drop depends on the whole bench's flow"
     )
 
     @property
@@ -144,7 +144,7 @@ class SupplySag(PortEffect):
 
 @dataclass(frozen=True)
 class TankPressure(PortEffect):
-    """The return stands at p_t + p_back (Q / Q_pump)^2 instead of zero (Merritt 1967, chapter 3).
+    """The return pressure is p_t + p_back (Q / Q_pump)^2 instead of zero (Merritt 1967, chapter 3).
 
     The line's part is turbulent; Q is the flow that the valves give back.
     """
@@ -156,7 +156,7 @@ class TankPressure(PortEffect):
     variable: ClassVar[str] = "the pressure left across the edge to the tank"
     confounders: ClassVar[tuple[str, ...]] = ("supply_sag", "sensor_offset", "external_leakage")
     separated_by: ClassVar[str] = (
-        "motion at low chamber pressure: there little is left across the edge to the tank"
+        "motion at low chamber pressure, where the drop across the edge to the tank is small"
     )
 
     @property
@@ -209,10 +209,10 @@ class TankPressure(PortEffect):
 
 @dataclass(frozen=True)
 class ReturnLine(PortEffect):
-    """The return stands under its line's pressure: dp r (r^3 + r_t^3)^(1/3), r = Q / Q_pump.
+    """The return pressure is the drop of its line: dp r (r^3 + r_t^3)^(1/3), r = Q / Q_pump.
 
     Laminar below the share r_t of the pump's flow, turbulent above (as `supply_sag`; Merritt 1967,
-    chapter 3). What stands at no flow as well is `tank_pressure`.
+    chapter 3). A pressure that is there at zero flow too is `tank_pressure`.
     """
 
     name: ClassVar[str] = "return_line"
@@ -221,7 +221,9 @@ class ReturnLine(PortEffect):
     least_shape: ClassVar[tuple[float, ...]] = (0.2e6,)  # [Pa] at the rated flow
     variable: ClassVar[str] = "the flow given back to the tank"
     confounders: ClassVar[tuple[str, ...]] = ("tank_pressure", "supply_sag")
-    separated_by: ClassVar[str] = "two amplitudes: a tank's own pressure stays, the line's grows"
+    separated_by: ClassVar[str] = (
+        "two amplitudes: a tank's own pressure stays the same, the line's grows"
+    )
 
     @property
     def kernel(self) -> Kernel:

@@ -52,7 +52,8 @@ class UnderlapLeakage(ValveEffect):
         "external_leakage",
     )
     separated_by: ClassVar[str] = (
-        "small spool amplitudes about the null beside large ones: leakage of seals does not care"
+        "small spool amplitudes about the null beside large ones: leakage of seals does not depend "
+        "on the spool"
     )
 
     @property

@@ -77,7 +77,7 @@ class ValveDeadband(ValveEffect):
     An edge at x is open by (x + (|x|^n + r^n)^(1/n)) / 2, n = 2 + c: r the rounding, 0 for a sharp
     edge, c its corner, 0 where only clearance rounds it (see `edges`).
     Source: Merritt 1967, chapter 5 (overlap, "dead band"); Jelali and Kroll 2003.
-    Hides in the flow gains: 10 mV make those of the seed bench 12 to 17 % too small.
+    Without it the flow gains are biased: 10 mV make those of the seed bench 12 to 17 % too small.
     """
 
     name: ClassVar[str] = "valve_deadband"
@@ -123,9 +123,10 @@ class ValveDeadband(ValveEffect):
 
 @dataclass(frozen=True)
 class SpoolOffset(ValveEffect):
-    """The edges' null lies at u0 of the LVDT: opening u - u0 (Merritt 1967, chapter 5, "null").
+    """The edges' null is at u0 of the LVDT: opening u - u0 (Merritt 1967, chapter 5, "null").
 
-    Hides in the gains of the two directions with opposite signs (5 mV: 7 to 9 % on the seed bench).
+    Without it the gains of the two directions are biased with opposite signs (5 mV: 7 to 9 % on the
+    seed bench).
     """
 
     name: ClassVar[str] = "spool_offset"
@@ -134,7 +135,7 @@ class SpoolOffset(ValveEffect):
     variable: ClassVar[str] = "the spool's sign"
     confounders: ClassVar[tuple[str, ...]] = ("valve_deadband", "internal_leakage")
     separated_by: ClassVar[str] = (
-        "two spool amplitudes: the error of flow stays the same, that of a gain grows with them"
+        "two spool amplitudes: the flow error stays the same, that of a gain grows with them"
     )
 
     @property

@@ -31,10 +31,10 @@ DIFFERENCE: Final = 0.1  # of the mean slope: with less between directions they 
 class AsymmetricViscousFriction(Effect):
     """F = c_ext s' extending, c_ret s' retracting, beside the joint's Fv q': slopes by direction.
 
-    Wipers and lip seals drag less oil one way than the other (Jelali and Kroll 2003). The slope of
-    a direction is its own and Fv G^-2 together; what the records determine well is the difference.
-    On an electric joint G is 1, Fv is the mean slope, and one coefficient dFv, the column |q'|,
-    says the rest.
+    Wipers and lip seals drag less oil in one direction (Jelali and Kroll 2003). The slope of a
+    direction is its coefficient plus Fv G^-2; the records determine the difference well.
+    On an electric joint G is 1, Fv is the mean slope, and the one coefficient dFv, of the column
+    |q'|, is half the difference.
     """
 
     mechanism: ClassVar[str] = "friction_curve"
@@ -49,7 +49,7 @@ class AsymmetricViscousFriction(Effect):
         "coulomb_friction",
     )
     separated_by: ClassVar[str] = (
-        "two speeds of the same motion: an offset and a difference of levels stay, this doubles"
+        "two speeds of one motion: offset and difference of levels stay the same, this doubles"
     )
     per_joint: ClassVar[bool] = True
     where: str = "joint 1"

@@ -14,13 +14,13 @@ from rig.model.rig import Rig
 from tests.studies.pages import markdown_table
 
 FAMILIES: Final[Mapping[str, str]] = {
-    "friction": "Friction of a cylinder's seals: a force at the piston, so that its torque goes "
-    "with the cylinder's Jacobian G.",
-    "mechanics": "Effects on the arm and what it carries.",
-    "valve": "What stands between the spool's LVDT and the metering edges.",
-    "fluid": "Leaks, port pressures and the oil's stiffness.",
-    "measurement": "What sensors do to the truth. These transform data, not the model; a "
-    "simulation is compared with channels put right.",
+    "friction": "Friction of a cylinder's seals: a force at the piston, so that its torque is "
+    "proportional to the cylinder's Jacobian G.",
+    "mechanics": "Effects on the arm and its load.",
+    "valve": "Effects between the spool's LVDT and the metering edges.",
+    "fluid": "Leakage, port pressures and the oil's stiffness.",
+    "measurement": "Errors of sensors. They transform the data, not the model; a simulation is "
+    "compared with corrected channels.",
 }
 OTHERS: Final = re.compile(r"joint ([2-9]|1\d)")  # joints that the table leaves out
 _CODE: Final = re.compile(r"`[^`]*`|[^`]+")
@@ -44,7 +44,7 @@ def parameter_rows(rig: Rig) -> list[tuple[str, str, str, str, str]]:
     for name, kind in catalogue().items():
         for effect in examples(kind, rig):
             for c in effect.coefficients(rig):
-                kept = "the orifice's own" if c.parameter in gain_names(1) else "coefficient"
+                kept = "the orifice's gain" if c.parameter in gain_names(1) else "coefficient"
                 rows.append((name, effect.place, c.parameter, c.unit or "-", kept))
             for s in effect.shapes(rig):
                 if s.fixed:  # a knot of a curve, where the data are
@@ -69,24 +69,25 @@ def overview(rig: Rig) -> str:
     """Return the page of the whole catalogue for a rig."""
     parts = [
         "# Effects\n",
-        "What the baseline model may lack. Each effect is one class of `analysis/effects`; this "
-        "page and those of the families are made from the classes by\n",
+        "Physical effects that the baseline model may lack. Each effect is one class of "
+        "`analysis/effects`; this page and those of the families are generated from the classes "
+        "by\n",
         "    python -m tests.studies effects --docs docs/\n",
-        f"Parameters of joint 1 and of the bench, bounds of the rig `{rig.name}`. A *coefficient* "
-        "is found by least squares, a *shape* by a search within its bounds, at most two per "
-        "effect. Bounds of spools, forces and volumes scale with the rig. What has no name for its "
-        "form is a curve by its values at knots, tried where no named effect explains the records."
-        "\n",
+        f"The table lists the parameters of joint 1 and of the bench, with bounds for the rig "
+        f"`{rig.name}`. A *coefficient* is found by least squares, a *shape* by a search within "
+        "its bounds. Bounds of spools, forces and volumes scale with the rig. An effect whose name "
+        "ends in `_curve`, and `position_force`, is a free form: a curve by its values at knots, "
+        "tried only where no named effect explains the records.\n",
         table(rig),
         "\n## Families\n",
         *(f"- [{family}](effects-{family}.md): {text}" for family, text in FAMILIES.items()),
-        "\n## What no data can tell\n",
+        "\n## What no data can separate\n",
         *hidden_from_data(rig),
-        "\n## An effect of your own\n",
-        "A module in `analysis/effects` with one frozen dataclass derived from `Effect`, named in "
-        "`TERMS`, is found by itself: rows, simulation, trace, model files and this page take it "
-        "from there. Rows, kernel and limits are then held to one another by "
-        "`tests/analysis/effects/test_catalogue.py`.",
+        "\n## Adding an effect\n",
+        "Add a module in `analysis/effects` with one frozen dataclass derived from `Effect`, and "
+        "name it in the module's `TERMS`. Rows, simulation, trace, model files and this page then "
+        "use it. `tests/analysis/effects/test_catalogue.py` checks that rows, simulation kernel "
+        "and limits agree.",
     ]
     return "\n".join(parts) + "\n"
 
@@ -100,8 +101,8 @@ def hidden_from_data(rig: Rig) -> list[str]:
                 at = effect.where if effect.where == effect.place else effect.where.split()[-1]
                 lines.append(f"- `{name}` ({at}): {effect.absorbed(rig)}.")
             lines += [
-                f"- `{name}` and `{other}` of the same spool: one to the data; reported as "
-                f"`{name}`."
+                f"- `{name}` and `{other}` of the same spool: the same to the data; reported "
+                f"as `{name}`."
                 for other, _ in effect.twins()
             ]
     return lines
@@ -116,18 +117,18 @@ def family_page(family: str) -> str:
         parts.append(_plain(inspect.getdoc(module) or "") + "\n")
     parts.append(f"\n![signatures](images/effects-{family}.svg)\n")
     parts.append(
-        "Residual of the baseline against each effect's own variable, on simulated benches that "
-        "have the effect: grey as recorded (mean over bins), red after the catalogue's entry was "
-        "added. The simulator's form of every effect differs from the catalogue's. Made by "
+        "Residual of the baseline against each effect's variable, on simulated benches that have "
+        "the effect: grey without the effect in the model (mean over bins), red with it. The "
+        "simulator's code is separate, and the form of an effect may differ there. Made by "
         "`python -m tests.studies effects --docs docs/`.\n"
     )
     for kind in kinds:
         rivals = ", ".join(f"`{name}`" for name in kind.confounders) or "none"
         parts.append(f"## `{kind.name}`\n")
         parts.append(_plain(inspect.getdoc(kind) or "") + "\n")
-        parts.append(f"- Moves with: {kind.variable}.")
-        parts.append(f"- Looks like: {rivals}.")
-        parts.append(f"- Told apart by: {kind.separated_by}.\n")
+        parts.append(f"- Depends on: {kind.variable}.")
+        parts.append(f"- Resembles: {rivals}.")
+        parts.append(f"- Separated by: {kind.separated_by}.\n")
     return "\n".join(parts) + "\n"
 
 

@@ -40,9 +40,9 @@ def effects(
     written["effects.md"] += (
         "\n## Found on simulated benches\n\n"
         f"One record per step of `{simulated.PROTOCOL}` (seed {seed}) on a bench that has the "
-        "effect in the simulator's form; `before` and `after` are residuals over the noise floor "
-        "on another draw at 0.7 of the amplitude, in the row that shows the effect best.\n\n"
-        + simulated.table(outcomes)
+        "effect in the simulator's form. `before` and `after` are residuals over the noise floor "
+        "in held-out records (another wave at 0.7 of the amplitude), in the equation in which the "
+        "effect is largest.\n\n" + simulated.table(outcomes)
     )
     for name, text in written.items():
         (docs / name).write_text(text, encoding="utf-8")

@@ -170,21 +170,22 @@ def sections(found: Mapping[int, Sequence[Answer]], command: str) -> list[Sectio
     return [
         Section("", (
             f"{len(base)} benches of textbook physics (`python -m tests.studies foreign`), drawn "
-            f"by seed, each traced with all rules and again without each of {len(RULES)}. With "
+            f"by seed, are each traced with all rules and again without each of {len(RULES)}. With "
             f"all rules {settled} answers are right, in class or a right refusal "
-            f"({100 * low:.0f} to {100 * high:.0f} %, 95 %), {wrong} wrong or partial. "
-            "Made by:",
+            f"({100 * low:.0f} to {100 * high:.0f} %, one-sided 95 % bounds), {wrong} "
+            f"{'is' if wrong == 1 else 'are'} wrong or partial. Made by:",
             f"```sh\n{command}\n```",
-            "*Changed*: verdict or names differ. *Lost*: settled before, not without the rule. "
-            "*Wrong*: a wrong or partial name, or a false alarm, that the rule had kept away. "
-            "*Won* and *cured* are the reverse: what the rule costs.",
-            Table("Answers changed by a rule's absence",
+            "*Changed*: verdict or names differ. *Lost*: right, in class or a right refusal with "
+            "all rules, but not without this one. *Wrong*: a wrong or partial name, or a false "
+            "alarm, that occurs only without the rule. *Won* and *cured* are the reverse of "
+            "*lost* and *wrong*: answers that the rule makes worse.",
+            Table("Answers that change without a rule",
                   ("rule", "without it", "benches", "changed", "lost", "wrong", "won", "cured"),
                   rows),
-            "No answer changed here without: " + (", ".join(idle) or "none") + ". On so few "
-            "benches that is no proof that a rule is idle: the tests of the gates "
-            "(`tests/analysis/trace/test_gates.py`) hold a bench that needs it for each but "
-            "pairs.",
+            "No answer changes on these benches without: " + (", ".join(idle) or "none") + ". So "
+            "few benches do not prove that a rule has no use: "
+            "`tests/analysis/trace/test_gates.py` has a bench that needs the rule, for each rule "
+            "but pairs.",
         )),
         Section("Every change", (
             Table("With all rules, and without one",

@@ -333,19 +333,20 @@ def sections(found: Mapping[int, Sequence[MethodAnswer]], command: str) -> list[
     return [
         Section("", (
             f"{len(found)} benches of textbook physics (`python -m tests.studies foreign`), drawn "
-            "by seed. *Stepwise*: effects of the catalogue join and leave by Schwarz's criterion, "
-            "from the columns that the trace looks at, without its gates. *Sparse*: products of up "
-            "to two variables of a joint in each of its equations, by pysindy; it names nothing. "
-            "All are fitted to the training records; *taken* is the share of the energy above "
-            "noise that goes on held-out ones, below zero where they are worse than without. "
-            "Made by:",
+            "by seed. *Stepwise*: effects of the catalogue enter and leave by Schwarz's criterion, "
+            "from the same columns as the trace's, without its gates. *Sparse*: products of up to "
+            "two variables of a joint in each of its equations, by pysindy; it names no effect. "
+            "All are fitted to the training records. *Removed* is the share of the energy above "
+            "noise that is removed from held-out records; it is negative where they are met worse "
+            "than without. Made by:",
             f"```sh\n{command}\n```",
-            Table("All benches (wrong names), those at three times the noise or more (the rest)",
+            Table("Wrong or partial names: of all benches; other columns: of those at three times "
+                  "the noise or more; bounds one-sided, 95 %",
                   ("method", "right or in class", "wrong or partial names", "terms, median",
-                   "taken, median", "taken, least"), rows),
+                   "removed, median", "removed, least"), rows),
         )),
         Section("Every bench", (
-            Table("What each method makes of it",
+            Table("Answer of each method",
                   ("seed", "hidden", "x noise", TRACE, STEPWISE, SPARSE), benches),
         )),
     ]  # fmt: skip

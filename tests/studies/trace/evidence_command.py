@@ -1,4 +1,4 @@
-"""The studies `ablations`, `isolability` and `baselines`: what carries the trace's answers."""
+"""The studies `ablations`, `isolability` and `baselines` of the trace's answers."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def ablations(
     done = performed(work, perform, cluster or workers, report, kept, left_out=(Exception,))
     found = dict(sorted(done, key=lambda pair: pair[0]))
     write_json(json, {str(k): as_json(v) for k, v in found.items()})
-    _show("What each rule of the trace is worth", sections(found, _command(
+    _show("Answers of the trace without each of its rules", sections(found, _command(
         "ablations", {"--seed": seed, "--count": count}, docs)), json, docs)  # fmt: skip
 
 
@@ -102,7 +102,7 @@ def baselines(
     done = performed(work, perform, cluster or workers, report, kept, left_out=(Exception,))
     found = dict(sorted(done, key=lambda pair: pair[0]))
     write_json(json, {str(k): as_json(v) for k, v in found.items()})
-    _show("The trace beside two plain methods", sections(found, _command(
+    _show("The trace compared with two plain methods", sections(found, _command(
         "baselines", {"--seed": seed, "--count": count}, docs)), json, docs)  # fmt: skip
 
 

@@ -142,40 +142,41 @@ def picture(found: Isolability) -> str:
         for k in range(0, 9, 2):
             axes.plot([], [], "-", color=shades[k], lw=6, label=f"{10 ** (k // 2):,}")
         axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=5, frameon=False,
-                    title="what stays, standard deviations of noise")  # fmt: skip
+                    title="remaining residual, standard deviations of noise")  # fmt: skip
         axes.set(xlim=(-0.5, K - 0.5), ylim=(K - 0.5, -0.5), aspect="equal")
         axes.set_xticks(range(K), found.names, rotation=90, fontsize=6)
         axes.set_yticks(range(K), found.names, fontsize=6)
         axes.set_xlabel("fitted in its place, at any size")
-        axes.set_ylabel("there, at its smallest size of interest")
+        axes.set_ylabel("present, at its smallest size of interest")
         made.subplots_adjust(left=0.19, right=0.99, bottom=0.2, top=0.93)
-        return str(svg(made, "isolability", "Which effects can be told from which"))
+        return str(svg(made, "isolability", "Which effects can be separated"))
 
 
 def sections(found: Isolability, command: str, run: Run) -> list[Section]:
-    """Return the page: picture, the pairs that cannot be told apart, what is not seen at all."""
+    """Return the page: picture, the pairs that cannot be separated, what is not detected."""
     quiet = [n for k, n in enumerate(found.names) if found.distance[k, k] < SEEN]
     pairs = found.inseparable
     K = len(found.names)
     seen = K - len(quiet)
     return [
         Section("", (
-            f"Of {K} effects at joint 2, its sensors or the bench, each at the smallest size of "
-            f"interest, {seen} stand at least {SEEN:g} standard deviations of noise out of what "
-            f"the baseline absorbs ({PROTOCOL}, {len(run.records)} records). Of their "
-            f"{seen * (K - 1)} ordered pairs {len(pairs)} cannot be told apart: what stays when "
-            "the other is fitted in its place is below that. It follows from the "
-            "records' columns and the noise floor by linear algebra; what the trace answers, the "
-            "confusion table of [trace.md](trace.md), cannot be better than this, at this size. "
-            "Larger effects, and other poses, tell more.",
+            f"{K} effects at joint 2, its sensors or the bench are each taken at the smallest size "
+            f"of interest. Of these, {seen} leave a residual of at least {SEEN:g} standard "
+            f"deviations of noise beyond what the baseline absorbs ({PROTOCOL}, "
+            f"{len(run.records)} records). Of their {seen * (K - 1)} ordered pairs, {len(pairs)} "
+            "cannot be separated: with the other effect fitted in its place, the residual is "
+            "below that. The result follows from the records' columns and the noise floor by "
+            "linear algebra. At this size, the trace ([trace.md](trace.md)) cannot separate more. "
+            "Larger effects and other poses separate more.",
             "Made by:",
             f"```sh\n{command}\n```",
-            Picture("matrix.svg", picture(found), "Rows: the effect that is there. Columns: the "
-                    "effect fitted in its place; on the diagonal none. Crosses: seen alone, not "
-                    "told from the other. Dots: not seen at all."),
-            Table("Seen alone, but not told from another (standard deviations of noise)",
-                  ("there", "fitted in its place", "alone", "what stays"),
+            Picture("matrix.svg", picture(found), "Rows: the effect that is present. Columns: "
+                    "the effect fitted in its place; none on the diagonal. Crosses: detected "
+                    "alone, but not separated from the other. Dots: not detected."),
+            Table("Detected, but not separated from another effect (standard deviations of noise)",
+                  ("present", "fitted in its place", "residual", "remaining residual"),
                   [[a, b, f"{alone:.0f}", f"{left:.1f}"] for a, b, alone, left in pairs]),
-            "Not seen at their smallest size of interest: " + (", ".join(quiet) or "none") + ".",
+            "Not detected at their smallest size of interest: "
+            + (", ".join(quiet) or "none") + ".",
         )),
     ]  # fmt: skip
