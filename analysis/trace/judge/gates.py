@@ -62,7 +62,7 @@ def judge(
     for used in winner.effects:
         assert isinstance(used.term, Effect)
         key = (used.term.name, used.term.where)
-        rest = hypotheses.exact(tuple(u for u in winner.effects if u is not used))
+        rest = _without(hypotheses, winner, used)
         share, others = steady[key]
         often = {
             k
@@ -108,6 +108,25 @@ def judge(
             )
         )
     return tuple(out)
+
+
+def _without(hypotheses: HypothesisSet, winner: Hypothesis, used: Used) -> Hypothesis:
+    """Return the set without one effect, or the best physical one of readings of the others.
+
+    Two levels of friction of opposite signs make a torque offset: what physics refuses is no
+    alternative to an effect.
+    """
+    kept = [u for u in winner.effects if u is not used]
+    rest = hypotheses.exact(kept)
+    if not hypotheses.physical(rest):
+        return rest
+    simpler = [
+        o
+        for o in hypotheses.fitted.values()
+        if not hypotheses.physical(o)
+        and all(any(u.term == k.term or related(u.term, k.term) for k in kept) for u in o.effects)  # type: ignore[arg-type]
+    ]
+    return min([hypotheses.empty, *simpler], key=lambda o: o.total)
 
 
 def remaining(
@@ -230,8 +249,8 @@ def _rivals(
     the effect is no rival: held-out records have said that it is too simple.
     """
     others = winner.keys - {key}
-    (mine,) = (u.term for u in winner.effects if (u.term.name, u.term.where) == key)
-    rest = hypotheses.exact([u for u in winner.effects if u.term is not mine])
+    (used,) = (u for u in winner.effects if (u.term.name, u.term.where) == key)
+    mine, rest = used.term, _without(hypotheses, winner, used)
     equations = _touched(hypotheses, winner, rest)
     judged, trained = (
         _Near(data, equations, left, without)
