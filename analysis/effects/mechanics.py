@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import ClassVar, Final
 
 import numpy as np
 
@@ -101,6 +101,9 @@ def _inclination(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untype
             x[THETA, i] += par[0]
 
 
+RESTS: Final = 5  # rest angles of first look, evenly in the joint's reach
+
+
 @dataclass(frozen=True)
 class JointSpring(Effect):
     """Torque k (q - rest) back to the rest angle (a hose, a counterweight's spring): Hooke.
@@ -135,11 +138,13 @@ class JointSpring(Effect):
         return (f"rest_{self.joint + 1}",)
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return the rest angle [rad], anywhere in the joint's reach."""
+        """Return the rest angle [rad], anywhere in the joint's reach.
+
+        Far from the true one a search ends at a spring that pushes away: several are looked at.
+        """
         low, high = _reach(rig, self.joint)
-        part = rig.joints[self.joint]
-        middle = float(part.geometry(0.5 * sum(part.position_range))[0])
-        return (Shape(f"rest_{self.joint + 1}", "rad", low, high, (middle,)),)
+        looks = tuple(map(float, np.linspace(low, high, RESTS + 2)[1:-1]))
+        return (Shape(f"rest_{self.joint + 1}", "rad", low, high, looks),)
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return q - rest."""

@@ -87,7 +87,7 @@ def judge(
                 share >= TRACE.least_chosen or bool(tied),
                 _chosen(share, others, bool(tied)),
             ),
-            Gate(SIGNIFICANT, p <= TRACE.p_limit, f"family-wise p = {p:.3g}"),
+            _significant(train_data, used, p, errors),
             Gate(ALONE, not (tied or twins), _told_apart([*twins, *rivals])),
         )
         out.append(
@@ -352,6 +352,22 @@ def _parameters(
         name: Estimate(float(v), units.get(name, ""), float(s), (float(v - h), float(v + h)))
         for name, v, s, h in zip(errors.names, errors.value, std, half, strict=True)
     }
+
+
+def _significant(
+    train_data: RegressionData, used: Used, p: float, errors: inference.EffectErrors
+) -> Gate:
+    """Ask for a small p, and for one number at least that is known to be something.
+
+    The numbers of an effect that the others of the set can stand for are known to nothing.
+    """
+    neutral = {s.parameter: s.neutral or 0.0 for s in shapes_of(train_data.rig, used)}
+    value = errors.value - np.array([neutral.get(name, 0.0) for name in errors.names])
+    known = bool(np.any(np.abs(value) > TRACE.normal_quantile * errors.std))
+    words = f"family-wise p = {p:.3g}"
+    if not known:
+        words += ", but the other effects can stand for all of its numbers"
+    return Gate(SIGNIFICANT, p <= TRACE.p_limit and known, words)
 
 
 def _differences(differing: Sequence[tuple[str, str, float, float]]) -> str:

@@ -18,7 +18,7 @@ from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.held_out import residual as held_left
 from analysis.trace.search.hypothesis import Hypothesis, Key
-from analysis.trace.search.hypothesis_set import HypothesisSet
+from analysis.trace.search.hypothesis_set import HypothesisSet, effect_of
 from analysis.trace.settings import SEARCH, TRACE
 
 Array = NDArray[np.float64]
@@ -30,12 +30,14 @@ def settled(
 ) -> Hypothesis:
     """Return the winner with the simplest reading of every mechanism that loses no more than noise.
 
-    A richer reading takes the place of one that it includes, or stands beside it. It must be
-    physical, which asks that its own number is more than a form's tolerance; training and held-out
-    records must lose by the restriction more than `TRACE.standard_errors` of their noise; beside a
-    name it must take the share of what is left that a further effect must. Of several that
-    leave about as little the one with the fewest numbers stays.
+    First each effect is tried as one that it includes. A richer reading then takes the place of
+    one that it includes, or stands beside it. It must be physical, which asks that its own number
+    is more than a form's tolerance; training and held-out records must lose by the restriction
+    more than `TRACE.standard_errors` of their noise; its further number must take more than the
+    richer form itself leaves; beside a name it must take the share of what is left that a further
+    effect must. Of several that leave about as little the one with the fewest numbers stays.
     """
+    winner = _restricted(hypotheses, winner, holdout_data)
     while winner.effects:
         held = held_left(holdout_data, winner.fit)
         richer = [o for o in _richer(hypotheses, winner) if not hypotheses.physical(o)]
@@ -47,6 +49,29 @@ def settled(
         best = min(near, key=lambda o: (o.size, o.fit.energy))
         log.info("richer reading: %s for %s", sorted(best.keys), sorted(winner.keys))
         winner = best
+    return winner
+
+
+def _restricted(
+    hypotheses: HypothesisSet, winner: Hypothesis, holdout_data: RegressionData
+) -> Hypothesis:
+    """Return the winner with every effect as the one it includes, where nothing is lost by that."""
+    for used in winner.effects:
+        assert isinstance(used.term, Effect)
+        for name in used.term.includes:
+            if (name, used.term.where) in winner.keys or used not in winner.effects:
+                continue
+            simple = effect_of(name, used.term.where)
+            effects = [u for u in winner.effects if u is not used]
+            other = hypotheses.exact(
+                (*effects, Used(simple, simple.shape_of(hypotheses.train_data.rig, ())))
+            )
+            held = held_left(holdout_data, other.fit)
+            if not hypotheses.physical(other) and not _lost(
+                hypotheses, other, winner, held, holdout_data
+            ):
+                log.info("simpler reading: %s for %s", sorted(other.keys), sorted(winner.keys))
+                winner = other
     return winner
 
 
@@ -73,7 +98,7 @@ def _lost(
 ) -> bool:  # fmt: skip
     """Return whether training and held-out records lose by taking `one` for the richer `other`."""
     gain = hypothesis.fit.energy - other.fit.energy
-    if gain <= TRACE.standard_errors**2:
+    if gain <= max(TRACE.standard_errors**2, other.total):
         return False
     if len(other.effects) > len(hypothesis.effects):
         price = SEARCH.number_price * (other.size[1] - hypothesis.size[1])

@@ -112,7 +112,7 @@ class HypothesisSet:
             assert isinstance(used.term, Effect)
             term, shape = used.term, used.shape
             if term.simpler(rig, values):
-                term = _effect(term.simpler(rig, values), term.where)
+                term = effect_of(term.simpler(rig, values), term.where)
                 shape = term.shape_of(rig, ())
             effects.setdefault((term.name, term.where), Used(term, shape))
         changed = frozenset(effects) != hypothesis.keys
@@ -307,7 +307,7 @@ class HypothesisSet:
         return drop < SEARCH.add_share * without.total
 
 
-def _effect(name: str, where: str) -> Effect:
+def effect_of(name: str, where: str) -> Effect:
     """Return an effect of the catalogue at a place."""
     effect = make(name, where)
     assert isinstance(effect, Effect)
