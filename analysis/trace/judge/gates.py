@@ -32,9 +32,11 @@ Array = NDArray[np.float64]
 Key = tuple[str, str]
 
 
-REMOVES, PHYSICAL, INVARIANT, STABLE, SIGNIFICANT, ALONE = (
-    "removes on held-out", "physical", "invariant", "stable", "significant", "no rival",
+REMOVES, PHYSICAL, INVARIANT, STABLE, SIGNIFICANT, DETERMINED, ALONE = (
+    "removes on held-out", "physical", "invariant", "stable", "significant", "determined",
+    "no rival",
 )  # fmt: skip
+ENTANGLED = "the other effects can stand for all of its numbers"
 
 
 def stands(effect: JudgedEffect) -> bool:
@@ -76,6 +78,7 @@ def judge(
         p = inference.p_value(rest.fit.energy - winner.fit.energy, null)
         errors = inference.spread(train_data, winner.fit, used, values)
         differing = invariance(train_data, winner.fit, used, errors, _joint(used.term))
+        known = _determined(train_data, used, errors)
         tied = [r for r in rivals if r.tied]
         twins = [Rival(name, where, 1.0, 1.0, True) for name, where in used.term.twins()]
         gates = (
@@ -87,7 +90,8 @@ def judge(
                 share >= TRACE.least_chosen or bool(tied),
                 _chosen(share, others, bool(tied)),
             ),
-            _significant(train_data, used, p, errors),
+            Gate(SIGNIFICANT, p <= TRACE.p_limit, f"family-wise p = {p:.3g}"),
+            Gate(DETERMINED, known, "a number of it is" if known else ENTANGLED),
             Gate(ALONE, not (tied or twins), _told_apart([*twins, *rivals])),
         )
         out.append(
@@ -114,9 +118,10 @@ def _without(hypotheses: HypothesisSet, winner: Hypothesis, used: Used) -> Hypot
     """Return the set without one effect, or the best physical one of readings of the others.
 
     Two levels of friction of opposite signs make a torque offset: what physics refuses is no
-    alternative to an effect.
+    alternative to an effect. Two readings of one law go together: whether both are needed is
+    asked in `readings`.
     """
-    kept = [u for u in winner.effects if u is not used]
+    kept = [u for u in winner.effects if u is not used and not related(u.term, used.term)]  # type: ignore[arg-type]
     rest = hypotheses.exact(kept)
     if not hypotheses.physical(rest):
         return rest
@@ -354,20 +359,14 @@ def _parameters(
     }
 
 
-def _significant(
-    train_data: RegressionData, used: Used, p: float, errors: inference.EffectErrors
-) -> Gate:
-    """Ask for a small p, and for one number at least that is known to be something.
+def _determined(train_data: RegressionData, used: Used, errors: inference.EffectErrors) -> bool:
+    """Return whether one number of an effect at least is known to be something.
 
-    The numbers of an effect that the others of the set can stand for are known to nothing.
+    What the others of a set can stand for (a torque offset beside a spring's rest angle) is not.
     """
     neutral = {s.parameter: s.neutral or 0.0 for s in shapes_of(train_data.rig, used)}
     value = errors.value - np.array([neutral.get(name, 0.0) for name in errors.names])
-    known = bool(np.any(np.abs(value) > TRACE.normal_quantile * errors.std))
-    words = f"family-wise p = {p:.3g}"
-    if not known:
-        words += ", but the other effects can stand for all of its numbers"
-    return Gate(SIGNIFICANT, p <= TRACE.p_limit and known, words)
+    return bool(np.any(np.abs(value) > TRACE.normal_quantile * errors.std))
 
 
 def _differences(differing: Sequence[tuple[str, str, float, float]]) -> str:

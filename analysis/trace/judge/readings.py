@@ -59,19 +59,18 @@ def _restricted(
     for used in winner.effects:
         assert isinstance(used.term, Effect)
         for name in used.term.includes:
-            if (name, used.term.where) in winner.keys or used not in winner.effects:
-                continue
-            simple = effect_of(name, used.term.where)
             effects = [u for u in winner.effects if u is not used]
-            other = hypotheses.exact(
-                (*effects, Used(simple, simple.shape_of(hypotheses.train_data.rig, ())))
-            )
+            if (name, used.term.where) not in winner.keys:
+                simple = effect_of(name, used.term.where)
+                shape = simple.shape_of(hypotheses.train_data.rig, ())
+                effects.append(Used(simple, shape))
+            other = hypotheses.exact(effects)
             held = held_left(holdout_data, other.fit)
             if not hypotheses.physical(other) and not _lost(
                 hypotheses, other, winner, held, holdout_data
             ):
                 log.info("simpler reading: %s for %s", sorted(other.keys), sorted(winner.keys))
-                winner = other
+                return _restricted(hypotheses, other, holdout_data)
     return winner
 
 
@@ -97,13 +96,14 @@ def _lost(
     holdout_data: RegressionData,
 ) -> bool:  # fmt: skip
     """Return whether training and held-out records lose by taking `one` for the richer `other`."""
-    gain = hypothesis.fit.energy - other.fit.energy
-    if gain <= max(TRACE.standard_errors**2, other.total):
-        return False
     if len(other.effects) > len(hypothesis.effects):
         price = SEARCH.number_price * (other.size[1] - hypothesis.size[1])
-        if gain <= max(price, SEARCH.add_share * hypothesis.total):
-            return False
+        least = max(price, SEARCH.add_share * hypothesis.total)
+    else:
+        left = sum(max(0.0, v - hypotheses.limits.band[e]) for e, v in other.excess_energy.items())
+        least = max(TRACE.standard_errors**2, left)
+    if hypothesis.fit.energy - other.fit.energy <= least:
+        return False
     return loss(held, held_left(holdout_data, other.fit)) > TRACE.standard_errors
 
 

@@ -160,6 +160,12 @@ def what_noise_makes_as_large_is_not_significant(b: Benches) -> None:
     assert not gate(s.judged("internal_leakage"), gates.SIGNIFICANT)
 
 
+def a_torque_that_a_rest_angle_stands_for_is_not_determined(b: Benches) -> None:
+    s = b.searched(b.runs(k_spring=60.0), "joint_spring", "torque_offset")
+    found = s.judged("torque_offset", "joint_spring")
+    assert not gate(found, gates.DETERMINED)
+
+
 def a_null_and_its_sensors_offset_are_confounded(b: Benches) -> None:
     result = b.traced(b.runs(u_null=3e-3), "spool_offset")
     assert result.verdict == "confounded"
@@ -321,6 +327,7 @@ STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
     (a_leak_of_one_step_alone_is_no_leak, ("invariance", "tolerance x 10")),
     (what_no_half_of_the_repeats_chooses_is_not_stable, ("stability", "chosen always")),
     (what_noise_makes_as_large_is_not_significant, ("family-wise p", "p always 0")),
+    (a_torque_that_a_rest_angle_stands_for_is_not_determined, ("determined",)),
     (a_null_and_its_sensors_offset_are_confounded, ("twins",)),
     (a_gain_and_a_crosstalk_that_fit_alike_are_confounded, ("rivals",)),
     (what_a_linear_spring_leaves_of_a_cubic_one_is_not_nothing,

@@ -137,6 +137,8 @@ RULES: Final = (
     Rule("stability", "an effect need not be chosen in half-samples",
          (setting("least_chosen", -1.0),)),
     Rule("family-wise p", "no significance test", (setting("p_limit", 1.0),)),
+    Rule("determined", "an effect may stand for what others stand for as well",
+         ((gates, "_determined", lambda *_: True),)),
     Rule("rivals", "no other effect counts as tied", ((gates, "_rivals", lambda *_: []),)),
     Rule("twins", "effects that no data can separate are not listed as rivals",
          ((SpoolOffset, "twins", lambda _: ()), (SensorOffset, "twins", lambda _: ()))),
