@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import select
 import socket
 import time
 from abc import ABC, abstractmethod
@@ -25,7 +26,6 @@ from drivers.modbus_frames import (
 logger = logging.getLogger(__name__)
 
 _CHUNK = 4096
-_SOONEST = 1e-6  # [s]: a socket's timeout of 0 would mean another thing
 
 
 class ModbusConnection(ABC):
@@ -219,6 +219,7 @@ class TcpConnection(ModbusConnection):
                 f"nothing answers at {self.where}; is the device (or `bramah sim`) running there?"
             ) from error
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket.setblocking(False)  # with a timeout every call asks the system twice
         self._waiting = b""
 
     def _disconnect(self) -> None:
@@ -229,10 +230,13 @@ class TcpConnection(ModbusConnection):
     def _send(self, request: bytes) -> int:
         assert self._socket is not None
         self._transaction = self._transaction % 0xFFFF + 1
+        frame = tcp_frame(self._transaction, self._unit, request)
         try:
-            self._socket.sendall(tcp_frame(self._transaction, self._unit, request))
+            sent = self._socket.send(frame)
         except OSError as error:
             self._lost(error)
+        if sent < len(frame):  # no device is asked for so much at once: it has stopped to listen
+            self._lost(None)
         return self._transaction
 
     def _receive(self, number: int, patience: float) -> bytes:
@@ -255,14 +259,12 @@ class TcpConnection(ModbusConnection):
         """Return what arrives next, before a time [s, monotonic]."""
         assert self._socket is not None
         try:
-            self._socket.settimeout(max(until - time.monotonic(), _SOONEST))
-            data = self._socket.recv(_CHUNK)
-        except TimeoutError:
-            raise (
-                self._no_answer(len(self._waiting)) if self._waiting else self._silent()
-            ) from None
+            ready, _, _ = select.select([self._socket], [], [], max(until - time.monotonic(), 0.0))
+            data = self._socket.recv(_CHUNK) if ready else b""
         except OSError as error:
             self._lost(error)
+        if not ready:
+            raise self._no_answer(len(self._waiting)) if self._waiting else self._silent()
         if not data:
             self._lost(None)
         return data
