@@ -169,7 +169,7 @@ def _fit(terms: Array, values: Array) -> Array:
 def _detrended(x: Array) -> Array:
     """Return columns without their straight line, shape (n, ...)."""
     time = np.arange(len(x)) - 0.5 * (len(x) - 1)
-    centred = x - x.mean(axis=0)
-    slope = np.tensordot(time, centred, 1) / float(time @ time)
-    out: Array = centred - np.multiply.outer(time, slope)
-    return out
+    columns = x.reshape(len(x), -1)
+    centred: Array = columns - np.add.reduce(columns, axis=0) / len(x)
+    centred -= np.multiply.outer(time, time @ centred / (time @ time))
+    return centred.reshape(x.shape)
