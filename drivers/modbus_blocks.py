@@ -49,7 +49,7 @@ class BlockDecoder:
         # -most becomes one of the largest, so that a single comparison finds every impossible code.
         self._shift = self._rows([np.zeros(len(top)), most], np.uint16)
         self._span = self._rows([top, 2 * most], np.uint16)
-        self._almost_top = self._rows([top - 1, most], np.uint16)
+        self._almost_top = self._rows([top - 1, 2 * most], np.uint16)
         self._scale = self._rows([step, volt], np.float64)
         self._offset = self._rows([low, -(most * volt)], np.float64)
         self._sequence: int | None = None
@@ -96,20 +96,20 @@ class BlockDecoder:
         sequence, tick = self._follow(header)
         codes = np.frombuffer(samples, ">u2").reshape(self._shape).astype(np.uint16)
         codes += self._shift
-        impossible = codes > self._span
-        if np.count_nonzero(impossible):
-            raise self._impossible(impossible, codes)
+        ends = codes - _ONE >= self._almost_top  # 0 wraps to the top
+        if np.count_nonzero(ends):  # what is beyond an end is at one as well
+            impossible = codes > self._span
+            if np.count_nonzero(impossible):
+                raise self._impossible(impossible, codes)
         data = codes.astype(np.float64)
         data *= self._scale
         data += self._offset
-        codes -= _ONE
-        ends = (codes >= self._almost_top)[:, : self.layout.channels]  # 0 wraps to the top
         self._sequence, self.tick = sequence, tick + self.layout.samples
         return SampleBlock(
             sequence=sequence,
             tick=tick,
             data=data,
-            saturated=ends,
+            saturated=ends[:, : self.layout.channels],
             backlog=header.backlog,
             tripped=bool(header.status & _TRIPPED),
         )
