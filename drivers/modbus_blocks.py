@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import logging
-from typing import Final
+from collections.abc import Sequence
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import DeviceError, DeviceLost, SampleBlock
+from drivers.base import Array, DeviceError, DeviceLost, SampleBlock
 from drivers.settings import DRIVER
 from rig.model import channels as ch
 from rig.model.rig import Rig
@@ -46,13 +47,20 @@ class BlockDecoder:
         volt = np.array([j.valve.command_range for j in rig.joints]) / most
         # An output's code counts from -most; with `most` added all codes count from 0. One below
         # -most becomes one of the largest, so that a single comparison finds every impossible code.
-        self._shift = np.concatenate([np.zeros(len(top)), most]).astype(np.uint16)
-        self._span = np.concatenate([top, 2 * most]).astype(np.uint16)
-        self._almost_top = (top - 1).astype(np.uint16)
-        self._scale = np.concatenate([step, volt])
-        self._offset = np.concatenate([low, -(most * volt)])
+        self._shift = self._rows([np.zeros(len(top)), most], np.uint16)
+        self._span = self._rows([top, 2 * most], np.uint16)
+        self._almost_top = self._rows([top - 1, 2 * most], np.uint16)
+        self._scale = self._rows([step, volt], np.float64)
+        self._offset = self._rows([low, -(most * volt)], np.float64)
         self._sequence: int | None = None
         self.tick = 0  # of the sample expected next
+
+    def _rows(self, parts: Sequence[Array], kind: type[np.generic]) -> NDArray[Any]:
+        """Return one value per column, repeated for every sample.
+
+        Arrays of a block's own shape are worked through at once, a row that fits is not.
+        """
+        return np.tile(np.concatenate(parts).astype(kind), (self.layout.samples, 1))
 
     @property
     def acknowledge(self) -> int:
@@ -86,19 +94,22 @@ class BlockDecoder:
     def decode_samples(self, header: BlockHeader, samples: bytes) -> SampleBlock:
         """Return the block in SI; raises DeviceError if it is impossible after the last one."""
         sequence, tick = self._follow(header)
-        codes = np.frombuffer(samples, ">u2").reshape(self._shape) + self._shift
-        impossible = codes > self._span
-        if np.count_nonzero(impossible):
-            raise self._impossible(impossible, codes)
-        data = codes * self._scale
+        codes = np.frombuffer(samples, ">u2").reshape(self._shape).astype(np.uint16)
+        codes += self._shift
+        ends = codes - _ONE >= self._almost_top  # 0 wraps to the top
+        if np.count_nonzero(ends):  # what is beyond an end is at one as well
+            impossible = codes > self._span
+            if np.count_nonzero(impossible):
+                raise self._impossible(impossible, codes)
+        data = codes.astype(np.float64)
+        data *= self._scale
         data += self._offset
-        ends = codes[:, : self.layout.channels] - _ONE >= self._almost_top  # 0 wraps to the top
         self._sequence, self.tick = sequence, tick + self.layout.samples
         return SampleBlock(
             sequence=sequence,
             tick=tick,
             data=data,
-            saturated=ends,
+            saturated=ends[:, : self.layout.channels],
             backlog=header.backlog,
             tripped=bool(header.status & _TRIPPED),
         )
@@ -122,7 +133,7 @@ class BlockDecoder:
     def _impossible(self, marks: Flags, codes: Codes) -> DeviceError:
         """Return the error of the first code that is marked."""
         row, column = np.argwhere(marks)[0]
-        code = codes[row, column] - self._shift[column]
+        code = codes[row, column] - self._shift[row, column]
         signed = code if column < self.layout.channels else code.view(np.int16)
         return DeviceError(
             f"impossible block: channel {self._names[column]} has the converter code {signed}, "

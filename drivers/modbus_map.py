@@ -2,7 +2,7 @@
 
 Documented for people in docs/wire-modbus-map.md. The device has no sample clock: `drivers.polled`
 reads and writes it at the host's rate. Answers carry the transaction number of their request, and
-one with another number is dropped by the library; after any timeout the connection ends.
+one with another number is dropped; after any timeout the connection ends.
 """
 
 from __future__ import annotations
@@ -18,19 +18,11 @@ from urllib.parse import SplitResult
 
 import numpy as np
 from pydantic import Field
-from pymodbus.exceptions import ModbusException
-from pymodbus.pdu import ModbusPDU
-from pymodbus.pdu.register_message import (
-    ReadHoldingRegistersRequest,
-    ReadInputRegistersRequest,
-    ReadInputRegistersResponse,
-    WriteMultipleRegistersRequest,
-    WriteSingleRegisterRequest,
-)
 
-from drivers.base import Array, DeviceError, WireSettings
+from drivers.base import Array, DeviceError, DeviceLost, WireSettings
 from drivers.bench_protocol import DeviceRefused
-from drivers.modbus_transport import ModbusConnection, RawAnswer
+from drivers.modbus_frames import READ_HOLDING
+from drivers.modbus_transport import TcpConnection
 from drivers.polled import PolledDriver
 from drivers.register_types import (
     RegisterType,
@@ -54,8 +46,6 @@ from rig.model.rig import Rig
 
 logger = logging.getLogger(__name__)
 
-HOLDING: Final = 3
-INPUT: Final = 4
 MAX_READ: Final = 125  # registers in one answer: the protocol's own limit
 MAX_WRITE: Final = 123
 _LAST_REGISTER: Final = 0xFFFF
@@ -171,7 +161,7 @@ def register_map(settings: MapSettings, rig: Rig) -> RegisterMap:
         )
     )
     outputs = tuple(
-        _point(f"outputs.{i}", f"{i}", entry, HOLDING, "V")
+        _point(f"outputs.{i}", f"{i}", entry, READ_HOLDING, "V")
         for i, entry in enumerate(outputs_by_joint(OutputEntry, settings.outputs, rig), start=1)
     )
     _refuse_overlap("inputs", inputs)
@@ -255,59 +245,15 @@ def spans(points: Iterable[Point], most: int = MAX_READ) -> tuple[Span, ...]:
     )
 
 
-class _ReadInput(RawAnswer, ReadInputRegistersResponse):
-    pass
-
-
-class UnitConnection(ModbusConnection):
+class UnitConnection(TcpConnection):
     """A connection to one unit behind an address, that ends with the first unanswered request."""
 
-    def __init__(self, host: str, port: int, unit: int, timeout: float) -> None:
-        super().__init__(host, port, timeout)
-        self._unit = unit
-
-    def _connected(self, client: Any) -> None:
-        super()._connected(client)
-        client.register(_ReadInput)
-
-    def fetch(self, function: int, address: int, count: int) -> bytes:
-        """Read registers by function 3 or 4 as big-endian bytes; DeviceLost, DeviceError."""
-        made = ReadInputRegistersRequest if function == INPUT else ReadHoldingRegistersRequest
-        answer = self._answer(made(address=address, count=count))
-        payload = answer.payload if isinstance(answer, RawAnswer) else b""
-        if answer.function_code != function or len(payload) != 2 * count:
-            self.close()
-            raise DeviceError(
-                f"the device at {self.where} answered {len(payload)} bytes to function "
-                f"{answer.function_code}, expected {2 * count} to function {function}"
-            )
-        return payload
-
-    def store(self, address: int, words: list[int]) -> None:
-        """Write registers by function 6 (one) or 16; raises DeviceLost, DeviceError."""
-        if len(words) == 1:
-            request: ModbusPDU = WriteSingleRegisterRequest(address=address, registers=words)
-        else:
-            request = WriteMultipleRegistersRequest(address=address, registers=words)
-        answer = self._answer(request)
-        confirmed = answer.registers == words if len(words) == 1 else answer.count == len(words)
-        same = answer.function_code == request.function_code and answer.address == address
-        if not (same and confirmed):
-            self.close()
-            raise DeviceError(
-                f"the device at {self.where} confirmed another write than that of register "
-                f"{address}"
-            )
-
-    def _answer(self, request: ModbusPDU) -> ModbusPDU:
-        request.dev_id = self._unit
-        client = self._usable()
+    def _end(self, number: int, within: float | None) -> bytes:
         try:
-            return self._checked(client.execute(False, request))
-        except (ModbusException, OSError) as error:
-            failure = self._failure(error)
+            return super()._end(number, within)
+        except DeviceLost:
             self.close()  # what comes late then comes to nobody
-            raise failure from error
+            raise
 
 
 class MappedModule:
@@ -321,7 +267,7 @@ class MappedModule:
         timeout: float,
     ) -> None:
         """Know a map and the range [SI] of every channel's sensor; nothing is opened."""
-        self._link = UnitConnection(settings.host, settings.port, settings.unit, timeout)
+        self._link = UnitConnection(settings.host, settings.port, timeout, settings.unit)
         self._unit = settings.unit
         self._ranges = ranges
         self._who = f"I/O module at {settings.host}:{settings.port}, unit {settings.unit}"
@@ -368,7 +314,7 @@ class MappedModule:
         """Yield (place among the inputs, point, its registers' bytes)."""
         for span in self._reads:
             with self._explained(str(span)):
-                data = self._link.fetch(span.function, span.address, span.words)
+                data = self._link.read(span.address, span.words, span.function)
             for index, point in span.points:
                 first = 2 * (point.address - span.address)
                 yield index, point, data[first : first + 2 * point.words]
@@ -380,7 +326,7 @@ class MappedModule:
             for index, point in span.points:
                 words += point.registers(float(volts[index]))
             with self._explained(str(span)):
-                self._link.store(span.address, words)
+                self._link.write(span.address, words)
 
     def close(self) -> None:
         """End the connection."""
@@ -402,8 +348,8 @@ class MappedModule:
             return
         where = f"register {entry.watchdog_register} (zero_by.watchdog_register)"
         with self._explained(where):
-            self._link.store(entry.watchdog_register, [entry.milliseconds])
-            data = self._link.fetch(HOLDING, entry.watchdog_register, 1)
+            self._link.write(entry.watchdog_register, [entry.milliseconds])
+            data = self._link.read(entry.watchdog_register, 1)
         stored = int.from_bytes(data, "big")
         if stored != entry.milliseconds:
             raise DeviceError(

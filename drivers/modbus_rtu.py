@@ -7,27 +7,23 @@ is listened to until it is quiet, and blocks carry a sequence number that only t
 
 from __future__ import annotations
 
-import logging
-import os
-import select
 import time
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
 from urllib.parse import SplitResult, parse_qs
 
 from pydantic import Field
-from pymodbus.client import ModbusSerialClient
-from serial import Serial, SerialException
 
 from drivers.base import DeviceError, DeviceLost, WireSettings
 from drivers.bench_protocol import AnswerDamaged
+from drivers.modbus_frames import read_rtu_answer, rtu_frame
 from drivers.modbus_tcp import ModbusTcpDriver
 from drivers.modbus_transport import ModbusConnection
-from drivers.serial_transport import OPENING_ERRORS, why_not_opened
+from drivers.serial_transport import PySerialTransport
 from drivers.settings import DRIVER
 from rig.model.parts import Wire
 
-logger = logging.getLogger(__name__)
+UNIT: Final = 1  # of the device on its line
 
 
 class RtuSettings(WireSettings):
@@ -48,51 +44,39 @@ class RtuSettings(WireSettings):
         return {"device": url.path, **query}
 
 
-class _WaitingClient(ModbusSerialClient):
-    """pymodbus's client, which else looks every millisecond whether something has come."""
-
-    def _wait_for_data(self) -> int:
-        line: Any = self.socket
-        if os.name != "posix" or line is None:
-            return int(super()._wait_for_data())
-        if select.select([line.fileno()], [], [], self.comm_params.timeout_connect)[0]:
-            return int(line.in_waiting)
-        return 0
-
-
 class RtuConnection(ModbusConnection):
     """A serial line that is opened once and, broken once, stays closed until opened again."""
 
     pipelines = False  # an answer without a number could be that of any request
 
     def __init__(self, at: RtuSettings, timeout: float) -> None:
-        super().__init__(at.device, 0, timeout)
-        self.where = at.device
+        super().__init__(at.device, UNIT, timeout)
         self._at = at
+        self._port = PySerialTransport(at.device, at.baud, at.parity)
 
-    def _new_client(self) -> ModbusSerialClient:
-        return _WaitingClient(
-            self._at.device,
-            baudrate=self._at.baud,
-            parity=self._at.parity,
-            timeout=self._timeout,
-            retries=0,
-            trace_packet=self._note,
-        )
+    @property
+    def is_open(self) -> bool:
+        """Whether a request may be sent."""
+        return self._port.is_open
 
-    def _not_connected(self) -> DeviceError:
-        # The library keeps the reason to itself.
-        try:
-            Serial(self._at.device, self._at.baud, exclusive=True).close()
-        except OPENING_ERRORS as error:
-            return why_not_opened(self._at.device, self._at.baud, error)
-        return super()._not_connected()
+    def _connect(self) -> None:
+        self._port.open()
 
-    def _connected(self, client: Any) -> None:
-        client.socket.reset_input_buffer()
+    def _disconnect(self) -> None:
+        self._port.close()
 
-    def _answers_earlier_request(self, data: bytes) -> bool:
-        return False  # no frame says which request it answers
+    def _send(self, request: bytes) -> int:
+        self._port.read(0.0)  # a late answer that came since
+        self._port.write(rtu_frame(self._unit, request))
+        return 0
+
+    def _receive(self, number: int, patience: float) -> bytes:
+        until, received = time.monotonic() + patience, b""
+        while (left := until - time.monotonic()) > 0.0:
+            received += self._port.read(left)
+            if (answer := read_rtu_answer(received, self._unit)) is not None:
+                return answer
+        raise self._no_answer(len(received)) if received else self._silent()
 
     def _no_answer(self, received: int) -> DeviceError:
         self.settle()
@@ -116,22 +100,11 @@ class RtuConnection(ModbusConnection):
 
         Raises DeviceLost where the line is gone or does not fall silent.
         """
-        line: Any = self._usable().socket
-        began = heard = time.monotonic()
-        try:
-            while time.monotonic() - heard < DRIVER.quiet:
-                if line.in_waiting:
-                    line.read(line.in_waiting)
-                    heard = time.monotonic()
-                if heard - began > DRIVER.babble:
-                    self.close()
-                    raise DeviceLost(
-                        f"{self.where} sends without end; does another host talk on it?"
-                    )
-                time.sleep(DRIVER.quiet / 20)
-        except (SerialException, OSError) as error:
-            self.close()
-            raise DeviceLost(f"the serial line {self.where} is gone: {error}") from error
+        began = time.monotonic()
+        while self._port.read(DRIVER.quiet):
+            if time.monotonic() - began > DRIVER.babble:
+                self.close()
+                raise DeviceLost(f"{self.where} sends without end; does another host talk on it?")
 
 
 class ModbusRtuDriver(ModbusTcpDriver):

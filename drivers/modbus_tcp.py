@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import struct
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -35,7 +36,7 @@ from drivers.bench_protocol import (
     wave_codes,
 )
 from drivers.modbus_blocks import BlockDecoder, unwrap
-from drivers.modbus_transport import ModbusConnection, unpack
+from drivers.modbus_transport import ModbusConnection, TcpConnection
 from drivers.settings import DRIVER
 from rig.model.parts import LOCALHOST, PORT, Wire
 from rig.model.rig import Rig
@@ -78,6 +79,9 @@ class ModbusTcpDriver:
         self._sleep = sleep
         # Two tries within the time after which a silent device counts as lost.
         self._link = self.connection(wire, wire.timeout / 2)
+        # A block is asked for again early enough for a lost answer to trip neither watchdog.
+        self._wait = min(wire.timeout / 2, wire.watchdog / 4)
+        self._tries = math.ceil(wire.timeout / self._wait - 1e-9)
         self._layout = reg.block_layout(len(rig.channels), len(rig.joints))
         self._decoder = BlockDecoder(rig)
         self._heartbeat = 0
@@ -88,7 +92,7 @@ class ModbusTcpDriver:
     def connection(wire: Wire, timeout: float) -> ModbusConnection:
         """Return the closed connection to the device, which waits `timeout` [s] for an answer."""
         at = TcpSettings.of(wire)
-        return ModbusConnection(at.host, at.port, timeout)
+        return TcpConnection(at.host, at.port, timeout)
 
     # -- session ----------------------------------------------------------------------------
 
@@ -264,20 +268,16 @@ class ModbusTcpDriver:
         return self._due + (1.0 - DRIVER.earlier) * period
 
     def _exchange(self) -> bytes:
-        # Asked again early enough for a lost answer to trip neither watchdog.
-        wait = min(self._wire.timeout / 2, self._wire.watchdog / 4)
-        tries = math.ceil(self._wire.timeout / wait - 1e-9)
         last: DeviceSilent | None = None
-        for number in range(tries):
+        for number in range(self._tries):
             try:
                 if number:
                     self._link.settle()
-                with self._link.waiting(wait):
-                    answer = self._exchange_once()
+                answer = self._exchange_once()
             except DeviceSilent as silent:
                 # The block stays in the device until acknowledged, so the same one comes again.
                 last = silent
-                if number < tries - 1:
+                if number < self._tries - 1:
                     logger.warning("%s; asking again", silent)
                 continue
             if number:
@@ -294,10 +294,10 @@ class ModbusTcpDriver:
     def _exchange_once(self) -> bytes:
         try:
             if self._link.asked_ahead:
-                return self._link.answer_ahead()
+                return self._link.answer_ahead(self._wait)
             words = self._acknowledgement()
             return self._link.write_and_read(
-                reg.CONTROL_ACK.address, words, reg.BLOCK.address, self._layout.words
+                reg.CONTROL_ACK.address, words, reg.BLOCK.address, self._layout.words, self._wait
             )
         except DeviceRefused as refused:
             raise self._explained(refused, "block") from refused
@@ -349,3 +349,9 @@ def _offset(register: reg.Register, first: int = reg.STATUS_SPAN[0]) -> int:
 
 def _u32(value: int) -> list[int]:
     return [value >> 16, value & 0xFFFF]
+
+
+def unpack(form: str, data: bytes, offset: int = 0) -> int:
+    """Read one integer in `struct`'s form from bytes at `offset`."""
+    (value,) = struct.unpack_from(form, data, offset)
+    return int(value)

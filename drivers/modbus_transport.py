@@ -1,170 +1,104 @@
-"""One Modbus TCP connection as requests that return bytes or raise DeviceLost / DeviceError."""
+"""A Modbus connection as requests that return bytes or raise DeviceLost / DeviceError."""
 
 from __future__ import annotations
 
 import logging
+import select
 import socket
-import struct
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from typing import Any, ClassVar
-
-from pymodbus.client import ModbusSerialClient, ModbusTcpClient
-from pymodbus.exceptions import ConnectionException, ModbusException, ModbusIOException
-from pymodbus.pdu import ExceptionResponse, ModbusPDU
-from pymodbus.pdu.register_message import (
-    ReadHoldingRegistersRequest,
-    ReadHoldingRegistersResponse,
-    ReadWriteMultipleRegistersRequest,
-    ReadWriteMultipleRegistersResponse,
-)
+import time
+from abc import ABC, abstractmethod
+from contextlib import suppress
+from typing import ClassVar, NoReturn
 
 from drivers.base import DeviceError, DeviceLost
 from drivers.bench_protocol import DeviceRefused, DeviceSilent
+from drivers.modbus_frames import (
+    READ_HOLDING,
+    REFUSED,
+    payload_of,
+    read_request,
+    read_tcp_frame,
+    tcp_frame,
+    write_and_read_request,
+    write_request,
+)
 
 logger = logging.getLogger(__name__)
 
-_MBAP = struct.Struct(">HHH")  # transaction, protocol (0), length of what follows
+_CHUNK = 4096
 
 
-class RawAnswer:
-    """Mixin: an answer kept as the bytes of its registers, not as a list of integers."""
-
-    payload = b""
-
-    def decode(self, data: bytes) -> None:
-        """Keep the registers' bytes; raises ModbusIOException if their count is not as stated."""
-        if len(data) < 1 or data[0] != len(data) - 1:
-            raise ModbusIOException(f"{len(data) - 1} bytes follow a byte count of {data[0]}")
-        self.payload = data[1:]
-
-    def __str__(self) -> str:
-        return type(self).__name__
-
-
-class _Read(RawAnswer, ReadHoldingRegistersResponse):
-    pass
-
-
-class _ReadWrite(RawAnswer, ReadWriteMultipleRegistersResponse):
-    pass
-
-
-def answer_classes() -> tuple[type[ModbusPDU], ...]:
-    """Return the answers that a connection understands beside the library's own."""
-    return _Read, _ReadWrite
-
-
-class ModbusConnection:
+class ModbusConnection(ABC):
     """A connection that is opened once and, broken once, stays closed until opened again.
 
     One request may be under way whose answer nobody waits for yet (`ask_ahead`). Whatever is asked
     before its answer was taken leaves that answer to be dropped, as a late one.
     """
 
-    pipelines: ClassVar[bool] = True  # requests are numbered, so that two may be under way
+    pipelines: ClassVar[bool]  # requests are numbered, so that two may be under way
 
-    def __init__(self, host: str, port: int, timeout: float) -> None:
-        self.where = f"{host}:{port}"
-        self._host, self._port, self._timeout = host, port, timeout
-        self._client: ModbusTcpClient | ModbusSerialClient | None = None
-        self._received = 0
-        self._answered = False  # ever since it was opened
-        self._asked = b""
-        self._ahead: ReadWriteMultipleRegistersRequest | None = None
-        self._given_up = -1  # transaction number of a request ahead whose answer nobody wants
+    def __init__(self, where: str, unit: int, timeout: float) -> None:
+        """Know the device `where` as `unit` of its wire; an answer may take `timeout` [s]."""
+        self.where = where
+        self._unit, self._timeout = unit, timeout
         self._factor = 1.0
-        # What the library logs is raised here as well, in words for people.
-        logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
+        self._answered = False  # ever since it was opened
+        self._ahead: tuple[int, bytes, int] | None = None  # number, request, registers
+        self._given_up = -1  # number of a request ahead whose answer nobody wants
 
     @property
+    @abstractmethod
     def is_open(self) -> bool:
         """Whether a request may be sent."""
-        return self._client is not None and self._client.connected
 
     def open(self) -> None:
         """Connect; raises DeviceLost where nothing listens, DeviceError where it may not be."""
         self.close()
         self._answered = False
         self._factor = 1.0
-        client = self._new_client()
-        client.set_max_no_responses(1_000_000)  # when to give up is decided by the driver
-        for kind in answer_classes():
-            client.register(kind)
-        if not client.connect() or client.socket is None:
-            raise self._not_connected()
-        self._connected(client)
-        self._client = client
+        self._connect()
 
-    def _new_client(self) -> ModbusTcpClient | ModbusSerialClient:
-        return ModbusTcpClient(
-            self._host,
-            port=self._port,
-            timeout=self._timeout,
-            retries=0,
-            trace_packet=self._note,
-        )
-
-    def _not_connected(self) -> DeviceError:
-        """Return why `open` has failed."""
-        return DeviceLost(
-            f"nothing answers at {self.where}; is the device (or `bramah sim`) running there?"
-        )
-
-    def _connected(self, client: Any) -> None:
-        client.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-
-    def settle(self) -> None:
-        """Let a late answer pass before the next request; TCP's transaction numbers need none."""
-
-    def be_patient(self, factor: float) -> None:
-        """Wait `factor` times as long for every answer of the open connection."""
-        self._factor = factor
-        self._wait(self._timeout)
-
-    @contextmanager
-    def waiting(self, seconds: float) -> Iterator[None]:
-        """Wait no longer than this for each answer meanwhile."""
-        self._wait(min(seconds, self._timeout))
-        try:
-            yield
-        finally:
-            self._wait(self._timeout)
-
-    def _wait(self, seconds: float) -> None:
-        if self._client is not None:
-            self._client.comm_params.timeout_connect = self._factor * seconds
+    @abstractmethod
+    def _connect(self) -> None:
+        """Open what is closed; raises as `open`."""
 
     def close(self) -> None:
         """Close the connection if there is one."""
         self._ahead = None
-        client, self._client = self._client, None
-        if client is not None:
-            client.close()  # type: ignore[no-untyped-call]
+        self._disconnect()
 
-    def read(self, address: int, count: int) -> bytes:
-        """Read `count` registers (function 3) as big-endian bytes."""
-        return self._registers(ReadHoldingRegistersRequest(address=address, count=count), count)
+    @abstractmethod
+    def _disconnect(self) -> None:
+        """Close what may be open."""
+
+    @abstractmethod
+    def settle(self) -> None:
+        """Let a late answer pass before the next request."""
+
+    def be_patient(self, factor: float) -> None:
+        """Wait `factor` times as long for every answer of the open connection."""
+        self._factor = factor
+
+    def read(self, address: int, count: int, function: int = READ_HOLDING) -> bytes:
+        """Read `count` registers (function 3 or 4) as big-endian bytes."""
+        request = read_request(function, address, count)
+        return self._payload(request, self._ask(request), count)
 
     def write(self, address: int, words: list[int]) -> None:
         """Write registers from `address` on (functions 6 and 16)."""
-        client = self._usable()
-        try:
-            if len(words) == 1:
-                answer = self._checked(client.write_register(address, words[0]))
-            else:
-                answer = self._checked(client.write_registers(address, words))
-        except (ModbusException, OSError) as error:
-            raise self._failure(error) from error
-        if answer.address != address or len(words) not in (answer.count, len(answer.registers)):
+        request = write_request(address, words)
+        if self._ask(request) != request[:5]:
             raise self._mismatch(
-                f"device at {self.where} confirmed another write than that of "
-                f"{len(words)} registers at 0x{address:04X}"
+                f"the device at {self.where} confirmed another write than that of "
+                f"{len(words)} registers from {address}"
             )
 
-    def write_and_read(self, write_at: int, words: list[int], read_at: int, count: int) -> bytes:
-        """Write, then read, in one transaction (function 23)."""
-        return self._registers(_write_and_read(write_at, words, read_at, count), count)
+    def write_and_read(
+        self, write_at: int, words: list[int], read_at: int, count: int, within: float | None = None
+    ) -> bytes:
+        """Write, then read, in one transaction (function 23) of at most `within` [s]."""
+        request = write_and_read_request(write_at, words, read_at, count)
+        return self._payload(request, self._ask(request, within), count)
 
     @property
     def asked_ahead(self) -> bool:
@@ -176,37 +110,61 @@ class ModbusConnection:
 
         A connection that cannot send says so at the next request.
         """
-        request = _write_and_read(write_at, words, read_at, count)
-        request.dev_id = 1
-        with suppress(ModbusException, OSError, DeviceLost):
-            self._usable().execute(True, request)
-            self._ahead = request
+        request = write_and_read_request(write_at, words, read_at, count)
+        with suppress(DeviceError):
+            self._ahead = self._begin(request), request, count
 
-    def answer_ahead(self) -> bytes:
+    def answer_ahead(self, within: float | None = None) -> bytes:
         """Return the registers that `ask_ahead` asked for; raises as `write_and_read`."""
-        request, self._ahead = self._ahead, None
-        if request is None:
+        ahead, self._ahead = self._ahead, None
+        if ahead is None:
             raise ValueError("nothing was asked ahead")
-        client: Any = self._usable()
-        try:
-            answer = client.transaction.sync_get_response(request.dev_id, request.transaction_id)
-            return self._payload(self._checked(answer), request.read_count)
-        except (ModbusException, OSError) as error:
-            raise self._failure(error) from error
+        number, request, count = ahead
+        return self._payload(request, self._end(number, within), count)
 
-    def _registers(self, request: ModbusPDU, count: int) -> bytes:
-        request.dev_id = 1
-        try:
-            answer = self._checked(self._usable().execute(False, request))
-        except (ModbusException, OSError) as error:
-            raise self._failure(error) from error
-        return self._payload(answer, count)
+    def _ask(self, request: bytes, within: float | None = None) -> bytes:
+        """Return the answer to a request; DeviceRefused where it was not carried out."""
+        return self._end(self._begin(request), within)
 
-    def _payload(self, answer: ModbusPDU, count: int) -> bytes:
-        payload = answer.payload if isinstance(answer, RawAnswer) else b""
-        if len(payload) != 2 * count:
+    def _begin(self, request: bytes) -> int:
+        """Send a request; returns its number."""
+        if not self.is_open:
+            raise DeviceLost(f"the connection to the device at {self.where} is closed")
+        if self._ahead is not None:
+            self._given_up, self._ahead = self._ahead[0], None
+        return self._send(request)
+
+    def _end(self, number: int, within: float | None) -> bytes:
+        """Return the answer to a request by its number."""
+        if not self.is_open:
+            raise DeviceLost(f"the connection to the device at {self.where} is closed")
+        patience = self._timeout if within is None else min(within, self._timeout)
+        answer = self._receive(number, self._factor * patience)
+        self._answered = True
+        if answer[0] & REFUSED:
+            raise DeviceRefused(
+                f"device at {self.where} refused function {answer[0] & ~REFUSED} "
+                f"with Modbus exception {answer[1]}"
+            )
+        return answer
+
+    @abstractmethod
+    def _send(self, request: bytes) -> int:
+        """Send a PDU; returns its number."""
+
+    @abstractmethod
+    def _receive(self, number: int, patience: float) -> bytes:
+        """Return the PDU that answers request `number` within `patience` [s]."""
+
+    def _payload(self, request: bytes, answer: bytes, count: int) -> bytes:
+        try:
+            payload = payload_of(answer)
+        except ValueError:
+            raise self._no_answer(len(answer)) from None
+        if answer[0] != request[0] or len(payload) != 2 * count:
             raise self._mismatch(
-                f"device at {self.where} answered {len(payload)} bytes, {2 * count} expected"
+                f"the device at {self.where} answered {len(payload)} bytes to function "
+                f"{answer[0]}, expected {2 * count} to function {request[0]}"
             )
         return payload
 
@@ -215,82 +173,108 @@ class ModbusConnection:
         self.close()  # what else is under way would be taken for the next answer
         return DeviceError(text)
 
-    def _usable(self) -> ModbusTcpClient | ModbusSerialClient:
-        # The library would reconnect by itself, to a device that has tripped meanwhile.
-        client = self._client
-        if client is None or not client.connected:
-            raise DeviceLost(f"the connection to the device at {self.where} is closed")
-        self._received = 0
-        if self._ahead is not None:
-            self._given_up, self._ahead = self._ahead.transaction_id, None
-        return client
-
-    def _checked(self, answer: ModbusPDU) -> ModbusPDU:
-        self._answered = True
-        if isinstance(answer, ExceptionResponse):
-            raise DeviceRefused(
-                f"device at {self.where} refused function {answer.function_code & 0x7F} "
-                f"with Modbus exception {answer.exception_code}"
-            )
-        return answer
-
-    def _failure(self, error: Exception) -> DeviceError:
-        """Return what a failed request means, and close a connection that is out of step."""
-        received = self._received
-        if isinstance(error, ConnectionException | ConnectionError):
-            self.close()
-            return DeviceLost(f"the device at {self.where} closed the connection")
-        if received:
-            return self._no_answer(received)
-        text = f"the device at {self.where} does not answer ({self._timeout:g} s)"
-        return DeviceSilent(text if self._answered else f"{text}; {self._never_answered()}")
-
-    def _never_answered(self) -> str:
-        """Return what may be wrong where nothing has ever answered."""
-        return (
-            "something takes connections there, but speaks no Modbus so far: check `port`, which "
-            "another program may have, and the unit's number"
-        )
-
     def _no_answer(self, received: int) -> DeviceError:
-        """Return what `received` bytes mean that are no answer; leaves nothing of them behind."""
+        """Return what `received` bytes mean that are no Modbus answer; leaves nothing of them."""
         self.close()
         return DeviceError(
             f"the device at {self.where} answered {received} bytes that are no Modbus answer "
             "to the request; does another program listen on this port?"
         )
 
-    def _note(self, sending: bool, data: bytes) -> bytes:
-        if sending:
-            self._asked = data
-        elif self._answers_earlier_request(data):
-            if _MBAP.unpack_from(data)[0] != self._given_up:
+    def _silent(self) -> DeviceSilent:
+        """Return the error of a request without an answer."""
+        text = f"the device at {self.where} does not answer ({self._timeout:g} s)"
+        return DeviceSilent(text if self._answered else f"{text}; {self._never_answered()}")
+
+    @abstractmethod
+    def _never_answered(self) -> str:
+        """Return what may be wrong where nothing has ever answered."""
+
+
+class TcpConnection(ModbusConnection):
+    """A connection over TCP, whose answers carry the number of their request."""
+
+    pipelines = True
+
+    def __init__(self, host: str, port: int, timeout: float, unit: int = 1) -> None:
+        super().__init__(f"{host}:{port}", unit, timeout)
+        self._address = host, port
+        self._socket: socket.socket | None = None
+        self._waiting = b""  # received and not taken
+        self._transaction = 0
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a request may be sent."""
+        return self._socket is not None
+
+    def settle(self) -> None:
+        """Do nothing: an answer with another number is dropped when it comes."""
+
+    def _connect(self) -> None:
+        try:
+            self._socket = socket.create_connection(self._address, self._timeout)
+        except OSError as error:
+            raise DeviceLost(
+                f"nothing answers at {self.where}; is the device (or `bramah sim`) running there?"
+            ) from error
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket.setblocking(False)  # with a timeout every call asks the system twice
+        self._waiting = b""
+
+    def _disconnect(self) -> None:
+        opened, self._socket = self._socket, None
+        if opened is not None:
+            opened.close()
+
+    def _send(self, request: bytes) -> int:
+        assert self._socket is not None
+        self._transaction = self._transaction % 0xFFFF + 1
+        frame = tcp_frame(self._transaction, self._unit, request)
+        try:
+            sent = self._socket.send(frame)
+        except OSError as error:
+            self._lost(error)
+        if sent < len(frame):  # no device is asked for so much at once: it has stopped to listen
+            self._lost(None)
+        return self._transaction
+
+    def _receive(self, number: int, patience: float) -> bytes:
+        until = time.monotonic() + patience
+        while True:
+            try:
+                frame = read_tcp_frame(self._waiting)
+            except ValueError:
+                raise self._no_answer(len(self._waiting)) from None
+            if frame is None:
+                self._waiting += self._more(until)
+                continue
+            self._waiting = self._waiting[frame.used :]
+            if frame.transaction == number and frame.unit == self._unit:
+                return frame.pdu
+            if frame.transaction != self._given_up:
                 logger.warning("a late answer from %s is dropped", self.where)
-        else:
-            self._received = len(data)
+
+    def _more(self, until: float) -> bytes:
+        """Return what arrives next, before a time [s, monotonic]."""
+        assert self._socket is not None
+        try:
+            ready, _, _ = select.select([self._socket], [], [], max(until - time.monotonic(), 0.0))
+            data = self._socket.recv(_CHUNK) if ready else b""
+        except OSError as error:
+            self._lost(error)
+        if not ready:
+            raise self._no_answer(len(self._waiting)) if self._waiting else self._silent()
+        if not data:
+            self._lost(None)
         return data
 
-    def _answers_earlier_request(self, data: bytes) -> bool:
-        """Return whether what came carries the transaction number of another request."""
-        head = data[: _MBAP.size]
-        if len(head) < _MBAP.size:
-            return False
-        transaction, protocol, _ = _MBAP.unpack(head)
-        return bool(protocol == 0 and transaction != _MBAP.unpack_from(self._asked)[0])
+    def _lost(self, error: OSError | None) -> NoReturn:
+        self.close()
+        raise DeviceLost(f"the device at {self.where} closed the connection") from error
 
-
-def _write_and_read(
-    write_at: int, words: list[int], read_at: int, count: int
-) -> ReadWriteMultipleRegistersRequest:
-    return ReadWriteMultipleRegistersRequest(
-        read_address=read_at,
-        read_count=count,
-        write_address=write_at,
-        write_registers=words,
-    )
-
-
-def unpack(form: str, data: bytes, offset: int = 0) -> int:
-    """Read one integer in `struct`'s form from bytes at `offset`."""
-    (value,) = struct.unpack_from(form, data, offset)
-    return int(value)
+    def _never_answered(self) -> str:
+        return (
+            "something takes connections there, but speaks no Modbus so far: check `port`, which "
+            "another program may have, and the unit's number"
+        )

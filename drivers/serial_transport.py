@@ -92,10 +92,10 @@ class PortInUse(DeviceBusy):
 
 
 class PySerialTransport:
-    """`Transport` over pyserial: 8 data bits, no parity, 1 stop bit, no flow control."""
+    """`Transport` over pyserial: 8 data bits, 1 stop bit, no flow control."""
 
-    def __init__(self, device: str, baud: int) -> None:
-        self._device, self._baud = device, baud
+    def __init__(self, device: str, baud: int, parity: str = "N") -> None:
+        self._device, self._baud, self._parity = device, baud, parity
         self._port: serial.Serial | None = None
         self._file: int | None = None
 
@@ -116,6 +116,7 @@ class PySerialTransport:
             self._port = serial.Serial(
                 self._device,
                 self._baud,
+                parity=self._parity,
                 timeout=DRIVER.serial_wait,
                 write_timeout=DRIVER.serial_write,
                 exclusive=None if shared else True,

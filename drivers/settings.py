@@ -15,7 +15,7 @@ class DriverSettings:
 
     # Modbus.
     retry: float = 0.1  # [blocks] until a block that was not there is asked for again
-    earlier: float = 0.02  # [blocks] by which each block is asked for earlier
+    earlier: float = 0.005  # [blocks] by which each block is asked for earlier
     late_blocks: int = 16  # blocks back that a late answer may be of
     quiet: float = 0.05  # [s] without a byte: nothing more of a late answer on a line is coming
     babble: float = 1.0  # [s] that a line may keep talking before it counts as garbage

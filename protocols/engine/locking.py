@@ -213,7 +213,7 @@ def verify(session: Session, held: JointLock, step: str, first: int, last: int) 
     """Raise LockFailed if a locked piston left its place by more than the tolerance."""
     piston = session.piston(held.joint, first, last)
     moved = np.abs(piston - held.piston)
-    if np.any(moved > held.tolerance):
+    if (moved > held.tolerance).any():
         worst = float(piston[np.nanargmax(moved)])
         raise LockFailed(
             step,

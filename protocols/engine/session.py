@@ -104,8 +104,7 @@ class Session:
         self.laws: list[OutputLaw] = [OFF] * self.joints
         self.now = 0  # the tick after the last sample read
         self._columns = {name: column for column, name in enumerate(rig.recorded)}
-        self._ring = np.full((keep, len(rig.recorded)), np.nan)
-        self._stamps = np.full(keep, -1, dtype=np.int64)
+        self._ring = np.full((keep, len(rig.recorded)), np.nan)  # NaN where lost
 
     def apply(self, changes: Mapping[int, OutputLaw], restart: bool = False) -> int:
         """Put new laws in force for some joints; returns the tick from which they hold.
@@ -124,7 +123,7 @@ class Session:
 
     def forget(self) -> None:
         """Drop what was read and the laws: the device was connected anew."""
-        self._stamps[:] = -1
+        self._ring[:] = np.nan
         self.laws = [OFF] * self.joints
         self.now = 0
 
@@ -134,10 +133,11 @@ class Session:
             self._heed()
             more = tick - self.now > self.bench.info.block_samples
             block = self.bench.exchange(more)
+            if block.tick > self.now:
+                lost = max(self.now, block.tick - len(self._ring))
+                self._ring[self._places(lost, block.tick)] = np.nan
             self.now = block.tick + len(block.data)
-            ticks = np.arange(block.tick, self.now)
-            places = self._places(block.tick, self.now)
-            self._ring[places], self._stamps[places] = block.data, ticks
+            self._ring[self._places(block.tick, self.now)] = block.data
             if watch is not None:
                 watch()
 
@@ -153,16 +153,18 @@ class Session:
 
     def channel(self, name: str, first: int, last: int) -> Array:
         """Return a channel by its name over ticks [first, last), NaN where lost."""
-        ticks = np.arange(first, last)
-        places = self._places(first, last)
-        values = self._ring[places, self._columns[name]]
-        known = self._stamps[places] == ticks
-        # Nothing is lost most often; a copy either way, for the ring goes on.
-        return values.copy() if known.all() else np.where(known, values, np.nan)
+        column = self._columns[name]
+        begin, end = max(first, self.now - len(self._ring)), min(last, self.now)
+        if (begin, end) == (first, last):
+            return self._ring[self._places(first, last), column].copy()  # for the ring goes on
+        values = np.full(last - first, np.nan)
+        if begin < end:
+            values[begin - first : end - first] = self._ring[self._places(begin, end), column]
+        return values
 
     def _places(self, first: int, last: int) -> slice | NDArray[np.int64]:
         """Return where ticks [first, last) stand in the ring: a slice unless its end is between."""
-        size = len(self._stamps)
+        size = len(self._ring)
         begin = first % size
         if begin + last - first <= size:
             return slice(begin, begin + max(0, last - first))

@@ -169,10 +169,9 @@ class Guard:
         calm = self._tightest.contain(least, most)  # as almost every block is
         trips = [self._band_trip(block, calm)]
         self._unbroken = min(self._unbroken, len(self._tail)) + len(data)
-        with np.errstate(invalid="ignore"):  # inf - inf: the check of bands names it
-            # No difference of two samples is larger than that of the largest and the smallest.
-            steady = np.count_nonzero(most - least <= self._steady) == len(self._steady)
-            if not steady:
+        # No difference of two samples is larger than that of the largest and the smallest.
+        if not (calm and np.count_nonzero(most - least <= self._steady) == len(self._steady)):
+            with np.errstate(invalid="ignore"):  # inf - inf: the check of bands names it
                 trips += self._rate_trips(joined[-self._unbroken :], len(data), last)
         measured = data[:, : block.saturated.shape[1]]
         trips.append(self._saturation.find(block.saturated, measured, block.tick))

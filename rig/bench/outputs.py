@@ -78,15 +78,22 @@ class Outputs:
 
     def safely(self, call: Callable[[], Result]) -> Result:
         """Do one thing; whatever goes wrong in it, outputs are at zero before that shows."""
-        try:
+        with self:
             return call()
-        except BaseException as error:
-            if isinstance(error, DeviceLost):
-                self._silent = True
-            self.zero()  # says first what matters most: whether they are at zero
-            if isinstance(error, DeviceLost):
-                log.error("%s", error)
-            raise
+
+    def __enter__(self) -> None:
+        """Begin what is done `safely`."""
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, _: object
+    ) -> None:
+        if error is None:
+            return
+        if isinstance(error, DeviceLost):
+            self._silent = True
+        self.zero()  # says first what matters most: whether they are at zero
+        if isinstance(error, DeviceLost):
+            log.error("%s", error)
 
     def bounded(self, laws: Sequence[OutputLaw]) -> list[OutputLaw]:
         """Return the laws with their limit no wider than each joint's; ValueError if unfit."""

@@ -11,7 +11,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from dataclasses import asdict, replace
 from types import TracebackType
 from typing import Any, Self
@@ -218,7 +218,9 @@ class Bench:
             return True
 
         def keep(block: SampleBlock) -> None:
-            self._keep(block, None, self._continue(block))
+            lost = self._continue(block)
+            with self._outputs:
+                self._keep(block, None, lost)
 
         seconds = self.recorded_after
         after_zero = record_zero(self.rig, self._driver.read_block, keep, self._clock, seconds)
@@ -280,19 +282,21 @@ class Bench:
         outputs zeroed before; a block that trips is journalled all the same.
         """
         self._heed()
-        block = self._outputs.safely(self._driver.read_block)
-        if more:
-            self._ask_ahead()
-        late = None if self._arrival is None else self._arrival.late(block, self._clock())
-        lost = self._outputs.safely(lambda: self._continue(block))
-        violation = self._outputs.safely(lambda: self._inspect(block, lost, late))
+        with self._outputs:
+            block = self._driver.read_block()
+            if more:
+                self._ask_ahead()
+            late = None if self._arrival is None else self._arrival.late(block, self._clock())
+            lost = self._continue(block)
+            violation = self._inspect(block, lost, late)
         trip = None
         if violation is not None:
             self.zero_outputs()
             trip = self._latch(violation)
-        self._keep(block, late, lost)
-        self._timing.add(block)
-        self._outputs.safely(lambda: self._note_alarms(violation))
+        with self._outputs:
+            self._keep(block, late, lost)
+            self._timing.add(block)
+            self._note_alarms(violation)
         self.observers.block(block)
         self._display.show(block, late or 0.0, self.lost_samples, self._guard.roles)
         if trip is not None:
@@ -303,10 +307,13 @@ class Bench:
 
     def _note_alarms(self, trip: Violation | None) -> None:
         """Write down what warns and what tripped, and let the screens see it."""
-        with suppress(RecordingFailed) if trip is not None else nullcontext():
+        try:
             self._alarms.update(self._guard.warnings, self.tick)
             if trip is not None:
                 self._alarms.trip(trip)
+        except RecordingFailed:
+            if trip is None:  # else the trip is what the user must hear
+                raise
         self._display.alarms = self._alarms.table
 
     def _continue(self, block: SampleBlock) -> int:
@@ -336,14 +343,9 @@ class Bench:
     def _keep(self, block: SampleBlock, late: float | None, lost: int) -> None:
         if self.recorder is None:
             return
-        recorder = self.recorder
-
-        def keep() -> None:
-            if lost:
-                recorder.event("samples lost", block.tick - lost, lost=lost)
-            recorder.append(block, late)
-
-        self._outputs.safely(keep)
+        if lost:
+            self.recorder.event("samples lost", block.tick - lost, lost=lost)
+        self.recorder.append(block, late)
 
     def _latch(self, violation: Violation) -> SafetyTrip:
         self.trip = SafetyTrip(violation, self.rig)

@@ -169,7 +169,8 @@ class Journal:
     def append(self, stream: int, block: SampleBlock, late: float | None) -> None:
         """Keep one block (samples as float64); returns when it is safe; RecordingFailed."""
         data = np.ascontiguousarray(block.data, dtype="<f8").tobytes()
-        marks = np.packbits(block.saturated).tobytes() if block.saturated.any() else b""
+        marked = np.count_nonzero(block.saturated)
+        marks = np.packbits(block.saturated).tobytes() if marked else b""
         crc = _checksum(stream, block.sequence, block.tick, data, marks)
         values = (stream, block.sequence, block.tick, len(block.data), late, crc, data, marks)
         self._write("INSERT INTO block VALUES (NULL, ?, ?, ?, ?, ?, ?, ?, ?)", values)

@@ -291,12 +291,12 @@ def numbered(request: bytes) -> int:
 
 def fetched(*answers) -> bytes:  # type: ignore[no-untyped-def]
     server = Answers(*answers)
-    link = UnitConnection("127.0.0.1", server.port, 7, timeout=0.5)
+    link = UnitConnection("127.0.0.1", server.port, 0.5, unit=7)
     link.open()
     try:
         for _ in answers[1:]:
-            link.fetch(3, 0, 2)
-        return link.fetch(3, 0, 2)
+            link.read(0, 2)
+        return link.read(0, 2)
     finally:
         link.close()
         server.join()
@@ -315,13 +315,13 @@ def test_an_answer_with_another_transaction_number_is_not_taken() -> None:
 
 def test_the_first_unanswered_request_ends_the_connection() -> None:
     server = Answers(lambda _: b"")
-    link = UnitConnection("127.0.0.1", server.port, 7, timeout=0.3)
+    link = UnitConnection("127.0.0.1", server.port, 0.3, unit=7)
     link.open()
     with pytest.raises(DeviceLost, match=r"does not answer \(0.3 s\)"):
-        link.fetch(3, 0, 2)
+        link.read(0, 2)
     assert not link.is_open
     with pytest.raises(DeviceLost, match="is closed"):
-        link.fetch(3, 0, 2)
+        link.read(0, 2)
     server.join()
 
 
@@ -334,10 +334,10 @@ def test_an_answer_of_another_size_or_function_ends_the_connection() -> None:
 
 def test_a_write_that_was_not_confirmed_as_asked_is_an_error() -> None:
     server = Answers(lambda request: request[:-1] + b"\x09")
-    link = UnitConnection("127.0.0.1", server.port, 7, timeout=0.5)
+    link = UnitConnection("127.0.0.1", server.port, 0.5, unit=7)
     link.open()
-    with pytest.raises(DeviceError, match="another write than that of register 100"):
-        link.store(100, [3])
+    with pytest.raises(DeviceError, match="another write than that of 1 registers from 100"):
+        link.write(100, [3])
     assert not link.is_open
     server.join()
 

@@ -162,7 +162,6 @@ def test_a_port_that_may_not_be_opened_says_who_may(monkeypatch: pytest.MonkeyPa
     def denied(*_: object, **__: object) -> None:
         raise SerialException(errno.EACCES, "could not open port /dev/ttyUSB0: Permission denied")
 
-    monkeypatch.setattr("serial.serial_for_url", denied)
-    monkeypatch.setattr("drivers.modbus_rtu.Serial", denied)
+    monkeypatch.setattr("serial.Serial", denied)
     with pytest.raises(DeviceError, match=r"no permission to open /dev/ttyUSB0; .*dialout"):
         to_port("/dev/ttyUSB0").connect()

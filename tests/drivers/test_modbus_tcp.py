@@ -326,7 +326,7 @@ def test_nothing_is_asked_ahead_in_real_time() -> None:
         ("close", DeviceLost, "closed"),
         ("garbage", DeviceError, "no Modbus answer"),
         ("short", DeviceError, "no Modbus answer"),
-        ("fewer", DeviceError, "4 bytes, 250 expected"),
+        ("fewer", DeviceError, "4 bytes to function 23, expected 250"),
         ("miscounted", DeviceError, "no Modbus answer"),
     ],
 )

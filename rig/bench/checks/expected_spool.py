@@ -47,9 +47,11 @@ class ExpectedSpool:
             # At rest under the first command.
             place, speed = self._state[j] if self._state else (wanted[0], 0.0)
             (pp, ps, pu), (sp, ss, su) = step
-            for k, u in enumerate(wanted):
-                out[k, j] = place
+            places = []
+            for u in wanted:
+                places.append(place)
                 place, speed = pp * place + ps * speed + pu * u, sp * place + ss * speed + su * u
+            out[:, j] = places
             after.append((place, speed))
         self._state = after
         return out

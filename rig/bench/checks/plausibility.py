@@ -244,13 +244,15 @@ class Plausibility:
         """
         if self._rig.sample_rate < _SLOWEST_RATE:
             return
-        x = data[:, : len(self._noise)]
-        size = np.abs(x[3:] - x[:-3] + 3.0 * (x[1:-2] - x[2:-1]))
+        steps = data[:, : len(self._noise)]
+        for _ in range(3):
+            steps = steps[1:] - steps[:-1]
+        size = np.abs(steps)
         allowed, scale = self._settings.noise * self._noise, _NORMAL_MEDIAN * _THIRD_DIFFERENCE
-        # A median above a bound has half of its samples there: mostly none has, and need not be
-        # sorted. A NaN counts as above.
-        above = len(size) - np.count_nonzero(size <= allowed * scale * (1.0 - 1e-9), axis=0)
-        if not np.count_nonzero(2 * above >= len(size)):
+        # A median above a bound has half of its samples there: mostly not even all channels
+        # together have as many, and none need be sorted. A NaN counts as above.
+        above = size.size - np.count_nonzero(size <= allowed * scale * (1.0 - 1e-9))
+        if 2 * above < len(size):
             return
         seen = np.median(size, axis=0) / scale
         for column in np.flatnonzero(seen > allowed).tolist():

@@ -94,25 +94,27 @@ def drifting(
     """
     terms, time = _motion(rows[:, joint, PISTON], seconds)
     leftover = time - terms @ _fit(terms, time)
-    if leftover @ leftover < settings.trend_alone * (time @ time):
+    energy = leftover @ leftover
+    if energy < settings.trend_alone * (time @ time):
         return None
     part = rig.joints[joint].cylinder
     cap, rod = rows[2:-2, joint, CAP], rows[2:-2, joint, ROD]
     force = cap - part.rod_area / part.cap_area * rod
-    targets = np.column_stack([force, cap, rod])
-    trends = _fit(np.column_stack([terms, time]), targets)[-1]
     bound = settings.trend * rig.supply.pressure
-    if abs(trends[0]) < bound:
+    # What a fit of motion and time together gives to time (Frisch, Waugh 1933).
+    trend = (leftover @ force) / energy
+    if abs(trend) < bound:
         return None
     rest = force - terms @ _fit(terms, force)
-    explained = rest - leftover * (leftover @ rest) / (leftover @ leftover)
+    explained = rest - leftover * trend
     if rest @ rest < settings.trend_clear**2 * (explained @ explained):
         return None
-    size = np.abs(trends[1:])
+    trends = np.array([leftover @ cap, leftover @ rod]) / energy
+    size = np.abs(trends)
     side = int(np.argmax(size))
     if size[1 - side] > settings.trend_other * size[side]:
         return None
-    return PressureFinding(joint, side == 0, float(trends[1 + side]), (-bound, bound))
+    return PressureFinding(joint, side == 0, float(trends[side]), (-bound, bound))
 
 
 class SlowRows:
@@ -152,10 +154,9 @@ class SlowRows:
 
 def _motion(piston: Array, seconds: float) -> tuple[Array, Array]:
     """Return what a load's force may follow, (rows - 4, 5), and time from -1/2 to 1/2."""
-    speed = np.gradient(piston, seconds)
-    inner = slice(2, -2)  # differences at the ends are one-sided
-    acceleration = np.gradient(speed, seconds)[inner]
-    speed, piston = speed[inner], piston[inner]
+    speed = (piston[2:] - piston[:-2]) / (2.0 * seconds)
+    acceleration = (speed[2:] - speed[:-2]) / (2.0 * seconds)
+    speed, piston = speed[1:-1], piston[2:-2]
     sign = np.tanh(speed / max(_SLIP * float(np.abs(speed).max()), 1e-9))
     terms = np.column_stack([np.ones_like(piston), piston, speed, sign, acceleration])
     return terms / np.maximum(np.abs(terms).max(axis=0), 1e-12), np.linspace(-0.5, 0.5, len(piston))
@@ -168,7 +169,7 @@ def _fit(terms: Array, values: Array) -> Array:
 def _detrended(x: Array) -> Array:
     """Return columns without their straight line, shape (n, ...)."""
     time = np.arange(len(x)) - 0.5 * (len(x) - 1)
-    centred = x - x.mean(axis=0)
-    slope = np.tensordot(time, centred, 1) / float(time @ time)
-    out: Array = centred - np.multiply.outer(time, slope)
-    return out
+    columns = x.reshape(len(x), -1)
+    centred: Array = columns - np.add.reduce(columns, axis=0) / len(x)
+    centred -= np.multiply.outer(time, time @ centred / (time @ time))
+    return centred.reshape(x.shape)

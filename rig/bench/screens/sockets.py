@@ -15,6 +15,7 @@ import json
 import logging
 import os
 import re
+import select
 import socket
 import stat
 from collections.abc import Callable
@@ -143,9 +144,12 @@ class Publisher:
         self._holder = CommandHolder()
         self.past: Callable[[], tuple[dict[str, Any], bytes]] | None = None
         self._watched = False
+        self._unread = True  # whether commands may have come that were not taken
         try:
             self._pub = self._bind(zmq.XPUB, self.endpoint.pub)  # it hears who subscribes
             self._cmd = self._bind(zmq.REP, self.endpoint.cmd)
+            self._wake = select.poll()
+            self._wake.register(int(self._cmd.get(zmq.FD)), select.POLLIN)
         except zmq.ZMQError as error:
             self._context.destroy(linger=0)
             raise AttachError(f"{where}: sockets cannot be made: {error}") from error
@@ -181,9 +185,15 @@ class Publisher:
         `judge` says of every command but "stop" why it is refused, None where it is taken.
         """
         accepted: list[Command] = []
+        # Asking the library costs much more than its file, which can be read from when something
+        # may have come until the library is asked.
+        if not (self._unread or self._wake.poll(0)):
+            return accepted
+        self._unread = True
         for _ in range(_COMMANDS_AT_ONCE):
             try:
-                if not _pending(self._cmd):  # cheaper than an exception
+                if not _pending(self._cmd):
+                    self._unread = False
                     break
                 raw = self._cmd.recv_multipart(zmq.NOBLOCK)[0]
             except zmq.ZMQError:

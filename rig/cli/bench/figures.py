@@ -207,8 +207,8 @@ tune.
   less exact; all with the same output. The solve gives values and covariance of all records from
   their triangles, lstsq the values from all rows.
 - **growth**: with records, their length, joints and effects; least of five.
-- **run**: lock-and-excite over the wire, beside bare pymodbus that moves as many blocks from the
-  same device; a block's processor time in this process, and wall time, in virtual and real time;
+- **run**: lock-and-excite over the wire, beside bare pymodbus that asks the same device for the
+  same; a block's processor time in this process, and wall time, in virtual and real time;
   the wall time of a block of 100 ms into the journal, 1000 times.
 - **seed N**: a simulated bench started, run, identified and validated as in `bramah demo`; FIT
   is compared with every cell of the paper's Table IV.

@@ -10,7 +10,7 @@ import struct
 import zlib
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -176,8 +176,7 @@ class BlockLayout:
         return HEADER_WORDS + self.samples * self.columns
 
 
-@dataclass(frozen=True)
-class BlockHeader:
+class BlockHeader(NamedTuple):
     """What stands before a block's samples."""
 
     sequence: int
@@ -197,13 +196,12 @@ def block_layout(channels: int, joints: int) -> BlockLayout:
 
 def pack_header(header: BlockHeader) -> bytes:
     """Return the ten bytes of a header; raises struct.error for a value that does not fit."""
-    return _HEADER.pack(header.sequence, header.tick, header.status, header.backlog)
+    return _HEADER.pack(*header)
 
 
 def unpack_header(data: bytes) -> BlockHeader:
     """Read a header from the first ten bytes; raises struct.error when there are fewer."""
-    sequence, tick, status, backlog = _HEADER.unpack_from(data)
-    return BlockHeader(sequence, tick, status, backlog)
+    return BlockHeader._make(_HEADER.unpack_from(data))
 
 
 def pack_samples(measured: ArrayLike, commands: ArrayLike) -> bytes:

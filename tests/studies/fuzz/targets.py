@@ -6,18 +6,21 @@ import shutil
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib import resources
 from pathlib import Path
 
 import numpy as np
-from pymodbus.exceptions import ModbusException
-from pymodbus.framer import FramerRTU, FramerSocket
-from pymodbus.framer.base import FramerBase
-from pymodbus.pdu import DecodePDU
 
 from drivers.base import DeviceError, SampleBlock
 from drivers.modbus_blocks import BlockDecoder
-from drivers.modbus_transport import answer_classes
+from drivers.modbus_frames import (
+    payload_of,
+    read_rtu_answer,
+    read_tcp_frame,
+    rtu_frame,
+    tcp_frame,
+)
 from hil_sim.device.device import Device
 from hil_sim.device.serial_session import SerialSession
 from hil_sim.link.wires import WIRES
@@ -71,11 +74,12 @@ def _blocks(rig: Rig) -> Target:
     return Target("blocks of samples", (_block(rig),), read, (DeviceError,))
 
 
-def _answers(name: str, framer: Callable[[DecodePDU], FramerBase], rig: Rig) -> Target:
-    decoder = DecodePDU(False)
-    for kind in answer_classes():
-        decoder.register(kind)
-    frames = framer(decoder)
+def _answers(
+    name: str,
+    frame: Callable[[bytes], bytes],
+    answer_in: Callable[[bytes], bytes | None],
+    rig: Rig,
+) -> Target:
     block = _block(rig)
     bodies = [
         bytes([23, len(block)]) + block,
@@ -84,8 +88,17 @@ def _answers(name: str, framer: Callable[[DecodePDU], FramerBase], rig: Rig) -> 
         bytes([16, 2, 0, 0, 20]),
         bytes([0x97, 4]),
     ]
-    examples = tuple(frames.encode(body, 1, 7) for body in bodies)
-    return Target(name, examples, lambda data: frames.handleFrame(data, 1, 7), (ModbusException,))
+
+    def read(data: bytes) -> bytes:
+        answer = answer_in(data)
+        return b"" if answer is None else payload_of(answer)
+
+    return Target(name, tuple(map(frame, bodies)), read, (ValueError,))
+
+
+def _tcp_answer(data: bytes) -> bytes | None:
+    frame = read_tcp_frame(data)
+    return None if frame is None else frame.pdu
 
 
 def _serial_frames(rig: Rig) -> Target:
@@ -205,8 +218,15 @@ def _file(name: str, rig: Rig, *, finish: bool) -> Target:
 
 MAKERS: dict[str, Callable[[], Target]] = {
     "blocks": lambda: _blocks(load_rig(RIG)),
-    "modbus-tcp": lambda: _answers("Modbus TCP answers", FramerSocket, load_rig(RIG)),
-    "modbus-rtu": lambda: _answers("Modbus RTU answers", FramerRTU, load_rig(RIG)),
+    "modbus-tcp": lambda: _answers(
+        "Modbus TCP answers", partial(tcp_frame, 7, 1), _tcp_answer, load_rig(RIG)
+    ),
+    "modbus-rtu": lambda: _answers(
+        "Modbus RTU answers",
+        partial(rtu_frame, 1),
+        partial(read_rtu_answer, unit=1),
+        load_rig(RIG),
+    ),
     "serial": lambda: _serial_frames(load_rig(RIG)),
     "device": lambda: _device(load_rig(RIG)),
     "cutters": lambda: _cutters(load_rig(RIG)),

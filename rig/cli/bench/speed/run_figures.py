@@ -1,17 +1,27 @@
-"""A run over the wire beside bare pymodbus that moves as many blocks from the same device."""
+"""A run over the wire beside bare pymodbus that asks the same device for the same.
+
+In virtual time pymodbus sends the very requests of the run, so that the device does the same work
+and answers the same bytes: a machine at rest would cost it less. In real time both take blocks of a
+machine at rest, each when it is due.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+from pymodbus.client import ModbusTcpClient
 
 from drivers import make_driver, wire_at
 from drivers.base import SampleBlock
+from drivers.modbus_frames import READ_HOLDING, WRITE_AND_READ, WRITE_MANY, WRITE_ONE
+from drivers.modbus_tcp import ModbusTcpDriver, TcpSettings
+from drivers.modbus_transport import TcpConnection
 from protocols.engine import engine
 from protocols.engine.desk import Desk
 from protocols.engine.states import EngineState, StateMachine
@@ -23,6 +33,7 @@ from rig.bench.session import Bench
 from rig.cli.bench.figure import Figure
 from rig.cli.bench.wire_figures import bare_modbus
 from rig.cli.simulated_bench import simulated_bench
+from rig.model.parts import Wire
 from rig.model.rig import Rig
 from rig.runs.journal import Journal
 from rig.runs.recorder import Recorder
@@ -43,21 +54,31 @@ class _Cost:
     wall: float
 
 
+@dataclass(frozen=True)
+class _Conversation:
+    """What a host asked for, before, while and after its cost was measured, and the blocks then."""
+
+    before: list[bytes]
+    measured: list[bytes]
+    after: list[bytes]
+    blocks: int
+
+
 def run_figures(folder: Path, say: Say, seconds: float) -> list[Figure]:
     """Measure a run in virtual time, and `seconds` of streaming in real time, beside pymodbus."""
     say(f"run: {PROTOCOL}, {STEP}, in virtual time, {ROUNDS} times")
     rig = load_rig(RIG)
     pairs = []
     for number in range(ROUNDS):
-        own, blocks = _protocol_run(rig, folder / f"run-{number}")
-        pairs.append((own, _bare(rig, blocks)))
+        own, conversation = _protocol_run(rig, folder / f"run-{number}")
+        pairs.append((own, _repeated(rig, conversation)))
     figures = _figures("virtual time", pairs, 1.3)
     say(f"run: streaming in real time for {ROUNDS} times {seconds / ROUNDS:g} s")
     count = max(10, round(seconds / ROUNDS * rig.sample_rate / 10))
     pairs = []
     for number in range(ROUNDS):
         own = _streamed(rig, folder / f"stream-{number}", count)
-        pairs.append((own, _bare(rig, count, real_time=True)))
+        pairs.append((own, _bare(rig, count)))
     return [*figures, *_figures("real time", pairs, 1.6), *journal_figures(folder, rig)]
 
 
@@ -122,22 +143,89 @@ def _cost(work: Callable[[], int]) -> tuple[_Cost, int]:
     return _Cost(busy / blocks, wall / blocks), blocks
 
 
-def _protocol_run(rig: Rig, folder: Path) -> tuple[_Cost, int]:
+def _recorded(rig: Rig) -> tuple[ModbusTcpDriver, list[bytes]]:
+    """Return a driver, and the list that gets what it asks for from now on."""
+    requests: list[bytes] = []
+
+    class Connection(TcpConnection):
+        def _send(self, request: bytes) -> int:
+            requests.append(request)
+            return super()._send(request)
+
+    class Driver(ModbusTcpDriver):
+        @staticmethod
+        def connection(wire: Wire, timeout: float) -> TcpConnection:
+            at = TcpSettings.of(wire)
+            return Connection(at.host, at.port, timeout)
+
+    return Driver(rig.wire, rig), requests
+
+
+def _protocol_run(rig: Rig, folder: Path) -> tuple[_Cost, _Conversation]:
     """Run one step with guard, journal and a publisher, as `bramah run` does."""
     plan = resolve(library.load(PROTOCOL), rig, Overrides(repeats=1, steps=(STEP,)))
     with simulated_bench(RIG, seed=0) as endpoint:
         reached = _at(rig, endpoint)
-        driver, machine = make_driver(reached.wire, reached), StateMachine()
+        machine = StateMachine()
+        driver, requests = _recorded(reached)
         machine.to(EngineState.CHECKING, PROTOCOL)
         recorder, publisher = Recorder(folder, reached), Publisher(f"bench-{rig.name}")
         with Bench(reached, driver, recorder, publisher, signals=False) as bench:
             first = bench.exchange()
+            before = len(requests)
 
             def work() -> int:
                 engine.run(plan, reached, bench, lambda *_: None, Desk(machine=machine))
                 return (bench.tick - first.tick) // len(first.data)
 
-            return _cost(work)
+            cost, blocks = _cost(work)
+            ended = len(requests)
+    return cost, _Conversation(requests[:before], requests[before:ended], requests[ended:], blocks)
+
+
+def _repeated(rig: Rig, conversation: _Conversation) -> _Cost:
+    """Ask the same with pymodbus and nothing else."""
+    with simulated_bench(RIG, seed=0) as endpoint:
+        at = TcpSettings.of(_at(rig, endpoint).wire)
+        client: Any = ModbusTcpClient(at.host, port=at.port, timeout=2.0)
+        client.connect()
+        asked = [
+            [_asked(client, request) for request in part]
+            for part in (conversation.before, conversation.measured, conversation.after)
+        ]
+
+        def ask(part: int) -> int:
+            for call in asked[part]:
+                call()
+            return conversation.blocks
+
+        ask(0)
+        cost, _ = _cost(lambda: ask(1))
+        ask(2)
+        client.close()
+    return cost
+
+
+def _asked(client: Any, request: bytes) -> Callable[[], object]:
+    """Return the call of pymodbus that sends a request."""
+    function, at = request[0], int.from_bytes(request[1:3], "big")
+    words = np.frombuffer(request[1:], ">u2", len(request[1:]) // 2).tolist()
+    if function == READ_HOLDING:
+        return partial(client.read_holding_registers, at, count=words[1], device_id=1)
+    if function == WRITE_ONE:
+        return partial(client.write_register, at, words[1], device_id=1)
+    if function == WRITE_MANY:
+        values = np.frombuffer(request[6:], ">u2").tolist()
+        return partial(client.write_registers, at, values, device_id=1)
+    assert function == WRITE_AND_READ
+    return partial(
+        client.readwrite_registers,
+        read_address=at,
+        read_count=words[1],
+        write_address=words[2],
+        values=np.frombuffer(request[10:], ">u2").tolist(),
+        device_id=1,
+    )
 
 
 def _streamed(rig: Rig, folder: Path, count: int) -> _Cost:
@@ -159,10 +247,10 @@ def _streamed(rig: Rig, folder: Path, count: int) -> _Cost:
             return _cost(work)[0]
 
 
-def _bare(rig: Rig, blocks: int, *, real_time: bool = False) -> _Cost:
-    """Move blocks with pymodbus and nothing else; in real time, asking when the next is due."""
+def _bare(rig: Rig, blocks: int) -> _Cost:
+    """Take blocks in real time with pymodbus and nothing else, each when it is due."""
     with (
-        simulated_bench(RIG, seed=0, real_time=real_time) as endpoint,
+        simulated_bench(RIG, seed=0, real_time=True) as endpoint,
         bare_modbus(_at(rig, endpoint)) as ask,
     ):
         ask()
@@ -170,9 +258,8 @@ def _bare(rig: Rig, blocks: int, *, real_time: bool = False) -> _Cost:
         def work() -> int:
             due = time.perf_counter()
             for _ in range(blocks):
-                if real_time:
-                    due += 10 / rig.sample_rate
-                    time.sleep(max(0.0, due - time.perf_counter()))
+                due += 10 / rig.sample_rate
+                time.sleep(max(0.0, due - time.perf_counter()))
                 ask()
             return blocks
 
