@@ -220,10 +220,10 @@ class Effect(Term):
         """Return shapes from which a search finds other forms of the same effect."""
         return ()
 
-    def simpler(self, rig: Rig, values: Mapping[str, float]) -> str:
+    def simpler(self, rig: Rig, values: Mapping[str, float], times: float = 1.0) -> str:
         """Name the effect of `includes` that this one has become at its own numbers ('' if none).
 
-        `values` holds the effect's linear coefficients.
+        `values` holds the effect's linear coefficients; `times` widens what still counts as equal.
         """
         return ""
 

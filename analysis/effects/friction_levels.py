@@ -118,10 +118,10 @@ class AsymmetricFriction(Friction):
             return "the two directions differ by less than a tenth: this is coulomb_friction"
         return ""
 
-    def simpler(self, rig: Rig, values: Mapping[str, float]) -> str:
+    def simpler(self, rig: Rig, values: Mapping[str, float], times: float = 1.0) -> str:
         """Return Coulomb friction where the levels differ by less than `DIFFERENCE` of the mean."""
         ahead, back = (values[name] for name in self._names())
-        equal = abs(ahead - back) < DIFFERENCE * 0.5 * (ahead + back)
+        equal = abs(ahead - back) < times * DIFFERENCE * 0.5 * (ahead + back)
         return "coulomb_friction" if equal else ""
 
 

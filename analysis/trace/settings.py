@@ -67,6 +67,9 @@ class TraceSettings:
     judged, not this number (convention: a variance inflation factor of 100)."""
     subset_error: float = 0.25
     """Relative standard error beyond which a subset judges nothing (tuned)."""
+    nearly: float = 2.5
+    """Times the tolerance within which a richer reading is a simpler one: up to here its further
+    number must take more than the form leaves (tuned: Maxwell slip shows 13 % of difference)."""
     # Chance.
     sign_flips: int = 199
     """Sign flips: p not below 0.005 (convention)."""

@@ -17,7 +17,7 @@ from analysis.effects.base import Effect
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.held_out import residual as held_left
-from analysis.trace.search.hypothesis import Hypothesis, Key
+from analysis.trace.search.hypothesis import Hypothesis, Key, parameter_values
 from analysis.trace.search.hypothesis_set import HypothesisSet, effect_of
 from analysis.trace.settings import SEARCH, TRACE
 
@@ -33,9 +33,10 @@ def settled(
     First each effect is tried as one that it includes. A richer reading then takes the place of
     one that it includes, or stands beside it. It must be physical, which asks that its own number
     is more than a form's tolerance; training and held-out records must lose by the restriction
-    more than `TRACE.standard_errors` of their noise; its further number must take more than the
-    richer form itself leaves; beside a name it must take the share of what is left that a further
-    effect must. Of several that leave about as little the one with the fewest numbers stays.
+    more than `TRACE.standard_errors` of their noise; where its numbers differ little, the further
+    one must take more than the richer form itself leaves; beside a name it must take the share of
+    what is left that a further effect must. Of several that leave about as little the one with the
+    fewest numbers stays.
     """
     winner = _restricted(hypotheses, winner, holdout_data)
     while winner.effects:
@@ -100,11 +101,26 @@ def _lost(
         price = SEARCH.number_price * (other.size[1] - hypothesis.size[1])
         least = max(price, SEARCH.add_share * hypothesis.total)
     else:
-        left = sum(max(0.0, v - hypotheses.limits.band[e]) for e, v in other.excess_energy.items())
-        least = max(TRACE.standard_errors**2, left)
+        least = max(TRACE.standard_errors**2, _form_error(hypotheses, hypothesis, other))
     if hypothesis.fit.energy - other.fit.energy <= least:
         return False
     return loss(held, held_left(holdout_data, other.fit)) > TRACE.standard_errors
+
+
+def _form_error(hypotheses: HypothesisSet, hypothesis: Hypothesis, other: Hypothesis) -> float:
+    """Return the energy that the richer of two readings leaves, where it is nearly the simpler one.
+
+    Where its numbers differ little, so much may be the form's error and no further number.
+    """
+    values = parameter_values(hypotheses.train_data.rig, other.fit.terms, dict(other.fit.beta))
+    near = any(
+        (u.term.simpler(hypotheses.train_data.rig, values, TRACE.nearly), u.term.where)
+        in hypothesis.keys
+        for u in other.effects
+        if isinstance(u.term, Effect)
+    )
+    left = sum(max(0.0, v - hypotheses.limits.band[e]) for e, v in other.excess_energy.items())
+    return left if near else 0.0
 
 
 def _richer(hypotheses: HypothesisSet, hypothesis: Hypothesis) -> list[Hypothesis]:
