@@ -32,6 +32,7 @@ from rig.model.records import Record
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,15 @@ class Rows:
     rhs: Array
     time: Array
     masked: int
+
+
+def in_common(one: Rows, other: Rows) -> tuple[Indices, Indices]:
+    """Return the places in either of the instants that two sets of rows have in common."""
+    if np.array_equal(one.time, other.time):  # nearly always
+        at = np.arange(len(one.time))
+        return at, at
+    _, here, there = np.intersect1d(one.time, other.time, return_indices=True)
+    return here, there
 
 
 def default_filtering(record: Record) -> Filtering:
@@ -148,7 +158,18 @@ def record_rows(
     Only those of `families`, and only rows whose time [s] lies `within` (from, before), for a chunk
     of a longer record.
     """
-    signals = prepared(rig, terms, signals)
+    return rows_of_prepared(rig, terms, prepared(rig, terms, signals), filtering, families, within)
+
+
+def rows_of_prepared(
+    rig: Rig,
+    terms: Sequence[Used],
+    signals: Signals,
+    filtering: Filtering,
+    families: Collection[str] = tuple(FAMILIES),
+    within: tuple[float, float] = (-np.inf, np.inf),
+) -> dict[str, Rows]:
+    """Return the same of signals that the terms have prepared already."""
     columns: Columns = {}
     valid: dict[str, Mask] = {}
     for used in terms:

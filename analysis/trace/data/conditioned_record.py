@@ -12,16 +12,25 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.effects.base import SENSOR, ordered
+from analysis.effects.base import SENSOR, Effect, ordered
 from analysis.identify import checks as ck
 from analysis.regression.conditioned import ConditionedRecord, condition_runs
-from analysis.regression.rows import Filtering, Rows, default_filtering, record_rows
+from analysis.regression.rows import (
+    Filtering,
+    Rows,
+    default_filtering,
+    in_common,
+    record_rows,
+    rows_of_prepared,
+)
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import FAMILIES, Columns, Term, Used
+from analysis.trace.data.memory import RowMemory
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
 
@@ -54,10 +63,11 @@ def conditioned_records(
 def held(term: Term, conditioned: ConditionedRecord) -> bool:
     """Return whether an effect at a joint cannot show because the joint is locked.
 
-    A sensor of a locked joint still shows where that joint stands.
+    The sensor of a locked joint's piston still shows where that joint stands.
     """
     where = term.where
-    if not where.startswith("joint ") or getattr(term, "stage", None) == SENSOR:
+    piston = getattr(term, "stage", None) == SENSOR and where.endswith("piston")
+    if not where.startswith("joint ") or piston:
         return False
     return int(where.split()[1]) in conditioned.record.locked
 
@@ -68,11 +78,10 @@ def changes_signals(term: Term) -> bool:
     return kind.prepare is not Term.prepare or kind.valid is not Term.valid
 
 
-def acts_on(rig: Rig, term: Term, family: str) -> bool:
-    """Return whether a family's rows need a term: it has columns there, or alters their signals."""
-    if any(c.family == family for c in term.coefficients(rig)):
-        return True
-    return changes_signals(term) and family in getattr(term, "alters", FAMILIES)
+def families_of(rig: Rig, term: Term) -> frozenset[str]:
+    """Return the families of rows that need a term: it has columns or alters the signals there."""
+    altered = getattr(term, "alters", FAMILIES) if changes_signals(term) else ()
+    return frozenset((*altered, *(c.family for c in term.coefficients(rig))))
 
 
 def model_rows(rig: Rig, terms: Sequence[Used], conditioned: ConditionedRecord) -> dict[str, Rows]:
@@ -109,6 +118,64 @@ def filtered(
     return {name: stack_out[at, k] for k, name in enumerate(names)}
 
 
+def shared_rows(
+    rig: Rig, terms: Sequence[Used], conditioned: ConditionedRecord, memory: RowMemory
+) -> dict[str, Rows]:
+    """Return a record's rows under the terms that can show in it, each part of them built once.
+
+    Many models share what acts on a family of rows. A term that only has columns has them filtered
+    alone, beside the rows of the others.
+    """
+    here = [u for u in terms if not held(u.term, conditioned)]
+    families = memory.families
+    for u in here:
+        if u.term not in families:
+            families[u.term] = families_of(rig, u.term)
+    out: dict[str, Rows] = {}
+    for family in conditioned.families:
+        acting = [u for u in here if family in families[u.term]]
+        added = [u for u in acting if isinstance(u.term, Effect) and not changes_signals(u.term)]
+        others = tuple(u for u in acting if u not in added)
+        key, own = (conditioned.group, family, others), replace(conditioned, families=(family,))
+        seen = partial(memory.signals.of, key, partial(prepared, rig, others, own))
+        bare: dict[str, Rows] = memory.rows.of(key, partial(_bare_rows, rig, others, own, seen))
+        rows = bare
+        for u in added:
+            more = memory.rows.of((*key, u), partial(_own_columns, rig, own, seen, bare, u))
+            rows = {e: _beside(r, more.get(e, {})) for e, r in rows.items()}
+        out |= rows
+    return out
+
+
+def _bare_rows(
+    rig: Rig, terms: Sequence[Used], conditioned: ConditionedRecord, seen: Callable[[], Signals]
+) -> dict[str, Rows]:
+    return rows_of_prepared(
+        rig, ordered(terms), seen(), conditioned.filtering, conditioned.families
+    )
+
+
+def _own_columns(
+    rig: Rig, conditioned: ConditionedRecord, seen: Callable[[], Signals],
+    rows: Mapping[str, Rows], used: Used,
+) -> dict[str, dict[str, Array]]:  # fmt: skip
+    """Return what a term that leaves the signals alone adds to rows: equation -> name -> column."""
+    raw: Columns = used.term.columns(rig, seen(), used.shape)
+    return {
+        name: filtered(raw[name], conditioned, rows[name])
+        for name in rows
+        if name in raw and any(np.any(v) for v in raw[name].values())
+    }
+
+
+def _beside(rows: Rows, columns: Mapping[str, Array]) -> Rows:
+    """Return rows with columns (m,) of further parameters."""
+    if not columns:
+        return rows
+    matrix = np.column_stack([rows.matrix, *columns.values()])
+    return replace(rows, names=(*rows.names, *columns), matrix=matrix)
+
+
 def candidate_columns(
     rig: Rig,
     terms: Sequence[Used],
@@ -117,6 +184,7 @@ def candidate_columns(
     rows: Mapping[str, Rows],
     beta: Mapping[str, float],
     used: Used,
+    memory: RowMemory,
 ) -> dict[str, dict[str, Array]]:
     """Return what a candidate would add to a record's rows: equation -> name -> column.
 
@@ -124,21 +192,23 @@ def candidate_columns(
     (of the rows, b as 1/b). The pseudo-column of a change of signals is named ''.
     """
     if not changes_signals(used.term):
-        raw: Columns = used.term.columns(rig, seen, used.shape)
-        return {
-            name: filtered(raw[name], conditioned, rows[name])
-            for name in rows
-            if name in raw and any(np.any(v) for v in raw[name].values())
-        }
-    changed = model_rows(rig, (*terms, used), conditioned)
+        return _own_columns(rig, conditioned, lambda: seen, rows, used)
+    acting = families_of(rig, used.term)
+    families = tuple(f for f in conditioned.families if f in acting)
+    changed = shared_rows(rig, (*terms, used), replace(conditioned, families=families), memory)
     own = [c.parameter for c in used.term.coefficients(rig)]
     out: dict[str, dict[str, Array]] = {}
-    for name, before in rows.items():
-        after = changed[name]
-        _, here, there = np.intersect1d(before.time, after.time, return_indices=True)
-        difference = np.zeros(len(before.rhs))
-        difference[here] = row_residual(before, beta)[here] - row_residual(after, beta)[there]
-        columns = {"": difference}
+    for name, after in changed.items():
+        if name not in rows:
+            continue
+        before = rows[name]
+        here, there = in_common(before, after)
+        # Column by column: where a column is the same the difference is exactly nothing.
+        same = [after.names.index(n) for n in before.names]
+        moved = after.matrix[there][:, same] - before.matrix[here]
+        side = after.rhs[there] - before.rhs[here]
+        columns = {"": np.zeros(len(before.rhs))}
+        columns[""][here] = moved @ np.array([beta.get(n, 0.0) for n in before.names]) - side
         for k, parameter in enumerate(after.names):
             if parameter in own and np.any(after.matrix[:, k]):
                 columns[parameter] = np.zeros(len(before.rhs))
