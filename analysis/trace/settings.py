@@ -116,6 +116,8 @@ class DataSettings:
     """Bytes of rows that are kept since other models need them again."""
     remembered_signals: float = 5e7
     """Bytes of signals kept for the same."""
+    remembered_readings: int = 4
+    """Sets of columns that are kept of a term, each of other signals."""
     # Spectral lines.
     line_band: float = 1.2
     """Band over the row filter's cutoff, where that filter ends (arithmetic)."""

@@ -22,14 +22,21 @@ from analysis.identify import checks as ck
 from analysis.regression.conditioned import ConditionedRecord, condition_runs
 from analysis.regression.rows import (
     Filtering,
+    Indices,
     Rows,
+    TermPart,
+    assembled,
     default_filtering,
     in_common,
+    instants,
+    low_passed,
+    parameters_of,
     record_rows,
-    rows_of_prepared,
+    right_parts,
+    term_part,
 )
 from analysis.signals.conditioning import Signals
-from analysis.terms.base import FAMILIES, Columns, Term, Used
+from analysis.terms.base import FAMILIES, Term, Used
 from analysis.trace.data.memory import RowMemory
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
@@ -103,19 +110,14 @@ def filtered(
     columns: Mapping[str, Array], conditioned: ConditionedRecord, rows: Rows
 ) -> dict[str, Array]:
     """Filter point-by-point columns (n,) as `rows` were, at the instants of `rows`."""
-    names = list(columns)
-    reach, filters = conditioned.filtering.channels.reach, conditioned.filtering
-    n = conditioned.record.samples
-    stack = np.column_stack([columns[name] for name in names])[reach : n - reach]
-    time = conditioned.signals.t[reach : n - reach]
-    if filters.rows is not None:
-        stack_out = filters.rows.decimate(stack, filters.step)
-        first = -(-2 * filters.rows.reach // filters.step) * filters.step - filters.rows.reach
-        time = time[first + filters.step * np.arange(len(stack_out))]
-    else:
-        stack_out, time = stack[:: filters.step], time[:: filters.step]
-    at = np.searchsorted(time, rows.time - 1e-9)
-    return {name: stack_out[at, k] for k, name in enumerate(names)}
+    made = low_passed(columns, conditioned.filtering)
+    return {name: column[_at(conditioned, len(column), rows)] for name, column in made.items()}
+
+
+def _at(conditioned: ConditionedRecord, count: int, rows: Rows) -> Indices:
+    """Return the places of rows (m,) among all `count` filtered ones of their record."""
+    time = instants(conditioned.signals.t, conditioned.filtering, count)
+    return np.searchsorted(time, rows.time - 1e-9)
 
 
 def shared_rows(
@@ -138,34 +140,55 @@ def shared_rows(
         others = tuple(u for u in acting if u not in added)
         key, own = (conditioned.group, family, others), replace(conditioned, families=(family,))
         seen = partial(memory.signals.of, key, partial(prepared, rig, others, own))
-        bare: dict[str, Rows] = memory.rows.of(key, partial(_bare_rows, rig, others, own, seen))
+        bare: dict[str, Rows] = memory.rows.of(
+            key, partial(_bare_rows, rig, others, own, seen, memory)
+        )
         rows = bare
         for u in added:
-            more = memory.rows.of((*key, u), partial(_own_columns, rig, own, seen, bare, u))
+            more = memory.rows.of((*key, u), partial(_own_columns, rig, own, seen, bare, u, memory))
             rows = {e: _beside(r, more.get(e, {})) for e, r in rows.items()}
         out |= rows
     return out
 
 
 def _bare_rows(
-    rig: Rig, terms: Sequence[Used], conditioned: ConditionedRecord, seen: Callable[[], Signals]
-) -> dict[str, Rows]:
-    return rows_of_prepared(
-        rig, ordered(terms), seen(), conditioned.filtering, conditioned.families
+    rig: Rig, terms: Sequence[Used], conditioned: ConditionedRecord, seen: Callable[[], Signals],
+    memory: RowMemory,
+) -> dict[str, Rows]:  # fmt: skip
+    """Return the rows of the record's one family under terms."""
+    (family,), filtering = conditioned.families, conditioned.filtering
+    terms, signals = ordered(terms), seen()
+    parts = [_part(rig, u, conditioned, family, signals, memory) for u in terms]
+    key = conditioned.group, family
+    sides = memory.parts.of(key, signals, lambda x: right_parts(rig, x, filtering, family))
+    return assembled(parameters_of(rig, terms, family), parts, sides, filtering)
+
+
+def _part(
+    rig: Rig, used: Used, conditioned: ConditionedRecord, family: str, signals: Signals,
+    memory: RowMemory,
+) -> TermPart:  # fmt: skip
+    key, filtering = (conditioned.group, family, used), conditioned.filtering
+    part: TermPart = memory.parts.of(
+        key, signals, lambda x: term_part(rig, used, x, filtering, family)
     )
+    return part
 
 
 def _own_columns(
     rig: Rig, conditioned: ConditionedRecord, seen: Callable[[], Signals],
-    rows: Mapping[str, Rows], used: Used,
+    rows: Mapping[str, Rows], used: Used, memory: RowMemory,
 ) -> dict[str, dict[str, Array]]:  # fmt: skip
     """Return what a term that leaves the signals alone adds to rows: equation -> name -> column."""
-    raw: Columns = used.term.columns(rig, seen(), used.shape)
-    return {
-        name: filtered(raw[name], conditioned, rows[name])
-        for name in rows
-        if name in raw and any(np.any(v) for v in raw[name].values())
-    }
+    out: dict[str, dict[str, Array]] = {}
+    for family in conditioned.families:
+        part = _part(rig, used, conditioned, family, seen(), memory)
+        for name, columns in part.columns.items():
+            if name in rows and any(np.any(v) for v in columns.values()):
+                count = len(next(iter(columns.values())))
+                at = _at(conditioned, count, rows[name])
+                out[name] = {parameter: v[at] for parameter, v in columns.items()}
+    return {name: out[name] for name in rows if name in out}
 
 
 def _beside(rows: Rows, columns: Mapping[str, Array]) -> Rows:
@@ -192,7 +215,7 @@ def candidate_columns(
     (of the rows, b as 1/b). The pseudo-column of a change of signals is named ''.
     """
     if not changes_signals(used.term):
-        return _own_columns(rig, conditioned, lambda: seen, rows, used)
+        return _own_columns(rig, conditioned, lambda: seen, rows, used, memory)
     acting = families_of(rig, used.term)
     families = tuple(f for f in conditioned.families if f in acting)
     changed = shared_rows(rig, (*terms, used), replace(conditioned, families=families), memory)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping
-from dataclasses import fields, is_dataclass
+from collections.abc import Callable, Hashable
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
 
+from analysis.signals.conditioning import Signals
 from analysis.terms.base import Term
 from analysis.trace.settings import DATA
+
+FIELDS = frozenset(f.name for f in fields(Signals))
+READ = "read"
 
 
 class Memory:
@@ -33,6 +37,36 @@ class Memory:
         return value
 
 
+class _Watched(Signals):
+    """Signals that note which of their fields are read."""
+
+    def __getattribute__(self, name: str) -> Any:
+        if name in FIELDS:
+            object.__getattribute__(self, "__dict__").setdefault(READ, set()).add(name)
+        return object.__getattribute__(self, name)
+
+
+class Readings:
+    """What follows from signals, by key: made again only where a signal that it reads differs."""
+
+    def __init__(self) -> None:
+        self._kept: dict[Hashable, list[tuple[list[tuple[str, Any]], Any]]] = {}
+
+    def of(self, key: Hashable, signals: Signals, make: Callable[[Signals], Any]) -> Any:
+        """Return what `make` makes of the signals."""
+        known = self._kept.setdefault(key, [])
+        for read, value in known:
+            if all(getattr(signals, name) is x for name, x in read):
+                return value
+        watched = _Watched(**vars(signals))
+        value = make(watched)
+        read = [(name, getattr(signals, name)) for name in vars(watched).get(READ, ())]
+        # The first is that of the records themselves.
+        del known[1 : len(known) - DATA.remembered_readings + 2]
+        known.append((read, value))
+        return value
+
+
 class RowMemory:
     """What is remembered of some records: parts of their rows, and the signals behind them.
 
@@ -41,6 +75,7 @@ class RowMemory:
 
     def __init__(self) -> None:
         self.rows, self.signals = Memory(DATA.remembered_rows), Memory(DATA.remembered_signals)
+        self.parts = Readings()
         self.families: dict[Term, frozenset[str]] = {}
 
 
@@ -48,8 +83,6 @@ def _bytes(value: Any) -> int:
     """Return about how many bytes the arrays of a value take."""
     if isinstance(value, np.ndarray):
         return int(value.nbytes)
-    if isinstance(value, Mapping):
+    if isinstance(value, dict):
         return sum(map(_bytes, value.values()))
-    if is_dataclass(value):
-        return sum(_bytes(getattr(value, f.name)) for f in fields(value))
-    return 0
+    return sum(x.nbytes for x in vars(value).values() if isinstance(x, np.ndarray))
