@@ -139,7 +139,11 @@ def shared_rows(
         added = [u for u in acting if isinstance(u.term, Effect) and not changes_signals(u.term)]
         others = tuple(u for u in acting if u not in added)
         key, own = (conditioned.group, family, others), replace(conditioned, families=(family,))
-        seen = partial(memory.signals.of, key, partial(prepared, rig, others, own))
+        # The families of rows share signals, whatever other terms they have.
+        changing = tuple(u for u in others if type(u.term).prepare is not Term.prepare)
+        seen = partial(
+            memory.signals.of, (conditioned.group, changing), partial(prepared, rig, changing, own)
+        )
         bare: dict[str, Rows] = memory.rows.of(
             key, partial(_bare_rows, rig, others, own, seen, memory)
         )
