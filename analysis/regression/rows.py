@@ -8,8 +8,9 @@ why). Sum of columns times coefficients = right-hand side; units: torque_i [N m]
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,12 +27,13 @@ from analysis.signals.filters import (
     row_filter,
     row_step,
 )
-from analysis.terms.base import FAMILIES, Columns, Used, equation
+from analysis.terms.base import FAMILIES, Used, equation
 from rig.model import channels as ch
 from rig.model.records import Record
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,15 @@ class Rows:
     rhs: Array
     time: Array
     masked: int
+
+
+def in_common(one: Rows, other: Rows) -> tuple[Indices, Indices]:
+    """Return the places in either of the instants that two sets of rows have in common."""
+    if np.array_equal(one.time, other.time):  # nearly always
+        at = np.arange(len(one.time))
+        return at, at
+    _, here, there = np.intersect1d(one.time, other.time, return_indices=True)
+    return here, there
 
 
 def default_filtering(record: Record) -> Filtering:
@@ -149,34 +160,71 @@ def record_rows(
     of a longer record.
     """
     signals = prepared(rig, terms, signals)
-    columns: Columns = {}
-    valid: dict[str, Mask] = {}
-    for used in terms:
-        for name, more in used.term.columns(rig, signals, used.shape).items():
-            here = columns.setdefault(name, {})
-            here.update({p: here[p] + v if p in here else v for p, v in more.items()})
-        for name, mask in used.term.valid(rig, signals, used.shape).items():
-            valid[name] = valid.get(name, np.ones(len(mask), dtype=bool)) & mask
-    sides = right_sides(rig, signals)
-    out = {}
-    for family, kinds in FAMILIES.items():
-        if family not in families:
+    out: dict[str, Rows] = {}
+    for family in families:
+        sides = right_parts(rig, signals, filtering, family)
+        parts = [term_part(rig, used, signals, filtering, family) for used in terms]
+        out |= assembled(parameters_of(rig, terms, family), parts, sides, filtering, within)
+    return out
+
+
+@dataclass(frozen=True)
+class TermPart:
+    """What a term puts into one family's rows of the excited joints, by equation.
+
+    Filtered columns (m,) by parameter, before rows are dropped, and where (n,) the equation holds.
+    """
+
+    columns: dict[str, dict[str, Array]]
+    valid: dict[str, Mask]
+
+
+@dataclass(frozen=True)
+class RightPart:
+    """An equation's filtered right side and its instants (m,) [s], before rows are dropped.
+
+    And where (n,) its sensors are right, and where a sample never arrived.
+    """
+
+    side: Array
+    time: Array
+    sensors: Mask
+    lost: Mask
+
+
+def _equations(signals: Signals, family: str) -> list[str]:
+    joints = map(int, np.flatnonzero(signals.excited))
+    return [equation(kind, i) for i in joints for kind in FAMILIES[family]]
+
+
+def term_part(
+    rig: Rig, used: Used, signals: Signals, filtering: Filtering, family: str
+) -> TermPart:
+    """Return a term's filtered columns of one family, of signals as all terms see them."""
+    equations = _equations(signals, family)
+    raw = used.term.columns(rig, signals, used.shape)
+    valid = used.term.valid(rig, signals, used.shape)
+    return TermPart(
+        {e: low_passed(raw[e], filtering) for e in equations if raw.get(e)},
+        {e: valid[e] for e in equations if e in valid},
+    )
+
+
+def right_parts(
+    rig: Rig, signals: Signals, filtering: Filtering, family: str
+) -> dict[str, RightPart]:
+    """Return the right sides of one family's equations of the excited joints."""
+    sides, out = right_sides(rig, signals), {}
+    for name in _equations(signals, family):
+        if name not in sides:
             continue
-        names = parameters_of(rig, terms, family)
-        for i in map(int, np.flatnonzero(signals.excited)):
-            # Inertia couples: a clipped piston of any joint spoils every torque row.
-            whole = family == "mechanical"
-            sensors = np.asarray(signals.valid.all(axis=1) if whole else signals.valid[:, i])
-            lost = _lost(signals, slice(None) if whole else slice(i, i + 1))
-            for kind in kinds:
-                name = equation(kind, i)
-                if name not in sides:
-                    continue
-                masks = Masks(~(sensors & valid.get(name, sensors)), lost)
-                rows = _filtered(
-                    name, names, columns.get(name, {}), sides[name], masks, signals.t, filtering
-                )
-                out[name] = rows.kept(names, within)
+        i = int(name.rsplit("_", 1)[1]) - 1
+        # Inertia couples: a clipped piston of any joint spoils every torque row.
+        joints = slice(None) if family == "mechanical" else slice(i, i + 1)
+        side = low_passed({"": sides[name]}, filtering)[""]
+        time = instants(signals.t, filtering, len(side))
+        sensors = np.asarray(signals.valid[:, joints].all(axis=1))
+        out[name] = RightPart(side, time, sensors, _lost(signals, joints))
     return out
 
 
@@ -186,69 +234,68 @@ def _lost(signals: Signals, joints: slice) -> Mask:
     return np.asarray(signals.lost[:, joints].any(axis=1))
 
 
-@dataclass(frozen=True)
-class Masks:
-    """Samples (n,) outside the model or clipped, and samples that never arrived."""
-
-    bad: Mask
-    lost: Mask
-
-
-@dataclass(frozen=True)
-class _Filtered:
-    """One equation's filtered columns and right side (m, filled + 1), before rows are dropped."""
-
-    equation: str
-    filled: list[int]
-    stack: Array
-    dropped: Mask
-    time: Array
-
-    def kept(self, names: tuple[str, ...], within: tuple[float, float]) -> Rows:
-        """Return the rows within a stretch of time, without the dropped ones."""
-        inside = (self.time >= within[0]) & (self.time < within[1])
-        kept = inside & ~self.dropped
-        matrix = np.zeros((int(kept.sum()), len(names)))
-        matrix[:, self.filled] = self.stack[kept, :-1]
-        masked = int((inside & self.dropped).sum())
-        return Rows(self.equation, names, matrix, self.stack[kept, -1], self.time[kept], masked)
-
-
-def _filtered(
-    name: str,
+def assembled(
     names: tuple[str, ...],
-    columns: dict[str, Array],
-    side: Array,
-    masks: Masks,
-    time: Array,
+    parts: Sequence[TermPart],
+    sides: Mapping[str, RightPart],
     filtering: Filtering,
-) -> _Filtered:
-    """Filter and decimate one equation's columns and right side together."""
-    edges = filtering.channels.reach
-    inside = slice(edges, len(side) - edges)
-    filled = [k for k, parameter in enumerate(names) if parameter in columns]
-    stack = np.column_stack([*(columns[names[k]] for k in filled), side])[inside]
-    masks, time = Masks(masks.bad[inside], masks.lost[inside]), time[inside]
+    within: tuple[float, float] = (-np.inf, np.inf),
+) -> dict[str, Rows]:
+    """Put one family's rows together, without those that are masked."""
+    out = {}
+    for name, right in sides.items():
+        bad = ~right.sensors
+        for part in parts:
+            if name in part.valid:
+                bad = bad | ~part.valid[name]
+        inside = (right.time >= within[0]) & (right.time < within[1])
+        dropped = _dropped(bad, right.lost, filtering, len(right.side))
+        kept = inside & ~dropped
+        matrix = np.zeros((int(kept.sum()), len(names)))
+        for part in parts:
+            for parameter, column in part.columns.get(name, {}).items():
+                matrix[:, names.index(parameter)] += column[kept]
+        masked = int((inside & dropped).sum())
+        out[name] = Rows(name, names, matrix, right.side[kept], right.time[kept], masked)
+    return out
+
+
+def low_passed(columns: Mapping[str, Array], filtering: Filtering) -> dict[str, Array]:
+    """Filter and decimate columns (n,) by name, before rows are dropped."""
+    stack = _inside(np.column_stack(list(columns.values())), filtering)
     if filtering.rows is None:
-        dropped, every = masks.bad | masks.lost, slice(None, None, filtering.step)
-        return _Filtered(name, filled, stack[every], dropped[every], time[every])
-    stack, dropped, time = _low_passed(stack, masks, time, filtering.rows, filtering.step)
-    return _Filtered(name, filled, stack, dropped, time)
+        stack = stack[:: filtering.step]
+    else:
+        stack = filtering.rows.decimate(stack, filtering.step)
+    return dict(zip(columns, stack.T, strict=True))
 
 
-def _low_passed(
-    stack: Array, masks: Masks, time: Array, rows: FirSmoother, step: int
-) -> tuple[Array, Mask, Array]:
-    filtered = rows.decimate(stack, step)
-    start = -(-2 * rows.reach // step)
-    centres = start * step - rows.reach + step * np.arange(len(filtered))
-    dropped = np.zeros(len(filtered), dtype=bool)
-    weights = np.abs(rows.taps[0]) / np.abs(rows.taps[0]).sum()
+def instants(time: Array, filtering: Filtering, count: int) -> Array:
+    """Return the instants of the first `count` filtered rows of samples at `time` (n,)."""
+    step, first = filtering.step, 0
+    if filtering.rows is not None:
+        first = -(-2 * filtering.rows.reach // step) * step - filtering.rows.reach
+    return _inside(time, filtering)[first + step * np.arange(count)]
+
+
+def _inside(x: NDArray[Any], filtering: Filtering) -> NDArray[Any]:
+    """Return samples (n, ...) without those that the channel filter's edges have spoiled."""
+    edges = filtering.channels.reach
+    return x[edges : len(x) - edges]
+
+
+def _dropped(bad: Mask, lost: Mask, filtering: Filtering, count: int) -> Mask:
+    """Return which filtered rows (m,) a masked sample is under."""
+    bad, lost = _inside(bad, filtering), _inside(lost, filtering)
+    if filtering.rows is None:
+        return np.asarray((bad | lost)[:: filtering.step])
+    dropped = np.zeros(count, dtype=bool)
+    weights = np.abs(filtering.rows.taps[0]) / np.abs(filtering.rows.taps[0]).sum()
     # What stands for a lost sample is made up: not even the filter's tails may touch it.
     for mask, taps, limit in (
-        (masks.bad, weights, REGRESSION.masked_share),
-        (masks.lost, np.ones(len(weights)), 0.5),
+        (bad, weights, REGRESSION.masked_share),
+        (lost, np.ones(len(weights)), 0.5),
     ):
         if mask.any():
-            dropped |= decimated(mask.astype(np.float64), taps, step) > limit
-    return filtered, dropped, time[centres]
+            dropped |= decimated(mask.astype(np.float64), taps, filtering.step) > limit
+    return dropped

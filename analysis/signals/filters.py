@@ -181,16 +181,21 @@ def align(x: Array, shift: float) -> Array:
     Undoes a sensor's delay (shift > 0) and the multiplexer's skew (shift < 0), flat to 0.35 of
     the sample rate.
     """
-    whole = int(np.floor(shift + 0.5))
-    fraction = shift - whole
     if abs(shift) < 1e-9:
         return x
-    reach = SIGNALS.align_half_width + abs(whole)
-    offsets = np.arange(-reach, reach + 1)
-    distance: Array = np.asarray(offsets - whole - fraction, dtype=np.float64)
-    taps = _kernel(distance, 0.425, SIGNALS.align_half_width + 0.5, 8.0)
+    taps = _interpolation(shift)
     # Convolution turns the taps round.
-    return convolved(_extended(x, reach, "alignment"), taps[::-1] / taps.sum())
+    return convolved(_extended(x, len(taps) // 2, "alignment"), taps[::-1])
+
+
+@functools.lru_cache(maxsize=256)
+def _interpolation(shift: float) -> Array:
+    """Return the taps (2 reach + 1,) whose product with samples about n is x(n + shift)."""
+    whole = int(np.floor(shift + 0.5))
+    reach = SIGNALS.align_half_width + abs(whole)
+    distance: Array = np.asarray(np.arange(-reach, reach + 1) - shift, dtype=np.float64)
+    taps = _kernel(distance, 0.425, SIGNALS.align_half_width + 0.5, 8.0)
+    return np.asarray(taps / taps.sum())
 
 
 def bridged(x: Array) -> Array:

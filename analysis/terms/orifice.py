@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -52,8 +53,7 @@ class Orifice(Term):
 
     def coefficients(self, rig: Rig) -> tuple[Coefficient, ...]:
         """Return C_pp C_pm C_mp C_mm of each joint."""
-        names = (name for i in range(1, len(rig.joints) + 1) for name in gain_names(i))
-        return tuple(Coefficient(name, parameter_unit(name), "fluid") for name in names)
+        return _gains(len(rig.joints))
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return the four roots times the opening, in the chamber that each edge serves."""
@@ -83,6 +83,12 @@ class Orifice(Term):
             out[equation("flow_cap", i)] = cap[:, i]
             out[equation("flow_rod", i)] = rod[:, i]
         return out
+
+
+@functools.lru_cache
+def _gains(joints: int) -> tuple[Coefficient, ...]:
+    names = (name for i in range(1, joints + 1) for name in gain_names(i))
+    return tuple(Coefficient(name, parameter_unit(name), "fluid") for name in names)
 
 
 def root_of_drop(drop: Array) -> Array:

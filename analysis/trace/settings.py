@@ -127,8 +127,12 @@ class DataSettings:
     """[K] between all records: less moves b by a fraction of 0.001 (arithmetic)."""
     grid_points: int = 24
     """Of a candidate's shape grid: two shapes of five points each, or one of many."""
-    workers: int = 2
-    """Threads that make columns."""
+    remembered_rows: float = 2e8
+    """Bytes of rows that are kept since other models need them again."""
+    remembered_signals: float = 5e7
+    """Bytes of signals kept for the same."""
+    remembered_readings: int = 4
+    """Sets of columns that are kept of a term, each of other signals."""
     # Spectral lines.
     line_band: float = 1.2
     """Band over the row filter's cutoff, where that filter ends (arithmetic)."""
@@ -196,8 +200,6 @@ class SearchSettings:
     """Of a refinement, at most."""
     detail_share: float = 0.05
     """Of what is left above noise: less does not earn a detail of the form (tuned)."""
-    remembered_rows: int = 600
-    """Sets of rows kept, of at most about 0.1 MB each."""
     # Free forms.
     free_tried: int = 4
     """Free forms that are put through the gates."""

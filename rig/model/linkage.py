@@ -40,6 +40,7 @@ def jacobian(q: ArrayLike, a: float, c: float, mid_length: float, offset: float)
 def jacobian_rate(q: ArrayLike, a: float, c: float, mid_length: float, offset: float) -> Array:
     """Return dG/dq = d2s/dq2 [m/rad] at joint angle q [rad]."""
     beta = np.asarray(q, dtype=np.float64) + offset
-    length = np.sqrt(a * a + c * c - 2.0 * a * c * np.cos(beta))
+    cosine = np.cos(beta)
+    length = np.sqrt(a * a + c * c - 2.0 * a * c * cosine)
     slope = a * c * np.sin(beta) / length
-    return np.asarray((a * c * np.cos(beta) - slope * slope) / length)
+    return np.asarray((a * c * cosine - slope * slope) / length)

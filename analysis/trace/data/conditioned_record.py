@@ -12,16 +12,32 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.effects.base import SENSOR, ordered
+from analysis.effects.base import SENSOR, Effect, ordered
 from analysis.identify import checks as ck
 from analysis.regression.conditioned import ConditionedRecord, condition_runs
-from analysis.regression.rows import Filtering, Rows, default_filtering, record_rows
+from analysis.regression.rows import (
+    Filtering,
+    Indices,
+    Rows,
+    TermPart,
+    assembled,
+    default_filtering,
+    in_common,
+    instants,
+    low_passed,
+    parameters_of,
+    record_rows,
+    right_parts,
+    term_part,
+)
 from analysis.signals.conditioning import Signals
-from analysis.terms.base import FAMILIES, Columns, Term, Used
+from analysis.terms.base import FAMILIES, Term, Used
+from analysis.trace.data.memory import RowMemory
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
 
@@ -54,10 +70,11 @@ def conditioned_records(
 def held(term: Term, conditioned: ConditionedRecord) -> bool:
     """Return whether an effect at a joint cannot show because the joint is locked.
 
-    A sensor of a locked joint still shows where that joint stands.
+    The sensor of a locked joint's piston still shows where that joint stands.
     """
     where = term.where
-    if not where.startswith("joint ") or getattr(term, "stage", None) == SENSOR:
+    piston = getattr(term, "stage", None) == SENSOR and where.endswith("piston")
+    if not where.startswith("joint ") or piston:
         return False
     return int(where.split()[1]) in conditioned.record.locked
 
@@ -68,11 +85,10 @@ def changes_signals(term: Term) -> bool:
     return kind.prepare is not Term.prepare or kind.valid is not Term.valid
 
 
-def acts_on(rig: Rig, term: Term, family: str) -> bool:
-    """Return whether a family's rows need a term: it has columns there, or alters their signals."""
-    if any(c.family == family for c in term.coefficients(rig)):
-        return True
-    return changes_signals(term) and family in getattr(term, "alters", FAMILIES)
+def families_of(rig: Rig, term: Term) -> frozenset[str]:
+    """Return the families of rows that need a term: it has columns or alters the signals there."""
+    altered = getattr(term, "alters", FAMILIES) if changes_signals(term) else ()
+    return frozenset((*altered, *(c.family for c in term.coefficients(rig))))
 
 
 def model_rows(rig: Rig, terms: Sequence[Used], conditioned: ConditionedRecord) -> dict[str, Rows]:
@@ -94,19 +110,97 @@ def filtered(
     columns: Mapping[str, Array], conditioned: ConditionedRecord, rows: Rows
 ) -> dict[str, Array]:
     """Filter point-by-point columns (n,) as `rows` were, at the instants of `rows`."""
-    names = list(columns)
-    reach, filters = conditioned.filtering.channels.reach, conditioned.filtering
-    n = conditioned.record.samples
-    stack = np.column_stack([columns[name] for name in names])[reach : n - reach]
-    time = conditioned.signals.t[reach : n - reach]
-    if filters.rows is not None:
-        stack_out = filters.rows.decimate(stack, filters.step)
-        first = -(-2 * filters.rows.reach // filters.step) * filters.step - filters.rows.reach
-        time = time[first + filters.step * np.arange(len(stack_out))]
-    else:
-        stack_out, time = stack[:: filters.step], time[:: filters.step]
-    at = np.searchsorted(time, rows.time - 1e-9)
-    return {name: stack_out[at, k] for k, name in enumerate(names)}
+    made = low_passed(columns, conditioned.filtering)
+    return {name: column[_at(conditioned, len(column), rows)] for name, column in made.items()}
+
+
+def _at(conditioned: ConditionedRecord, count: int, rows: Rows) -> Indices:
+    """Return the places of rows (m,) among all `count` filtered ones of their record."""
+    time = instants(conditioned.signals.t, conditioned.filtering, count)
+    return np.searchsorted(time, rows.time - 1e-9)
+
+
+def shared_rows(
+    rig: Rig, terms: Sequence[Used], conditioned: ConditionedRecord, memory: RowMemory
+) -> dict[str, Rows]:
+    """Return a record's rows under the terms that can show in it, each part of them built once.
+
+    Many models share what acts on a family of rows. A term that only has columns has them filtered
+    alone, beside the rows of the others.
+    """
+    here = [u for u in terms if not held(u.term, conditioned)]
+    families = memory.families
+    for u in here:
+        if u.term not in families:
+            families[u.term] = families_of(rig, u.term)
+    out: dict[str, Rows] = {}
+    for family in conditioned.families:
+        acting = [u for u in here if family in families[u.term]]
+        added = [u for u in acting if isinstance(u.term, Effect) and not changes_signals(u.term)]
+        others = tuple(u for u in acting if u not in added)
+        key, own = (conditioned.group, family, others), replace(conditioned, families=(family,))
+        # The families of rows share signals, whatever other terms they have.
+        changing = tuple(u for u in others if type(u.term).prepare is not Term.prepare)
+        seen = partial(
+            memory.signals.of, (conditioned.group, changing), partial(prepared, rig, changing, own)
+        )
+        bare: dict[str, Rows] = memory.rows.of(
+            key, partial(_bare_rows, rig, others, own, seen, memory)
+        )
+        rows = bare
+        for u in added:
+            more = memory.rows.of((*key, u), partial(_own_columns, rig, own, seen, bare, u, memory))
+            rows = {e: _beside(r, more.get(e, {})) for e, r in rows.items()}
+        out |= rows
+    return out
+
+
+def _bare_rows(
+    rig: Rig, terms: Sequence[Used], conditioned: ConditionedRecord, seen: Callable[[], Signals],
+    memory: RowMemory,
+) -> dict[str, Rows]:  # fmt: skip
+    """Return the rows of the record's one family under terms."""
+    (family,), filtering = conditioned.families, conditioned.filtering
+    terms, signals = ordered(terms), seen()
+    parts = [_part(rig, u, conditioned, family, signals, memory) for u in terms]
+    key = conditioned.group, family
+    sides = memory.parts.of(key, signals, lambda x: right_parts(rig, x, filtering, family))
+    return assembled(parameters_of(rig, terms, family), parts, sides, filtering)
+
+
+def _part(
+    rig: Rig, used: Used, conditioned: ConditionedRecord, family: str, signals: Signals,
+    memory: RowMemory,
+) -> TermPart:  # fmt: skip
+    key, filtering = (conditioned.group, family, used), conditioned.filtering
+    part: TermPart = memory.parts.of(
+        key, signals, lambda x: term_part(rig, used, x, filtering, family)
+    )
+    return part
+
+
+def _own_columns(
+    rig: Rig, conditioned: ConditionedRecord, seen: Callable[[], Signals],
+    rows: Mapping[str, Rows], used: Used, memory: RowMemory,
+) -> dict[str, dict[str, Array]]:  # fmt: skip
+    """Return what a term that leaves the signals alone adds to rows: equation -> name -> column."""
+    out: dict[str, dict[str, Array]] = {}
+    for family in conditioned.families:
+        part = _part(rig, used, conditioned, family, seen(), memory)
+        for name, columns in part.columns.items():
+            if name in rows and any(np.any(v) for v in columns.values()):
+                count = len(next(iter(columns.values())))
+                at = _at(conditioned, count, rows[name])
+                out[name] = {parameter: v[at] for parameter, v in columns.items()}
+    return {name: out[name] for name in rows if name in out}
+
+
+def _beside(rows: Rows, columns: Mapping[str, Array]) -> Rows:
+    """Return rows with columns (m,) of further parameters."""
+    if not columns:
+        return rows
+    matrix = np.column_stack([rows.matrix, *columns.values()])
+    return replace(rows, names=(*rows.names, *columns), matrix=matrix)
 
 
 def candidate_columns(
@@ -117,6 +211,7 @@ def candidate_columns(
     rows: Mapping[str, Rows],
     beta: Mapping[str, float],
     used: Used,
+    memory: RowMemory,
 ) -> dict[str, dict[str, Array]]:
     """Return what a candidate would add to a record's rows: equation -> name -> column.
 
@@ -124,21 +219,23 @@ def candidate_columns(
     (of the rows, b as 1/b). The pseudo-column of a change of signals is named ''.
     """
     if not changes_signals(used.term):
-        raw: Columns = used.term.columns(rig, seen, used.shape)
-        return {
-            name: filtered(raw[name], conditioned, rows[name])
-            for name in rows
-            if name in raw and any(np.any(v) for v in raw[name].values())
-        }
-    changed = model_rows(rig, (*terms, used), conditioned)
+        return _own_columns(rig, conditioned, lambda: seen, rows, used, memory)
+    acting = families_of(rig, used.term)
+    families = tuple(f for f in conditioned.families if f in acting)
+    changed = shared_rows(rig, (*terms, used), replace(conditioned, families=families), memory)
     own = [c.parameter for c in used.term.coefficients(rig)]
     out: dict[str, dict[str, Array]] = {}
-    for name, before in rows.items():
-        after = changed[name]
-        _, here, there = np.intersect1d(before.time, after.time, return_indices=True)
-        difference = np.zeros(len(before.rhs))
-        difference[here] = row_residual(before, beta)[here] - row_residual(after, beta)[there]
-        columns = {"": difference}
+    for name, after in changed.items():
+        if name not in rows:
+            continue
+        before = rows[name]
+        here, there = in_common(before, after)
+        # Column by column: where a column is the same the difference is exactly nothing.
+        same = [after.names.index(n) for n in before.names]
+        moved = after.matrix[there][:, same] - before.matrix[here]
+        side = after.rhs[there] - before.rhs[here]
+        columns = {"": np.zeros(len(before.rhs))}
+        columns[""][here] = moved @ np.array([beta.get(n, 0.0) for n in before.names]) - side
         for k, parameter in enumerate(after.names):
             if parameter in own and np.any(after.matrix[:, k]):
                 columns[parameter] = np.zeros(len(before.rhs))

@@ -25,7 +25,7 @@ from scipy.spatial import cKDTree
 
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.noise import disturbed
-from analysis.regression.rows import Rows
+from analysis.regression.rows import Rows, in_common
 from analysis.signals.conditioning import condition
 from analysis.terms.base import Used
 from analysis.trace.data.conditioned_record import model_rows, row_residual
@@ -195,7 +195,7 @@ def stated_noise(
     again = model_rows(rig, terms, replace(conditioned, record=record, signals=signals))
     out = {}
     for name, before in rows.items():
-        _, a, b = np.intersect1d(before.time, again[name].time, return_indices=True)
+        a, b = in_common(before, again[name])
         change = row_residual(again[name], beta)[b] - row_residual(before, beta)[a]
         out[name] = float(np.sqrt(np.mean(change**2))) if len(change) else NO_ROWS
     return out

@@ -10,10 +10,8 @@ adds 1 per row to a residual's energy, whatever the unit and the number of repea
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Hashable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,8 +29,9 @@ from analysis.trace.data.conditioned_record import (
     prepared,
     row_residual,
 )
+from analysis.trace.data.memory import RowMemory
 from analysis.trace.data.noise_floor import Floor, Group, floors
-from analysis.trace.settings import DATA, TRACE
+from analysis.trace.settings import TRACE
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 
@@ -69,7 +68,7 @@ class RegressionData:
     floors: tuple[Floor, ...]
     records: tuple[ConditionedRecord, ...]
     rows: tuple[Mapping[str, Rows], ...]
-    memo: dict[Hashable, Any] = field(default_factory=dict, repr=False, compare=False)
+    memory: RowMemory = field(default_factory=RowMemory, repr=False, compare=False)
 
     @property
     def mean(self) -> Array:
@@ -222,12 +221,11 @@ def variant_columns(
     `progress` receives after each which share of them is done.
     """
     seen = [prepared(data.rig, data.terms, conditioned) for conditioned in data.records]
-    with ThreadPoolExecutor(DATA.workers) as pool:
-        columns = []
-        for entry in pool.map(lambda v: _entry(data, v, seen), chosen):
-            columns.append(entry)
-            if progress is not None:
-                progress(len(columns) / len(chosen))
+    columns = []
+    for variant in chosen:
+        columns.append(_entry(data, variant, seen))
+        if progress is not None:
+            progress(len(columns) / len(chosen))
     return [entry for entry in columns if entry is not None]
 
 
@@ -249,6 +247,7 @@ def _entry(
             rows,
             data.beta,
             variant.used,
+            data.memory,
         )
         for segment in data.segments:
             if segment.group == conditioned.group and segment.equation in candidate:

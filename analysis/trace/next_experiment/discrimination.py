@@ -36,6 +36,7 @@ from analysis.trace.data.conditioned_record import (
     prepared,
     trace_filtering,
 )
+from analysis.trace.data.memory import RowMemory
 from analysis.trace.data.noise_floor import stated_noise
 from analysis.trace.data.regression_data import RegressionData, variant_columns
 from analysis.trace.next_experiment.excitations import CandidateExcitation
@@ -103,14 +104,16 @@ class MeasurementView:
     seen: Signals
     rows: Mapping[str, Rows]
     noise: Mapping[str, float]
+    memory: RowMemory = field(default_factory=RowMemory, repr=False, compare=False)
 
     def columns(self, used: Used) -> Mapping[str, Mapping[str, Array]]:
         """Return what an effect would add in SI: equation -> name -> column."""
         if held(used.term, self.conditioned):
             return {}
         return candidate_columns(
-            self.rig, self.terms, self.conditioned, self.seen, self.rows, self.beta, used
-        )
+            self.rig, self.terms, self.conditioned, self.seen, self.rows, self.beta, used,
+            self.memory,
+        )  # fmt: skip
 
     def weight(self, equation: str) -> float:
         """Return the factor that whitens an equation's averaged rows."""

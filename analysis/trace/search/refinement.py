@@ -8,27 +8,17 @@ side's size before the change.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares as search_shapes
 
 from analysis.effects.base import Effect, Shape, shapes_of
-from analysis.regression.conditioned import ConditionedRecord
-from analysis.regression.rows import Rows
+from analysis.regression.rows import in_common
 from analysis.terms.base import Used
-from analysis.trace.data.conditioned_record import (
-    acts_on,
-    candidate_columns,
-    changes_signals,
-    held,
-    model_rows,
-    prepared,
-)
+from analysis.trace.data.conditioned_record import shared_rows
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.search.linear_fit import orthonormal
 from analysis.trace.settings import SEARCH, TRACE
@@ -70,7 +60,7 @@ def table(data: RegressionData, terms: Sequence[Used]) -> DesignMatrix:
     Of instants that the model masks stays what the data's own model leaves of them, so that no
     effect explains rows by moving its signals out of the model's domain.
     """
-    built = [_rows(data, terms, conditioned) for conditioned in data.records]
+    built = [shared_rows(data.rig, terms, record, data.memory) for record in data.records]
     names = tuple(dict.fromkeys(c.parameter for u in terms for c in u.term.coefficients(data.rig)))
     M = data.base.shape[0]
     X, y = np.zeros((M, len(names))), data.mean.copy()
@@ -78,7 +68,7 @@ def table(data: RegressionData, terms: Sequence[Used]) -> DesignMatrix:
     for segment in data.segments:
         k = index[segment.group]
         rows, before = built[k][segment.equation], data.rows[k][segment.equation]
-        _, here, there = np.intersect1d(before.time, rows.time, return_indices=True)
+        here, there = in_common(before, rows)
         size = np.linalg.norm(before.rhs[here]) / max(
             float(np.linalg.norm(rows.rhs[there])), 1e-300
         )
@@ -88,47 +78,6 @@ def table(data: RegressionData, terms: Sequence[Used]) -> DesignMatrix:
         X[np.ix_(at, columns)] = rows.matrix[there] * weight
         y[at] = rows.rhs[there] * weight
     return DesignMatrix(names, X, y)
-
-
-def _rows(
-    data: RegressionData, terms: Sequence[Used], conditioned: ConditionedRecord
-) -> dict[str, Rows]:
-    """Return a scene's rows, remembered: many sets share what acts on a family of its rows.
-
-    A term that only has columns has them filtered alone, beside the rows of the others.
-    """
-    here = [u for u in terms if not held(u.term, conditioned)]
-    by_equation: dict[str, Rows] = {}
-    for family in conditioned.families:
-        acting = [u for u in here if acts_on(data.rig, u.term, family)]
-        added = [u for u in acting if isinstance(u.term, Effect) and not changes_signals(u.term)]
-        others = tuple(u for u in acting if u not in added)
-        key, own = (conditioned.group, family, others), replace(conditioned, families=(family,))
-        rows: dict[str, Rows] = _kept(data, key, partial(model_rows, data.rig, others, own))
-        for u in added:
-            seen = _kept(data, (*key, None), partial(prepared, data.rig, others, own))
-            more = partial(candidate_columns, data.rig, (), own, seen, rows, {}, u)
-            columns = _kept(data, (*key, u), more)
-            rows = {e: _beside(r, columns.get(e, {})) for e, r in rows.items()}
-        by_equation |= rows
-    return by_equation
-
-
-def _kept(data: RegressionData, key: Any, make: Callable[[], Any]) -> Any:
-    """Return what belongs to a key, made where it is not remembered."""
-    if key not in data.memo:
-        if len(data.memo) >= SEARCH.remembered_rows:
-            data.memo.clear()
-        data.memo[key] = make()
-    return data.memo[key]
-
-
-def _beside(rows: Rows, columns: Mapping[str, Array]) -> Rows:
-    """Return rows with columns (m,) of further parameters."""
-    if not columns:
-        return rows
-    matrix = np.column_stack([rows.matrix, *columns.values()])
-    return replace(rows, names=(*rows.names, *columns), matrix=matrix)
 
 
 def fit(data: RegressionData, terms: Sequence[Used]) -> ExactFit:
@@ -328,10 +277,10 @@ def rebased(data: RegressionData, model: ExactFit) -> RegressionData:
     rows = table(data, model.terms)
     built = []
     for conditioned, before in zip(data.records, data.rows, strict=True):
-        now = model_rows(data.rig, model.terms, conditioned)
+        now = shared_rows(data.rig, model.terms, conditioned, data.memory)
         kept = {}
         for equation, old in before.items():
-            _, here, there = np.intersect1d(old.time, now[equation].time, return_indices=True)
+            here, there = in_common(old, now[equation])
             matrix = np.zeros((len(old.rhs), len(now[equation].names)))
             rhs = np.zeros(len(old.rhs))
             matrix[here], rhs[here] = now[equation].matrix[there], now[equation].rhs[there]

@@ -1,0 +1,50 @@
+"""What the trace remembers of records: made once, and no more of it than allowed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from analysis.signals.conditioning import Array, Signals
+from analysis.trace.data.memory import Memory, Readings
+from rig.model.rig import Rig
+
+
+def test_what_is_asked_for_again_is_not_made_again() -> None:
+    memory, made = Memory(1e6), []
+    for _ in range(3):
+        memory.of("rows", lambda: made.append("rows") or {"torque_1": np.zeros(10)})
+    assert made == ["rows"]
+
+
+def test_the_oldest_goes_first() -> None:
+    memory, made = Memory(2.5 * 80), []
+
+    def asked(key: str) -> None:
+        memory.of(key, lambda: made.append(key) or np.zeros(10))
+
+    for key in "abacba":  # c pushes a out
+        asked(key)
+    assert made == ["a", "b", "c", "a"]
+    assert memory.used <= memory.most
+
+
+def test_what_reads_no_changed_signal_is_not_made_again(rig: Rig) -> None:
+    n, N = 200, len(rig.joints)
+    fields = ("u", "s", "sd", "q", "qd", "qdd", "theta", "G", "p_cap", "p_rod", "pd_cap", "pd_rod")
+    arrays = {name: np.ones((n, N)) for name in (*fields, "V_cap", "V_rod")}
+    bench = {name: np.ones(n) for name in ("t", "p_s", "p_tank", "temperature")}
+    marks = {"excited": np.ones(N, dtype=bool), "valid": np.ones((n, N), dtype=bool)}
+    signals = Signals(rate=1e3, **arrays, **bench, **marks)
+    readings, made = Readings(), []
+
+    def rate(seen: Signals) -> Array:
+        made.append("rate")
+        return np.asarray(seen.V_cap * seen.pd_cap)
+
+    for other in (
+        signals, replace(signals, u=2.0 * signals.u), replace(signals, V_cap=2.0 * signals.V_cap)
+    ):  # fmt: skip
+        assert np.array_equal(readings.of("rate", other, rate), other.V_cap * other.pd_cap)
+    assert made == ["rate", "rate"]
