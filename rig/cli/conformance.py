@@ -55,8 +55,3 @@ def conformance(
     failed = [failure.check for failure in report.of(CheckVerdict.FAILED)]
     if failed:
         raise WorkError(f"{driver} fails {len(failed)} checks: {', '.join(failed)}")
-
-
-def register(app: typer.Typer) -> None:
-    """Add this verb to the command line."""
-    app.command()(conformance)

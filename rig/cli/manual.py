@@ -51,8 +51,3 @@ def manual(
         progress("manual: page 9 of `bramah monitor` moves a joint; space stops")
         Manual(bench, described, volts=volts, idle_after=idle).run()
     typer.echo("manual session over; outputs at zero, confirmed by the device")
-
-
-def register(app: typer.Typer) -> None:
-    """Add this verb to the command line."""
-    app.command()(manual)

@@ -49,8 +49,3 @@ def sim(
     from rig.cli.simulator import Served, serve_bench
 
     serve_bench(Served(rig, seed, scenario, port, real_time, truth, parent, wire, wire_faults))
-
-
-def register(app: typer.Typer) -> None:
-    """Add this verb to the command line."""
-    app.command()(sim)
