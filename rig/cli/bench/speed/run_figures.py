@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers import make_driver, wire_at
+from drivers import make_driver
 from drivers.base import SampleBlock
 from protocols.engine import engine
 from protocols.engine.desk import Desk
@@ -22,6 +22,7 @@ from rig.bench.screens.sockets import Publisher
 from rig.bench.session import Bench
 from rig.cli.bench.figure import Figure
 from rig.cli.bench.wire_figures import bare_modbus
+from rig.cli.device import reached_at
 from rig.cli.simulated_bench import simulated_bench
 from rig.model.rig import Rig
 from rig.runs.journal import Journal
@@ -110,10 +111,6 @@ def _figures(kind: str, pairs: list[tuple[_Cost, _Cost]], limit: float) -> list[
     return figures
 
 
-def _at(rig: Rig, endpoint: str) -> Rig:
-    return rig.model_copy(update={"wire": wire_at(endpoint, rig.wire)})
-
-
 def _cost(work: Callable[[], int]) -> tuple[_Cost, int]:
     """Return what a block costs in work that returns how many it moved, and that number."""
     began, busy = time.perf_counter(), time.process_time()
@@ -126,7 +123,7 @@ def _protocol_run(rig: Rig, folder: Path) -> tuple[_Cost, int]:
     """Run one step with guard, journal and a publisher, as `bramah run` does."""
     plan = resolve(library.load(PROTOCOL), rig, Overrides(repeats=1, steps=(STEP,)))
     with simulated_bench(RIG, seed=0) as endpoint:
-        reached = _at(rig, endpoint)
+        reached = reached_at(rig, endpoint)
         driver, machine = make_driver(reached.wire, reached), StateMachine()
         machine.to(EngineState.CHECKING, PROTOCOL)
         recorder, publisher = Recorder(folder, reached), Publisher(f"bench-{rig.name}")
@@ -143,7 +140,7 @@ def _protocol_run(rig: Rig, folder: Path) -> tuple[_Cost, int]:
 def _streamed(rig: Rig, folder: Path, count: int) -> _Cost:
     """Take blocks in real time with guard, journal and a publisher."""
     with simulated_bench(RIG, seed=0, real_time=True) as endpoint:
-        reached = _at(rig, endpoint)
+        reached = reached_at(rig, endpoint)
         recorder, publisher = Recorder(folder, reached), Publisher(f"bench-{rig.name}")
         driver = make_driver(reached.wire, reached)
         # A busy computer is late, and then to be measured: nothing moves, so nothing need trip.
@@ -163,7 +160,7 @@ def _bare(rig: Rig, blocks: int, *, real_time: bool = False) -> _Cost:
     """Move blocks with pymodbus and nothing else; in real time, asking when the next is due."""
     with (
         simulated_bench(RIG, seed=0, real_time=real_time) as endpoint,
-        bare_modbus(_at(rig, endpoint)) as ask,
+        bare_modbus(reached_at(rig, endpoint)) as ask,
     ):
         ask()
 
