@@ -13,12 +13,21 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from rig.bench.latch import STATE_VARIABLE
+from tests.warm_up import compile_all
 
 CACHE_VARIABLE = "BRAMAH_CACHE"
+# Equations compiled by one test serve the next, and those of the next day.
+CACHE = Path(__file__).parents[1] / ".equations_cache"
 
 # No test depends on how fast the machine is: an example may take what it takes.
 settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("patient")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Compile for all workers before the first starts."""
+    if config.getoption("numprocesses", None) and not hasattr(config, "workerinput"):
+        compile_all(CACHE)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -26,8 +35,7 @@ def _state_folder(tmp_path_factory: pytest.TempPathFactory):
     """A state folder for what runs in fixtures that several tests share."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(STATE_VARIABLE, str(tmp_path_factory.mktemp("state")))
-        # Equations compiled by one test serve the next, and those of the next day.
-        patch.setenv(CACHE_VARIABLE, str(Path(__file__).parents[1] / ".equations_cache"))
+        patch.setenv(CACHE_VARIABLE, str(CACHE))
         yield
 
 

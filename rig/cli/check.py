@@ -61,8 +61,3 @@ def check(
         known = "\n\nunchanged since it was proved; the kept proof stands" if proof.reused else ""
         typer.echo(f"{check_text(proof.report)}\n\n{proof.twin_text}\n\n{proof.text}{known}")
     proof.report.require()
-
-
-def register(app: typer.Typer) -> None:
-    """Add this verb to the command line."""
-    app.command()(check)

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from rig.cli.device import reached_at
 from rig.cli.options import EndpointOption, JsonOption, RigOption
 from rig.cli.output import progress, table, write_json
 
@@ -27,15 +28,11 @@ def conformance(
     Example: bramah conformance modbus-tcp --endpoint modbus-tcp://127.0.0.1:5020
     """
     from drivers.conformance import CheckVerdict, live_subject, run
-    from drivers.registry import wire_at
     from rig.cli.errors import WorkError
     from rig.model.parse import InputError
     from rig.runs.rigs import load_bench
 
-    described = load_bench(rig)
-    if endpoint is not None:
-        wire = wire_at(endpoint, described.wire)
-        described = described.model_copy(update={"wire": wire})
+    described = reached_at(load_bench(rig), endpoint)
     if described.wire.kind != driver:
         raise InputError(
             f"{driver}: rig {described.name!r} is reached by {described.wire.kind}; "
@@ -55,8 +52,3 @@ def conformance(
     failed = [failure.check for failure in report.of(CheckVerdict.FAILED)]
     if failed:
         raise WorkError(f"{driver} fails {len(failed)} checks: {', '.join(failed)}")
-
-
-def register(app: typer.Typer) -> None:
-    """Add this verb to the command line."""
-    app.command()(conformance)

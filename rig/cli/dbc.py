@@ -21,8 +21,3 @@ def dbc(
     from rig.runs.rigs import load_bench
 
     typer.echo(database_text(load_bench(rig), fd=fd), nl=False)
-
-
-def register(app: typer.Typer) -> None:
-    """Add this verb to the command line."""
-    app.command()(dbc)

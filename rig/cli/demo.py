@@ -22,8 +22,3 @@ def demo(
     from rig.cli.experiment import run_demo
 
     run_demo(out, seed, repeats)
-
-
-def register(app: typer.Typer) -> None:
-    """Add this verb to the command line."""
-    app.command()(demo)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import typer
-
 from rig.cli.device import device_of
 from rig.cli.options import EndpointOption, RigOption
 from rig.cli.stop import stop
@@ -25,8 +23,3 @@ def depressurise(rig: RigOption, endpoint: EndpointOption = None) -> None:
             f"rig {described.name!r} describes no way to let the pressure out: stop the pump and "
             f"open the relief by hand; still under pressure: {', '.join(pressurised)}"
         )
-
-
-def register(app: typer.Typer) -> None:
-    """Add this verb to the command line."""
-    app.command()(depressurise)

@@ -48,8 +48,3 @@ def design(
         typer.echo(
             f"{design_text(designed, out)}\nlimits and errors predicted on: {parameters.text}"
         )
-
-
-def register(app: typer.Typer) -> None:
-    """Add this verb to the command line."""
-    app.command()(design)

@@ -11,14 +11,22 @@ if TYPE_CHECKING:
     from rig.model.rig import Rig
 
 
+def reached_at(rig: Rig, endpoint: str | None) -> Rig:
+    """Return a rig with the wire of an endpoint; without one, as it is."""
+    from drivers import wire_at
+
+    if endpoint is None:
+        return rig
+    return rig.model_copy(update={"wire": wire_at(endpoint, rig.wire)})
+
+
 def device_of(rig: str, endpoint: str | None) -> tuple[Rig, Driver]:
-    """Return a rig and the unconnected driver of its wire, or of an endpoint instead."""
-    from drivers import make_driver, wire_at
+    """Return a rig, reached at an endpoint if one is given, and its unconnected driver."""
+    from drivers import make_driver
     from rig.runs.rigs import load_bench
 
-    described = load_bench(rig)
-    wire = described.wire if endpoint is None else wire_at(endpoint, described.wire)
-    return described, make_driver(wire, described)
+    described = reached_at(load_bench(rig), endpoint)
+    return described, make_driver(described.wire, described)
 
 
 def print_pressure(places: list[str], *, aside: bool = False) -> None:

@@ -116,8 +116,3 @@ def _model_of(run: Path, path: Path | None) -> Model:
     model = load_model(path)
     refuse_other_rig(model, read_run_head(run).rig, str(run))
     return model
-
-
-def register(app: typer.Typer) -> None:
-    """Add this verb to the command line."""
-    app.command()(export)

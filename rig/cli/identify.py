@@ -209,8 +209,3 @@ def identify(
     if json != Path("-"):
         known = None if truth is None else read_truth(truth)
         typer.echo(identification_text(result, known) + more)
-
-
-def register(app: typer.Typer) -> None:
-    """Add this verb to the command line."""
-    app.command()(identify)

@@ -10,7 +10,7 @@ import typer
 from rig.cli.output import progress
 
 
-def import_foreign(
+def import_(
     manifest: Annotated[Path, typer.Argument(help="A YAML file that lists CSV or MAT files.")],
     out: Annotated[Path, typer.Option(help="The run folder to make.")],
 ) -> None:
@@ -24,8 +24,3 @@ def import_foreign(
     for warning in report.warnings:
         progress(f"note: {warning}")
     typer.echo(str(report.path))
-
-
-def register(app: typer.Typer) -> None:
-    """Add this verb to the command line."""
-    app.command("import")(import_foreign)

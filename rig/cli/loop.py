@@ -113,8 +113,3 @@ def _show_result(going: Any, json: Path | None, report: Path) -> None:
         if json != Path("-"):
             typer.echo(rounds_text(going.rounds, going.stopped))
             typer.echo(f"report: {report}")
-
-
-def register(app: typer.Typer) -> None:
-    """Add this verb to the command line."""
-    app.command()(loop)

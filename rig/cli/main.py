@@ -9,6 +9,7 @@ import os
 import sys
 from collections.abc import Sequence
 from importlib.util import find_spec
+from keyword import iskeyword
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -21,7 +22,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 NAME: Final = "bramah"
 COMPLETING: Final = "_BRAMAH_COMPLETE"  # set by the shell's completion, which Typer installs
-# In the order of `bramah --help`: a verb, and the module whose `register` adds it.
+# In the order of `bramah --help`: a verb, and the module with the function or group of its name.
 VERBS: Final = {
     "demo": "rig.cli.demo",
     "sim": "rig.cli.sim",
@@ -69,7 +70,11 @@ def command_line(verbs: Sequence[str]) -> typer.Typer:
     app.callback()(_bramah)
     for verb, module in VERBS.items():
         if verb in verbs:
-            importlib.import_module(module).register(app)
+            work = getattr(importlib.import_module(module), f"{verb}_" if iskeyword(verb) else verb)
+            if isinstance(work, typer.Typer):
+                app.add_typer(work, name=verb)
+            else:
+                app.command(verb)(work)
         else:
             app.command(verb, help=_summary(module))(_not_imported)
     return app

@@ -28,7 +28,6 @@ def manual(
 
     Example: bramah manual --rig shinshu-2dof
     """
-    from drivers import make_driver
     from protocols.engine.manual import Manual
     from rig.bench.screens.sockets import AttachError, Publisher
     from rig.bench.session import Bench
@@ -36,23 +35,13 @@ def manual(
     from rig.cli.errors import WorkError
     from rig.runs.recorder import Recorder
 
-    described, _ = device_of(rig, endpoint)
-    if endpoint is not None:
-        from drivers import wire_at
-
-        wire = wire_at(endpoint, described.wire)
-        described = described.model_copy(update={"wire": wire})
+    described, driver = device_of(rig, endpoint)
     try:
         publisher = Publisher(described.name)
     except AttachError as error:
         raise WorkError(f"manual: no screen could command this session: {error}") from error
     recorder = None if out is None else Recorder(out, described)
-    with Bench(described, make_driver(described.wire, described), recorder, publisher) as bench:
+    with Bench(described, driver, recorder, publisher) as bench:
         progress("manual: page 9 of `bramah monitor` moves a joint; space stops")
         Manual(bench, described, volts=volts, idle_after=idle).run()
     typer.echo("manual session over; outputs at zero, confirmed by the device")
-
-
-def register(app: typer.Typer) -> None:
-    """Add this verb to the command line."""
-    app.command()(manual)

@@ -90,8 +90,3 @@ def _serve(rig: str | None, runs: Path, endpoint: str | None, port: int) -> int:
         )
 
     return serve([*BRAMAH, "monitor", *given], listening, ready)
-
-
-def register(app: typer.Typer) -> None:
-    """Add this verb to the command line."""
-    app.command()(monitor)

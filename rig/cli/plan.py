@@ -34,8 +34,3 @@ def plan(
     write_json(json, proof.as_dict())
     if json != Path("-"):
         typer.echo(proof_text(proof))
-
-
-def register(app: typer.Typer) -> None:
-    """Add this verb to the command line."""
-    app.command()(plan)

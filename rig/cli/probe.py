@@ -56,8 +56,3 @@ def _row(reading: Reading) -> tuple[str, ...]:
         f"{reading.codes[0]}..{reading.codes[1]}",
         reading.mark,
     )
-
-
-def register(app: typer.Typer) -> None:
-    """Add this verb to the command line."""
-    app.command()(probe)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from drivers import make_driver, wire_at
+from drivers import make_driver
 from protocols.engine import engine
 from protocols.engine.desk import Desk
 from protocols.engine.states import EngineState, StateMachine
@@ -20,6 +20,7 @@ from rig.bench.screens.past import PlanLine
 from rig.bench.screens.sockets import AttachError, Publisher
 from rig.bench.session import Bench
 from rig.cli.attended import TrackedEstimates, terminal_lines
+from rig.cli.device import device_of, reached_at
 from rig.cli.output import Countdown, clock_text
 from rig.cli.proofs import proved
 from rig.cli.provenance import provenance_of
@@ -118,8 +119,7 @@ def _tracking(
 def run_protocol(job: ProtocolJob, say: Say) -> Path:
     """Run a protocol into its folder and return that; raises what ended it, outputs at zero."""
     rig, plan = _plan(job.protocol, job.rig, job.overrides)
-    wire = rig.wire if job.endpoint is None else wire_at(job.endpoint, rig.wire)
-    rig = rig.model_copy(update={"wire": wire})
+    rig = reached_at(rig, job.endpoint)
     desk_machine = StateMachine()
     desk_machine.to(EngineState.CHECKING, plan.protocol.name)
     say(plan_text(plan))
@@ -142,7 +142,7 @@ def run_protocol(job: ProtocolJob, say: Say) -> Path:
     with ExitStack() as stack:
         tracking = _tracking(job, plan, rig, say, stack)
         publisher = _publisher(rig, say)
-        bench = stack.enter_context(Bench(rig, make_driver(wire, rig), recorder, publisher))
+        bench = stack.enter_context(Bench(rig, make_driver(rig.wire, rig), recorder, publisher))
         bench.recorded_after = plan.protocol.on_trip.record
         proof.keep(job.out)
         report = _PhaseReport(bench, say)
@@ -159,7 +159,5 @@ def run_protocol(job: ProtocolJob, say: Say) -> Path:
 
 def reset_device(rig: str, endpoint: str | None, reason: str) -> str:
     """Clear a bench's latched trip on a person's word; returns what had tripped it."""
-    described = load_bench(rig)
-    wire = described.wire if endpoint is None else wire_at(endpoint, described.wire)
-    described = described.model_copy(update={"wire": wire})
-    return reset_bench(described, make_driver(wire, described), reason)
+    described, driver = device_of(rig, endpoint)
+    return reset_bench(described, driver, reason)

@@ -429,12 +429,9 @@ def retry(item: ItemArgument, queue: QueueOption = None, json: JsonOption = None
     _show(retried, json, f"queued again; it will run into {retried.next_folder()}")
 
 
-def register(app: typer.Typer) -> None:
-    """Add these verbs to the command line, below `queue`."""
-    group = typer.Typer(no_args_is_help=True, rich_markup_mode=None, callback=queue_group)
-    group.command(context_settings={"allow_extra_args": True})(add)
-    group.command("list")(list_items)
-    group.command("page")(write_night_page)
-    for verb in (show, run, pause, cancel, move, retry):
-        group.command()(verb)
-    app.add_typer(group, name="queue")
+queue = typer.Typer(no_args_is_help=True, rich_markup_mode=None, callback=queue_group)
+queue.command(context_settings={"allow_extra_args": True})(add)
+queue.command("list")(list_items)
+queue.command("page")(write_night_page)
+for verb in (show, run, pause, cancel, move, retry):
+    queue.command()(verb)

@@ -28,8 +28,3 @@ def recover(
         raise WorkError(
             f"{run}: {report.missing} samples are known to be lost; {report.damaged.name} is kept"
         )
-
-
-def register(app: typer.Typer) -> None:
-    """Add this verb to the command line."""
-    app.command()(recover)

@@ -26,8 +26,3 @@ def reset(
     from rig.cli.protocol_run import reset_device
 
     typer.echo(f"cleared: {reset_device(rig, endpoint, reason)}")
-
-
-def register(app: typer.Typer) -> None:
-    """Add this verb to the command line."""
-    app.command()(reset)

@@ -66,8 +66,3 @@ def run(
     )
     folder = run_protocol(job, progress)
     typer.echo(str(folder))
-
-
-def register(app: typer.Typer) -> None:
-    """Add this verb to the command line."""
-    app.command()(run)

@@ -99,8 +99,3 @@ def _row(summary: RunSummary) -> tuple[str, ...]:
         str(summary.lost_samples) if summary.samples >= 0 else "—",
         f"{summary.seconds / 60.0:.1f}" if summary.seconds >= 0 else "—",
     )
-
-
-def register(app: typer.Typer) -> None:
-    """Add this verb to the command line."""
-    app.command()(runs)

@@ -19,8 +19,3 @@ def schema(
     from rig.cli.output import write_json
 
     write_json(Path("-") if out is None else out, protocol_schema())
-
-
-def register(app: typer.Typer) -> None:
-    """Add this verb to the command line."""
-    app.command()(schema)

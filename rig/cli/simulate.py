@@ -65,8 +65,3 @@ def channel_simulator(path: Path, rig: Rig, source: str) -> Callable[[Record], M
         return {name: every[name] for name in result.measured}
 
     return channels
-
-
-def register(app: typer.Typer) -> None:
-    """Add this verb to the command line."""
-    app.command()(simulate)

@@ -34,8 +34,3 @@ def stop(rig: RigOption, endpoint: EndpointOption = None) -> None:
         print_pressure(bench.pressurised(bench.probe(device_of(rig, endpoint)[1], described)))
     except DeviceError as error:
         progress(f"pressures not read: {error}")
-
-
-def register(app: typer.Typer) -> None:
-    """Add this verb to the command line."""
-    app.command()(stop)

@@ -72,8 +72,3 @@ def trace(
         write_trace(report, judged, result)
     if json != Path("-"):
         typer.echo(trace_text(result))
-
-
-def register(app: typer.Typer) -> None:
-    """Add this verb to the command line."""
-    app.command()(trace)

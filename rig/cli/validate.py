@@ -34,8 +34,3 @@ def validate(
     write_json(json, to_json(results))
     if json != Path("-"):
         typer.echo(validation_text(results))
-
-
-def register(app: typer.Typer) -> None:
-    """Add this verb to the command line."""
-    app.command()(validate)

@@ -132,7 +132,7 @@ def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         process = stack.enter_context(dask("scheduler", *place))
         wait_for(file, process)
         address = json.loads(file.read_text())["address"]
-        limits = ("--nworkers", 1, "--nthreads", 1, "--no-dashboard", "--host", "127.0.0.1")
+        limits = ("--no-nanny", "--nthreads", 1, "--no-dashboard", "--host", "127.0.0.1")
         stack.enter_context(dask("worker", address, *limits))
         deadline = time.monotonic() + 60.0
         while True:

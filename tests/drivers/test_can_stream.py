@@ -35,6 +35,7 @@ from rig.model.wire.can_layout import CanLayout, read_layout
 from rig.model.wire.registers import TripCause
 from tests.drivers.bus_node import BusNode
 from tests.drivers.driving_host import driving_host
+from tests.drivers.streamed_device import read
 from tests.drivers.test_can_frames import own_database
 from tests.drivers.wires import device_at
 from tests.hil_sim.integrator import IntegratorPlant, expected_outputs, seed_rig
@@ -48,10 +49,6 @@ def host(endpoint: str, **times: float) -> CanStreamDriver:
     driver = make_driver(wire_at(endpoint, rig.wire), rig)
     assert isinstance(driver, CanStreamDriver)
     return driver
-
-
-def read(driver: CanStreamDriver, blocks: int) -> np.ndarray:
-    return np.vstack([driver.read_block().data for _ in range(blocks)])
 
 
 @pytest.fixture(scope="module", params=["can", "can-slcan"])

@@ -43,8 +43,3 @@ def bench(
         docs.write_text(page(figures), encoding="utf-8")
     if json != Path("-"):
         typer.echo(text(figures))
-
-
-def register(app: typer.Typer) -> None:
-    """Add this verb to the command line."""
-    app.command()(bench)

@@ -20,13 +20,14 @@ import numpy as np
 import serial
 from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 
-from drivers import make_driver, wire_at
+from drivers import make_driver
 from drivers.base import Driver
 from drivers.serial_stream import SerialSettings
 from hil_sim.device.server import RTU, SERIAL, TCP, VALVES, WIRES
 from rig.bench.session import Bench
 from rig.cli.bench.acquisition import lateness, waited_seconds
 from rig.cli.bench.figure import Figure
+from rig.cli.device import reached_at
 from rig.cli.simulated_bench import simulated_bench
 from rig.model.parts import WATCHDOG_RANGE, Wire
 from rig.model.rig import Rig
@@ -91,7 +92,7 @@ def stream_of(wire: str, seconds: float) -> Stream:
     ):
         # A computer that stands still makes blocks late, which is measured; it must end nothing.
         patient = rig.wire.model_copy(update={"watchdog": WATCHDOG_RANGE[1]})
-        reached = _at(rig.model_copy(update={"wire": patient}), endpoint)
+        reached = reached_at(rig.model_copy(update={"wire": patient}), endpoint)
         recorder = Recorder(Path(folder) / "run", reached)
         with Bench(reached, make_driver(reached.wire, reached), recorder, signals=False) as bench:
             bench.run_for(0.5)  # what is imported and opened first is not the stream
@@ -138,17 +139,13 @@ def driver_and_bare(wire: str) -> tuple[float, float]:
     rig = load_rig(RIG)
     ours, bare = [], []
     with simulated_bench(RIG, seed=0, wire=wire) as endpoint:
-        reached = _at(rig, endpoint)
+        reached = reached_at(rig, endpoint)
         for _ in range(ROUNDS):
             with _streaming(reached) as driver:
                 ours.append(_time_of(driver.read_block))
             with _BARE[wire](reached) as ask:
                 bare.append(_time_of(ask))
     return min(ours), min(bare)
-
-
-def _at(rig: Rig, endpoint: str) -> Rig:
-    return rig.model_copy(update={"wire": wire_at(endpoint, rig.wire)})
 
 
 def _time_of(ask: Callable[[], object]) -> float:

@@ -17,7 +17,7 @@ from typing import Any, Final
 import h5py
 import numpy as np
 
-from drivers import make_driver, wire_at
+from drivers import make_driver
 from drivers.base import DeviceError, DeviceLost, OutputLaw, SampleBlock
 from hil_sim.device.server import CAN, SLCAN, TCP
 from hil_sim.faults import CLASSES
@@ -29,6 +29,7 @@ from rig.bench.guard import EXCITED, JointRole
 from rig.bench.latch import BenchState
 from rig.bench.session import Bench
 from rig.cli.bench.faults.bench import SILENCE, FaultBench
+from rig.cli.device import reached_at
 from rig.model import channels as ch
 from rig.model.alarms.states import Alarm
 from rig.model.rig import Rig
@@ -158,7 +159,7 @@ def try_fault(
     fault = example(name, REAL_BEGIN if realtime else BEGIN, wire)
     early = () if isinstance(fault, WireFault) else (fault,)
     endpoint = bench.begin(rig, wire, early, seed, realtime=realtime)
-    reached = rig.model_copy(update={"wire": wire_at(endpoint, rig.wire)})
+    reached = reached_at(rig, endpoint)
     outcome, warned = TrialOutcome(name, wire), _Warnings()
     logging.getLogger().addHandler(warned)
     try:
@@ -171,7 +172,7 @@ def try_fault(
                     raise
                 rig = _more_patient(rig)
                 endpoint = bench.begin(rig, wire, early, seed, realtime=realtime)
-                reached = rig.model_copy(update={"wire": wire_at(endpoint, rig.wire)})
+                reached = reached_at(rig, endpoint)
     finally:
         logging.getLogger().removeHandler(warned)
         outcome.warned = warned.lines

@@ -24,13 +24,14 @@ from typing import Any, Final, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers import make_driver, wire_at
+from drivers import make_driver
 from drivers.base import OFF, Driver, OutputLaw, SampleBlock
 from rig.bench.guard import FREE
 from rig.bench.latch import BenchState
 from rig.bench.screens.sockets import Publisher
 from rig.bench.session import Bench
 from rig.cli.bench.screen.terminal import SESSIONS
+from rig.cli.device import reached_at
 from rig.cli.errors import WorkError
 from rig.runs.recorder import Recorder
 from rig.runs.rigs import load_rig
@@ -119,7 +120,7 @@ def play(place: RunPlace, pipe: Connection, *, driven: bool) -> None:
     once it is in command, and at the end the RunTimes.
     """
     rig = load_rig(RIG)
-    rig = rig.model_copy(update={"wire": wire_at(place.endpoint, rig.wire)})
+    rig = reached_at(rig, place.endpoint)
     driver = StampedDriver(make_driver(rig.wire, rig), len(rig.channels), rig.sample_rate)
     publisher = Publisher(rig.name, place.runtime / SESSIONS)
     state = BenchState(rig.wire, place.runtime)

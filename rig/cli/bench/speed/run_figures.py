@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 from pymodbus.client import ModbusTcpClient
 
-from drivers import make_driver, wire_at
+from drivers import make_driver
 from drivers.base import SampleBlock
 from drivers.modbus_frames import READ_HOLDING, WRITE_AND_READ, WRITE_MANY, WRITE_ONE
 from drivers.modbus_tcp import ModbusTcpDriver, TcpSettings
@@ -32,6 +32,7 @@ from rig.bench.screens.sockets import Publisher
 from rig.bench.session import Bench
 from rig.cli.bench.figure import Figure
 from rig.cli.bench.wire_figures import bare_modbus
+from rig.cli.device import reached_at
 from rig.cli.simulated_bench import simulated_bench
 from rig.model.parts import Wire
 from rig.model.rig import Rig
@@ -131,10 +132,6 @@ def _figures(kind: str, pairs: list[tuple[_Cost, _Cost]], limit: float) -> list[
     return figures
 
 
-def _at(rig: Rig, endpoint: str) -> Rig:
-    return rig.model_copy(update={"wire": wire_at(endpoint, rig.wire)})
-
-
 def _cost(work: Callable[[], int]) -> tuple[_Cost, int]:
     """Return what a block costs in work that returns how many it moved, and that number."""
     began, busy = time.perf_counter(), time.process_time()
@@ -165,7 +162,7 @@ def _protocol_run(rig: Rig, folder: Path) -> tuple[_Cost, _Conversation]:
     """Run one step with guard, journal and a publisher, as `bramah run` does."""
     plan = resolve(library.load(PROTOCOL), rig, Overrides(repeats=1, steps=(STEP,)))
     with simulated_bench(RIG, seed=0) as endpoint:
-        reached = _at(rig, endpoint)
+        reached = reached_at(rig, endpoint)
         machine = StateMachine()
         driver, requests = _recorded(reached)
         machine.to(EngineState.CHECKING, PROTOCOL)
@@ -186,7 +183,7 @@ def _protocol_run(rig: Rig, folder: Path) -> tuple[_Cost, _Conversation]:
 def _repeated(rig: Rig, conversation: _Conversation) -> _Cost:
     """Ask the same with pymodbus and nothing else."""
     with simulated_bench(RIG, seed=0) as endpoint:
-        at = TcpSettings.of(_at(rig, endpoint).wire)
+        at = TcpSettings.of(reached_at(rig, endpoint).wire)
         client: Any = ModbusTcpClient(at.host, port=at.port, timeout=2.0)
         client.connect()
         asked = [
@@ -231,7 +228,7 @@ def _asked(client: Any, request: bytes) -> Callable[[], object]:
 def _streamed(rig: Rig, folder: Path, count: int) -> _Cost:
     """Take blocks in real time with guard, journal and a publisher."""
     with simulated_bench(RIG, seed=0, real_time=True) as endpoint:
-        reached = _at(rig, endpoint)
+        reached = reached_at(rig, endpoint)
         recorder, publisher = Recorder(folder, reached), Publisher(f"bench-{rig.name}")
         driver = make_driver(reached.wire, reached)
         # A busy computer is late, and then to be measured: nothing moves, so nothing need trip.
@@ -251,7 +248,7 @@ def _bare(rig: Rig, blocks: int) -> _Cost:
     """Take blocks in real time with pymodbus and nothing else, each when it is due."""
     with (
         simulated_bench(RIG, seed=0, real_time=True) as endpoint,
-        bare_modbus(_at(rig, endpoint)) as ask,
+        bare_modbus(reached_at(rig, endpoint)) as ask,
     ):
         ask()
 
