@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +54,21 @@ class Shape:
     def middle(self) -> float:
         """The middle point of first look."""
         return self.grid[len(self.grid) // 2]
+
+
+BETWEEN_SAMPLES: Final = 0.2  # of a sample that a held command may bend the spool's path
+
+
+def between_samples(rig: Rig, seconds: float) -> str:
+    """Say that a spool's delay is less than its path between two samples may be bent ('' if not).
+
+    A first-order spool of time constant tau under a held command seems off by dt^2 / (12 tau).
+    """
+    if seconds * rig.sample_rate >= BETWEEN_SAMPLES:
+        return ""
+    return (
+        f"{1e6 * seconds:.3g} us is what a held command may bend the spool's path between samples"
+    )
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from analysis.effects.base import NO_KERNEL, SENSOR, Array, Effect, Shape
+from analysis.effects.base import NO_KERNEL, SENSOR, Array, Effect, Shape, between_samples
 from analysis.signals.conditioning import Signals
 from analysis.signals.filters import align
 from analysis.terms.base import Coefficient, Columns, Kernel, Used, equation
@@ -189,6 +189,12 @@ class Late(Sensor):
         """Return every channel, then all pressures, and all pistons or spools of several joints."""
         kinds = ("pressure", "piston", "spool") if len(rig.joints) > 1 else ("pressure",)
         return (*super().all_places(rig), *(f"bench {kind}" for kind in kinds))
+
+    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
+        """Refuse a shape at its bounds, and a spool later than its path between samples bends."""
+        spool = "spool" in (self.side, self.shared)
+        bent = between_samples(rig, self.shape_of(rig, shape)[0]) if spool else ""
+        return super().problem(rig, values, shape) or bent
 
     def _shown(self, x: Array) -> Array:
         return np.gradient(x[:, self.joint])

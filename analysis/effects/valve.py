@@ -14,7 +14,7 @@ from typing import ClassVar, Final
 import numpy as np
 from numba import njit
 
-from analysis.effects.base import EDGES, LAG, NULL, Array, Effect, Shape
+from analysis.effects.base import EDGES, LAG, NULL, Array, Effect, Shape, between_samples
 from analysis.effects.edges import corner, edge, opened, rounding
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import (
@@ -213,6 +213,12 @@ class SpoolLag(ValveEffect):
         """Return the opening (n, 1) [V]."""
         u = np.ascontiguousarray(signals.u[:, self.joint])
         return lagged(u, self.shape_of(rig, shape)[0] * signals.rate)[:, None]
+
+    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
+        """Refuse a shape at its bounds, and a lag that a path between samples makes as well."""
+        return super().problem(rig, values, shape) or between_samples(
+            rig, self.shape_of(rig, shape)[0]
+        )
 
     def fastest(self, shape: Sequence[float]) -> float:
         """Return 1 / tau, as simulated."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from analysis.effects.base import Effect, ordered
 from analysis.identify import checks as ck
-from analysis.identify.estimators.nuisance import BulkTemperature
+from analysis.identify.estimators.nuisance import BulkTemperature, SpoolPath
 from analysis.identify.identify import identify
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.simulation.model import Model
@@ -24,6 +24,7 @@ from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.noise_floor import NEIGHBOURS, PERIODS, REPEATS, STATED
 from analysis.trace.data.regression_data import RegressionData, regression_data
 from analysis.trace.data.spectral_lines import lines
+from analysis.trace.data.spool_path import path_terms
 from analysis.trace.data.temperature_nuisance import stripped, temperature_terms
 from analysis.trace.free_forms import drawn_by_data, mechanisms
 from analysis.trace.judge import gates, held_out, readings
@@ -49,8 +50,8 @@ from rig.model.records import Record, Run
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
-# The other estimators add small faults of sensors of their own accord: here they are candidates.
-PLAIN = "plain"
+# Others replace the columns where noise in them matters: the trace compares least squares alone.
+ESTIMATOR = "ls"
 # Shares of a trace's time behind it, as measured on six records: reported as progress.
 PREPARED, COLUMNS, JUDGED = 0.1, 0.55, 0.8
 ELSEWHERE = (
@@ -91,12 +92,16 @@ def trace(
     judged = conditioned_records(rig, holdout, families=tuple(families))
     train_data = regression_data(rig, terms, train)
     _refuse_short(train_data, train)
+    paths = path_terms(train_data)
+    if paths:
+        terms = (*terms, *paths)
+        train_data = regression_data(rig, terms, train)
     holdout_data = regression_data(rig, terms, judged, train_data.beta)
     moving = len({s.equation.rsplit("_", 1)[1] for s in train_data.segments})
     candidates = _unknown(catalogue(rig) if effects is None else effects, known, moving)
     done = progress or _nobody
     hypotheses = HypothesisSet(train_data, candidates)
-    before = stripped(identify(runs, terms=terms, estimator=PLAIN).model)
+    before = _identified(runs, terms)
     notes = _notes(train_data, holdout_data)
     quiet = within(hypotheses.empty.excess_energy, hypotheses.limits)
     if quiet and not gates.remaining(hypotheses, hypotheses.empty, holdout_data):
@@ -369,6 +374,11 @@ def _extended(
     """Identify everything again together with the effects, their shapes' errors included."""
     if not winner.effects:
         return before
-    plain = [u for u in terms if not isinstance(u.term, BulkTemperature)]
-    model = identify(runs, terms=ordered((*plain, *winner.effects)), estimator="ls").model
-    return stripped(widened(train_data, winner.fit, model))
+    return stripped(widened(train_data, winner.fit, _identified(runs, (*terms, *winner.effects))))
+
+
+def _identified(runs: Sequence[Run], terms: Sequence[Used]) -> Model:
+    """Identify a model's parameters; what acts beside it is fitted by the estimator itself."""
+    beside = (BulkTemperature, SpoolPath)
+    own = [u for u in terms if not isinstance(u.term, beside)]
+    return identify(runs, terms=ordered(own), estimator=ESTIMATOR).model

@@ -165,9 +165,14 @@ class SearchSettings:
     form_share: float = 0.02
     """Of the energy before: what the catalogue's form of an effect may miss of the real (tuned)."""
     add_share: float = 0.3
-    """Of what is left in the equations an effect touches: less does not earn a place (tuned)."""
+    """Of what is left in the equations an effect acts on: less does not earn a place (tuned)."""
     simpler_ratio: float = 1.25
-    """What a simpler candidate may leave over the best, before noise counts (tuned)."""
+    """What a simpler candidate may leave over the best, as a product over equations (tuned)."""
+    touched: float = 0.05
+    """Of the largest change that an effect makes to any equation: with less it does not act there
+    (tuned)."""
+    least_growth: float = 0.1
+    """Sum over equations of log ratios of what is left: with less nothing was gained (tuned)."""
     number_price: float = 20.0
     """Energy that each further free number must take: ten times what noise gives it (tuned)."""
     visible: float = 0.03

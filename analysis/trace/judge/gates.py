@@ -26,7 +26,7 @@ from analysis.trace.judge.scatter import form_shift
 from analysis.trace.result import Gate, JudgedEffect, Rival
 from analysis.trace.search.hypothesis import Hypothesis, excess_of, parameter_values
 from analysis.trace.search.hypothesis_set import HypothesisSet
-from analysis.trace.settings import TRACE
+from analysis.trace.settings import SEARCH, TRACE
 
 Array = NDArray[np.float64]
 Key = tuple[str, str]
@@ -123,7 +123,10 @@ def _without(hypotheses: HypothesisSet, winner: Hypothesis, used: Used) -> Hypot
     """
     kept = [u for u in winner.effects if u is not used and not related(u.term, used.term)]  # type: ignore[arg-type]
     rest = hypotheses.exact(kept)
-    if not hypotheses.physical(rest):
+    rig = hypotheses.train_data.rig
+    # A shape at its bound is a matter of form.
+    at_bound = any(u.term.outside(rig, u.shape) for u in rest.effects)  # type: ignore[attr-defined]
+    if at_bound or not hypotheses.physical(rest):
         return rest
     simpler = [
         o
@@ -211,7 +214,7 @@ def _touched(hypotheses: HypothesisSet, winner: Hypothesis, rest: Hypothesis) ->
     """Return the equations in which an effect changes the training residual visibly."""
     change = {e: rest.excess_energy[e] - winner.excess_energy[e] for e in rest.excess_energy}
     most = max(change.values())
-    return {e for e, v in change.items() if v > 0.05 * most}
+    return {e for e, v in change.items() if v > SEARCH.touched * most}
 
 
 def _worse(hypotheses: HypothesisSet, winner: Hypothesis, rest: Hypothesis) -> list[str]:

@@ -118,13 +118,26 @@ class HypothesisSet:
         changed = frozenset(effects) != hypothesis.keys
         return self.exact(tuple(effects.values())) if changed else None
 
+    def excess(self, hypothesis: Hypothesis, other: Hypothesis) -> float:
+        """Return how much more one set leaves than another: the sum of log ratios over equations.
+
+        What the form of a loud effect leaves in its own equations must not hide a quiet one in
+        others, so that ratios count; what lies within the noise's band counts as nothing.
+        """
+        return sum(
+            float(np.log((max(0.0, v) + band) / (max(0.0, other.excess_energy[e]) + band)))
+            for e, v in hypothesis.excess_energy.items()
+            for band in (self.limits.band[e],)
+        )
+
     def better(self, hypothesis: Hypothesis, other: Hypothesis) -> bool:
         """Return whether `one` is to be preferred: much less left, or as little and simpler."""
         slack = SEARCH.number_price * max(1, abs(hypothesis.size[1] - other.size[1]))
+        more, near = self.excess(hypothesis, other), float(np.log(SEARCH.simpler_ratio))
         if hypothesis.size < other.size:
-            return hypothesis.total <= max(SEARCH.simpler_ratio * other.total, other.total + slack)
+            return more <= near or hypothesis.total <= other.total + slack
         if hypothesis.size > other.size:
-            return hypothesis.total < min(other.total / SEARCH.simpler_ratio, other.total - slack)
+            return more < -near and hypothesis.total < other.total - slack
         return hypothesis.total < other.total
 
     def best(self, among: Sequence[Hypothesis]) -> Hypothesis:
@@ -157,7 +170,7 @@ class HypothesisSet:
         now = self.prune(self.best([self.empty, *singles, *pairs]))
         while not within(now.excess_energy, self.limits) and len(now.effects) < SEARCH.largest_set:
             grown = self.prune(self.best([now, *self.extensions(now)]))
-            if grown.keys == now.keys or grown.total > 0.9 * now.total:
+            if grown.keys == now.keys or self.excess(now, grown) < SEARCH.least_growth:
                 break
             now = grown
             if self.formed(now):
@@ -275,9 +288,11 @@ class HypothesisSet:
             return sum(hypothesis.excess_energy[e] for e in equations)
 
         def earned(hypothesis: Hypothesis) -> bool:
-            drop, start = residual(now) - residual(hypothesis), max(0.0, residual(now))
+            drop = {e: now.excess_energy[e] - hypothesis.excess_energy[e] for e in equations}
+            here = [e for e, v in drop.items() if v >= SEARCH.touched * max(drop.values())]
+            start = sum(max(0.0, now.excess_energy[e]) for e in here)
             least = SEARCH.number_price * (hypothesis.size[1] - now.size[1])
-            return drop > max(least, SEARCH.add_share * start)
+            return sum(drop[e] for e in here) > max(least, SEARCH.add_share * start)
 
         more = [o for o in self.extensions(now, equations) if earned(o) and not self.physical(o)]
         if not more:
@@ -303,8 +318,7 @@ class HypothesisSet:
 
     def idle(self, without: Hypothesis, hypothesis: Hypothesis) -> bool:
         """Return whether the effect that `without` lacks takes too small a share away."""
-        drop = without.total - hypothesis.total
-        return drop < SEARCH.add_share * without.total
+        return self.excess(without, hypothesis) < -float(np.log(1.0 - SEARCH.add_share))
 
 
 def effect_of(name: str, where: str) -> Effect:

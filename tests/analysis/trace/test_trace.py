@@ -221,7 +221,7 @@ def test_runs_of_different_rigs_are_refused(quiet: tuple[Run, Run]) -> None:
 
 
 def test_the_baseline_before_is_what_identify_finds(leaking: Trace, rig: Rig) -> None:
-    alone = identify([experiment(rig, c_internal=2e-12)], estimator="plain").model
+    alone = identify([experiment(rig, c_internal=2e-12)], estimator="ls").model
     assert leaking.model_before.values == pytest.approx(alone.values, nan_ok=True)
 
 

@@ -1,0 +1,40 @@
+"""How a held command bends the spool's path between samples: known physics, nothing to name.
+
+The rows take the spool for linear between its samples. Under a held command a first-order spool of
+time constant tau runs along an exponential there, which in the flows acts as a lead of dt^2/(12
+tau): one column a joint, C T du/dt sqrt(dp) (`analysis.identify.estimators.nuisance.SpoolPath`).
+Without it a quick spool passes for a late sensor of some tens of microseconds.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from analysis.effects.base import BETWEEN_SAMPLES
+from analysis.identify.estimators.nuisance import BETWEEN, SpoolPath
+from analysis.terms.base import Used
+from analysis.trace.data.conditioned_record import model_rows
+from analysis.trace.data.regression_data import RegressionData, least_squares
+
+
+def path_terms(data: RegressionData) -> tuple[Used, ...]:
+    """Return the paths that belong beside the data's own terms: those of joints that move.
+
+    Not one whose lead is more than `BETWEEN_SAMPLES` of a sample: something else is late there.
+    """
+    gains = tuple(
+        (name, float(value))
+        for name, value in data.beta.items()
+        if name.startswith("C_") and name.count("_") == 2 and np.isfinite(value)
+    )
+    joints = sorted({int(s.equation[-1]) - 1 for s in data.segments if "flow" in s.equation})
+    paths = [Used(SpoolPath(gains=gains, joint=i)) for i in joints] if gains else []
+    if not paths or any(isinstance(u.term, SpoolPath) for u in data.terms):
+        return ()
+    rows = [model_rows(data.rig, (*data.terms, *paths), record) for record in data.records]
+    lead = least_squares(data.rig, rows)
+    return tuple(
+        used
+        for used, i in zip(paths, joints, strict=True)
+        if abs(lead.get(f"{BETWEEN}{i + 1}", np.inf)) <= BETWEEN_SAMPLES
+    )
