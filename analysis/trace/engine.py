@@ -23,6 +23,7 @@ from analysis.trace.data.candidates import catalogue, free_mechanisms
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.noise_floor import NEIGHBOURS, PERIODS, REPEATS, STATED
 from analysis.trace.data.regression_data import RegressionData, regression_data
+from analysis.trace.data.set_aside import Unseen, set_aside
 from analysis.trace.data.spectral_lines import lines
 from analysis.trace.data.spool_path import path_terms
 from analysis.trace.data.temperature_nuisance import stripped, temperature_terms
@@ -46,6 +47,7 @@ from analysis.trace.settings import TRACE
 from analysis.trace.words import sentence
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
+from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
@@ -70,8 +72,13 @@ def trace(
     terms: Sequence[Used] | None = None,
     free_forms: bool = True,
     progress: Callable[[float], None] | None = None,
+    judge: Sequence[Run] = (),
 ) -> Trace:
-    """Say what the baseline lacks on `runs`, name it or refuse to, and judge it on `holdout`.
+    """Say what the baseline lacks on `runs`, name it or refuse to, and judge it by other records.
+
+    Records of `holdout` choose between effects and forms. Those of `judge` are read once, when all
+    is settled: they give the errors, and may refuse an explanation. Without them a third of the
+    held-out rows is set aside for that (`data.set_aside`).
 
     `effects` are the candidates, by default the whole catalogue at every place. `seed` draws the
     half-samples and sign flips; `families` are the equations looked at, mechanical or fluid (they
@@ -79,30 +86,26 @@ def trace(
     designs the next experiment; `terms` take the baseline's place: a model's with its effects,
     whose shapes stay as they are; with `free_forms` a mechanism whose curve the data draw may
     explain what no named effect does; `progress` receives the share of the work done. Raises
-    InputError for records of different rigs, without held-out records, with held-out ones that
-    are training records, or too short to judge by.
+    InputError for records of different rigs, without held-out records, with held-out or judging
+    ones that have been seen before, or too short to judge by.
     """
     started = time.perf_counter()
-    rig = ck.common_rig([*runs, *holdout])
-    _refuse_same(runs, holdout)
+    rig = ck.common_rig([*runs, *holdout, *judge])
+    _refuse_same(runs, holdout, judge)
     rng = np.random.default_rng(seed)
     known = tuple(map(Used, baseline_of(rig))) if terms is None else tuple(terms)
-    terms = ordered((*known, *temperature_terms(known, runs, holdout)))
+    terms = ordered((*known, *temperature_terms(known, runs, [*holdout, *judge])))
     train = conditioned_records(rig, runs, families=tuple(families))
-    judged = conditioned_records(rig, holdout, families=tuple(families))
-    train_data = regression_data(rig, terms, train)
-    _refuse_short(train_data, train)
-    paths = path_terms(train_data)
-    if paths:
-        terms = (*terms, *paths)
-        train_data = regression_data(rig, terms, train)
-    holdout_data = regression_data(rig, terms, judged, train_data.beta)
+    train_data = _laid_out(rig, terms, train)
+    terms = train_data.terms
+    unseen = _unseen(train_data, holdout, judge, tuple(families))
+    holdout_data = unseen.choosing
     moving = len({s.equation.rsplit("_", 1)[1] for s in train_data.segments})
     candidates = _unknown(catalogue(rig) if effects is None else effects, known, moving)
     done = progress or _nobody
     hypotheses = HypothesisSet(train_data, candidates)
     before = _identified(runs, terms)
-    notes = _notes(train_data, holdout_data)
+    notes = [*unseen.notes, *_notes(train_data, holdout_data)]
     quiet = within(hypotheses.empty.excess_energy, hypotheses.limits)
     if quiet and not gates.remaining(hypotheses, hypotheses.empty, holdout_data):
         judged_effects: tuple[JudgedEffect, ...] = ()
@@ -114,11 +117,8 @@ def trace(
         hypotheses, judged_all, winner, verdict, rest = _settled(
             hypotheses, winner, free, holdout_data, rng
         )
-        refused = tuple(
-            sorted(
-                (f for f in judged_all if not gates.stands(f)), key=lambda f: -f.removed_fraction
-            )
-        )
+        most = sorted(judged_all, key=lambda f: -f.removed_fraction)
+        refused = tuple(f for f in most if not gates.stands(f))
         judged_effects = tuple(f for f in judged_all if gates.stands(f))
         notes += _rest_notes(verdict, rest, quiet, bool(judged_effects))
     done(JUDGED)
@@ -130,19 +130,21 @@ def trace(
     )
     further = propose(hypotheses, winner, judged_effects, verdict, moves) if look_ahead else None
     after = _extended(runs, terms, winner, before, train_data)
-    again = reshaped(runs, holdout, after, train_data, holdout_data, winner)
+    again = reshaped(runs, unseen.choosing_runs, after, train_data, holdout_data, winner)
     if again.winner is not winner:
         winner = again.winner
         after = _extended(runs, terms, winner, before, train_data)
         split = lines(train_data, winner.fit.residual)
     judged_effects = tuple(with_shots(f, again.shots) for f in judged_effects)
+    # All is settled: from here on the judging rows are read, and nothing is chosen.
     first, last = (
-        held_out.settled(holdout_data, hypotheses.empty.fit),
-        held_out.settled(holdout_data, winner.fit),
+        held_out.settled(unseen.judging, hypotheses.empty.fit),
+        held_out.settled(unseen.judging, winner.fit),
     )
-    error = held_out.errors(rig, judged, first, last)
-    notes += _missed_held(verdict, error, notes)
-    runs_before, runs_after = held_out.free_runs(holdout, before, after)
+    error = held_out.errors(rig, unseen.members, first, last, unseen.divided)
+    verdict, kept = _judged(verdict, unseen.judging, hypotheses.empty, winner)
+    notes += kept or _missed_held(verdict, error, notes)
+    runs_before, runs_after = held_out.free_runs([*holdout, *judge], before, after)
     result = Trace(
         verdict, judged_effects, error.noise, error.before, error.after,
         runs_before.fit, runs_after.fit, before, after,
@@ -157,25 +159,40 @@ def trace(
     return replace(result, sentence=sentence(result))
 
 
+def _laid_out(
+    rig: Rig, terms: tuple[Used, ...], train: Sequence[ConditionedRecord]
+) -> RegressionData:
+    """Lay out the training records, spools' paths between samples beside the terms."""
+    data = regression_data(rig, terms, train)
+    _refuse_short(data, train)
+    paths = path_terms(data)
+    return regression_data(rig, (*terms, *paths), train) if paths else data
+
+
 def _nobody(_: float) -> None:
     """Hear nothing."""
 
 
-def _refuse_same(runs: Sequence[Run], holdout: Sequence[Run]) -> None:
+def _refuse_same(runs: Sequence[Run], holdout: Sequence[Run], judge: Sequence[Run] = ()) -> None:
     if not holdout or not any(run.records for run in holdout):
         raise InputError(
             "no held-out records: give --holdout a run that the fit does not see, of another "
             "excitation (other wave or amplitude)"
         )
-    seen = {_digest(record): record.name for run in runs for record in run.records}
-    for run in holdout:
-        for record in run.records:
-            if _digest(record) in seen:
+    if judge and not any(run.records for run in judge):
+        raise InputError("no judging records: the runs of --judge are empty")
+    seen: dict[str, str] = {}
+    for kind, option, given in (
+        ("training", "", runs), ("held-out", "--holdout", holdout), ("judging", "--judge", judge),
+    ):  # fmt: skip
+        digests = [(_digest(record), record.name) for run in given for record in run.records]
+        for digest, name in digests if option else ():
+            if digest in seen:
                 raise InputError(
-                    f"held-out record {record.name!r} is training record "
-                    f"{seen[_digest(record)]!r}, sample for sample; what the fit has seen cannot "
-                    "judge it: give --holdout other records"
+                    f"{kind} record {name!r} is {seen[digest]}, sample for sample; what has been "
+                    f"seen cannot judge: give {option} other records"
                 )
+        seen |= {digest: f"{kind} record {name!r}" for digest, name in digests}
 
 
 def _digest(record: Record) -> str:
@@ -185,6 +202,33 @@ def _digest(record: Record) -> str:
         digest.update(name.encode())
         digest.update(np.ascontiguousarray(record.channels[name], dtype=np.float64).tobytes())
     return digest.hexdigest()
+
+
+def _unseen(
+    train_data: RegressionData,
+    holdout: Sequence[Run],
+    judge: Sequence[Run],
+    families: tuple[str, ...],
+) -> Unseen:
+    """Lay out what the fit does not see: what chooses, and what judges when all is settled."""
+    rig, terms, beta = train_data.rig, train_data.terms, train_data.beta
+    members = conditioned_records(rig, holdout, families=families)
+    data = regression_data(rig, terms, members, beta)
+    if not judge:
+        return set_aside(data, members, holdout)
+    members = conditioned_records(rig, judge, families=families)
+    return Unseen(data, regression_data(rig, terms, members, beta), tuple(members), tuple(holdout))
+
+
+def _judged(
+    verdict: str, judge_data: RegressionData, before: Hypothesis, after: Hypothesis
+) -> tuple[str, list[str]]:
+    """Return the verdict of the rows that judge, and what they keep if it is another."""
+    if verdict == UNEXPLAINED:
+        return verdict, []
+    kept = gates.remaining_held_out(judge_data, before.fit, after.fit)
+    words = [f"{e}: {figure} in the records that judge" for e, figure in kept]
+    return (UNEXPLAINED if kept else verdict), words
 
 
 def _refuse_short(train_data: RegressionData, train: Sequence[ConditionedRecord]) -> None:

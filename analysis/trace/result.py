@@ -170,7 +170,7 @@ class FreeCurves:
 
 @dataclass(frozen=True)
 class Trace:
-    """The whole result; every error, fit and rmse is of the held-out records, SI and percent.
+    """The whole result, SI and percent: errors are of the rows that judge, fits of whole records.
 
     `fit` and `rmse` are of free runs, `window` of 0.25 s windows restarted from the data.
 

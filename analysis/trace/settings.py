@@ -109,6 +109,9 @@ class TraceSettings:
 class DataSettings:
     """What the records are weighed by, and which columns are offered."""
 
+    judge_block: float = 1.0
+    """[s] of a held-out record: every third such block judges only (arithmetic: ten times the row
+    filter's memory, and a short record still has several)."""
     least_noise: float = 0.2
     """Of the noise that the rig file states: a floor measured lower is chance (tuned)."""
     # Noise by neighbouring states.

@@ -19,7 +19,13 @@ def trace(
     runs: Annotated[list[Path], typer.Argument(help="Run folders that the fit may see.")],
     holdout: Annotated[
         list[Path] | None,
-        typer.Option("--holdout", help="A run folder that only judges; repeatable."),
+        typer.Option("--holdout", help="A run folder that the fit does not see; repeatable."),
+    ] = None,
+    judge: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--judge", help="A run folder read once, at the end: it only judges; repeatable."
+        ),
     ] = None,
     json: JsonOption = None,
     model: Annotated[
@@ -56,19 +62,22 @@ def trace(
         )
     if equations not in FAMILIES_OF:
         raise InputError(f"--equations {equations}: expected one of: {' '.join(FAMILIES_OF)}")
-    every = load_runs([*runs, *holdout])
-    loaded, judged = every[: len(runs)], every[len(runs) :]
+    every = load_runs([*runs, *holdout, *(judge or ())])
+    loaded, unseen = every[: len(runs)], every[len(runs) :]
+    chosen_by, judged_by = unseen[: len(holdout)], unseen[len(holdout) :]
     progress(f"tracing {sum(len(r.records) for r in loaded)} records")
-    rigs = {run.source: run.rig for run in (*loaded, *judged)}
+    rigs = {run.source: run.rig for run in every}
     known = None if like is None else terms_like(like, rigs)
-    result = trace_runs(loaded, judged, seed=seed, families=FAMILIES_OF[equations], terms=known,
-                        progress=Countdown("tracing"))  # fmt: skip
+    result = trace_runs(
+        loaded, chosen_by, seed=seed, families=FAMILIES_OF[equations], terms=known,
+        progress=Countdown("tracing"), judge=judged_by,
+    )  # fmt: skip
     write_json(json, to_json(result))
     if model is not None:
         save_identified(result.model_after, model, progress)
     if report is not None:
         from rig.cli.reports import write_trace
 
-        write_trace(report, judged, result)
+        write_trace(report, unseen, result)
     if json != Path("-"):
         typer.echo(trace_text(result))

@@ -78,6 +78,23 @@ class RegressionData:
             weights[segment.where] = np.sqrt(segment.repeats)
         return np.asarray(np.nanmean(self.residual, axis=0) * weights)
 
+    def at(self, mask: NDArray[np.bool_]) -> RegressionData:
+        """Return the data with only the rows of a mask (M,), weighed by the floors of all."""
+        index = {conditioned.group: k for k, conditioned in enumerate(self.records)}
+        rows: tuple[dict[str, Rows], ...] = tuple({} for _ in self.records)
+        segments, start = [], 0
+        for s in self.segments:
+            kept, k = mask[s.where], index[s.group]
+            if kept.any():
+                whole = self.rows[k][s.equation]
+                rows[k][s.equation] = _at(whole, whole.time[kept])
+                segments.append(replace(s, where=slice(start, start + int(kept.sum()))))
+                start = segments[-1].where.stop
+        return replace(
+            self, base=self.base[mask], residual=self.residual[:, mask],
+            segments=tuple(segments), rows=rows, memory=RowMemory(),
+        )  # fmt: skip
+
 
 def averaged(rig: Rig, members: Sequence[ConditionedRecord]) -> list[ConditionedRecord]:
     """Return one scene per group: the repeats' channels averaged, filtered as they were."""

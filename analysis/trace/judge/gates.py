@@ -26,6 +26,7 @@ from analysis.trace.judge.scatter import form_shift
 from analysis.trace.result import Gate, JudgedEffect, Rival
 from analysis.trace.search.hypothesis import Hypothesis, excess_of, parameter_values
 from analysis.trace.search.hypothesis_set import HypothesisSet
+from analysis.trace.search.refinement import ExactFit
 from analysis.trace.settings import SEARCH, TRACE
 
 Array = NDArray[np.float64]
@@ -145,10 +146,6 @@ def remaining(
     What a catalogue's simpler form misses of an effect is a share of what was there before, however
     well it is measured.
     """
-    after = held_left(holdout_data, winner.fit)
-    start = excess_of(holdout_data, held_left(holdout_data, hypotheses.empty.fit))
-    now = excess_of(holdout_data, after)
-    ratio = _held_ratio(holdout_data, after)
     out = []
     for e, residual in winner.excess_energy.items():
         share = residual / max(hypotheses.empty.excess_energy[e], 1e-30)
@@ -157,12 +154,21 @@ def remaining(
             stays = f"{100 * share:.2g} % of what repeated stays"
             words = stays if share <= 1.0 else "more repeats than before"
             out.append((e, f"{words}, {times:.2g} times the band"))
-    out += [
+    return out + remaining_held_out(holdout_data, hypotheses.empty.fit, winner.fit)
+
+
+def remaining_held_out(
+    holdout_data: RegressionData, before: ExactFit, after: ExactFit
+) -> list[tuple[str, str]]:
+    """Return the equations that keep more than the band in these held-out rows, and how much."""
+    left = held_left(holdout_data, after)
+    start = excess_of(holdout_data, held_left(holdout_data, before))
+    now = excess_of(holdout_data, left)
+    return [
         (e, f"held-out error {r:.2f} times the noise floor")
-        for e, r in ratio.items()
+        for e, r in _held_ratio(holdout_data, left).items()
         if r > TRACE.held_out_band and now[e] > TRACE.held_out_share * start[e]
     ]
-    return out
 
 
 def _rms(data: RegressionData, residual: Array, equations: Collection[str]) -> float:

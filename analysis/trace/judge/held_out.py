@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,8 +15,9 @@ from analysis.regression.rows import Rows
 from analysis.simulation.model import Model
 from analysis.simulation.validate import RecordValidation, validate
 from analysis.trace.data.conditioned_record import model_rows, row_residual
-from analysis.trace.data.noise_floor import floors
+from analysis.trace.data.noise_floor import Group, floors
 from analysis.trace.data.regression_data import RegressionData
+from analysis.trace.data.set_aside import judging_rows
 from analysis.trace.data.temperature_nuisance import plausible
 from analysis.trace.result import FreeCurves
 from analysis.trace.search.refinement import DesignMatrix, ExactFit, table
@@ -66,18 +68,32 @@ def _settled(rows: DesignMatrix, model: ExactFit) -> ExactFit:
 
 
 def errors(
-    rig: Rig, members: Sequence[ConditionedRecord], before: ExactFit, after: ExactFit
+    rig: Rig,
+    members: Sequence[ConditionedRecord],
+    before: ExactFit,
+    after: ExactFit,
+    divided: Collection[Group] = (),
 ) -> Errors:
     """Return every equation's error under both models, its size and noise floor, over all records.
 
-    The floor is what does not repeat under the model after: its columns carry the sensors' noise
-    into the residual as the baseline's do.
+    Of groups that are `divided` only the rows set aside count. The floor is what does not repeat
+    under the model after: its columns carry the sensors' noise into the residual as the baseline's
+    do. A single record repeats itself only as a whole.
     """
+    whole = [model_rows(rig, after.terms, conditioned) for conditioned in members]
     first, other = (
-        [model_rows(rig, model.terms, conditioned) for conditioned in members]
-        for model in (before, after)
+        [
+            {e: judging_rows(r) for e, r in rows.items()} if c.group in divided else rows
+            for c, rows in zip(members, built, strict=True)
+        ]
+        for built in ([model_rows(rig, before.terms, c) for c in members], whole)
     )
-    split = floors(rig, after.terms, members, other, after.beta)
+    repeats = Counter(c.group for c in members)
+    compared = [
+        rows if repeats[c.group] > 1 else every
+        for c, rows, every in zip(members, other, whole, strict=True)
+    ]
+    split = floors(rig, after.terms, members, compared, after.beta)
     floor = {(f.group, f.equation): f.noise for f in split}
     noise: dict[str, list[float]] = {}
     counts: dict[str, list[int]] = {}

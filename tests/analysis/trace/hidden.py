@@ -53,3 +53,18 @@ def hardening(run: Run, force_per_cubed: float) -> Run:
         channels["rod_pressure_2"] = channels["rod_pressure_2"] - 0.5 * extra / 5.4e-4
         records.append(replace(record, channels=channels))
     return replace(run, records=tuple(records))
+
+
+def pushed(run: Run, force: float, blocks: tuple[int, ...], keep: float = 0.3) -> Run:
+    """Return the run as if something pushed at piston 2 in the middle of some of three blocks."""
+    records = []
+    for record in run.records:
+        t = np.asarray(record.time)
+        inside = (t % 1.0 - keep) / (1.0 - 2 * keep)
+        here = (inside > 0) & (inside < 1) & np.isin(np.floor(t) % 3, blocks)
+        extra = force * np.where(here, np.sin(np.pi * inside) ** 2, 0.0)
+        channels = dict(record.channels)
+        channels["cap_pressure_2"] = channels["cap_pressure_2"] + 0.5 * extra / 7.0e-4
+        channels["rod_pressure_2"] = channels["rod_pressure_2"] - 0.5 * extra / 5.4e-4
+        records.append(replace(record, channels=channels))
+    return replace(run, records=tuple(records))

@@ -25,7 +25,7 @@ from rig.model.records import Run
 from rig.model.rig import Rig
 from tests.analysis.trace import foreign_bench, gate_cases
 from tests.analysis.trace.gate_cases import LEAK, Searched, gate, joined, with_residual
-from tests.analysis.trace.hidden import experiment, hardening, pair_of_runs
+from tests.analysis.trace.hidden import experiment, hardening, pair_of_runs, pushed
 from tests.studies.trace.rules import FAULTS, RULES, by_name, switched_off
 
 Array = NDArray[np.float64]
@@ -231,6 +231,13 @@ def twice_the_noise_on_the_held_out_day_is_not_clean(b: Benches) -> None:
     assert list(s.left_in(s.hypotheses.empty)) == ["flow_cap_2"]
 
 
+def what_the_judging_rows_alone_show_is_not_explained(b: Benches) -> None:
+    train, held_out = b.runs(c_internal=LEAK)
+    assert b.traced((train, pushed(held_out, 10.0, (1,))), "internal_leakage").verdict == (
+        "unexplained"
+    )
+
+
 def a_further_number_must_earn_its_place(b: Benches) -> None:
     s = b.searched(b.runs(c_internal=LEAK), "internal_leakage", "torque_offset")
     leak, both = s.set_of("internal_leakage"), s.set_of("internal_leakage", "torque_offset")
@@ -337,6 +344,7 @@ STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
     (seals_that_rub_speak_against_no_leak, ("formula check by equation",)),
     (a_quiet_friction_is_named_beside_a_loud_leak, ("further search",)),
     (twice_the_noise_on_the_held_out_day_is_not_clean, ("held-out band", "held-out floor x 2")),
+    (what_the_judging_rows_alone_show_is_not_explained, ("judging rows unread",)),
     (a_further_number_must_earn_its_place, ("price of parameters",)),
     (an_effect_that_takes_nothing_is_dropped, ("pruning",)),
     (levels_that_do_not_differ_are_coulomb_friction, ("simpler effect",)),

@@ -200,7 +200,10 @@ FAULTS: Final = (
     Rule("tolerance x 10", "a size may differ twofold between parts",
          (setting("invariance_tolerance", 2.0),)),
     Rule("nothing is left", "whatever stays counts as nothing",
-         ((remaining, "left_over", lambda *_: []), (engine, "left_over", lambda *_: []))),
+         ((remaining, "left_over", lambda *_: []), (engine, "left_over", lambda *_: []),
+          (gates, "remaining_held_out", lambda *_: []))),
+    Rule("judging rows unread", "nobody asks what the judging rows keep",
+         ((engine, "_judged", lambda verdict, *_: (verdict, [])),)),
 )  # fmt: skip
 
 

@@ -1,0 +1,110 @@
+"""What the fit does not see: rows that choose between effects, and rows that judge at the end.
+
+Where no records are given to judge alone, held-out ones are divided. What chooses has been looked
+at many times, and its error flatters what was chosen. Of every three blocks of `DATA.judge_block`
+by time in the record the second is therefore set aside: its rows are read once, when everything is
+settled. The noise floor that rows are weighed by stays that of the whole record, for periods and
+neighbouring states are not found within blocks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.regression.conditioned import ConditionedRecord
+from analysis.regression.rows import Rows
+from analysis.trace.data.noise_floor import Group
+from analysis.trace.data.regression_data import RegressionData
+from analysis.trace.settings import DATA, TRACE
+from rig.model.records import Record, Run
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+def judging(time: Array) -> Mask:
+    """Return which instants (n,) of a record [s] lie in a block that is set aside."""
+    return np.asarray(np.floor(time / DATA.judge_block) % 3 == 1)
+
+
+@dataclass(frozen=True)
+class Unseen:
+    """Rows that choose and rows that judge; `members` are the records of these, repeats apart.
+
+    Of the groups that are `divided` only the judging blocks of a member count. `choosing_runs` are
+    the records that choose, to be simulated.
+    """
+
+    choosing: RegressionData
+    judging: RegressionData
+    members: tuple[ConditionedRecord, ...]
+    choosing_runs: tuple[Run, ...]
+    divided: frozenset[Group] = frozenset()
+    notes: tuple[str, ...] = ()
+
+
+def set_aside(
+    data: RegressionData, members: Sequence[ConditionedRecord], runs: Sequence[Run]
+) -> Unseen:
+    """Divide held-out `runs`, of which `data` are the rows.
+
+    A group is not divided where an equation of it would have fewer than `TRACE.least_rows` on
+    either side: all its rows then choose and judge.
+    """
+    judge = np.zeros(data.base.shape[0], dtype=bool)
+    index = {conditioned.group: k for k, conditioned in enumerate(data.records)}
+    short = set()
+    for s in data.segments:
+        judge[s.where] = here = judging(data.rows[index[s.group]][s.equation].time)
+        if min(here.sum(), (~here).sum()) < TRACE.least_rows:
+            short.add(s.group)
+    choose = ~judge
+    for s in data.segments:
+        if s.group in short:
+            judge[s.where] = choose[s.where] = True
+    divided = frozenset(index) - short
+    return Unseen(
+        data.at(choose), data.at(judge), tuple(members), _without_blocks(runs, divided), divided,
+        (_said(divided, sorted({step for _, step in short})),),
+    )  # fmt: skip
+
+
+def judging_rows(rows: Rows) -> Rows:
+    """Return a record's rows in the blocks that are set aside."""
+    kept = judging(rows.time)
+    return replace(rows, matrix=rows.matrix[kept], rhs=rows.rhs[kept], time=rows.time[kept])
+
+
+def _without_blocks(runs: Sequence[Run], divided: Collection[Group]) -> tuple[Run, ...]:
+    """Return the runs with the samples that are set aside lost, and what filters spread of them."""
+    out = []
+    for number, run in enumerate(runs):
+        records = [
+            _lost(record) if (number, record.step) in divided else record for record in run.records
+        ]
+        out.append(replace(run, records=tuple(records)))
+    return tuple(out)
+
+
+def _lost(record: Record) -> Record:
+    aside = judging(np.asarray(record.time))
+    channels = {name: np.where(aside, np.nan, x) for name, x in record.channels.items()}
+    return replace(record, channels=channels)
+
+
+def _said(divided: Collection[Group], short: Sequence[str]) -> str:
+    """Say in a sentence what judges where no records were given for it."""
+    if not divided:
+        return (
+            "the held-out records are too short to set rows aside: the same rows choose and "
+            "judge; `--judge RUN` gives others to judge"
+        )
+    rest = f"; too short for that, {' '.join(short)} does both" if short else ""
+    return (
+        f"a third of the held-out rows (every third block of {DATA.judge_block:g} s) judges and "
+        f"the rest chooses; `--judge RUN` gives both in full{rest}"
+    )

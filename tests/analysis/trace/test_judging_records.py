@@ -1,0 +1,188 @@
+"""Records that judge are read once: they choose no name, and may refuse what others have chosen."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from analysis.terms import baseline_of
+from analysis.terms.base import Used
+from analysis.trace.data.conditioned_record import conditioned_records
+from analysis.trace.data.regression_data import RegressionData, regression_data
+from analysis.trace.data.set_aside import judging, set_aside
+from analysis.trace.engine import trace
+from analysis.trace.result import Trace
+from analysis.trace.search.refinement import table
+from analysis.trace.settings import TRACE
+from rig.cli.main import app
+from rig.model.parse import InputError
+from rig.model.records import Run
+from rig.model.rig import Rig
+from rig.runs.exchange.fixtures import write_run
+from tests.analysis.trace.gate_cases import LEAK, at_joint_2
+from tests.analysis.trace.hidden import RMS, experiment, pair_of_runs, pushed
+
+FEW = ("internal_leakage", "external_leakage", "spool_offset")
+PUSH = 10.0  # [N], five times the torque's noise in a block
+BORDER = 1e-3  # relative, of what a row filter's tails carry over a block's border
+
+
+def traced(rig: Rig, train: Run, held_out: Run, *judge: Run) -> Trace:
+    return trace(
+        [train], [held_out], at_joint_2(rig, *FEW), look_ahead=False, free_forms=False, judge=judge
+    )
+
+
+def chosen(result: Trace) -> dict[str, object]:
+    """Return all that was chosen: names, sizes, gates and the model with them."""
+    return {
+        "effects": [(e.name, e.where, e.parameters, e.gates) for e in result.effects],
+        "refused": [(e.name, e.where, e.gates) for e in result.refused],
+        "model": {k: v for k, v in result.model_after.values.items() if np.isfinite(v)},
+        "depends": result.depends_on,
+    }
+
+
+@pytest.fixture(scope="module")
+def leaky(rig: Rig) -> tuple[Run, Run]:
+    return pair_of_runs(rig, c_internal=LEAK)
+
+
+@pytest.fixture(scope="module")
+def found(rig: Rig, leaky: tuple[Run, Run]) -> Trace:
+    return traced(rig, *leaky)
+
+
+def test_the_note_says_what_judges(found: Trace) -> None:
+    (note,) = [n for n in found.notes if "--judge RUN" in n]
+    assert "a third of the held-out rows" in note
+    assert "the rest chooses" in note
+
+
+def test_what_only_the_judging_rows_show_changes_no_name_but_the_verdict(
+    rig: Rig, leaky: tuple[Run, Run], found: Trace
+) -> None:
+    assert found.verdict == "explained"
+    result = traced(rig, leaky[0], pushed(leaky[1], PUSH, (1,)))
+    assert chosen(result) == chosen(found)
+    assert result.verdict == "unexplained"
+    assert result.after["torque_2"] > 1.5 * result.noise_floor["torque_2"]
+    (note,) = [n for n in result.notes if n.startswith("torque_2: held-out error")]
+    assert note.endswith("times the noise floor in the records that judge")
+
+
+def test_what_only_the_choosing_rows_show_is_in_no_reported_error(
+    rig: Rig, leaky: tuple[Run, Run], found: Trace
+) -> None:
+    result = traced(rig, leaky[0], pushed(leaky[1], PUSH, (0, 2)))
+    assert result.verdict == "unexplained"  # seen while choosing
+    assert not any("records that judge" in n for n in result.notes)
+    assert result.before == pytest.approx(found.before, rel=BORDER)
+    assert [e.name for e in result.effects] == [e.name for e in found.effects]
+    assert result.after == pytest.approx(found.after, rel=BORDER)
+    assert result.noise_floor == pytest.approx(found.noise_floor, rel=BORDER)
+
+
+def test_records_given_to_judge_are_read_once(
+    rig: Rig, leaky: tuple[Run, Run], found: Trace
+) -> None:
+    """All of the held-out rows choose then; another day's push at the piston refuses the name."""
+    other = experiment(rig, repeats=2, seed=3, rms=0.8 * RMS, c_internal=LEAK)
+    good, bad = (traced(rig, *leaky, pushed(other, force, (0, 1, 2))) for force in (0.0, PUSH))
+    assert (good.verdict, bad.verdict) == ("explained", "unexplained")
+    assert chosen(good) == chosen(bad)
+    assert [e.name for e in good.effects] == [e.name for e in found.effects]
+    assert not any("--judge RUN" in note for note in good.notes)
+    assert any("in the records that judge" in note for note in bad.notes)
+
+
+@pytest.mark.parametrize("kind", ["training", "held-out"])
+def test_records_that_have_been_seen_cannot_judge(
+    leaky: tuple[Run, Run], tmp_path: Path, kind: str
+) -> None:
+    seen = leaky[kind == "held-out"]
+    runs = (*leaky, replace(seen, records=seen.records[1:2]))
+    train, held_out, judge = (
+        str(write_run(tmp_path / name, run)) for name, run in zip("abc", runs, strict=True)
+    )
+    words = ["trace", train, "--holdout", held_out, "--judge", judge]
+    done = CliRunner().invoke(app, words, standalone_mode=False)
+    assert isinstance(done.exception, InputError), done.exception
+    assert re.match(
+        rf"judging record 'step1_r2' is {kind} record 'step1_r2', .* give --judge other records",
+        str(done.exception),
+    )
+
+
+def rows_of(rig: Rig, *runs: Run) -> RegressionData:
+    terms = tuple(map(Used, baseline_of(rig)))
+    beta = {name: rig.nominal[name] for name in rig.nominal if name != "b"}
+    return regression_data(rig, terms, conditioned_records(rig, runs), beta)
+
+
+def same(one: RegressionData, other: RegressionData) -> None:
+    np.testing.assert_array_equal(one.base, other.base)
+    np.testing.assert_array_equal(one.residual, other.residual)
+    assert one.segments == other.segments
+    for mine, theirs in zip(one.rows, other.rows, strict=False):
+        assert mine.keys() == theirs.keys()
+        for equation, rows in mine.items():
+            np.testing.assert_array_equal(rows.matrix, theirs[equation].matrix)
+            np.testing.assert_array_equal(rows.time, theirs[equation].time)
+    now, later = (table(data, data.terms) for data in (one, other))
+    np.testing.assert_array_equal(now.matrix, later.matrix)
+    np.testing.assert_array_equal(now.rhs, later.rhs)
+
+
+def test_a_part_of_the_data_is_what_its_records_alone_would_make(
+    rig: Rig, leaky: tuple[Run, Run]
+) -> None:
+    train, held_out = (replace(run, records=run.records[:2]) for run in leaky)
+    both, first = rows_of(rig, train, held_out), rows_of(rig, train)
+    assert table(both, both.terms).matrix.shape == both.base.shape  # remembered from here on
+    mask = np.arange(len(both.base)) < len(first.base)
+    part = both.at(mask)
+    assert part.memory is not both.memory
+    same(part, first)
+    same(both.at(np.ones(len(both.base), dtype=bool)), both)
+    every_other = np.arange(len(first.base)) % 2 == 0
+    thinned = table(first.at(every_other), first.terms)
+    np.testing.assert_allclose(
+        thinned.matrix, table(first, first.terms).matrix[every_other], rtol=1e-12
+    )
+
+
+def test_every_third_second_is_set_aside_and_no_row_is_in_both(
+    rig: Rig, leaky: tuple[Run, Run]
+) -> None:
+    data = rows_of(rig, leaky[1])
+    unseen = set_aside(data, (), (leaky[1],))
+    for equation, rows in unseen.judging.rows[0].items():
+        others = unseen.choosing.rows[0][equation].time
+        assert judging(rows.time).all()
+        assert not judging(others).any()
+        assert len(rows.time) + len(others) == len(data.rows[0][equation].time)
+    (lost,) = unseen.choosing_runs
+    nan = np.isnan(lost.records[0].channels["piston_2"])
+    np.testing.assert_array_equal(nan, judging(np.asarray(lost.records[0].time)))
+
+
+def test_a_record_too_short_to_be_divided_chooses_and_judges(
+    rig: Rig, leaky: tuple[Run, Run]
+) -> None:
+    short = replace(leaky[1], records=tuple(
+        replace(r, channels={k: np.asarray(v)[:3000] for k, v in r.channels.items()})
+        for r in leaky[1].records
+    ))  # fmt: skip
+    data = rows_of(rig, short)
+    assert all(s.where.stop - s.where.start >= TRACE.least_rows for s in data.segments)
+    unseen = set_aside(data, (), (short,))
+    same(unseen.choosing, data)
+    same(unseen.judging, data)
+    assert unseen.divided == frozenset()
+    assert "too short to set rows aside" in unseen.notes[0]
