@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +14,10 @@ from numpy.typing import NDArray
 from analysis.effects.base import Effect, ordered
 from analysis.identify import checks as ck
 from analysis.identify.estimators.nuisance import BulkTemperature
+from analysis.identify.geometry import NAME as GEOMETRY
+from analysis.identify.geometry import wider
 from analysis.identify.identify import identify
+from analysis.identify.result import by_geometry
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.simulation.model import Model
 from analysis.terms import baseline_of
@@ -96,8 +99,10 @@ def trace(
     candidates = _unknown(catalogue(rig) if effects is None else effects, known, moving)
     done = progress or _nobody
     hypotheses = HypothesisSet(train_data, candidates)
-    before = stripped(identify(runs, terms=terms, estimator=PLAIN).model)
+    first_found = identify(runs, terms=terms, estimator=PLAIN)
+    before = stripped(first_found.model)
     notes = _notes(train_data, holdout_data)
+    notes += [check.detail for check in first_found.checks if check.name == GEOMETRY]
     quiet = within(hypotheses.empty.excess_energy, hypotheses.limits)
     if quiet and not gates.remaining(hypotheses, hypotheses.empty, holdout_data):
         judged_effects: tuple[JudgedEffect, ...] = ()
@@ -124,13 +129,15 @@ def trace(
         else clues_to(train_data, holdout_data, winner, split)
     )
     further = propose(hypotheses, winner, judged_effects, verdict, moves) if look_ahead else None
-    after = _extended(runs, terms, winner, before, train_data)
+    after, unknown = _extended(runs, terms, winner, before, train_data)
     again = reshaped(runs, holdout, after, train_data, holdout_data, winner)
     if again.winner is not winner:
         winner = again.winner
-        after = _extended(runs, terms, winner, before, train_data)
+        after, unknown = _extended(runs, terms, winner, before, train_data)
         split = lines(train_data, winner.fit.residual)
-    judged_effects = tuple(with_shots(f, again.shots) for f in judged_effects)
+    judged_effects = tuple(
+        with_shots(_with_tolerances(f, unknown), again.shots) for f in judged_effects
+    )
     first, last = (
         held_out.settled(holdout_data, hypotheses.empty.fit),
         held_out.settled(holdout_data, winner.fit),
@@ -365,10 +372,22 @@ def _extended(
     winner: Hypothesis,
     before: Model,
     train_data: RegressionData,
-) -> Model:
-    """Identify everything again together with the effects, their shapes' errors included."""
+) -> tuple[Model, dict[str, float]]:
+    """Identify everything again together with the effects, their shapes' errors included.
+
+    Also returns the part of each standard error that the rig's tolerances make, by name.
+    """
     if not winner.effects:
-        return before
+        return before, {}
     plain = [u for u in terms if not isinstance(u.term, BulkTemperature)]
-    model = identify(runs, terms=ordered((*plain, *winner.effects)), estimator="ls").model
-    return stripped(widened(train_data, winner.fit, model))
+    found = identify(runs, terms=ordered((*plain, *winner.effects)), estimator="ls")
+    return stripped(widened(train_data, winner.fit, found.model)), by_geometry(found)
+
+
+def _with_tolerances(effect: JudgedEffect, unknown: Mapping[str, float]) -> JudgedEffect:
+    """Return an effect whose intervals include the rig's tolerances; its shapes' are as before."""
+    parameters = {
+        name: wider(estimate, unknown[name]) if name in unknown else estimate
+        for name, estimate in effect.parameters.items()
+    }
+    return replace(effect, parameters=parameters)
