@@ -22,6 +22,7 @@ from rig.model.parameters import gain_names, inertia_names
 from rig.model.parse import InputError
 from rig.model.records import Record, RecordHead, Run
 from rig.model.rig import Rig
+from rig.model.tolerances import widest
 from rig.runs.stream import RunHead
 
 Array = NDArray[np.float64]
@@ -37,7 +38,10 @@ class Check:
 
 
 def common_rig(runs: Sequence[Run] | Sequence[RunHead]) -> Rig:
-    """Return the rig all runs share; raises InputError where they differ or hold no record."""
+    """Return the rig all runs share; raises InputError where they differ or hold no record.
+
+    Where runs state different tolerances, it has the largest of each.
+    """
     if not runs or not any(run.records for run in runs):
         raise InputError("no records to work on: the run holds none (was it aborted at once?)")
     for run in runs[1:]:
@@ -53,7 +57,10 @@ def common_rig(runs: Sequence[Run] | Sequence[RunHead]) -> Rig:
             "every record has every joint locked: nothing moved, so nothing can be identified; "
             "record a step that excites a joint"
         )
-    return runs[0].rig
+    rig = runs[0].rig
+    tolerances = widest(run.rig.tolerances for run in runs)
+    same = tolerances == rig.tolerances
+    return rig if same else rig.model_copy(update={"tolerances": tolerances})
 
 
 def spans_of(record: Record) -> dict[str, tuple[float, float]]:

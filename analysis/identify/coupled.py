@@ -13,6 +13,7 @@ from analysis.identify import checks as ck
 from analysis.identify.advice import base_statements
 from analysis.identify.checks import Check, consistency
 from analysis.identify.estimation import UNBIASED, EstimationJob, Refined, refine
+from analysis.identify.geometry import GeometryShifts, geometry_check, shifts_of_rows, widened
 from analysis.identify.reduction import (
     RecordReduction,
     record_checks,
@@ -71,8 +72,9 @@ def coupled(
     reductions = reduce_rows(rig, used, built)
     sources = [run.source for run in runs]
     result = conclude(
-        rig, sources, used, reductions, reject_noise, None if estimator == PLAIN else refined
-    )
+        rig, sources, used, reductions, reject_noise, None if estimator == PLAIN else refined,
+        shifts_of_rows(rig, used, built),
+    )  # fmt: skip
     return replace(result, built=tuple(built))
 
 
@@ -83,8 +85,12 @@ def conclude(
     reductions: Sequence[RecordReduction],
     reject_noise: bool,
     refined: Callable[[Mapping[str, Solution]], Refined] | None = None,
+    geometry: GeometryShifts | None = None,
 ) -> Identification:
-    """Solve the reductions of all records of the runs `sources`, and judge what comes out."""
+    """Solve the reductions of all records of the runs `sources`, and judge what comes out.
+
+    `geometry` widens the intervals by what the rig's tolerances leave unknown.
+    """
     started = time.perf_counter()
     solutions = solve_reductions(rig, used, reductions, reject_noise)
     seconds = time.perf_counter() - started
@@ -93,11 +99,16 @@ def conclude(
     estimates, covariance = estimates_of(rig, used, solutions)
     if refinement.bootstrap:
         estimates = with_ends(estimates, refinement.bootstrap)
+    known: tuple[Check, ...] = ()
+    if geometry is not None:
+        known = (geometry_check(rig, used, estimates, geometry),)
+        estimates, covariance = widened(rig, used, estimates, covariance, geometry)
     rows = {family: solution.rows for family, solution in solutions.items()}
     masked = sum(reduction.masked for reduction in reductions)
     statements = (
         *_statements(rig, reductions, refinement, estimates, rows),
         *refinement.checks,
+        *known,
     )
     provenance = {
         "method": "coupled",
@@ -109,7 +120,10 @@ def conclude(
     }
     model = Model(rig, used, estimates, covariance, provenance)
     log.info("identified %d parameters from %d records", len(estimates), len(reductions))
-    return Identification("coupled", estimates, solutions, rows, masked, seconds, statements, model)
+    return Identification(
+        "coupled", estimates, solutions, rows, masked, seconds, statements, model,
+        geometry=geometry,
+    )  # fmt: skip
 
 
 def _statements(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from analysis.identify import checks as ck
 from analysis.identify.coupled import coupled
 from analysis.identify.estimation import refuse_unknown
+from analysis.identify.geometry import left_out
 from analysis.identify.methods import SearchOptions, identify_by
 from analysis.identify.result import PLAIN, Identification
 from analysis.identify.settings import IDENTIFY
@@ -18,6 +20,7 @@ from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
+from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
@@ -55,10 +58,21 @@ def identify(
     rig = ck.common_rig(runs)
     used = tuple(terms) if terms is not None else tuple(map(Used, baseline_of(rig)))
     if method != "coupled":
-        return identify_by(method, runs, used, filtering, reject_noise, rng, search)
+        result = identify_by(method, runs, used, filtering, reject_noise, rng, search)
+        return result if result.geometry is not None else _with_exact_geometry(rig, result)
     return coupled(
         runs, used, filtering, reject_noise, estimator, bootstrap, rng, nuisances, progress
     )
+
+
+def _with_exact_geometry(rig: Rig, result: Identification) -> Identification:
+    """Return the result of a method without tolerances, which says so where the rig has some."""
+    if not rig.uncertain_numbers:
+        return result
+    checks = (*result.checks, left_out(rig, result.method))
+    failed = [c.name for c in checks if not c.ok]
+    model = replace(result.model, provenance={**result.model.provenance, "checks_failed": failed})
+    return replace(result, checks=checks, model=model)
 
 
 def _refuse_method(method: str) -> None:

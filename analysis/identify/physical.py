@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from scipy.special import fdtrc
 
 from analysis.identify.checks import Check
+from analysis.identify.geometry import GeometryShifts, widened
 from analysis.identify.result import Identification, estimates_of
 from analysis.identify.settings import IDENTIFY
 from analysis.regression.constrained import Feasible, Minimum, minimise
@@ -70,6 +71,7 @@ class Level:
     estimates: Mapping[str, Estimate]
     covariance: Array
     prices: Mapping[str, Price]
+    geometry: GeometryShifts | None = None  # with the directions that are held taken out
 
     @property
     def rejected(self) -> bool:
@@ -162,35 +164,51 @@ def with_physics(result: Identification, physical: Physical) -> Identification:
         result.model, parameters=level.estimates, covariance=level.covariance,
         provenance=provenance,
     )  # fmt: skip
-    return replace(result, estimates=level.estimates, model=model, checks=checks)
+    return replace(
+        result, estimates=level.estimates, model=model, checks=checks, geometry=level.geometry
+    )
 
 
 def _level(result: Identification, name: str, rigid: bool) -> Level:
-    rig = result.model.rig
-    solutions, prices = {}, {}
+    rig, geometry = result.model.rig, result.geometry
+    solutions, prices, shifts = {}, {}, {}
     for family, solution in result.solutions.items():
         k = len(solution.names)
         X, y = solution.triangle[:k, :k], solution.triangle[:k, k]
         # An estimator may have moved the free solution off the triangle's own: project that one.
         minimum = minimise(X, X @ solution.value, feasible(rig, solution.names, rigid))
-        solutions[family] = _constrained(solution, X, minimum)
-        prices[family] = _price(rig, solution, X, y, minimum)
+        P = _projection(X, minimum)
+        solutions[family] = _constrained(solution, P, minimum)
+        free = solution
+        if geometry is not None:
+            shifts[family] = P @ geometry.shifts[family]
+            free = replace(solution, covariance=solution.covariance + geometry.covariance(family))
+        prices[family] = _price(rig, free, X, y, minimum)
     estimates, covariance = estimates_of(rig, result.model.terms, solutions)
-    return Level(name, estimates, covariance, prices)
+    held = None if geometry is None else replace(geometry, shifts=shifts)
+    if held is not None:
+        estimates, covariance = widened(rig, result.model.terms, estimates, covariance, held)
+    return Level(name, estimates, covariance, prices, held)
 
 
-def _constrained(solution: Solution, X: Array, minimum: Minimum) -> Solution:
+def _constrained(solution: Solution, P: Array, minimum: Minimum) -> Solution:
     """Return the solution moved; its covariance loses the directions that are held."""
+    if not len(minimum.active):
+        return solution
+    return replace(solution, value=minimum.beta, covariance=P @ solution.covariance @ P.T)
+
+
+def _projection(X: Array, minimum: Minimum) -> Array:
+    """Return P (k, k), which takes from a small change what the active constraints hold."""
     k, C = len(minimum.beta), minimum.active
     if not len(C):
-        return solution
+        return np.eye(k)
     scale = 1.0 / np.linalg.norm(X, axis=0)
     A = (X * scale).T @ (X * scale)
     held = C * scale
     lever = np.linalg.solve(A, held.T)
     P = np.eye(k) - lever @ np.linalg.pinv(held @ lever) @ held
-    P = P * np.outer(scale, 1.0 / scale)
-    return replace(solution, value=minimum.beta, covariance=P @ solution.covariance @ P.T)
+    return np.asarray(P * np.outer(scale, 1.0 / scale))
 
 
 def _price(rig: Rig, solution: Solution, X: Array, y: Array, minimum: Minimum) -> Price:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.identify import geometry as geo
 from analysis.identify.checks import Check
 from analysis.identify.stacked_rows import RecordRows
 from analysis.regression.solve import Solution, half_width
@@ -25,7 +26,8 @@ PLAIN = "plain"  # least squares as in the paper: no nuisances, scatter between 
 class Identification:
     """What an identification found: estimates, conditioning, rows used and left out, checks.
 
-    `built` are the rows it was solved from; none where they were not all in memory.
+    `built` are the rows it was solved from; none where they were not all in memory. `geometry` is
+    what the rig's tolerances shift; None where it has none, or the method does not include them.
     """
 
     method: str
@@ -38,6 +40,7 @@ class Identification:
     model: Model
     extra: Mapping[str, Any] = field(default_factory=dict)  # a method's own figures, plain data
     built: tuple[RecordRows, ...] = field(default=(), repr=False, compare=False)
+    geometry: geo.GeometryShifts | None = field(default=None, repr=False, compare=False)
 
 
 def to_json(result: Identification) -> dict[str, Any]:
@@ -54,8 +57,26 @@ def to_json(result: Identification) -> dict[str, Any]:
         "solve_seconds": result.solve_seconds,
         "checks": [{"name": c.name, "ok": bool(c.ok), "detail": c.detail} for c in result.checks],
         "residual_rms": {family: finite(s.residual_rms) for family, s in result.solutions.items()},
+        **_geometry(result),
         **result.extra,
     }
+
+
+def by_geometry(result: Identification) -> dict[str, float]:
+    """Return the standard uncertainty of each parameter that the rig's tolerances make, by name."""
+    if result.geometry is None:
+        return {}
+    model = result.model
+    S = geo.parameter_shifts(model.rig, model.terms, result.estimates, result.geometry)
+    return dict(zip(result.estimates, map(float, np.linalg.norm(S, axis=1)), strict=True))
+
+
+def _geometry(result: Identification) -> dict[str, Any]:
+    """Return the shifts by the rig's tolerances under their key; nothing where there are none."""
+    if result.geometry is None:
+        return {}
+    model = result.model
+    return {"geometry": geo.to_json(model.rig, model.terms, result.estimates, result.geometry)}
 
 
 def estimates_of(

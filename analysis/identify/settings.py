@@ -24,6 +24,7 @@ class IdentifySettings:
     rejected_level: float = 0.01  # p value below which the data reject a physical constraint
     bulk_modulus_range: tuple[float, float] = (5e7, 2.5e9)  # [Pa] hoses with air .. mineral oil
     length_tolerance: float = 0.05  # relative, of R12/W2 against l1
+    normal_quantile: float = 1.96  # half of a 95 % interval over the standard error, known sigma
     record_segments: int = 10  # parts of a record whose residuals are compared
 
     # -- what other experiment would identify a parameter --------------------------------------

@@ -94,7 +94,7 @@ def solve(
     `noise` (k+1, k+1) is the part of [X y]'[X y] that sensors' noise makes
     (`analysis.regression.noise`); with `reject_noise` a parameter that rests on it counts as
     undetermined. The errors come from the clusters `scatter`, where those are others
-    (`analysis.identify.online`).
+    (`analysis.identify.streams.online`).
     """
     k = len(names)
     R = merge(c.triangle for c in clusters)

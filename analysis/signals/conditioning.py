@@ -8,7 +8,7 @@ pressures [Pa gauge], `V_cap V_rod` chamber volumes [m^3], `p_s p_tank` supply a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -161,6 +161,24 @@ def condition(
         valid=_valid(rig, record, smoother.reach),
         lost=_lost(rig, record, smoother.reach + align_reach(rig, record.sample_rate)),
         moving=moving,
+    )  # fmt: skip
+
+
+def of_other_geometry(rig: Rig, signals: Signals, other: Rig) -> Signals:
+    """Return the signals of `rig` as a rig with other linkages and cylinders has them.
+
+    Pistons and pressures are measured and stay; q, its rates, G and the volumes are anew, with
+    s'' = G q'' + (dG/dq) q'^2 of the linkages that the signals were made with.
+    """
+    s = signals.s
+    slope = np.column_stack([j.geometry(s[:, i])[2] for i, j in enumerate(rig.joints)])
+    sdd = signals.G * signals.qdd + slope * signals.qd**2
+    q, qd, qdd, G = _angles(other, s, signals.sd, sdd)
+    volumes = [other.chamber_volumes(i, s[:, i]) for i in range(signals.joints)]
+    return replace(
+        signals, q=q, qd=qd, qdd=qdd, G=G, theta=other.base_angle + np.cumsum(q, axis=1),
+        V_cap=np.column_stack([v[0] for v in volumes]),
+        V_rod=np.column_stack([v[1] for v in volumes]),
     )  # fmt: skip
 
 

@@ -211,10 +211,13 @@ def terms_like(path: Path, rigs: Mapping[str, Rig]) -> tuple[Used, ...]:
 
 
 def rig_difference(rig: Rig, other: Rig) -> str:
-    """Say what differs between two rigs as far as physics is concerned ('' if nothing)."""
+    """Say what differs between two rigs as far as physics is concerned ('' if nothing).
+
+    Tolerances say how well a rig is known, not what it is.
+    """
     if rig.name != other.name:
         return f"name {rig.name!r} and {other.name!r}"
-    ignored = {"description", "nominal", "wire", "sample_rate"}
+    ignored = {"description", "nominal", "wire", "sample_rate", "tolerances"}
     first, second = (r.model_dump(exclude=ignored) for r in (rig, other))
     for key, value in first.items():
         if value != second.get(key):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +14,10 @@ from numpy.typing import NDArray
 from analysis.effects.base import Effect, ordered
 from analysis.identify import checks as ck
 from analysis.identify.estimators.nuisance import BulkTemperature, SpoolPath
+from analysis.identify.geometry import NAME as GEOMETRY
+from analysis.identify.geometry import wider
 from analysis.identify.identify import identify
+from analysis.identify.result import Identification, by_geometry
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.simulation.model import Model
 from analysis.terms import baseline_of
@@ -104,8 +107,10 @@ def trace(
     candidates = _unknown(catalogue(rig) if effects is None else effects, known, moving)
     done = progress or _nobody
     hypotheses = HypothesisSet(train_data, candidates)
-    before = _identified(runs, terms)
+    baseline = _identified(runs, terms)
+    before = baseline.model
     notes = [*unseen.notes, *_notes(train_data, holdout_data)]
+    notes += [check.detail for check in baseline.checks if check.name == GEOMETRY]
     quiet = within(hypotheses.empty.excess_energy, hypotheses.limits)
     if quiet and not gates.remaining(hypotheses, hypotheses.empty, holdout_data):
         judged_effects: tuple[JudgedEffect, ...] = ()
@@ -129,13 +134,15 @@ def trace(
         else clues_to(train_data, holdout_data, winner, split)
     )
     further = propose(hypotheses, winner, judged_effects, verdict, moves) if look_ahead else None
-    after = _extended(runs, terms, winner, before, train_data)
+    after, unknown = _extended(runs, terms, winner, before, train_data)
     again = reshaped(runs, unseen.choosing_runs, after, train_data, holdout_data, winner)
     if again.winner is not winner:
         winner = again.winner
-        after = _extended(runs, terms, winner, before, train_data)
+        after, unknown = _extended(runs, terms, winner, before, train_data)
         split = lines(train_data, winner.fit.residual)
-    judged_effects = tuple(with_shots(f, again.shots) for f in judged_effects)
+    judged_effects = tuple(
+        with_shots(_with_tolerances(f, unknown), again.shots) for f in judged_effects
+    )
     # All is settled: from here on the judging rows are read, and nothing is chosen.
     first, last = (
         held_out.settled(unseen.judging, hypotheses.empty.fit),
@@ -414,15 +421,28 @@ def _extended(
     winner: Hypothesis,
     before: Model,
     train_data: RegressionData,
-) -> Model:
-    """Identify everything again together with the effects, their shapes' errors included."""
+) -> tuple[Model, dict[str, float]]:
+    """Identify everything again together with the effects, their shapes' errors included.
+
+    Also returns the part of each standard error that the rig's tolerances make, by name.
+    """
     if not winner.effects:
-        return before
-    return stripped(widened(train_data, winner.fit, _identified(runs, (*terms, *winner.effects))))
+        return before, {}
+    found = _identified(runs, (*terms, *winner.effects))
+    return stripped(widened(train_data, winner.fit, found.model)), by_geometry(found)
 
 
-def _identified(runs: Sequence[Run], terms: Sequence[Used]) -> Model:
+def _identified(runs: Sequence[Run], terms: Sequence[Used]) -> Identification:
     """Identify a model's parameters; what acts beside it is fitted by the estimator itself."""
     beside = (BulkTemperature, SpoolPath)
     own = [u for u in terms if not isinstance(u.term, beside)]
-    return identify(runs, terms=ordered(own), estimator=ESTIMATOR).model
+    return identify(runs, terms=ordered(own), estimator=ESTIMATOR)
+
+
+def _with_tolerances(effect: JudgedEffect, unknown: Mapping[str, float]) -> JudgedEffect:
+    """Return an effect whose intervals include the rig's tolerances; its shapes' are as before."""
+    parameters = {
+        name: wider(estimate, unknown[name]) if name in unknown else estimate
+        for name, estimate in effect.parameters.items()
+    }
+    return replace(effect, parameters=parameters)

@@ -7,7 +7,7 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.identify.online import Tracker
+from analysis.identify.streams.online import Tracker
 from rig.model.records import RecordHead
 from rig.model.rig import Rig
 

@@ -56,7 +56,7 @@ def _streamed(
     like: Path | None,
     cluster: str | None,
 ) -> Identification:
-    from analysis.identify.out_of_core import identify_folders
+    from analysis.identify.streams.out_of_core import identify_folders
     from analysis.simulation.model import load_model
     from analysis.workers.cluster import DaskCluster
     from analysis.workers.pool import Serial

@@ -24,7 +24,7 @@ from typing import Any, Self
 import numpy as np
 import zmq
 
-from analysis.identify.online import Tracker
+from analysis.identify.streams.online import Tracker
 from analysis.simulation.model import Estimate, estimate_json
 from analysis.workers.pool import environment
 from drivers.base import SampleBlock

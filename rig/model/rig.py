@@ -33,6 +33,12 @@ from rig.model.electric import (
 from rig.model.parameters import MAX_JOINTS, parameter_names, parameter_unit
 from rig.model.parts import Array, BenchLimits, Joint, Oil, Part, Sensors, Supply, Wire
 from rig.model.quantity import Acceleration, Angle, Frequency, parse_quantity
+from rig.model.tolerances import (
+    Tolerances,
+    UncertainNumber,
+    refuse_open_triangles,
+    uncertain_numbers,
+)
 
 
 class Rig(Part):
@@ -46,6 +52,7 @@ class Rig(Part):
     oil: Oil
     joints: tuple[Joint, ...] = Field(min_length=1, max_length=MAX_JOINTS)
     sensors: Sensors
+    tolerances: Tolerances | None = Field(default=None, exclude_if=lambda value: value is None)
     limits: BenchLimits = BenchLimits()
     alarms: Alarms = Alarms()
     wire: Wire = Wire()
@@ -65,6 +72,12 @@ class Rig(Part):
             raise ValueError("joints of both types, hydraulic and electric, in one rig: not yet")
         chosen = _CLASSES[types.pop()] if types else cls
         return handler(data) if chosen is cls else chosen.model_validate(data, context=info.context)
+
+    @field_validator("tolerances")
+    @classmethod
+    def _tolerances_fit(cls, value: Tolerances | None, info: ValidationInfo) -> Tolerances | None:
+        refuse_open_triangles(value, info.data.get("joints", ()))
+        return value
 
     @field_validator("nominal", mode="before")
     @classmethod
@@ -142,6 +155,15 @@ class Rig(Part):
             ch.COMMAND: (-own.command, own.command),
         }
         return limits_by_kind.get(kind, everything)
+
+    @property
+    def uncertain_numbers(self) -> tuple[UncertainNumber, ...]:
+        """The areas, volumes and lengths that `tolerances` states; none without that section."""
+        return uncertain_numbers(self.tolerances, self.joints)
+
+    def with_moved(self, number: UncertainNumber) -> Self:
+        """Return the rig with one of its numbers larger by its tolerance."""
+        return self.model_copy(update={"joints": number.moved(self.joints)})
 
     @property
     def electric(self) -> bool:
@@ -241,6 +263,13 @@ class ElectricRig(Rig):
     def _no_fluid(cls, value: Any) -> Any:
         if value is not None:
             raise ValueError("an electric rig has neither supply nor oil; remove this key")
+        return value
+
+    @field_validator("tolerances", mode="before")
+    @classmethod
+    def _no_tolerances(cls, value: Any) -> Any:
+        if value is not None:
+            raise ValueError("an electric rig has neither cylinders nor linkages; remove this key")
         return value
 
     @field_validator("sensors", mode="before")

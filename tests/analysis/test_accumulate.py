@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from scipy.linalg import lstsq
 
 from analysis.identify.identify import identify
-from analysis.identify.out_of_core import identify_folders
 from analysis.identify.reduction import reduce_record, reduce_rows, solve_reductions
 from analysis.identify.result import PLAIN, Identification
 from analysis.identify.stacked_rows import build_rows
+from analysis.identify.streams.out_of_core import identify_folders
 from analysis.regression.chunks import InMemory, source_rows
 from analysis.regression.qr import Accumulator, accumulate
 from analysis.regression.rows import default_filtering, paper_filtering

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 from analysis.identify.identify import identify
-from analysis.identify.out_of_core import identify_folders
 from analysis.identify.result import PLAIN
+from analysis.identify.streams.out_of_core import identify_folders
 from analysis.workers.cluster import DaskCluster
 from analysis.workers.pool import Pool, Processes, Serial
 from rig.model.parse import InputError

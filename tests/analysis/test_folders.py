@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from analysis.identify.identify import identify
-from analysis.identify.out_of_core import identify_folders
 from analysis.identify.result import PLAIN
+from analysis.identify.streams.out_of_core import identify_folders
 from analysis.terms import with_effects
 from analysis.terms.base import Used
 from rig.model.records import Run

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from analysis.identify.identify import identify
-from analysis.identify.online import RowFeed, Tracker, _Filter, track
 from analysis.identify.reduction import reduce_rows, solve_reductions
 from analysis.identify.result import PLAIN
 from analysis.identify.settings import IDENTIFY
 from analysis.identify.stacked_rows import build_rows
+from analysis.identify.streams.online import RowFeed, Tracker, _Filter, track
 from analysis.regression.chunks import Locks, stretch_rows
 from analysis.regression.rows import Rows, default_filtering
 from analysis.terms import baseline

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.identify.online import Tracker, track
-from analysis.identify.out_of_core import identify_folders
+from analysis.identify.streams.online import Tracker, track
+from analysis.identify.streams.out_of_core import identify_folders
 from drivers.base import SampleBlock
 from rig.bench.observers import Observers
 from rig.bench.session import Bench

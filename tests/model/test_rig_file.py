@@ -155,3 +155,59 @@ def test_any_text_at_all_is_read_or_refused_in_one_line(text: str) -> None:
 def test_yaml_that_is_no_bench_is_refused(bad: str) -> None:
     with pytest.raises(InputError):
         parse_model(Rig, bad, "x.yaml")
+
+
+def with_tolerances(block: str) -> str:
+    return TEXT.replace("wire:", f"tolerances: {block}\nwire:", 1)
+
+
+def test_tolerances_have_units_and_are_stored_with_a_run() -> None:
+    text = with_tolerances("{area: 0.3 %, volume: 5 %, pin: 0.2 mm}")
+    bench = parse_model(Rig, text, "bench.yaml")
+    assert bench.tolerances is not None
+    assert bench.tolerances.area == pytest.approx(0.003)
+    assert bench.tolerances.volume == pytest.approx(0.05)
+    assert bench.tolerances.pin == pytest.approx(2e-4)
+    assert bench.tolerances.mid_length == 0.0
+    assert Rig.model_validate_json(bench.model_dump_json()) == bench
+    sigma = {number.name: number.sigma for number in bench.uncertain_numbers}
+    assert len(sigma) == 12  # two areas, two volumes, two pins of each joint; no mid length
+    assert sigma["rod_area of joint 2"] == pytest.approx(0.003 * 5.4e-4)
+    assert sigma["cap_pipe_volume of joint 1"] == pytest.approx(0.05 * 7.9e-5)
+    assert sigma["arm_pin of joint 1"] == pytest.approx(2e-4)
+
+
+def test_a_bench_without_tolerances_is_stored_as_ever() -> None:
+    bench = parse_model(Rig, TEXT, "bench.yaml")
+    assert bench.uncertain_numbers == ()
+    assert "tolerances" not in bench.model_dump(mode="json")
+    assert "tolerances" not in bench.model_dump_json()
+
+
+@pytest.mark.parametrize(
+    ("block", "expected"),
+    [
+        ("{pins: 0.2 mm}", "tolerances.pins: unknown key"),
+        ("{pin: -0.2 mm}", "tolerances.pin: expected greater than or equal to 0, found -0.0002"),
+        ("{area: -1 %}", "tolerances.area: expected greater than or equal to 0, found -0.01"),
+        ("{area: 120 %}", "tolerances.area: expected less than 1, found 1.2"),
+        ("{pin: 0.2}", "tolerances.pin: 0.2 has no unit; write one beside the number"),
+        ("{area: 3 mm^2}", "tolerances.area: unit 'mm^2' does not measure what is wanted here"),
+        ("{mid_length: 5 cm}", "mid_length 50 mm: with mid_length of joint 2 larger by it"),
+    ],
+)
+def test_a_tolerance_that_makes_no_sense_is_refused_with_its_line(
+    block: str, expected: str
+) -> None:
+    text = with_tolerances(block)
+    with pytest.raises(InputError) as caught:
+        parse_model(Rig, text, "bench.yaml")
+    (line,) = str(caught.value).splitlines()
+    assert expected in line
+    assert line.startswith(f"bench.yaml:{line_of('tolerances:', text)}: tolerances")
+
+
+def test_an_electric_rig_has_no_geometry_with_tolerances() -> None:
+    text = SHIPPED.with_name("electric-2dof.yaml").read_text()
+    with pytest.raises(InputError, match=r"tolerances: .* neither cylinders nor linkages"):
+        parse_model(Rig, text + "\ntolerances: {area: 1 %}\n", "arm.yaml")

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from analysis.identify.identify import identify
-from analysis.identify.online import Tracker, track
 from analysis.identify.result import PLAIN
+from analysis.identify.streams.online import Tracker, track
 from drivers.base import SampleBlock
 from rig.cli.bench.analysis import bench_run
 from rig.cli.bench.figure import Figure

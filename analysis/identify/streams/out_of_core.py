@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from analysis.effects.base import open_shapes
 from analysis.identify import checks as ck
 from analysis.identify.coupled import conclude
+from analysis.identify.geometry import shifts_of_reductions
 from analysis.identify.reduction import (
     RecordTask,
     first_of_steps,
@@ -40,8 +41,9 @@ def identify_folders(
 
     This is `identify` by the coupled method with the estimator "plain", for the other methods and
     estimators go over all rows again and again. The terms are those of the model `like`, or the
-    rig's baseline with `effects` (`analysis.terms.with_effects`). With a `pool` each record
-    is reduced in one of its processes, where the folders are read; only triangles come back.
+    rig's baseline with `effects` (`analysis.terms.with_effects`). The records are read once more
+    for every number of the rig with a tolerance (`analysis.identify.geometry`). With a `pool` each
+    record is reduced in one of its processes, where the folders are read; only triangles come back.
     `progress` hears the share of the records that are reduced, 0 to 1. Raises InputError as
     `identify` and `load_run` do, for a model of another rig, and for an effect whose shape is open.
     """
@@ -63,17 +65,19 @@ def identify_folders(
     moving = {
         (n, repeats.step): moves for (n, repeats), moves in zip(steps, decisions, strict=True)
     }
+    rigs = [rig, *map(rig.with_moved, rig.uncertain_numbers)]
     tasks = [
         RecordTask(
-            rig,
+            changed,
             number,
             folder,
             record.name,
             used,
             filtering,
-            record.name in first,
+            changed is rig and record.name in first,
             moving=moving.get((number, record.step)),
         )
+        for changed in rigs
         for number, (folder, head) in enumerate(zip(folders, heads, strict=True))
         for first in (first_of_steps(head.records),)
         for record in head.records
@@ -83,7 +87,10 @@ def identify_folders(
         reductions.append(reduction)
         if progress is not None:
             progress(len(reductions) / len(tasks))
-    return conclude(rig, [h.source for h in heads], used, reductions, reject_noise)
+    count = len(tasks) // len(rigs)
+    own, *moved = (reductions[k : k + count] for k in range(0, len(tasks), count))
+    geometry = shifts_of_reductions(rig, used, own, moved)
+    return conclude(rig, [h.source for h in heads], used, own, reject_noise, geometry=geometry)
 
 
 def _refuse_open(rig: Rig, terms: Sequence[Used]) -> None:

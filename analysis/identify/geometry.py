@@ -1,0 +1,226 @@
+"""What the tolerances of a rig's areas, volumes and pin distances leave unknown of the parameters.
+
+The rows of an identification take the rig's geometry as exact, so that a wrong area shifts the
+parameters the same way in every repeat and no scatter shows it. For every number g_j of the rig
+file with a tolerance sigma_j (`rig.model.tolerances`) the same records are solved again by least
+squares with that number larger by sigma_j, and the shifts
+
+    s_j = theta(g_j + sigma_j) - theta(g_j)
+
+are added to the covariance as sum_j s_j s_j' (GUM, 5.1, to first order): a number moves all
+parameters together. Intervals grow in quadrature, by 1.96 standard deviations of the sum.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.identify.checks import Check
+from analysis.identify.reduction import Part, RecordReduction
+from analysis.identify.settings import IDENTIFY
+from analysis.identify.stacked_rows import RecordRows
+from analysis.regression.qr import Accumulator
+from analysis.regression.rows import Rows, parameters_of, record_rows
+from analysis.regression.solve import RowCluster, solve
+from analysis.signals.conditioning import of_other_geometry
+from analysis.simulation.model import Estimate
+from analysis.terms.base import FAMILIES, Used, family_of
+from rig.model.rig import Rig
+from rig.model.tolerances import UncertainNumber
+
+Array = NDArray[np.float64]
+Parts = Mapping[str, Sequence[Part]]  # by family: triangles of [X y] and their rows
+
+NAME = "geometry"
+
+
+@dataclass(frozen=True)
+class GeometryShifts:
+    """How far each of J uncertain numbers, larger by one sigma, moves the rows' coefficients.
+
+    `shifts` holds (k, J) for each family, its coefficients in the order of `names`.
+    """
+
+    numbers: tuple[UncertainNumber, ...]
+    names: Mapping[str, tuple[str, ...]]
+    shifts: Mapping[str, Array]
+
+    def covariance(self, family: str) -> Array:
+        """Return what the numbers add to the covariance (k, k) of one family's coefficients."""
+        shift = self.shifts[family]
+        return np.asarray(shift @ shift.T)
+
+
+def shifts_of_rows(
+    rig: Rig, terms: Sequence[Used], built: Sequence[RecordRows]
+) -> GeometryShifts | None:
+    """Return the shifts by the rows of records in memory; None for a rig without tolerances."""
+    if not rig.uncertain_numbers:
+        return None
+    others = map(rig.with_moved, rig.uncertain_numbers)
+    parts = [_folded(other, terms, _rows_again(rig, terms, built, other)) for other in others]
+    return _shifts(rig, terms, _folded(rig, terms, (item.rows for item in built)), parts)
+
+
+def shifts_of_reductions(
+    rig: Rig,
+    terms: Sequence[Used],
+    reductions: Sequence[RecordReduction],
+    moved: Sequence[Sequence[RecordReduction]],
+) -> GeometryShifts | None:
+    """Return the same from reductions: of all records, and `moved` for each uncertain number."""
+    if not rig.uncertain_numbers:
+        return None
+    return _shifts(rig, terms, _collected(reductions), [_collected(each) for each in moved])
+
+
+def widened(
+    rig: Rig,
+    terms: Sequence[Used],
+    estimates: Mapping[str, Estimate],
+    covariance: Array,
+    geometry: GeometryShifts,
+) -> tuple[dict[str, Estimate], Array]:
+    """Return the estimates and their covariance (k, k) with the tolerances in them."""
+    S = parameter_shifts(rig, terms, estimates, geometry)
+    more = np.linalg.norm(S, axis=1)
+    grown = {
+        name: wider(estimate, float(extra))
+        for (name, estimate), extra in zip(estimates.items(), more, strict=True)
+    }
+    return grown, covariance + S @ S.T
+
+
+def wider(estimate: Estimate, more: float) -> Estimate:
+    """Return an estimate with a standard deviation `more` added in quadrature to either side."""
+    value, (low, high) = estimate.value, estimate.ci95
+    half = IDENTIFY.normal_quantile * more
+    ends = (value - math.hypot(value - low, half), value + math.hypot(high - value, half))
+    return replace(estimate, std=math.hypot(estimate.std, more), ci95=ends)
+
+
+def parameter_shifts(
+    rig: Rig,
+    terms: Sequence[Used],
+    estimates: Mapping[str, Estimate],
+    geometry: GeometryShifts,
+) -> Array:
+    """Return the shifts (k, J) of the parameters in the order of `estimates`, to first order.
+
+    Of a reciprocal coefficient c = 1/b that is - b^2 dc. Those of what the rows do not hold are 0.
+    """
+    coefficients = {c.parameter: c for used in terms for c in used.term.parameters(rig)}
+    order = {name: row for row, name in enumerate(estimates)}
+    S = np.zeros((len(order), len(geometry.numbers)))
+    for family, names in geometry.names.items():
+        for name, shift in zip(names, geometry.shifts[family], strict=True):
+            if name in order:
+                slope = -(estimates[name].value ** 2) if coefficients[name].reciprocal else 1.0
+                S[order[name]] = slope * shift
+    return S
+
+
+def geometry_check(
+    rig: Rig,
+    terms: Sequence[Used],
+    estimates: Mapping[str, Estimate],
+    geometry: GeometryShifts,
+) -> Check:
+    """State for every kind of tolerance which number moves which parameter most, and how far."""
+    S = parameter_shifts(rig, terms, estimates, geometry)
+    value = np.array([estimate.value for estimate in estimates.values()])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        relative = np.nan_to_num(S / np.abs(value)[:, None], nan=0.0, posinf=0.0, neginf=0.0)
+    clauses = []
+    for kind in dict.fromkeys(number.kind for number in geometry.numbers):
+        of_kind = [j for j, number in enumerate(geometry.numbers) if number.kind == kind]
+        k, j = np.unravel_index(np.argmax(np.abs(relative[:, of_kind])), (len(value), len(of_kind)))
+        number = geometry.numbers[of_kind[int(j)]]
+        moves = 100 * relative[k, of_kind[int(j)]]
+        clauses.append(
+            f"{number.name} ({number.stated}) moves {list(estimates)[int(k)]} by {moves:+.2g} %"
+        )
+    return Check(
+        NAME,
+        True,
+        "the intervals include the tolerances of the rig file; the largest relative shift by one "
+        f"standard uncertainty of each kind: {'; '.join(clauses)}",
+    )
+
+
+def left_out(rig: Rig, method: str) -> Check:
+    """State that a method's intervals do not include the tolerances that the rig file has."""
+    return Check(
+        NAME,
+        False,
+        f"the intervals of the method {method} take the geometry of {rig.name!r} for exact; "
+        "--method coupled includes the tolerances of the rig file",
+    )
+
+
+def to_json(
+    rig: Rig,
+    terms: Sequence[Used],
+    estimates: Mapping[str, Estimate],
+    geometry: GeometryShifts,
+) -> dict[str, Any]:
+    """Return every uncertain number with its sigma and the shift of each parameter, in SI."""
+    S = parameter_shifts(rig, terms, estimates, geometry)
+    return {
+        number.name: {
+            "sigma": number.sigma,
+            "shifts": {
+                name: float(shift) if math.isfinite(shift) else None
+                for name, shift in zip(estimates, S[:, j], strict=True)
+            },
+        }
+        for j, number in enumerate(geometry.numbers)
+    }
+
+
+def _rows_again(
+    rig: Rig, terms: Sequence[Used], built: Sequence[RecordRows], other: Rig
+) -> Iterable[Mapping[str, Rows]]:
+    """Yield the rows of every record as the rig `other` has them."""
+    for item in built:
+        signals = of_other_geometry(rig, item.conditioned.signals, other)
+        yield record_rows(other, terms, signals, item.conditioned.filtering)
+
+
+def _folded(rig: Rig, terms: Sequence[Used], records: Iterable[Mapping[str, Rows]]) -> Parts:
+    """Return one triangle for each family of the rows of all records."""
+    sums = {family: Accumulator(len(parameters_of(rig, terms, family))) for family in FAMILIES}
+    for rows_by_equation in records:
+        for equation, rows in rows_by_equation.items():
+            sums[family_of(equation)].fold(rows.matrix, rows.rhs)
+    return {family: ((part.triangle, part.rows),) for family, part in sums.items()}
+
+
+def _collected(reductions: Sequence[RecordReduction]) -> Parts:
+    return {
+        family: [part for reduction in reductions for part in reduction.parts[family]]
+        for family in FAMILIES
+    }
+
+
+def _shifts(rig: Rig, terms: Sequence[Used], own: Parts, moved: Sequence[Parts]) -> GeometryShifts:
+    """Return the shifts from the triangles of the rig itself and of it with each number moved."""
+    names = {f: names for f in FAMILIES if (names := parameters_of(rig, terms, f))}
+    shifts = {
+        family: np.column_stack(
+            [_solved(columns, parts[family]) for parts in moved]
+        ) - _solved(columns, own[family])[:, None]
+        for family, columns in names.items()
+    }  # fmt: skip
+    return GeometryShifts(rig.uncertain_numbers, names, shifts)
+
+
+def _solved(names: Sequence[str], parts: Sequence[Part]) -> Array:
+    """Return the least-squares coefficients (k,), NaN where the rows do not determine one."""
+    return solve(names, [RowCluster(0, 0, R, rows) for R, rows in parts]).value
