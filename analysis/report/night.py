@@ -1,4 +1,4 @@
-"""The page of a night: what ran, what was found, what tripped, and how each parameter drifted.
+"""The page of a night: items, trips, identified parameters and their drift.
 
 Every number comes from the arguments; the page refers to nothing outside itself.
 """

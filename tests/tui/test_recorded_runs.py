@@ -135,7 +135,7 @@ async def test_a_trace_shows_verdict_effects_errors_and_a_free_run_before_and_af
         await opened(office, shown, "monday", "before and after of its trace")
         assert "● EXPLAINED" in shown.text
         assert "▸ internal leakage at joint 2" in shown.text
-        assert "2.03e-12 ± 4e-14 m³/(s·Pa)" in shown.text
+        assert "2.030e-12 ± 0.040e-12 m³/(s·Pa)" in shown.text
         assert "not named: valve deadband at joint 1:" in shown.text
         assert "8.3× → 1.1×" in shown.text
         for _ in range(size[1]):  # to its end
