@@ -115,7 +115,7 @@ def _lead(night: Night, counts: Mapping[str, int]) -> str:
     total = len(night.items)
     done = counts.get("done", 0)
     trips = counts.get("tripped", 0)
-    first = f"{done} of {fm.count(total, 'item')} ran to {'its' if done == 1 else 'their'} end"
+    first = f"{done} of {fm.count(total, 'item')} completed"
     others = [f"{number} {state}" for state, number in counts.items() if state != "done"]
     text = f"{first}; {', '.join(others)}." if others else f"{first}."
     if trips:

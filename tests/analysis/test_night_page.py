@@ -39,7 +39,7 @@ def page() -> Page:
 
 
 def test_the_page_says_what_ran_what_tripped_and_what_waits(page: Page) -> None:
-    assert "2 of 5 items ran to their end; 1 failed, 1 tripped, 1 queued." in page.text
+    assert "2 of 5 items completed; 1 failed, 1 tripped, 1 queued." in page.text
     assert "Tripped in item 4, job <4>: cap_pressure_1 9.31 MPa" in page.text
     rows = page.table("Items").rows
     assert [row[2] for row in rows if row[0].isdigit()] == [
