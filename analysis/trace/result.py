@@ -18,6 +18,7 @@ from analysis.trace.data.spectral_lines import SpectralLines
 from analysis.trace.search.refinement import ExactFit
 from analysis.trace.settings import CLUES
 from rig.model.channels import place_in_words
+from rig.model.units import plain
 
 Array = NDArray[np.float64]
 
@@ -42,7 +43,10 @@ class Formula:
     @property
     def text(self) -> str:
         """The formula in one line."""
-        parts = [f"{value:+.3g} {name}".replace("e-0", "e-") for name, value in self.terms.items()]
+        parts = [
+            f"{'' if value < 0 else '+'}{plain(value, 3)} {name}".replace("e-0", "e-")
+            for name, value in self.terms.items()
+        ]
         line = " ".join(parts).removeprefix("+")
         what = "force at the piston [N]" if self.at_piston else f"{self.equation} [SI]"
         return f"{what} ≈ {line}"

@@ -47,12 +47,11 @@ def stands(effect: JudgedEffect) -> bool:
 
 
 def refused(effects: Sequence[JudgedEffect]) -> tuple[JudgedEffect, ...]:
-    """Return the effects that do not stand, each once: where it removes most, strongest first."""
-    fallen = sorted((f for f in effects if not stands(f)), key=lambda f: -f.removed_fraction)
+    """Return the effects that stand in no set, each once where it removes most, in that order."""
     once: dict[Key, JudgedEffect] = {}
-    for effect in fallen:
+    for effect in sorted(effects, key=lambda f: (not stands(f), -f.removed_fraction)):
         once.setdefault((effect.name, effect.at or effect.where), effect)
-    return tuple(once.values())
+    return tuple(f for f in once.values() if not stands(f))
 
 
 def judge(

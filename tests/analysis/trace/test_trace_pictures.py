@@ -157,3 +157,5 @@ def test_an_effect_that_several_sets_hold_is_refused_once_where_it_removes_most(
         for removed, at in ((0.1, "joint 1 spool"), (0.4, "joint 1 spool"), (0.2, "joint 1 piston"))
     )
     assert refused([first, LEAK, second, other]) == (second, other)
+    named = replace(first, gates=())
+    assert refused([named, second, other]) == (other,)
