@@ -18,6 +18,7 @@ from analysis.signals.conditioning import Signals
 from analysis.terms.base import FAMILIES, Kernel, Term, Used, kernel
 from rig.model.parse import InputError
 from rig.model.rig import Rig
+from rig.model.units import plain
 
 Array = NDArray[np.float64]
 
@@ -255,8 +256,8 @@ class Effect(Term):
             low = s.low if allowed else s.low + margin
             if not low <= value <= s.high - margin:
                 return (
-                    f"{s.parameter} = {value:.4g} {s.unit} lies at the edge of what is physical, "
-                    f"{s.low:.4g} to {s.high:.4g}"
+                    f"{s.parameter} = {plain(value, 4)} {s.unit} lies at the edge of what is "
+                    f"physical, {plain(s.low, 4)} to {plain(s.high, 4)}"
                 )
         return ""
 
@@ -265,7 +266,8 @@ def beyond(parameter: str, value: float, unit: str, high: float, low: float = 0.
     """Say that a coefficient is not within (low, high) ('' if it is)."""
     if low < value < high:
         return ""
-    return f"{parameter} = {value:.4g} {unit} is not between {low:.4g} and {high:.4g}"
+    shown, least, most = (plain(x, 4) for x in (value, low, high))
+    return f"{parameter} = {shown} {unit} is not between {least} and {most}"
 
 
 def shapes_of(rig: Rig, used: Used) -> tuple[Shape, ...]:

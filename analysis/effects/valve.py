@@ -160,7 +160,7 @@ class SpoolOffset(ValveEffect):
 
     def twins(self) -> tuple[tuple[str, str], ...]:
         """Return the LVDT's own offset: valve and sensor are one to the data."""
-        return (("sensor_offset", f"joint {self.joint + 1}"),)
+        return (("sensor_offset", f"joint {self.joint + 1} spool"),)
 
 
 TAKEN_UP: Final = 5e-4  # [s] in which the simulation remembers where the spool was pushed

@@ -74,7 +74,7 @@ def truth_remark(rig: Rig, truth: Mapping[str, float] | None) -> str:
         return ""
     return (
         f"The simulated bench's own truth has {'; '.join(remarks)}: there the check on link length "
-        "speaks of the bench, not of the identification."
+        "describes the bench, not the identification."
     )
 
 
@@ -196,7 +196,7 @@ def tiles(
             inside = sum(covers(known[n], truth[n]) for n in errors)
             out.append(
                 Tile(f"{fm.percent(errors[name], signed=True)} %", "largest error against truth",
-                     f"{name}; {inside} of {len(errors)} intervals hold the truth")
+                     f"{name}; {inside} of {len(errors)} intervals contain the truth")
             )  # fmt: skip
     worst = worst_fit(validation)
     if worst is not None:

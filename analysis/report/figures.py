@@ -48,7 +48,7 @@ def parameters(
     if reference and any(name in reference for name in estimates):
         text = (
             "Zero is the value the simulated bench was built with." if truth
-            else "Zero is the rig file's nominal value: a design figure, not the truth."
+            else "Zero is the rig file's nominal value: a design value, not the truth."
         )  # fmt: skip
         figures.append(
             ReportFigure(interval_plots.against_reference(estimates, reference, kind),
@@ -56,7 +56,7 @@ def parameters(
         )  # fmt: skip
     figures.append(
         ReportFigure(interval_plots.interval_widths(estimates), "Width of the intervals",
-              "Scatter is not accuracy: a narrow interval says nothing of what the model lacks.")
+              "Scatter is not accuracy: the interval does not include model error.")
     )  # fmt: skip
     return Gallery(tuple(figures))
 

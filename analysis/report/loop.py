@@ -1,4 +1,4 @@
-"""The loop's report: its rounds, what each experiment promised and brought, and the last trace."""
+"""The loop's report: its rounds, predicted and achieved separation, and the last trace."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from analysis.report.plots.style import BLUE, CARD, GREY, INK, PALE, figure, not
 from analysis.report.trace import body
 from analysis.trace.loop_rounds import Round
 from rig.model import channels as ch
+from rig.model.channels import place_in_words
 from rig.model.records import Record, Run
 
 TEMPLATE = "loop.html"
@@ -54,13 +55,13 @@ def _round(r: Round, run: Run | None, last: bool) -> dict[str, Any]:
     return {
         "number": r.number,
         "verdict": result.verdict,
-        "named": _names((e.name, e.where) for e in result.effects),
-        "tied": _names(result.tied),
+        "named": _names((e.name, e.at or e.where) for e in result.effects),
+        "tied": _names(result.tied_at),
         "predicted": fm.significant(r.predicted),
         "achieved": fm.significant(r.achieved),
         "loudest": fm.significant(r.loudest),
         "left": fm.significant(r.residual),
-        "did": "The protocol as it was given." if r.experiment is None
+        "did": "The protocol as given." if r.experiment is None
         else f"{_capital(str(r.experiment['text']))}.",
         "runs": " and ".join(r.runs),
         "sentence": result.sentence,
@@ -76,11 +77,14 @@ def _capital(text: str) -> str:
 
 
 def _names(effects: Any) -> str:
-    return ", ".join(f"{name.replace('_', ' ')} at {where}" for name, where in effects) or fm.DASH
+    return (
+        ", ".join(f"{name.replace('_', ' ')} at {place_in_words(at)}" for name, at in effects)
+        or fm.DASH
+    )
 
 
 def worth(rounds: Sequence[Round]) -> Markup | None:
-    """Draw what each experiment promised and brought, and the error left after each round."""
+    """Draw predicted and achieved separation of each experiment, and the error after each round."""
     if len(rounds) < 2:
         return None
     with style():
@@ -97,7 +101,7 @@ def worth(rounds: Sequence[Round]) -> Markup | None:
         axes.set_xlim(1.4, len(rounds) + 0.6)
         axes.set_xlabel("round")
         axes.set_ylabel("separation over noise")
-        note(axes, 0.02, 0.98, "pale promised, blue achieved", INK, ha="left")
+        note(axes, 0.02, 0.98, "pale predicted, blue achieved", INK, ha="left")
         axes = canvas.add_subplot(1, 2, 2)
         numbers = [r.number for r in rounds]
         before = [r.result.worst(r.result.before) for r in rounds]
@@ -108,9 +112,11 @@ def worth(rounds: Sequence[Round]) -> Markup | None:
         axes.set_ylim(0.0, 1.2 * axes.get_ylim()[1])
         axes.set_xlabel("round")
         axes.set_ylabel("worst held-out error over noise")
-        note(axes, 0.98, 0.98, "grey without, blue with what was found", INK)
+        note(axes, 0.98, 0.98, "grey without, blue with the effects found", INK)
         canvas.tight_layout()
-        return svg(canvas, "worth", "What each experiment promised and brought, by round")
+        return svg(
+            canvas, "worth", "Predicted and achieved separation of each experiment, by round"
+        )
 
 
 def excited(run: Run, number: int) -> Markup | None:
@@ -135,4 +141,4 @@ def excited(run: Run, number: int) -> Markup | None:
                 axes.set_ylabel("piston [mm]")
             note(axes, 0.98, 0.98, "joint " + " and ".join(map(str, moving)), INK)
         canvas.tight_layout()
-        return svg(canvas, f"excited{number}", "Pistons in a period of each step")
+        return svg(canvas, f"excited{number}", "Piston positions in a period of each step")

@@ -1,4 +1,4 @@
-"""The page of a night: what ran, what was found, what tripped, and how each parameter drifted.
+"""The page of a night: items, trips, identified parameters and their drift.
 
 Every number comes from the arguments; the page refers to nothing outside itself.
 """
@@ -115,7 +115,7 @@ def _lead(night: Night, counts: Mapping[str, int]) -> str:
     total = len(night.items)
     done = counts.get("done", 0)
     trips = counts.get("tripped", 0)
-    first = f"{done} of {fm.count(total, 'item')} ran to {'its' if done == 1 else 'their'} end"
+    first = f"{done} of {fm.count(total, 'item')} completed"
     others = [f"{number} {state}" for state, number in counts.items() if state != "done"]
     text = f"{first}; {', '.join(others)}." if others else f"{first}."
     if trips:

@@ -17,15 +17,16 @@ from analysis.trace.data.spectral_lines import loudest
 from analysis.trace.result import CLEAN, CONFOUNDED, JudgedEffect, Trace
 from analysis.trace.settings import TRACE
 from analysis.trace.words import quantity, shot_in_words, unit_of_equation
+from rig.model.channels import place_in_words
 from rig.model.records import Run
 from rig.model.rig import Rig
 
 TEMPLATE = "trace.html"
 TITLES = {
-    "clean": "Nothing above the noise",
-    "explained": "What the model lacked, named",
-    "confounded": "Two or more effects fit alike",
-    "unexplained": "Something the catalogue does not hold",
+    "clean": "No residual above the noise",
+    "explained": "The missing effects are named",
+    "confounded": "Two or more effects fit equally well",
+    "unexplained": "An effect that the catalogue does not have",
 }
 
 
@@ -100,7 +101,7 @@ def _pictures(rig: Rig, holdout: Sequence[Run], result: Trace) -> list[dict[str,
     ]
     for k, effect in enumerate(effects):
         equation = trace_plots.equation_of(effect, rig, result, lines)
-        heading = f"{effect.name.replace('_', ' ')} at {getattr(effect, 'place', effect.where)}"
+        heading = f"{effect.name.replace('_', ' ')} at {place_in_words(effect.where)}"
         add(effect, effect.variable, equation, heading, f"e{k}")
     # A frequency is seen in time and in the lines, not against anything; noise moves with nothing.
     drawn = [
@@ -110,7 +111,7 @@ def _pictures(rig: Rig, holdout: Sequence[Run], result: Trace) -> list[dict[str,
              or result.after[d.equation] > TRACE.noted_ratio * result.noise_floor[d.equation])
     ][:2]  # fmt: skip
     for k, clue in enumerate(drawn):
-        heading = f"what is left of {clue.equation} against {clue.variable}"
+        heading = f"remaining residual of {clue.equation} against {clue.variable}"
         add(None, clue.variable, clue.equation, heading, f"c{k}")
     return out
 
@@ -170,7 +171,7 @@ def _effect(effect: JudgedEffect, key: str) -> dict[str, Any]:
         "curve": trace_plots.curves(effect, key) if effect.curves else None,
         "tried": trace_plots.instead(effect, f"{key}r"),
         "name": effect.name.replace("_", " "),
-        "where": effect.where,
+        "where": effect.location,
         "values": [(n, quantity(e)) for n, e in effect.parameters.items()],
         "p": fm.significant(effect.p_value),
         "removed": fm.significant(100 * effect.removed_fraction),
@@ -178,8 +179,8 @@ def _effect(effect: JudgedEffect, key: str) -> dict[str, Any]:
         "gates": effect.gates,
         "rivals": [
             (
-                r.name.replace("_", " "), r.where, fm.significant(r.ratio),
-                fm.significant(r.training_ratio), "cannot be told apart" if r.tied else "ruled out",
+                r.name.replace("_", " "), r.location, fm.significant(r.ratio),
+                fm.significant(r.training_ratio), "cannot be separated" if r.tied else "ruled out",
             )
             for r in effect.rivals
         ],

@@ -51,6 +51,7 @@ from analysis.trace.words import sentence
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
+from rig.model.units import plain
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
@@ -61,7 +62,7 @@ ESTIMATOR = "ls"
 PREPARED, COLUMNS, JUDGED = 0.1, 0.55, 0.8
 ELSEWHERE = (
     "the training records are met to within the noise, the held-out ones are not: train on "
-    "records that excite as much as these do"
+    "records with as much excitation as the held-out ones"
 )
 
 
@@ -122,8 +123,7 @@ def trace(
         hypotheses, judged_all, winner, verdict, rest = _settled(
             hypotheses, winner, free, holdout_data, rng
         )
-        most = sorted(judged_all, key=lambda f: -f.removed_fraction)
-        refused = tuple(f for f in most if not gates.stands(f))
+        refused = gates.refused(judged_all)
         judged_effects = tuple(f for f in judged_all if gates.stands(f))
         notes += _rest_notes(verdict, rest, quiet, bool(judged_effects))
     done(JUDGED)
@@ -183,7 +183,7 @@ def _nobody(_: float) -> None:
 def _refuse_same(runs: Sequence[Run], holdout: Sequence[Run], judge: Sequence[Run] = ()) -> None:
     if not holdout or not any(run.records for run in holdout):
         raise InputError(
-            "no held-out records: give --holdout a run that the fit does not see, of another "
+            "no held-out records: give --holdout a run that is not used for the fit, with another "
             "excitation (other wave or amplitude)"
         )
     if judge and not any(run.records for run in judge):
@@ -196,8 +196,8 @@ def _refuse_same(runs: Sequence[Run], holdout: Sequence[Run], judge: Sequence[Ru
         for digest, name in digests if option else ():
             if digest in seen:
                 raise InputError(
-                    f"{kind} record {name!r} is {seen[digest]}, sample for sample; what has been "
-                    f"seen cannot judge: give {option} other records"
+                    f"{kind} record {name!r} is {seen[digest]}, sample for sample; it must not be "
+                    f"used twice: give {option} other records"
                 )
         seen |= {digest: f"{kind} record {name!r}" for digest, name in digests}
 
@@ -247,8 +247,8 @@ def _refuse_short(train_data: RegressionData, train: Sequence[ConditionedRecord]
             )
             raise InputError(
                 f"step {s.group[1]!r}: records of {seconds:.3g} s leave {count} rows of "
-                f"{s.equation} behind the filters' edges and masks; the trace needs "
-                f"{TRACE.least_rows}: record longer"
+                f"{s.equation} after filter edges and masks; the trace needs "
+                f"{TRACE.least_rows}: take longer records"
             )
 
 
@@ -260,8 +260,8 @@ def _notes(train_data: RegressionData, holdout_data: RegressionData) -> list[str
     if single:
         out.append(
             f"one repeat of {' '.join(single)} and no whole periods to compare: the noise floor is "
-            "the rig file's stated sensor noise; noise that the file does not state would pass "
-            "for model error, so nothing is named with full confidence"
+            "the rig file's stated sensor noise; noise above that value would be taken "
+            "for model error, so the evidence for every name is weaker"
         )
     elif sources != {REPEATS}:
         where = PERIODS if PERIODS in sources else NEIGHBOURS
@@ -269,7 +269,7 @@ def _notes(train_data: RegressionData, holdout_data: RegressionData) -> list[str
     few = min((f.count for f in train_data.floors if f.count > 1), default=0)
     if 0 < few < 4:
         out.append(
-            f"{few} repeats: stability is judged on few half-samples; four or more tell more"
+            f"{few} repeats: stability is judged on few half-samples; use four repeats or more"
         )
     if all(f.source == STATED for f in holdout_data.floors):
         out.append("the held-out noise floor is the rig file's stated sensor noise")
@@ -336,7 +336,8 @@ def _missed_held(verdict: str, error: held_out.Errors, failures: Sequence[str]) 
             share = (error.after[e] ** 2 - noise**2) / max(error.before[e] ** 2 - noise**2, 1e-30)
             out.append(
                 f"{e}: held-out error {error.after[e] / noise:.2f} times the noise floor, "
-                f"{100 * share:.2g} % of the energy that was there, which the named form may miss"
+                f"{plain(100 * share, 2)} % of the baseline's energy, within "
+                "the tolerance for the form of the named effect"
             )
     return out
 
@@ -346,8 +347,10 @@ def _rest_notes(verdict: str, rest: Sequence[Rest], quiet: bool, named: bool) ->
     out = [ELSEWHERE] if quiet and verdict == UNEXPLAINED else []
     if verdict == UNEXPLAINED and (named or quiet):
         out += [f"{r.equation}: {r.words}" for r in rest if r.veto]
-    few = [f"{r.equation}: {r.words}; too little to speak against" for r in rest if not r.veto]
-    return out + few
+    few = [f"{r.equation}: {r.words}" for r in rest if not r.veto]
+    return out + [
+        f"{words}; within the tolerance for the form of the named effect" for words in few
+    ]
 
 
 def _named(

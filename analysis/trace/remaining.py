@@ -21,6 +21,7 @@ from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.refinement import rebased
 from analysis.trace.settings import TRACE
+from rig.model.units import plain
 
 
 class Rest(NamedTuple):
@@ -59,7 +60,8 @@ def left_over(
             and expression.share >= TRACE.formula_share
             and expression.variables
         ):
-            words = f"{100 * seen[equation]:.2g} % of what repeated stays, and a formula holds it"
+            share = plain(100 * seen[equation], 2)
+            words = f"{share} % of the repeatable energy remains, and a formula fits it"
             loud = winner.excess_energy[equation] > hypotheses.limits.band[equation]
             veto = loud and seen[equation] < TRACE.unexplained_share
             out.append(Rest(equation, f"{words}: {expression.text}", veto))
@@ -73,8 +75,7 @@ def _missed(hypotheses: HypothesisSet, winner: Hypothesis, known: Sequence[Rest]
     for e, residual in winner.excess_energy.items():
         if winner.effects and e not in listed and not hypotheses.negligible(e, residual):
             share = 100 * residual / max(hypotheses.empty.excess_energy[e], 1e-30)
-            words = f"{share:.2g} % of what repeated stays, which the named form may miss"
-            out.append(Rest(e, words, False))
+            out.append(Rest(e, f"{plain(share, 2)} % of the repeatable energy remains", False))
     return out
 
 

@@ -17,6 +17,8 @@ from analysis.trace.data.noise_floor import Floor
 from analysis.trace.data.spectral_lines import SpectralLines
 from analysis.trace.search.refinement import ExactFit
 from analysis.trace.settings import CLUES
+from rig.model.channels import place_in_words
+from rig.model.units import plain
 
 Array = NDArray[np.float64]
 
@@ -41,7 +43,10 @@ class Formula:
     @property
     def text(self) -> str:
         """The formula in one line."""
-        parts = [f"{value:+.3g} {name}".replace("e-0", "e-") for name, value in self.terms.items()]
+        parts = [
+            f"{'' if value < 0 else '+'}{plain(value, 3)} {name}".replace("e-0", "e-")
+            for name, value in self.terms.items()
+        ]
         line = " ".join(parts).removeprefix("+")
         what = "force at the piston [N]" if self.at_piston else f"{self.equation} [SI]"
         return f"{what} ≈ {line}"
@@ -69,8 +74,8 @@ class Formula:
 class Rival:
     """Another effect in the same part: what it leaves on held-out records over what the best does.
 
-    `ratio` and `training_ratio` are of whitened rms; `tied` says that the data cannot tell it
-    from the best.
+    `ratio` and `training_ratio` are of whitened rms; `tied` says that the data cannot separate it
+    from the best. `at` is its place with the sensor or chamber, as the catalogue has it.
     """
 
     name: str
@@ -78,6 +83,12 @@ class Rival:
     ratio: float
     training_ratio: float
     tied: bool
+    at: str = ""
+
+    @property
+    def location(self) -> str:
+        """Where it is, in words: of a sensor or chamber, which."""
+        return place_in_words(self.at or self.where)
 
 
 @dataclass(frozen=True)
@@ -111,6 +122,7 @@ class JudgedEffect:
     shooting makes of an effect with a hidden state. `mechanism` is where it acts; a `free` one has
     no name of its own and is what its `curves` say. `left_without` and `left_with` are the held-out
     rms in the equations it touches without it and with it, the mean of the repeats' noise being 1.
+    `at` is its place with the sensor or chamber, as the catalogue has it.
     """
 
     name: str
@@ -127,6 +139,12 @@ class JudgedEffect:
     curves: tuple[Curve, ...] = ()
     left_without: float = math.nan
     left_with: float = math.nan
+    at: str = ""
+
+    @property
+    def location(self) -> str:
+        """Where it is, in words: of a sensor or chamber, which."""
+        return place_in_words(self.at or self.where)
 
     @property
     def named(self) -> bool:
@@ -212,8 +230,13 @@ class Trace:
     free_curves: FreeCurves | None = None
 
     @property
+    def tied_at(self) -> list[tuple[str, str]]:
+        """As `tied`, the places with sensor or chamber."""
+        return sorted({(r.name, r.at or r.where) for e in self.effects for r in e.rivals if r.tied})
+
+    @property
     def tied(self) -> list[tuple[str, str]]:
-        """Name and place of the rivals that the data cannot tell from an effect named."""
+        """Name and place of the rivals that the data cannot separate from an effect named."""
         return sorted({(r.name, r.where) for e in self.effects for r in e.rivals if r.tied})
 
     def worst(self, error: Mapping[str, float]) -> float:
@@ -230,7 +253,7 @@ class Trace:
 def to_json(result: Trace) -> dict[str, Any]:
     """Return the contract's JSON.
 
-    Added to it are `refused gates size rmse window_rmse noise lines notes sentence seconds`, and
+    Added to it are `refused at gates size rmse window_rmse noise lines notes sentence seconds`, and
     `free_run`, to be drawn.
     """
     return {
@@ -284,6 +307,7 @@ def _effect(effect: JudgedEffect) -> dict[str, Any]:
     return {
         "name": effect.name,
         "where": effect.where,
+        "at": effect.at or effect.where,
         "mechanism": effect.mechanism,
         "form": FREE if effect.free else NAMED,
         "curve": _curve(effect.curves[0]) if effect.curves else None,
@@ -293,8 +317,9 @@ def _effect(effect: JudgedEffect) -> dict[str, Any]:
         "removed_fraction": finite(effect.removed_fraction),
         "rivals": [
             {
-                "name": r.name, "where": r.where, "held_out_ratio": finite(r.ratio),
-                "training_ratio": finite(r.training_ratio), "tied": r.tied,
+                "name": r.name, "where": r.where, "at": r.at or r.where,
+                "held_out_ratio": finite(r.ratio), "training_ratio": finite(r.training_ratio),
+                "tied": r.tied,
             }
             for r in effect.rivals
         ],

@@ -9,7 +9,9 @@ import numpy as np
 from analysis.simulation.model import Estimate
 from analysis.trace.clues.formula import surest
 from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, JudgedEffect, Trace
+from rig.model.channels import place_in_words
 from rig.model.rig import Rig
+from rig.model.units import plain, typeset, with_interval
 
 UNITS = {"torque": "N·m", "flow_cap": "m³/s", "flow_rod": "m³/s"}
 
@@ -26,24 +28,27 @@ def sentence(result: Trace) -> str:
     """Return one paragraph that a person can act on."""
     if result.verdict == CLEAN:
         return (
-            "Nothing stands above the noise: the baseline model explains these records, and there "
-            "is nothing to name."
+            "No residual exceeds the noise: the baseline model explains these records; no effect "
+            "is named."
         )
     named = "; ".join(_effect(e) for e in result.effects)
     errors = _errors(result)
     if result.verdict == EXPLAINED:
         return f"{_moves(result.effects)}: {named}. {errors}"
     if result.verdict == CONFOUNDED:
-        rivals = ", ".join(f"{name} at {where}" for name, where in result.tied)
-        text = f"Best is {named}, but these records cannot tell it from {rivals}."
+        rivals = ", ".join(
+            f"{name.replace('_', ' ')} at {place_in_words(at)}" for name, at in result.tied_at
+        )
+        text = f"The best fit is {named}, but these records cannot separate it from {rivals}."
         if result.next_experiment:
-            text += f" What would tell: {result.next_experiment['text']}."
+            text += f" An experiment that separates them: {result.next_experiment['text']}."
         return f"{text} {errors}"
-    prefix = f"Found so far: {named}. " if named else "No effect of the catalogue is named. "
+    prefix = f"Effects found: {named}. " if named else "No effect of the catalogue is named. "
     clue = ", ".join(d.text for d in result.depends_on[:2])
     return (
-        f"{prefix}{100 * result.unexplained_fraction:.0f} % of what repeats stays unexplained"
-        + (f"; it moves with {clue}" if clue else "")
+        f"{prefix}{100 * result.unexplained_fraction:.0f} % of the repeatable residual energy "
+        "remains unexplained"
+        + (f"; it depends on {clue}" if clue else "")
         + _symmetry(result)
         + _formula(result)
         + (f". {errors}" if named else ".")
@@ -51,9 +56,9 @@ def sentence(result: Trace) -> str:
 
 
 def _formula(result: Trace) -> str:
-    """Say what a sparse fit reads that leaves next to nothing ('' where none does)."""
+    """Return the sparse fit that leaves least in words ('' where none is sure)."""
     best = surest(result.formulas)
-    return f"; a sparse fit reads {best.text}" if best else ""
+    return f"; a sparse fit is {best.text}" if best else ""
 
 
 def _symmetry(result: Trace) -> str:
@@ -61,7 +66,7 @@ def _symmetry(result: Trace) -> str:
     loud = max(result.lines, key=lambda lines: lines.loud_after, default=None)
     if loud is None or loud.loud_after < 1.0:
         return ""
-    return f"; by its lines in {loud.equation} it is {loud.meaning_after}"
+    return f"; its spectral lines in {loud.equation} show that it is {loud.meaning_after}"
 
 
 def _moves(effects: tuple[JudgedEffect, ...]) -> str:
@@ -77,14 +82,13 @@ def _constant(variable: str) -> bool:
 
 def _effect(effect: JudgedEffect) -> str:
     values = ", ".join(f"{n} = {quantity(e)}" for n, e in effect.parameters.items())
-    return f"{effect.name.replace('_', ' ')} at {effect.where} ({values})"
+    return f"{effect.name.replace('_', ' ')} at {effect.location} ({values})"
 
 
 def quantity(estimate: Estimate) -> str:
     """Return value ± 95 % half-width with its unit."""
-    unit = estimate.unit.replace("*", "·").replace("^2", "²").replace("^3", "³")
     half = 0.5 * (estimate.ci95[1] - estimate.ci95[0])
-    return f"{estimate.value:.3g} ± {half:.1g} {unit}".strip()
+    return with_interval(estimate.value, half, typeset(estimate.unit))
 
 
 def shot_in_words(effect: JudgedEffect) -> str:
@@ -93,8 +97,12 @@ def shot_in_words(effect: JudgedEffect) -> str:
         return ""
     shot = effect.shot
     values = ", ".join(f"{n} = {quantity(e)}" for n, e in shot.shapes.items())
-    which = "taken" if shot.taken else "the rows' stay, their interval holds both"
-    judged = "no held-out window tells which is closer"
+    which = (
+        "taken"
+        if shot.taken
+        else ("the values from the rows are kept, with an interval that contains both")
+    )
+    judged = "held-out windows do not decide which is closer"
     if np.isfinite([shot.before, shot.after]).all():
         judged = f"held-out windows {shot.before:.2f} → {shot.after:.2f} times the sensors' noise"
     return f"by multiple shooting {values}; {judged}: {which}"
@@ -111,7 +119,8 @@ def _errors(result: Trace) -> str:
         return ""
     e = loudest(result)
     unit = unit_of_equation(result.model_before.rig, e)
-    return (
-        f"Held-out error of {e}: {result.before[e]:.2g} → {result.after.get(e, float('nan')):.2g} "
-        f"{unit}, noise floor {result.noise_floor.get(e, float('nan')):.2g}."
+    before, after, floor = (
+        plain(error.get(e, float("nan")), 2)
+        for error in (result.before, result.after, result.noise_floor)
     )
+    return f"Held-out error of {e}: {before} → {after} {unit}, noise floor {floor}."

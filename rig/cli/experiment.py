@@ -76,7 +76,7 @@ def experiment(
     runs, judged = (load_run(first),), (load_run(second),)
     say("identifying from the first run")
     identification = identify(runs)
-    say("validating on the second, which the fit has not seen")
+    say("validating on the second, which is held out")
     results = validate(identification.model, judged)
     return Experiment(
         runs, judged, tuple(map(load_run, unseen)), identification, results, read_truth(truth)
@@ -92,7 +92,7 @@ def run_demo(out: Path, seed: int, repeats: int | None) -> None:
     done = experiment(folder, seed, Overrides(repeats=repeats), progress, HIDDEN)
     write_json(folder / "identify.json", identification_json(done.identification))
     write_json(folder / "validate.json", validation_json(done.validation))
-    progress("tracing what the model lacks, judged on runs that the fit has not seen")
+    progress("tracing missing effects, judged on held-out runs")
     held_out = (*done.unseen, *done.judged)
     traced = trace(done.runs, held_out, seed=seed, progress=Countdown("tracing"))
     write_json(folder / "trace.json", trace_json(traced))

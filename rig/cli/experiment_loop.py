@@ -38,10 +38,10 @@ HELD_OUT: Final = Overrides(amplitude_scale=0.7, seed=1007, repeats=2)
 SMALLER = 0.8  # an experiment that the bench or its twin refuses is tried again so much smaller
 TRIES = 4
 
-FLOOR: Final = "what is left lies within the noise"
-NOTHING: Final = "no experiment within the limits promises more than noise"
-ROUNDS: Final = "as many experiments as were asked for"
-DECLINED: Final = "the operator did not want the next experiment"
+FLOOR: Final = "the remaining residual is within the noise"
+NOTHING: Final = "no experiment within the limits predicts a separation above the noise"
+ROUNDS: Final = "the number of experiments asked for is reached"
+DECLINED: Final = "the operator declined the next experiment"
 REFUSED: Final = "the bench refused the next experiment"
 
 

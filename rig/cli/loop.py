@@ -48,9 +48,9 @@ def loop(
         str | None, typer.Option(help="Written into the runs.  [default: you]")
     ] = None,
 ) -> None:
-    """Close the loop: run, trace, design the experiment that would tell, run it, trace again.
+    """Close the loop: run, trace, design the experiment that separates, run it, trace again.
 
-    It stops when what is left is noise, or when no experiment promises more than noise.
+    It stops when the remaining residual is noise, or no experiment predicts more than noise.
 
     Example: bramah loop --rig shinshu-2dof --out loops/monday --unattended
     """

@@ -149,3 +149,7 @@ def run(arguments: list[str] | None = None) -> None:
         return result
 
     sys.exit(guarded(work, debug=debug))
+
+
+if __name__ == "__main__":
+    run()

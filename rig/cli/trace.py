@@ -16,10 +16,10 @@ FAMILIES_OF: Final = {
 
 
 def trace(
-    runs: Annotated[list[Path], typer.Argument(help="Run folders that the fit may see.")],
+    runs: Annotated[list[Path], typer.Argument(help="Run folders used for the fit.")],
     holdout: Annotated[
         list[Path] | None,
-        typer.Option("--holdout", help="A run folder that the fit does not see; repeatable."),
+        typer.Option("--holdout", help="A held-out run folder, not used for the fit; repeatable."),
     ] = None,
     judge: Annotated[
         list[Path] | None,
@@ -33,11 +33,11 @@ def trace(
     ] = None,
     like: Annotated[
         Path | None,
-        typer.Option(help="A model file: what does it lack still, its effects taken as known?"),
+        typer.Option(help="Start from this model file, its effects taken as known."),
     ] = None,
     report: Annotated[Path | None, typer.Option(help="Write an HTML report here.")] = None,
     equations: Annotated[
-        str, typer.Option(help="all, torque or flow: where one hides what the other lacks.")
+        str, typer.Option(help="Equations to trace: all, torque or flow.")
     ] = "all",
     seed: Annotated[int, typer.Option(min=0, help="Of half-samples and sign flips.")] = 0,
 ) -> None:
@@ -57,8 +57,8 @@ def trace(
 
     if not holdout:
         raise InputError(
-            "trace needs --holdout RUN: records of another excitation that the fit does not see; "
-            "an effect is only named where it explains those too"
+            "trace needs --holdout RUN: records of another excitation, not used for the fit; an "
+            "effect is named only if it explains those too"
         )
     if equations not in FAMILIES_OF:
         raise InputError(f"--equations {equations}: expected one of: {' '.join(FAMILIES_OF)}")

@@ -10,11 +10,12 @@ from analysis.trace.loop_rounds import Round
 from analysis.trace.result import JudgedEffect, Trace
 from analysis.trace.words import quantity, shot_in_words, unit_of_equation
 from rig.cli.output import table
-from rig.model.units import RESIDUALS, display_unit
+from rig.model.channels import place_in_words
+from rig.model.units import RESIDUALS, display_unit, plain
 
 
 def trace_text(result: Trace) -> str:
-    """Return verdict, effects with their gates, errors, what is left, and what to do next."""
+    """Return verdict, effects with their gates, errors, clues, and the next experiment."""
     lines = [f"verdict: {result.verdict}", "", result.sentence, ""]
     for effect in result.effects:
         lines += _effect(effect)
@@ -57,13 +58,15 @@ def trace_text(result: Trace) -> str:
     changed = _changed(result)
     if changed:
         lines += [table(["parameter", "before", "after", "change"], changed), ""]
-    lines += [f"lines: {lines_of_equation.text}" for lines_of_equation in loudest(result.lines)]
+    lines += [
+        f"spectral lines: {lines_of_equation.text}" for lines_of_equation in loudest(result.lines)
+    ]
     if result.depends_on:
         moves = ", ".join(f"{d.text} ({100 * d.share:.0f} %)" for d in result.depends_on[:4])
-        lines.append(f"what is left moves with: {moves} (a clue, not a name)")
+        lines.append(f"the remaining residual depends on: {moves} (a clue, not a name)")
     lines += [
-        f"a sparse fit of what {f.equation} lacks: {f.text} "
-        f"({100 * f.share:.0f} % of it on held-out records; a clue, not a name)"
+        f"a sparse fit of the remaining residual of {f.equation}: {f.text} "
+        f"({100 * f.share:.0f} % of its energy on held-out records; a clue, not a name)"
         for f in result.formulas
     ]
     if result.next_experiment:
@@ -80,13 +83,13 @@ def _share(error: float | None, size: float | None) -> str:
 
 def _effect(effect: JudgedEffect) -> list[str]:
     values = ", ".join(f"{n} = {quantity(e)}" for n, e in effect.parameters.items())
-    lines = [f"{effect.name} at {effect.where}: {values}"]
+    lines = [f"{effect.name} at {effect.location}: {values}"]
     if effect.shot:
         lines.append(f"  {shot_in_words(effect)}")
     lines += [f"  {'ok    ' if g.ok else 'NOT OK'} {g.name}: {g.detail}" for g in effect.gates]
     lines += [
-        f"  rival {r.name} at {r.where}: {r.ratio:.2f} times the held-out rms"
-        + (" (cannot be told apart)" if r.tied else "")
+        f"  rival {r.name} at {r.location}: {r.ratio:.2f} times the held-out rms"
+        + (" (cannot be separated)" if r.tied else "")
         for r in effect.rivals
     ]
     return [*lines, ""]
@@ -123,7 +126,7 @@ def _free_run(result: Trace, channel: str) -> list[str]:
 
 
 def _number(value: float, digits: int = 3) -> str:
-    return f"{value:.{digits}g}" if math.isfinite(value) else "—"
+    return plain(value, digits) if math.isfinite(value) else "—"
 
 
 def rounds_text(rounds: Sequence[Round], stopped: str) -> str:
@@ -131,7 +134,7 @@ def rounds_text(rounds: Sequence[Round], stopped: str) -> str:
     rows = [
         [
             str(r.number), r.result.verdict, named(r.result), _figure(r.predicted),
-            _figure(r.achieved), f"{r.loudest:.2g}", f"{r.residual:.2g}",
+            _figure(r.achieved), plain(r.loudest, 2), plain(r.residual, 2),
         ]
         for r in rounds
     ]  # fmt: skip
@@ -144,10 +147,10 @@ def rounds_text(rounds: Sequence[Round], stopped: str) -> str:
 
 def named(result: Trace) -> str:
     """Return the effects of a trace in a few words, the tied ones too."""
-    names = [f"{e.name} at {e.where}" for e in result.effects]
-    tied = ", ".join(f"{name} at {where}" for name, where in result.tied)
+    names = [f"{e.name} at {e.location}" for e in result.effects]
+    tied = ", ".join(f"{name} at {place_in_words(at)}" for name, at in result.tied_at)
     return (", ".join(names) or "nothing") + (f" (or {tied})" if tied else "")
 
 
 def _figure(value: float | None) -> str:
-    return "—" if value is None else f"{value:.2g}"
+    return "—" if value is None else plain(value, 2)

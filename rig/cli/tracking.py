@@ -33,6 +33,7 @@ from rig.cli.output import write_json
 from rig.model.parse import InputError
 from rig.model.records import RecordHead
 from rig.model.rig import Rig
+from rig.model.units import with_interval
 from rig.runs.recorder import RecordMeta
 from rig.runs.runstate import EventLog
 
@@ -63,7 +64,8 @@ def summary(parameters: Mapping[str, Mapping[str, Any]]) -> str:
         scale, unit = (1e-6, " MPa") if name == "b" else (1e7, "")
         text = "?" if value is None else f"{scale * value:.4g}"
         if value is not None and low is not None and high is not None:
-            text += f"±{0.5 * scale * (high - low):.1g}"
+            half = 0.5 * scale * (high - low)
+            text = with_interval(scale * value, half).replace(" ± ", "±")
         parts.append(f"{name} {text}{unit}")
     return "  ".join(parts)
 

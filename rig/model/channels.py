@@ -52,6 +52,13 @@ def kind_of(name: str) -> tuple[str, int | None]:
     return match["kind"], int(match["joint"])
 
 
+def place_in_words(where: str) -> str:
+    """Return an effect's `where` for people: ``joint 1, spool`` for ``joint 1 spool``."""
+    words = where.split()
+    count = 2 if words[:1] == ["joint"] else 1
+    return ", ".join(" ".join(part) for part in (words[:count], words[count:]) if part)
+
+
 def unit_of(name: str) -> str:
     """Return the SI unit of a channel's samples; raises ValueError for an unknown name.
 

@@ -11,6 +11,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from decimal import Decimal
 from typing import Final
 
 _PREFIXES: Final = {
@@ -25,6 +26,7 @@ _PREFIXES: Final = {
 }
 _TOKEN: Final = re.compile(r"\s*(\*\*|[*/^()]|[+-]?\d+\.?\d*(?:[eE][+-]?\d+)?|[A-Za-zµ_]+)\s*")
 _ZERO_CELSIUS: Final = 273.15  # [K]
+_PLAIN_FROM, _PLAIN_BELOW = 1e-3, 1e5  # numbers that are written without exponent
 
 
 @dataclass(frozen=True)
@@ -173,6 +175,34 @@ RESIDUALS: Final = {
 def display_unit(si: str, table: Mapping[str, DisplayUnit]) -> DisplayUnit:
     """Return how an SI unit is shown; one that the table does not hold is shown in SI."""
     return table.get(si) or DisplayUnit(1.0, si)
+
+
+def plain(value: float, digits: int) -> str:
+    """Return a number with so many significant digits, without exponent below 1e5."""
+    text = f"{value:.{digits}g}"
+    return f"{Decimal(text):f}" if "e+" in text and abs(value) < _PLAIN_BELOW else text
+
+
+def with_interval(value: float, half: float, unit: str = "") -> str:
+    """Return ``value ± half unit``: half an interval with two digits, the value to its decimals.
+
+    Without exponent where the larger of both is from 1e-3 to 1e5, else both with the same one. A
+    half interval that is not known (NaN or 0) is left out.
+    """
+    if not math.isfinite(value) or not math.isfinite(half) or half <= 0.0:
+        text = plain(value, 4) + (" ± ∞" if half == math.inf else "")
+        return f"{text} {unit}".strip()
+    largest = max(abs(value), half)
+    inside = _PLAIN_FROM <= largest < _PLAIN_BELOW
+    exponent = 0 if inside else math.floor(math.log10(largest))
+    power = f"e{exponent}" if exponent else ""
+    mantissa = float(f"{half:.1e}") / 10.0**exponent
+    places = 1 - math.floor(math.log10(mantissa) + 1e-9)
+    numbers = [
+        f"{round(x / 10.0**exponent, places) + 0.0:.{max(places, 0)}f}" for x in (value, half)
+    ]
+    shown, width = (text if float(text) == 0.0 else f"{text}{power}" for text in numbers)
+    return f"{shown} ± {width} {unit}".strip()
 
 
 def typeset(unit: str) -> str:

@@ -9,6 +9,8 @@ from typing import Final
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from rig.model.channels import place_in_words
+
 STORED: Final = "trace.json"  # what `bramah trace --json` wrote, in the run's folder or above it
 
 Numbers = Mapping[str, float | None]
@@ -41,9 +43,15 @@ class StoredEffect(_Stored):
 
     name: str
     where: str
+    at: str = ""
     parameters: Mapping[str, StoredEstimate] = {}
     removed_fraction: float | None = None
     gates: tuple[StoredGate, ...] = ()
+
+    @property
+    def location(self) -> str:
+        """Where it is, in words: of one sensor of a joint, which."""
+        return place_in_words(self.at or self.where)
 
 
 class StoredErrors(_Stored):

@@ -39,13 +39,13 @@ def page() -> Page:
 
 
 def test_the_page_says_what_ran_what_tripped_and_what_waits(page: Page) -> None:
-    assert "2 of 5 items ran to their end; 1 failed, 1 tripped, 1 queued." in page.text
+    assert "2 of 5 items completed; 1 failed, 1 tripped, 1 queued." in page.text
     assert "Tripped in item 4, job <4>: cap_pressure_1 9.31 MPa" in page.text
-    rows = page.table("What ran").rows
+    rows = page.table("Items").rows
     assert [row[2] for row in rows if row[0].isdigit()] == [
         "done", "failed", "done", "tripped", "queued",
     ]  # fmt: skip
-    assert page.table("What ran").row("2")[3] == "joint 2 gave 3.1 mm"
+    assert page.table("Items").row("2")[3] == "joint 2 gave 3.1 mm"
     assert "16 complete records" in page.text
     assert "12 samples lost" in page.text
     assert "runner begins: process 4" in page.text
@@ -67,8 +67,8 @@ def test_the_page_needs_nothing_from_elsewhere(page: Page) -> None:
 
 def test_an_empty_night_is_a_page_too() -> None:
     text = Page(render(Night("q", "pc", BEGIN, ()))).text
-    assert "Nothing has run." in text
-    assert "Nothing was identified." in text
+    assert "No item has run." in text
+    assert "No run was identified." in text
 
 
 def test_a_change_is_judged_by_both_errors() -> None:

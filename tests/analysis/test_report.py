@@ -251,9 +251,9 @@ def test_an_import_of_another_rig_with_one_repeat_and_no_truth_says_what_is_miss
     assert "No validation records were given" in page.text
     assert "yard-crane is another rig" in page.text
     assert "The truth is not known" in page.text
-    assert "noise and model error cannot be told apart" in page.text
+    assert "noise and model error cannot be separated" in page.text
     assert "not periodic" in page.table("Steps recorded for the identification").row("step1")[5]
-    assert page.table("What the equations").row("step1")[7:9] == ["—", "—"]
+    assert page.table("Residuals of the equations").row("step1")[7:9] == ["—", "—"]
 
 
 def test_what_cannot_be_identified_is_named_and_not_drawn_as_a_number(multisine_run: Run) -> None:

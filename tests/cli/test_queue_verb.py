@@ -48,7 +48,7 @@ def test_a_night_on_a_bench_from_add_to_its_page(tmp_path: Path) -> None:
     first = json.loads(bramah("queue", "show", 1, "--json", "-").stdout)
     assert first["found"]["parameters"]["C_pp_2"]["value"] == pytest.approx(6.28e-7, rel=0.05)
     page = (tmp_path / "night.html").read_text()
-    assert "2 of 2 items ran to their end" in page
+    assert "2 of 2 items completed" in page
     assert "C_pp_2" in page
     runs = json.loads(bramah("runs", tmp_path / "runs", "--json", "-").stdout)
     assert [run["state"] for run in runs] == ["done", "done"]

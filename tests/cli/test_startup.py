@@ -111,3 +111,9 @@ def test_the_completion_of_a_shell_is_shown_and_named_after_the_program() -> Non
     )
     assert done.returncode == 0, done.stderr
     assert "complete -o default -F _bramah_completion bramah" in done.stdout
+
+
+def test_the_command_line_runs_as_a_module_too() -> None:
+    call = [sys.executable, "-m", "rig.cli.main", "--help"]
+    done = subprocess.run(call, capture_output=True, text=True, check=True)
+    assert "Usage: bramah" in done.stdout

@@ -201,4 +201,4 @@ def test_a_run_is_tracked_to_what_identify_finds(tmp_path: Path) -> None:
 def test_one_line_says_what_is_known() -> None:
     known = {"value": 233.4e6, "ci95": [232.4e6, 234.4e6]}
     unknown = {"value": None, "ci95": [None, None]}
-    assert summary({"b": known, "C_pp_1": unknown}) == "b 233.4±1 MPa  C_pp_1 ?"
+    assert summary({"b": known, "C_pp_1": unknown}) == "b 233.4±1.0 MPa  C_pp_1 ?"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import subprocess
 import sys
 
@@ -21,6 +22,8 @@ from rig.model.units import (
     differs,
     linear_map,
     measure,
+    plain,
+    with_interval,
 )
 
 SHIPPED = ("boom-1dof", "digger-3dof", "electric-2dof", "emps", "shinshu-2dof", "uia-crane")
@@ -173,3 +176,42 @@ def test_a_display_unit_scales_as_pint_does(table: dict[str, DisplayUnit]) -> No
         if "√" not in shown.text:
             unit = {"°": "deg", "°C": "degC"}.get(shown.text, shown.text)
             assert shown.scale * map_by_pint(unit, si)[0] == pytest.approx(1.0, rel=1e-12), si
+
+
+@pytest.mark.parametrize(
+    ("value", "half", "shown"),
+    [
+        (128.4, 20.3, "128 ± 20"),
+        (1.00002, 0.00204, "1.0000 ± 0.0020"),
+        (1.53e-12, 4e-14, "1.530e-12 ± 0.040e-12"),
+        (-37.6, 3.9, "-37.6 ± 3.9"),
+        (99.96, 9.97, "100 ± 10"),
+        (128.0, 412.0, "130 ± 410"),
+        (3.2, 4e11, "0.0 ± 4.0e11"),
+        (5e5, 9960.0, "5.00e5 ± 0.10e5"),
+        (99999.96, 0.5, "99999.96 ± 0.50"),
+        (0.252, 0.0, "0.252"),
+        (0.252, math.nan, "0.252"),
+        (0.252, math.inf, "0.252 ± ∞"),
+        (-0.01, 5.0, "0.0 ± 5.0"),
+    ],
+)
+def test_a_value_has_the_decimals_of_its_interval(value: float, half: float, shown: str) -> None:
+    assert with_interval(value, half) == shown
+    assert with_interval(value, half, "N") == f"{shown} N"
+
+
+@given(st.floats(1e-14, 1e14), st.floats(1e-4, 1e4), st.sampled_from((-1.0, 1.0)))
+def test_what_is_shown_of_an_interval_is_its_value(size: float, times: float, sign: float) -> None:
+    """To the last digit shown; half the interval has two digits, wherever the point stands."""
+    value, half = sign * size, times * size
+    shown, _, width = with_interval(value, half).partition(" ± ")
+    assert float(width) == pytest.approx(half, rel=0.051)
+    assert abs(float(shown) - value) <= 0.051 * half
+    assert ("e" in width) == (not 1e-3 <= max(size, half) < 1e5)
+
+
+@given(st.floats(1e-3, 99_000.0), st.integers(2, 4))
+def test_no_number_of_usual_size_is_written_with_an_exponent(value: float, digits: int) -> None:
+    assert "e" not in plain(value, digits)
+    assert float(plain(value, digits)) == float(f"{value:.{digits}g}")

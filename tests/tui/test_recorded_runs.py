@@ -17,7 +17,7 @@ from rig.tui.following.link import Frame
 from rig.tui.look import PlotView
 from rig.tui.pages.trace import run_trace_page
 from rig.tui.run_log import read_log
-from rig.tui.run_trace import read_trace
+from rig.tui.run_trace import StoredEffect, read_trace
 from tests.services.children import RIG
 from tests.tui.glass import Glass
 from tests.tui.stored import log_bytes, run_folder, trace_json
@@ -135,7 +135,7 @@ async def test_a_trace_shows_verdict_effects_errors_and_a_free_run_before_and_af
         await opened(office, shown, "monday", "before and after of its trace")
         assert "● EXPLAINED" in shown.text
         assert "▸ internal leakage at joint 2" in shown.text
-        assert "2.03e-12 ± 4e-14 m³/(s·Pa)" in shown.text
+        assert "2.030e-12 ± 0.040e-12 m³/(s·Pa)" in shown.text
         assert "not named: valve deadband at joint 1:" in shown.text
         assert "8.3× → 1.1×" in shown.text
         for _ in range(size[1]):  # to its end
@@ -159,6 +159,13 @@ async def test_a_trace_that_is_not_there_or_damaged_is_a_sentence(runs: Path) ->
         await opened(office, shown, "monday", "before and after of its trace")
         assert "error: Field required" in shown.sentences
         assert "Traceback" not in shown.text
+
+
+def test_an_effect_of_a_sensor_is_shown_with_it() -> None:
+    assert StoredEffect(name="sensor_lag", where="joint 1", at="joint 1 spool").location == (
+        "joint 1, spool"
+    )
+    assert StoredEffect(name="sensor_lag", where="joint 1 cap").location == "joint 1, cap"
 
 
 def test_a_trace_without_curves_and_with_gaps_is_drawn(tmp_path: Path) -> None:

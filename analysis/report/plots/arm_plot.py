@@ -121,7 +121,7 @@ def _tip_region(axes: Any, rig: Rig, tips: Array) -> None:
         axes.plot(*tips.T, ".", color=PALE, markersize=2.0, zorder=0.5)
     low = tips[tips[:, 1].argmin()]
     axes.annotate(
-        "where the tip can be", low, (0, -5), textcoords="offset points", ha="center", va="top",
+        "reach of the tip", low, (0, -5), textcoords="offset points", ha="center", va="top",
         fontsize=7, color="#6b7280",
     )  # fmt: skip
 

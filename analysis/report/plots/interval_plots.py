@@ -99,7 +99,7 @@ def interval_widths(estimates: Mapping[str, Estimate]) -> Markup:
         _rows(axes, names)
         axes.set_xlim(low, max(shown, default=1.0) * 2.5)
         axes.set_xlabel("half of the 95 % interval, relative to the value [%]")
-        axes.set_title("how well each is determined")
+        axes.set_title("relative interval")
         axes.xaxis.set_major_formatter(lambda v, _: f"{v:g}")
         return svg(canvas, "par-ci", "Relative half width of every parameter's 95 % interval")
 

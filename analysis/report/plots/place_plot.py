@@ -17,6 +17,7 @@ from analysis.effects.base import Effect
 from analysis.report.plots.style import CARD, GREY, INK, MODEL, ORANGE, PALE, figure, style, svg
 from analysis.terms import known
 from analysis.trace.result import Trace
+from rig.model.channels import place_in_words
 from rig.model.rig import Rig
 
 Line = tuple[str, str, tuple[str, ...], str]  # effect, place, names of its parameters, colour
@@ -72,7 +73,7 @@ def marked(rig: Rig, name: str, where: str, parameters: Collection[str] = ()) ->
     words = where.split()
     joints = words[1:2] if words[0] == "joint" else [str(i + 1) for i in range(len(rig.joints))]
     if kind is not None and element == "sensor":
-        return _sensors(rig, kind, where, joints, " ".join(parameters))
+        return _sensors(rig, kind, where, joints, " ".join((*parameters, *words[2:])))
     if words[-1] in CHAMBERS:
         return (f"{words[-1]} {joints[0]}",)
     if element == "chamber":
@@ -104,17 +105,9 @@ def places(result: Trace) -> Markup | None:
 
 def lines_of(result: Trace) -> list[Line]:
     """Return what is marked: the effects, then what the records cannot tell from them."""
-    # A valve's null has for its twin the offset of its own sensor.
-    twins = [twin for e in result.effects for twin in _twins(e.name, e.where)]
-    return [(e.name, e.where, tuple(e.parameters), MODEL) for e in result.effects] + [
-        (name, where, ("spool",) if (name, where) in twins else (), ORANGE)
-        for name, where in result.tied
+    return [(e.name, e.at or e.where, tuple(e.parameters), MODEL) for e in result.effects] + [
+        (name, where, (), ORANGE) for name, where in result.tied_at
     ]
-
-
-def _twins(name: str, where: str) -> tuple[tuple[str, str], ...]:
-    kind = known().get(name)
-    return kind(where).twins() if kind is not None and issubclass(kind, Effect) else ()
 
 
 def drawn(rig: Rig, lines: Sequence[Line]) -> Markup:
@@ -140,9 +133,9 @@ def drawn(rig: Rig, lines: Sequence[Line]) -> Markup:
             for element in marked(rig, name, where, parameters):
                 _mark(axes, boxes[element], k + 1, colour, taken.setdefault(element, 0), element)
                 taken[element] += 1
-            words = f"{k + 1}  {name.replace('_', ' ')} at {where}"
+            words = f"{k + 1}  {name.replace('_', ' ')} at {place_in_words(where)}"
             if colour == ORANGE:
-                words += ", which these records cannot tell from it"
+                words += ", which these records cannot separate from it"
             canvas.text(
                 0.02, share - 0.3 * (k + 0.7) / canvas.get_figheight(), words,
                 color=INK, fontsize=9,

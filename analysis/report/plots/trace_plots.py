@@ -170,11 +170,12 @@ def instead(effect: JudgedEffect, key: str) -> Markup | None:
     if not (np.isfinite(effect.left_without) and np.isfinite(effect.left_with)):
         return None
     bars = [
-        ("nothing in its place", effect.left_without, "", GREY),
-        (_called(effect.name, effect.where), effect.left_with, _verdict(effect), BLUE),
+        ("without the effect", effect.left_without, "", GREY),
+        (_called(effect.name, effect.location), effect.left_with, _verdict(effect), BLUE),
     ]
     bars += [
-        (_called(r.name, r.where), r.ratio * effect.left_with, *_against(r)) for r in effect.rivals
+        (_called(r.name, r.location), r.ratio * effect.left_with, *_against(r))
+        for r in effect.rivals
     ]
     bars.sort(key=lambda bar: bar[1])
     high = 1.25 * max(2.0, *(bar[1] for bar in bars))
@@ -218,11 +219,11 @@ def _verdict(effect: JudgedEffect) -> str:
 def _against(rival: Rival) -> tuple[str, str]:
     """Return why a rival is not named, and its colour."""
     if rival.tied:
-        return "cannot be told from it", ORANGE
+        return "cannot be separated from it", ORANGE
     if rival.ratio <= TRACE.tie_ratio:
         times = fm.significant(rival.training_ratio)
-        return f"ruled out: training records keep {times} times as much", PALE
-    return f"ruled out: held-out records keep {fm.significant(rival.ratio)} times as much", PALE
+        return f"ruled out: training error {times} times as large", PALE
+    return f"ruled out: held-out error {fm.significant(rival.ratio)} times as large", PALE
 
 
 def in_time(line: ResidualSeries, noise: float, unit: str, key: str, after: bool) -> Markup:
@@ -300,7 +301,7 @@ def spectrum(shown: Spectrum, unit: str, key: str, after: bool) -> Markup:
             axes.yaxis.set_major_formatter(lambda v, _: f"{v:g}")
             axes.set_xlabel("frequency [Hz]")
             if not k:
-                axes.set_ylabel(f"repeats, rms per line [{unit}]")
+                axes.set_ylabel(f"repeatable rms per line [{unit}]")
                 axes.legend(loc="lower left", fontsize=7, ncols=3, handletextpad=0.2, frameon=False)
             note(axes, 0.98, 0.98, word, INK)
         canvas.tight_layout()

@@ -76,5 +76,5 @@ def comparison(
         grid[1].margins(x=0, y=0.3)
         grid[-1].set_xlabel("time [s]", labelpad=1)
         if result.failure and real < part.stop:
-            note(grid[1], 0.995, 1.0, "the model's state ceased to exist", MODEL)
+            note(grid[1], 0.995, 1.0, "the simulation failed", MODEL)
         return svg(canvas, key, f"Measured and simulated channels of joint {joint}")

@@ -187,7 +187,7 @@ def regression_data(
             start = where.stop
     if not segments:
         raise InputError(
-            "the records are too short: no rows are left behind the filters' edges; record longer"
+            "the records are too short: no rows are left after filter edges; take longer records"
         )
     return RegressionData(
         rig, tuple(terms), beta, names, np.concatenate(base), np.concatenate(residual, axis=1),

@@ -32,8 +32,8 @@ Array = NDArray[np.float64]
 CONSTANT, EXCITED, ODD, EVEN = "constant", "excited", "odd", "even"
 KINDS = (CONSTANT, EXCITED, ODD, EVEN)
 WORDS = {
-    CONSTANT: "constant", EXCITED: "on excited lines", ODD: "on empty odd ones",
-    EVEN: "on even ones",
+    CONSTANT: "constant", EXCITED: "on excited lines", ODD: "on empty odd lines",
+    EVEN: "on even lines",
 }  # fmt: skip
 
 
@@ -88,10 +88,10 @@ class SpectralLines:
 def meaning(shares: Mapping[str, float], own: Mapping[str, float]) -> str:
     """Return what the shares of a residual say of its cause, beside those of the velocity."""
     if not any(shares.values()):
-        return "nothing above the noise"
+        return "not above the noise"
     moving = 1.0 - shares[CONSTANT]
     if moving < DATA.asymmetric:
-        return "a constant"
+        return "constant"
     meanings = []
     for kind, least, word in (
         (EVEN, DATA.asymmetric, "asymmetric"),

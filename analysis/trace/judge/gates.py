@@ -25,9 +25,11 @@ from analysis.trace.judge.readings import loss, related
 from analysis.trace.judge.scatter import form_shift
 from analysis.trace.result import Gate, JudgedEffect, Rival
 from analysis.trace.search.hypothesis import Hypothesis, excess_of, parameter_values
-from analysis.trace.search.hypothesis_set import HypothesisSet
+from analysis.trace.search.hypothesis_set import HypothesisSet, effect_of
 from analysis.trace.search.refinement import ExactFit
 from analysis.trace.settings import SEARCH, TRACE
+from rig.model.channels import place_in_words
+from rig.model.units import plain, with_interval
 
 Array = NDArray[np.float64]
 Key = tuple[str, str]
@@ -45,6 +47,14 @@ def stands(effect: JudgedEffect) -> bool:
     return all(gate.ok for gate in effect.gates if gate.name != ALONE)
 
 
+def refused(effects: Sequence[JudgedEffect]) -> tuple[JudgedEffect, ...]:
+    """Return the effects that stand in no set, each once where it removes most, in that order."""
+    once: dict[Key, JudgedEffect] = {}
+    for effect in sorted(effects, key=lambda f: (not stands(f), -f.removed_fraction)):
+        once.setdefault((effect.name, effect.at or effect.where), effect)
+    return tuple(f for f in once.values() if not stands(f))
+
+
 def judge(
     hypotheses: HypothesisSet,
     winner: Hypothesis,
@@ -59,7 +69,6 @@ def judge(
     )
     steady = inference.stability(hypotheses, winner, rng)
     after = held_left(holdout_data, winner.fit)
-    physical = hypotheses.physical(winner)
     shift = form_shift(train_data, winner.fit)
     out = []
     for used in winner.effects:
@@ -80,11 +89,15 @@ def judge(
         errors = inference.spread(train_data, winner.fit, used, values)
         differing = invariance(train_data, winner.fit, used, errors, _joint(used.term))
         known = _determined(train_data, used, errors)
+        unphysical = hypotheses.physical(winner, used)
         tied = [r for r in rivals if r.tied]
-        twins = [Rival(name, where, 1.0, 1.0, True) for name, where in used.term.twins()]
+        twins = [
+            Rival(name, _place(effect_of(name, at)), 1.0, 1.0, True, at)
+            for name, at in used.term.twins()
+        ]
         gates = (
             Gate(REMOVES, removed >= TRACE.least_removed and not worse, _taken(removed, worse)),
-            Gate(PHYSICAL, not physical, physical or "sign and size are"),
+            Gate(PHYSICAL, not unphysical, unphysical or "sign and size are possible"),
             Gate(INVARIANT, not differing, _differences(differing)),
             Gate(
                 STABLE,
@@ -92,7 +105,7 @@ def judge(
                 _chosen(share, others, bool(tied)),
             ),
             Gate(SIGNIFICANT, p <= TRACE.p_limit, f"family-wise p = {p:.3g}"),
-            Gate(DETERMINED, known, "a number of it is" if known else ENTANGLED),
+            Gate(DETERMINED, known, "at least one of its numbers is" if known else ENTANGLED),
             Gate(ALONE, not (tied or twins), _told_apart([*twins, *rivals])),
         )
         out.append(
@@ -110,6 +123,7 @@ def judge(
                 curves=curves_of(train_data, winner.fit, used),
                 left_without=_rms(holdout_data, held_left(holdout_data, rest.fit), touched),
                 left_with=_rms(holdout_data, after, touched),
+                at=used.term.where,
             )
         )
     return tuple(out)
@@ -151,9 +165,11 @@ def remaining(
         share = residual / max(hypotheses.empty.excess_energy[e], 1e-30)
         if share > TRACE.training_share and not hypotheses.negligible(e, residual):
             times = residual / hypotheses.limits.band[e]
-            stays = f"{100 * share:.2g} % of what repeated stays"
-            words = stays if share <= 1.0 else "more repeats than before"
-            out.append((e, f"{words}, {times:.2g} times the band"))
+            stays = f"{plain(100 * share, 2)} % of the repeatable energy remains"
+            words = (
+                stays if share <= 1.0 else "the repeatable energy is larger than under the baseline"
+            )
+            out.append((e, f"{words}, {plain(times, 2)} times the band"))
     return out + remaining_held_out(holdout_data, hypotheses.empty.fit, winner.fit)
 
 
@@ -235,8 +251,10 @@ def _worse(hypotheses: HypothesisSet, winner: Hypothesis, rest: Hypothesis) -> l
 
 
 def _taken(removed: float, worse: Sequence[str]) -> str:
-    text = f"{100 * removed:.0f} % of what repeats"
-    return f"{text}, but more is left of {' '.join(worse)} than before" if worse else text
+    text = f"{100 * removed:.0f} % of the energy above noise"
+    if not worse:
+        return text
+    return f"{text}, but the residual of {' '.join(worse)} is larger than under the baseline"
 
 
 def _removed(
@@ -299,7 +317,14 @@ def _rivals(
         )
         tied = tied or (other.name, other.where) in often
         out.append(
-            Rival(other.name, _place(other), ratio, trained.ratio(hypothesis.fit.residual), tied)
+            Rival(
+                other.name,
+                _place(other),
+                ratio,
+                trained.ratio(hypothesis.fit.residual),
+                tied,
+                other.where,
+            )
         )
     out.sort(key=lambda r: (not r.tied, r.ratio))
     return out[: TRACE.most_rivals]
@@ -382,7 +407,7 @@ def _differences(differing: Sequence[tuple[str, str, float, float]]) -> str:
     if not differing:
         return "the same in every step, half, direction and speed"
     return "; ".join(
-        f"{name} = {value:.3g} ± {error:.2g} in {label}"
+        f"{name} = {with_interval(value, error)} in {label}"
         for label, name, value, error in differing[:3]
     )
 
@@ -390,16 +415,18 @@ def _differences(differing: Sequence[tuple[str, str, float, float]]) -> str:
 def _chosen(share: float, others: Mapping[Key, int], tied: bool) -> str:
     text = f"chosen in {100 * share:.0f} % of half-samples"
     if share < TRACE.least_chosen and tied:
-        text = f"not asked, for a rival fits as well: {text}"
+        text = f"not required, since a rival fits as well: {text}"
     if share < TRACE.least_chosen and others:
         most = sorted(others, key=lambda k: -others[k])[:2]
-        text += "; else " + ", ".join(f"{name} at {where}" for name, where in most)
+        text += "; otherwise " + ", ".join(f"{n} at {place_in_words(at)}" for n, at in most)
     return text
 
 
 def _told_apart(rivals: Sequence[Rival]) -> str:
     if not rivals:
-        return "none came near"
+        return "no other set fits nearly as well"
     nearest = rivals[0]
-    words = "cannot be told from" if nearest.tied else "the nearest is"
-    return f"{words} {nearest.name} at {nearest.where}: {nearest.ratio:.2f} times the held-out rms"
+    words = "cannot be separated from" if nearest.tied else "the closest is"
+    return (
+        f"{words} {nearest.name} at {nearest.location}: {nearest.ratio:.2f} times the held-out rms"
+    )

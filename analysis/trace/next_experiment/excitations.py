@@ -50,19 +50,19 @@ class Family:
 
 
 FAMILIES: Final = (
-    Family("wide", "at all frequencies, as far as the limits allow", 0.1, 0.5, 9.5, 0.25),
+    Family("wide", "at all frequencies, as much as the limits allow", 0.1, 0.5, 9.5, 0.25),
     Family("slow", "slowly over the whole stroke", 0.1, 0.1, 0.9, 0.5),
-    Family("creep", "back and forth at creeping speed over the whole stroke", 0.1, 0.1, 0.3, 1.0),
+    Family("creep", "very slowly in both directions over the whole stroke", 0.1, 0.1, 0.3, 1.0),
     # Its few slow lines move the piston, which the bench needs to centre it.
     # Much faster, a joint that is held and one behind a closed valve resonate otherwise.
-    Family("fast", "up to 15 Hz, all frequencies alike", 0.2, 0.6, 15.0, 0.0),
-    Family("small", "by small amplitudes about the valve's null", 0.1, 0.3, 5.0, 0.25, 0.12),
+    Family("fast", "up to 15 Hz with equal amplitudes", 0.2, 0.6, 15.0, 0.0),
+    Family("small", "with small amplitudes about the valve's null", 0.1, 0.3, 5.0, 0.25, 0.12),
     Family(
-        "out", "at all frequencies a quarter of the stroke out of its middle", 0.1, 0.5, 9.5, 0.25,
+        "out", "at all frequencies, a quarter of the stroke above mid-stroke", 0.1, 0.5, 9.5, 0.25,
         centre=0.5,
     ),
     Family(
-        "in", "at all frequencies a quarter of the stroke into its middle", 0.1, 0.5, 9.5, 0.25,
+        "in", "at all frequencies, a quarter of the stroke below mid-stroke", 0.1, 0.5, 9.5, 0.25,
         centre=-0.5,
     ),
 )  # fmt: skip

@@ -251,10 +251,13 @@ def _proposal(
 ) -> Mapping[str, Any]:
     weakest = min(answers, key=lambda a: a.promised)
     separates = _names(answers)
-    what = f"predicted separation {weakest.promised:.1f} times the noise, {weakest.present:.1f} now"
+    what = (
+        f"predicted separation {weakest.promised:.1f} times the noise, {weakest.present:.1f} with "
+        "the present records"
+    )
     if kind == SHOW:
         names = ", ".join(dict.fromkeys(k["name"].replace("_", " ") for k in separates))
-        what = f"would show {names} of small size, which these records cannot"
+        what = f"would show small sizes of {names}, which the present records cannot show"
     return {
         "kind": kind,
         "separates": separates,

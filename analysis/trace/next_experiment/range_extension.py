@@ -54,7 +54,10 @@ def farther(
             ]
             k = int(np.argmax(reach))
             if reach[k] >= least:
-                words = f"carries {name} {reach[k]:.1f} times as far, which what is left moves with"
+                words = (
+                    f"covers {reach[k]:.1f} times the range of {name}, on which the remaining "
+                    "residual depends"
+                )
                 return Beyond(k, name, reach[k], clue.equation, words)
     return None
 
@@ -93,5 +96,5 @@ def richer(
     times = counts[k] / max(held)
     if times < EXPERIMENT.line_ratio:
         return None
-    words = f"moves joint {joint + 1} by {counts[k]} lines where the records hold {max(held)}"
+    words = f"excites joint {joint + 1} at {counts[k]} frequencies instead of {max(held)}"
     return Beyond(k, LINES, times, equation, words)

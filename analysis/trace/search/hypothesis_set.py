@@ -36,6 +36,7 @@ from analysis.trace.search.hypothesis import (
 )
 from analysis.trace.search.refinement import ExactFit, fit, jacobian, rebased, refine
 from analysis.trace.settings import SEARCH
+from rig.model.channels import place_in_words
 
 Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
@@ -75,17 +76,21 @@ class HypothesisSet:
         seen = evidence(data, residual) if any(e.by_data for e in self.effects) else None
         return variants(data.rig, self.effects, seen)
 
-    def physical(self, hypothesis: Hypothesis) -> str:
-        """Say why a set is not physical ('' if it is)."""
+    def physical(self, hypothesis: Hypothesis, of: Used | None = None) -> str:
+        """Say whose number makes a set unphysical, and why ('' if none does).
+
+        The effect `of` is asked first; its own number is stated without its name.
+        """
         rig = self.train_data.rig
         values = parameter_values(rig, hypothesis.fit.terms, dict(hypothesis.fit.beta))
-        for used in hypothesis.effects:
+        for used in sorted(hypothesis.effects, key=lambda used: used is not of):
             assert isinstance(used.term, Effect)
             problem = used.term.problem(rig, values, used.shape) or used.term.outside(
                 rig, used.shape
             )
             if problem:
-                return problem
+                whose = f"of {used.term.name} at {place_in_words(used.term.where)}: "
+                return problem if used is of else whose + problem
         return ""
 
     def exact(self, effects: Sequence[Used]) -> Hypothesis:

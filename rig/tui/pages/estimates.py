@@ -10,6 +10,7 @@ from typing import Final
 
 import numpy as np
 
+from rig.model.units import plain, with_interval
 from rig.tui.drawing.plot import PlotTrace, draw, time_axis
 from rig.tui.drawing.rows import Row, beside, block, box, fit, row, wrapped
 from rig.tui.drawing.styles import DIM, STRONG, WARN_TEXT
@@ -189,9 +190,9 @@ def _estimate(view: PlotView, name: str, width: int, height: int) -> list[Row]:
     half = 0.5 * (table[-1, 2] - table[-1, 1])
     share = abs(half / value) if value else nan
     wide = ("▲ wide ", WARN_TEXT) if not share < 0.5 else ("", "")
-    line = row(
-        (f"{value:.4g}", STRONG), (f" ± {half:.2g} ({1e2 * share:.2g} %, 95 %)  ", DIM), wide
-    )
+    text, _, width_text = with_interval(float(value), float(half)).partition(" ± ")
+    interval = f" ± {width_text or '?'} ({plain(1e2 * share, 2)} %, 95 %)  "
+    line = row((text, STRONG), (interval, DIM), wide)
     power = 3 * math.floor(math.log10(abs(value)) / 3) if value else 0  # the axis has few digits
     title = f"{name}  axis in 1e{power}" if power else name
     scale = 10.0**-power

@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.model.units import plain, typeset, with_interval
 from rig.tui.drawing.plot import GUTTER, PlotTrace, draw
 from rig.tui.drawing.rows import Part, Row, beside, block, columns, fit, row, wrapped
 from rig.tui.drawing.styles import DIM, STRONG, WARN_TEXT
@@ -73,7 +74,9 @@ def _effect(effect: StoredEffect, width: int) -> list[Row]:
     removed = effect.removed_fraction
     share = f"   removes {removed:.0%}" if removed is not None else ""
     name = effect.name.replace("_", " ")
-    rows: list[Row] = [row((f" ▸ {name}", STRONG), (f" at {effect.where}", STRONG), (share, DIM))]
+    rows: list[Row] = [
+        row((f" ▸ {name}", STRONG), (f" at {effect.location}", STRONG), (share, DIM))
+    ]
     for key, value in effect.parameters.items():
         rows += wrapped(f"     {key} = {estimate_text(value)}", width)
     return rows
@@ -83,7 +86,7 @@ def _refused(effect: StoredEffect, width: int) -> list[Row]:
     failed = next((gate for gate in effect.gates if not gate.ok), None)
     why = f": {failed.name}, {failed.detail}" if failed is not None else ""
     name = effect.name.replace("_", " ")
-    return wrapped(f"   fitted best, but not named: {name} at {effect.where}{why}", width, DIM)
+    return wrapped(f"   fitted best, but not named: {name} at {effect.location}{why}", width, DIM)
 
 
 def estimate_text(estimate: StoredEstimate) -> str:
@@ -91,9 +94,8 @@ def estimate_text(estimate: StoredEstimate) -> str:
     low, high = estimate.ci95
     if estimate.value is None:
         return "not identified"
-    half = f" ± {0.5 * (high - low):.2g}" if low is not None and high is not None else ""
-    unit = estimate.unit.replace("*", "·").replace("^2", "²").replace("^3", "³")
-    return f"{estimate.value:.4g}{half} {unit}".rstrip()
+    half = 0.5 * (high - low) if low is not None and high is not None else math.nan
+    return with_interval(estimate.value, half, typeset(estimate.unit))
 
 
 def _errors(stored: StoredTrace) -> list[Row]:
@@ -140,7 +142,7 @@ def free_run_rows(stored: StoredTrace, chosen: int, width: int, height: int) -> 
     for word, error in (("before", before), ("after", after)):
         kept = error[np.isfinite(error)]
         rms = float(np.sqrt(np.mean(kept**2))) if len(kept) else math.nan
-        title = row((f" {word}", STRONG), (f"  rms {how.factor * rms:.3g} {how.unit}", DIM))
+        title = row((f" {word}", STRONG), (f"  rms {plain(how.factor * rms, 3)} {how.unit}", DIM))
         trace = PlotTrace(time, error, error, float(time[0]), float(time[-1]), ends, how)
         rows += [fit(title, width), *draw(trace, width, each)]
     first, last = (f"{at:.3g} s" for at in (time[0], time[-1]))
@@ -163,7 +165,7 @@ def _over(error: float | None, floor: float | None) -> str:
 
 
 def _number(value: float | None) -> str:
-    return "–" if value is None else f"{value:.2g}"
+    return "–" if value is None else plain(value, 2)
 
 
 def _percent(value: float | None) -> str:

@@ -41,7 +41,7 @@ def test_what_moves_with_the_acceleration_asks_for_faster_lines(
     assert found is not None
     assert candidates[0][found.index].family.name == "wide"
     assert found.times > 1.3
-    assert "carries acceleration_2" in found.words
+    assert "the range of acceleration_2" in found.words
 
 
 def test_a_clue_that_cannot_be_carried_farther_yields_to_the_next(
@@ -62,7 +62,7 @@ def test_records_of_one_sine_ask_for_many_lines(
     found = richer(train_data, [clue("supply_pressure")], candidates[0])
     assert found is not None
     assert (found.variable, candidates[0][found.index].family.name) == (LINES, "wide")
-    assert "where the records hold 1" in found.words
+    assert "frequencies instead of 1" in found.words
     assert (
         richer(train_data, [clue("supply_pressure")], candidates[0][1:]) is None
     )  # creep has 2 lines

@@ -147,6 +147,7 @@ def test_friction_with_a_cube_of_the_speed_is_a_curve_without_a_name(
     result = traced(rig, Hidden(60.0, 60.0, drag_cubed=50_000.0))
     assert result.verdict == "explained"
     found = to_json(result)["effects"]
+    assert all(e["at"].startswith(e["where"]) for e in found)
     assert [(e["name"], e["form"], e["mechanism"]) for e in found] == [
         ("friction_curve", "free", "friction_curve")
     ]

@@ -136,9 +136,19 @@ def a_name_that_disturbs_another_equation_is_refused(b: Benches) -> None:
 
 
 def a_leak_cannot_pump(b: Benches) -> None:
-    s = b.searched(b.runs(c_internal=-0.25 * LEAK), "internal_leakage")
+    s = b.searched(b.runs(c_internal=-0.25 * LEAK), "internal_leakage", "torque_offset")
     assert s.winner.effects == ()
     assert not gate(s.judged("internal_leakage"), gates.PHYSICAL)
+    # Beside it nothing stands, but the number that is not possible is the leak's.
+    whose = {
+        f.name: next(g for g in f.gates if g.name == gates.PHYSICAL)
+        for f in s.judged("torque_offset", "internal_leakage")
+    }
+    assert not any(g.ok for g in whose.values())
+    assert whose["internal_leakage"].detail.startswith("c_internal_2 = ")
+    assert whose["torque_offset"].detail.startswith(
+        "of internal_leakage at joint 2: c_internal_2 = "
+    )
 
 
 def a_leak_of_one_step_alone_is_no_leak(b: Benches) -> None:
@@ -188,7 +198,7 @@ def _hardened(b: Benches) -> tuple[Run, Run]:
 def what_a_linear_spring_leaves_of_a_cubic_one_is_not_nothing(b: Benches) -> None:
     s = b.searched(_hardened(b), "joint_spring", "torque_offset")
     assert [u.term.name for u in s.winner.effects] == ["joint_spring"]
-    assert "of what repeated stays" in s.left_in(s.winner).get("torque_2", "")
+    assert "of the repeatable energy remains" in s.left_in(s.winner).get("torque_2", "")
 
 
 def a_cubic_spring_is_not_explained_by_a_linear_one(b: Benches) -> None:

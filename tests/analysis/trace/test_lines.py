@@ -83,8 +83,8 @@ def test_what_the_shares_mean_is_judged_beside_the_motions_own_lines() -> None:
     assert meaning(bent, bent) == "linear in the motion"  # the linkage alone does that
     both = {CONSTANT: 0.0, EXCITED: 0.3, ODD: 0.3, EVEN: 0.4}
     assert meaning(both, straight) == "asymmetric and a symmetric nonlinearity"
-    assert meaning({CONSTANT: 0.9, EXCITED: 0.05, ODD: 0.0, EVEN: 0.05}, straight) == "a constant"
-    assert meaning(dict.fromkeys(KINDS, 0.0), straight) == "nothing above the noise"
+    assert meaning({CONSTANT: 0.9, EXCITED: 0.05, ODD: 0.0, EVEN: 0.05}, straight) == "constant"
+    assert meaning(dict.fromkeys(KINDS, 0.0), straight) == "not above the noise"
 
 
 def traced(rig: Rig, **wrong: float) -> Trace:
@@ -117,6 +117,6 @@ def test_friction_shows_on_the_empty_odd_lines_and_a_null_on_the_even_ones(rig: 
     null = traced(rig, u_null=5e-3)
     assert null.lines[0].equation.startswith("flow")
     assert null.lines[0].shares[EVEN] + null.lines[0].shares[CONSTANT] > 0.8
-    assert null.lines[0].meaning in ("asymmetric", "mostly asymmetric", "a constant")
+    assert null.lines[0].meaning in ("asymmetric", "mostly asymmetric", "constant")
     data = json.loads(json.dumps(to_json(null), allow_nan=False))
     assert data["lines"][0]["text"] == null.lines[0].text

@@ -96,7 +96,7 @@ def test_held_out_records_in_which_the_joint_stands_judge_nothing(
     (found,) = result.effects
     assert found.shot is not None
     unjudged = replace(found.shot, before=float("inf"), after=float("inf"))
-    assert "no held-out window tells" in shot_in_words(replace(found, shot=unjudged))
+    assert "held-out windows do not decide" in shot_in_words(replace(found, shot=unjudged))
 
 
 def test_records_without_a_whole_window_are_not_shot_and_nothing_falls(rig: Rig) -> None:

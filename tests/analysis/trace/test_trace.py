@@ -147,7 +147,7 @@ def test_what_only_the_held_out_records_show_is_not_called_clean(rig: Rig) -> No
     held_out = experiment(rig, repeats=2, seed=2, rms=0.04, dp_supply=4e5)
     result = trace([train], [held_out], look_ahead=False)
     assert (result.verdict, result.effects) == ("unexplained", ())
-    assert any("train on records that excite as much" in note for note in result.notes)
+    assert any("train on records with as much excitation" in note for note in result.notes)
 
 
 @pytest.mark.slow
@@ -180,7 +180,7 @@ def test_a_spring_that_hardens_a_little_is_not_explained_by_one_that_does_not(ri
     result = trace([train], [held_out], look_ahead=False, free_forms=False)
     assert result.verdict == "unexplained"
     assert [e.name for e in result.effects] == ["joint_spring"]  # named so far
-    assert any("a formula holds it" in note and "piston_2³" in note for note in result.notes)
+    assert any("a formula fits it" in note and "piston_2³" in note for note in result.notes)
     assert result.depends_on[0].variable == "piston_2"
 
 
@@ -210,7 +210,7 @@ def test_records_too_short_are_refused_with_what_is_needed(quiet: tuple[Run, Run
             for r in quiet[0].records
         ),
     )
-    with pytest.raises(InputError, match=r"record longer|too short"):
+    with pytest.raises(InputError, match=r"take longer records|too short"):
         trace([short], [quiet[1]], look_ahead=False)
 
 

@@ -14,7 +14,9 @@ import rig as rig_package
 from analysis.report.plots import place_plot, trace_plots
 from analysis.report.plots.style import MODEL, ORANGE
 from analysis.trace.data.candidates import catalogue, free_mechanisms
+from analysis.trace.judge.gates import refused
 from analysis.trace.result import Gate, JudgedEffect, Rival, Trace
+from rig.model.channels import place_in_words
 from rig.model.parse import parse_model
 from rig.model.rig import Rig
 
@@ -25,7 +27,7 @@ LEAK = JudgedEffect(
         Rival("sensor_gain", "joint 2 cap", 1.02, 1.01, True),
         Rival("external_leakage", "joint 2 rod", 1.05, 1.9, False),
     ),
-    (Gate("no rival", False, "cannot be told from sensor_gain"),),
+    (Gate("no rival", False, "cannot be separated from sensor_gain"),),
     left_without=27.6, left_with=1.5,
 )  # fmt: skip
 
@@ -55,7 +57,9 @@ def test_every_place_that_the_catalogue_names_is_marked_in_the_drawing(name: str
         found = re.findall(rf'id="places-mark-{k}-([^"]*)"', drawn)
         wanted = place_plot.marked(rig, effect_name, place)
         assert sorted(found) == sorted(spot.replace(" ", "-") for spot in wanted)
-        assert f"{k} {effect_name.replace('_', ' ')} at {place}" in " ".join(drawn.split())
+        assert f"{k} {effect_name.replace('_', ' ')} at {place_in_words(place)}" in " ".join(
+            drawn.split()
+        )
 
 
 @pytest.mark.parametrize(
@@ -92,41 +96,66 @@ def test_two_effects_at_one_place_are_both_marked(rig: Rig) -> None:
     drawn = str(place_plot.drawn(rig, lines))
     assert "mark-1" in drawn
     assert "mark-2" in drawn
-    assert "coulomb friction at joint 2, which these records cannot tell from it" in drawn
+    assert "coulomb friction at joint 2, which these records cannot separate from it" in drawn
 
 
 def test_a_valve_s_null_is_drawn_beside_the_spool_s_own_sensor(rig: Rig) -> None:
     """They are one to the data; `sensor_offset at joint 2` alone would be the piston's."""
     null = JudgedEffect("spool_offset", "joint 2", {}, 0.005, 1.0, (), ())
     result = SimpleNamespace(
-        model_before=SimpleNamespace(rig=rig), effects=(null,), tied=[("sensor_offset", "joint 2")]
+        model_before=SimpleNamespace(rig=rig),
+        effects=(null,),
+        tied_at=[("sensor_offset", "joint 2 spool")],
     )
     assert place_plot.lines_of(cast(Trace, result)) == [
         ("spool_offset", "joint 2", (), MODEL),
-        ("sensor_offset", "joint 2", ("spool",), ORANGE),
+        ("sensor_offset", "joint 2 spool", (), ORANGE),
     ]
-    assert place_plot.marked(rig, "sensor_offset", "joint 2", ("spool",)) == ("spool sensor 2",)
+    assert place_plot.marked(rig, "sensor_offset", "joint 2 spool") == ("spool sensor 2",)
     assert place_plot.marked(rig, "sensor_offset", "joint 2") == ("piston sensor 2",)
     assert "mark-2" in str(place_plot.places(cast(Trace, result)))
-    nothing = SimpleNamespace(model_before=result.model_before, effects=(), tied=[])
+    nothing = SimpleNamespace(model_before=result.model_before, effects=(), tied_at=[])
     assert place_plot.places(cast(Trace, nothing)) is None
 
 
 def test_rivals_stand_by_what_they_leave_and_say_why_they_are_not_named() -> None:
     drawn = str(trace_plots.instead(LEAK, "e0"))
     said = [re.sub(r"<[^>]+>", "", line) for line in re.findall(r"<text.*?</text>", drawn)]
-    stand = [s for s in said if "joint 2" in s or s == "nothing in its place"]
+    stand = [s for s in said if "joint 2" in s or s == "without the effect"]
     assert [s.partition(":")[0] for s in stand] == [
-        "nothing in its place", "spool offset at joint 2", "external leakage at joint 2 rod",
-        "sensor gain at joint 2 cap", "internal leakage at joint 2",
+        "without the effect", "spool offset at joint 2", "external leakage at joint 2, rod",
+        "sensor gain at joint 2, cap", "internal leakage at joint 2",
     ]  # fmt: skip
-    assert "held-out records keep 9.40 times as much" in stand[1]
-    assert "training records keep 1.90 times as much" in stand[2]
-    assert "cannot be told from it" in stand[3]
-    assert "not named (no rival: cannot be told from sensor gain)" in stand[4]
+    assert "held-out error 9.40 times as large" in stand[1]
+    assert "training error 1.90 times as large" in stand[2]
+    assert "cannot be separated from it" in stand[3]
+    assert "not named (no rival: cannot be separated from sensor gain)" in stand[4]
     for left in ("27.6", "14.1", "1.58", "1.53", "1.50"):
         assert f" {left}" in said
 
 
 def test_a_trace_of_before_is_drawn_without_what_nobody_knows() -> None:
     assert trace_plots.instead(replace(LEAK, left_without=float("nan")), "e0") is None
+
+
+def test_a_sensor_s_effect_is_told_with_its_sensor_and_stored_by_its_joint() -> None:
+    lag = JudgedEffect(
+        "sensor_lag", "joint 1", {}, 0.01, 0.4,
+        (Rival("sensor_lag", "bench", 1.0, 1.0, True, "bench pressure"),),
+        (Gate("stable", False, ""),), at="joint 1 spool",
+    )  # fmt: skip
+    assert (lag.where, lag.location) == ("joint 1", "joint 1, spool")
+    assert (lag.rivals[0].where, lag.rivals[0].location) == ("bench", "bench, pressure")
+    assert replace(lag, at="").location == "joint 1"
+    assert LEAK.rivals[1].location == "joint 2, cap"
+
+
+def test_an_effect_that_several_sets_hold_is_refused_once_where_it_removes_most() -> None:
+    failed = (Gate("stable", False, ""),)
+    first, second, other = (
+        JudgedEffect("sensor_lag", "joint 1", {}, 0.01, removed, (), failed, at=at)
+        for removed, at in ((0.1, "joint 1 spool"), (0.4, "joint 1 spool"), (0.2, "joint 1 piston"))
+    )
+    assert refused([first, LEAK, second, other]) == (second, other)
+    named = replace(first, gates=())
+    assert refused([named, second, other]) == (other,)
