@@ -87,7 +87,7 @@ def decisions_only(kept: Kept) -> Iterator[None]:
     )
     changes = (
         *((module, name, kept(getattr(module, name), key)) for module, name, key in remembered),
-        (engine, "_extended", lambda runs, terms, winner, before, *_: before),
+        (engine, "_extended", lambda runs, terms, winner, before, *_: (before, {})),
         (engine, "reshaped", lambda runs, holdout, after, train, judged, one: Reshaped(one, ())),
         (engine, "clues_to", lambda *_: ((), ())),
         (held_out, "free_runs", lambda *_: (held_out.FreeRunErrors({}, {}, {}),) * 2),
