@@ -398,7 +398,7 @@ def test_every_rule_and_fault_has_a_story() -> None:
 def test_few_instants_outside_the_domain_speak_neither_way(
     benches: Benches, monkeypatch: pytest.MonkeyPatch, outside: float, counts: bool
 ) -> None:
-    """A gain of 5 % moves some readings beyond the supply pressure, where there is no flow to compare."""
+    """A gain of 5 % moves readings beyond the supply pressure, where no flow can be compared."""
     s = benches.searched(benches.runs(c_internal=LEAK), "internal_leakage")
     data, model = s.hypotheses.train_data, s.winner.fit
     whole = table(data, model.terms)
