@@ -57,7 +57,9 @@ class Shape:
         return self.grid[len(self.grid) // 2]
 
 
-BETWEEN_SAMPLES: Final = 0.2  # of a sample that a held command may bend the spool's path
+# Of a sample that a held command may bend the spool's path: as `identify` accepts, four times its
+# `path_between_samples`.
+BETWEEN_SAMPLES: Final = 0.2
 
 
 def between_samples(rig: Rig, seconds: float) -> str:

@@ -15,6 +15,7 @@ from analysis.identify.estimators.nuisance import BETWEEN, SpoolPath
 from analysis.terms.base import Used
 from analysis.trace.data.conditioned_record import model_rows
 from analysis.trace.data.regression_data import RegressionData, least_squares
+from rig.model.parameters import gain_names
 
 
 def path_terms(data: RegressionData) -> tuple[Used, ...]:
@@ -22,15 +23,13 @@ def path_terms(data: RegressionData) -> tuple[Used, ...]:
 
     Not one whose lead is more than `BETWEEN_SAMPLES` of a sample: something else is late there.
     """
-    gains = tuple(
-        (name, float(value))
-        for name, value in data.beta.items()
-        if name.startswith("C_") and name.count("_") == 2 and np.isfinite(value)
-    )
-    joints = sorted({int(s.equation[-1]) - 1 for s in data.segments if "flow" in s.equation})
-    paths = [Used(SpoolPath(gains=gains, joint=i)) for i in joints] if gains else []
-    if not paths or any(isinstance(u.term, SpoolPath) for u in data.terms):
+    kinds = [s.equation.rsplit("_", 1) for s in data.segments]
+    joints = sorted({int(number) - 1 for kind, number in kinds if kind.startswith("flow")})
+    names = [name for i in joints for name in gain_names(i + 1)]
+    gains = tuple((n, float(data.beta[n])) for n in names if np.isfinite(data.beta[n]))
+    if not gains:
         return ()
+    paths = [Used(SpoolPath(gains=gains, joint=i)) for i in joints]
     rows = [model_rows(data.rig, (*data.terms, *paths), record) for record in data.records]
     lead = least_squares(data.rig, rows)
     return tuple(
