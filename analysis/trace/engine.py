@@ -34,6 +34,7 @@ from analysis.trace.free_forms import drawn_by_data, mechanisms
 from analysis.trace.judge import gates, held_out, readings
 from analysis.trace.judge.scatter import widened
 from analysis.trace.judge.shooting import reshaped, with_shots
+from analysis.trace.next_experiment.detection_limits import detection_limits, in_words
 from analysis.trace.next_experiment.proposal import propose
 from analysis.trace.remaining import Rest, clues_to, left_over
 from analysis.trace.result import (
@@ -96,7 +97,6 @@ def trace(
     started = time.perf_counter()
     rig = ck.common_rig([*runs, *holdout, *judge])
     _refuse_same(runs, holdout, judge)
-    rng = np.random.default_rng(seed)
     known = tuple(map(Used, baseline_of(rig))) if terms is None else tuple(terms)
     terms = ordered((*known, *temperature_terms(known, runs, [*holdout, *judge])))
     train = conditioned_records(rig, runs, families=tuple(families))
@@ -121,7 +121,7 @@ def trace(
         winner = hypotheses.run(lambda share: done(PREPARED + (COLUMNS - PREPARED) * share))
         free = _unknown(free_mechanisms(rig), known) if free_forms else []
         hypotheses, judged_all, winner, verdict, rest = _settled(
-            hypotheses, winner, free, holdout_data, rng
+            hypotheses, winner, free, holdout_data, np.random.default_rng(seed)
         )
         refused = gates.refused(judged_all)
         judged_effects = tuple(f for f in judged_all if gates.stands(f))
@@ -150,7 +150,9 @@ def trace(
     )
     error = held_out.errors(rig, unseen.members, first, last, unseen.divided)
     verdict, kept = _judged(verdict, unseen.judging, hypotheses.empty, winner)
-    notes += kept or _missed_held(verdict, error, notes)
+    explained = verdict != UNEXPLAINED
+    hidden = detection_limits(train_data, candidates, winner, after) if explained else []
+    notes += [*(kept or _missed_held(verdict, error, notes)), *in_words(hidden)]
     runs_before, runs_after = held_out.free_runs([*holdout, *judge], before, after)
     result = Trace(
         verdict, judged_effects, error.noise, error.before, error.after,
@@ -161,7 +163,7 @@ def trace(
         window_before=runs_before.window_rmse, window_after=runs_after.window_rmse,
         lines=split, formulas=formulas,
         free_curves=held_out.free_curves(runs_before, runs_after),
-        seconds=time.perf_counter() - started,
+        detection_limits=tuple(hidden), seconds=time.perf_counter() - started,
     )  # fmt: skip
     return replace(result, sentence=sentence(result))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any, Final
 
 import numpy as np
@@ -187,6 +187,24 @@ class FreeCurves:
 
 
 @dataclass(frozen=True)
+class DetectionLimit:
+    """The largest size of an effect that the records would not have shown, and what it changes.
+
+    `size` [unit] is that of the effect's number `quantity`; an effect so large would have changed
+    `parameter` by `shift`, as a share of its value.
+    """
+
+    name: str
+    where: str
+    at: str
+    quantity: str
+    size: float
+    unit: str
+    parameter: str
+    shift: float
+
+
+@dataclass(frozen=True)
 class Trace:
     """The whole result, SI and percent: errors are of the rows that judge, fits of whole records.
 
@@ -228,6 +246,7 @@ class Trace:
     lines: tuple[SpectralLines, ...] = ()
     formulas: tuple[Formula, ...] = ()
     free_curves: FreeCurves | None = None
+    detection_limits: tuple[DetectionLimit, ...] = ()
 
     @property
     def tied_at(self) -> list[tuple[str, str]]:
@@ -253,8 +272,8 @@ class Trace:
 def to_json(result: Trace) -> dict[str, Any]:
     """Return the contract's JSON.
 
-    Added to it are `refused at gates size rmse window_rmse noise lines notes sentence seconds`, and
-    `free_run`, to be drawn.
+    Added to it are `refused at gates size rmse window_rmse noise lines notes sentence seconds
+    detection_limits`, and `free_run`, to be drawn.
     """
     return {
         "verdict": result.verdict,
@@ -297,6 +316,7 @@ def to_json(result: Trace) -> dict[str, Any]:
             for f in result.floors
         ],
         "lines": [_lines(lines) for lines in result.lines],
+        "detection_limits": [asdict(limit) for limit in result.detection_limits],
         "notes": list(result.notes),
         "sentence": result.sentence,
         "seconds": result.seconds,

@@ -98,6 +98,11 @@ class TraceSettings:
     """Rows of an equation in one record (arithmetic)."""
     most_rivals: int = 4
     """Rivals in a result."""
+    visible_shift: float = 0.01
+    """Of a parameter: an effect below its detection limit that changes one by more is noted
+    (tuned: with good excitation none does)."""
+    most_limits: int = 3
+    """Detection limits that are noted."""
     normal_quantile: float = 1.96
     """Half-width of a 95 % interval over the standard error (convention)."""
     dependent_share: float = 1e-10

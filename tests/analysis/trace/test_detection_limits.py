@@ -1,0 +1,65 @@
+"""A clean verdict on small motions: the trace lists what could still hide, and what it would do."""
+
+from __future__ import annotations
+
+import pytest
+
+from analysis.trace.engine import trace
+from analysis.trace.result import DetectionLimit, Trace, to_json
+from rig.model.rig import Rig
+from tests.analysis.trace.hidden import experiment
+
+SMALL = 0.004  # [V] of the spool, rms: the friction of such a motion is near the noise
+
+
+def traced(rig: Rig, rms: float, **hidden: float) -> Trace:
+    train = experiment(rig, rms=rms, **hidden)
+    held_out = experiment(rig, repeats=2, seed=2, rms=0.7 * rms, **hidden)
+    return trace([train], [held_out], look_ahead=False)
+
+
+@pytest.fixture(scope="module")
+def small(rig: Rig) -> Trace:
+    return traced(rig, SMALL)
+
+
+def limit(result: Trace, name: str) -> DetectionLimit:
+    return next(d for d in result.detection_limits if d.name == name)
+
+
+def test_large_motions_leave_nothing_to_hide(rig: Rig) -> None:
+    result = traced(rig, 0.03)
+    assert result.verdict == "clean"
+    assert result.detection_limits == ()
+
+
+@pytest.mark.parametrize(
+    ("name", "at", "parameter", "hidden"),
+    [
+        ("coulomb_friction", "joint 2", "Fv2", "Fc"),
+        ("tank_pressure", "bench", "C_pm_2", "p_tank"),
+    ],
+)
+def test_an_effect_at_its_limit_stays_hidden_and_changes_the_parameter_as_stated(
+    rig: Rig, small: Trace, name: str, at: str, parameter: str, hidden: str
+) -> None:
+    found = limit(small, name)
+    assert (found.at, found.parameter) == (at, parameter)
+    biased = traced(rig, SMALL, **{hidden: found.size})
+    assert biased.verdict == "clean"
+    right = small.model_after.parameters[parameter]
+    change = biased.model_after.parameters[parameter].value / right.value - 1
+    # Both benches have the same noise: the change is the effect's alone.
+    assert abs(change) == pytest.approx(found.shift, rel=0.1)
+
+
+def test_the_largest_changes_are_noted_and_all_are_in_the_result(small: Trace) -> None:
+    noted = [note for note in small.notes if note.startswith("not excluded by these records")]
+    assert len(noted) == 3
+    assert all(
+        d.name in note and d.parameter in note
+        for d, note in zip(small.detection_limits, noted, strict=False)
+    )
+    shifts = [d["shift"] for d in to_json(small)["detection_limits"]]
+    assert shifts == sorted(shifts, reverse=True)
+    assert shifts[-1] >= 0.01
