@@ -70,6 +70,14 @@ def in_common(one: Rows, other: Rows) -> tuple[Indices, Indices]:
     return here, there
 
 
+def at_instants(rows: Rows, time: Array) -> Rows:
+    """Return the rows at instants (m,) [s], all of which they have."""
+    if np.array_equal(rows.time, time):  # nearly always
+        return rows
+    at = np.searchsorted(rows.time, time)
+    return replace(rows, matrix=rows.matrix[at], rhs=rows.rhs[at], time=time)
+
+
 def default_filtering(record: Record) -> Filtering:
     """Return the filters that the bias study chose, fitted to the record's excitation."""
     rate = record.sample_rate
@@ -159,11 +167,11 @@ def record_rows(
     Only those of `families`, and only rows whose time [s] lies `within` (from, before), for a chunk
     of a longer record.
     """
-    signals = prepared(rig, terms, signals)
+    measured, signals = signals, prepared(rig, terms, signals)
     out: dict[str, Rows] = {}
     for family in families:
         sides = right_parts(rig, signals, filtering, family)
-        parts = [term_part(rig, used, signals, filtering, family) for used in terms]
+        parts = [term_part(rig, used, signals, filtering, family, measured) for used in terms]
         out |= assembled(parameters_of(rig, terms, family), parts, sides, filtering, within)
     return out
 
@@ -198,12 +206,15 @@ def _equations(signals: Signals, family: str) -> list[str]:
 
 
 def term_part(
-    rig: Rig, used: Used, signals: Signals, filtering: Filtering, family: str
+    rig: Rig, used: Used, signals: Signals, filtering: Filtering, family: str, measured: Signals
 ) -> TermPart:
-    """Return a term's filtered columns of one family, of signals as all terms see them."""
+    """Return a term's filtered columns of one family, of signals as all terms see them.
+
+    Where the equations hold is decided by the `measured` signals, whatever a term makes of them.
+    """
     equations = _equations(signals, family)
     raw = used.term.columns(rig, signals, used.shape)
-    valid = used.term.valid(rig, signals, used.shape)
+    valid = used.term.valid(rig, measured, used.shape)
     return TermPart(
         {e: low_passed(raw[e], filtering) for e in equations if raw.get(e)},
         {e: valid[e] for e in equations if e in valid},

@@ -40,8 +40,8 @@ class Orifice(Term):
     cap: C_pp sqrt(p_s - p_cap) u [u>0] + C_pm sqrt(p_cap - p_t) u [u<0];
     rod: - C_mp sqrt(p_rod - p_t) u [u>0] - C_mm sqrt(p_s - p_rod) u [u<0].
     The paper prints the rod's root for u > 0 as zero and divides one rod term by V_cap; here
-    it is from first principles. Outside [p_t, p_s] there is no real root: the rows mask the sample,
-    the simulation takes the signed root and counts it.
+    it is from first principles. Outside [p_t, p_s] the root has the drop's sign. Rows are masked
+    where measured pressures lie there: what no sensor should show is no evidence.
     """
 
     name: ClassVar[str] = "orifice"
@@ -92,8 +92,8 @@ def _gains(joints: int) -> tuple[Coefficient, ...]:
 
 
 def root_of_drop(drop: Array) -> Array:
-    """Return the roots [Pa^0.5] of pressure drops [Pa], zero where the drop is not positive."""
-    return np.asarray(np.sqrt(np.maximum(drop, 0.0)))
+    """Return the roots [Pa^0.5] of the amounts of pressure drops [Pa], with the drops' signs."""
+    return np.copysign(np.sqrt(np.abs(drop)), drop)
 
 
 @njit(cache=True)

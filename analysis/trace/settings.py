@@ -41,9 +41,6 @@ class TraceSettings:
     """The same on held-out records, which may be quieter (tuned)."""
     held_out_band: float = 1.5
     """Held-out rms over the noise floor, by equation (tuned on clean benches: none is above)."""
-    masked_share: float = 0.1
-    """Of an equation's rows outside the model's domain: up to here they speak neither way (tuned:
-    a gain of 5 % put 8 % of the rows beyond the supply pressure)."""
     noted_ratio: float = 1.3
     """The same, from which an explanation says what stays (contract)."""
     visible_deviations: float = 8.0

@@ -172,7 +172,7 @@ def test_every_baseline_parameter_belongs_to_exactly_one_term(rig: Rig) -> None:
         assert [n for n in names if n in inertia_names(joints)] == list(inertia_names(joints))
 
 
-def test_samples_without_a_real_root_are_marked(rig: Rig) -> None:
+def test_samples_beyond_tank_and_supply_are_marked_and_flow_the_other_way(rig: Rig) -> None:
     rng = np.random.default_rng(5)
     signals = signals_of(rig, *(rng.uniform(-1, 1, (4, 2)) for _ in range(3)), rng)
     signals.p_cap[1, 0] = -1e4
@@ -180,8 +180,13 @@ def test_samples_without_a_real_root_are_marked(rig: Rig) -> None:
     valid = make("orifice").valid(rig, signals, ())
     assert valid["flow_cap_1"].tolist() == [True, False, True, True]
     assert valid["flow_rod_2"].tolist() == [True, True, False, True]
-    for columns in make("orifice").columns(rig, signals, ()).values():
-        assert all(np.isfinite(column).all() for column in columns.values())
+    columns = make("orifice").columns(rig, signals, ())
+    opened, closed = signals.u[:, 0] > 0, signals.u[:, 0] < 0
+    for name, at, sign in (("C_pp_1", opened, 1.0), ("C_pm_1", closed, -1.0)):
+        inward = np.sign(columns["flow_cap_1"][name][at])
+        below = np.flatnonzero(at) == 1
+        # From the tank into a chamber below it; else out of the chamber, or in from the supply.
+        assert inward.tolist() == np.where(below & (name == "C_pm_1"), -sign, sign).tolist()
 
 
 def test_an_unknown_term_is_named_with_those_known() -> None:

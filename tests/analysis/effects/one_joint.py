@@ -70,7 +70,7 @@ def _edges(x, e):
 
 @njit(cache=True)
 def _through(gain, opening, drop):
-    return gain * opening * math.sqrt(max(drop, 0.0))
+    return gain * opening * math.copysign(math.sqrt(abs(drop)), drop)
 
 
 @njit(cache=True)

@@ -19,7 +19,7 @@ from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import regression_data
 from analysis.trace.judge import gates, inference
 from analysis.trace.result import Trace
-from analysis.trace.search.refinement import ExactFit, jacobian, table
+from analysis.trace.search.refinement import ExactFit, jacobian
 from rig.model.parse import InputError
 from rig.model.records import Run
 from rig.model.rig import Rig
@@ -392,22 +392,3 @@ def test_what_a_gate_is_for_holds_and_is_lost_without_it(
 def test_every_rule_and_fault_has_a_story() -> None:
     told = {name for _, broken in STORIES for name in broken}
     assert set(by_name(RULES + FAULTS)) - told == NO_BENCH
-
-
-@pytest.mark.parametrize(("outside", "counts"), [(0.05, False), (0.3, True)])
-def test_few_instants_outside_the_domain_speak_neither_way(
-    benches: Benches, monkeypatch: pytest.MonkeyPatch, outside: float, counts: bool
-) -> None:
-    """A gain of 5 % moves readings beyond the supply pressure, where no flow can be compared."""
-    s = benches.searched(benches.runs(c_internal=LEAK), "internal_leakage")
-    data, model = s.hypotheses.train_data, s.winner.fit
-    whole = table(data, model.terms)
-    masked = np.zeros(len(model.residual), dtype=bool)
-    for segment in data.segments:
-        rows = np.arange(segment.where.start, segment.where.stop)
-        masked[rows[: int(outside * len(rows))]] = True
-    matrix = np.where(masked[:, None], 0.0, whole.matrix)
-    monkeypatch.setattr(gates, "table", lambda *_: replace(whole, matrix=matrix))
-    left = gates._in_domain(data, model, model.residual)
-    assert bool(left[masked].any()) == counts
-    np.testing.assert_array_equal(left[~masked], model.residual[~masked])
