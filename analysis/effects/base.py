@@ -166,6 +166,10 @@ class Effect(Term):
         """How many joints must move for it to be anything of its own."""
         return 1
 
+    def bounded(self, shape: Sequence[float]) -> tuple[float, ...]:
+        """Return a shape whose numbers are within what they leave to each other."""
+        return tuple(shape)
+
     def least_shapes(self) -> tuple[float, ...]:
         """Return the first shapes of its smallest size of interest."""
         return self.least_shape

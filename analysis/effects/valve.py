@@ -70,6 +70,11 @@ class ValveEffect(Effect):
         return {equation(kind, self.joint): u for kind in ("flow_cap", "flow_rod")}
 
 
+# Rounding r over overlap w at which a round edge's gain at the null, 1 - w / sqrt(w^2 + r^2), is
+# half of that far from it.
+MOST_ROUND: Final = 1.7
+
+
 @dataclass(frozen=True)
 class ValveDeadband(ValveEffect):
     """Overlapped edges: no opening for -w_astern < u < w_ahead, u less the edge beyond.
@@ -112,6 +117,16 @@ class ValveDeadband(ValveEffect):
         ahead, astern, r, c = self.whole(rig, shape)
         u = signals.u[:, self.joint]
         return self.with_opening(signals, opened(u - ahead, r, c) - opened(-u - astern, r, c))
+
+    def bounded(self, shape: Sequence[float]) -> tuple[float, ...]:
+        """Limit the rounding: beyond, the valve is not shut at its null, and this no dead band."""
+        ahead, astern, *form = shape
+        return (
+            ahead,
+            astern,
+            *(min(r, MOST_ROUND * max(ahead, astern)) for r in form[:1]),
+            *form[1:],
+        )
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Refuse a shape at its bounds, and one edge without the other."""

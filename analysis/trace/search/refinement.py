@@ -141,7 +141,10 @@ def _searched(data: RegressionData, terms: Sequence[Used], steps: int) -> ExactF
         shapes = [list(u.shape) for u in terms]
         for value, (k, j, s) in zip(x, free, strict=True):
             shapes[k][j] = _from_unit(float(value), s)
-        return tuple(Used(u.term, tuple(v)) for u, v in zip(terms, shapes, strict=True))
+        return tuple(
+            Used(u.term, u.term.bounded(v) if isinstance(u.term, Effect) else tuple(v))
+            for u, v in zip(terms, shapes, strict=True)
+        )
 
     search = search_shapes(
         lambda x: fit(data, at(x)).residual, np.clip(start, 1e-6, 1 - 1e-6), bounds=(0.0, 1.0),
