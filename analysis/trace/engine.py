@@ -32,6 +32,7 @@ from analysis.trace.data.spool_path import path_terms
 from analysis.trace.data.temperature_nuisance import stripped, temperature_terms
 from analysis.trace.free_forms import drawn_by_data, mechanisms
 from analysis.trace.judge import gates, held_out, readings
+from analysis.trace.judge.curves import beyond_in_words, within_curves
 from analysis.trace.judge.scatter import widened
 from analysis.trace.judge.shooting import reshaped, with_shots
 from analysis.trace.next_experiment.detection_limits import detection_limits, in_words
@@ -152,7 +153,7 @@ def trace(
     verdict, kept = _judged(verdict, unseen.judging, hypotheses.empty, winner)
     explained = verdict != UNEXPLAINED
     hidden = detection_limits(train_data, candidates, winner, after) if explained else []
-    notes += [*(kept or _missed_held(verdict, error, notes)), *in_words(hidden)]
+    notes += [*kept, *_missed_held(verdict, error, [*notes, *kept]), *in_words(hidden)]
     runs_before, runs_after = held_out.free_runs([*holdout, *judge], before, after)
     result = Trace(
         verdict, judged_effects, error.noise, error.before, error.after,
@@ -232,12 +233,13 @@ def _unseen(
 def _judged(
     verdict: str, judge_data: RegressionData, before: Hypothesis, after: Hypothesis
 ) -> tuple[str, list[str]]:
-    """Return the verdict of the rows that judge, and what they keep if it is another."""
+    """Return the verdict of the rows that judge, and in words what these keep or cannot show."""
     if verdict == UNEXPLAINED:
         return verdict, []
-    kept = gates.remaining_held_out(judge_data, before.fit, after.fit)
+    known = within_curves(judge_data, after.fit)
+    kept = gates.remaining_held_out(known, before.fit, after.fit)
     words = [f"{e}: {figure} in the records that judge" for e, figure in kept]
-    return (UNEXPLAINED if kept else verdict), words
+    return (UNEXPLAINED if kept else verdict), [*words, *beyond_in_words(judge_data, known)]
 
 
 def _refuse_short(train_data: RegressionData, train: Sequence[ConditionedRecord]) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from analysis.effects.base import Effect
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge import gates
+from analysis.trace.judge.curves import within_curves
 from analysis.trace.remaining import Rest, left_over
 from analysis.trace.result import JudgedEffect
 from analysis.trace.search.hypothesis import Hypothesis
@@ -53,8 +54,9 @@ def drawn_by_data(
         ),
     )
     for hypothesis in list({o.keys: o for o in first}.values())[: SEARCH.free_tried]:
-        effects = gates.judge(wide, hypothesis, holdout_data, rng)
-        rest = left_over(wide, hypothesis, holdout_data)
+        known = within_curves(holdout_data, hypothesis.fit)
+        effects = gates.judge(wide, hypothesis, known, rng)
+        rest = left_over(wide, hypothesis, known)
         failed = [(f.name, g.name, g.detail) for f in effects for g in f.gates if not g.ok]
         log.info("free form %s: %s %s", sorted(hypothesis.keys), [r.words for r in rest], failed)
         names = {kind.name for kind in wide.effects if not kind.free}

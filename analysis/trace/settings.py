@@ -41,6 +41,8 @@ class TraceSettings:
     """The same on held-out records, which may be quieter (tuned)."""
     held_out_band: float = 1.5
     """Held-out rms over the noise floor, by equation (tuned on clean benches: none is above)."""
+    beyond_knots: float = 0.05
+    """Of a free curve's range: so far beyond its outermost knots it is still compared (tuned)."""
     noted_ratio: float = 1.3
     """The same, from which an explanation says what stays (contract)."""
     visible_deviations: float = 8.0

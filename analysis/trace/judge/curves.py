@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.effects.base import Effect, shape_values
+from analysis.effects.base import Effect, shape_values, shapes_of
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.result import Curve
 from analysis.trace.search.refinement import ExactFit, tangent
 from analysis.trace.settings import TRACE
+from rig.model.units import plain
 
 Array = NDArray[np.float64]
 
@@ -36,6 +39,64 @@ def curves_of(data: RegressionData, model: ExactFit, used: Used) -> tuple[Curve,
             y, ends = 1.0 / y, (1.0 / ends[1], 1.0 / ends[0])
         out.append(Curve(line.label, line.x, y, *ends, line.unit_x, line.unit_y))
     return tuple(out)
+
+
+def within_curves(data: RegressionData, model: ExactFit) -> RegressionData:
+    """Return data with only the rows where every free curve of a model is known.
+
+    Beyond its outermost knots a curve is a guess, a straight line, that speaks neither for nor
+    against the mechanism. All rows are returned where too few would be left to judge by.
+    """
+    inside = np.ones(len(data.base), dtype=bool)
+    for used in model.terms:
+        if isinstance(used.term, Effect) and used.term.free:
+            inside &= _between_knots(data, used)
+    least = min(
+        (np.count_nonzero(inside[s.where]) for s in data.segments if not inside[s.where].all()),
+        default=TRACE.least_rows,
+    )
+    return data if inside.all() or least < TRACE.least_rows else data.at(inside)
+
+
+def beyond_in_words(whole: RegressionData, known: RegressionData) -> list[str]:
+    """Return a sentence for every equation of which `known` lacks rows (see `within_curves`)."""
+    rows, left = _counts(whole), _counts(known)
+    return [
+        f"{e}: {plain(100 * (1 - left[e] / rows[e]), 2)} % of the judging rows lie beyond the "
+        "range of the fitted curve: they are in the errors, but speak neither for nor against it; "
+        "train with motions at least as large"
+        for e in rows
+        if left[e] < rows[e]
+    ]
+
+
+def _counts(data: RegressionData) -> Counter[str]:
+    """Return how many rows each equation has."""
+    rows: Counter[str] = Counter()
+    for s in data.segments:
+        rows[s.equation] += s.where.stop - s.where.start
+    return rows
+
+
+def _between_knots(data: RegressionData, used: Used) -> NDArray[np.bool_]:
+    """Return in which rows (M,) the variable of a curve lies between its outermost knots."""
+    inside, effect = np.ones(len(data.base), dtype=bool), used.term
+    assert isinstance(effect, Effect)
+    named = zip(shapes_of(data.rig, used), used.shape, strict=True)
+    knots = [value for shape, value in named if "_knot_" in shape.parameter]
+    margin = TRACE.beyond_knots * (knots[-1] - knots[0])
+    for conditioned, rows in zip(data.records, data.rows, strict=True):
+        signals = conditioned.signals
+        for equation, values in effect.abscissa(data.rig, signals).items():
+            at = [
+                s for s in data.segments if (s.group, s.equation) == (conditioned.group, equation)
+            ]
+            for segment in at:
+                x = values[np.searchsorted(signals.t, rows[equation].time - 1e-9)]
+                # A curve of an amount begins at zero.
+                x = np.abs(x) if knots[0] == 0.0 else x
+                inside[segment.where] = (x >= knots[0] - margin) & (x <= knots[-1] + margin)
+    return inside
 
 
 def _covariance(data: RegressionData, model: ExactFit) -> tuple[tuple[str, ...], Array]:

@@ -39,8 +39,11 @@ def detection_limits(
     """Return the effects that may hide and would change a parameter visibly, the worst first.
 
     `effects` are the candidates, of which each name is returned once, where it changes most;
-    `winner` is the set in use and `model` the model identified with it.
+    `winner` is the set in use and `model` the model identified with it. A curve that the data
+    draw takes what is alike into itself: beside one nothing is asked.
     """
+    if any(isinstance(u.term, Effect) and u.term.free for u in winner.effects):
+        return []
     data = rebased(train_data, winner.fit) if winner.effects else train_data
     rows = ComparisonRows(data)
     own = {c.parameter for u in train_data.terms for c in u.term.coefficients(data.rig)}

@@ -20,10 +20,12 @@ from tests.analysis.small_bench import TRUTH
 from tests.analysis.trace.foreign_bench import (
     KARNOPP,
     PUMP,
+    RMS,
     SIGMOID,
     TANH,
     Hidden,
     Sensors,
+    experiment,
     pair_of_runs,
 )
 
@@ -181,6 +183,19 @@ def test_a_spring_that_hardens_is_a_force_over_position(rig: Rig) -> None:
     assert line.y + weight / lever == pytest.approx(pull, abs=0.03 * np.abs(pull).max())
     without = traced(rig, Hidden(spring=20.0, hardening=150.0), free_forms=False)
     assert without.verdict == "unexplained"
+
+
+@pytest.mark.slow
+def test_a_curve_is_not_judged_where_the_training_motions_never_were(rig: Rig) -> None:
+    """Held-out motions twice as large run beyond the curve, where it is a straight line."""
+    spring = Hidden(spring=20.0, hardening=600.0)
+    train = experiment(rig, spring, repeats=4, seed=1, rms=0.6 * RMS)
+    held_out = experiment(rig, spring, repeats=2, seed=2, rms=1.2 * RMS)
+    result = trace([train], [held_out], look_ahead=False)
+    assert result.verdict == "explained"
+    assert [(e.name, e.free) for e in result.effects] == [("position_force", True)]
+    assert any("lie beyond the range of the fitted curve" in note for note in result.notes)
+    assert result.after["torque_2"] > 2.0 * result.noise_floor["torque_2"]
 
 
 @pytest.mark.slow
