@@ -48,6 +48,7 @@ from rig.model.parameters import gain_names
 from rig.model.rig import Rig
 
 OPENINGS: Final = 5  # knots of |u|, the first at the null; that and the last have no value
+SOFTENS: Final = 0.2  # of a bulk modulus curve's range that it may soften by: its uncertainty
 DROPS: Final = 5  # knots of a leak's pressure, the first at zero, where nothing leaks
 PRESSURES: Final = 4  # knots of the oil's pressure; the last has no value: it is 1/b
 BACKWARDS: Final = 0.05  # of its largest that an edge or a leak may pass against: uncertainty
@@ -349,11 +350,16 @@ class BulkModulusCurve(Effect):
         return (Branch("bulk modulus over pressure", at, weights, "Pa", "Pa", reciprocal=True),)
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Refuse oil that gives way to no pressure."""
+        """Refuse oil that gives way to no pressure, or the more the higher the pressure is."""
         knots = self.shape_of(rig, shape)
         b = values.get("b", rig.nominal.get("b", math.nan))
         soft = spline(knots, shown(knots)) @ self._values(values) + 1.0 / b
-        return "" if not np.min(soft) <= 0.0 else "the oil would not be compressible"
+        if np.min(soft) <= 0.0:
+            return "the oil would not be compressible"
+        # Air and hoses are the softest at low pressure, and oil stiffens with it.
+        rise = float(np.max(soft - np.minimum.accumulate(soft)))
+        falls = rise <= SOFTENS * float(np.ptp(soft))
+        return "" if falls else "the oil would be softer at higher pressure"
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return each chamber's pressure [Pa]."""

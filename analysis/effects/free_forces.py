@@ -44,7 +44,7 @@ from rig.model.rig import Rig
 SPEEDS: Final = 4  # knots of |s'|, the first at rest
 PLACES: Final = 6  # knots of s
 ALIKE: Final = 0.03  # of gravity that a curve of s leaves: less, and the records show one pose
-DRIVES: Final = 0.1  # of the largest friction that it may drive by: the curve's uncertainty
+DRIVES: Final = 0.1  # of the curve's largest force that it may drive by: its uncertainty
 # Values at the knots of the part that both directions share, by its coefficients, where G is 1: a
 # slope from the first to the last knot is the baseline's viscous friction there. Elsewhere that
 # slope goes with G^2, and the values stand for themselves.
@@ -143,10 +143,11 @@ class FrictionCurve(Friction):
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Refuse friction that drives, and more than half of the cylinder's force."""
         (line,) = self.branches(rig, self.shape_of(rig, shape))
-        y = sum(w * values.get(name, 0.0) for name, w in line.weights.items())
-        against = np.asarray(y) * np.sign(line.x)
-        most = float(np.max(np.abs(against)))
-        if np.min(against[line.x != 0.0]) < -DRIVES * most:
+        parts = {name: w * values.get(name, 0.0) for name, w in line.weights.items()}
+        whole = np.asarray(sum(parts.values()))
+        own = np.asarray(sum(y for name, y in parts.items() if name != f"Fv{self.joint + 1}"))
+        against = whole * np.sign(line.x)
+        if np.min(against[line.x != 0.0]) < -DRIVES * np.max(np.abs(own)):
             return "friction would drive the piston"
         return refuse_large(against, force_limit(rig, self.joint), "friction")
 

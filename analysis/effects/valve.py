@@ -128,13 +128,6 @@ class ValveDeadband(ValveEffect):
             *form[1:],
         )
 
-    def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Refuse a shape at its bounds, and one edge without the other."""
-        ahead, astern = shape[:2]
-        if min(ahead, astern) <= 0.05 * max(ahead, astern):
-            return "one edge overlaps and the other does not: this is nearer to spool_offset"
-        return self.outside(rig, shape)
-
 
 @dataclass(frozen=True)
 class SpoolOffset(ValveEffect):
@@ -283,10 +276,10 @@ class SpoolHysteresis(ValveEffect):
         return (f"w_hysteresis_{self.joint + 1}",)
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return the width [V], up to a tenth of the spool's stroke."""
+        """Return the width [V], up to a quarter of the spool's stroke."""
         stroke = rig.joints[self.joint].valve.spool_stroke
         grid = (0.002 * stroke, 0.006 * stroke, 0.02 * stroke)
-        return (Shape(self.shape_names()[0], "V", 0.0, 0.1 * stroke, grid, 0.0),)
+        return (Shape(self.shape_names()[0], "V", 0.0, 0.25 * stroke, grid, 0.0),)
 
     def hidden(self, rig: Rig) -> int:
         """Return 1: the opening."""
