@@ -12,8 +12,8 @@ from rig.cli.bench import figures
 from rig.cli.bench.figure import Figure
 from rig.cli.output import EVERY, Countdown, clock_text
 from rig.cli.proofs import proved
+from rig.runs.files import CACHE_VARIABLE
 from rig.runs.rigs import load_rig
-from tests.conftest import CACHE_VARIABLE
 
 
 class Clock:
