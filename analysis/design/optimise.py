@@ -34,7 +34,6 @@ from rig.model.parse import InputError
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
-Lines = NDArray[np.int64]
 log = logging.getLogger(__name__)
 Say = Callable[[str], None]
 Passes = Callable[[TwinStep, Mapping[int, Tone]], bool]

@@ -12,7 +12,6 @@ experiments and not between the repeats of one. Glossary: `std` standard error o
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -39,7 +38,6 @@ from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 Filters = Callable[[Record], Filtering]
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ the seed bench). So only joints held by an end stop are held here; a closed valv
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -22,7 +21,6 @@ from rig.model.records import Record
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)

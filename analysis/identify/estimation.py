@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -44,7 +43,6 @@ from rig.model.records import Run
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
-log = logging.getLogger(__name__)
 
 ESTIMATORS = ("ls", "wls", "iv", "robust", "output-error", "auto")
 NEED_REPEATS = ("wls", "iv")

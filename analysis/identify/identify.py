@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from analysis.identify import checks as ck
 from analysis.identify.coupled import coupled
@@ -21,8 +20,6 @@ from analysis.terms.base import Used
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
-
-Array = NDArray[np.float64]
 
 METHODS = ("coupled", "sequential", "simultaneous", "pso", "ga")
 

@@ -233,17 +233,3 @@ def remedy_text(scale: float | None) -> str:
     if scale is None:
         return "no smaller amplitude was found to pass"
     return f"{scale:g} times this amplitude would pass"
-
-
-def worst(report: CheckReport) -> Sequence[tuple[str, MotionPrediction]]:
-    """Return, step by step, the binding line with the least margin as a share of its range."""
-    margins = []
-    for entry in report.steps:
-        binding = [line for line in entry.predictions if line.binding]
-        margins.append(
-            (
-                entry.step,
-                min(binding, key=lambda p: p.margin / (p.allowed_high - p.allowed_low)),
-            )
-        )
-    return margins

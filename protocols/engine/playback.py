@@ -7,7 +7,6 @@ law is changed when the block that holds the boundary has been read: a few sampl
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Mapping, Sequence
 
@@ -29,8 +28,6 @@ from protocols.engine.session import Session
 from protocols.engine.settings import ENGINE
 from protocols.steps.parts import Place
 from protocols.steps.plans import FIRM_SECONDS, StepPlan
-
-log = logging.getLogger(__name__)
 
 
 class Playback:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import logging
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -32,8 +31,6 @@ from rig.cli.twin_choice import (
 from rig.model.parse import InputError
 from rig.model.rig import Rig
 from rig.runs.files import cache_folder
-
-log = logging.getLogger(__name__)
 
 Progress = Callable[[float], None]
 NAME = "proof.json"

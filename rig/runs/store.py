@@ -5,7 +5,6 @@ from __future__ import annotations
 import getpass
 import hashlib
 import json
-import logging
 import os
 import socket
 from collections.abc import Mapping, Sequence
@@ -33,7 +32,6 @@ from rig.runs.runstate import (
 )
 from rig.runs.versions import versions
 
-log = logging.getLogger(__name__)
 T = TypeVar("T", Record, RecordHead)
 
 ARCHIVE = "records.h5"

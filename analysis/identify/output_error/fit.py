@@ -12,7 +12,6 @@ Schloeder; Ljung, System Identification (1999), section 3.6.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -34,7 +33,6 @@ from rig.model.records import Run
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
