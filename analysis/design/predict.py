@@ -96,8 +96,6 @@ class Prediction:
 def predict(
     rig: Rig,
     steps: Sequence[TwinStep],
-    terms: Sequence[Used] | None = None,
-    filtering: Filters = default_filtering,
     jitter: float | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Prediction:
@@ -107,15 +105,15 @@ def predict(
     `progress` receives after each step which share of them is done.
     Raises InputError for a rig without nominal values and for steps the twin cannot follow.
     """
-    used = tuple(terms) if terms is not None else tuple(Used(term) for term in baseline())
+    used = tuple(Used(term) for term in baseline())
     played, parts = [], []
     for number, step in enumerate(steps, start=1):
         played.append(play(rig, step))
-        parts.append(information(rig, played[-1], used, filtering, moments=True))
+        parts.append(information(rig, played[-1], used, default_filtering, moments=True))
         if progress is not None:
             progress(number / len(steps))
     predicted = combine(rig, used, parts)
-    cost = None if jitter is None else lateness_cost(rig, played, used, filtering, jitter)
+    cost = None if jitter is None else lateness_cost(rig, played, used, default_filtering, jitter)
     if cost is None:
         return predicted
     bulk = predicted.parameters[BULK]

@@ -86,18 +86,18 @@ def ideal(rig: Rig) -> Rig:
     return rig.model_copy(update={"sensors": sensors.model_copy(update={**parts, "skew": 0.0})})
 
 
-def play(rig: Rig, step: TwinStep, trims: int = DESIGN.trims) -> Played:
+def play(rig: Rig, step: TwinStep) -> Played:
     """Play a step on the twin, trimming the biases until the pistons stay where they belong.
 
     Raises InputError where the twin's state ceases to exist or it cannot be centred.
     """
-    for attempt in range(trims):
+    for attempt in range(DESIGN.trims):
         commands, start, lead = _commands(rig, step)
         moved = simulate_commands(rig, commands, start, _held(rig, step))
         exists = moved["valid"] > 0
         good = len(exists) if exists.all() else int(np.argmin(exists))
         step, steady, gains = _trimmed(rig, step, commands, moved["piston"], lead, good)
-        if good == len(exists) and (steady or attempt == trims - 1):
+        if good == len(exists) and (steady or attempt == DESIGN.trims - 1):
             motion = {name: values[lead:] for name, values in moved.items()}
             motion["command"] = commands[lead:]
             return Played(step, _record(rig, step, motion), motion, gains)

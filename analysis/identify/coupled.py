@@ -48,7 +48,6 @@ def coupled(
     estimator: str = "auto",
     bootstrap: int = 0,
     rng: np.random.Generator | None = None,
-    nuisances: bool = True,
     progress: Callable[[float], None] | None = None,
 ) -> Identification:
     """Identify all parameters of the terms `used` from all records of the runs at once.
@@ -65,7 +64,7 @@ def coupled(
 
             fitted, check = free_run_fit(rig, runs, used, solutions)
             return Refined(fitted, (check,), estimator)
-        job = EstimationJob(rig, runs, used, built, estimator, bootstrap, rng, nuisances)
+        job = EstimationJob(rig, runs, used, built, estimator, bootstrap, rng)
         return refine(job, solutions)
 
     built = build_rows(rig, runs, used, filtering, progress)

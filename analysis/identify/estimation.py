@@ -60,10 +60,7 @@ _FITS: Mapping[str, Callable[[Sequence[RepeatBlock]], EquationFit]] = {
 
 @dataclass(frozen=True)
 class EstimationJob:
-    """What to estimate from: rig, runs, the model's terms, and the rows built with them.
-
-    With `nuisances` the small effects of `analysis.identify.estimators.nuisance` are fitted beside.
-    """
+    """What to estimate from: rig, runs, the model's terms, and the rows built with them."""
 
     rig: Rig
     runs: Sequence[Run]
@@ -72,7 +69,6 @@ class EstimationJob:
     estimator: str = "ls"
     bootstrap: int = 0
     rng: np.random.Generator | None = None
-    nuisances: bool = True
 
 
 @dataclass(frozen=True)
@@ -177,7 +173,7 @@ def _prepare(
     for s in solutions.values():
         for name, v in zip(s.names, s.value, strict=True):
             values[name] = float(1.0 / v) if name == "b" and v != 0 else float(v)
-    extra = list(nu.nuisance_terms(job.terms, job.runs, values)) if job.nuisances else []
+    extra = list(nu.nuisance_terms(job.terms, job.runs, values))
     built = with_columns(job.rig, job.terms, job.built, extra)
     checks: list[Check] = []
     out = []

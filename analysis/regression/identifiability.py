@@ -31,15 +31,13 @@ Triangles = Mapping[str, Array]  # family -> triangle (k, k) of its rows
 _KEYS = {ch.SPOOL: "spool", ch.PISTON: "piston", ch.CAP: "cap_pressure", ch.ROD: "rod_pressure"}
 
 
-def predicted_rows(
-    rig: Rig, moved: Mapping[str, Array], locked: Sequence[int], terms: Sequence[Used] | None = None
-) -> dict[str, Array]:
+def predicted_rows(rig: Rig, moved: Mapping[str, Array], locked: Sequence[int]) -> dict[str, Array]:
     """Return the triangle (k, k) of each family's rows of a motion on the twin.
 
     `moved` is what `analysis.simulation.twin.simulate_commands` returns or a stretch of it, arrays
     (n, N); `locked` the joints (1-based) that were held.
     """
-    used = tuple(terms) if terms is not None else tuple(Used(term) for term in baseline())
+    used = tuple(Used(term) for term in baseline())
     ideal = rig.model_copy(update={"sensors": rig.sensors.model_copy(update={"skew": 0.0})})
     n = len(moved["piston"])
     channels: dict[str, Array] = {}

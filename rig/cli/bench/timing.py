@@ -23,9 +23,9 @@ class Spent:
     median: float
 
 
-def spent(work: Callable[[], object], repeats: int = REPEATS) -> Spent:
-    """Return the processor time of `work`, done `repeats` times."""
-    (only,) = spent_together({"": work}, repeats).values()
+def spent(work: Callable[[], object]) -> Spent:
+    """Return the processor time of `work`, done several times."""
+    (only,) = spent_together({"": work}).values()
     return only
 
 
