@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import getpass
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
@@ -40,10 +38,9 @@ ItemArgument = Annotated[int, typer.Argument(help="The item's number.")]
 
 
 def _who() -> str:
-    try:
-        return getpass.getuser()
-    except (OSError, KeyError):
-        return str(os.getuid())
+    from rig.runs.runstate import user_name
+
+    return user_name()
 
 
 def _path(queue: Path | None) -> Path:

@@ -93,6 +93,12 @@ def ends(left: Row, right: Row, width: int, style: str = PLAIN) -> Row:
     return (*fit(left, room, style), *right)
 
 
+def window(rows: list[Row], at: int, height: int) -> list[Row]:
+    """Return `height` of the rows with the marked one among them."""
+    first = min(max(at - height // 2, 0), max(len(rows) - height, 0))
+    return rows[first : first + height]
+
+
 def block(rows: Sequence[Row], width: int, height: int, style: str = PLAIN) -> list[Row]:
     """Return exactly `height` rows of `width` cells."""
     kept = [fit(line, width, style) for line in rows[: max(height, 0)]]

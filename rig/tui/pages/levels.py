@@ -7,15 +7,12 @@ from rig.tui.drawing.rows import Part, Row, beside, block, box, columns, fit, ro
 from rig.tui.drawing.styles import ALARM_TEXT, DIM, STRONG, WARN_TEXT
 from rig.tui.look import PlotView
 from rig.tui.pages.parts import (
-    CURVES,
-    GAUGES,
-    bar_of,
     curve,
     curves,
+    joint_channels,
     joint_title,
     joints_in,
     said_of,
-    short_name,
 )
 from rig.tui.units import age_text, clock_text, limit, shown
 from rig.tui.words import NEARNESS, band_of, run_time, value
@@ -32,11 +29,8 @@ def joint_page(view: PlotView, width: int, height: int) -> list[Row]:
     if not joints:
         return block([row((" this run has no joints", DIM))], width, height)
     joint = joints[min(max(view.look.joint, 1), len(joints)) - 1]
-    have = {kind: ch.channel(kind, joint) for kind in GAUGES}
-    have = {kind: name for kind, name in have.items() if name in snapshot.channels}
     inner = width - 4
-    bars = [bar_of(view, name, short_name(kind), inner) for kind, name in have.items()]
-    names = {have[kind]: short_name(kind) for kind in CURVES if kind in have}
+    bars, names = joint_channels(view, joint, inner)
     room = height - 2 - len(bars)
     if width >= TWO:
         pressures = {n: k for n, k in names.items() if ch.kind_of(n)[0] in (ch.CAP, ch.ROD)}

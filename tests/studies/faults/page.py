@@ -12,12 +12,11 @@ from hil_sim.device.server import TCP
 from hil_sim.faults.device import DeviceFault
 from hil_sim.faults.wire import WireFault
 from rig.cli.bench.faults.bench import fault_bench
-from rig.cli.bench.faults.figures import RIG, counted
+from rig.cli.bench.faults.figures import RIG, counted, quiet
 from rig.cli.bench.faults.trials import TrialOutcome, kinds, try_fault, wires
 from rig.cli.bench.figures import text
 from rig.model.trips import SafetyTrip
 from rig.runs.rigs import load_rig
-from tests.studies.quiet import quiet
 
 HEADER = ("fault", "wire", "what notices", "after", "what the operator reads", "what is kept")
 _PLACE = re.compile(r"(/tmp/\S*?/line|127\.0\.0\.1:\d+)")

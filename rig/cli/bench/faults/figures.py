@@ -42,7 +42,7 @@ def jobs(wire: str, least: int) -> Iterator[tuple[int, str]]:
 
 def fault_trials(folder: Path, least: int, say: Say) -> list[TrialOutcome]:
     """Run at least `least` trials in virtual time, each with a fault of its own."""
-    with _quiet(), ThreadPoolExecutor(len(wires())) as pool:  # they wait more than they work
+    with quiet(), ThreadPoolExecutor(len(wires())) as pool:  # they wait more than they work
         outcomes = pool.map(lambda wire: _on_wire(folder, wire, least, say), wires())
         return [outcome for part in outcomes for outcome in part]
 
@@ -90,7 +90,7 @@ def counted(outcomes: Sequence[TrialOutcome]) -> list[Figure]:
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     """Keep hundreds of provoked warnings off the terminal; they are in the outcomes."""
     root = logging.getLogger()
     handlers, root.handlers = root.handlers, [logging.NullHandler()]
