@@ -59,7 +59,7 @@ class StepInformation:
 
 
 @dataclass(frozen=True)
-class Expected:
+class ParameterPrediction:
     """One parameter's prediction; `std`, `half` and `oil` are relative, NaN where undetermined."""
 
     nominal: float
@@ -78,7 +78,7 @@ class Prediction:
     is what a host-timed device's samples cost b; its interval includes that.
     """
 
-    parameters: Mapping[str, Expected]
+    parameters: Mapping[str, ParameterPrediction]
     condition: Mapping[str, float]
     rank: Mapping[str, tuple[int, int]]
     covariance: Mapping[str, Array]
@@ -179,7 +179,7 @@ def _oil(rig: Rig, terms: Sequence[Used], rows: Mapping[str, Rows]) -> Array:
 
 def combine(rig: Rig, terms: Sequence[Used], steps: Sequence[StepInformation]) -> Prediction:
     """Solve all steps together, each with its repeats, as the coupled method would."""
-    parameters: dict[str, Expected] = {}
+    parameters: dict[str, ParameterPrediction] = {}
     condition, rank, covariances, order = {}, {}, {}, {}
     nominal = coefficients(rig, terms)
     units = {c.parameter: c.unit for used in terms for c in used.term.coefficients(rig)}
@@ -204,7 +204,7 @@ def combine(rig: Rig, terms: Sequence[Used], steps: Sequence[StepInformation]) -
         for i, name in enumerate(names):
             note = solved.unidentifiable.get(name, "")
             value = rig.nominal[name]
-            parameters[name] = Expected(
+            parameters[name] = ParameterPrediction(
                 value, units[name], float(std[i]), float(half[i]), float(oil[i]), note
             )
         condition[family], rank[family] = solved.condition_number, (int(kept.sum()), len(names))

@@ -93,7 +93,7 @@ def play(rig: Rig, step: TwinStep) -> Played:
     """
     for attempt in range(DESIGN.trims):
         commands, start, lead = _commands(rig, step)
-        moved = simulate_commands(rig, commands, start, _held(rig, step))
+        moved = simulate_commands(rig, commands, start, _held_positions(rig, step))
         exists = moved["valid"] > 0
         good = len(exists) if exists.all() else int(np.argmin(exists))
         step, steady, gains = _trimmed(rig, step, commands, moved["piston"], lead, good)
@@ -107,7 +107,7 @@ def play(rig: Rig, step: TwinStep) -> Played:
     )
 
 
-def _held(rig: Rig, step: TwinStep) -> dict[int, float]:
+def _held_positions(rig: Rig, step: TwinStep) -> dict[int, float]:
     out = {}
     for joint, piston in step.held.items():
         half = 0.5 * rig.joints[joint].cylinder.stroke - DESIGN.end_distance

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.regression.base_parameters import Determined, determined
+from analysis.regression.base_parameters import Determinacy, determined
 from analysis.regression.rows import Filtering, parameters_of, record_rows
 from analysis.regression.settings import REGRESSION
 from analysis.regression.solve import square
@@ -58,7 +58,7 @@ def predicted_rows(rig: Rig, moved: Mapping[str, Array], locked: Sequence[int]) 
     return {family: square(np.vstack(parts)) for family, parts in stacked.items()}
 
 
-def judge(rig: Rig, steps: Sequence[Triangles]) -> dict[str, Determined]:
+def judge(rig: Rig, steps: Sequence[Triangles]) -> dict[str, Determinacy]:
     """Say, by family, what the rows of these steps determine together."""
     used = tuple(Used(term) for term in baseline())
     out = {}

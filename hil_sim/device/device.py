@@ -83,7 +83,7 @@ class Device:
         self._prefetch = Prefetch(plant) if ahead and isinstance(plant, Rewindable) else None
         self._plant: PlantInterface = plant if self._prefetch is None else self._prefetch
         self._clock = clock
-        self._heard = self._polled = self._origin = clock()
+        self._last_request = self._last_poll = self._origin = clock()
         self._drift = 0.0  # by which share the sample clock runs fast
         self._zero_tick = 0  # of the plant, at which this device counts 0
         self._first_tick = plant.tick
@@ -134,14 +134,14 @@ class Device:
             self._controller = client
         elif self._controller is not client:
             raise Refused(Refusal.NOT_IN_CONTROL)
-        self._heard = self._clock()
+        self._last_request = self._clock()
 
     def beat(self, client: object, heartbeat: int) -> None:
         """Feed the watchdog, if the heartbeat changed: a host repeating itself is not alive."""
-        before = self._heard
+        before = self._last_request
         self.take_control(client)
         if heartbeat == self.heartbeat:
-            self._heard = before
+            self._last_request = before
         self.heartbeat = heartbeat
 
     def set_watchdog(self, milliseconds: int) -> None:
@@ -240,13 +240,13 @@ class Device:
     def poll(self) -> None:
         """Do what is due by the clock; to be called again after `idle_seconds`."""
         now = self._clock()
-        stall, self._polled = now - self._polled, now
+        stall, self._last_poll = now - self._last_poll, now
         if stall > 2 * POLL_SECONDS:
             # Whoever could not listen cannot say that the other was silent.
-            self._heard += stall
+            self._last_request += stall
         with suppress(Refused):  # a fault: tripped and logged where it happened
             self.catch_up()
-            if self._controller is not None and now - self._heard > self._silence_allowed():
+            if self._controller is not None and now - self._last_request > self._silence_allowed():
                 self._controller = None
                 if self.streaming or self.laws.armed:
                     self.trip(TripCause.WATCHDOG)

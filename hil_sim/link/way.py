@@ -89,11 +89,11 @@ class Way:
         self._striker, self._cut = striker, cut
         self._on_wire, self._error_of = on_wire, error_of
         self._buffer = b""
-        self._heard = 0.0
+        self._last = 0.0
         self._ready: deque[_Due] = deque()
-        self._behind: list[Piece] = []  # for the next frame to go first
-        self._before: list[_Due] = []  # to go in one piece with the next frame, or at their time
-        self._asked: list[Piece] = []  # for the other way's next frame
+        self._after_next: list[Piece] = []  # for the next frame to go first
+        self._held: list[_Due] = []  # to go in one piece with the next frame, or at their time
+        self._for_other_way: list[Piece] = []  # for the other way's next frame
         self.ended = False
 
     @property
@@ -104,7 +104,7 @@ class Way:
     def take(self, data: bytes, now: float, seconds: float) -> int:
         """Take bytes in; returns how many whole frames they completed."""
         self._buffer += data
-        self._heard = now
+        self._last = now
         frames = 0
         while length := self._cut(self._buffer):
             frame, self._buffer = self._buffer[:length], self._buffer[length:]
@@ -113,8 +113,8 @@ class Way:
 
     def other_way(self, now: float) -> None:
         """Note a frame of the other way: late answers go on."""
-        asked, self._asked = self._asked, []
-        self._queue(asked, now)
+        late, self._for_other_way = self._for_other_way, []
+        self._queue(late, now)
 
     def mend(self) -> None:
         """Let a way that a fault has ended carry again."""
@@ -122,9 +122,9 @@ class Way:
 
     def due(self, now: float) -> list[Piece]:
         """Return the pieces that go now."""
-        quiet = bool(self._buffer) and now - self._heard > QUIET
-        while self._before and (quiet or self._before[0].at <= now):  # older than the buffer
-            self._queue([replace(self._before.pop(0).piece, wait=0.0)], now)
+        quiet = bool(self._buffer) and now - self._last > QUIET
+        while self._held and (quiet or self._held[0].at <= now):  # older than the buffer
+            self._queue([replace(self._held.pop(0).piece, wait=0.0)], now)
         if quiet:
             whole, self._buffer = self._buffer, b""
             self._queue([Piece(whole)], now)
@@ -135,8 +135,8 @@ class Way:
 
     def next_time(self) -> float:
         """Return the earliest time [s] at which `due` may have something, inf if none is known."""
-        times = [due.at for due in (*list(self._ready)[:1], *self._before[:1])]
-        return min([*times, *([self._heard + QUIET] if self._buffer else [])], default=math.inf)
+        times = [due.at for due in (*list(self._ready)[:1], *self._held[:1])]
+        return min([*times, *([self._last + QUIET] if self._buffer else [])], default=math.inf)
 
     def _frame(self, frame: bytes, now: float, seconds: float) -> bool:
         """Take one frame; returns whether it is one of the wire, not of the adapter's talk."""
@@ -146,8 +146,8 @@ class Way:
         if self.ended:
             return True
         pieces = list(self._striker.strike(frame, seconds, self._error_of(frame)))
-        joined, self._before = b"".join(due.piece.data for due in self._before), []
-        behind, self._behind = self._behind, []
+        joined, self._held = b"".join(due.piece.data for due in self._held), []
+        behind, self._after_next = self._after_next, []
         if joined:
             first = pieces.pop(0) if pieces else Piece(b"")
             pieces.insert(0, replace(first, data=joined + first.data))
@@ -158,12 +158,12 @@ class Way:
     def _queue(self, pieces: Sequence[Piece], now: float) -> None:
         for piece in pieces:
             if piece.release is Release.NEXT_FRAME:
-                self._behind.append(piece)
+                self._after_next.append(piece)
             elif piece.release is Release.WITH_NEXT:
                 held = replace(piece, release=Release.TIME)
-                self._before.append(_Due(now + piece.wait, held))
+                self._held.append(_Due(now + piece.wait, held))
             elif piece.release is Release.OTHER_WAY:
-                self._asked.append(replace(piece, release=Release.TIME))
+                self._for_other_way.append(replace(piece, release=Release.TIME))
             else:
                 last = self._ready[-1].at if self._ready else now
                 self._ready.append(_Due(max(last, now) + piece.wait, piece))

@@ -276,10 +276,10 @@ def show(item: ItemArgument, queue: QueueOption = None, json: JsonOption = None)
             typer.echo(f"  {key:9s} {value}")
     for line in lines:
         typer.echo(f"  {_local(line.time)}  {line.event}{': ' if line.reason else ''}{line.reason}")
-    if entry.found.get("parameters"):
+    if entry.results.get("parameters"):
         rows = [
             (name, f"{p['value']:.5g}", f"{p['std']:.2g}" if p.get("std") else "—", p["unit"])
-            for name, p in entry.found["parameters"].items()
+            for name, p in entry.results["parameters"].items()
             if p.get("value") is not None
         ]
         typer.echo(table(("parameter", "value", "std", "unit"), rows))

@@ -34,7 +34,7 @@ class ItemOutcome:
         """Return it with a further reason."""
         return replace(self, reason=f"{self.reason}; {more}".removeprefix("; "))
 
-    def asked(self, state: str) -> ItemOutcome:
+    def as_requested(self, state: str) -> ItemOutcome:
         """Return it as `state` where the process ended because it was asked to for that."""
         if not state or self.state not in (it.STOPPED, it.FAILED):
             return self

@@ -14,7 +14,7 @@ from rig.tui.following.link import POLL, Frame, Link, LinkStage, LocalSessions
 from rig.tui.units import age_text, clock_text, shown
 from rig.tui.words import headline, nearest_margin, notices, run_time
 
-EVERY: Final = 1.0  # [s]
+LINE_SECONDS: Final = 1.0  # [s]
 
 
 def status_line(frame: Frame, now: float) -> str:
@@ -75,7 +75,7 @@ class Reader:
             for notice in notices(frame, None, now, paused=False):
                 self._say(f"  {notice.text}")
         elif not quiet and now >= self._next:
-            self._next = now + EVERY
+            self._next = now + LINE_SECONDS
             self._say(line)
         self._last = line
 

@@ -49,7 +49,7 @@ class RepeatBlock:
 
 
 @dataclass(frozen=True)
-class Prepared:
+class FamilyBlocks:
     """A family's blocks, nuisance columns last, with the names of all columns."""
 
     family: str

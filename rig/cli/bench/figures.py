@@ -20,7 +20,7 @@ from rig.cli.bench.analysis import identify_figures
 from rig.cli.bench.faults.figures import fault_figures
 from rig.cli.bench.figure import Figure
 from rig.cli.bench.screen.figures import screen_figures
-from rig.cli.bench.speed.figures import beside, free_run_figures, plant_over_kernel
+from rig.cli.bench.speed.figures import free_run_figures, plant_over_kernel, ratio_figures
 from rig.cli.bench.speed.growth import growth_figures
 from rig.cli.bench.speed.run_figures import run_figures
 from rig.cli.bench.stream_figures import stream_figures
@@ -67,8 +67,8 @@ def analysis_figures(folder: Path, say: Say) -> list[Figure]:
         Figure("analysis", "records of 10 s", times["records"]),
         Figure("analysis", "load and identify", loading + times["identify_seconds"], "s", 5.0),
         Figure("analysis", "of it the solve", 1e3 * times["solve_seconds"], "ms", 50.0),
-        *beside("analysis", "solve", times["solve"], ("numpy's lstsq", times["lstsq"]), 1.1),
-        *beside("analysis", "identify 12 of them", times["twelve"], None, 300.0),
+        *ratio_figures("analysis", "solve", times["solve"], ("numpy's lstsq", times["lstsq"]), 1.1),
+        *ratio_figures("analysis", "identify 12 of them", times["twelve"], None, 300.0),
         *free_run_figures(load_rig(RIG)),
     ]
 

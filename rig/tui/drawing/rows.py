@@ -107,7 +107,7 @@ def block(rows: Sequence[Row], width: int, height: int, style: str = PLAIN) -> l
     return kept
 
 
-def beside(blocks: Sequence[tuple[Sequence[Row], int]], height: int, gap: int = 1) -> list[Row]:
+def hstack(blocks: Sequence[tuple[Sequence[Row], int]], height: int, gap: int = 1) -> list[Row]:
     """Return blocks of given widths side by side, each filled up to `height` rows."""
     filled = [block(rows, width, height) for rows, width in blocks]
     space: Row = ((" " * gap, PLAIN),) if gap else ()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rig.model import channels as ch
-from rig.tui.drawing.rows import Part, Row, beside, block, box, columns, fit, row
+from rig.tui.drawing.rows import Part, Row, block, box, columns, fit, hstack, row
 from rig.tui.drawing.styles import ALARM_TEXT, DIM, STRONG, WARN_TEXT
 from rig.tui.look import PlotView
 from rig.tui.pages.parts import (
@@ -37,7 +37,7 @@ def joint_page(view: PlotView, width: int, height: int) -> list[Row]:
         motion = {n: k for n, k in names.items() if n not in pressures}
         half = (inner - 2) // 2
         sides = [(curves(view, side, half, room), half) for side in (pressures, motion) if side]
-        above = beside(sides, room, gap=2)
+        above = hstack(sides, room, gap=2)
     else:
         above = curves(view, names, inner, room)
     title = f"{joint_title(view, joint)} of {len(joints)}  ← →"
@@ -74,7 +74,7 @@ def channel_page(view: PlotView, width: int, height: int) -> list[Row]:
         for what, low, high in words
     ]
     plot = curve(view, name, name, room, height - len(text), axis=True)
-    return beside([(listed, LIST), ([*plot, *text], room)], height)
+    return hstack([(listed, LIST), ([*plot, *text], room)], height)
 
 
 def diagnostics_page(view: PlotView, width: int, height: int) -> list[Row]:
@@ -114,7 +114,7 @@ def diagnostics_page(view: PlotView, width: int, height: int) -> list[Row]:
     listed = columns(names)
     if width >= TWO:
         left = max(width // 2, 60)
-        return beside([(table, left), (listed, width - left - 1)], height)
+        return hstack([(table, left), (listed, width - left - 1)], height)
     return block([*table, row(), *listed][:height], width, height)
 
 

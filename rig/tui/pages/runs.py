@@ -8,7 +8,7 @@ from typing import Any
 from rig.queue.items import Item
 from rig.runs.listing.summary import RunSummary
 from rig.tui.browse import TABS
-from rig.tui.drawing.rows import Part, Row, beside, block, box, columns, fit, row, window, wrapped
+from rig.tui.drawing.rows import Part, Row, block, box, columns, fit, hstack, row, window, wrapped
 from rig.tui.drawing.styles import ALARM_TEXT, DIM, NORMAL, STRONG, WARN_TEXT
 from rig.tui.look import PlotView
 
@@ -39,7 +39,7 @@ def runs_page(view: PlotView, width: int, height: int) -> list[Row]:
         left = width * 2 // 5
         right = width - left - 1
         pair = [(window(listed, at, room), left), (_job(view, right, room), right)]
-        return [*head, *beside(pair, room)]
+        return [*head, *hstack(pair, room)]
     above = max(room // 3, 3)
     return block(
         [*head, *block(window(listed, at, above), width, above),

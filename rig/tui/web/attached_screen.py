@@ -73,11 +73,11 @@ class AttachedScreen(AppService):
         await super().run()
         assert self._process is not None
         await self._wait(self._process)
-        said = self._said()
+        reason = self._end_reason()
         if self._process.returncode != 0 and not self._stopping:
-            log.warning("a screen ended: %s", said)
+            log.warning("a screen ended: %s", reason)
         with suppress(ConnectionError):  # the page may be gone
-            await self._ended(f"The screen ended: {said}" if said else CLOSED)
+            await self._ended(f"The screen ended: {reason}" if reason else CLOSED)
 
     async def stop(self) -> None:
         """Ask the process to end, wait for it, kill it where it does not; then nothing is left."""
@@ -130,7 +130,7 @@ class AttachedScreen(AppService):
             self._kill()
             await process.wait()
 
-    def _said(self) -> str:
+    def _end_reason(self) -> str:
         """Return why the process ended, in the words of its last error."""
         if self._process is None or self._process.returncode == 0:
             return ""
