@@ -19,7 +19,7 @@ import numpy as np
 from hil_sim.device.can.adapters import Adapter
 from hil_sim.device.device import PlantInterface
 from hil_sim.device.laws import OFF, DeviceLaw
-from hil_sim.device.lifetime import PARENT_SECONDS, ParentProcess, termination_signals
+from hil_sim.device.lifetime import run_until, termination_signals
 from rig.model import channels as ch
 from rig.model.rig import Rig
 from rig.model.wire import cia408
@@ -191,16 +191,9 @@ def serve_valves(
 ) -> None:
     """Serve a plant behind valve nodes 1 to N until SIGTERM, SIGINT or the end of `parent`."""
     bench = ValveBench(rig, plant, adapter)
-    owner = None if parent is None else ParentProcess(parent)
-    look = time.monotonic()
     try:
         with termination_signals() as ended:
             on_ready(adapter.endpoint.replace("can://", "canopen-408://", 1))
-            while not ended:
-                bench.poll(POLL_SECONDS)
-                if owner is not None and time.monotonic() > look:
-                    look = time.monotonic() + PARENT_SECONDS
-                    if owner.has_ended():
-                        return
+            run_until(ended, parent, lambda: bench.poll(POLL_SECONDS))
     finally:
         adapter.close()
