@@ -1,4 +1,4 @@
-"""Frames of a CAN bus by python-can: one thread of our own receives, whoever calls sends.
+"""Frames of a CAN bus by python-can: a thread of this module receives, the caller's thread sends.
 
 Nothing is sent by python-can's periodic sender: its thread ends silently with the first error of
 the bus, and the device's watchdog would be all that is left.
@@ -379,7 +379,7 @@ class _Reader:
                     self._take(message)
         except Exception as error:
             self.fault = error
-            self.frames.put((-1, b""))  # wakes whoever waits
+            self.frames.put((-1, b""))  # ends the wait of the reader
         finally:
             with suppress(Exception):
                 self.bus.shutdown()

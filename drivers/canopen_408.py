@@ -280,7 +280,7 @@ class CanOpenValves:
                 self._received.notify_all()
 
     def _heartbeat(self, *, force: bool = False) -> None:
-        # From whoever serves the outputs, so that a host that stands still is silent.
+        # Sent by the thread that serves the outputs, so that a host that stops sends none.
         now = self._clock()
         if force or now - self._beat > self._wire.watchdog / DRIVER.heartbeats:
             state = bytes([cia408.OPERATIONAL])

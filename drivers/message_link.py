@@ -50,7 +50,7 @@ class MessageLine(Protocol):
         """Whether messages can be sent and received."""
 
     def open(self, *, shared: bool = False) -> None:
-        """Open the line and forget what it had received.
+        """Open the line and drop what it had received.
 
         Raises DeviceLost when there is none, DeviceError when it may not be opened, DeviceBusy
         when another program has it, unless `shared`.

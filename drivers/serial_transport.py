@@ -38,7 +38,7 @@ class Transport(Protocol):
         """Whether bytes can be written and read."""
 
     def open(self, *, shared: bool = False) -> None:
-        """Open the port and forget what it had received.
+        """Open the port and drop what it had received.
 
         Raises DeviceLost when there is no such port, DeviceError when it may not be opened or,
         unless `shared`, another program has it.

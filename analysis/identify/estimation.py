@@ -88,7 +88,7 @@ def refuse_unknown(estimator: str) -> None:
 
 
 def refine(job: EstimationJob, solutions: Mapping[str, Solution]) -> Refinement:
-    """Solve again by the job's estimator, nuisances beside the parameters, with honest intervals.
+    """Solve again by the job's estimator, nuisances beside the parameters, with intervals.
 
     `solutions` are those of plain least squares; what they found unidentifiable stays so. Raises
     InputError for an estimator that needs repeats where a step has one only.

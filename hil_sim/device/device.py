@@ -34,7 +34,7 @@ Codes = NDArray[np.int64]
 
 QUEUE_SECONDS = 4.0
 SETTLE_SECONDS = 0.2  # virtual time that passes with zero outputs after the host is gone
-VIRTUAL_SILENCE = 10.0  # nothing moves while a virtual host thinks, so it may think for long
+VIRTUAL_SILENCE = 10.0  # virtual time stands still between requests
 POLL_SECONDS = 0.05
 WATCHDOG_RANGE_MS = (round(1e3 * WATCHDOG_RANGE[0]), round(1e3 * WATCHDOG_RANGE[1]))
 _U32 = 0xFFFF_FFFF
@@ -115,7 +115,7 @@ class Device:
 
     @property
     def boots(self) -> bool:
-        """Whether it restarts and hears nothing."""
+        """Whether it restarts and answers nothing."""
         return self._clock() < self._boots_until
 
     @property
@@ -209,7 +209,7 @@ class Device:
             self._run(self.layout.samples)
 
     def prefetch(self) -> None:
-        """Compute, while nobody waits, what the host will most likely read next.
+        """Compute between requests what the host will most likely read next.
 
         Nothing of it shows before it is read, and a change of laws makes it void.
         """
@@ -242,7 +242,7 @@ class Device:
         now = self._clock()
         stall, self._last_poll = now - self._last_poll, now
         if stall > 2 * POLL_SECONDS:
-            # Whoever could not listen cannot say that the other was silent.
+            # While the device itself stood still the host does not count as silent.
             self._last_request += stall
         with suppress(Refused):  # a fault: tripped and logged where it happened
             self.catch_up()
@@ -277,7 +277,7 @@ class Device:
         self._run(due)
 
     def restart(self, boot: float) -> None:
-        """Lose all state as at power-on, and hear nothing for `boot` [s]."""
+        """Lose all state as at power-on, and answer nothing for `boot` [s]."""
         logger.warning("restarts at tick %d", self.tick)
         self._power_up()
         self._zero_tick = self._plant.tick

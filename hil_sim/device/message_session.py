@@ -115,7 +115,7 @@ class MessageSession:
         self._host, self._stream, self._next = None, 0, 0
 
     def ended(self) -> None:
-        """Note that nobody holds the other end of the line any more."""
+        """Note that no program has the other end of the line open."""
         host, self._host = self._host, None
         if host is not None:
             self._device.disconnected(host)

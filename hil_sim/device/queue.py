@@ -47,7 +47,7 @@ class BlockQueue:
         return self._layout.samples - self._filled
 
     def clear(self) -> None:
-        """Forget everything and number anew from 0."""
+        """Empty the queue and number anew from 0."""
         self._blocks.clear()
         self._parts.clear()
         self._filled = 0

@@ -1,7 +1,7 @@
 """One way of a link: frames in, spoiled pieces out, each at its time. No sockets, no clock.
 
-Glossary: a *way* is one direction of one connection; its *striker* decides what becomes of each
-frame and lives as long as the link, so that a new connection does not meet the same faults again.
+A *way* is one direction of one connection. Its fault injector exists as long as the link, so that a
+new connection does not meet the same faults again.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ QUIET: Final = 0.02  # [s] after which bytes that are no whole frame go on as th
 MOST_WAITING: Final = 8192  # bytes that a way holds before it takes no more
 
 
-class Striker:
-    """Draws, by a seed, which frames of one way are struck by which fault."""
+class FaultInjector:
+    """Draws, by a seed, which frames of one way are changed by which fault."""
 
     def __init__(
         self,
@@ -39,28 +39,28 @@ class Striker:
         self._carrier = carrier
         self._rng = np.random.default_rng([*seed, STREAM])
         self._faults: tuple[WireFault, ...] = ()
-        self._struck: Counter[int] = Counter()
+        self._injected: Counter[int] = Counter()
         self.counts: Counter[str] = Counter()
         self.use(faults)
 
     def use(self, faults: Sequence[WireFault]) -> None:
-        """Strike with other faults from the next frame on; what each may do at most begins anew."""
-        self._struck = Counter()
+        """Inject other faults from the next frame on; the count of each begins anew."""
+        self._injected = Counter()
         self._faults = tuple(fault for fault in faults if fault.strikes(self.way))
 
-    def strike(self, frame: bytes, seconds: float, error: bytes = b"") -> Sequence[Piece]:
+    def inject(self, frame: bytes, seconds: float, error: bytes = b"") -> Sequence[Piece]:
         """Return what becomes of a frame at `seconds` of the device's time; one fault a frame.
 
         `error` is what the wire's adapter says instead of a frame that its controller has dropped.
         """
         for number, fault in enumerate(self._faults):
             until = math.inf if fault.until is None else fault.until
-            spent = fault.most is not None and self._struck[number] >= fault.most
+            spent = fault.most is not None and self._injected[number] >= fault.most
             if spent or not fault.at <= seconds < until:
                 continue
             if fault.probability < 1.0 and self._rng.random() >= fault.probability:
                 continue
-            self._struck[number] += 1
+            self._injected[number] += 1
             self.counts[fault.name] += 1
             logger.info("%.3f s: %s, %s, %d bytes", seconds, fault.name, self.way, len(frame))
             return fault.on(self._carrier, frame, self._rng, error)
@@ -80,13 +80,13 @@ class Way:
 
     def __init__(
         self,
-        striker: Striker,
+        injector: FaultInjector,
         cut: Cutter,
         on_wire: Callable[[bytes], bool] = every_frame,
         error_of: Callable[[bytes], bytes] = no_error,
     ) -> None:
-        """Carry what `cut` cuts; faults strike what `on_wire` says is a frame of the wire."""
-        self._striker, self._cut = striker, cut
+        """Carry what `cut` cuts; faults change only what `on_wire` says is a frame of the wire."""
+        self._injector, self._cut = injector, cut
         self._on_wire, self._error_of = on_wire, error_of
         self._buffer = b""
         self._last = 0.0
@@ -139,13 +139,13 @@ class Way:
         return min([*times, *([self._last + QUIET] if self._buffer else [])], default=math.inf)
 
     def _frame(self, frame: bytes, now: float, seconds: float) -> bool:
-        """Take one frame; returns whether it is one of the wire, not of the adapter's talk."""
+        """Take one frame; returns whether it is one of the wire, not of the adapter."""
         if not self._on_wire(frame):
             self._queue([] if self.ended else [Piece(frame)], now)
             return False
         if self.ended:
             return True
-        pieces = list(self._striker.strike(frame, seconds, self._error_of(frame)))
+        pieces = list(self._injector.inject(frame, seconds, self._error_of(frame)))
         joined, self._held = b"".join(due.piece.data for due in self._held), []
         behind, self._after_next = self._after_next, []
         if joined:

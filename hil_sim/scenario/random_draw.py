@@ -1,4 +1,4 @@
-"""Scenarios drawn by a seed: what is wrong with a bench that nobody has told anything about.
+"""Scenarios drawn by a seed: the hidden effects of a bench.
 
 A draw is none, one or two effects of the simulator's list, or one that is made of its parts in a
 way no short formula describes (a spring that hardens steeply, seals as soft as a backlash).

@@ -32,7 +32,7 @@ class ExcitationDesk(Protocol):
         """Whether a person asked for a pause, or to skip the step."""
 
     def report_phase(self, step: str, phase: str, repeat: int, repeats: int, message: str) -> None:
-        """Hear where the step stands."""
+        """Receive the progress of the step."""
 
 
 class ExcitationRun:

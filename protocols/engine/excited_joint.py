@@ -1,4 +1,4 @@
-"""One excited joint in flight: what its bias is, how it moved, what its bias should become."""
+"""One excited joint: its bias, its motion, and the correction of its bias."""
 
 from __future__ import annotations
 

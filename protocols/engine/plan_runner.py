@@ -31,7 +31,7 @@ log = logging.getLogger(__name__)
 OnPhase = Callable[[str, str, int, int, str], None]
 
 
-class Conductor:
+class PlanRunner:
     """One run of a plan: its session, its state, what is done and what is left."""
 
     def __init__(
@@ -65,7 +65,7 @@ class Conductor:
     @property
     def interrupted(self) -> bool:
         """Whether a person asked for a pause, or to skip the step."""
-        return self.desk.control.wishes.pause or self.desk.control.wishes.skip
+        return self.desk.control.requests.pause or self.desk.control.requests.skip
 
     @property
     def elapsed(self) -> float:
@@ -217,7 +217,7 @@ class Conductor:
         """
         self.rest_now("a question")
         control = self.desk.control
-        control.answers, control.wishes.answer = question.answers, None
+        control.answers, control.requests.answer = question.answers, None
         self.machine.to(EngineState.PROMPTING, question.text)
         self.bench.status(prompt=question.text, answers=list(question.answers))
         choice = f"{question.text} [{'/'.join(question.answers)}]"
@@ -236,9 +236,9 @@ class Conductor:
         began = self.elapsed
         while self.elapsed - began < limit:
             self.session.wait(ENGINE.look_seconds)
-            wish = self.desk.control.wishes.answer
-            if wish is not None:
-                return wish, "from the screen"
+            answer = self.desk.control.requests.answer
+            if answer is not None:
+                return answer, "from the screen"
             typed = None if self.desk.terminal is None else self.desk.terminal()
             if typed is not None:
                 if typed.strip() in question.answers:
@@ -298,41 +298,41 @@ class Conductor:
             self.machine.to(EngineState.IDLE, why)
 
     def reconnect(self, wait: float) -> None:
-        """Connect anew to a lost device and forget what was read of it."""
+        """Connect anew to a lost device and drop what was read of it."""
         self._elapsed_before = self.elapsed
         self.bench.reconnect(wait)
         self.session.forget()
         self._origin = None
 
     def _heed(self) -> None:
-        if self.desk.control.wishes.abort:
+        if self.desk.control.requests.abort:
             self.bench.zero_outputs()
-            raise OperatorStop(self.desk.control.wishes.abort)
+            raise OperatorStop(self.desk.control.requests.abort)
 
     def _safe_point(self) -> None:
         """Pause here if a person asked for it; raises RunEnded when nobody resumes."""
-        wishes = self.desk.control.wishes
-        if not wishes.pause:
+        requests = self.desk.control.requests
+        if not requests.pause:
             return
         self.rest_now("a pause was asked for")
-        wishes.pause = wishes.resume = False
+        requests.pause = requests.resume = False
         self.machine.to(EngineState.PAUSED, "until someone resumes")
         self.report_phase("pause", "paused", 0, 0, "outputs at zero until someone resumes")
         began = self.elapsed
-        while not wishes.resume and not wishes.skip:
+        while not requests.resume and not requests.skip:
             if self.elapsed - began > self.desk.longest_pause:
                 raise RunEnded(
                     f"paused for longer than {self.desk.longest_pause:g} s; the run is over"
                 )
             self.session.wait(ENGINE.look_seconds)
-        wishes.resume = False
+        requests.resume = False
         self.machine.to(EngineState.IDLE, "resumed; places and locks are made anew")
 
     def _skipped(self, name: str) -> bool:
-        wishes = self.desk.control.wishes
-        if not wishes.skip:
+        requests = self.desk.control.requests
+        if not requests.skip:
             return False
-        wishes.skip = False
+        requests.skip = False
         self.rest_now(f"{name} is skipped")
         self.mark(f"{name} was skipped by a person")
         self.report_phase(name, "skip", 0, 0, "skipped by a person")
@@ -343,9 +343,9 @@ class Conductor:
         began = self.elapsed
         self.session.wait(min(ENGINE.look_seconds, seconds))
         while done is None or not done():
-            if self.desk.control.wishes.skip:
+            if self.desk.control.requests.skip:
                 return True
-            if self.desk.control.wishes.pause and self.machine.state is EngineState.IDLE:
+            if self.desk.control.requests.pause and self.machine.state is EngineState.IDLE:
                 self._safe_point()
             left = seconds - (self.elapsed - began)
             if left <= 0.5 / self.session.rate:

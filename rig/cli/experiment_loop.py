@@ -72,7 +72,7 @@ def refuse_taken(out: Path) -> None:
 
 
 class Loop:
-    """A loop under way: `rounds` so far, `stopped` why it ended ('' while it has not)."""
+    """A running loop: `rounds` so far, `stopped` why it ended ('' while it runs)."""
 
     def __init__(self, request: LoopRequest, say: Callable[[str], None]) -> None:
         refuse_taken(request.out)

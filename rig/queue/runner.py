@@ -80,7 +80,7 @@ def folder_of(queue: Path) -> Path:
 
 
 def runner_of(queue: Path) -> int | None:
-    """Return the process that runs a queue now, None if nobody does."""
+    """Return the process that runs a queue now, None if there is none."""
     path = folder_of(queue) / "runner.lock"
     return holder(path) if held(path) else None
 
@@ -288,14 +288,14 @@ class Runner:
         """Wait until a process has ended; returns the state it was asked to end for, or ''."""
         asked, since = "", 0.0
         while not over():
-            wish = it.STOPPED if self._stop.reason else ""
-            if not wish and self._queue.item(item.id).cancel:
-                wish = it.CANCELLED
+            end_state = it.STOPPED if self._stop.reason else ""
+            if not end_state and self._queue.item(item.id).cancel:
+                end_state = it.CANCELLED
             process = pid()
-            if wish and not asked and process is not None:
+            if end_state and not asked and process is not None:
                 self._say(f"item {item.id} {item.job.name}: asked to end")
                 processes.ask_to_end(process)
-                asked, since = wish, time.monotonic()
+                asked, since = end_state, time.monotonic()
             if asked and process and time.monotonic() - since > self._settings.stop_seconds:
                 log.error("item %d: did not end within %g s and is killed", item.id,
                           self._settings.stop_seconds)  # fmt: skip

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rig.model.parse import InputError
 
-MAX_TEXT = 1 << 20  # a description, not data: a megabyte is far beyond any honest one
+MAX_TEXT = 1 << 20  # a description, not data: far beyond any real one
 CACHE_VARIABLE = "BRAMAH_CACHE"
 
 

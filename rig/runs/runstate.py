@@ -107,7 +107,7 @@ def release_ownership(folder: Path) -> None:
 
 
 def read_owner(folder: Path) -> Owner | None:
-    """Return who writes the run, None if nobody says so."""
+    """Return the process that writes the run, None if the file names none."""
     try:
         return Owner(**json.loads((folder / _OWNER).read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError):

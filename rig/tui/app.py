@@ -36,7 +36,7 @@ SPANS: Final = (2.0, 5.0, 10.0, 30.0, 60.0)  # of the plots [s of device time]
 LONG_SPANS: Final = (*SPANS, 120.0, 300.0, 600.0)
 CROSSING: Final = 5.0  # least wall time in which a curve crosses its plot [s]
 SLOW: Final = 0.2  # ages are redrawn this often where nothing arrives [s]
-BLINK: Final = 0.5  # half a period of what nobody has acknowledged [s]
+BLINK: Final = 0.5  # half a period of an unacknowledged alarm [s]
 TWICE: Final = 0.7  # two presses of Escape within this time stop [s]
 ALARM_WINDOW: Final = 60.0  # of samples held while the alarms are looked at [s]
 

@@ -62,7 +62,7 @@ class VerbJob:
 
 
 def begin(words: Sequence[str], changed: Callable[[VerbJob], None]) -> None:
-    """Start a verb; `changed` hears of its start at once, then of its output and its end."""
+    """Start a verb; `changed` is called at its start, with its output and at its end."""
     # Closed by the thread that watches the child.
     output, errors = tempfile.TemporaryFile(), tempfile.TemporaryFile()  # noqa: SIM115
     job = VerbJob(tuple(words))

@@ -1,4 +1,4 @@
-"""SI inside, the operator's units on the glass: MPa, mm, and short words for times."""
+"""Display of SI values in the operator's units (MPa, mm), and times as short text."""
 
 from __future__ import annotations
 

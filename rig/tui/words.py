@@ -281,7 +281,7 @@ def band_of(view: ChannelView) -> Band:
 
 
 def value(view: ChannelView, fresh: Freshness, *, sign: bool = False) -> Row:
-    """Return a channel's newest value with its unit; its form says whether it can be believed.
+    """Return a channel's newest value with its unit; its form says whether it is valid.
 
     ▲ close to a limit, ■ beyond it, ✕ not a number, ◌ stale, ⊘ disconnected, ‖ held.
     """

@@ -198,7 +198,7 @@ def with_values(model: Model, values: Mapping[str, float]) -> Model:
 
 
 def score(task: SearchTask, values: Mapping[str, float]) -> Score:
-    """Simulate a candidate over all windows and return its error and its fate."""
+    """Simulate a candidate over all windows and return its error and its status."""
     ready = compiled(with_values(task.model, values), Effort.FIT)
     total, lost, samples, fate = 0.0, 0, 0, ""
     for window in task.windows:

@@ -172,7 +172,7 @@ class _Filter:
         return float(np.exp((segment.time - self._time) / self._memory))
 
     def _fade(self, seconds: float) -> None:
-        """Forget, but hold up what has become too faint at the value it had."""
+        """Discount old rows, and keep a parameter with too little information at its value."""
         self._sum.fade(float(np.exp(-seconds / self._memory)))
         R = self._sum.triangle
         size, least = _norms(R), IDENTIFY.online_floor * self._peak

@@ -48,7 +48,7 @@ class Adapter(Protocol):
 
     @property
     def free(self) -> bool:
-        """Whether somebody listens and what was sent so far is on its way."""
+        """Whether a program listens and what was sent so far has left."""
 
     @property
     def attended(self) -> bool:
@@ -69,7 +69,7 @@ class _Client:
 
     def __init__(self, end: socket.socket) -> None:
         self.end = end
-        self.raw = False  # past its greeting: it hears the bus
+        self.raw = False  # after its greeting: it receives the bus
         self.unsent = b""
         self._partial = b""
 
@@ -116,7 +116,7 @@ class SocketcandServer:
 
     @property
     def free(self) -> bool:
-        """Whether somebody listens."""
+        """Whether a program listens."""
         return any(client.raw for client in self._clients)
 
     @property
@@ -228,7 +228,7 @@ class SlcanLine:
 
     @property
     def _on_bus(self) -> bool:
-        # At another rate an adapter hears nothing but errors, and is heard as such.
+        # At another rate an adapter receives and causes errors only.
         return self._opened and self._rate == self._bitrate
 
     def receive(self, patience: float) -> list[CanFrame]:

@@ -102,7 +102,7 @@ class FrameDecoder:
         return frames
 
     def reset(self) -> None:
-        """Forget a frame that was begun: the line was opened anew."""
+        """Drop an incomplete frame: the line was opened anew."""
         self._partial = b""
         self._skipping = False
 

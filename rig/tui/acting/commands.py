@@ -167,7 +167,7 @@ class Commands:
         elif not frame.over:
             self.command("acknowledge", alarm.key, alarm.key)
         else:
-            # The run has no ear any more: this screen keeps it, and the run's log.
+            # The run takes no more commands: this screen keeps it, and the run's log.
             self.seen_alarms |= {(frame.snapshot.pid, alarm.key)}
             self._note("alarm acknowledged", alarm)
             self.remark = f"acknowledge: {alarm.key}"

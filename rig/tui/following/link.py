@@ -203,7 +203,7 @@ class Link:
     def ask(
         self, endpoint: Endpoint, word: str, value: str, answered: Callable[[str | None], None]
     ) -> None:
-        """Send a command on a thread of its own; `answered` hears why not, or None."""
+        """Send a command on a thread of its own; `answered` gets the refusal, or None."""
 
         def send() -> None:
             try:

@@ -114,7 +114,7 @@ def alarm_lines(view: PlotView, width: int, most: int) -> list[Row]:
 
 
 def alarm_mark(view: PlotView, alarm: Alarm) -> Row:
-    """Return an alarm's shape and state; its colour blinks until somebody has acknowledged it."""
+    """Return an alarm's shape and state; its colour blinks until it is acknowledged."""
     shape, style, text = ("■", ALARM, ALARM_TEXT) if alarm.trips else ("▲", WARN, WARN_TEXT)
     bright = alarm.acknowledged or view.look.blink
     word = f"{shape} {alarm.state.upper()}"

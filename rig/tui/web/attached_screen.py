@@ -26,7 +26,7 @@ _LONGEST = 4096  # of a beat's text or of an error, in characters
 
 
 class AttachedScreen(AppService):
-    """Starts `words` with a page for its terminal; `ended` hears in one line how it ended."""
+    """Starts `words` with a page for its terminal; `ended` gets one line on how it ended."""
 
     def __init__(
         self,
@@ -115,7 +115,7 @@ class AttachedScreen(AppService):
             await super().on_meta(data)
 
     async def _leaving(self) -> None:
-        """Let a screen that says it ends do so; the page hears of it when the process is gone."""
+        """Let a screen end that announces its end; the page is told when the process has ended."""
         asyncio.get_running_loop().call_later(GRACE, self._kill)
 
     def _kill(self) -> None:
