@@ -40,7 +40,7 @@ class DeviceBusy(DeviceError):
 
 
 @runtime_checkable
-class Doubting(Protocol):
+class ReportsDoubts(Protocol):
     """A driver that can say which of its settings makes a channel's values implausible."""
 
     def doubts(self) -> Mapping[str, str]:

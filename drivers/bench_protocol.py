@@ -18,7 +18,7 @@ from rig.model.wire import registers as reg
 from rig.model.wire.codes import encode_output
 from rig.model.wire.registers import Refusal, TripCause
 
-# Nothing moves in a virtual device while it thinks: a busy computer is no danger to it.
+# A virtual device's clock stands still between requests: a busy computer does not affect it.
 VIRTUAL_PATIENCE: Final = 10.0
 _VERSION = "protocol version"
 _TOLERANCE = 1e-6  # registers hold single precision

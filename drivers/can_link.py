@@ -87,9 +87,9 @@ class CanLine:
                 f"{seen.errors} error frames came: check that every node runs at {self._bitrate} "
                 "bit/s, and the termination"
             )
-        if not heard and seen.kept:
+        if not heard and seen.accepted:
             return (
-                f"{seen.kept} frames with the bench's identifiers came, none a whole message: "
+                f"{seen.accepted} frames with the bench's identifiers came, none a whole message: "
                 "another node uses them, or the device has another DBC file"
             )
         if not heard and seen.foreign:

@@ -1,4 +1,4 @@
-"""Frames of a CAN bus by python-can: one thread of our own receives, whoever calls sends.
+"""Frames of a CAN bus by python-can: a thread of this module receives, the caller's thread sends.
 
 Nothing is sent by python-can's periodic sender: its thread ends silently with the first error of
 the bus, and the device's watchdog would be all that is left.
@@ -88,7 +88,7 @@ class CanPort:
     ) -> None:
         self._place, self._bitrate, self._data_bitrate = place, bitrate, data_bitrate
         self._deliver = deliver
-        self._wanted = wanted
+        self._identifiers = wanted
         self._make = make
         self._reader: _Reader | None = None
 
@@ -108,9 +108,9 @@ class CanPort:
         return None if self._reader is None else self._reader.fault
 
     @property
-    def seen(self) -> Seen:
+    def seen(self) -> FrameCounts:
         """What came since the bus was opened last."""
-        return Seen() if self._reader is None else self._reader.seen
+        return FrameCounts() if self._reader is None else self._reader.seen
 
     def open(self) -> None:
         """Open the bus; raises DeviceLost where there is none, DeviceError where it may not be."""
@@ -119,7 +119,7 @@ class CanPort:
         logging.getLogger("can").setLevel(logging.CRITICAL)
         if self._place.interface == SOCKETCAND:
             self._greeted()
-        reader = _Reader(self._opened, self._wanted, self._deliver)
+        reader = _Reader(self._opened, self._identifiers, self._deliver)
         if not reader.opened.wait(DRIVER.can_open):
             reader.end()
             raise DeviceLost(f"{self.where} did not open within {DRIVER.can_open:g} s")
@@ -143,7 +143,7 @@ class CanPort:
                 reader.bus.send(message, timeout=DRIVER.can_send)
             except _ERRORS as error:
                 if not _is_full(error):
-                    raise self._gone(error) from error
+                    raise self._loss(error) from error
                 if time.monotonic() > end:
                     self.close()
                     raise DeviceLost(
@@ -166,7 +166,7 @@ class CanPort:
             while True:
                 frames.append(reader.frames.get_nowait())
         if not frames and reader.fault is not None:
-            raise self._gone(reader.fault) from reader.fault
+            raise self._loss(reader.fault) from reader.fault
         return [frame for frame in frames if frame[0] >= 0]
 
     def close(self) -> None:
@@ -182,7 +182,7 @@ class CanPort:
             raise DeviceLost(f"the bus {self.where} is closed")
         return self._reader
 
-    def _gone(self, error: BaseException) -> DeviceLost:
+    def _loss(self, error: BaseException) -> DeviceLost:
         self.close()
         return DeviceLost(f"the bus {self.where} has gone: {_line(error)}")
 
@@ -329,10 +329,10 @@ def _first_text(begun: bytearray) -> str | None:
 
 
 @dataclass
-class Seen:
+class FrameCounts:
     """Frames since a bus was opened, by what they were."""
 
-    kept: int = 0
+    accepted: int = 0
     foreign: int = 0
     errors: int = 0
     overrun: int = 0
@@ -352,8 +352,8 @@ class _Reader:
         self.opened = threading.Event()
         self.fault: BaseException | None = None
         self.frames: queue.SimpleQueue[tuple[int, bytes]] = queue.SimpleQueue()
-        self.seen = Seen()
-        self._make, self._wanted = make, wanted
+        self.seen = FrameCounts()
+        self._make, self._identifiers = make, wanted
         self._ending = False
         self._thread = threading.Thread(target=self._run, name="can-receive", daemon=True)
         self._thread.start()
@@ -379,7 +379,7 @@ class _Reader:
                     self._take(message)
         except Exception as error:
             self.fault = error
-            self.frames.put((-1, b""))  # wakes whoever waits
+            self.frames.put((-1, b""))  # ends the wait of the reader
         finally:
             with suppress(Exception):
                 self.bus.shutdown()
@@ -388,12 +388,12 @@ class _Reader:
         key = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
         if message.is_error_frame:
             self.seen.errors += 1
-        elif message.is_remote_frame or key not in self._wanted:
+        elif message.is_remote_frame or key not in self._identifiers:
             self.seen.foreign += 1
         elif self.frames.qsize() >= DRIVER.can_frames:
             self.seen.overrun += 1
         else:
-            self.seen.kept += 1
+            self.seen.accepted += 1
             if self._deliver is None:
                 self.frames.put((key, bytes(message.data)))
             else:

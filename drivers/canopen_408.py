@@ -86,7 +86,7 @@ class CanOpenValves:
             ) from error
         self._eds, self._source = _eds(at)
         self._received = threading.Condition()
-        self._waited: set[int] = set()
+        self._awaited_ids: set[int] = set()
         self._network: Any = None
         self._nodes: list[Any] = []
         self._places = self._find_sensors()
@@ -124,16 +124,16 @@ class CanOpenValves:
         self._usable()
         self._heartbeat()
         with self._received:
-            self._waited = set(self._tpdo_ids)
+            self._awaited_ids = set(self._tpdo_ids)
         self._port.send(CanFrame(cia408.SYNC_ID, b""))
         end = time.monotonic() + self._wire.timeout
         with self._received:
-            while self._waited:
+            while self._awaited_ids:
                 remaining = end - time.monotonic()
                 if remaining <= 0.0 or self._port.fault is not None:
                     break
                 self._received.wait(min(remaining, 0.05))
-            missing = sorted({1 + (cob - 1) % 0x80 for cob in self._waited})
+            missing = sorted({1 + (cob - 1) % 0x80 for cob in self._awaited_ids})
         if missing:
             # A late answer would pass for the next one.
             self._port.close()
@@ -275,12 +275,12 @@ class CanOpenValves:
             return
         network.notify(key, bytearray(data), time.time())
         with self._received:
-            self._waited.discard(key)
-            if not self._waited:
+            self._awaited_ids.discard(key)
+            if not self._awaited_ids:
                 self._received.notify_all()
 
     def _heartbeat(self, *, force: bool = False) -> None:
-        # From whoever serves the outputs, so that a host that stands still is silent.
+        # Sent by the thread that serves the outputs, so that a host that stops sends none.
         now = self._clock()
         if force or now - self._beat > self._wire.watchdog / DRIVER.heartbeats:
             state = bytes([cia408.OPERATIONAL])

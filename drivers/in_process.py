@@ -146,7 +146,7 @@ class InProcessDriver:
         return factory
 
     def close(self) -> None:
-        """Forget laws and object; never raises."""
+        """Drop laws and object; never raises."""
         self._streaming = False
         self._rest()
         self._object = None
@@ -201,7 +201,7 @@ class InProcessDriver:
         try:
             measured, outputs = device.advance(BLOCK_SAMPLES, laws)
             block = self._block(np.asarray(measured), np.asarray(outputs))
-        except Exception as error:  # what a stranger's object raises
+        except Exception as error:  # anything that the user's object raises
             self.close()
             raise DeviceLost(f"the object of the wire in-process failed: {error!r}") from error
         self._tick += BLOCK_SAMPLES
@@ -236,9 +236,3 @@ class InProcessDriver:
         if self._object is None:
             raise DeviceLost("the wire in-process is not connected")
         return self._object
-
-
-def over(made: Advancing, rig: Rig) -> InProcessDriver:
-    """Return the unconnected driver of an object made before, as in a notebook."""
-    wire = rig.wire.reached_by("in-process", {})
-    return InProcessDriver(wire, rig, make=lambda _: made)

@@ -50,7 +50,7 @@ class MessageLine(Protocol):
         """Whether messages can be sent and received."""
 
     def open(self, *, shared: bool = False) -> None:
-        """Open the line and forget what it had received.
+        """Open the line and drop what it had received.
 
         Raises DeviceLost when there is none, DeviceError when it may not be opened, DeviceBusy
         when another program has it, unless `shared`.
@@ -88,7 +88,7 @@ class MessageLink:
         self._session = 0
         self._number = 0
         self._answers: dict[int, WireFrame] = {}
-        self._heard = 0  # messages since the line was opened
+        self._received = 0  # messages since the line was opened
         self.blocks: deque[WireFrame] = deque(maxlen=4 * msg.WINDOW)
         self.late = 0  # answers and blocks of earlier requests, streams and sessions
 
@@ -110,7 +110,7 @@ class MessageLink:
     def open(self, *, shared: bool = False) -> None:
         """Open the line for a new session; raises what `MessageLine.open` does."""
         self._line.open(shared=shared)
-        self._heard = 0
+        self._received = 0
         self._session = secrets.randbits(32)
         self._patience = self._timeout
         self._answers.clear()
@@ -168,7 +168,7 @@ class MessageLink:
         return self._answers.pop(self._number)
 
     def _sort(self, frame: WireFrame) -> None:
-        self._heard += 1
+        self._received += 1
         if frame.session != self._session:
             self.late += 1
         elif frame.type == Message.BLOCK:
@@ -212,7 +212,7 @@ class MessageLink:
 
     def complaint(self) -> str:
         """Say what came since opening that may explain what is missing, or ''."""
-        return self._line.complaint(self._heard)
+        return self._line.complaint(self._received)
 
     def _silence(self) -> str:
         text = f"the device at {self.where} has not answered for {self._patience:g} s"

@@ -100,7 +100,7 @@ class MessageStreamDriver:
         """Zero the outputs if the device still answers, then close; never raises."""
         try:
             if self._link.is_open:
-                # Whoever has control or not: zero first, then give it up.
+                # With or without control: zero first, then give it up.
                 self._command(Message.ZERO)
                 self._command(Message.CLOSE)
         except DeviceError as error:
@@ -262,7 +262,7 @@ class MessageStreamDriver:
             raise DeviceRefused(f"{refused.what}: {text}") from refused
 
     def _alive(self, *, resend: bool = False) -> None:
-        if self._stream is None:  # between two streams nobody waits for blocks
+        if self._stream is None:  # between two streams no block is expected
             return
         self._heartbeat = (self._heartbeat + 1) & 0xFFFF
         alive = msg.Alive((self._expected - 1) & 0xFFFF, self._heartbeat, resend)

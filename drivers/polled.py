@@ -135,7 +135,7 @@ class PolledDriver:
         self._volts = np.zeros(len(rig.joints))
         self._written = 0.0
         self._cause: str | None = None
-        self._gone: str | None = None  # why the device was lost, until it is opened again
+        self._loss: str | None = None  # why the device was lost, until it is opened again
         self._timing = Timing()
 
     @property
@@ -150,7 +150,7 @@ class PolledDriver:
         self._zero_laws()
         self._streaming = False
         identity = self._safely(self._device.open)
-        self._open, self._gone = True, None
+        self._open, self._loss = True, None
         try:
             self._put(self._volts)
             self._prove_speed()
@@ -209,7 +209,7 @@ class PolledDriver:
         self._streaming = False
         self._drop()
         self._safely(self._device.open)
-        self._open, self._gone = True, None
+        self._open, self._loss = True, None
         try:
             self._put(self._volts)
         except DeviceError:
@@ -297,8 +297,8 @@ class PolledDriver:
         Raises DeviceLost or DeviceError with the outputs zeroed if the device still obeys.
         """
         if not self._streaming:
-            if self._gone is not None:
-                raise DeviceLost(self._gone)
+            if self._loss is not None:
+                raise DeviceLost(self._loss)
             raise DeviceError(f"the device of wire {self._wire.kind} is not started; start it")
         patience = self._wire.timeout + self._block_samples / self._rig.sample_rate
         deadline = self._clock() + self._silence_allowed + patience
@@ -450,7 +450,7 @@ class PolledDriver:
     def _require_open(self) -> None:
         if not self._open or self._origin is None:
             raise DeviceLost(
-                self._gone or f"the device of wire {self._wire.kind} is closed; connect first"
+                self._loss or f"the device of wire {self._wire.kind} is closed; connect first"
             )
 
     def _drop(self) -> None:
@@ -465,13 +465,13 @@ class PolledDriver:
         try:
             return call()
         except DeviceLost as error:
-            self._gone = str(error)
+            self._loss = str(error)
             raise
         except DeviceError:
             raise
         except OSError as error:
-            self._gone = f"the device of wire {self._wire.kind} is gone: {error}"
-            raise DeviceLost(self._gone) from error
+            self._loss = f"the device of wire {self._wire.kind} is gone: {error}"
+            raise DeviceLost(self._loss) from error
         except Exception as error:
             raise DeviceError(
                 f"the device of wire {self._wire.kind} failed: {type(error).__name__}: {error}"

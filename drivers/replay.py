@@ -107,7 +107,7 @@ class ReplayDriver:
         )
 
     def close(self) -> None:
-        """Forget the recording; never raises."""
+        """Drop the recording; never raises."""
         self._data, self._streaming = None, False
 
     def zero_outputs(self) -> None:

@@ -38,7 +38,7 @@ class Transport(Protocol):
         """Whether bytes can be written and read."""
 
     def open(self, *, shared: bool = False) -> None:
-        """Open the port and forget what it had received.
+        """Open the port and drop what it had received.
 
         Raises DeviceLost when there is no such port, DeviceError when it may not be opened or,
         unless `shared`, another program has it.
@@ -135,7 +135,7 @@ class PySerialTransport:
         except serial.SerialTimeoutException as error:
             raise DeviceLost(f"the device at {self._device} takes no more bytes") from error
         except _ERRORS as error:
-            raise self._gone() from error
+            raise self._loss() from error
 
     def read(self, patience: float) -> bytes:
         """Return what is waiting; see `Transport`."""
@@ -146,19 +146,19 @@ class PySerialTransport:
             while self._file is not None:
                 left = end - time.monotonic()
                 if select.select([self._file], [], [], min(max(left, 0.0), DRIVER.serial_wait))[0]:
-                    return self._taken(port, self._file)
+                    return self._read_file(port, self._file)
                 if left <= 0.0:
                     return b""
             while True:
                 if waiting := port.in_waiting:
-                    return self._some(port, waiting)
+                    return self._read_port(port, waiting)
                 if time.monotonic() >= end:
                     return b""
                 # pyserial waits in the system for the first byte; the rest came with it.
-                if first := self._some(port, 1):
-                    return first + self._some(port, port.in_waiting)
+                if first := self._read_port(port, 1):
+                    return first + self._read_port(port, port.in_waiting)
         except _ERRORS as error:
-            raise self._gone() from error
+            raise self._loss() from error
 
     def close(self) -> None:
         """Close the port; never raises."""
@@ -168,7 +168,7 @@ class PySerialTransport:
                 port.close()
 
     @staticmethod
-    def _taken(port: serial.Serial, file: int) -> bytes:
+    def _read_file(port: serial.Serial, file: int) -> bytes:
         try:
             data = os.read(file, _CHUNK)
         except BlockingIOError:  # another program that shares the port was quicker
@@ -177,7 +177,7 @@ class PySerialTransport:
             _ = port.in_waiting  # raises OSError where the port has gone
         return data
 
-    def _some(self, port: serial.Serial, size: int) -> bytes:
+    def _read_port(self, port: serial.Serial, size: int) -> bytes:
         try:
             return port.read(size) if size else b""
         except serial.SerialException:
@@ -191,6 +191,6 @@ class PySerialTransport:
             raise DeviceLost(f"the port {self._device} is closed")
         return self._port
 
-    def _gone(self) -> DeviceLost:
+    def _loss(self) -> DeviceLost:
         self.close()
         return DeviceLost(f"the port {self._device} has gone: device unplugged or ended")

@@ -13,9 +13,9 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from rig.bench.latch import STATE_VARIABLE
+from rig.runs.files import CACHE_VARIABLE
 from tests.warm_up import compile_all
 
-CACHE_VARIABLE = "BRAMAH_CACHE"
 # Equations compiled by one test serve the next, and those of the next day.
 CACHE = Path(__file__).parents[1] / ".equations_cache"
 

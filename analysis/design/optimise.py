@@ -34,7 +34,6 @@ from rig.model.parse import InputError
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
-Lines = NDArray[np.int64]
 log = logging.getLogger(__name__)
 Say = Callable[[str], None]
 Passes = Callable[[TwinStep, Mapping[int, Tone]], bool]
@@ -45,7 +44,7 @@ class Candidate:
     """One step as designed so far: its tones by joint, the twin's motion, the information."""
 
     tones: Mapping[int, Tone]
-    played: Played
+    simulated: Played
     information: StepInformation
     share: float
     limit: str
@@ -61,8 +60,8 @@ class Design:
     after: Mapping[str, float]
     shares_before: Mapping[str, tuple[float, str]]
     shares_after: Mapping[str, tuple[float, str]]
-    tried: int
-    kept: int
+    evaluated: int
+    accepted: int
 
 
 def improve(
@@ -91,7 +90,7 @@ def improve(
     search.begin([c.information for c in candidates])
     before = search.errors([c.information for c in candidates])
     shares = {c.information.step: (c.share, c.limit) for c in candidates}
-    plays, kept, children = 0, 0, 0
+    plays, accepted, children = 0, 0, 0
     for s, _ in dict.fromkeys((s, 0) for s, _ in free):
         candidates[s], cost = search.fitted(candidates[s])
         plays += cost
@@ -106,13 +105,13 @@ def improve(
             continue
         trial = [*candidates[:s], child, *candidates[s + 1 :]]
         value = search.value([c.information for c in trial])
-        if value < best and passes(child.played.step, child.tones):
-            candidates, best, kept = trial, value, kept + 1
+        if value < best and passes(child.simulated.step, child.tones):
+            candidates, best, accepted = trial, value, accepted + 1
             say(f"{plays:4d} of {budget}: {search.text(value)} ({child.limit} {child.share:.0%})")
     return Design(
-        tuple(c.played.step for c in candidates), tuple(c.tones for c in candidates), before,
+        tuple(c.simulated.step for c in candidates), tuple(c.tones for c in candidates), before,
         search.errors([c.information for c in candidates]), shares,
-        {c.information.step: (c.share, c.limit) for c in candidates}, children, kept,
+        {c.information.step: (c.share, c.limit) for c in candidates}, children, accepted,
     )  # fmt: skip
 
 
@@ -193,14 +192,14 @@ class _Search:
             j: tone_of(j, wave, empty.get((step.name, j), ())) for j, wave in step.waves.items()
         }
         candidate = self.judged(step, tones)
-        self.gains[step.name] = candidate.played.gains
+        self.gains[step.name] = candidate.simulated.gains
         return candidate
 
     def judged(self, step: TwinStep, tones: Mapping[int, Tone]) -> Candidate:
         """Play a step; raises InputError where the twin cannot."""
-        played = play(self.rig, step)
-        step_information = information(self.rig, played, self.terms)
-        return Candidate(tones, played, step_information, *used(self.rig, played))
+        simulated = play(self.rig, step)
+        step_information = information(self.rig, simulated, self.terms)
+        return Candidate(tones, simulated, step_information, *used(self.rig, simulated))
 
     def fitted(self, candidate: Candidate) -> tuple[Candidate, int]:
         """Make a step that passes a limit smaller until it keeps them all."""
@@ -212,7 +211,7 @@ class _Search:
                 )
                 for j, t in candidate.tones.items()
             }
-            candidate = self.judged(with_tones(candidate.played.step, smaller), smaller)
+            candidate = self.judged(with_tones(candidate.simulated.step, smaller), smaller)
             cost += 1
         return candidate, cost
 
@@ -230,12 +229,12 @@ class _Search:
         )
         base, fitting = parent, None
         for cost in range(1, plays + 1):
-            known = forecast_of(self.rig, base.played, joint, tone.lines)
+            known = forecast_of(self.rig, base.simulated, joint, tone.lines)
             spectrum, share = known.flattened(spectrum, DESIGN.phase_rounds)
             spectrum = spectrum * min(DESIGN.fill / share, DESIGN.largest_scaling)
             tones = {**parent.tones, joint: replace(tone, spectrum=spectrum)}
             try:
-                base = self.judged(with_tones(base.played.step, tones), tones)
+                base = self.judged(with_tones(base.simulated.step, tones), tones)
             except InputError:
                 spectrum, base = 0.5 * spectrum, parent
                 continue
@@ -254,6 +253,8 @@ class _Search:
         The bench trims its biases by that gain; excited only near its resonance a joint shows
         none, and could not be kept in its stroke.
         """
-        played = candidate.played
-        first = self.gains[played.step.name]
-        return all(abs(math.log(k / first[j])) < DESIGN.gain_band for j, k in played.gains.items())
+        simulated = candidate.simulated
+        first = self.gains[simulated.step.name]
+        return all(
+            abs(math.log(k / first[j])) < DESIGN.gain_band for j, k in simulated.gains.items()
+        )

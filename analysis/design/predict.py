@@ -12,7 +12,6 @@ experiments and not between the repeats of one. Glossary: `std` standard error o
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -39,7 +38,6 @@ from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 Filters = Callable[[Record], Filtering]
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -61,7 +59,7 @@ class StepInformation:
 
 
 @dataclass(frozen=True)
-class Expected:
+class ParameterPrediction:
     """One parameter's prediction; `std`, `half` and `oil` are relative, NaN where undetermined."""
 
     nominal: float
@@ -80,7 +78,7 @@ class Prediction:
     is what a host-timed device's samples cost b; its interval includes that.
     """
 
-    parameters: Mapping[str, Expected]
+    parameters: Mapping[str, ParameterPrediction]
     condition: Mapping[str, float]
     rank: Mapping[str, tuple[int, int]]
     covariance: Mapping[str, Array]
@@ -98,8 +96,6 @@ class Prediction:
 def predict(
     rig: Rig,
     steps: Sequence[TwinStep],
-    terms: Sequence[Used] | None = None,
-    filtering: Filters = default_filtering,
     jitter: float | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Prediction:
@@ -109,15 +105,15 @@ def predict(
     `progress` receives after each step which share of them is done.
     Raises InputError for a rig without nominal values and for steps the twin cannot follow.
     """
-    used = tuple(terms) if terms is not None else tuple(Used(term) for term in baseline())
+    used = tuple(Used(term) for term in baseline())
     played, parts = [], []
     for number, step in enumerate(steps, start=1):
         played.append(play(rig, step))
-        parts.append(information(rig, played[-1], used, filtering, moments=True))
+        parts.append(information(rig, played[-1], used, default_filtering, moments=True))
         if progress is not None:
             progress(number / len(steps))
     predicted = combine(rig, used, parts)
-    cost = None if jitter is None else lateness_cost(rig, played, used, filtering, jitter)
+    cost = None if jitter is None else lateness_cost(rig, played, used, default_filtering, jitter)
     if cost is None:
         return predicted
     bulk = predicted.parameters[BULK]
@@ -183,7 +179,7 @@ def _oil(rig: Rig, terms: Sequence[Used], rows: Mapping[str, Rows]) -> Array:
 
 def combine(rig: Rig, terms: Sequence[Used], steps: Sequence[StepInformation]) -> Prediction:
     """Solve all steps together, each with its repeats, as the coupled method would."""
-    parameters: dict[str, Expected] = {}
+    parameters: dict[str, ParameterPrediction] = {}
     condition, rank, covariances, order = {}, {}, {}, {}
     nominal = coefficients(rig, terms)
     units = {c.parameter: c.unit for used in terms for c in used.term.coefficients(rig)}
@@ -208,7 +204,7 @@ def combine(rig: Rig, terms: Sequence[Used], steps: Sequence[StepInformation]) -
         for i, name in enumerate(names):
             note = solved.unidentifiable.get(name, "")
             value = rig.nominal[name]
-            parameters[name] = Expected(
+            parameters[name] = ParameterPrediction(
                 value, units[name], float(std[i]), float(half[i]), float(oil[i]), note
             )
         condition[family], rank[family] = solved.condition_number, (int(kept.sum()), len(names))

@@ -7,7 +7,6 @@ the seed bench). So only joints held by an end stop are held here; a closed valv
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -22,7 +21,6 @@ from rig.model.records import Record
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -88,18 +86,18 @@ def ideal(rig: Rig) -> Rig:
     return rig.model_copy(update={"sensors": sensors.model_copy(update={**parts, "skew": 0.0})})
 
 
-def play(rig: Rig, step: TwinStep, trims: int = DESIGN.trims) -> Played:
+def play(rig: Rig, step: TwinStep) -> Played:
     """Play a step on the twin, trimming the biases until the pistons stay where they belong.
 
     Raises InputError where the twin's state ceases to exist or it cannot be centred.
     """
-    for attempt in range(trims):
+    for attempt in range(DESIGN.trims):
         commands, start, lead = _commands(rig, step)
-        moved = simulate_commands(rig, commands, start, _held(rig, step))
+        moved = simulate_commands(rig, commands, start, _held_positions(rig, step))
         exists = moved["valid"] > 0
         good = len(exists) if exists.all() else int(np.argmin(exists))
         step, steady, gains = _trimmed(rig, step, commands, moved["piston"], lead, good)
-        if good == len(exists) and (steady or attempt == trims - 1):
+        if good == len(exists) and (steady or attempt == DESIGN.trims - 1):
             motion = {name: values[lead:] for name, values in moved.items()}
             motion["command"] = commands[lead:]
             return Played(step, _record(rig, step, motion), motion, gains)
@@ -109,7 +107,7 @@ def play(rig: Rig, step: TwinStep, trims: int = DESIGN.trims) -> Played:
     )
 
 
-def _held(rig: Rig, step: TwinStep) -> dict[int, float]:
+def _held_positions(rig: Rig, step: TwinStep) -> dict[int, float]:
     out = {}
     for joint, piston in step.held.items():
         half = 0.5 * rig.joints[joint].cylinder.stroke - DESIGN.end_distance

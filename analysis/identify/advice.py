@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from analysis.identify.checks import Check
 from analysis.identify.settings import IDENTIFY
-from analysis.regression.base_parameters import Determined, determined
+from analysis.regression.base_parameters import Determinacy, determined
 from analysis.regression.identifiability import predicted_rows
 from analysis.regression.solve import Solution
 from rig.model.parameters import gain_names, parameter_names
@@ -45,7 +45,7 @@ def base_statements(rig: Rig, solutions: Mapping[str, Solution]) -> list[Check]:
     return out
 
 
-def _help(rig: Rig, family: str, lacking: Determined) -> list[str]:
+def _help(rig: Rig, family: str, lacking: Determinacy) -> list[str]:
     # The steps of electric rigs are not planned: no stroke says what motion is to be had. What an
     # effect's own parameters need stands in the catalogue, not here.
     known = parameter_names(len(rig.joints))
@@ -60,7 +60,7 @@ def _joined(helps: Sequence[str]) -> str:
     return "Add: " + ", and: ".join(helps)
 
 
-def fluid_help(rig: Rig, lacking: Determined) -> list[str]:
+def fluid_help(rig: Rig, lacking: Determinacy) -> list[str]:
     """Return what would show gains and bulk modulus."""
     helps = []
     for joint in range(1, len(rig.joints) + 1):
@@ -71,7 +71,7 @@ def fluid_help(rig: Rig, lacking: Determined) -> list[str]:
     return helps
 
 
-def mechanical_help(rig: Rig, lacking: Determined) -> list[str]:
+def mechanical_help(rig: Rig, lacking: Determinacy) -> list[str]:
     """Return the fewest steps found that show every null direction, in words."""
     undetermined = lacking.null
     steps = list(_candidates(rig))

@@ -12,7 +12,7 @@ import numpy as np
 from analysis.identify import checks as ck
 from analysis.identify.advice import base_statements
 from analysis.identify.checks import Check, consistency
-from analysis.identify.estimation import UNBIASED, EstimationJob, Refined, refine
+from analysis.identify.estimation import UNBIASED, EstimationJob, Refinement, refine
 from analysis.identify.geometry import GeometryShifts, geometry_check, shifts_of_rows, widened
 from analysis.identify.reduction import (
     RecordReduction,
@@ -48,7 +48,6 @@ def coupled(
     estimator: str = "auto",
     bootstrap: int = 0,
     rng: np.random.Generator | None = None,
-    nuisances: bool = True,
     progress: Callable[[float], None] | None = None,
 ) -> Identification:
     """Identify all parameters of the terms `used` from all records of the runs at once.
@@ -59,13 +58,13 @@ def coupled(
     rig = ck.common_rig(runs)
     estimator = _fitting_estimator(rig, used, estimator, bootstrap)
 
-    def refined(solutions: Mapping[str, Solution]) -> Refined:
+    def refined(solutions: Mapping[str, Solution]) -> Refinement:
         if rig.electric:
             from analysis.identify.output_error.free_run import free_run_fit  # noqa: PLC0415 - compiles
 
             fitted, check = free_run_fit(rig, runs, used, solutions)
-            return Refined(fitted, (check,), estimator)
-        job = EstimationJob(rig, runs, used, built, estimator, bootstrap, rng, nuisances)
+            return Refinement(fitted, (check,), estimator)
+        job = EstimationJob(rig, runs, used, built, estimator, bootstrap, rng)
         return refine(job, solutions)
 
     built = build_rows(rig, runs, used, filtering, progress)
@@ -84,7 +83,7 @@ def conclude(
     used: tuple[Used, ...],
     reductions: Sequence[RecordReduction],
     reject_noise: bool,
-    refined: Callable[[Mapping[str, Solution]], Refined] | None = None,
+    refined: Callable[[Mapping[str, Solution]], Refinement] | None = None,
     geometry: GeometryShifts | None = None,
 ) -> Identification:
     """Solve the reductions of all records of the runs `sources`, and judge what comes out.
@@ -94,7 +93,9 @@ def conclude(
     started = time.perf_counter()
     solutions = solve_reductions(rig, used, reductions, reject_noise)
     seconds = time.perf_counter() - started
-    refinement = Refined(solutions, (_UNREFINED,), PLAIN) if refined is None else refined(solutions)
+    refinement = (
+        Refinement(solutions, (_UNREFINED,), PLAIN) if refined is None else refined(solutions)
+    )
     solutions = refinement.solutions
     estimates, covariance = estimates_of(rig, used, solutions)
     if refinement.bootstrap:
@@ -129,7 +130,7 @@ def conclude(
 def _statements(
     rig: Rig,
     reductions: Sequence[RecordReduction],
-    refinement: Refined,
+    refinement: Refinement,
     estimates: Mapping[str, Estimate],
     rows: Mapping[str, int],
 ) -> tuple[Check, ...]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -15,7 +14,7 @@ from analysis.identify.estimators.bootstrap import bootstrap
 from analysis.identify.estimators.covariance import CovarianceParts, spread
 from analysis.identify.estimators.equations import (
     EquationFit,
-    Prepared,
+    FamilyBlocks,
     RepeatBlock,
     blocks_of,
     least_squares,
@@ -44,7 +43,6 @@ from rig.model.records import Run
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
-log = logging.getLogger(__name__)
 
 ESTIMATORS = ("ls", "wls", "iv", "robust", "output-error", "auto")
 NEED_REPEATS = ("wls", "iv")
@@ -62,10 +60,7 @@ _FITS: Mapping[str, Callable[[Sequence[RepeatBlock]], EquationFit]] = {
 
 @dataclass(frozen=True)
 class EstimationJob:
-    """What to estimate from: rig, runs, the model's terms, and the rows built with them.
-
-    With `nuisances` the small effects of `analysis.identify.estimators.nuisance` are fitted beside.
-    """
+    """What to estimate from: rig, runs, the model's terms, and the rows built with them."""
 
     rig: Rig
     runs: Sequence[Run]
@@ -74,11 +69,10 @@ class EstimationJob:
     estimator: str = "ls"
     bootstrap: int = 0
     rng: np.random.Generator | None = None
-    nuisances: bool = True
 
 
 @dataclass(frozen=True)
-class Refined:
+class Refinement:
     """Solutions by family as the estimator has them, and what it has to say."""
 
     solutions: dict[str, Solution]
@@ -93,8 +87,8 @@ def refuse_unknown(estimator: str) -> None:
         raise InputError(f"unknown estimator {estimator!r}; known: {' '.join(ESTIMATORS)}")
 
 
-def refine(job: EstimationJob, solutions: Mapping[str, Solution]) -> Refined:
-    """Solve again by the job's estimator, nuisances beside the parameters, with honest intervals.
+def refine(job: EstimationJob, solutions: Mapping[str, Solution]) -> Refinement:
+    """Solve again by the job's estimator, nuisances beside the parameters, with intervals.
 
     `solutions` are those of plain least squares; what they found unidentifiable stays so. Raises
     InputError for an estimator that needs repeats where a step has one only.
@@ -140,7 +134,7 @@ def refine(job: EstimationJob, solutions: Mapping[str, Solution]) -> Refined:
         done = output_error(job.rig, job.runs, job.terms, values)
         checks.append(done.check)
         new = {family: done.solution(family, solution) for family, solution in solutions.items()}
-        return Refined(new, tuple(checks), estimator)
+        return Refinement(new, tuple(checks), estimator)
     new = dict(solutions)
     ends: dict[str, tuple[float, float]] = {}
     for p in prepared:
@@ -153,12 +147,12 @@ def refine(job: EstimationJob, solutions: Mapping[str, Solution]) -> Refined:
         if estimator == "robust":
             checks.append(outlier_statement(p.family, fit))
         if job.bootstrap:
-            ends |= _drawn(job, p, estimator, fit, shift)
-    return Refined(new, tuple(checks), estimator, ends)
+            ends |= _bootstrap_ends(job, p, estimator, fit, shift)
+    return Refinement(new, tuple(checks), estimator, ends)
 
 
-def _drawn(
-    job: EstimationJob, p: Prepared, estimator: str, fit: EquationFit, shift: Array
+def _bootstrap_ends(
+    job: EstimationJob, p: FamilyBlocks, estimator: str, fit: EquationFit, shift: Array
 ) -> dict[str, tuple[float, float]]:
     """Return the bootstrap's intervals by name, extended by a shift (k,) that no draw can show."""
     rng = job.rng or np.random.default_rng(0)
@@ -173,13 +167,13 @@ def _drawn(
 
 def _prepare(
     job: EstimationJob, solutions: Mapping[str, Solution]
-) -> tuple[list[Prepared], list[Check]]:
+) -> tuple[list[FamilyBlocks], list[Check]]:
     """Build rows with the nuisances; one that the data contradict is left out, and said."""
     values: dict[str, float] = {}
     for s in solutions.values():
         for name, v in zip(s.names, s.value, strict=True):
             values[name] = float(1.0 / v) if name == "b" and v != 0 else float(v)
-    extra = list(nu.nuisance_terms(job.terms, job.runs, values)) if job.nuisances else []
+    extra = list(nu.nuisance_terms(job.terms, job.runs, values))
     built = with_columns(job.rig, job.terms, job.built, extra)
     checks: list[Check] = []
     out = []
@@ -214,15 +208,15 @@ def _family(
     columns: Sequence[str],
     mine: Sequence[str],
     beside: Sequence[str],
-) -> Prepared:
+) -> FamilyBlocks:
     names = (*mine, *beside)
     kept = [list(columns).index(n) for n in names]
     records = {(rows.conditioned.run, rows.record.name): rows.record for rows in built}
     blocks = levelled(blocks_of(built, family, kept), records)
-    return Prepared(family, names, len(mine), tuple(blocks))
+    return FamilyBlocks(family, names, len(mine), tuple(blocks))
 
 
-def _solve(p: Prepared, estimator: str) -> tuple[Array, CovarianceParts, EquationFit]:
+def _solve(p: FamilyBlocks, estimator: str) -> tuple[Array, CovarianceParts, EquationFit]:
     fit = _FITS[estimator](p.blocks)
     error = spread([pieces(fit), pieces(fit, "level")], fit.inverse)
     beta, inverse = fit.beta, fit.inverse
@@ -232,7 +226,7 @@ def _solve(p: Prepared, estimator: str) -> tuple[Array, CovarianceParts, Equatio
 
 
 def _redo(
-    p: Prepared, kind: Callable[[Sequence[RepeatBlock]], EquationFit], error: CovarianceParts
+    p: FamilyBlocks, kind: Callable[[Sequence[RepeatBlock]], EquationFit], error: CovarianceParts
 ) -> Callable[[Sequence[RepeatBlock]], Array]:
     """Return the estimate of resampled blocks; what is known beforehand weighs as before."""
 
@@ -251,7 +245,7 @@ def _first(s: CovarianceParts, k: int) -> CovarianceParts:
 
 
 def _named(
-    prepared: Sequence[Prepared], fits: Mapping[str, tuple[Array, CovarianceParts, EquationFit]]
+    prepared: Sequence[FamilyBlocks], fits: Mapping[str, tuple[Array, CovarianceParts, EquationFit]]
 ) -> dict[str, float]:
     return {
         name: float(v)

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from analysis.identify import checks as ck
 from analysis.identify.coupled import coupled
@@ -22,8 +21,6 @@ from rig.model.parse import InputError
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
 
-Array = NDArray[np.float64]
-
 METHODS = ("coupled", "sequential", "simultaneous", "pso", "ga")
 
 
@@ -37,7 +34,6 @@ def identify(
     bootstrap: int = 0,
     rng: np.random.Generator | None = None,
     search: SearchOptions | None = None,
-    nuisances: bool = True,
     progress: Callable[[float], None] | None = None,
 ) -> Identification:
     """Identify all parameters from all records of the runs at once (the paper's STEP4).
@@ -48,10 +44,9 @@ def identify(
     `analysis.identify.estimation.ESTIMATORS` ("auto": least squares, or instruments where noise in
     the regressors biases it and that matters), "plain" the bare solution without nuisances;
     `bootstrap` draws of whole repeats replace the intervals; `rng` is for what is drawn (default:
-    seed 0); without `nuisances` no small effects are fitted beside the terms; `progress` receives
-    the share of the runs that the coupled method has worked through. Raises InputError for
-    another method or estimator, for runs of different rigs and for records that cannot be used,
-    naming record and channel.
+    seed 0); `progress` receives the share of the runs that the coupled method has worked through.
+    Raises InputError for another method or estimator, for runs of different rigs and for records
+    that cannot be used, naming record and channel.
     """
     _refuse_method(method)
     _refuse_estimator(estimator, bootstrap)
@@ -60,9 +55,7 @@ def identify(
     if method != "coupled":
         result = identify_by(method, runs, used, filtering, reject_noise, rng, search)
         return result if result.geometry is not None else _with_exact_geometry(rig, result)
-    return coupled(
-        runs, used, filtering, reject_noise, estimator, bootstrap, rng, nuisances, progress
-    )
+    return coupled(runs, used, filtering, reject_noise, estimator, bootstrap, rng, progress)
 
 
 def _with_exact_geometry(rig: Rig, result: Identification) -> Identification:

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from analysis.identify import checks as ck
 from analysis.regression.conditioned import ConditionedRecord, condition_runs
@@ -18,8 +17,6 @@ from analysis.regression.rows import Filtering, Rows, default_filtering, prepare
 from analysis.terms.base import Used, family_of
 from rig.model.records import Record, RecordHead, Run
 from rig.model.rig import Rig
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

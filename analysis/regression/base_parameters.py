@@ -50,7 +50,7 @@ class Combination:
 
 
 @dataclass(frozen=True)
-class Determined:
+class Determinacy:
     """What rows determine of `names`: rank, condition number of the unit columns, and the rest.
 
     `null` (m, k) are the directions of the parameters that do not show; `lost` the parameters in
@@ -71,7 +71,7 @@ class Determined:
         return self.rank == len(self.names)
 
 
-def determined(names: Sequence[str], X: Array, noise: Array | None = None) -> Determined:
+def determined(names: Sequence[str], X: Array, noise: Array | None = None) -> Determinacy:
     """Say what rows X (m, k), or their triangle, determine of the k parameters `names`.
 
     `noise` (k, k) is the part of X'X that sensor noise makes.
@@ -87,7 +87,7 @@ def determined(names: Sequence[str], X: Array, noise: Array | None = None) -> De
     lost = tuple(n for n, inside in zip(names, members, strict=True) if inside)
     known = tuple(n for n in names if n not in lost)
     base = _combinations(names, null, scale, np.any(X != 0.0, axis=0)) if len(null) else ()
-    return Determined(
+    return Determinacy(
         tuple(names), k - len(null), factors.condition, null / scale, known, lost,
         tuple(c for c in base if any(name in lost for name, _ in c.parts)),
     )  # fmt: skip

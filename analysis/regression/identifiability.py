@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.regression.base_parameters import Determined, determined
+from analysis.regression.base_parameters import Determinacy, determined
 from analysis.regression.rows import Filtering, parameters_of, record_rows
 from analysis.regression.settings import REGRESSION
 from analysis.regression.solve import square
@@ -31,15 +31,13 @@ Triangles = Mapping[str, Array]  # family -> triangle (k, k) of its rows
 _KEYS = {ch.SPOOL: "spool", ch.PISTON: "piston", ch.CAP: "cap_pressure", ch.ROD: "rod_pressure"}
 
 
-def predicted_rows(
-    rig: Rig, moved: Mapping[str, Array], locked: Sequence[int], terms: Sequence[Used] | None = None
-) -> dict[str, Array]:
+def predicted_rows(rig: Rig, moved: Mapping[str, Array], locked: Sequence[int]) -> dict[str, Array]:
     """Return the triangle (k, k) of each family's rows of a motion on the twin.
 
     `moved` is what `analysis.simulation.twin.simulate_commands` returns or a stretch of it, arrays
     (n, N); `locked` the joints (1-based) that were held.
     """
-    used = tuple(terms) if terms is not None else tuple(Used(term) for term in baseline())
+    used = tuple(Used(term) for term in baseline())
     ideal = rig.model_copy(update={"sensors": rig.sensors.model_copy(update={"skew": 0.0})})
     n = len(moved["piston"])
     channels: dict[str, Array] = {}
@@ -60,7 +58,7 @@ def predicted_rows(
     return {family: square(np.vstack(parts)) for family, parts in stacked.items()}
 
 
-def judge(rig: Rig, steps: Sequence[Triangles]) -> dict[str, Determined]:
+def judge(rig: Rig, steps: Sequence[Triangles]) -> dict[str, Determinacy]:
     """Say, by family, what the rows of these steps determine together."""
     used = tuple(Used(term) for term in baseline())
     out = {}

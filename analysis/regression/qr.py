@@ -10,8 +10,6 @@ that is kept of its samples.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
@@ -76,11 +74,3 @@ class Accumulator:
         if info != 0:
             raise ValueError(f"LAPACK refused the rows (dgeqrf: {info})")
         self._R = np.triu(packed[: self._width])
-
-
-def accumulate(columns: int, blocks: Iterable[tuple[Array, Array]]) -> Accumulator:
-    """Fold all blocks of rows ((m, k), (m,)) into one accumulator."""
-    whole = Accumulator(columns)
-    for matrix, rhs in blocks:
-        whole.fold(matrix, rhs)
-    return whole

@@ -202,6 +202,6 @@ def satterthwaite(variance: Array, squares: Array) -> Array:
         return np.asarray(np.where(squares > 0, variance**2 / squares, 1.0))
 
 
-def half_width(std: Array, dof: Array, level: float = 0.95) -> Array:
-    """Return the half width of confidence intervals, Student's t with `dof` (arrays alike)."""
-    return np.asarray(stdtrit(np.maximum(dof, 1.0), 0.5 + 0.5 * level) * std)
+def half_width(std: Array, dof: Array) -> Array:
+    """Return the half width of 95 % intervals, Student's t with `dof` (arrays alike)."""
+    return np.asarray(stdtrit(np.maximum(dof, 1.0), 0.975) * std)

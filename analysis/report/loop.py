@@ -10,7 +10,7 @@ import numpy as np
 from markupsafe import Markup
 
 from analysis.report import format as fm
-from analysis.report.identification import Provenance
+from analysis.report.identification.report import Provenance
 from analysis.report.page import page, write
 from analysis.report.plots import trace_plots
 from analysis.report.plots.style import BLUE, CARD, GREY, INK, PALE, figure, note, style, svg

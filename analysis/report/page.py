@@ -11,6 +11,7 @@ from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup
 
 from rig.model.parse import InputError
+from rig.runs.files import replace_text
 
 
 def page(template: str, context: Mapping[str, Any]) -> str:
@@ -25,10 +26,8 @@ def page(template: str, context: Mapping[str, Any]) -> str:
 
 def write(path: Path, text: str) -> None:
     """Write a page whole or not at all; raises InputError where it cannot be written."""
-    part = path.with_name(path.name + ".part")
     try:
-        part.write_text(text, encoding="utf-8")
-        part.replace(path)
+        replace_text(path, text)
     except OSError as error:
         raise InputError(f"cannot write the report {path}: {error.strerror or error}") from error
 

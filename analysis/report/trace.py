@@ -9,7 +9,7 @@ from typing import Any
 
 from analysis.effects.base import Effect
 from analysis.report import format as fm
-from analysis.report.identification import Provenance
+from analysis.report.identification.report import Provenance
 from analysis.report.page import page, write
 from analysis.report.plots import place_plot, trace_plots
 from analysis.trace.clues.frequency import FREQUENCY

@@ -12,7 +12,6 @@ import functools
 import hashlib
 import json
 import logging
-import os
 import platform
 import shutil
 import sys
@@ -26,19 +25,12 @@ from typing import Any, Final
 import llvmlite.binding as llvm  # type: ignore[import-untyped]
 from numba import config
 
+from rig.runs.files import cache_folder
+
 log = logging.getLogger(__name__)
 
-CACHE_VARIABLE: Final = "BRAMAH_CACHE"
 _SOURCE, _CHECKSUMS = "rates.py", "checksums.json"
 _LIBRARIES: Final = ("numba", "llvmlite", "numpy")
-
-
-def cache_folder() -> Path:
-    """Return where compiled code is kept: `BRAMAH_CACHE`, or below this user's cache folder."""
-    named = os.environ.get(CACHE_VARIABLE)
-    if named:
-        return Path(named)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "bramah"
 
 
 def key_of(source: str) -> str:

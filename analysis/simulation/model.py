@@ -21,6 +21,7 @@ from analysis.terms import make
 from analysis.terms.base import Used
 from rig.model.parse import InputError
 from rig.model.rig import Rig
+from rig.runs.files import replace_text
 
 Array = NDArray[np.float64]
 
@@ -129,11 +130,8 @@ def model_json(model: Model) -> dict[str, Any]:
 
 def save_model(model: Model, path: str | Path) -> None:
     """Write the model file, replacing an old one only when the new one is complete."""
-    path = Path(path)
     text = json.dumps(model_json(model), indent=1, allow_nan=False)
-    part = path.with_name(path.name + ".part")
-    part.write_text(text + "\n", encoding="utf-8")
-    part.replace(path)
+    replace_text(Path(path), text + "\n")
 
 
 def load_model(path: str | Path) -> Model:

@@ -8,7 +8,6 @@ under the paths given.
 from __future__ import annotations
 
 import importlib
-import logging
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, Self, TypeVar
@@ -16,7 +15,6 @@ from typing import Any, Self, TypeVar
 from analysis.workers.pool import Reads, in_order
 from rig.model.parse import InputError
 
-log = logging.getLogger(__name__)
 T = TypeVar("T")
 U = TypeVar("U")
 

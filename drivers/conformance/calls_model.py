@@ -29,7 +29,7 @@ class DeviceModel:
         self._clear()
 
     def _clear(self) -> None:
-        """Forget a session; nothing is known of waveforms stored in the device."""
+        """Drop a session; the waveforms stored in the device are unknown."""
         self.streaming = False
         self.tripped = False
         self.waves: dict[int, Array] = {}  # as uploaded, for the next apply

@@ -34,7 +34,7 @@ Codes = NDArray[np.int64]
 
 QUEUE_SECONDS = 4.0
 SETTLE_SECONDS = 0.2  # virtual time that passes with zero outputs after the host is gone
-VIRTUAL_SILENCE = 10.0  # nothing moves while a virtual host thinks, so it may think for long
+VIRTUAL_SILENCE = 10.0  # virtual time stands still between requests
 POLL_SECONDS = 0.05
 WATCHDOG_RANGE_MS = (round(1e3 * WATCHDOG_RANGE[0]), round(1e3 * WATCHDOG_RANGE[1]))
 _U32 = 0xFFFF_FFFF
@@ -83,7 +83,7 @@ class Device:
         self._prefetch = Prefetch(plant) if ahead and isinstance(plant, Rewindable) else None
         self._plant: PlantInterface = plant if self._prefetch is None else self._prefetch
         self._clock = clock
-        self._heard = self._polled = self._origin = clock()
+        self._last_request = self._last_poll = self._origin = clock()
         self._drift = 0.0  # by which share the sample clock runs fast
         self._zero_tick = 0  # of the plant, at which this device counts 0
         self._first_tick = plant.tick
@@ -115,7 +115,7 @@ class Device:
 
     @property
     def boots(self) -> bool:
-        """Whether it restarts and hears nothing."""
+        """Whether it restarts and answers nothing."""
         return self._clock() < self._boots_until
 
     @property
@@ -134,14 +134,14 @@ class Device:
             self._controller = client
         elif self._controller is not client:
             raise Refused(Refusal.NOT_IN_CONTROL)
-        self._heard = self._clock()
+        self._last_request = self._clock()
 
     def beat(self, client: object, heartbeat: int) -> None:
         """Feed the watchdog, if the heartbeat changed: a host repeating itself is not alive."""
-        before = self._heard
+        before = self._last_request
         self.take_control(client)
         if heartbeat == self.heartbeat:
-            self._heard = before
+            self._last_request = before
         self.heartbeat = heartbeat
 
     def set_watchdog(self, milliseconds: int) -> None:
@@ -209,7 +209,7 @@ class Device:
             self._run(self.layout.samples)
 
     def prefetch(self) -> None:
-        """Compute, while nobody waits, what the host will most likely read next.
+        """Compute between requests what the host will most likely read next.
 
         Nothing of it shows before it is read, and a change of laws makes it void.
         """
@@ -240,13 +240,13 @@ class Device:
     def poll(self) -> None:
         """Do what is due by the clock; to be called again after `idle_seconds`."""
         now = self._clock()
-        stall, self._polled = now - self._polled, now
+        stall, self._last_poll = now - self._last_poll, now
         if stall > 2 * POLL_SECONDS:
-            # Whoever could not listen cannot say that the other was silent.
-            self._heard += stall
+            # While the device itself stood still the host does not count as silent.
+            self._last_request += stall
         with suppress(Refused):  # a fault: tripped and logged where it happened
             self.catch_up()
-            if self._controller is not None and now - self._heard > self._silence_allowed():
+            if self._controller is not None and now - self._last_request > self._silence_allowed():
                 self._controller = None
                 if self.streaming or self.laws.armed:
                     self.trip(TripCause.WATCHDOG)
@@ -277,7 +277,7 @@ class Device:
         self._run(due)
 
     def restart(self, boot: float) -> None:
-        """Lose all state as at power-on, and hear nothing for `boot` [s]."""
+        """Lose all state as at power-on, and answer nothing for `boot` [s]."""
         logger.warning("restarts at tick %d", self.tick)
         self._power_up()
         self._zero_tick = self._plant.tick

@@ -143,6 +143,6 @@ class LawTable:
         self.active = tuple(replace(law, start=tick) for law in self.active)
 
     def zero(self) -> None:
-        """Switch all outputs off, and forget what was staged so that nothing brings it back."""
+        """Switch all outputs off and drop staged laws."""
         self._staged[:] = 0.0
         self.active = tuple(replace(OFF, start=law.start) for law in self.active)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Final
+
+logger = logging.getLogger(__name__)
 
 PARENT_SECONDS: Final = 0.25  # between two looks at the parent
 
@@ -37,6 +41,19 @@ def _exists(pid: int) -> bool:
     except PermissionError:
         return True
     return True
+
+
+def run_until(ended: Sequence[object], parent: int | None, step: Callable[[], None]) -> None:
+    """Call `step` until `ended` is not empty, or process `parent` has ended."""
+    owner = None if parent is None else ParentProcess(parent)
+    look = time.monotonic()
+    while not ended:
+        step()
+        if owner is not None and time.monotonic() > look:
+            look = time.monotonic() + PARENT_SECONDS
+            if owner.has_ended():
+                logger.info("process %d, which this server served, has ended", parent)
+                return
 
 
 @contextmanager

@@ -95,13 +95,13 @@ class MessageSession:
     def push(self) -> WireFrame | None:
         """Return the next block that may be sent, None if none may."""
         device, host = self._device, self._host
-        oldest = device.queue.waiting(0)
+        oldest = device.queue.queued(0)
         if host is None or oldest is None or not device.streaming:
             return None
         place = (self._next - oldest.sequence) & 0xFFFF
         if place > len(device.queue):
             place = 0  # what would have been next was dropped from a full queue
-        block = device.queue.waiting(place)
+        block = device.queue.queued(place)
         if block is None or place >= WINDOW:
             return None
         self._next = (block.sequence + 1) & 0xFFFF
@@ -115,7 +115,7 @@ class MessageSession:
         self._host, self._stream, self._next = None, 0, 0
 
     def ended(self) -> None:
-        """Note that nobody holds the other end of the line any more."""
+        """Note that no program has the other end of the line open."""
         host, self._host = self._host, None
         if host is not None:
             self._device.disconnected(host)
@@ -210,7 +210,7 @@ class MessageSession:
             if frame.number != self._stream or not device.streaming:
                 return
             device.queue.release(alive.acknowledge)
-            oldest = device.queue.waiting(0)
+            oldest = device.queue.queued(0)
             if alive.resend and oldest is not None:
                 self._next = oldest.sequence
             device.measure_ahead()

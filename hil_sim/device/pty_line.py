@@ -80,7 +80,7 @@ class PtyLine:
             self._unsent = b""
 
     def close(self) -> None:
-        """Take the terminal away: whoever has it open sees the device's end."""
+        """Close the terminal: a program that has it open sees the device's end."""
         os.close(self.fd)
 
     def _read(self) -> bytes | None:

@@ -33,7 +33,7 @@ class BlockQueue:
         self._parts: list[tuple[Codes, Codes]] = []
         self._filled = 0
         self._tick = 0
-        self._offered: int | None = None
+        self._offered_sequence: int | None = None
         self.next_sequence = 0
         self.dropped = 0
         self._to_lose = 0
@@ -47,11 +47,11 @@ class BlockQueue:
         return self._layout.samples - self._filled
 
     def clear(self) -> None:
-        """Forget everything and number anew from 0."""
+        """Empty the queue and number anew from 0."""
         self._blocks.clear()
         self._parts.clear()
         self._filled = 0
-        self._offered = None
+        self._offered_sequence = None
         self.next_sequence = 0
         self.dropped = 0
 
@@ -85,9 +85,9 @@ class BlockQueue:
 
     def acknowledge(self, sequence: int) -> None:
         """Drop the oldest block if it is the one last offered and carries this number."""
-        if self._blocks and self._offered == sequence == self._blocks[0].sequence:
+        if self._blocks and self._offered_sequence == sequence == self._blocks[0].sequence:
             self._blocks.popleft()
-            self._offered = None
+            self._offered_sequence = None
 
     def release(self, sequence: int) -> None:
         """Drop all blocks up to number `sequence`, if that one is waiting."""
@@ -96,7 +96,7 @@ class BlockQueue:
             for _ in range(count if count <= len(self._blocks) else 0):
                 self._blocks.popleft()
 
-    def waiting(self, index: int) -> QueuedBlock | None:
+    def queued(self, index: int) -> QueuedBlock | None:
         """Return the block at place `index` of those waiting, the oldest at 0, if there is one."""
         return self._blocks[index] if index < len(self._blocks) else None
 
@@ -104,5 +104,5 @@ class BlockQueue:
         """Return the oldest block, which stays until acknowledged."""
         if not self._blocks:
             return None
-        self._offered = self._blocks[0].sequence
+        self._offered_sequence = self._blocks[0].sequence
         return self._blocks[0]

@@ -58,7 +58,7 @@ class DeviceRegisters:
             device.beat(client, int(words[0]))
             return
         if address == reg.CONTROL_ZERO.address and count == 1:
-            # No control needed: whoever reaches the bench may make it safe.
+            # No control needed: any client may zero the outputs.
             _expect(words[0] == reg.ZERO_NOW)
             device.zero()
             return

@@ -52,7 +52,7 @@ class RtuLine:
         os.set_blocking(self._master, False)
         self.endpoint = f"modbus-rtu://{os.ttyname(slave)}"
         self._received = b""
-        self._heard = 0.0
+        self._last_byte = 0.0
 
     def attach(self, loop: asyncio.AbstractEventLoop) -> None:
         """Answer what arrives, on this event loop."""
@@ -68,9 +68,9 @@ class RtuLine:
     def _arrived(self) -> None:
         data = os.read(self._master, 4096)
         now = self._loop.time()
-        if now - self._heard > GAP:
+        if now - self._last_byte > GAP:
             self._received = b""
-        self._heard = now
+        self._last_byte = now
         self._received += data
         while (length := frame_length(self._received)) is not None:
             if len(self._received) < length:

@@ -7,12 +7,11 @@ host is lost.
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 
 from hil_sim.device.device import Device, PlantInterface
-from hil_sim.device.lifetime import PARENT_SECONDS, ParentProcess, termination_signals
+from hil_sim.device.lifetime import run_until, termination_signals
 from hil_sim.device.pty_line import PtyLine
 from hil_sim.device.serial_session import SerialSession
 from hil_sim.faults.device import DeviceFault
@@ -40,7 +39,7 @@ def serve_serial(
     try:
         with termination_signals() as ended:
             on_ready(f"serial://{line.name}")
-            serve_port(line, device, ended, None if parent is None else ParentProcess(parent))
+            serve_port(line, device, ended, parent)
     finally:
         device.zero()
         line.close()
@@ -50,17 +49,17 @@ def serve_port(
     line: PtyLine,
     device: Device,
     ended: Sequence[object],
-    owner: ParentProcess | None = None,
+    parent: int | None = None,
     lock: AbstractContextManager[object] | None = None,
 ) -> None:
-    """Serve a device on a pty until `ended` is not empty, or its owner has ended.
+    """Serve a device on a pty until `ended` is not empty, or process `parent` has ended.
 
     Whoever else has the device takes `lock`, which is held here but while waiting for bytes.
     """
     lock = lock or nullcontext()
     session = SerialSession(device)
-    look = time.monotonic()
-    while not ended:
+
+    def step() -> None:
         received = line.receive(device.idle_seconds())
         with lock:
             if received is None:
@@ -70,8 +69,5 @@ def serve_port(
             device.poll()
             while line.free and (block := session.push()):
                 line.send(block)
-        if owner is not None and time.monotonic() > look:
-            look = time.monotonic() + PARENT_SECONDS
-            if owner.has_ended():
-                logger.info("the process that this server belongs to has ended")
-                return
+
+    run_until(ended, parent, step)

@@ -25,6 +25,6 @@ class SerialSession:
         return b"" if block is None else encode_frame(block)
 
     def ended(self) -> None:
-        """Note that nobody holds the other end of the line any more."""
+        """Note that no program has the other end of the line open."""
         self._decoder.reset()
         self._session.ended()

@@ -146,7 +146,7 @@ class BenchServer(ModbusTcpServer):
         return _Connection(self, self._device, self._registers)
 
     def abort_connections(self) -> None:
-        """End every connection without a goodbye, as a restart does."""
+        """Abort every connection, as a restart does."""
         for handler in list(self.active_connections.values()):
             _abort(handler)
 

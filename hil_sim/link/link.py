@@ -17,7 +17,7 @@ from typing import ClassVar, Final, Self
 
 from hil_sim.faults.wire import TO_DEVICE, TO_HOST, Carrier, WireFault
 from hil_sim.link.frames import Framing
-from hil_sim.link.way import Striker, Way
+from hil_sim.link.way import FaultInjector, Way
 
 logger = logging.getLogger(__name__)
 
@@ -42,9 +42,9 @@ class FaultyLink(ABC):
         seconds: Callable[[], float] | None = None,
     ) -> None:
         self._framing = framing
-        self._strikers = (
-            Striker(TO_DEVICE, faults, (seed, 0), framing.carrier or self.beneath),
-            Striker(TO_HOST, faults, (seed, 1), framing.carrier or self.beneath),
+        self._injectors = (
+            FaultInjector(TO_DEVICE, faults, (seed, 0), framing.carrier or self.beneath),
+            FaultInjector(TO_HOST, faults, (seed, 1), framing.carrier or self.beneath),
         )
         made = time.monotonic()
         self.seconds = seconds or (lambda: time.monotonic() - made)
@@ -72,13 +72,13 @@ class FaultyLink(ABC):
     @property
     def injected(self) -> Counter[str]:
         """How many frames each fault has struck."""
-        first, second = self._strikers
+        first, second = self._injectors
         return first.counts + second.counts
 
     def use(self, faults: Sequence[WireFault]) -> None:
         """Do other things to frames from now on; without any the link is healthy."""
-        for striker in self._strikers:
-            striker.use(faults)
+        for injector in self._injectors:
+            injector.use(faults)
 
     def cut(self) -> None:
         """End every connection, as the death of the host's process does."""
@@ -103,7 +103,7 @@ class FaultyLink(ABC):
 
     def _ways(self) -> tuple[Way, Way]:
         """Return the ways of a new connection: to the device, to the host."""
-        to_device, to_host = self._strikers
+        to_device, to_host = self._injectors
         framing = self._framing
         on_wire = framing.on_wire
         return (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import Future
 from typing import TYPE_CHECKING, Final, Self, TypeVar
 
@@ -14,7 +14,6 @@ from hil_sim.device.pty_line import PtyLine
 from hil_sim.device.rtu_server import serve_line
 from hil_sim.device.serial_server import serve_port
 from hil_sim.device.server import BITRATE, CAN, RTU, SERIAL, SLCAN, TCP, serve_until
-from hil_sim.faults.wire import WireFault
 from hil_sim.link.wires import faulty_link
 
 if TYPE_CHECKING:
@@ -44,7 +43,6 @@ class ServedDevice:
         device: Device,
         wire: str,
         *,
-        faults: Sequence[WireFault] = (),
         seed: int = 0,
         seconds: Callable[[], float] | None = None,
     ) -> None:
@@ -59,7 +57,7 @@ class ServedDevice:
         self._thread = threading.Thread(target=self._serve_or_report, args=(wire,), daemon=True)
         self._thread.start()
         target = self._endpoint.result(_SECONDS)
-        self.link = faulty_link(target, faults, seed=seed, seconds=seconds)
+        self.link = faulty_link(target, (), seed=seed, seconds=seconds)
 
     @property
     def deserted(self) -> bool:

@@ -1,7 +1,7 @@
 """One way of a link: frames in, spoiled pieces out, each at its time. No sockets, no clock.
 
-Glossary: a *way* is one direction of one connection; its *striker* decides what becomes of each
-frame and lives as long as the link, so that a new connection does not meet the same faults again.
+A *way* is one direction of one connection. Its fault injector exists as long as the link, so that a
+new connection does not meet the same faults again.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ QUIET: Final = 0.02  # [s] after which bytes that are no whole frame go on as th
 MOST_WAITING: Final = 8192  # bytes that a way holds before it takes no more
 
 
-class Striker:
-    """Draws, by a seed, which frames of one way are struck by which fault."""
+class FaultInjector:
+    """Draws, by a seed, which frames of one way are changed by which fault."""
 
     def __init__(
         self,
@@ -39,28 +39,28 @@ class Striker:
         self._carrier = carrier
         self._rng = np.random.default_rng([*seed, STREAM])
         self._faults: tuple[WireFault, ...] = ()
-        self._struck: Counter[int] = Counter()
+        self._injected: Counter[int] = Counter()
         self.counts: Counter[str] = Counter()
         self.use(faults)
 
     def use(self, faults: Sequence[WireFault]) -> None:
-        """Strike with other faults from the next frame on; what each may do at most begins anew."""
-        self._struck = Counter()
+        """Inject other faults from the next frame on; the count of each begins anew."""
+        self._injected = Counter()
         self._faults = tuple(fault for fault in faults if fault.strikes(self.way))
 
-    def strike(self, frame: bytes, seconds: float, error: bytes = b"") -> Sequence[Piece]:
+    def inject(self, frame: bytes, seconds: float, error: bytes = b"") -> Sequence[Piece]:
         """Return what becomes of a frame at `seconds` of the device's time; one fault a frame.
 
         `error` is what the wire's adapter says instead of a frame that its controller has dropped.
         """
         for number, fault in enumerate(self._faults):
             until = math.inf if fault.until is None else fault.until
-            spent = fault.most is not None and self._struck[number] >= fault.most
+            spent = fault.most is not None and self._injected[number] >= fault.most
             if spent or not fault.at <= seconds < until:
                 continue
             if fault.probability < 1.0 and self._rng.random() >= fault.probability:
                 continue
-            self._struck[number] += 1
+            self._injected[number] += 1
             self.counts[fault.name] += 1
             logger.info("%.3f s: %s, %s, %d bytes", seconds, fault.name, self.way, len(frame))
             return fault.on(self._carrier, frame, self._rng, error)
@@ -80,20 +80,20 @@ class Way:
 
     def __init__(
         self,
-        striker: Striker,
+        injector: FaultInjector,
         cut: Cutter,
         on_wire: Callable[[bytes], bool] = every_frame,
         error_of: Callable[[bytes], bytes] = no_error,
     ) -> None:
-        """Carry what `cut` cuts; faults strike what `on_wire` says is a frame of the wire."""
-        self._striker, self._cut = striker, cut
+        """Carry what `cut` cuts; faults change only what `on_wire` says is a frame of the wire."""
+        self._injector, self._cut = injector, cut
         self._on_wire, self._error_of = on_wire, error_of
         self._buffer = b""
-        self._heard = 0.0
+        self._last = 0.0
         self._ready: deque[_Due] = deque()
-        self._behind: list[Piece] = []  # for the next frame to go first
-        self._before: list[_Due] = []  # to go in one piece with the next frame, or at their time
-        self._asked: list[Piece] = []  # for the other way's next frame
+        self._after_next: list[Piece] = []  # for the next frame to go first
+        self._held: list[_Due] = []  # to go in one piece with the next frame, or at their time
+        self._for_other_way: list[Piece] = []  # for the other way's next frame
         self.ended = False
 
     @property
@@ -104,7 +104,7 @@ class Way:
     def take(self, data: bytes, now: float, seconds: float) -> int:
         """Take bytes in; returns how many whole frames they completed."""
         self._buffer += data
-        self._heard = now
+        self._last = now
         frames = 0
         while length := self._cut(self._buffer):
             frame, self._buffer = self._buffer[:length], self._buffer[length:]
@@ -113,8 +113,8 @@ class Way:
 
     def other_way(self, now: float) -> None:
         """Note a frame of the other way: late answers go on."""
-        asked, self._asked = self._asked, []
-        self._queue(asked, now)
+        late, self._for_other_way = self._for_other_way, []
+        self._queue(late, now)
 
     def mend(self) -> None:
         """Let a way that a fault has ended carry again."""
@@ -122,9 +122,9 @@ class Way:
 
     def due(self, now: float) -> list[Piece]:
         """Return the pieces that go now."""
-        quiet = bool(self._buffer) and now - self._heard > QUIET
-        while self._before and (quiet or self._before[0].at <= now):  # older than the buffer
-            self._queue([replace(self._before.pop(0).piece, wait=0.0)], now)
+        quiet = bool(self._buffer) and now - self._last > QUIET
+        while self._held and (quiet or self._held[0].at <= now):  # older than the buffer
+            self._queue([replace(self._held.pop(0).piece, wait=0.0)], now)
         if quiet:
             whole, self._buffer = self._buffer, b""
             self._queue([Piece(whole)], now)
@@ -135,19 +135,19 @@ class Way:
 
     def next_time(self) -> float:
         """Return the earliest time [s] at which `due` may have something, inf if none is known."""
-        times = [due.at for due in (*list(self._ready)[:1], *self._before[:1])]
-        return min([*times, *([self._heard + QUIET] if self._buffer else [])], default=math.inf)
+        times = [due.at for due in (*list(self._ready)[:1], *self._held[:1])]
+        return min([*times, *([self._last + QUIET] if self._buffer else [])], default=math.inf)
 
     def _frame(self, frame: bytes, now: float, seconds: float) -> bool:
-        """Take one frame; returns whether it is one of the wire, not of the adapter's talk."""
+        """Take one frame; returns whether it is one of the wire, not of the adapter."""
         if not self._on_wire(frame):
             self._queue([] if self.ended else [Piece(frame)], now)
             return False
         if self.ended:
             return True
-        pieces = list(self._striker.strike(frame, seconds, self._error_of(frame)))
-        joined, self._before = b"".join(due.piece.data for due in self._before), []
-        behind, self._behind = self._behind, []
+        pieces = list(self._injector.inject(frame, seconds, self._error_of(frame)))
+        joined, self._held = b"".join(due.piece.data for due in self._held), []
+        behind, self._after_next = self._after_next, []
         if joined:
             first = pieces.pop(0) if pieces else Piece(b"")
             pieces.insert(0, replace(first, data=joined + first.data))
@@ -158,12 +158,12 @@ class Way:
     def _queue(self, pieces: Sequence[Piece], now: float) -> None:
         for piece in pieces:
             if piece.release is Release.NEXT_FRAME:
-                self._behind.append(piece)
+                self._after_next.append(piece)
             elif piece.release is Release.WITH_NEXT:
                 held = replace(piece, release=Release.TIME)
-                self._before.append(_Due(now + piece.wait, held))
+                self._held.append(_Due(now + piece.wait, held))
             elif piece.release is Release.OTHER_WAY:
-                self._asked.append(replace(piece, release=Release.TIME))
+                self._for_other_way.append(replace(piece, release=Release.TIME))
             else:
                 last = self._ready[-1].at if self._ready else now
                 self._ready.append(_Due(max(last, now) + piece.wait, piece))

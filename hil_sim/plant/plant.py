@@ -104,7 +104,7 @@ class Plant:
             t.channels,
             table,
             waves,
-            self._drawn(ticks),
+            self._noise_of(ticks),
             measured,
             outputs,
         )
@@ -113,22 +113,22 @@ class Plant:
 
     def mark(self) -> object:
         """Return what `rewind` needs to come back to now."""
-        return self.tick, [array.copy() for array in self._moving]
+        return self.tick, [array.copy() for array in self._changing]
 
     def rewind(self, mark: Any) -> None:
         """Be as at the mark, as if nothing had been computed since; the same noise comes again."""
         tick, before = mark
         self._used -= self.tick - tick
         self.tick = tick
-        for array, values in zip(self._moving, before, strict=True):
+        for array, values in zip(self._changing, before, strict=True):
             array[:] = values
 
     @property
-    def _moving(self) -> tuple[NDArray[Any], ...]:
+    def _changing(self) -> tuple[NDArray[Any], ...]:
         """What a tick changes in place; among the channels it is what their filters hold."""
         return self._state, self._spool, self._values, self._slopes, self._tables.channels
 
-    def _drawn(self, ticks: int) -> Array:
+    def _noise_of(self, ticks: int) -> Array:
         """Return the noise of the next `ticks` ticks, (ticks, channels).
 
         What was drawn last is kept for as long as `rewind` may want it again.

@@ -1,4 +1,4 @@
-"""A plant that is run ahead of its clock while nobody asks, and set back where that was wrong.
+"""A plant that is computed ahead between requests, and set back where the laws changed.
 
 In virtual time the next block is all but certain: the laws stay as they are. So it is computed
 while the host works on the block before it. It is used only if it is what would be

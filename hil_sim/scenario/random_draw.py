@@ -1,4 +1,4 @@
-"""Scenarios drawn by a seed: what is wrong with a bench that nobody has told anything about.
+"""Scenarios drawn by a seed: the hidden effects of a bench.
 
 A draw is none, one or two effects of the simulator's list, or one that is made of its parts in a
 way no short formula describes (a spring that hardens steeply, seals as soft as a backlash).
@@ -23,11 +23,11 @@ from rig.model.rig import Rig
 
 RANDOM: Final = "random"  # what a command line says instead of a file
 STREAM: Final = 2  # of a bench's seed; 0 and 1 are the plant's own
-NONE, ONE, TWO, STRANGE = "none", "one", "two", "strange"
-SHARES: Final[Mapping[str, float]] = {NONE: 0.2, ONE: 0.4, TWO: 0.25, STRANGE: 0.15}
+NONE, ONE, TWO, NO_FORMULA = "none", "one", "two", "strange"
+SHARES: Final[Mapping[str, float]] = {NONE: 0.2, ONE: 0.4, TWO: 0.25, NO_FORMULA: 0.15}
 
 # Effects that no short formula describes: name, and keys with their ranges [SI].
-STRANGERS: Final[tuple[tuple[type[PlantEffect], Mapping[str, Size]], ...]] = (
+NO_FORMULA_EFFECTS: Final[tuple[tuple[type[PlantEffect], Mapping[str, Size]], ...]] = (
     (JointSpring, {"stiffness": (25.0, 40.0), "hardening": (30.0, 50.0)}),
     (CoulombFriction, {"force": (90.0, 150.0), "presliding": (3e-3, 5e-3)}),
 )
@@ -38,9 +38,9 @@ def draw(rig: Rig, seed: int) -> Scenario:
     rng = np.random.default_rng([seed, STREAM])
     kind = str(rng.choice(list(SHARES), p=list(SHARES.values())))
     effects: list[dict[str, Any]] = []
-    if kind == STRANGE:
-        strange, sizes = STRANGERS[int(rng.integers(len(STRANGERS)))]
-        effects = [_effect(strange, sizes, rig, rng)]
+    if kind == NO_FORMULA:
+        effect_class, sizes = NO_FORMULA_EFFECTS[int(rng.integers(len(NO_FORMULA_EFFECTS)))]
+        effects = [_effect(effect_class, sizes, rig, rng)]
     elif kind != NONE:
         count = 1 if kind == ONE else 2
         chosen = [CLASSES[int(i)] for i in rng.choice(len(CLASSES), size=count, replace=False)]

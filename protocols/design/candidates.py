@@ -76,12 +76,9 @@ def played(step: Step, amplitude: float, tilt: float, seed: int) -> Step:
 def described(step: Step) -> str:
     """Say a step in words: "excite joint 1; joint 2 at end_min, joint 3 closed"."""
     moving = ", ".join(f"joint {part.joint}" for part in step.excite)
-    still = ", ".join(f"joint {lock.joint} {_at(lock)}" for lock in _sorted(step.lock))
+    locks = sorted(step.lock, key=lambda lock: lock.joint)
+    still = ", ".join(f"joint {lock.joint} {_at(lock)}" for lock in locks)
     return f"excite {moving}" + (f"; {still}" if still else "")
-
-
-def _sorted(locks: tuple[Lock, ...]) -> list[Lock]:
-    return sorted(locks, key=lambda lock: lock.joint)
 
 
 def _at(lock: Lock) -> str:

@@ -9,7 +9,6 @@ that the protocol allows.
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -31,8 +30,6 @@ from protocols.steps.base import PlannedStep
 from protocols.steps.plans import ExcitePlan, StepPlan
 from rig.model.parse import InputError
 from rig.model.rig import Rig
-
-log = logging.getLogger(__name__)
 
 
 class NotCentred(InputError):

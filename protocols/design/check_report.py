@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from operator import attrgetter
 from typing import Any, Final, Self
 
 from protocols.design.settings import DESIGN
@@ -74,20 +75,12 @@ def widened(central: StepCheck, others: Sequence[StepCheck]) -> StepCheck:
         below, above = (
             DESIGN.sigmas
             * math.sqrt(sum((end(p) - end(line)) ** 2 for p in same) / max(len(same), 1))
-            for end in (_low, _high)
+            for end in (attrgetter("low"), attrgetter("high"))
         )
         lines.append(
             replace(line, low=line.low - below, high=line.high + above, spread=(below, above))
         )
     return replace(central, predictions=tuple(lines))
-
-
-def _low(line: MotionPrediction) -> float:
-    return line.low
-
-
-def _high(line: MotionPrediction) -> float:
-    return line.high
 
 
 @dataclass(frozen=True)
@@ -233,17 +226,3 @@ def remedy_text(scale: float | None) -> str:
     if scale is None:
         return "no smaller amplitude was found to pass"
     return f"{scale:g} times this amplitude would pass"
-
-
-def worst(report: CheckReport) -> Sequence[tuple[str, MotionPrediction]]:
-    """Return, step by step, the binding line with the least margin as a share of its range."""
-    margins = []
-    for entry in report.steps:
-        binding = [line for line in entry.predictions if line.binding]
-        margins.append(
-            (
-                entry.step,
-                min(binding, key=lambda p: p.margin / (p.allowed_high - p.allowed_low)),
-            )
-        )
-    return margins

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from protocols.design.candidates import candidates, described
 from protocols.design.check import Twin, centred
 from protocols.design.proof import Proof, Reason, Triangles, Verdicts
-from protocols.design.selection import Judge, Sized, complete, extended, smallest
+from protocols.design.selection import Judge, SizedStep, complete, extended, smallest
 from protocols.design.settings import DESIGN
 from protocols.design.sizing import sized
 from protocols.engine.centring import Array
@@ -42,14 +42,14 @@ class Predictor:
 
 
 @dataclass(frozen=True)
-class Generated:
+class GeneratedProtocol:
     """A protocol and its proof."""
 
     protocol: Protocol
     proof: Proof
 
 
-def generate(rig: Rig, predictor: Predictor, name: str) -> Generated:
+def generate(rig: Rig, predictor: Predictor, name: str) -> GeneratedProtocol:
     """Return the smallest set of steps found that determines every parameter of `rig`.
 
     Raises InputError where no candidate can be run on the rig at all.
@@ -71,7 +71,7 @@ def generate(rig: Rig, predictor: Predictor, name: str) -> Generated:
         joints=len(rig.joints),
         steps=steps,
     )
-    return Generated(protocol, prove(protocol, rig, predictor))
+    return GeneratedProtocol(protocol, prove(protocol, rig, predictor))
 
 
 def prove(protocol: Protocol, rig: Rig, predictor: Predictor) -> Proof:
@@ -80,13 +80,13 @@ def prove(protocol: Protocol, rig: Rig, predictor: Predictor) -> Proof:
     Raises InputError for a protocol that does not fit the rig or that the twin cannot follow.
     """
     plan, judge = resolve(protocol, rig), predictor.judge_of(rig)
-    done: list[Sized] = []
+    done: list[SizedStep] = []
     reasons: list[Reason] = []
     before = judge([])
     for step, planned in zip(plan.protocol.excitations, plan.steps, strict=True):
         _, moved = centred(planned, rig, predictor.twin)
         rows = predictor.rows(rig, moved, [part.joint + 1 for part in planned.locks])
-        done.append(Sized(step, rows))
+        done.append(SizedStep(step, rows))
         after = judge([proof.rows for proof in done])
         reasons.append(Reason(step.name, described(step), _why(before, after), after))
         before = after
@@ -96,7 +96,7 @@ def prove(protocol: Protocol, rig: Rig, predictor: Predictor) -> Proof:
     )  # fmt: skip
 
 
-def _pool(rig: Rig, predictor: Predictor) -> list[Sized]:
+def _pool(rig: Rig, predictor: Predictor) -> list[SizedStep]:
     """Return every candidate that the rig bears, as large as it bears it."""
     pool = []
     for seed, step in enumerate(candidates(rig), start=1):
@@ -104,7 +104,7 @@ def _pool(rig: Rig, predictor: Predictor) -> list[Sized]:
         if step_sized is not None:
             kept, moved = step_sized
             locked = [lock.joint for lock in kept.lock]
-            pool.append(Sized(kept, predictor.rows(rig, moved, locked)))
+            pool.append(SizedStep(kept, predictor.rows(rig, moved, locked)))
     return pool
 
 
@@ -125,7 +125,7 @@ def _why(before: Verdicts, after: Verdicts) -> str:
     return "; ".join(words) or "more of what is known already"
 
 
-def _help(done: Sequence[Sized], rig: Rig, predictor: Predictor) -> tuple[str, ...]:
+def _help(done: Sequence[SizedStep], rig: Rig, predictor: Predictor) -> tuple[str, ...]:
     """Return the steps, in words, that would make the rest identifiable."""
     pool = _pool(rig, predictor)
     more = extended(done, pool, predictor.judge_of(rig))[len(done) :]

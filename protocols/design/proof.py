@@ -18,7 +18,7 @@ class ProofPart(Protocol):
 
 
 class Verdict(Protocol):
-    """What rows determine (`analysis.regression.base_parameters.Determined` is one)."""
+    """What rows determine (`analysis.regression.base_parameters.Determinacy` is one)."""
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -24,20 +24,22 @@ Judge = Callable[[Sequence[Triangles]], Verdicts]
 
 
 @dataclass(frozen=True, eq=False)
-class Sized:
+class SizedStep:
     """A step with an amplitude that the rig bears, and the rows that it gives."""
 
     step: Step
     rows: Triangles
 
 
-def smallest(pool: Sequence[Sized], judge: Judge) -> list[Sized]:
+def smallest(pool: Sequence[SizedStep], judge: Judge) -> list[SizedStep]:
     """Return the fewest steps found in the pool that determine all it can, in the pool's order."""
     chosen = _exchanged(_pruned(extended([], pool, judge), judge), pool, judge)
     return sorted(chosen, key=pool.index)
 
 
-def extended(start: Sequence[Sized], pool: Sequence[Sized], judge: Judge) -> list[Sized]:
+def extended(
+    start: Sequence[SizedStep], pool: Sequence[SizedStep], judge: Judge
+) -> list[SizedStep]:
     """Return `start` and what is added to it from the pool until all is determined."""
     chosen = list(start)
     scales = _scales([*start, *pool])
@@ -75,11 +77,11 @@ def worst(verdicts: Verdicts) -> float:
     return max(verdict.condition for verdict in verdicts.values())
 
 
-def _verdicts(steps: Sequence[Sized], judge: Judge) -> Verdicts:
+def _verdicts(steps: Sequence[SizedStep], judge: Judge) -> Verdicts:
     return judge([step.rows for step in steps])
 
 
-def _pruned(chosen: Sequence[Sized], judge: Judge) -> list[Sized]:
+def _pruned(chosen: Sequence[SizedStep], judge: Judge) -> list[SizedStep]:
     """Drop every step without which as much is determined, and as well as wanted."""
     kept = list(chosen)
     now = _verdicts(kept, judge)
@@ -93,7 +95,9 @@ def _pruned(chosen: Sequence[Sized], judge: Judge) -> list[Sized]:
     return kept
 
 
-def _exchanged(chosen: Sequence[Sized], pool: Sequence[Sized], judge: Judge) -> list[Sized]:
+def _exchanged(
+    chosen: Sequence[SizedStep], pool: Sequence[SizedStep], judge: Judge
+) -> list[SizedStep]:
     """Exchange single steps for others while that betters the worse condition number."""
     now = list(chosen)
     for _ in pool:
@@ -110,7 +114,7 @@ def _exchanged(chosen: Sequence[Sized], pool: Sequence[Sized], judge: Judge) -> 
     return now
 
 
-def _badness(steps: Sequence[Sized], judge: Judge) -> float:
+def _badness(steps: Sequence[SizedStep], judge: Judge) -> float:
     """Return the log of the worse condition number, a tenth more for each valve closed beyond."""
     verdicts = _verdicts(steps, judge)
     if not complete(verdicts):
@@ -120,13 +124,13 @@ def _badness(steps: Sequence[Sized], judge: Judge) -> float:
     )
 
 
-def _cost(step: Sized) -> int:
+def _cost(step: SizedStep) -> int:
     """Count the valves closed beyond the excited joint: a lock of oil gives, a stop does not."""
     excited = min(part.joint for part in step.step.excite)
     return sum(lock.at == CLOSED and lock.joint > excited for lock in step.step.lock)
 
 
-def _scales(steps: Sequence[Sized]) -> dict[str, Array]:
+def _scales(steps: Sequence[SizedStep]) -> dict[str, Array]:
     """Return the columns' norms over all candidates: a measure that no choice changes."""
     return {
         family: np.maximum(
@@ -136,7 +140,7 @@ def _scales(steps: Sequence[Sized]) -> dict[str, Array]:
     }
 
 
-def _score(steps: Sequence[Sized], scales: Mapping[str, Array]) -> float:
+def _score(steps: Sequence[SizedStep], scales: Mapping[str, Array]) -> float:
     total = 0.0
     for family, scale in scales.items():
         rows = np.vstack(

@@ -131,7 +131,7 @@ class BiasForecast:
 def forecast(
     reference: Array, seen: Array, horizon: int, rate: float, shortest: int
 ) -> BiasForecast:
-    """Predict the way of a piston from one period that it is known, or believed, to repeat.
+    """Predict the motion of a piston from one period that it is known, or assumed, to repeat.
 
     `reference` (period,) is that period; `seen` (m,) what came since, from phase 0; `horizon`
     the samples still to come. seen - reference is a straight line where the drift changed once,

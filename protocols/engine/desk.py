@@ -39,8 +39,8 @@ class NoEstimates:
 
 
 @dataclass
-class Wishes:
-    """What was asked and not yet done."""
+class OperatorRequests:
+    """What operators requested and is not yet done."""
 
     pause: bool = False
     resume: bool = False
@@ -50,10 +50,10 @@ class Wishes:
 
 
 class RunControl:
-    """Judges the commands of screens; the engine takes what they wish."""
+    """Judges the commands of screens and keeps their requests for the engine."""
 
     def __init__(self, machine: StateMachine) -> None:
-        self.wishes = Wishes()
+        self.requests = OperatorRequests()
         self.answers: tuple[str, ...] = ()  # of the open prompt
         self._machine = machine
 
@@ -76,28 +76,28 @@ class RunControl:
     def _pause(self, command: Command, state: EngineState) -> str | None:
         if state is EngineState.PAUSED:
             return "the run is paused already"
-        if self.wishes.pause:
+        if self.requests.pause:
             return "a pause is asked for already; it comes at the end of the record"
-        self.wishes.pause = True
+        self.requests.pause = True
         return None
 
     def _resume(self, command: Command, state: EngineState) -> str | None:
         if state is not EngineState.PAUSED:
-            if self.wishes.pause:
-                self.wishes.pause = False  # taken back before it came
+            if self.requests.pause:
+                self.requests.pause = False  # taken back before it came
                 return None
             return f"the run is not paused but {state}"
-        self.wishes.resume = True
+        self.requests.resume = True
         return None
 
     def _skip(self, command: Command, state: EngineState) -> str | None:
         if state is EngineState.CHECKING:
             return "nothing runs yet that could be skipped"
-        self.wishes.skip = True
+        self.requests.skip = True
         return None
 
     def _abort(self, command: Command, state: EngineState) -> str | None:
-        self.wishes.abort = f"aborted by {command.holder or 'the operator'} (from the screen)"
+        self.requests.abort = f"aborted by {command.holder or 'the operator'} (from the screen)"
         return None
 
     def _answer(self, command: Command, state: EngineState) -> str | None:
@@ -105,7 +105,7 @@ class RunControl:
             return f"nothing is asked now; the run is {state}"
         if command.value not in self.answers:
             return f"{command.value!r} is no answer; expected one of: {', '.join(self.answers)}"
-        self.wishes.answer = command.value
+        self.requests.answer = command.value
         return None
 
 

@@ -12,8 +12,8 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 
 from drivers.base import DeviceError, DeviceLost
-from protocols.engine.conductor import Conductor
 from protocols.engine.desk import Desk
+from protocols.engine.plan_runner import PlanRunner
 from protocols.engine.session import BenchSession
 from protocols.engine.states import EngineState, ProtocolAborted, RunEnded
 from protocols.files.plan import Plan
@@ -41,76 +41,76 @@ def run(
     ProtocolAborted (or its LockFailed) if the bench does not do what a step needs, and whatever the
     bench raises; in every case the outputs were put to zero first.
     """
-    conductor = Conductor(plan, rig, bench, on_phase or _nobody, desk or Desk())
-    machine = conductor.machine
-    machine.listen(conductor.note_state)
-    bench.listen(conductor.desk.control.accept)
+    runner = PlanRunner(plan, rig, bench, on_phase or _nobody, desk or Desk())
+    machine = runner.machine
+    machine.listen(runner.note_state)
+    bench.listen(runner.desk.control.accept)
     machine.to(EngineState.IDLE, "the plan is proved")
     try:
-        _all(plan, conductor)
-        conductor.report_phase(plan.sequence[-1].name, "done", 0, 0, f"{conductor.records} records")
+        _all(plan, runner)
+        runner.report_phase(plan.sequence[-1].name, "done", 0, 0, f"{runner.records} records")
     except SafetyTrip as trip:
-        _trip(plan, conductor, trip)
+        _trip(plan, runner, trip)
         raise
     finally:
-        _make_safe(conductor)
+        _make_safe(runner)
 
 
 def _nobody(step: str, phase: str, repeat: int, repeats: int, message: str) -> None:
     log.debug("%s %s %d/%d %s", step, phase, repeat, repeats, message)
 
 
-def _all(plan: Plan, conductor: Conductor) -> None:
+def _all(plan: Plan, runner: PlanRunner) -> None:
     """Run the steps; what fails is skipped or retried as the protocol allows."""
     skipped, lost = 0, 0
     rule, retry = plan.protocol.on_error, plan.protocol.retry
     waiting: Sequence[PlannedStep] = plan.sequence
     while waiting:
         part = waiting[0]
-        conductor.begin(part, waiting[1:])
+        runner.begin(part, waiting[1:])
         try:
-            conductor.do(part)
+            runner.do(part)
         except DeviceLost as error:
             lost += 1
             if retry is None or lost > retry.times:
                 raise
-            _reconnect(conductor, error, retry.wait, retry.times - lost)
+            _reconnect(runner, error, retry.wait, retry.times - lost)
             continue
         except RunEnded:
             raise
         except ProtocolAborted as error:
-            conductor.rest_now(f"{part.name} failed")
+            runner.rest_now(f"{part.name} failed")
             if rule.then != "skip" or skipped >= rule.at_most:
                 raise
             skipped += 1
-            conductor.mark(rule.mark or f"{part.name} is skipped: {error}")
+            runner.mark(rule.mark or f"{part.name} is skipped: {error}")
             log.warning("%s is skipped: %s", part.name, error)
         waiting = waiting[1:]
 
 
-def _reconnect(conductor: Conductor, error: DeviceLost, wait: float, left: int) -> None:
+def _reconnect(runner: PlanRunner, error: DeviceLost, wait: float, left: int) -> None:
     """Come to rest and connect anew; each further loss uses up the budget in the caller."""
     log.warning("%s; connecting again in %g s, %d more allowed", error, wait, left)
-    conductor.rest_now("the device was lost", confirmed=False)
-    conductor.bench.event("device lost", conductor.bench.tick, message=str(error), retries=left)
-    conductor.reconnect(wait)
-    conductor.bench.event("device back", conductor.bench.tick)
+    runner.rest_now("the device was lost", confirmed=False)
+    runner.bench.event("device lost", runner.bench.tick, message=str(error), retries=left)
+    runner.reconnect(wait)
+    runner.bench.event("device back", runner.bench.tick)
 
 
-def _trip(plan: Plan, conductor: Conductor, trip: SafetyTrip) -> None:
-    conductor.machine.to(EngineState.TRIPPED, str(trip))
+def _trip(plan: Plan, runner: PlanRunner, trip: SafetyTrip) -> None:
+    runner.machine.to(EngineState.TRIPPED, str(trip))
     if plan.protocol.on_trip.mark:
         with suppress(RecordingFailed):
-            conductor.mark(plan.protocol.on_trip.mark)
+            runner.mark(plan.protocol.on_trip.mark)
 
 
-def _make_safe(conductor: Conductor) -> None:
+def _make_safe(runner: PlanRunner) -> None:
     """Zero the outputs and say so; a device that does not confirm leaves the state as it was."""
     try:
-        sure = conductor.bench.zero_outputs()
+        sure = runner.bench.zero_outputs()
     except DeviceError as error:
         log.error("%s", error)
         sure = False
     if sure:
         with suppress(RecordingFailed):
-            conductor.machine.to(EngineState.SAFE, "outputs confirmed at zero")
+            runner.machine.to(EngineState.SAFE, "outputs confirmed at zero")

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
-from protocols.engine.excited_joint import Driven
+from protocols.engine.excited_joint import ExcitedJoint
 from protocols.engine.locking import Hold, JointLock, give, lock, look, move
 from protocols.engine.playback import Playback
 from protocols.engine.session import Session
@@ -32,7 +32,7 @@ class ExcitationDesk(Protocol):
         """Whether a person asked for a pause, or to skip the step."""
 
     def report_phase(self, step: str, phase: str, repeat: int, repeats: int, message: str) -> None:
-        """Hear where the step stands."""
+        """Receive the progress of the step."""
 
 
 class ExcitationRun:
@@ -195,7 +195,7 @@ class ExcitationRun:
         )
 
     def _attributes(
-        self, first: int, driven: Sequence[Driven], excitation: Playback
+        self, first: int, driven: Sequence[ExcitedJoint], excitation: Playback
     ) -> dict[str, str | float | int]:
         """Return what is known of a record only when it has been taken."""
         attributes: dict[str, str | float | int] = {}

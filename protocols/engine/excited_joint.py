@@ -1,4 +1,4 @@
-"""One excited joint in flight: what its bias is, how it moved, what its bias should become."""
+"""One excited joint: its bias, its motion, and the correction of its bias."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ AT_REST = Motion(0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
-class Driven:
+class ExcitedJoint:
     """An excited joint: its plan, bias [V], gain k [m/(s V)], drift asked for [m/s], motion."""
 
     plan: ExcitePlan
     bias: float
     gain: float = math.nan
-    wanted: float = 0.0
+    target: float = 0.0
     moved: Motion = AT_REST
 
     @property
@@ -56,8 +56,8 @@ class Driven:
 
 
 def found_under_loop(
-    driven: Driven, command: Array, piston: Array, period: int, rate: float, step: str
-) -> Driven:
+    driven: ExcitedJoint, command: Array, piston: Array, period: int, rate: float, step: str
+) -> ExcitedJoint:
     """Return the joint with gain and bias as seen while a loop centred it; arrays of shape (n,).
 
     Two whole periods give the drift exactly, less of them by the fit of `follow`. Raises
@@ -81,13 +81,13 @@ def found_under_loop(
     return replace(driven, bias=bias, gain=seen.gain, moved=moved)
 
 
-def off_centre(driven: Driven) -> float:
+def off_centre(driven: ExcitedJoint) -> float:
     """Return how far the piston was off its centre, as a share of the offset allowed."""
     return abs(driven.moved.ends - driven.plan.centre) / driven.centring.offset
 
 
 def check_swing(
-    driven: Driven, period: Array, limits: tuple[float, float], step: str
+    driven: ExcitedJoint, period: Array, limits: tuple[float, float], step: str
 ) -> None:  # fmt: skip
     """Raise ProtocolAborted if a period (n,) of the piston has no room for its allowed offset."""
     swing = period - np.nanmean(period) + driven.plan.centre
@@ -101,18 +101,18 @@ def check_swing(
         )
 
 
-def settled(driven: Driven, moved: Motion, record: float, step: str) -> bool:
+def settled(driven: ExcitedJoint, moved: Motion, record: float, step: str) -> bool:
     """Say whether drift over a record of `record` seconds and offset are as small as allowed."""
     off = moved.ends - driven.plan.centre
     log.info(
         "%s: joint %d at bias %.4f V drifts %.3f mm/s (asked %.3f), centre off by %.2f mm",
-        step, driven.joint + 1, driven.bias, 1e3 * moved.drift, 1e3 * driven.wanted, 1e3 * off,
+        step, driven.joint + 1, driven.bias, 1e3 * moved.drift, 1e3 * driven.target, 1e3 * off,
     )  # fmt: skip
-    wrong = abs(moved.drift - driven.wanted) * record
+    wrong = abs(moved.drift - driven.target) * record
     return wrong <= driven.centring.drift and abs(off) <= driven.centring.offset
 
 
-def trimmed(driven: Driven, moved: Motion, seconds: float, gently: bool) -> Driven:
+def trimmed(driven: ExcitedJoint, moved: Motion, seconds: float, gently: bool) -> ExcitedJoint:
     """Return the joint with the bias for its next `seconds`; `gently` where that is a record."""
     if driven.loop > 0.0:
         # The loop stands off by what it has to add to the bias: take that over.
@@ -120,13 +120,13 @@ def trimmed(driven: Driven, moved: Motion, seconds: float, gently: bool) -> Driv
         bias = driven.bias - driven.loop * off - moved.drift / driven.gain
         return replace(driven, bias=bias, moved=moved)
     cap = ENGINE.recentre_cap * driven.centring.drift if gently else math.inf
-    wanted = recentring(moved, driven.plan.centre, seconds, cap)
-    bias = trim(driven.bias, moved.drift, wanted, driven.gain)
-    return replace(driven, bias=bias, wanted=wanted, moved=moved)
+    target = recentring(moved, driven.plan.centre, seconds, cap)
+    bias = trim(driven.bias, moved.drift, target, driven.gain)
+    return replace(driven, bias=bias, target=target, moved=moved)
 
 
 def corrected(
-    driven: Driven,
+    driven: ExcitedJoint,
     reference: Array,
     other_law: bool,
     seen: Array,
@@ -134,7 +134,7 @@ def corrected(
     rate: float,
     limits: tuple[float, float],
     step: str,
-) -> Driven | None:  # fmt: skip
+) -> ExcitedJoint | None:  # fmt: skip
     """Return the joint with a bias that keeps it within `limits` [m], None if it stays anyway.
 
     `reference`, `seen` and `horizon` are those of `forecast`; `other_law`, if the reference was
@@ -158,15 +158,15 @@ def corrected(
         "%s: joint %d would reach %.1f..%.1f mm; its bias is corrected at once",
         step, driven.joint + 1, 1e3 * ahead.low, 1e3 * ahead.high,
     )  # fmt: skip
-    return replace(driven, bias=trim(driven.bias, drift, back, driven.gain), wanted=back)
+    return replace(driven, bias=trim(driven.bias, drift, back, driven.gain), target=back)
 
 
-def returned(driven: Driven) -> Driven:
+def returned(driven: ExcitedJoint) -> ExcitedJoint:
     """Return the joint with the way back taken out of its bias."""
-    return replace(driven, bias=trim(driven.bias, driven.wanted, 0.0, driven.gain), wanted=0.0)
+    return replace(driven, bias=trim(driven.bias, driven.target, 0.0, driven.gain), target=0.0)
 
 
-def not_centred(driven: Driven, record: float, tries: int, step: str) -> ProtocolAborted:
+def not_centred(driven: ExcitedJoint, record: float, tries: int, step: str) -> ProtocolAborted:
     """Return the refusal to go on with a joint whose bias would not settle."""
     allowed = driven.centring
     return ProtocolAborted(

@@ -55,7 +55,7 @@ class Manual:
         self._locked: dict[int, float] = {}  # joint (0-based): where [m]
         self._jog: tuple[int, float] | None = None  # joint (0-based) and where to [m]
         self._until = -float("inf")
-        self._asked = clock()
+        self._last_command = clock()
         self._over = False
         self._laws: tuple[OutputLaw, ...] = ()
         self._piston = np.full(len(rig.joints), np.nan)
@@ -67,7 +67,7 @@ class Manual:
 
     def accept(self, command: Command) -> str | None:
         """Take a command; returns None, or in one line why it is refused."""
-        self._asked = self._clock()
+        self._last_command = self._clock()
         if command.word == "abort":
             self._over = True
             return None
@@ -130,7 +130,7 @@ class Manual:
             if self._clock() >= self._until:
                 self._jog = None
             self._put_out()
-            if self._clock() - self._asked > self._idle_after:
+            if self._clock() - self._last_command > self._idle_after:
                 log.info("nobody commanded for %g s; the manual session ends", self._idle_after)
                 break
         bench.zero_outputs()

@@ -7,14 +7,13 @@ law is changed when the block that holds the boundary has been read: a few sampl
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Mapping, Sequence
 
 from drivers.base import OutputLaw
 from protocols.engine.centring import Array, Motion, follow, free_path, motion, moved_by
 from protocols.engine.excited_joint import (
-    Driven,
+    ExcitedJoint,
     check_swing,
     corrected,
     found_under_loop,
@@ -30,8 +29,6 @@ from protocols.engine.settings import ENGINE
 from protocols.steps.parts import Place
 from protocols.steps.plans import FIRM_SECONDS, StepPlan
 
-log = logging.getLogger(__name__)
-
 
 class Playback:
     """One step's excitation in progress; `at` is the tick of the boundary reached."""
@@ -43,7 +40,7 @@ class Playback:
         self.step = step
         self.place = place
         self.locks = tuple(locks)
-        self.joints: tuple[Driven, ...] = ()
+        self.joints: tuple[ExcitedJoint, ...] = ()
         self.start = 0
         self.at = 0
         self._alone = True  # the period before ran under other laws than this one
@@ -58,7 +55,7 @@ class Playback:
         loosened slowly. Raises ProtocolAborted for a piston that does not follow its command or
         swings too far.
         """
-        self.joints = tuple(Driven(e, nulls[e.joint]) for e in self.step.excite)
+        self.joints = tuple(ExcitedJoint(e, nulls[e.joint]) for e in self.step.excite)
         for driven in self.joints:
             self.session.bench.upload(driven.joint, driven.plan.wave.samples)
         firm = self.place.position_gain
@@ -177,7 +174,7 @@ class Playback:
             self.session.wait(ENGINE.ramp_step)
         self.session.off()
 
-    def _law(self, driven: Driven, scale: float, position_gain: float) -> OutputLaw:
+    def _law(self, driven: ExcitedJoint, scale: float, position_gain: float) -> OutputLaw:
         limit = self.session.rig.joints[driven.joint].limits.command
         return OutputLaw(scale, driven.bias, position_gain, driven.plan.centre, limit)
 
@@ -240,7 +237,7 @@ class Playback:
             for driven in self.joints
         )
 
-    def _moved(self, driven: Driven) -> Motion:
+    def _moved(self, driven: ExcitedJoint) -> Motion:
         """Measure the last stretch of one joint."""
         j, period, rate = driven.joint, self.step.period, self.session.rate
         if self._alone and self.step.trial < 2 * period:

@@ -94,7 +94,7 @@ class Session:
     def __init__(
         self, bench: BenchSession, rig: Rig, keep: int, machine: StateMachine, heed: Watch
     ) -> None:
-        """Remember the last `keep` samples; `heed` is called before each block."""
+        """Keep the last `keep` samples; `heed` is called before each block."""
         self.bench = bench
         self._machine = machine
         self._heed = heed

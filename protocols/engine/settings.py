@@ -23,7 +23,7 @@ class EngineSettings:
     creep_share: float = 0.25  # of the tolerance, that a closed joint may creep during one record
     guard_share: float = 2.0  # of the tolerance at which the engine gives up a lock: a trip
     relock_share: float = 0.5  # of the tolerance; a closed valve that gave more is closed anew
-    settle_seconds: float = 1.0  # [s] at rest before a place is believed, where no time is stated
+    settle_seconds: float = 1.0  # [s] at rest before a position counts, where no time is stated
 
     # Centring an excited piston
     recentre_share: float = 0.5  # of the offset, taken out within the next record

@@ -214,7 +214,7 @@ class _RigPlanner:
         return tuple(planned)
 
     def locked(self, locks: Sequence[Lock]) -> None:
-        """Remember locks for the steps that follow."""
+        """Keep locks for the steps that follow."""
         self._standing = {part.joint: part for part in locks}
 
     def locks(self, step: StepKind, locks: Sequence[Lock]) -> tuple[LockPlan, ...]:

@@ -23,7 +23,6 @@ from rig.model.quantity import Time
 
 VERSION: Final = 2
 INCOMPLETE: Final = "incomplete"  # validation context: steps are missing, refused before
-PARAMETER = r"^[a-z][a-z0-9_]*$"
 
 
 class OnTrip(ProtocolPart):

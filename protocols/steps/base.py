@@ -36,7 +36,7 @@ class Planner(Protocol):
         """Resolve the steps within a step."""
 
     def locked(self, locks: Sequence[Any]) -> None:
-        """Remember locks (of `protocols.steps.parts`) for the steps that follow."""
+        """Keep locks (of `protocols.steps.parts`) for the steps that follow."""
 
     def locks(self, step: StepKind, locks: Sequence[Any]) -> tuple[LockPlan, ...]:
         """Resolve locks; InputError naming step, joint and limit."""

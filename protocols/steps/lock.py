@@ -25,7 +25,7 @@ class LockStep(StepKind):
         return self
 
     def plan(self, planner: Planner) -> PlannedStep:
-        """Resolve the locks and remember them."""
+        """Resolve the locks and keep them for later steps."""
         planner.locked(self.lock)
         locks = planner.locks(self, self.lock)
         title = ", ".join(f"joint {p.joint + 1} {p.at}" for p in locks)

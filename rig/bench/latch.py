@@ -8,7 +8,6 @@ reached under two addresses has two folders; the trip latched in the device cove
 
 from __future__ import annotations
 
-import getpass
 import json
 import logging
 import os
@@ -66,13 +65,6 @@ def state_folder() -> Path:
     return Path.home() / ".local" / "state" / "bramah"
 
 
-def _user() -> str:
-    try:
-        return getpass.getuser()
-    except (OSError, KeyError):  # a user number without a name, as in containers
-        return str(os.getuid())
-
-
 def _folder_name(wire: Wire) -> str:
     kind, _, place = wire.endpoint.lower().partition("?")[0].partition("://")
     for name in _THIS_COMPUTER:
@@ -121,7 +113,9 @@ class BenchState:
         if self.read_trip() is not None:
             return True
         where = "" if run is None else str(run.absolute())
-        kept = LatchedTrip(trip, runstate.now(), where, rig.name, _user(), runstate.here())
+        kept = LatchedTrip(
+            trip, runstate.now(), where, rig.name, runstate.user_name(), runstate.here()
+        )
         try:
             replace_text(self.folder / _TRIP, json.dumps(asdict(kept)) + "\n")
         except OSError as error:
@@ -148,7 +142,7 @@ class BenchState:
         trip = self.read_trip()
         entry = {
             "time": runstate.now(),
-            "who": _user(),
+            "who": runstate.user_name(),
             "host": runstate.here(),
             "reason": reason,
             "trip": None if trip is None else asdict(trip),

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import Doubting, Driver, SampleBlock
+from drivers.base import Driver, ReportsDoubts, SampleBlock
 from rig.bench.settings import BENCH
 from rig.model import channels as ch
 from rig.model.rig import Rig
@@ -65,7 +65,7 @@ def probe_timed(driver: Driver, rig: Rig) -> tuple[list[Reading], Lateness | Non
                 due = (taken.tick + np.arange(len(taken.data))) / rig.sample_rate
                 late.append((taken.read_at - due)[np.isfinite(taken.read_at)])
         driver.stop()
-        doubts = driver.doubts() if isinstance(driver, Doubting) else {}
+        doubts = driver.doubts() if isinstance(driver, ReportsDoubts) else {}
     finally:
         driver.close()
     every = np.concatenate(late) if late else np.empty(0)

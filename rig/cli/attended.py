@@ -19,10 +19,10 @@ def terminal_lines(attended: bool | None) -> Callable[[], str | None] | None:
     """
     if attended is None:
         attended = sys.stdin.isatty() and sys.stderr.isatty()
-    return _typed if attended else None
+    return _read_answer if attended else None
 
 
-def _typed() -> str | None:
+def _read_answer() -> str | None:
     ready, _, _ = select.select([sys.stdin], [], [], 0.0)
     if not ready:
         return None

@@ -13,7 +13,7 @@ def dbc(
     rig: RigOption,
     fd: Annotated[bool, typer.Option("--fd", help="With frames of CAN FD.")] = False,
 ) -> None:
-    """Print the DBC file of a rig: what its bench says and hears on a CAN bus.
+    """Print the DBC file of a rig: the messages of its bench on a CAN bus.
 
     Example: bramah dbc --rig shinshu-2dof
     """

@@ -18,8 +18,6 @@ TRIPPED = 3
 DEVICE_LOST = 4
 INTERRUPTED = 130
 
-log = logging.getLogger(__name__)
-
 
 class WorkError(Exception):
     """The work could not be done; the message says why in one line (exit code 1)."""

@@ -13,7 +13,7 @@ from pathlib import Path
 from analysis.identify.identify import identify
 from analysis.identify.result import Identification
 from analysis.identify.result import to_json as identification_json
-from analysis.report.identification import write_report
+from analysis.report.identification.report import write_report
 from analysis.simulation.model import save_model
 from analysis.simulation.validate import RecordValidation, validate
 from analysis.simulation.validate import to_json as validation_json

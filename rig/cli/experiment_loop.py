@@ -46,10 +46,10 @@ REFUSED: Final = "the bench refused the next experiment"
 
 
 @dataclass(frozen=True)
-class Wanted:
+class LoopRequest:
     """What to do: `rounds` counts designed experiments, `ask` is given each before it runs.
 
-    `closer` goes on after `clean` while an effect of interesting size could not have shown.
+    `until_visible` goes on after `clean` while an effect of interesting size could not have shown.
     """
 
     rig: str
@@ -59,7 +59,7 @@ class Wanted:
     overrides: Overrides = field(default_factory=Overrides)
     rounds: int = 4
     seed: int = 0
-    closer: bool = False
+    until_visible: bool = False
     operator: str | None = None
     ask: Callable[[Mapping[str, Any]], bool] = lambda experiment: True
 
@@ -72,12 +72,12 @@ def refuse_taken(out: Path) -> None:
 
 
 class Loop:
-    """A loop under way: `rounds` so far, `stopped` why it ended ('' while it has not)."""
+    """A running loop: `rounds` so far, `stopped` why it ended ('' while it runs)."""
 
-    def __init__(self, wanted: Wanted, say: Callable[[str], None]) -> None:
-        refuse_taken(wanted.out)
-        self.wanted, self.say = wanted, say
-        self.rig: Rig = load_bench(wanted.rig)
+    def __init__(self, request: LoopRequest, say: Callable[[str], None]) -> None:
+        refuse_taken(request.out)
+        self.request, self.say = request, say
+        self.rig: Rig = load_bench(request.rig)
         self.rounds: list[Round] = []
         self.stopped = ""
         self.train: list[Run] = []
@@ -85,7 +85,7 @@ class Loop:
 
     def close(self) -> None:
         """Go round until there is nothing more to learn; raises what ends a run."""
-        self._take(1, self.wanted.protocol, self.wanted.overrides, HELD_OUT)
+        self._take(1, self.request.protocol, self.request.overrides, HELD_OUT)
         self._trace(1, None)
         while not self.stopped:
             number = len(self.rounds) + 1
@@ -93,7 +93,7 @@ class Loop:
             if experiment is None:
                 return
             self.say(f"round {number}: {experiment['text']}")
-            if not self.wanted.ask(experiment):
+            if not self.request.ask(experiment):
                 self.stopped = DECLINED
             elif not self._perform(number, experiment):
                 self.stopped = REFUSED
@@ -103,18 +103,18 @@ class Loop:
     def _next(self) -> Mapping[str, Any] | None:
         """Return the experiment to run now; None, and why in `stopped`, where there is none."""
         last = self.rounds[-1].result
-        if last.verdict == EXPLAINED or (last.verdict == CLEAN and not self.wanted.closer):
+        if last.verdict == EXPLAINED or (last.verdict == CLEAN and not self.request.until_visible):
             self.stopped = FLOOR
         elif last.next_experiment is None or "protocol" not in last.next_experiment:
             self.stopped = FLOOR if last.verdict == CLEAN else NOTHING
-        elif len(self.rounds) > self.wanted.rounds:
+        elif len(self.rounds) > self.request.rounds:
             self.stopped = ROUNDS
         return None if self.stopped else last.next_experiment
 
     def _trace(self, number: int, experiment: Mapping[str, Any] | None) -> None:
         self.say(f"round {number}: tracing {sum(len(r.records) for r in self.train)} records")
         result = trace(
-            self.train, self.judge, seed=self.wanted.seed,
+            self.train, self.judge, seed=self.request.seed,
             progress=Countdown(f"round {number}: tracing", self.say),
         )  # fmt: skip
         worth = None
@@ -126,7 +126,7 @@ class Loop:
 
     def _perform(self, number: int, experiment: Mapping[str, Any]) -> bool:
         """Run an experiment and its held-out variant; False where the bench refuses both sizes."""
-        files = {kind: self.wanted.out / f"{kind}-{number}.yaml" for kind in ("next", "judge")}
+        files = {kind: self.request.out / f"{kind}-{number}.yaml" for kind in ("next", "judge")}
         for path, key in ((files["next"], "protocol"), (files["judge"], "holdout")):
             text = yaml.safe_dump(dict(experiment[key]), sort_keys=False, allow_unicode=True)
             path.write_text(text, encoding="utf-8")
@@ -165,7 +165,7 @@ class Loop:
         self.judge.append(second)
 
     def _run(self, name: str, protocol: str, sizes: Overrides) -> Run:
-        w = self.wanted
+        w = self.request
         self.say(f"{name}: {protocol}")
         return load_run(
             run_protocol(
@@ -176,7 +176,7 @@ class Loop:
     def _set_aside(self, number: int) -> None:
         """Keep an aborted run under another name, so that the next try has its own."""
         for kind in ("run", "holdout"):
-            folder = self.wanted.out / f"{kind}-{number}"
+            folder = self.request.out / f"{kind}-{number}"
             if folder.exists():
-                k = sum(1 for _ in self.wanted.out.glob(f"{folder.name}-aborted-*")) + 1
+                k = sum(1 for _ in self.request.out.glob(f"{folder.name}-aborted-*")) + 1
                 folder.rename(folder.with_name(f"{folder.name}-aborted-{k}"))

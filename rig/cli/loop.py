@@ -67,7 +67,7 @@ def loop(
         )
     # What loads the analysis comes after what can be refused without it.
     from protocols.files.plan import Overrides
-    from rig.cli.experiment_loop import Loop, Wanted, refuse_taken
+    from rig.cli.experiment_loop import Loop, LoopRequest, refuse_taken
     from rig.cli.simulated_bench import simulated_bench
 
     refuse_taken(out)
@@ -75,41 +75,43 @@ def loop(
         if simulate:
             # The truth stays with the simulator: the loop does not look at it.
             endpoint = stack.enter_context(simulated_bench(rig, seed=seed, scenario=scenario))
-        ask = (lambda experiment: True) if unattended else _asked
+        ask = (lambda experiment: True) if unattended else _confirmed
         sizes = Overrides(repeats=repeats, amplitude_scale=amplitude_scale)
-        wanted = Wanted(
+        request = LoopRequest(
             rig, out, endpoint, protocol, sizes, rounds, seed, until_visible, operator, ask
         )
-        going = Loop(wanted, progress)
+        experiments = Loop(request, progress)
         try:
-            going.close()
+            experiments.close()
         except BaseException as error:
-            going.stopped = f"{type(error).__name__}: {error}"
+            experiments.stopped = f"{type(error).__name__}: {error}"
             raise
         finally:
-            _show_result(going, json, report or out / "loop.html")
+            _show_result(experiments, json, report or out / "loop.html")
 
 
-def _asked(experiment: Mapping[str, Any]) -> bool:
+def _confirmed(experiment: Mapping[str, Any]) -> bool:
     return typer.confirm(f"Run the next experiment ({experiment['text']})?", err=True)
 
 
-def _show_result(going: Any, json: Path | None, report: Path) -> None:
+def _show_result(experiments: Any, json: Path | None, report: Path) -> None:
     from analysis.trace.loop_rounds import rounds_json
     from rig.cli.reports import write_loop
     from rig.cli.trace_text import rounds_text
     from rig.cli.twin_choice import save_identified
 
-    if not going.rounds and not going.wanted.out.is_dir():
+    if not experiments.rounds and not experiments.request.out.is_dir():
         return  # ended before anything was taken
-    document = rounds_json(going.rounds, going.stopped)
-    write_json(going.wanted.out / "loop.json", document)
+    document = rounds_json(experiments.rounds, experiments.stopped)
+    write_json(experiments.request.out / "loop.json", document)
     write_json(json, document)
-    if going.rounds:
+    if experiments.rounds:
         report.parent.mkdir(parents=True, exist_ok=True)
-        write_loop(report, going.train, going.judge, going.rounds, going.stopped)
-        last = going.rounds[-1].result.model_after
-        save_identified(last, going.wanted.out / "model.json", progress)
+        write_loop(
+            report, experiments.train, experiments.judge, experiments.rounds, experiments.stopped
+        )
+        last = experiments.rounds[-1].result.model_after
+        save_identified(last, experiments.request.out / "model.json", progress)
         if json != Path("-"):
-            typer.echo(rounds_text(going.rounds, going.stopped))
+            typer.echo(rounds_text(experiments.rounds, experiments.stopped))
             typer.echo(f"report: {report}")

@@ -58,9 +58,9 @@ def monitor(
     if web:
         raise typer.Exit(_serve(rig, runs, endpoint, port or 0))
     from rig.tui.app import main
-    from rig.tui.browse import Browsed
+    from rig.tui.browse import BrowserState
 
-    raise typer.Exit(main(name, Browsed(folder=runs, rig=rig or "", endpoint=endpoint)))
+    raise typer.Exit(main(name, BrowserState(folder=runs, rig=rig or "", endpoint=endpoint)))
 
 
 def _serve(rig: str | None, runs: Path, endpoint: str | None, port: int) -> int:

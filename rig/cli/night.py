@@ -45,7 +45,7 @@ def _time(text: str) -> datetime | None:
 def _shown(item: Item) -> NightItem:
     folder = Path(item.run) if item.run else None
     summary = summarise(folder) if folder is not None and is_run(folder) else None
-    parameters = item.found.get("parameters") or {}
+    parameters = item.results.get("parameters") or {}
     return NightItem(
         number=item.id,
         name=item.job.name,
@@ -64,7 +64,7 @@ def _shown(item: Item) -> NightItem:
             for name, p in parameters.items()
             if p.get("value") is not None
         },
-        unidentified=str(item.found.get("error", "")),
+        unidentified=str(item.results.get("error", "")),
     )
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-EVERY: Final = 3.0  # [s] between two lines of a countdown, and before its first
+LINE_SECONDS: Final = 3.0  # [s] between two lines of a countdown, and before its first
 
 
 def progress(message: str) -> None:
@@ -38,14 +38,14 @@ class Countdown:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._what, self._say, self._clock = what, say, clock
-        self._began = self._said = clock()
+        self._began = self._last_line = clock()
 
     def __call__(self, share: float) -> None:
         """Take the share that is done by now."""
         now = self._clock()
-        if now - self._said < EVERY or not 0.0 < share < 1.0:
+        if now - self._last_line < LINE_SECONDS or not 0.0 < share < 1.0:
             return
-        self._said = now
+        self._last_line = now
         left = (now - self._began) * (1.0 - share) / share
         self._say(f"{self._what}: {100 * share:.0f} %, about {clock_text(left)} left")
 
@@ -71,10 +71,10 @@ def write_json(path: Path | None, data: Any) -> None:
     if str(path) == "-":
         sys.stdout.write(text)
         return
+    from rig.runs.files import replace_text
+
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_text(text)
-    temporary.replace(path)
+    replace_text(path, text)
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]], left: Sequence[str] = ()) -> str:

@@ -27,10 +27,10 @@ def plan(
     Example: bramah plan --rig digger-3dof --out digger.yaml --validation digger-validate.yaml
     """
     from rig.cli.sheets import proof_text
-    from rig.cli.step_planning import Wish, planned
+    from rig.cli.step_planning import PlanRequest, plan_steps
 
-    wish = Wish(rig, out, validation, prove)
-    proof = planned(wish, progress)
+    request = PlanRequest(rig, out, validation, prove)
+    proof = plan_steps(request, progress)
     write_json(json, proof.as_dict())
     if json != Path("-"):
         typer.echo(proof_text(proof))

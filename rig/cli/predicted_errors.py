@@ -156,7 +156,7 @@ def prediction_text(forecast: CheckedForecast) -> str:
 
 
 @dataclass(frozen=True)
-class Designed:
+class DesignedProtocol:
     """A designed protocol: its file's text, what was found, and both predictions of it."""
 
     text: str
@@ -184,7 +184,7 @@ def _checker(
 
 def design_protocol(
     protocol: str, rig: str, criterion: str, budget: int, seed: int, parameters: TwinParameters
-) -> Designed:
+) -> DesignedProtocol:
     """Improve a protocol's multisines; raises InputError where that cannot be done.
 
     Limits and errors are predicted on the twin that `parameters` hold.
@@ -205,10 +205,12 @@ def design_protocol(
         f"bramah design {protocol} --rig {rig} --criterion {criterion} --budget {budget} "
         f"--seed {seed}"
     )
-    return Designed(protocol_text(better, f"Made by: {command}"), after_plan, design, before, after)
+    return DesignedProtocol(
+        protocol_text(better, f"Made by: {command}"), after_plan, design, before, after
+    )
 
 
-def design_text(designed: Designed, out: Path) -> str:
+def design_text(designed: DesignedProtocol, out: Path) -> str:
     """Return the parameters before and after, and the limits that each step fills."""
     before, after = designed.before.prediction, designed.after.prediction
     assert before is not None  # the design itself needed it
@@ -222,11 +224,13 @@ def design_text(designed: Designed, out: Path) -> str:
     for step, (share, limit) in designed.design.shares_after.items():
         was, which = designed.design.shares_before[step]
         lines.append(f"{limit} at {share:.0%} of its limit (before: {which} at {was:.0%})")
-    lines.append(f"{designed.design.tried} trials, {designed.design.kept} kept; written to {out}")
+    lines.append(
+        f"{designed.design.evaluated} trials, {designed.design.accepted} kept; written to {out}"
+    )
     return "\n".join(lines)
 
 
-def design_json(designed: Designed) -> dict[str, Any]:
+def design_json(designed: DesignedProtocol) -> dict[str, Any]:
     """Return predicted relative standard errors before and after, and the shares of limits."""
     before, after = designed.before.prediction, designed.after.prediction
     assert before is not None
@@ -240,6 +244,6 @@ def design_json(designed: Designed) -> dict[str, Any]:
             step: {"limit": limit, "share": share}
             for step, (share, limit) in designed.design.shares_after.items()
         },
-        "tried": designed.design.tried,
-        "kept": designed.design.kept,
+        "tried": designed.design.evaluated,
+        "kept": designed.design.accepted,
     }

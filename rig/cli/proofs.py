@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import logging
-import os
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -32,12 +30,10 @@ from rig.cli.twin_choice import (
 )
 from rig.model.parse import InputError
 from rig.model.rig import Rig
-
-log = logging.getLogger(__name__)
+from rig.runs.files import cache_folder
 
 Progress = Callable[[float], None]
 NAME = "proof.json"
-CACHE_VARIABLE = "BRAMAH_CACHE"
 KEPT = 200  # proofs in the cache; the oldest go
 _ROOT = Path(__file__).parents[2]
 _SOURCES = (
@@ -176,17 +172,8 @@ def _source_digest() -> str:
     return digest.hexdigest()
 
 
-def cache_folder() -> Path:
-    """Return the folder of kept proofs: $BRAMAH_CACHE, or the user's cache."""
-    stated = os.environ.get(CACHE_VARIABLE)
-    if stated:
-        return Path(stated) / "proofs"
-    base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    return Path(base) / "bramah" / "proofs"
-
-
 def _from_cache(key: str) -> PlanProof | None:
-    path = cache_folder() / f"{key}.json"
+    path = cache_folder() / "proofs" / f"{key}.json"
     try:
         data = json.loads(path.read_text("utf-8"))
         report = CheckReport.from_dict(data["report"])
@@ -200,7 +187,7 @@ def _from_cache(key: str) -> PlanProof | None:
 
 
 def _to_cache(proof: PlanProof) -> None:
-    folder = cache_folder()
+    folder = cache_folder() / "proofs"
     with suppress(OSError):  # a cache that cannot be written costs time, nothing else
         write_json(folder / f"{proof.key}.json", proof.as_dict())
         kept = sorted(folder.glob("*.json"), key=lambda path: path.stat().st_mtime)

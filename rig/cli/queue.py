@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import getpass
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
@@ -40,10 +38,9 @@ ItemArgument = Annotated[int, typer.Argument(help="The item's number.")]
 
 
 def _who() -> str:
-    try:
-        return getpass.getuser()
-    except (OSError, KeyError):
-        return str(os.getuid())
+    from rig.runs.runstate import user_name
+
+    return user_name()
 
 
 def _path(queue: Path | None) -> Path:
@@ -279,10 +276,10 @@ def show(item: ItemArgument, queue: QueueOption = None, json: JsonOption = None)
             typer.echo(f"  {key:9s} {value}")
     for line in lines:
         typer.echo(f"  {_local(line.time)}  {line.event}{': ' if line.reason else ''}{line.reason}")
-    if entry.found.get("parameters"):
+    if entry.results.get("parameters"):
         rows = [
             (name, f"{p['value']:.5g}", f"{p['std']:.2g}" if p.get("std") else "—", p["unit"])
-            for name, p in entry.found["parameters"].items()
+            for name, p in entry.results["parameters"].items()
             if p.get("value") is not None
         ]
         typer.echo(table(("parameter", "value", "std", "unit"), rows))

@@ -9,7 +9,7 @@ from datetime import datetime
 from pathlib import Path
 
 from analysis.identify.result import Identification
-from analysis.report.identification import Provenance, write_report
+from analysis.report.identification.report import Provenance, write_report
 from analysis.report.loop import write_loop_report
 from analysis.report.trace import write_trace_report
 from analysis.trace.loop_rounds import Round

@@ -51,6 +51,8 @@ def sim(
     # is served here, and without it the bench starts a quarter sooner.
     if "aiohttp" not in sys.modules:
         sys.modules["aiohttp"] = None  # type: ignore[assignment]
-    from rig.cli.simulator import Served, serve_bench
+    from rig.cli.simulator import BenchRequest, serve_bench
 
-    serve_bench(Served(rig, seed, scenario, port, real_time, truth, parent, wire, wire_faults))
+    serve_bench(
+        BenchRequest(rig, seed, scenario, port, real_time, truth, parent, wire, wire_faults)
+    )

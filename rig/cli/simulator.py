@@ -33,7 +33,7 @@ VALVES_RATE: Final = 1000.0  # [Hz] of the plant behind valves that the host sam
 
 
 @dataclass(frozen=True)
-class Served:
+class BenchRequest:
     """What to serve and where.
 
     `scenario` is a file of hidden effects, a shipped one's name, or ``random``: drawn here, by
@@ -57,7 +57,7 @@ def _endpoint_first(endpoint: str) -> None:
     print(endpoint, flush=True)
 
 
-def hidden(what: Served, rig: Rig) -> Scenario:
+def hidden(what: BenchRequest, rig: Rig) -> Scenario:
     """Return the scenario that a bench hides; raises InputError for a bad file."""
     if what.scenario is None:
         return Scenario()
@@ -89,7 +89,7 @@ def wire_faults(name: str | None) -> tuple[WireFault, ...]:
     return scenario.wire_faults
 
 
-def serve_bench(what: Served) -> None:
+def serve_bench(what: BenchRequest) -> None:
     """Serve a simulated bench; raises InputError for bad files, WorkError for a busy port."""
     if what.wire not in WIRES:
         raise InputError(f"--wire {what.wire}: expected one of: {' '.join(WIRES)}")
@@ -138,7 +138,7 @@ def serve_bench(what: Served) -> None:
             link.close()
 
 
-def _place(what: Served, rig: Rig) -> dict[str, Any]:
+def _place(what: BenchRequest, rig: Rig) -> dict[str, Any]:
     """Return where to serve, as keywords of `serve`; raises InputError for a wire it cannot be."""
     if what.wire == VALVES:
         return {"port": what.port or 0}
@@ -148,7 +148,7 @@ def _place(what: Served, rig: Rig) -> dict[str, Any]:
     return {"host": tcp.host, "port": tcp.port if what.port is None else what.port}
 
 
-def _bus(what: Served, rig: Rig) -> dict[str, Any]:
+def _bus(what: BenchRequest, rig: Rig) -> dict[str, Any]:
     from drivers.can_port import SOCKETCAND, BusPlace
     from drivers.can_stream import CanSettings, can_layout
 

@@ -167,7 +167,7 @@ class Tracking:
     # What the bench tells
 
     def block(self, block: SampleBlock) -> None:
-        """Hand a block on, and hear what there is to hear; never waits."""
+        """Hand a block on and read the answers that have come; never waits."""
         started = time.perf_counter()
         tick = str(block.tick).encode()
         self._send([b"block", tick, np.ascontiguousarray(block.data, dtype="<f8").tobytes()])

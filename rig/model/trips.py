@@ -109,7 +109,7 @@ def reset_command(rig: Rig) -> str:
 
 
 class Latched(Exception):
-    """The bench tripped earlier and nobody has cleared that; nothing was moved (exit 3)."""
+    """The bench tripped earlier and the trip is not cleared; nothing was moved (exit 3)."""
 
     def __init__(self, what: str, rig: Rig) -> None:
         super().__init__(f"{what}; look at the bench, then clear it with `{reset_command(rig)}`")

@@ -193,7 +193,7 @@ class Item:
     """An item as it stands in the queue.
 
     `priority`: higher starts first; `place` orders equal ones. `run` is the folder of the latest
-    attempt, `proof` what the proof said when queued, `found` what was identified from the run.
+    attempt, `proof` what the proof said when queued, `results` what was identified from the run.
     """
 
     id: int
@@ -210,7 +210,7 @@ class Item:
     started: str = ""
     ended: str = ""
     proof: dict[str, Any] = field(default_factory=dict)
-    found: dict[str, Any] = field(default_factory=dict)
+    results: dict[str, Any] = field(default_factory=dict)
 
     @property
     def over(self) -> bool:
@@ -219,7 +219,8 @@ class Item:
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as plain data for JSON."""
-        return {**asdict(self), "job": self.job.as_dict()}
+        plain = {**asdict(self), "job": self.job.as_dict()}
+        return {**plain, "found": plain.pop("results")}
 
     def next_folder(self) -> str:
         """Return the run folder of the next attempt: the first as named, later ones numbered."""

@@ -34,7 +34,7 @@ class ItemOutcome:
         """Return it with a further reason."""
         return replace(self, reason=f"{self.reason}; {more}".removeprefix("; "))
 
-    def asked(self, state: str) -> ItemOutcome:
+    def as_requested(self, state: str) -> ItemOutcome:
         """Return it as `state` where the process ended because it was asked to for that."""
         if not state or self.state not in (it.STOPPED, it.FAILED):
             return self
@@ -52,7 +52,7 @@ def outcome_of(code: int, reason: str, *, began: bool) -> ItemOutcome:
 
 
 def outcome_of_folder(folder: Path, said: str) -> ItemOutcome:
-    """Judge a process whose exit code nobody saw: its run folder and last line say how it ended."""
+    """Judge a process with unknown exit code from its run folder and its last line."""
     unseen = "no runner saw its end"
     if not store.is_run(folder):
         if not said:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import logging
 import os
 import signal
 import subprocess
@@ -19,8 +18,6 @@ from typing import IO, Any, Final
 
 from rig.model.trips import OperatorStop
 from rig.queue.locks import LockFile
-
-log = logging.getLogger(__name__)
 
 BRAMAH: Final = (sys.executable, "-c", "from rig.cli.main import run; run()")
 _SAID = "bramah: "  # begins the one line in which a verb says why it failed

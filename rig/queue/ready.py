@@ -61,9 +61,9 @@ def dependence(item: Item, others: Mapping[int, Item]) -> Readiness:
 
 def _compared(wanted: str, other: Item) -> Readiness:
     condition = result_condition(wanted)
-    value = result_value(other.found, condition)
+    value = result_value(other.results, condition)
     if value is None:
-        why = other.found.get("error", f"{condition.name} was not identified")
+        why = other.results.get("error", f"{condition.name} was not identified")
         return Readiness(False, f"{wanted!r} of item {other.id} cannot be judged: {why}", SKIPPED)
     if condition.holds(value):
         return Readiness(True)

@@ -80,7 +80,7 @@ def folder_of(queue: Path) -> Path:
 
 
 def runner_of(queue: Path) -> int | None:
-    """Return the process that runs a queue now, None if nobody does."""
+    """Return the process that runs a queue now, None if there is none."""
     path = folder_of(queue) / "runner.lock"
     return holder(path) if held(path) else None
 
@@ -274,7 +274,7 @@ class Runner:
             child = processes.start(words, output, subprocess.STDOUT, lock)
         try:
             self._queue.note_process(item.id, child.pid)
-            asked = self._watch(item, lambda: child.poll() is not None, lambda: child.pid)
+            request = self._watch(item, lambda: child.poll() is not None, lambda: child.pid)
         except BaseException:
             # Whatever went wrong here: the bench is made safe by the child before this goes on.
             processes.ask_to_end(child.pid)
@@ -282,20 +282,20 @@ class Runner:
             raise
         began = store.is_run(Path(item.run))
         outcome = outcome_of(child.returncode, processes.reason_of(path), began=began)
-        return outcome.asked(asked)
+        return outcome.as_requested(request)
 
     def _watch(self, item: Item, over: Callable[[], bool], pid: Callable[[], int | None]) -> str:
         """Wait until a process has ended; returns the state it was asked to end for, or ''."""
         asked, since = "", 0.0
         while not over():
-            wish = it.STOPPED if self._stop.reason else ""
-            if not wish and self._queue.item(item.id).cancel:
-                wish = it.CANCELLED
+            end_state = it.STOPPED if self._stop.reason else ""
+            if not end_state and self._queue.item(item.id).cancel:
+                end_state = it.CANCELLED
             process = pid()
-            if wish and not asked and process is not None:
+            if end_state and not asked and process is not None:
                 self._say(f"item {item.id} {item.job.name}: asked to end")
                 processes.ask_to_end(process)
-                asked, since = wish, time.monotonic()
+                asked, since = end_state, time.monotonic()
             if asked and process and time.monotonic() - since > self._settings.stop_seconds:
                 log.error("item %d: did not end within %g s and is killed", item.id,
                           self._settings.stop_seconds)  # fmt: skip
@@ -364,14 +364,16 @@ class Runner:
     def _identify_due(self) -> None:
         """Identify from the runs that are done, for what waits on their result and for the page."""
         for item in self._queue.items():
-            if item.state != it.DONE or not item.job.identify or item.found:
+            if item.state != it.DONE or not item.job.identify or item.results:
                 continue
             self._say(f"item {item.id} {item.job.name}: identifying")
             words = ["identify", item.run, "--json", "-"]
             answer = self._call(words, self._settings.identify_seconds)
             result = answer.as_json() if answer.code == 0 else None
             why = answer.reason or "no result"
-            self._queue.keep_found(item.id, result if isinstance(result, dict) else {"error": why})
+            self._queue.keep_results(
+                item.id, result if isinstance(result, dict) else {"error": why}
+            )
 
     # What another runner left behind
 
@@ -384,12 +386,12 @@ class Runner:
 
     def _left_running(self, item: Item) -> ItemOutcome:
         lock = item_lock(self._queue.path, item.id)
-        asked = it.CANCELLED if item.cancel else ""
+        request = it.CANCELLED if item.cancel else ""
         if held(lock):
             self._say(f"item {item.id} {item.job.name}: its process still runs and is waited for")
-            asked = self._watch(item, lambda: not held(lock), lambda: _pid_of(item)) or asked
+            request = self._watch(item, lambda: not held(lock), lambda: _pid_of(item)) or request
         said = processes.reason_of(log_of(self._queue.path, item))
-        return outcome_of_folder(Path(item.run), said).asked(asked)
+        return outcome_of_folder(Path(item.run), said).as_requested(request)
 
     def _notify(self, event: str, item: Item | None, reason: str) -> None:
         counts = Counter(other.state for other in self._queue.items())

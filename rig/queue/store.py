@@ -58,10 +58,10 @@ class QueueLine:
 
 def _item(row: Sequence[Any]) -> Item:
     (number, priority, place, state, reason, job, attempt, run, pid, cancel) = row[:10]
-    added, started, ended, proof, found = row[10:]
+    added, started, ended, proof, results = row[10:]
     return Item(
         number, priority, place, state, reason, QueueJob.from_dict(json.loads(job)), attempt, run,
-        pid, bool(cancel), added, started, ended, json.loads(proof), json.loads(found),
+        pid, bool(cancel), added, started, ended, json.loads(proof), json.loads(results),
     )  # fmt: skip
 
 
@@ -316,10 +316,12 @@ class QueueStore:
                 self._enter(self.item(number), QUEUED, reason)
         return self.item(number)
 
-    def keep_found(self, number: int, found: dict[str, Any]) -> None:
+    def keep_results(self, number: int, results: dict[str, Any]) -> None:
         """Keep what was identified from an item's run."""
         with self._transaction():
-            self._db.execute("UPDATE item SET found = ? WHERE id = ?", (json.dumps(found), number))
+            self._db.execute(
+                "UPDATE item SET found = ? WHERE id = ?", (json.dumps(results), number)
+            )
 
     def note(self, event: str, reason: str = "") -> None:
         """Note what the queue as a whole did."""

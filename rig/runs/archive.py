@@ -10,7 +10,6 @@ may go. Lists are one-dimensional integer arrays, flags are 0 or 1, text is UTF-
 
 from __future__ import annotations
 
-import logging
 import os
 import shutil
 from collections.abc import Callable, Mapping, Sequence
@@ -29,7 +28,6 @@ from rig.runs.journal import Journal
 from rig.runs.runstate import BETWEEN, StreamClock, read_events, stream_clocks
 from rig.runs.sections import Assembled, Section, Written, assemble, blocks_of, plan
 
-log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 NAME = "records.h5"

@@ -98,7 +98,7 @@ def _python(value: Any) -> Any:
 def read_heads(file: h5py.File, path: Path) -> list[RecordHead]:
     """Return the heads of every record in the order it was taken."""
     heads = [head_of(name, group, path) for name, group in file.items() if name != BETWEEN]
-    return sorted(heads, key=_taken)
+    return sorted(heads, key=_record_order)
 
 
 def count(path: Path) -> Written:
@@ -124,6 +124,6 @@ def read_records(path: Path) -> list[Record]:
         return [samples_of(file[head.name], head) for head in read_heads(file, path)]
 
 
-def _taken(record: RecordHead) -> tuple[int, int, str]:
+def _record_order(record: RecordHead) -> tuple[int, int, str]:
     stream, tick = record.attributes.get("stream", 0), record.attributes.get("start_tick", 0)
     return int(stream), int(tick), record.name

@@ -7,7 +7,16 @@ from pathlib import Path
 
 from rig.model.parse import InputError
 
-MAX_TEXT = 1 << 20  # a description, not data: a megabyte is far beyond any honest one
+MAX_TEXT = 1 << 20  # a description, not data: far beyond any real one
+CACHE_VARIABLE = "BRAMAH_CACHE"
+
+
+def cache_folder() -> Path:
+    """Return the folder of what can be computed again: $BRAMAH_CACHE, or below the user's cache."""
+    stated = os.environ.get(CACHE_VARIABLE)
+    if stated:
+        return Path(stated)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "bramah"
 
 
 def read_text(path: Path, what: str, limit: int = MAX_TEXT) -> str:
@@ -39,11 +48,7 @@ def read_text(path: Path, what: str, limit: int = MAX_TEXT) -> str:
 
 def sync_folder(folder: Path) -> None:
     """Make renames and new names in `folder` survive a power cut; raises OSError."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+    sync_file(folder)
 
 
 def sync_file(path: Path) -> None:
@@ -56,7 +61,7 @@ def sync_file(path: Path) -> None:
 
 
 def replace_text(path: Path, text: str) -> None:
-    """Replace a small file so that a reader sees the old or the new text, never half of one."""
+    """Replace a file so that a reader sees the old or the new text, never half; raises OSError."""
     fresh = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         with fresh.open("w", encoding="utf-8") as stream:

@@ -8,6 +8,7 @@ event's `t` [s] counts from the run's first sample; `tick` is the device's clock
 
 from __future__ import annotations
 
+import getpass
 import json
 import logging
 import os
@@ -41,6 +42,14 @@ _STATE, _OWNER = "state", "owner.json"
 def here() -> str:
     """Return this computer's name."""
     return socket.gethostname()
+
+
+def user_name() -> str:
+    """Return the name of the user whose process this is."""
+    try:
+        return getpass.getuser()
+    except (OSError, KeyError):  # a user number without a name, as in containers
+        return str(os.getuid())
 
 
 def now() -> str:
@@ -98,7 +107,7 @@ def release_ownership(folder: Path) -> None:
 
 
 def read_owner(folder: Path) -> Owner | None:
-    """Return who writes the run, None if nobody says so."""
+    """Return the process that writes the run, None if the file names none."""
     try:
         return Owner(**json.loads((folder / _OWNER).read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError):

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import getpass
 import hashlib
 import json
-import logging
-import os
 import socket
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -29,11 +26,11 @@ from rig.runs.runstate import (
     read_owner,
     read_state,
     take_ownership,
+    user_name,
     write_state,
 )
 from rig.runs.versions import versions
 
-log = logging.getLogger(__name__)
 T = TypeVar("T", Record, RecordHead)
 
 ARCHIVE = "records.h5"
@@ -73,13 +70,6 @@ def refuse_occupied(folder: Path) -> None:
         raise InputError(f"{folder}: cannot be used for a run: {error.strerror}") from error
 
 
-def _operator() -> str:
-    try:
-        return getpass.getuser()
-    except (OSError, KeyError):  # a user number without a name, as in containers
-        return str(os.getuid())
-
-
 def create_run(
     folder: Path,
     rig: Rig,
@@ -103,7 +93,7 @@ def create_run(
     head = {
         "format": _FORMAT,
         "created": now(),
-        "operator": _operator() if operator is None else operator,
+        "operator": user_name() if operator is None else operator,
         "host": socket.gethostname(),
         "seed": seed,
         "source": source,

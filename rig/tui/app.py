@@ -22,7 +22,7 @@ from rig.bench.screens.commands import own_command
 from rig.bench.screens.sockets import Endpoint
 from rig.model.alarms.states import AlarmTable
 from rig.tui.acting.manual import ByHand
-from rig.tui.browse import Browsed
+from rig.tui.browse import BrowserState
 from rig.tui.canvas import Canvas
 from rig.tui.following.event_lines import KINDS
 from rig.tui.following.link import Frame, Link, LinkStage, LocalSessions, Sessions
@@ -36,7 +36,7 @@ SPANS: Final = (2.0, 5.0, 10.0, 30.0, 60.0)  # of the plots [s of device time]
 LONG_SPANS: Final = (*SPANS, 120.0, 300.0, 600.0)
 CROSSING: Final = 5.0  # least wall time in which a curve crosses its plot [s]
 SLOW: Final = 0.2  # ages are redrawn this often where nothing arrives [s]
-BLINK: Final = 0.5  # half a period of what nobody has acknowledged [s]
+BLINK: Final = 0.5  # half a period of an unacknowledged alarm [s]
 TWICE: Final = 0.7  # two presses of Escape within this time stop [s]
 ALARM_WINDOW: Final = 60.0  # of samples held while the alarms are looked at [s]
 
@@ -94,14 +94,14 @@ class Monitor(ByHand, App[int]):
         clock: Callable[[], float] = time.monotonic,
         *,
         threaded: bool = True,
-        browsed: Browsed | None = None,
+        browsed: BrowserState | None = None,
     ) -> None:
         App.__init__(self, ansi_color=True)  # the 16 colours of the terminal itself
         self.rig, self.clock, self._threaded = rig, clock, threaded
         self.link = Link(sessions or LocalSessions(rig), clock)
         self.me = own_command("take").holder
         self.look = ScreenStyle()
-        self.browsed = browsed or Browsed()
+        self.browsed = browsed or BrowserState()
         self.dialog: Dialog | None = None
         self.accept: Callable[[str], None] | None = None  # what the open question's answer does
         self.remark = ""
@@ -110,10 +110,10 @@ class Monitor(ByHand, App[int]):
         self.reset_alarms: frozenset[tuple[int, str]] = frozenset()
         self.marked_session: Endpoint | None = None
         self._span: float | None = None  # None: automatic
-        self._held: Frame | None = None  # what a held picture shows
-        self._drawn: object = None
+        self._held_frame: Frame | None = None  # what a held picture shows
+        self._drawn_frame: object = None
         self._slow = -float("inf")
-        self._escaped = -float("inf")
+        self._last_escape = -float("inf")
         self._stopped_by: events.Key | None = None  # the newest key that stopped before its turn
         self._ticking: asyncio.Task[None] | None = None
         self._wake: Callable[[], None] = lambda: None  # ends the wait for the next picture
@@ -142,7 +142,7 @@ class Monitor(ByHand, App[int]):
         self._wake = self.link.on_window = wake
         while True:
             frame = self.link.frame
-            idle = self._drawn is frame and (frame.over or frame.endpoint is None)
+            idle = self._drawn_frame is frame and (frame.over or frame.endpoint is None)
             with suppress(TimeoutError):
                 await asyncio.wait_for(woken.wait(), BLINK if idle else SLOW)
             woken.clear()
@@ -170,7 +170,7 @@ class Monitor(ByHand, App[int]):
         if self.look.seconds != span:
             self.look = replace(self.look, seconds=span)
         return PlotView(
-            frame=self._held or newest,
+            frame=self._held_frame or newest,
             newest=newest,
             now=self.clock(),
             look=self.look,
@@ -191,12 +191,12 @@ class Monitor(ByHand, App[int]):
         if blink != self.look.blink:
             self.look = replace(self.look, blink=blink)
             force = True
-        same = self._drawn is frame and not force
+        same = self._drawn_frame is frame and not force
         waits = self.stop_asked is not None and now - self.stop_asked.at < LINGER
         idle = (frame.over or frame.endpoint is None) and not waits
         if same and (idle or now - self._slow < SLOW):
             return
-        self._drawn, self._slow = frame, now
+        self._drawn_frame, self._slow = frame, now
         size = self.size
         self.canvas.show(compose(self.view(), size.width, size.height))
         self.pictures += 1
@@ -253,11 +253,11 @@ class Monitor(ByHand, App[int]):
 
     def _escape(self) -> None:
         now = self.clock()
-        if now - self._escaped <= TWICE:
-            self._escaped = -float("inf")
+        if now - self._last_escape <= TWICE:
+            self._last_escape = -float("inf")
             self.act_stop()
         else:
-            self._escaped = now
+            self._last_escape = now
         self.dialog, self.accept = None, None
 
     def ask(self, dialog: Dialog, accept: Callable[[str], None] | None = None) -> None:
@@ -353,7 +353,7 @@ class Monitor(ByHand, App[int]):
 
     def act_hold(self) -> None:
         """Hold the picture, or let it live again."""
-        self._held = None if self._held is not None else self.link.frame
+        self._held_frame = None if self._held_frame is not None else self.link.frame
 
     def act_zoom(self) -> None:
         """Scale the plots to the data or to the limits."""
@@ -421,7 +421,7 @@ class Monitor(ByHand, App[int]):
 
     def redraw(self) -> None:
         """Draw at once, whether or not anything arrived; any thread may ask."""
-        self._drawn = None
+        self._drawn_frame = None
         self._wake()
 
 
@@ -437,7 +437,7 @@ def farewell(frame: Frame) -> str:
     )
 
 
-def main(rig: str | None, browsed: Browsed | None = None) -> int:
+def main(rig: str | None, browsed: BrowserState | None = None) -> int:
     """Show the screen until the operator leaves it; return the exit code (0, or 130 on Ctrl-C)."""
     code = Monitor(rig, browsed=browsed).run()
     return 0 if code is None else code

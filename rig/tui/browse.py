@@ -26,7 +26,7 @@ READ_AT_MOST: Final = 1_000_000  # [bytes] of a file, to see whether it is a pro
 
 
 @dataclass(frozen=True)
-class Browsed:
+class BrowserState:
     """What was found; `trouble` says in one line what could not be read.
 
     `log` and `trace` are those of the run that was opened last. `job` is the newest verb that was
@@ -58,7 +58,7 @@ class Browsed:
         return len((self.protocols, self.runs, self.queue)[self.tab])
 
 
-def read_disk(before: Browsed) -> Browsed:
+def read_disk(before: BrowserState) -> BrowserState:
     """Read everything anew; never raises: what cannot be read is said in `trouble`."""
     troubles: list[str] = []
     runs: tuple[RunSummary, ...] = ()

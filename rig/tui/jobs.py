@@ -6,7 +6,6 @@ The screen never holds the hardware: closing or killing it leaves what it starte
 from __future__ import annotations
 
 import json
-import logging
 import os
 import subprocess
 import tempfile
@@ -17,8 +16,6 @@ from pathlib import Path
 from typing import IO, Any, Final
 
 from rig.queue.processes import BRAMAH, reason_in, start
-
-log = logging.getLogger(__name__)
 
 POLL: Final = 0.1  # [s]
 TAIL: Final = 400  # lines of a verb's output that are shown
@@ -65,7 +62,7 @@ class VerbJob:
 
 
 def begin(words: Sequence[str], changed: Callable[[VerbJob], None]) -> None:
-    """Start a verb; `changed` hears of its start at once, then of its output and its end."""
+    """Start a verb; `changed` is called at its start, with its output and at its end."""
     # Closed by the thread that watches the child.
     output, errors = tempfile.TemporaryFile(), tempfile.TemporaryFile()  # noqa: SIM115
     job = VerbJob(tuple(words))

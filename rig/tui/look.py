@@ -8,7 +8,7 @@ from typing import Final
 
 from rig.bench.screens.sockets import Endpoint
 from rig.model.alarms.states import AlarmTable
-from rig.tui.browse import Browsed
+from rig.tui.browse import BrowserState
 from rig.tui.following.link import Frame
 from rig.tui.words import Freshness, Stop, freshness
 
@@ -70,7 +70,7 @@ class PlotView:
     remark: str = ""  # what became of the operator's newest act
     me: str = ""  # this screen, as a holder of the controls
     rig: str | None = None
-    browsed: Browsed = field(default_factory=Browsed)
+    browsed: BrowserState = field(default_factory=BrowserState)
     marked_session: Endpoint | None = None
     tripped: Mapping[str, str] = field(default_factory=dict)
 

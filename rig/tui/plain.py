@@ -10,11 +10,11 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from rig.tui.following.link import POLL, Frame, Link, LinkStage, LocalSessions, Sessions
+from rig.tui.following.link import POLL, Frame, Link, LinkStage, LocalSessions
 from rig.tui.units import age_text, clock_text, shown
 from rig.tui.words import headline, nearest_margin, notices, run_time
 
-EVERY: Final = 1.0  # [s]
+LINE_SECONDS: Final = 1.0  # [s]
 
 
 def status_line(frame: Frame, now: float) -> str:
@@ -75,24 +75,19 @@ class Reader:
             for notice in notices(frame, None, now, paused=False):
                 self._say(f"  {notice.text}")
         elif not quiet and now >= self._next:
-            self._next = now + EVERY
+            self._next = now + LINE_SECONDS
             self._say(line)
         self._last = line
 
 
-def read_aloud(
-    rig: str | None,
-    say: Callable[[str], None],
-    sessions: Sessions | None = None,
-    clock: Callable[[], float] = time.monotonic,
-) -> None:
+def read_aloud(rig: str | None, say: Callable[[str], None]) -> None:
     """Say what a run does until interrupted; it is watched, never commanded."""
-    link = Link(sessions or LocalSessions(rig), clock)
+    link = Link(LocalSessions(rig), time.monotonic)
     reader = Reader(say)
     link.start()
     try:
         while True:
-            reader.read(link.frame, clock())
+            reader.read(link.frame, time.monotonic())
             time.sleep(POLL)
     finally:
         link.close()

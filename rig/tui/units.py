@@ -1,4 +1,4 @@
-"""SI inside, the operator's units on the glass: MPa, mm, and short words for times."""
+"""Display of SI values in the operator's units (MPa, mm), and times as short text."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rig.model.units import READINGS, display_unit
 
 
 @dataclass(frozen=True)
-class Shown:
+class Format:
     """How a channel's SI unit is shown: its name, SI to shown factor, decimals.
 
     `least` is the smallest height [SI] of a plot without limits: noise must not look like motion.
@@ -48,10 +48,10 @@ class Shown:
 _LEAST: Final = {"Pa": 0.2e6, "m": 2e-3, "V": 0.02, "degC": 2.0}
 
 
-def shown(unit: str) -> Shown:
+def shown(unit: str) -> Format:
     """Return how an SI unit is shown; one not listed keeps its own name."""
     known = display_unit(unit, READINGS)
-    return Shown(known.text, known.scale, known.decimals, _LEAST.get(unit, 0.0))
+    return Format(known.text, known.scale, known.decimals, _LEAST.get(unit, 0.0))
 
 
 class Band(IntEnum):

@@ -89,7 +89,7 @@ class Margin:
 def freshness(frame: Frame, now: float, *, held: bool = False) -> Freshness:
     """Return what the numbers of a frame are."""
     snapshot = frame.snapshot
-    if snapshot is not None and (snapshot.device == LOST or _gone(frame, snapshot)):
+    if snapshot is not None and (snapshot.device == LOST or _run_gone(frame, snapshot)):
         return Freshness.DISCONNECTED
     if frame.over:
         return Freshness.ENDED
@@ -98,7 +98,7 @@ def freshness(frame: Frame, now: float, *, held: bool = False) -> Freshness:
     return Freshness.HELD if held else Freshness.LIVE
 
 
-def _gone(frame: Frame, snapshot: Snapshot) -> bool:
+def _run_gone(frame: Frame, snapshot: Snapshot) -> bool:
     return frame.stage is LinkStage.ENDED and snapshot.state not in ENDED_STATES
 
 
@@ -112,7 +112,7 @@ def headline(frame: Frame, now: float) -> Headline:
         (UNSURE in snapshot.message, Headline("OUTPUTS NOT CONFIRMED", "alarm")),
         (snapshot.device == LOST, Headline("DEVICE LOST", "alarm")),
         (state == "tripped" or snapshot.trip is not None, Headline("TRIPPED", "alarm")),
-        (_gone(frame, snapshot), Headline("RUN GONE", "alarm")),
+        (_run_gone(frame, snapshot), Headline("RUN GONE", "alarm")),
         (state == "done", Headline("RUN ENDED", "ended")),
         (frame.over, Headline("STOPPED" if _zeroed(snapshot) else state.upper(), "warn")),
         (frame.age(now) > VERY_OLD, Headline("NO DATA", "alarm")),
@@ -281,7 +281,7 @@ def band_of(view: ChannelView) -> Band:
 
 
 def value(view: ChannelView, fresh: Freshness, *, sign: bool = False) -> Row:
-    """Return a channel's newest value with its unit; its form says whether it can be believed.
+    """Return a channel's newest value with its unit; its form says whether it is valid.
 
     ▲ close to a limit, ■ beyond it, ✕ not a number, ◌ stale, ⊘ disconnected, ‖ held.
     """

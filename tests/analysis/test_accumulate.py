@@ -19,7 +19,7 @@ from analysis.identify.result import PLAIN, Identification
 from analysis.identify.stacked_rows import build_rows
 from analysis.identify.streams.out_of_core import identify_folders
 from analysis.regression.chunks import InMemory, source_rows
-from analysis.regression.qr import Accumulator, accumulate
+from analysis.regression.qr import Accumulator
 from analysis.regression.rows import default_filtering, paper_filtering
 from analysis.regression.solve import triangle
 from analysis.signals.locks import held_positions, moving_joints
@@ -39,7 +39,9 @@ def test_blocks_folded_one_by_one_solve_what_all_rows_at_once_solve() -> None:
     X = rng.standard_normal((50_000, 9)) * np.logspace(6, -6, 9)
     y = X @ np.logspace(-6, 6, 9) + 0.01 * rng.standard_normal(len(X))
     edges = [0, 1, 5, 4101, 4102, 30_000, 50_000]
-    whole = accumulate(9, [(X[a:b], y[a:b]) for a, b in pairwise(edges)])
+    whole = Accumulator(9)
+    for a, b in pairwise(edges):
+        whole.fold(X[a:b], y[a:b])
     R = whole.triangle
     assert whole.rows == 50_000
     assert np.linalg.solve(R[:9, :9], R[:9, 9]) == pytest.approx(lstsq(X, y)[0], rel=1e-10)

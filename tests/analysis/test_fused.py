@@ -29,6 +29,7 @@ from analysis.terms import base, baseline_of, known
 from analysis.terms.base import Coefficient, Kernel, Term, Used, kernel
 from analysis.terms.specialise import NotSpecialisable
 from rig.model.rig import Rig
+from rig.runs.files import CACHE_VARIABLE
 from rig.runs.rigs import load_rig
 from tests.variants import kept
 
@@ -266,7 +267,7 @@ def test_a_kernel_that_cannot_be_written_out_is_simulated_term_by_term(
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A cache folder of the test's own, and a process that remembers nothing."""
-    monkeypatch.setenv(compiled_sources.CACHE_VARIABLE, str(tmp_path))
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
     forget()
     yield tmp_path
     forget()
@@ -367,7 +368,7 @@ def test_a_cache_that_cannot_be_written_costs_time_and_no_more(
     cache: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     (cache / "file").write_text("in the way")
-    monkeypatch.setenv(compiled_sources.CACHE_VARIABLE, str(cache / "file"))
+    monkeypatch.setenv(CACHE_VARIABLE, str(cache / "file"))
     assert run_small()[0].fused
     assert "cannot be written" in caplog.text
 

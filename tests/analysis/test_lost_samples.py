@@ -11,7 +11,7 @@ import pytest
 from analysis.identify.identify import identify
 from analysis.identify.stacked_rows import build_rows
 from analysis.regression.rows import default_filtering
-from analysis.report.identification import write_report
+from analysis.report.identification.report import write_report
 from analysis.simulation.model import Model
 from analysis.simulation.validate import validate
 from analysis.terms import baseline

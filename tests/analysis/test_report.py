@@ -12,7 +12,7 @@ import pytest
 from analysis.identify.checks import Check
 from analysis.identify.identify import identify
 from analysis.identify.result import Identification
-from analysis.report.identification import Provenance, render_report, write_report
+from analysis.report.identification.report import Provenance, render_report, write_report
 from analysis.simulation.validate import RecordValidation, validate
 from rig.model.parse import InputError
 from rig.model.records import Run

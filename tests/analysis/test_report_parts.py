@@ -14,8 +14,9 @@ from analysis.identify.identify import identify
 from analysis.identify.stacked_rows import RecordRows, build_rows
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.rows import Rows
-from analysis.report import facts, paper
 from analysis.report import format as fm
+from analysis.report import paper
+from analysis.report.identification import facts
 from analysis.report.plots import arm_plot, record_plots, style, trace_plots
 from analysis.report.residuals import per_repeat, residuals
 from analysis.trace.result import Curve, JudgedEffect

@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import t as student
 
 from analysis.identify.estimators.covariance import spread
-from analysis.identify.estimators.equations import Prepared, RepeatBlock, least_squares, pieces
+from analysis.identify.estimators.equations import FamilyBlocks, RepeatBlock, least_squares, pieces
 from analysis.identify.estimators.instruments import hausman
 from analysis.identify.estimators.nuisance import Belief, joined
 from analysis.identify.estimators.shifts import Shift, certain_shift, including, shifts_of
@@ -37,7 +37,7 @@ def test_a_shift_must_be_certain_and_large_to_speak_against_least_squares(case: 
         )
         for b in line(rng, 0.0)
     )
-    p = Prepared("mechanical", ("M1",), 1, blocks)
+    p = FamilyBlocks("mechanical", ("M1",), 1, blocks)
     fit, test = least_squares(blocks), hausman(blocks)
     error = spread([pieces(fit)], fit.inverse)
     (shift,) = shifts_of([p], {"mechanical": test}, {"mechanical": (fit.beta, error, fit)})

@@ -10,7 +10,7 @@ from hil_sim.scenario.file import Scenario, parse_scenario
 from protocols.engine import engine
 from protocols.files import library
 from protocols.files.plan import Overrides, resolve
-from rig.cli.experiment_loop import Loop, Wanted
+from rig.cli.experiment_loop import Loop, LoopRequest
 from rig.model.records import Run
 from tests.studies.direct_bench import DirectBench
 
@@ -52,9 +52,9 @@ class Inside(Loop):
     Its oil keeps its temperature: what that does to b is no part of these stories.
     """
 
-    def __init__(self, wanted: Wanted, hidden: Scenario) -> None:
+    def __init__(self, request: LoopRequest, hidden: Scenario) -> None:
         self.said: list[str] = []
-        super().__init__(wanted, self.said.append)
+        super().__init__(request, self.said.append)
         steady = self.rig.oil.model_copy(update={"temperature_band": 0.0})
         self.rig = self.rig.model_copy(update={"oil": steady})
         self._bench = DirectBench(self.rig, hidden, 41)
@@ -66,13 +66,15 @@ class Inside(Loop):
 
 
 def looped(
-    out: Path, protocol: str, effects: str, *, rounds: int = 2, closer: bool = False,
+    out: Path, protocol: str, effects: str, *, rounds: int = 2, until_visible: bool = False,
     ask: Callable[[Mapping[str, Any]], bool] = lambda experiment: True,
 ) -> Inside:  # fmt: skip
     """Close a loop on a bench that hides `effects`, and return it as it ended."""
     path = out / "first.yaml"
     path.write_text(protocol)
-    wanted = Wanted("shinshu-2dof", out, protocol=str(path), rounds=rounds, closer=closer, ask=ask)
-    going = Inside(wanted, parse_scenario(f"effects: [{effects}]", "hidden"))
-    going.close()
-    return going
+    request = LoopRequest(
+        "shinshu-2dof", out, protocol=str(path), rounds=rounds, until_visible=until_visible, ask=ask
+    )
+    experiments = Inside(request, parse_scenario(f"effects: [{effects}]", "hidden"))
+    experiments.close()
+    return experiments

@@ -11,7 +11,7 @@ from rig.cli.bench.figure import Figure
 from rig.cli.bench.figures import text
 from rig.cli.bench.speed.free_run import both_moving, free_run_times
 from rig.cli.bench.speed.growth import four_joints
-from rig.cli.bench.timing import spent_together
+from rig.cli.bench.timing import processor_times
 from rig.runs.rigs import load_rig
 
 
@@ -39,7 +39,7 @@ def test_the_table_says_how_busy_the_machine_was() -> None:
 
 def test_anchors_take_turns_so_that_a_busy_machine_slows_all_alike() -> None:
     order: list[str] = []
-    found = spent_together({n: lambda n=n: order.append(n) for n in "ab"}, 3)  # type: ignore[misc]
+    found = processor_times({n: lambda n=n: order.append(n) for n in "ab"}, 3)  # type: ignore[misc]
     assert "".join(order) == "ababab"
     assert found["a"].least <= found["a"].median
 

@@ -10,10 +10,10 @@ from protocols.files.library import load
 from protocols.files.plan import resolve
 from rig.cli.bench import figures
 from rig.cli.bench.figure import Figure
-from rig.cli.output import EVERY, Countdown, clock_text
+from rig.cli.output import LINE_SECONDS, Countdown, clock_text
 from rig.cli.proofs import proved
+from rig.runs.files import CACHE_VARIABLE
 from rig.runs.rigs import load_rig
-from tests.conftest import CACHE_VARIABLE
 
 
 class Clock:
@@ -36,7 +36,7 @@ def test_short_work_is_quiet_and_long_work_says_what_is_left() -> None:
     clock.now = 100.0 + 20.0
     progress(0.25)
     progress(0.26)
-    clock.now += EVERY
+    clock.now += LINE_SECONDS
     progress(0.5)
     clock.now += 100.0
     progress(1.0)

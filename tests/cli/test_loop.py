@@ -18,7 +18,7 @@ from protocols.design.check import check
 from protocols.files import library
 from protocols.files.plan import resolve
 from rig.cli import experiment_loop
-from rig.cli.experiment_loop import DECLINED, FLOOR, NOTHING, REFUSED, ROUNDS, Loop, Wanted
+from rig.cli.experiment_loop import DECLINED, FLOOR, NOTHING, REFUSED, ROUNDS, Loop, LoopRequest
 from rig.cli.trace_text import rounds_text
 from rig.runs.rigs import load_rig
 from tests.analysis.page import Page
@@ -37,7 +37,7 @@ def air(tmp_path_factory: pytest.TempPathFactory) -> Inside:
         patch.setattr(experiment_loop, "trace", few)
         return looped(
             tmp_path_factory.mktemp("air"), SINE, "{name: entrained_air, fraction: 1 %}",
-            closer=True,
+            until_visible=True,
         )  # fmt: skip
 
 
@@ -66,9 +66,9 @@ def test_an_experiment_brings_about_what_it_promised(air: Inside) -> None:
 def test_the_designed_protocol_is_one_that_run_takes_and_the_twin_proves(air: Inside) -> None:
     rig = load_rig(RIG)
     for name in ("next-2.yaml", "judge-2.yaml"):
-        plan = resolve(library.load(air.wanted.out / name), rig)
+        plan = resolve(library.load(air.request.out / name), rig)
         assert check(plan, rig, simulate_commands).ok
-    train, judge = (library.load(air.wanted.out / f"{n}-2.yaml") for n in ("next", "judge"))
+    train, judge = (library.load(air.request.out / f"{n}-2.yaml") for n in ("next", "judge"))
     assert train.steps[0].excite[0].signal != judge.steps[0].excite[0].signal
 
 
@@ -87,8 +87,8 @@ def test_the_story_is_told_in_json_in_words_and_on_one_page(air: Inside) -> None
 class Replayed(Loop):
     """A loop whose traces are those of another; nothing is moved."""
 
-    def __init__(self, wanted: Wanted, rounds: Sequence[Round], takes: bool = True) -> None:
-        super().__init__(wanted, lambda line: None)
+    def __init__(self, request: LoopRequest, rounds: Sequence[Round], takes: bool = True) -> None:
+        super().__init__(request, lambda line: None)
         self._others, self._takes = list(rounds), takes
 
     def _take(self, *arguments: object) -> None:
@@ -104,7 +104,7 @@ class Replayed(Loop):
 @pytest.mark.parametrize(
     ("changes", "takes", "why", "count"),
     [
-        ({"closer": False}, True, FLOOR, 1),
+        ({"until_visible": False}, True, FLOOR, 1),
         ({"ask": lambda experiment: False}, True, DECLINED, 1),
         ({"rounds": 0}, True, ROUNDS, 1),
         ({"rounds": 2}, True, ROUNDS, 3),
@@ -114,11 +114,11 @@ class Replayed(Loop):
 def test_it_stops_where_it_should_and_says_why(
     air: Inside, tmp_path: Path, changes: dict[str, object], takes: bool, why: str, count: int
 ) -> None:
-    wanted = Wanted(RIG, tmp_path, **({"closer": True, **changes}))  # type: ignore[arg-type]
-    going = Replayed(wanted, air.rounds[:1], takes)
-    going.close()
-    assert going.stopped == why
-    assert len(going.rounds) == count
+    request = LoopRequest(RIG, tmp_path, **({"until_visible": True, **changes}))  # type: ignore[arg-type]
+    experiments = Replayed(request, air.rounds[:1], takes)
+    experiments.close()
+    assert experiments.stopped == why
+    assert len(experiments.rounds) == count
 
 
 @pytest.mark.slow
@@ -183,6 +183,6 @@ def test_nothing_to_gain_is_a_reason_to_stop(air: Inside, tmp_path: Path) -> Non
 
     one = air.rounds[0]
     puzzled = replace(one, result=replace(one.result, verdict="unexplained", next_experiment=None))
-    going = Replayed(Wanted(RIG, tmp_path), [puzzled])
-    going.close()
-    assert going.stopped == NOTHING
+    experiments = Replayed(LoopRequest(RIG, tmp_path), [puzzled])
+    experiments.close()
+    assert experiments.stopped == NOTHING

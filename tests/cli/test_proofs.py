@@ -15,14 +15,14 @@ import pytest
 from protocols.files.library import read_protocol
 from protocols.files.plan import Overrides, Plan, resolve
 from rig.cli import proofs, space
-from rig.cli.proofs import PlanProof, cache_folder, proved
+from rig.cli.proofs import PlanProof, proved
 from rig.cli.protocol_run import ProtocolJob, run_protocol
 from rig.cli.twin_choice import TwinSource
 from rig.model.parse import InputError
 from rig.model.rig import Rig
+from rig.runs.files import CACHE_VARIABLE, cache_folder
 from rig.runs.rigs import load_rig
 from tests.cli.bench import ROOT, SHORT, bramah
-from tests.conftest import CACHE_VARIABLE
 
 RIG = "shinshu-2dof"
 
@@ -35,7 +35,7 @@ def rig() -> Rig:
 @pytest.fixture(autouse=True)
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A cache of the test's own, with the equations that earlier tests compiled."""
-    rates = cache_folder().parent / "rates"
+    rates = cache_folder() / "rates"
     own = tmp_path / "cache"
     own.mkdir()
     if rates.is_dir():

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import CACHE_VARIABLE
+from rig.runs.files import CACHE_VARIABLE
 from tests.variants import kept
 
 HEAVY = (

@@ -82,7 +82,7 @@ def test_noise_is_no_frame_and_takes_no_memory(noise: list[bytes]) -> None:
     decoder = FrameDecoder()
     for data in noise:
         assert decoder.feed(data) == []
-        assert len(decoder._begun) <= MAX_ENCODED
+        assert len(decoder._partial) <= MAX_ENCODED
     whole = WireFrame(1, 2, 3, b"after noise")
     assert decoder.feed(encode_frame(whole)) == [whole]
     assert decoder.received == sum(map(len, noise)) + len(encode_frame(whole))

@@ -18,7 +18,7 @@ from drivers.conformance import (
     Subject,
     run,
 )
-from drivers.in_process import ActiveLaw, InProcessDriver, over
+from drivers.in_process import ActiveLaw, Advancing, InProcessDriver
 from rig.model.rig import Rig
 from tests.hil_sim.integrator import IntegratorPlant, seed_rig
 
@@ -29,6 +29,10 @@ BARE = Capabilities(latches_trips=False, refuses_other_rigs=False)
 def imported(path: str = MAKE) -> InProcessDriver:
     rig = seed_rig()
     return InProcessDriver(rig.wire.reached_by("in-process", {"object": path}), rig)
+
+
+def over(made: Advancing, rig: Rig) -> InProcessDriver:
+    return InProcessDriver(rig.wire.reached_by("in-process", {}), rig, make=lambda _: made)
 
 
 class Straight:

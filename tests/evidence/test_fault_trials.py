@@ -12,11 +12,11 @@ from hil_sim.faults.base import Fault
 from rig.cli.bench.faults.bench import FaultBench, fault_bench
 from rig.cli.bench.faults.figures import RIG, counted, jobs
 from rig.cli.bench.faults.trials import (
-    Naming,
+    Diagnosis,
     TrialOutcome,
+    diagnosis,
     example,
     kinds,
-    naming,
     try_fault,
     wires,
 )
@@ -41,25 +41,25 @@ def bench() -> Iterator[FaultBench]:
 
 
 @pytest.mark.parametrize(
-    ("wire", "fault", "naming", "says"),
+    ("wire", "fault", "diagnosis", "message"),
     [
-        ("modbus-tcp", "sensor_stuck", Naming.NAMED, "cap_pressure_1 of joint 1"),
-        ("modbus-tcp", "link_closed", Naming.NAMED, "closed the connection"),
-        ("modbus-rtu", "queue_overrun", Naming.COUNTED, ""),
-        ("serial", "reboots", Naming.NAMED, "has restarted"),
-        ("serial", "frame_duplicated", Naming.HARMLESS, ""),
-        ("can", "frame_lost", Naming.HARMLESS, ""),
-        ("can-slcan", "link_closed", Naming.NAMED, "has gone"),
+        ("modbus-tcp", "sensor_stuck", Diagnosis.NAMED, "cap_pressure_1 of joint 1"),
+        ("modbus-tcp", "link_closed", Diagnosis.NAMED, "closed the connection"),
+        ("modbus-rtu", "queue_overrun", Diagnosis.COUNTED, ""),
+        ("serial", "reboots", Diagnosis.NAMED, "has restarted"),
+        ("serial", "frame_duplicated", Diagnosis.HARMLESS, ""),
+        ("can", "frame_lost", Diagnosis.HARMLESS, ""),
+        ("can-slcan", "link_closed", Diagnosis.NAMED, "has gone"),
     ],
 )
 def test_a_session_meets_a_fault_ends_safe_and_keeps_every_block(
-    bench: FaultBench, tmp_path: Path, wire: str, fault: str, naming: Naming, says: str
+    bench: FaultBench, tmp_path: Path, wire: str, fault: str, diagnosis: Diagnosis, message: str
 ) -> None:
     found = try_fault(bench, patient_rig(), wire, fault, tmp_path, 3, realtime=False)
-    assert (found.naming, found.zeroed, found.lost_blocks) == (naming, True, 0)
+    assert (found.diagnosis, found.zeroed, found.lost_blocks) == (diagnosis, True, 0)
     assert found.blocks > 60
     assert found.struck >= 1
-    assert says in found.says
+    assert message in found.message
     assert (found.missing == 30) == (fault == "queue_overrun")
 
 
@@ -110,52 +110,52 @@ def trip(limit: str, joint: int | None, channel: str) -> SafetyTrip:
 @pytest.mark.parametrize(
     ("fault", "error", "expected"),
     [
-        ("sensor_stuck", trip("frozen sensor", 1, "cap_pressure_1"), Naming.NAMED),
-        ("sensor_stuck", trip("frozen sensor", 2, "cap_pressure_2"), Naming.WRONG),
-        ("sensor_stuck", DeviceLost("gone"), Naming.WRONG),
-        ("sensor_drift", None, Naming.UNNOTICED),
-        ("sensor_drift", trip("stale data", None, ""), Naming.UNKNOWN),
-        ("pump_off", trip("sample gap", None, ""), Naming.UNKNOWN),
-        ("valve_stuck", trip("piston", 1, "piston_1"), Naming.NAMED),
-        ("pump_off", trip("supply pressure", None, "supply_pressure"), Naming.NAMED),
-        ("hose_burst", trip("supply pressure", None, "supply_pressure"), Naming.UNKNOWN),
-        ("frame_lost", None, Naming.HARMLESS),
-        ("frame_lost", DeviceLost("the device has not answered"), Naming.NAMED),
-        ("frame_lost", trip("stale data", None, ""), Naming.UNKNOWN),
-        ("bits_flipped", trip("pressure rate", 1, "cap_pressure_1"), Naming.WRONG),
-        ("reboots", DeviceLost("the device has restarted"), Naming.NAMED),
-        ("reboots", DeviceLost("closed the connection"), Naming.UNKNOWN),
-        ("clock_jump", DeviceError("impossible block: ..."), Naming.NAMED),
+        ("sensor_stuck", trip("frozen sensor", 1, "cap_pressure_1"), Diagnosis.NAMED),
+        ("sensor_stuck", trip("frozen sensor", 2, "cap_pressure_2"), Diagnosis.WRONG),
+        ("sensor_stuck", DeviceLost("gone"), Diagnosis.WRONG),
+        ("sensor_drift", None, Diagnosis.UNNOTICED),
+        ("sensor_drift", trip("stale data", None, ""), Diagnosis.UNKNOWN),
+        ("pump_off", trip("sample gap", None, ""), Diagnosis.UNKNOWN),
+        ("valve_stuck", trip("piston", 1, "piston_1"), Diagnosis.NAMED),
+        ("pump_off", trip("supply pressure", None, "supply_pressure"), Diagnosis.NAMED),
+        ("hose_burst", trip("supply pressure", None, "supply_pressure"), Diagnosis.UNKNOWN),
+        ("frame_lost", None, Diagnosis.HARMLESS),
+        ("frame_lost", DeviceLost("the device has not answered"), Diagnosis.NAMED),
+        ("frame_lost", trip("stale data", None, ""), Diagnosis.UNKNOWN),
+        ("bits_flipped", trip("pressure rate", 1, "cap_pressure_1"), Diagnosis.WRONG),
+        ("reboots", DeviceLost("the device has restarted"), Diagnosis.NAMED),
+        ("reboots", DeviceLost("closed the connection"), Diagnosis.UNKNOWN),
+        ("clock_jump", DeviceError("impossible block: ..."), Diagnosis.NAMED),
     ],
 )
 def test_a_message_is_judged_by_what_was_done(
-    fault: str, error: Exception | None, expected: Naming
+    fault: str, error: Exception | None, expected: Diagnosis
 ) -> None:
-    assert naming(example(fault), TrialOutcome(fault, "serial", error=error)) == expected
+    assert diagnosis(example(fault), TrialOutcome(fault, "serial", error=error)) == expected
 
 
 @pytest.mark.parametrize(
     ("channel", "joint", "expected"),
-    [("cap_pressure_1", 1, Naming.NAMED), ("cap_pressure_2", 2, Naming.WRONG)],
+    [("cap_pressure_1", 1, Diagnosis.NAMED), ("cap_pressure_2", 2, Diagnosis.WRONG)],
 )
 def test_a_warning_counts_as_noticing_and_is_judged_like_a_trip(
-    channel: str, joint: int, expected: Naming
+    channel: str, joint: int, expected: Diagnosis
 ) -> None:
     alarm = Alarm(
         check="noisy sensor", channel=channel, joint=joint, value=2.0, limit=(None, 1.0),
         unit="Pa", tick=5, time=1.5, sentence="A sensor is noisy.", remedy="", trips=False,
     )  # fmt: skip
     outcome = TrialOutcome("sensor_noise", "serial", alarm=alarm)
-    assert naming(example("sensor_noise"), outcome) == expected
-    assert outcome.says == "warning: A sensor is noisy."
+    assert diagnosis(example("sensor_noise"), outcome) == expected
+    assert outcome.message == "warning: A sensor is noisy."
 
 
 def test_a_missed_number_shows_in_the_figures() -> None:
     good = TrialOutcome(
-        "sensor_stuck", "serial", struck=1, seconds=0.3, blocks=9, naming=Naming.NAMED
+        "sensor_stuck", "serial", struck=1, seconds=0.3, blocks=9, diagnosis=Diagnosis.NAMED
     )
     bad = TrialOutcome("frame_lost", "serial", struck=4, blocks=9, lost_blocks=1, zeroed=False)
-    late = TrialOutcome("valve_stuck", "serial", struck=1, seconds=2.5, naming=Naming.NAMED)
+    late = TrialOutcome("valve_stuck", "serial", struck=1, seconds=2.5, diagnosis=Diagnosis.NAMED)
     figures = {figure.name: figure for figure in counted([good, bad, late])}
     assert not figures["outputs left on"].ok
     assert not figures["of them not in records.h5"].ok

@@ -19,7 +19,7 @@ from hil_sim.device.lifetime import EndpointError
 from hil_sim.faults import CLASSES
 from hil_sim.faults.wire import TO_DEVICE, TO_HOST, Carrier, End, WireFault
 from hil_sim.link import frames
-from hil_sim.link.way import QUIET, Striker, Way
+from hil_sim.link.way import QUIET, FaultInjector, Way
 from hil_sim.link.wires import WIRES, faulty_link
 from rig.cli.simulator import wire_faults
 from rig.model.parse import InputError
@@ -40,8 +40,8 @@ class Line:
     """One way with a clock in hand."""
 
     def __init__(self, *faults: WireFault, seed: int = 1) -> None:
-        self.striker = Striker(TO_HOST, faults, (seed,))
-        self.way = Way(self.striker, frames.between_zeros)
+        self.injector = FaultInjector(TO_HOST, faults, (seed,))
+        self.way = Way(self.injector, frames.between_zeros)
         self.now = self.seconds = 0.0
 
     def send(self, data: bytes) -> list[bytes]:
@@ -126,7 +126,7 @@ def test_a_fault_strikes_in_its_time_its_share_and_its_way_only() -> None:
     half = Line(fault("frame_lost", probability=0.5))
     came = sum(len(half.send(message(1))) for _ in range(1000))
     assert 430 < came < 570
-    assert half.striker.counts["frame_lost"] == 1000 - came
+    assert half.injector.counts["frame_lost"] == 1000 - came
     again = Line(fault("frame_lost", probability=0.5))
     assert sum(len(again.send(message(1))) for _ in range(1000)) == came
 
@@ -188,12 +188,12 @@ def test_what_an_adapter_says_of_itself_is_no_traffic_of_the_bus(is_frame, talk,
 
 def test_a_fault_strikes_the_frames_of_a_can_bus_and_not_the_adapters_talk() -> None:
     framing = WIRES["can"].framing
-    striker = Striker(TO_HOST, [fault("frame_lost")], (1,), Carrier.CAN)
-    way = Way(striker, framing.to_host, framing.on_wire, framing.error_of)
+    injector = FaultInjector(TO_HOST, [fault("frame_lost")], (1,), Carrier.CAN)
+    way = Way(injector, framing.to_host, framing.on_wire, framing.error_of)
     frame = b"< frame 080 1.500000 A501 >"
     assert way.take(b"< hi >< ok >" + frame + b"< ok >", 0.0, 0.0) == 1
     assert [piece.data for piece in way.due(0.0)] == [b"< hi >", b"< ok >", b"< ok >"]
-    assert striker.counts == {"frame_lost": 1}
+    assert injector.counts == {"frame_lost": 1}
 
 
 def test_a_damaged_frame_of_a_can_bus_is_an_error_frame_or_nothing_and_never_a_frame() -> None:
@@ -203,8 +203,8 @@ def test_a_damaged_frame_of_a_can_bus_is_an_error_frame_or_nothing_and_never_a_f
         ("can-slcan", b"t0802A501\r", []),  # its text has no word for error frames
     ):
         framing = WIRES[wire].framing
-        striker = Striker(TO_HOST, [fault("bits_flipped")], (1,), Carrier.CAN)
-        way = Way(striker, framing.to_host, framing.on_wire, framing.error_of)
+        injector = FaultInjector(TO_HOST, [fault("bits_flipped")], (1,), Carrier.CAN)
+        way = Way(injector, framing.to_host, framing.on_wire, framing.error_of)
         way.take(text, 0.0, 0.0)
         assert [piece.data for piece in way.due(0.0)] == arrives
     read = convert_ascii_message_to_can_message("< error 00000088 1.500000 >")

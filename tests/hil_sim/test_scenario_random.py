@@ -9,7 +9,7 @@ import pytest
 from hil_sim.effects import CLASSES
 from hil_sim.plant.plant import Law, Plant
 from hil_sim.scenario.file import Scenario
-from hil_sim.scenario.random_draw import STRANGERS, draw
+from hil_sim.scenario.random_draw import NO_FORMULA_EFFECTS, draw
 from rig.model.rig import Rig
 from rig.runs.rigs import load_rig
 
@@ -39,7 +39,7 @@ def test_all_kinds_come_up_and_every_place_with_them(rig: Rig) -> None:
 def test_sizes_stay_within_what_such_a_bench_shows(rig: Rig) -> None:
     ranges = [
         (kind.effect_name(), key, low, high)
-        for kind, sizes in (*((c, c.sizes) for c in CLASSES), *STRANGERS)
+        for kind, sizes in (*((c, c.sizes) for c in CLASSES), *NO_FORMULA_EFFECTS)
         for key, (low, high) in sizes.items()
     ]
     for seed in range(300):

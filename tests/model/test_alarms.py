@@ -16,7 +16,6 @@ from rig.model.alarms.states import (
     acknowledged,
     folded,
     raised,
-    reset,
     returned,
 )
 from rig.model.parse import InputError
@@ -54,19 +53,12 @@ def test_a_warning_that_comes_again_must_be_seen_again() -> None:
     assert one.time == 1.0  # since when it has been standing
 
 
-def test_a_trip_is_reset_only_after_it_was_acknowledged_and_with_a_reason() -> None:
+def test_a_trip_stays_whatever_the_value_and_though_it_was_acknowledged() -> None:
     table = raised(AlarmTable(), alarm("piston", trips=True))
     key = "piston: piston_1"
     assert states_of(returned(table, key)) == [AlarmState.LATCHED]
-    with pytest.raises(ValueError, match="acknowledge it first"):
-        reset(table, key, "hose replaced")
     table = acknowledged(table, key)
-    assert states_of(table) == [AlarmState.LATCHED]
-    with pytest.raises(ValueError, match="needs a reason"):
-        reset(table, key, "  ")
-    assert states_of(reset(table, key, "hose replaced")) == []
-    with pytest.raises(KeyError, match="is latched"):
-        reset(AlarmTable(), key, "why not")
+    assert states_of(table) == states_of(returned(table, key)) == [AlarmState.LATCHED]
 
 
 def test_the_first_cause_stands_above_what_follows_from_it() -> None:
@@ -104,7 +96,7 @@ def test_a_trip_takes_the_place_of_its_own_warning() -> None:
 
 ACTS = st.lists(
     st.tuples(
-        st.sampled_from(["raise", "trip", "return", "acknowledge", "reset"]),
+        st.sampled_from(["raise", "trip", "return", "acknowledge"]),
         st.sampled_from(["piston", "lock", "pressure"]),
         st.integers(1, 2),
     ),
@@ -133,9 +125,6 @@ def test_no_order_of_events_loses_a_latched_trip_or_shows_an_alarm_twice(
             table = returned(table, key)
         elif act == "acknowledge" and table.get(key):
             table = acknowledged(table, key)
-        elif act == "reset" and (one := table.get(key)) and one.trips and one.acknowledged:
-            table = reset(table, key, "looked at")
-            latched.discard(key)
         keys = [one.key for one in table.alarms]
         assert len(keys) == len(set(keys))
         assert {one.key for one in table.alarms if one.trips} == latched

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from protocols.design.check import check
-from protocols.design.check_report import CheckReport, worst
+from protocols.design.check_report import CheckReport
 from protocols.files.library import load
 from protocols.files.plan import Overrides, resolve
 from protocols.language.waveforms import Array
@@ -92,13 +92,6 @@ def test_a_supply_that_will_sag_is_a_note_and_no_refusal(rig: Rig) -> None:
     report = check(resolve(load("validate"), weak, Overrides(steps=("both_1hz",))), weak, twin)
     assert report.ok
     assert any("pump flow" in note and "L/min" in note for note in report.notes)
-
-
-def test_the_tightest_line_of_each_step_is_found(rig: Rig) -> None:
-    report = check(resolve(load("lock-and-excite"), rig), rig, twin)
-    tightest = dict(worst(report))
-    assert set(tightest) == {"step1", "step2", "step3"}
-    assert all(line.quantity == "piston" for line in tightest.values())
 
 
 def test_the_report_is_json(rig: Rig) -> None:

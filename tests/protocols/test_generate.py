@@ -10,7 +10,7 @@ import pytest
 from analysis.simulation.twin import simulate_commands
 from protocols.design.candidates import candidates
 from protocols.design.check import check
-from protocols.design.generate import Generated, generate, prove
+from protocols.design.generate import GeneratedProtocol, generate, prove
 from protocols.design.validation_steps import validation
 from protocols.files import library
 from protocols.files.plan import resolve
@@ -28,7 +28,7 @@ def rig() -> Rig:
 
 
 @pytest.fixture(scope="module")
-def generated(rig: Rig) -> Generated:
+def generated(rig: Rig) -> GeneratedProtocol:
     return generate(rig, predictor(), "mine")
 
 
@@ -37,7 +37,7 @@ def part(protocol: Protocol, *names: str) -> Protocol:
     return protocol.model_copy(update={"steps": kept})
 
 
-def test_two_joints_get_the_papers_three_steps(generated: Generated) -> None:
+def test_two_joints_get_the_papers_three_steps(generated: GeneratedProtocol) -> None:
     assert [reason.description for reason in generated.proof.reasons] == [
         "excite joint 2; joint 1 closed at 0 mm",
         "excite joint 1; joint 2 at end_min",
@@ -51,7 +51,7 @@ def test_two_joints_get_the_papers_three_steps(generated: Generated) -> None:
 
 
 def test_what_was_generated_keeps_the_rigs_limits_and_survives_its_file(
-    generated: Generated, rig: Rig, tmp_path: Path
+    generated: GeneratedProtocol, rig: Rig, tmp_path: Path
 ) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text(protocol_text(generated.protocol, "Two\nlines"), encoding="utf-8")
@@ -76,7 +76,7 @@ def test_one_joint_needs_one_step() -> None:
 
 
 def test_a_protocol_that_leaves_parameters_open_names_them_and_the_step_that_helps(
-    generated: Generated, rig: Rig
+    generated: GeneratedProtocol, rig: Rig
 ) -> None:
     proof = prove(part(generated.protocol, "step1", "step2"), rig, predictor())
     verdict = proof.verdicts["mechanical"]

@@ -42,7 +42,7 @@ def test_a_night_ends_with_each_item_in_a_named_state_and_a_reason(night: Night)
     with QueueStore(night.path) as store:
         assert [item.id for item in store.items()] == [1, 2, 3, 4, 5, 6]
     assert [night.starts(k) for k in range(1, 7)] == [1, 1, 0, 0, 1, 1]
-    assert night.item(1).found["parameters"]["b"]["value"] == 2.0
+    assert night.item(1).results["parameters"]["b"]["value"] == 2.0
     assert night.run().ended == ()
 
 

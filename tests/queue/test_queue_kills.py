@@ -76,7 +76,7 @@ def test_an_item_without_a_runner_can_be_cancelled_all_the_same(night: Night) ->
     assert night.states() == ["cancelled"]
 
 
-@pytest.mark.parametrize("place", ["claim", "begin", "note_process", "finish", "keep_found"])
+@pytest.mark.parametrize("place", ["claim", "begin", "note_process", "finish", "keep_results"])
 @pytest.mark.parametrize("after", kept([False, True], (1,)))
 def test_killed_at_each_of_its_steps_the_next_runner_carries_on(
     night: Night, place: str, after: bool, monkeypatch: pytest.MonkeyPatch
@@ -92,7 +92,7 @@ def test_killed_at_each_of_its_steps_the_next_runner_carries_on(
     assert states[1] == "done"
     assert night.starts(1) <= 1
     assert night.starts(2) == 1
-    if place in ("claim", "finish", "keep_found") or (place, after) == ("begin", False):
+    if place in ("claim", "finish", "keep_results") or (place, after) == ("begin", False):
         assert states[0] == "done"
     elif place == "begin":  # the moment between the note and the process: it never began
         assert states[0] == "interrupted"

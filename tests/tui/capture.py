@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from rig.tui.browse import Browsed
+from rig.tui.browse import BrowserState
 from rig.tui.run_log import read_log
 from rig.tui.run_trace import read_trace
 from tests.tui.glass import Machine, Recorded, endpoint, glass
@@ -37,13 +37,13 @@ def machine(*, trip: bool = False) -> Machine:
     return Machine({endpoint(): record})
 
 
-def recorded_run() -> Browsed:
+def recorded_run() -> BrowserState:
     """Return what was read of a run that is over: its log and its trace."""
     with tempfile.TemporaryDirectory() as folder:
         path = run_folder(Path(folder) / "run")
         log, trace = read_log(path), read_trace(path)
     run = Path("runs/2024-05-17-lock-and-excite")
-    return Browsed(
+    return BrowserState(
         log=replace(log, folder=run), trace=replace(trace, folder=run, path=run / "trace.json")
     )
 

@@ -13,7 +13,7 @@ from rig.tui.drawing.braille import (
     Scale,
     curve_dots,
     decimate,
-    plot,
+    level_dots,
     scale_around,
     to_cells,
     to_text,
@@ -39,7 +39,10 @@ def line_of(
     values: list[float], height: int = 1, limits: tuple[float | None, ...] = ()
 ) -> list[str]:
     array = np.array(values)
-    return plot(array, array, height, UNIT, limits)
+    levels = [
+        level_dots(level, len(array), 4 * height, UNIT) for level in limits if level is not None
+    ]
+    return to_text(np.logical_or.reduce([curve_dots(array, array, 4 * height, UNIT), *levels]))
 
 
 def test_a_constant_is_a_level_line() -> None:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from rig.runs.store import create_run
 from rig.tui.acting import starts
-from rig.tui.browse import Browsed
+from rig.tui.browse import BrowserState
 from rig.tui.following.link import Frame
 from rig.tui.look import PlotView
 from rig.tui.pages.trace import run_trace_page
@@ -175,7 +175,7 @@ def test_a_trace_without_curves_and_with_gaps_is_drawn(tmp_path: Path) -> None:
     folder = run_folder(tmp_path / "run")
     for stored in (data, data | {"free_run": None, "effects": []}):
         (folder / "trace.json").write_text(json.dumps(stored))
-        browsed = Browsed(trace=read_trace(folder))
+        browsed = BrowserState(trace=read_trace(folder))
         view = PlotView(Frame(), Frame(), 0.0, browsed=browsed)
         for width, height in (*SIZES, (60, 10)):
             assert len(run_trace_page(view, width, height)) == height

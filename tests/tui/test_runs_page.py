@@ -16,7 +16,7 @@ from rig.queue.store import QueueStore
 from rig.runs.store import create_run
 from rig.tui import jobs
 from rig.tui.app import Monitor
-from rig.tui.browse import Browsed, read_disk
+from rig.tui.browse import BrowserState, read_disk
 from rig.tui.jobs import VerbJob
 from tests.services.children import RIG
 from tests.tui.glass import Clock, Glass, Machine, Recorded, endpoint
@@ -69,7 +69,7 @@ class Office:
 
     def __init__(self, folder: Path, machine: Machine | None = None) -> None:
         self.clock = Clock()
-        browsed = Browsed(folder=folder, rig="shinshu-2dof")
+        browsed = BrowserState(folder=folder, rig="shinshu-2dof")
         self.app = Monitor(None, machine or Machine(), self.clock, threaded=False, browsed=browsed)
 
     async def opened(self, shown: Glass, tab: int = 0) -> None:
@@ -117,7 +117,7 @@ async def test_runs_protocols_and_the_queue_are_listed_and_a_corrupt_run_is_a_se
 
 
 def test_a_folder_that_is_not_there_is_a_sentence(tmp_path: Path) -> None:
-    found = read_disk(Browsed(folder=tmp_path / "nowhere"))
+    found = read_disk(BrowserState(folder=tmp_path / "nowhere"))
     assert "nowhere" in found.trouble
     assert "\n" not in found.trouble
     assert found.protocols
@@ -127,7 +127,7 @@ def test_the_folders_own_protocols_are_listed_before_the_shipped_ones(tmp_path: 
     (tmp_path / "evening.yaml").write_text("version: 2\nname: evening\nsteps:\n  - hold: 1 s\n")
     (tmp_path / "arm.yaml").write_text("name: arm\nnote: {steps: none}\n")
     (tmp_path / "gone.yaml").symlink_to(tmp_path / "nowhere")
-    found = read_disk(Browsed(folder=tmp_path)).protocols
+    found = read_disk(BrowserState(folder=tmp_path)).protocols
     assert found[0] == str(tmp_path / "evening.yaml")
     assert found[1:] == shipped_names()
 

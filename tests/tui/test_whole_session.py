@@ -15,7 +15,7 @@ from rig.bench.screens.sockets import Snapshot
 from rig.runs.rigs import load_rig
 from rig.runs.runstate import read_events
 from rig.tui.app import Monitor
-from rig.tui.browse import Browsed
+from rig.tui.browse import BrowserState
 from tests.cli.bench import SHORT, simulated
 
 RIG = "shinshu-2dof"
@@ -87,7 +87,7 @@ class Session:
 
 
 def screen(folder: Path, endpoint: str) -> Monitor:
-    return Monitor(None, browsed=Browsed(folder=folder, rig=RIG, endpoint=endpoint))
+    return Monitor(None, browsed=BrowserState(folder=folder, rig=RIG, endpoint=endpoint))
 
 
 @pytest.mark.timeout(PATIENCE)

@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Drawn:
+class BootstrapScatter:
     """Bootstrapped standard error (k,) and the 95 % interval's ends (k,) in rows' coefficients."""
 
     std: Array
@@ -35,7 +35,7 @@ def bootstrap(
     estimate: Callable[[Sequence[RepeatBlock]], Array],
     draws: int,
     rng: np.random.Generator,
-) -> Drawn:
+) -> BootstrapScatter:
     """Return the scatter of `estimate` over `draws` resampled sets of blocks."""
     value = estimate(blocks)
     drawn = np.array([estimate(_resampled(blocks, rng)) for _ in range(draws)])
@@ -46,7 +46,7 @@ def bootstrap(
         stretch *= stdtrit(dof, 0.975) / ndtri(0.975)
     low, high = np.quantile(drawn, (0.025, 0.975), axis=0) - value
     std = np.sqrt(n / max(n - 1, 1)) * drawn.std(axis=0, ddof=1)
-    return Drawn(std, value + stretch * low, value + stretch * high)
+    return BootstrapScatter(std, value + stretch * low, value + stretch * high)
 
 
 def _units(blocks: Sequence[RepeatBlock]) -> dict[tuple[int, str], list[tuple[int, int]]]:

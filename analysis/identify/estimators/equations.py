@@ -49,7 +49,7 @@ class RepeatBlock:
 
 
 @dataclass(frozen=True)
-class Prepared:
+class FamilyBlocks:
     """A family's blocks, nuisance columns last, with the names of all columns."""
 
     family: str
@@ -73,16 +73,14 @@ class EquationFit:
         return [b.y - b.X @ self.beta for b in self.blocks]
 
 
-def segments(
-    time: Array, period: float, segments_wanted: int = IDENTIFY.period_segments
-) -> Indices:
+def segments(time: Array, period: float) -> Indices:
     """Return which part of the excitation's period each row (m,) lies in.
 
     Without a period [s] (0) the record itself is cut. Rows of the same part of later periods
     belong together: what the model lacks comes back there.
     """
     span = period if period > 0 else float(time[-1] - time[0]) + 1e-9 if len(time) else 1.0
-    count = int(np.clip(span / IDENTIFY.shortest_segment, 1, segments_wanted))
+    count = int(np.clip(span / IDENTIFY.shortest_segment, 1, IDENTIFY.period_segments))
     place = (time - (0.0 if period > 0 else time[0] if len(time) else 0.0)) / span
     return np.asarray(np.floor((place % 1.0) * count), dtype=np.int64)
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.identify.estimators.covariance import CovarianceParts
-from analysis.identify.estimators.equations import EquationFit, Prepared
+from analysis.identify.estimators.equations import EquationFit, FamilyBlocks
 from analysis.identify.estimators.instruments import Hausman
 from analysis.identify.settings import IDENTIFY
 from analysis.regression.solve import half_width
@@ -54,7 +54,7 @@ class Shift:
 
 
 def shifts_of(
-    prepared: Sequence[Prepared],
+    prepared: Sequence[FamilyBlocks],
     tests: Mapping[str, Hausman],
     reference: Mapping[str, tuple[Array, CovarianceParts, EquationFit]],
 ) -> list[Shift]:
@@ -79,7 +79,7 @@ def shifts_of(
     return shifts
 
 
-def certain_shift(test: Hausman, p: Prepared) -> Array:
+def certain_shift(test: Hausman, p: FamilyBlocks) -> Array:
     """Return least squares minus instruments (k,) of the family's parameters, 0 where chance."""
     return np.where(test.certain, test.difference, 0.0)[: p.parameters]
 

@@ -75,7 +75,7 @@ class SearchOptions:
 class SearchWindow:
     """A stretch of the record: where it starts, the state there, what was measured by channel.
 
-    `here` (samples,) is false where a sample was lost and nothing is compared.
+    `valid` (samples,) is false where a sample was lost and nothing is compared.
     """
 
     first: int
@@ -83,7 +83,7 @@ class SearchWindow:
     start: State
     measured: Mapping[str, Array]
     spread: Mapping[str, float]
-    here: Mask
+    valid: Mask
 
 
 @dataclass(frozen=True)
@@ -156,10 +156,10 @@ def make_task(
     windows = []
     for first in np.unique(np.linspace(reach, reach + room, options.windows).astype(int)):
         measured = {name: channels[name][first : first + length] for name in shown}
-        here = every[first : first + length]
-        spread = {n: float(here.sum() * y[here].var()) for n, y in measured.items()}
+        valid = every[first : first + length]
+        spread = {n: float(valid.sum() * y[valid].var()) for n, y in measured.items()}
         start = state_at(signals, int(first))
-        windows.append(SearchWindow(int(first), length, start, measured, spread, here))
+        windows.append(SearchWindow(int(first), length, start, measured, spread, valid))
     return SearchTask(
         record.name, model, names, nominal / options.factor, nominal * options.factor,
         drive, tuple(windows),
@@ -198,7 +198,7 @@ def with_values(model: Model, values: Mapping[str, float]) -> Model:
 
 
 def score(task: SearchTask, values: Mapping[str, float]) -> Score:
-    """Simulate a candidate over all windows and return its error and its fate."""
+    """Simulate a candidate over all windows and return its error and its status."""
     ready = compiled(with_values(task.model, values), Effort.FIT)
     total, lost, samples, fate = 0.0, 0, 0, ""
     for window in task.windows:
@@ -215,7 +215,7 @@ def score(task: SearchTask, values: Mapping[str, float]) -> Score:
         elif not fate:
             channels = simulated.channels()
             for name, y in window.measured.items():
-                off = (y - channels[name])[window.here]
+                off = (y - channels[name])[window.valid]
                 total += float(np.sum(off**2)) / window.spread[name]
     if fate:
         return Score(IDENTIFY.dead_error * (1.0 + lost / samples), fate)

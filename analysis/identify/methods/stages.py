@@ -156,14 +156,11 @@ def _solve_rest(
     T[:k, -1] = [-known[name].value if name in known else 0.0 for name in names]
     T[k, -1] = 1.0
     clusters = [
-        replace(c, triangle=triangle(*_split(c.triangle @ T))) for s in stages for c in s.clusters
-    ]
+        replace(c, triangle=triangle(rows[:, :-1], rows[:, -1]))
+        for s in stages for c in s.clusters for rows in (c.triangle @ T,)
+    ]  # fmt: skip
     noise = sum((T.T @ s.noise @ T for s in stages), np.zeros((len(free) + 1,) * 2))
     return solve([names[i] for i in free], clusters, noise, reject_noise)
-
-
-def _split(rows: Array) -> tuple[Array, Array]:
-    return rows[:, :-1], rows[:, -1]
 
 
 def as_solution(outcome: StageOutcome, values: Mapping[str, StageValue]) -> Solution:

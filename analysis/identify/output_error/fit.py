@@ -12,7 +12,6 @@ Schloeder; Ljung, System Identification (1999), section 3.6.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -23,7 +22,7 @@ from analysis.identify.checks import Check
 from analysis.identify.estimators import nuisance as nu
 from analysis.identify.estimators.covariance import CovarianceParts, spread
 from analysis.identify.estimators.equations import Pieces
-from analysis.identify.output_error.window_data import Reduced
+from analysis.identify.output_error.window_data import ReducedWindow
 from analysis.identify.output_error.windows import Windows
 from analysis.identify.settings import IDENTIFY
 from analysis.regression.least_squares import scaled_inverse
@@ -34,7 +33,6 @@ from rig.model.records import Run
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -112,9 +110,9 @@ class Search:
         theta: Array,
         starts: list[Array],
         sigma: dict[int, Array],
-        reduced: list[Reduced | None],
+        reduced: list[ReducedWindow | None],
         step: Array,
-    ) -> tuple[Array, list[Array], list[Reduced | None], bool]:
+    ) -> tuple[Array, list[Array], list[ReducedWindow | None], bool]:
         """Take the step, halved until the cost falls."""
         before = sum(r.cost for r in reduced if r is not None)
         for halving in range(IDENTIFY.fit_halvings):
@@ -132,7 +130,7 @@ class Search:
                 return new_theta, new_starts, new, True
         return theta, starts, reduced, False
 
-    def _step(self, theta: Array, reduced: Sequence[Reduced | None]) -> tuple[Array, Array]:
+    def _step(self, theta: Array, reduced: Sequence[ReducedWindow | None]) -> tuple[Array, Array]:
         good = [r for r in reduced if r is not None]
         if not good:
             raise InputError(
@@ -149,7 +147,7 @@ class Search:
         return inverse @ g, inverse
 
     def _refined(
-        self, reduced: Sequence[Reduced | None], sigma: dict[int, Array]
+        self, reduced: Sequence[ReducedWindow | None], sigma: dict[int, Array]
     ) -> dict[int, Array]:
         """Return each step's scatter of the outputs as the first fit left it."""
         out = {}
@@ -164,7 +162,7 @@ class Search:
         return out
 
     def _result(
-        self, theta: Array, reduced: Sequence[Reduced | None], rounds: int, moved: float
+        self, theta: Array, reduced: Sequence[ReducedWindow | None], rounds: int, moved: float
     ) -> OutputErrorFit:
         _, inverse = self._step(theta, reduced)
         pairs = [(s, r) for s, r in zip(self.placed, reduced, strict=True) if r is not None]

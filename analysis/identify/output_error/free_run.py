@@ -14,7 +14,6 @@ Identification (1999), section 3.6; Janot, Vandanjon and Gautier (2014), DIDIM, 
 from __future__ import annotations
 
 import itertools
-import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -40,7 +39,6 @@ from rig.model.records import Run
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
-log = logging.getLogger(__name__)
 
 
 class _Record:

@@ -40,7 +40,7 @@ class WindowSource:
 
 
 @dataclass(frozen=True)
-class Reduced:
+class ReducedWindow:
     """A window after its start was eliminated: score, information, cost, and how to get back.
 
     `rest` is the cost that the best start leaves.
@@ -56,7 +56,7 @@ class Reduced:
 
 
 @dataclass(frozen=True)
-class Nudged:
+class PerturbedModel:
     """The model of one record: as it is, and `pars` (1 + k, parameters) with every nudge.
 
     `sizes` (k,) are the nudges, `hidden` the terms' own states (n, h) along the record for each.

@@ -17,7 +17,12 @@ from analysis.identify.output_error.shooting import (
     parts_of,
     shoot,
 )
-from analysis.identify.output_error.window_data import Nudged, PlacedWindow, Reduced, WindowSource
+from analysis.identify.output_error.window_data import (
+    PerturbedModel,
+    PlacedWindow,
+    ReducedWindow,
+    WindowSource,
+)
 from analysis.identify.settings import IDENTIFY
 from analysis.regression.conditioned import condition_runs
 from analysis.signals.conditioning import Mask
@@ -151,7 +156,7 @@ class Windows:
         moved[self._state_places(window)] += change
         return moved
 
-    def _nudged(self, theta: Array, source: WindowSource) -> Nudged:
+    def _nudged(self, theta: Array, source: WindowSource) -> PerturbedModel:
         """Compile the model with every parameter nudged, and find where its own states stand."""
         nudges = IDENTIFY.sensitivity_step * np.where(theta == 0.0, 1.0, np.abs(theta))
         if self.warm:
@@ -165,7 +170,7 @@ class Windows:
             hidden_paths(model, source.signals) if first.size and name in self.places else first
             for model, name in zip(models, ("", *self.names), strict=True)
         ]
-        return Nudged(ready[0], np.array([r.par for r in ready]), nudges, tuple(hidden))
+        return PerturbedModel(ready[0], np.array([r.par for r in ready]), nudges, tuple(hidden))
 
     def model(self, theta: Array, kelvin: float = 0.0) -> Model:
         """Return the model of parameters theta (k,), the oil `kelvin` above nominal."""
@@ -181,11 +186,11 @@ class Windows:
 
     def linearised(
         self, theta: Array, starts: Sequence[Array], sigma: Mapping[int, Array]
-    ) -> list[Reduced | None]:
+    ) -> list[ReducedWindow | None]:
         """Shoot every window with every nudge; None for one whose state ceased to exist."""
         ready = [self._nudged(theta, source) for source in self.sources]
 
-        def shot(k: int) -> Reduced | None:
+        def shot(k: int) -> ReducedWindow | None:
             window = self.placed[k]
             return self._window(window, starts[k], sigma[window.stratum], ready[window.record])
 
@@ -201,8 +206,8 @@ class Windows:
         return [reductions[k] for k in range(len(self.placed))]
 
     def _window(
-        self, window: PlacedWindow, start: Array, sigma: Array, nudged: Nudged
-    ) -> Reduced | None:
+        self, window: PlacedWindow, start: Array, sigma: Array, nudged: PerturbedModel
+    ) -> ReducedWindow | None:
         """Shoot one window with every nudge and eliminate its start."""
         ready, nudges = nudged.ready, nudged.sizes
         source = self.sources[window.record]
@@ -237,7 +242,7 @@ class Windows:
         Q, R = np.linalg.qr(Js)
         inner, outer = Q.T @ J, Q.T @ r
         left_J, left_r = J - Q @ inner, r - Q @ outer
-        return Reduced(
+        return ReducedWindow(
             left_J.T @ left_r, left_J.T @ left_J, float(r @ r), float(left_r @ left_r),
             np.linalg.solve(R, inner), np.linalg.solve(R, outer), residual,
         )  # fmt: skip

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import copy
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -53,14 +53,13 @@ class RowFeed:
         head: RecordHead,
         filtering: Filtering,
         families: Collection[str],
-        chunk: float = IDENTIFY.online_chunk,
     ) -> None:
         if not divisible(filtering):
             raise InputError("rows can only be made on-line by filters of finite length")
         N = len(rig.joints)
         self._rig, self._terms, self._head, self._filtering = rig, terms, head, filtering
         self._families = families
-        self._chunk = round(chunk * head.sample_rate)
+        self._chunk = round(IDENTIFY.online_chunk * head.sample_rate)
         self._spare = overlap(rig, head.sample_rate, filtering)
         self._locks = Locks(np.ones(N, dtype=bool), np.zeros(N))
         self._waiting: list[Mapping[str, Array]] = []
@@ -173,7 +172,7 @@ class _Filter:
         return float(np.exp((segment.time - self._time) / self._memory))
 
     def _fade(self, seconds: float) -> None:
-        """Forget, but hold up what has become too faint at the value it had."""
+        """Discount old rows, and keep a parameter with too little information at its value."""
         self._sum.fade(float(np.exp(-seconds / self._memory)))
         R = self._sum.triangle
         size, least = _norms(R), IDENTIFY.online_floor * self._peak
@@ -238,17 +237,15 @@ class Tracker:
     def __init__(
         self,
         rig: Rig,
-        terms: Sequence[Used] | None = None,
         memory: float = np.inf,
         families: Collection[str] | None = None,
-        filtering: Callable[[Record], Filtering] = default_filtering,
     ) -> None:
         if not memory > 0.0:
             raise InputError(f"a memory of {memory:g} s; expected more than 0")
-        used = tuple(terms) if terms is not None else tuple(map(Used, baseline_of(rig)))
         if families is None:  # what needs nothing of the locked joints, where there is such
             families = rig.families[-1:]
-        self._rig, self._filtering, self._families = rig, filtering, tuple(families)
+        self._rig, self._families = rig, tuple(families)
+        used = map(Used, baseline_of(rig))
         self._terms = tuple(term for term in used if self._concerns(term))
         names = {family: parameters_of(rig, self._terms, family) for family in families}
         self._kept = {family: _Filter(every, memory) for family, every in names.items()}
@@ -270,7 +267,7 @@ class Tracker:
         # Imported records all start at 0: then one follows the other.
         self._start = max(head.start, self._clock)
         self._head = head
-        filters = self._filtering(head.record({}))
+        filters = default_filtering(head.record({}))
         self._feed = RowFeed(self._rig, self._terms, head, filters, self._families)
         self._running = copy.deepcopy(self._kept)
 

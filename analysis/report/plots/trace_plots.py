@@ -73,17 +73,17 @@ def held_out(rig: Rig, holdout: Sequence[Run], result: Trace) -> dict[str, list[
     out: dict[str, list[ResidualSeries]] = {}
     families = tuple({family_of(e): None for e in result.before})
     for conditioned in conditioned_records(rig, holdout, families=families):
-        before = _left(rig, conditioned, result.rows_before)
-        after = _left(rig, conditioned, result.rows_after)
+        before = _residuals(rig, conditioned, result.rows_before)
+        after = _residuals(rig, conditioned, result.rows_after)
         for name, (rows, r) in before.items():
             later, q = after[name]
-            _, here, there = np.intersect1d(rows.time, later.time, return_indices=True)
-            part = Rows(name, rows.names, rows.matrix[here], rows.rhs[here], rows.time[here], 0)
-            out.setdefault(name, []).append(ResidualSeries(conditioned, part, r[here], q[there]))
+            _, i, j = np.intersect1d(rows.time, later.time, return_indices=True)
+            part = Rows(name, rows.names, rows.matrix[i], rows.rhs[i], rows.time[i], 0)
+            out.setdefault(name, []).append(ResidualSeries(conditioned, part, r[i], q[j]))
     return out
 
 
-def _left(
+def _residuals(
     rig: Rig, conditioned: ConditionedRecord, model: ExactFit
 ) -> dict[str, tuple[Rows, Array]]:
     built = model_rows(rig, model.terms, conditioned)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 from markupsafe import Markup
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 
 from analysis.report.format import fit
 from analysis.report.plots.style import GREY, INK, MODEL, figure, note, style, svg, thin
@@ -18,8 +17,6 @@ from analysis.simulation.validate import RecordValidation
 from rig.model import channels as ch
 from rig.model.records import Record
 from rig.model.rig import Rig
-
-Array = NDArray[np.float64]
 
 
 def shown_part(result: RecordValidation) -> slice:

@@ -25,7 +25,7 @@ logger = logging.getLogger(__name__)
 CHANNEL: Final = "can0"  # the bus's name behind socketcand
 _CHUNK = 65_536
 _MOST_UNSENT = 1 << 20  # [bytes] for a program that does not read; then frames are lost to it
-_MOST_BEGUN = 256  # [bytes] of a text that does not end
+_MOST_PARTIAL = 256  # [bytes] of a text that does not end
 _CLASSIC_RATES = {
     b"S0": 10_000,
     b"S1": 20_000,
@@ -48,7 +48,7 @@ class Adapter(Protocol):
 
     @property
     def free(self) -> bool:
-        """Whether somebody listens and what was sent so far is on its way."""
+        """Whether a program listens and what was sent so far has left."""
 
     @property
     def attended(self) -> bool:
@@ -69,9 +69,9 @@ class _Client:
 
     def __init__(self, end: socket.socket) -> None:
         self.end = end
-        self.raw = False  # past its greeting: it hears the bus
+        self.raw = False  # after its greeting: it receives the bus
         self.unsent = b""
-        self._begun = b""
+        self._partial = b""
 
     def lines(self) -> list[bytes] | None:
         """Return the texts between < and > that have come; None when the program has gone."""
@@ -83,9 +83,9 @@ class _Client:
             return None
         if not data:
             return None
-        *ended, self._begun = (self._begun + data).split(b">")
-        if len(self._begun) > _MOST_BEGUN:
-            self._begun = b""
+        *ended, self._partial = (self._partial + data).split(b">")
+        if len(self._partial) > _MOST_PARTIAL:
+            self._partial = b""
         return [line.partition(b"<")[2].strip() for line in ended]
 
     def say(self, data: bytes) -> None:
@@ -116,7 +116,7 @@ class SocketcandServer:
 
     @property
     def free(self) -> bool:
-        """Whether somebody listens."""
+        """Whether a program listens."""
         return any(client.raw for client in self._clients)
 
     @property
@@ -136,7 +136,7 @@ class SocketcandServer:
             if client.end in writable:
                 self._say(client, b"")
             if client.end in ready:
-                frames += self._heard(client)
+                frames += self._received(client)
         return frames
 
     def send(self, frames: list[CanFrame]) -> None:
@@ -162,14 +162,14 @@ class SocketcandServer:
             self._clients.append(client)
             self._say(client, b"< hi >")
 
-    def _heard(self, client: _Client) -> list[CanFrame]:
+    def _received(self, client: _Client) -> list[CanFrame]:
         lines = client.lines()
         if lines is None:
             self._drop(client)
             return []
         frames = []
         for line in lines:
-            frame = self._carried_out(client, line)
+            frame = self._executed(client, line)
             if frame is not None:
                 frames.append(frame)
                 for other in list(self._clients):
@@ -177,7 +177,7 @@ class SocketcandServer:
                         self._say(other, _frame_text(frame))
         return frames
 
-    def _carried_out(self, client: _Client, line: bytes) -> CanFrame | None:
+    def _executed(self, client: _Client, line: bytes) -> CanFrame | None:
         words = line.split()
         if words[:1] == [b"open"] and len(words) == 2:
             known = words[1] == CHANNEL.encode()
@@ -212,7 +212,7 @@ class SlcanLine:
         self._line = PtyLine()
         self._bitrate = bitrate
         self.endpoint = f"can://slcan{self._line.name}"
-        self._begun = b""
+        self._partial = b""
         self._opened = False
         self._rate = 0
 
@@ -228,19 +228,19 @@ class SlcanLine:
 
     @property
     def _on_bus(self) -> bool:
-        # At another rate an adapter hears nothing but errors, and is heard as such.
+        # At another rate an adapter receives and causes errors only.
         return self._opened and self._rate == self._bitrate
 
     def receive(self, patience: float) -> list[CanFrame]:
         """Return the frames that the program has sent; see `Adapter`."""
         data = self._line.receive(patience)
         if data is None:
-            self._begun, self._opened = b"", False
+            self._partial, self._opened = b"", False
             return []
-        *lines, self._begun = (self._begun + data).split(b"\r")
-        if len(self._begun) > _MOST_BEGUN:
-            self._begun = b""
-        frames = [self._carried_out(line) for line in lines]
+        *lines, self._partial = (self._partial + data).split(b"\r")
+        if len(self._partial) > _MOST_PARTIAL:
+            self._partial = b""
+        frames = [self._executed(line) for line in lines]
         return [frame for frame in frames if frame is not None and self._on_bus]
 
     def send(self, frames: list[CanFrame]) -> None:
@@ -252,7 +252,7 @@ class SlcanLine:
         """Take the terminal away."""
         self._line.close()
 
-    def _carried_out(self, line: bytes) -> CanFrame | None:
+    def _executed(self, line: bytes) -> CanFrame | None:
         if line in (b"O", b"C"):
             self._opened = line == b"O"
         elif line in _CLASSIC_RATES:

@@ -6,14 +6,13 @@ A node of a bus does not see a program end; its watchdog is what zeroes the outp
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 
 from hil_sim.device.can.adapters import Adapter
 from hil_sim.device.can.session import CanSession
 from hil_sim.device.device import Device, PlantInterface
-from hil_sim.device.lifetime import PARENT_SECONDS, ParentProcess, termination_signals
+from hil_sim.device.lifetime import run_until, termination_signals
 from hil_sim.faults.device import DeviceFault
 from rig.model.rig import Rig
 from rig.model.wire.can_database import database_text
@@ -46,13 +45,7 @@ def serve_can(
     try:
         with termination_signals() as ended:
             on_ready(adapter.endpoint)
-            run_device(
-                adapter,
-                device,
-                layout_of(rig) if layout is None else layout,
-                ended,
-                None if parent is None else ParentProcess(parent),
-            )
+            run_device(adapter, device, layout or layout_of(rig), ended, parent)
     finally:
         device.zero()
         adapter.close()
@@ -63,17 +56,17 @@ def run_device(
     device: Device,
     layout: CanLayout,
     ended: Sequence[object],
-    owner: ParentProcess | None = None,
+    parent: int | None = None,
     lock: AbstractContextManager[object] | None = None,
 ) -> None:
-    """Serve a device until `ended` is not empty, or its owner has ended.
+    """Serve a device until `ended` is not empty, or process `parent` has ended.
 
     Whoever else has the device takes `lock`, which is held here but while waiting for frames.
     """
     lock = lock or nullcontext()
     session = CanSession(device, layout)
-    look = time.monotonic()
-    while not ended:
+
+    def step() -> None:
         received = adapter.receive(device.idle_seconds())
         with lock:
             for frame in received:
@@ -81,8 +74,5 @@ def run_device(
             device.poll()
             while adapter.free and (block := session.push()):
                 adapter.send(block)
-        if owner is not None and time.monotonic() > look:
-            look = time.monotonic() + PARENT_SECONDS
-            if owner.has_ended():
-                logger.info("the process that this server belongs to has ended")
-                return
+
+    run_until(ended, parent, step)

@@ -19,7 +19,7 @@ import numpy as np
 from hil_sim.device.can.adapters import Adapter
 from hil_sim.device.device import PlantInterface
 from hil_sim.device.laws import OFF, DeviceLaw
-from hil_sim.device.lifetime import PARENT_SECONDS, ParentProcess, termination_signals
+from hil_sim.device.lifetime import run_until, termination_signals
 from rig.model import channels as ch
 from rig.model.rig import Rig
 from rig.model.wire import cia408
@@ -54,7 +54,7 @@ class ValveNode:
         self.state = ValveState.INIT
         self._word = 0
         self._clock = clock
-        self._heard: float | None = None
+        self._heartbeat: float | None = None
         # The library's types leave open what a variable holds; here every one is a whole number.
         self.node: Any = canopen.LocalNode(number, eds)
         node: Any = self.node
@@ -77,14 +77,14 @@ class ValveNode:
     def heartbeat(self, producer: int) -> None:
         """Note a sign of life of node `producer`."""
         if producer == self._consumed()[0]:
-            self._heard = self._clock()
+            self._heartbeat = self._clock()
 
     def watch(self) -> bool:
         """Go to FAULT_DISABLED where the host has been silent too long; returns whether it did."""
         allowed = self._consumed()[1]
-        if self._heard is None or not allowed or self._clock() - self._heard <= allowed:
+        if self._heartbeat is None or not allowed or self._clock() - self._heartbeat <= allowed:
             return False
-        self._heard = None
+        self._heartbeat = None
         self.state = ValveState.FAULT_DISABLED
         logger.warning("valve %d: the host's heartbeat is lost; outputs zero", self.node.id)
         return True
@@ -112,7 +112,7 @@ class ValveNode:
         if index == cia408.CONTROL_WORD:
             self._follow(int.from_bytes(data, "little"))
         elif index == cia408.CONSUMER_HEARTBEAT:
-            self._heard = None  # CiA 301: the watch begins with the first heartbeat after that
+            self._heartbeat = None  # CiA 301: the watch begins with the first heartbeat after that
 
     def _follow(self, word: int) -> None:
         self.state = cia408.next_state(self.state, self._word, word)
@@ -191,16 +191,9 @@ def serve_valves(
 ) -> None:
     """Serve a plant behind valve nodes 1 to N until SIGTERM, SIGINT or the end of `parent`."""
     bench = ValveBench(rig, plant, adapter)
-    owner = None if parent is None else ParentProcess(parent)
-    look = time.monotonic()
     try:
         with termination_signals() as ended:
             on_ready(adapter.endpoint.replace("can://", "canopen-408://", 1))
-            while not ended:
-                bench.poll(POLL_SECONDS)
-                if owner is not None and time.monotonic() > look:
-                    look = time.monotonic() + PARENT_SECONDS
-                    if owner.has_ended():
-                        return
+            run_until(ended, parent, lambda: bench.poll(POLL_SECONDS))
     finally:
         adapter.close()

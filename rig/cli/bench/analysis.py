@@ -12,7 +12,7 @@ from analysis.identify.identify import identify
 from analysis.identify.reduction import reduce_rows, solve_reductions
 from analysis.simulation.synthetic import multisine, synthetic_run
 from analysis.terms.base import family_of
-from rig.cli.bench.timing import spent, spent_together
+from rig.cli.bench.timing import processor_time, processor_times
 from rig.model.records import Run
 from rig.model.rig import Rig
 
@@ -56,6 +56,6 @@ def identify_figures(run: Run) -> dict[str, Any]:
         "rows": sum(result.rows.values()),
         "identify_seconds": seconds,
         "solve_seconds": result.solve_seconds,
-        "twelve": spent(lambda: identify([twelve])),
-        **spent_together(works),
+        "twelve": processor_time(lambda: identify([twelve])),
+        **processor_times(works),
     }

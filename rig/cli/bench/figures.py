@@ -20,7 +20,7 @@ from rig.cli.bench.analysis import identify_figures
 from rig.cli.bench.faults.figures import fault_figures
 from rig.cli.bench.figure import Figure
 from rig.cli.bench.screen.figures import screen_figures
-from rig.cli.bench.speed.figures import beside, free_run_figures, plant_over_kernel
+from rig.cli.bench.speed.figures import free_run_figures, plant_over_kernel, ratio_figures
 from rig.cli.bench.speed.growth import growth_figures
 from rig.cli.bench.speed.run_figures import run_figures
 from rig.cli.bench.stream_figures import stream_figures
@@ -67,8 +67,8 @@ def analysis_figures(folder: Path, say: Say) -> list[Figure]:
         Figure("analysis", "records of 10 s", times["records"]),
         Figure("analysis", "load and identify", loading + times["identify_seconds"], "s", 5.0),
         Figure("analysis", "of it the solve", 1e3 * times["solve_seconds"], "ms", 50.0),
-        *beside("analysis", "solve", times["solve"], ("numpy's lstsq", times["lstsq"]), 1.1),
-        *beside("analysis", "identify 12 of them", times["twelve"], None, 300.0),
+        *ratio_figures("analysis", "solve", times["solve"], ("numpy's lstsq", times["lstsq"]), 1.1),
+        *ratio_figures("analysis", "identify 12 of them", times["twelve"], None, 300.0),
         *free_run_figures(load_rig(RIG)),
     ]
 
@@ -189,36 +189,36 @@ def as_json(figures: Sequence[Figure]) -> list[dict[str, Any]]:
 _PAGE = """# Figures
 
 Written by `bramah bench --docs docs/figures.md` on {cores} cores; `bramah bench` measures yours.
-Limits are those the project has set itself; seeds from {first} on judge and were never used to
-tune.
+The limits are the project's own targets; seeds from {first} on serve for evaluation only, never for
+tuning.
 
 ```text
 {table}
 ```
 
-- **plant**: the simulated bench's fixed step against scipy (DOP853, rtol 1e-10) over 1 s of a
-  hard multisine on both joints; speed in processor time, converters and noise included; in blocks
-  as served, beside one call of the same compiled loop; the time that scipy's LSODA takes for the
-  same input at equal accuracy.
+- **plant**: error of the simulated bench's fixed step against scipy (DOP853, rtol 1e-10) over 1 s
+  of a multisine of 1.6 V, 0.5 to 9.5 Hz, on both joints; speed in processor time with converters
+  and noise, in blocks as served and in one call of the same compiled loop; the time of scipy's
+  LSODA for the same input at equal accuracy.
 - **analysis**: 30 records of 10 s taken over the wire, loaded and identified; a free run of
-  10 s with both joints moving, beside the same equations and steps written by hand and scipy's
-  odeint over the same compiled equations and CVODES over C that CasADi makes of them (with the
-  extra `bench`), at the loosest of tolerances a quarter of a decade apart at which no state is
-  less exact; all with the same output. The solve gives values and covariance of all records from
-  their triangles, lstsq the values from all rows.
-- **growth**: with records, their length, joints and effects; least of five.
-- **run**: lock-and-excite over the wire, beside bare pymodbus that asks the same device for the
-  same; a block's processor time in this process, and wall time, in virtual and real time;
-  the wall time of a block of 100 ms into the journal, 1000 times.
+  10 s of both joints, compared with the same equations and steps written by hand, with scipy's
+  odeint over the same compiled equations, and with CVODES over C code from CasADi (with the extra
+  `bench`). The solvers run at the loosest tolerance, in steps of a quarter of a decade, at which no
+  state is less accurate; all give the same output. The solve computes values and covariance of all
+  records from their triangles, lstsq the values from all rows.
+- **growth**: times against the number of records, their length, joints and effects; least of five.
+- **run**: lock-and-excite over the wire, compared with bare pymodbus sending the same requests to
+  the same device: processor time of this process and wall time of a block, in virtual and real
+  time; wall time of writing a block of 100 ms to the journal, 1000 times.
 - **seed N**: a simulated bench started, run, identified and validated as in `bramah demo`; FIT
   is compared with every cell of the paper's Table IV.
-- **acquisition**: every channel at 1 kHz in real time over the wire. Lateness is a block's arrival
-  by the host's clock after the time of its last sample by the device's.
+- **acquisition**: every channel at 1 kHz in real time over the wire. Lateness is the arrival of a
+  block by the host's clock minus the time of its last sample by the device's clock.
 
-Times are processor time, least and median of five, where nothing else is said.
+Times are processor time, least and median of five, unless stated otherwise.
 `bramah bench --only wires --minutes 10` (each wire: losses, processor time, lateness, the bare
 library), `--only faults` ([faults](faults.md)) and `--only screen` (the operator's screen:
-its cost, its stop, the age of its numbers: [screen](screen.md#figures)) are measured on their own.
+processor load, delay of a stop, age of its values: [screen](screen.md#figures)) are run separately.
 """
 
 

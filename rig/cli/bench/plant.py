@@ -176,14 +176,14 @@ def accuracy(seconds: float = 1.0) -> dict[str, float]:
     return {**errors(simulated, true, len(rig.joints)), "step": STEP, "seconds": seconds}
 
 
-def speed(seconds: float = 5.0, rig: Rig | None = None) -> dict[str, float]:
+def speed(seconds: float = 5.0) -> dict[str, float]:
     """Return how much faster than time the plant runs on one core, converters and noise included.
 
     Keys: real_time_ratio; lsoda_ratio, the time scipy's LSODA takes over the plant's for the same
     input at the loosest of several tolerances that is no less exact, lsoda_rtol that tolerance,
     plant_error and lsoda_error the two largest errors.
     """
-    rig = rig or _shipped()
+    rig = _shipped()
     laws, ticks = hard_laws(rig), round(seconds * rig.sample_rate)
     taken = math.inf
     for _ in range(3):  # the best of three, in processor time: other programs are not its fault

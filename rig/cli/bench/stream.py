@@ -10,14 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from analysis.identify.streams.out_of_core import identify_folders
 from analysis.regression.qr import Accumulator
 from analysis.workers.cluster import DaskCluster
 from analysis.workers.pool import ONE_THREAD, Processes, environment
-
-Array = NDArray[np.float64]
 
 COLUMNS = 9  # of the two-joint bench's fluid rows
 READ_ROWS = 16_384

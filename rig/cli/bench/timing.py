@@ -13,7 +13,7 @@ REPEATS: Final = 5
 
 
 @dataclass(frozen=True)
-class Spent:
+class ProcessorTime:
     """Processor time [s] of one piece of work: least and median of its repeats.
 
     The least is what the work costs; a median far above it says that the machine was busy.
@@ -23,15 +23,15 @@ class Spent:
     median: float
 
 
-def spent(work: Callable[[], object], repeats: int = REPEATS) -> Spent:
-    """Return the processor time of `work`, done `repeats` times."""
-    (only,) = spent_together({"": work}, repeats).values()
+def processor_time(work: Callable[[], object]) -> ProcessorTime:
+    """Return the processor time of `work`, done several times."""
+    (only,) = processor_times({"": work}).values()
     return only
 
 
-def spent_together(
+def processor_times(
     works: dict[str, Callable[[], object]], repeats: int = REPEATS
-) -> dict[str, Spent]:
+) -> dict[str, ProcessorTime]:
     """Return the processor time of each of several pieces of work, done in turns.
 
     In turns, because a machine that gets busier meanwhile slows all of them alike.
@@ -42,4 +42,4 @@ def spent_together(
             began = time.process_time()
             work()
             times[name].append(time.process_time() - began)
-    return {name: Spent(min(t), float(np.median(t))) for name, t in times.items()}
+    return {name: ProcessorTime(min(t), float(np.median(t))) for name, t in times.items()}

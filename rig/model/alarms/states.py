@@ -152,22 +152,6 @@ def acknowledged(table: AlarmTable, key: str | None = None) -> AlarmTable:
     return table
 
 
-def reset(table: AlarmTable, key: str, reason: str) -> AlarmTable:
-    """Return the table without a latched alarm whose cause a person says is removed.
-
-    Raises KeyError for one that is not latched, ValueError without a reason or before it was
-    acknowledged.
-    """
-    old = table.get(key)
-    if old is None or old.state is not AlarmState.LATCHED:
-        raise KeyError(f"no alarm {key!r} is latched")
-    if not old.acknowledged:
-        raise ValueError(f"{key}: acknowledge it first; to reset is another act")
-    if not reason.strip():
-        raise ValueError(f"{key}: a reset needs a reason")
-    return _put(table, replace(old, state=AlarmState.NORMAL))
-
-
 def folded(table: AlarmTable) -> tuple[tuple[Alarm, tuple[Alarm, ...]], ...]:
     """Return (first cause, its consequences) in the order of urgency.
 

@@ -103,7 +103,7 @@ class PartCollector:
         return message
 
     def reset(self) -> None:
-        """Forget a message that was begun."""
+        """Drop an incomplete message."""
         self._stream, self._next = b"", 0
 
 
@@ -225,7 +225,7 @@ class BlockCollector:
         return None
 
     def reset(self) -> None:
-        """Forget a block that was begun."""
+        """Drop an incomplete block."""
         self._sync = None
 
     def _empty(self) -> NDArray[np.int64]:

@@ -134,13 +134,13 @@ def read_layout(text: str, source: str, rig: Rig) -> CanLayout:
     rows = reader.rows(rig)
     layout = CanLayout(
         source,
-        reader.one(ZERO),
-        reader.one(ALIVE),
+        reader.message_of(ZERO),
+        reader.message_of(ALIVE),
         reader.parts(REQUEST),
         reader.parts(ANSWER_PARTS),
-        reader.one(SYNC),
+        reader.message_of(SYNC),
         rows,
-        reader.one(CHECK),
+        reader.message_of(CHECK),
         rig.recorded,
     )
     keys: dict[int, str] = {}
@@ -186,7 +186,7 @@ class _Reader:
             for signal in message.signals:
                 self._places.setdefault(signal.name, []).append((message, signal))
 
-    def one(self, needed: Mapping[str, int]) -> CanMessage:
+    def message_of(self, needed: Mapping[str, int]) -> CanMessage:
         """Return the one message that carries all of these signals."""
         signals = [(name, *self._signal(name, bits)) for name, bits in needed.items()]
         message = signals[0][1]
@@ -200,7 +200,7 @@ class _Reader:
 
     def parts(self, needed: Mapping[str, int]) -> CanMessage:
         """Return the message whose first byte is this signal; the others carry bytes."""
-        message = self.one(needed)
+        message = self.message_of(needed)
         (signal,) = message.signals.values()
         first = 8 * (message.size - 1) if signal.big_endian else 0
         if signal.bits != 8 or signal.shift != first or message.size < CLASSIC_BYTES:

@@ -78,13 +78,13 @@ class FrameDecoder:
     def __init__(self) -> None:
         self.damaged = 0
         self.received = 0
-        self._begun = b""
+        self._partial = b""
         self._skipping = False  # in something too long for a frame, up to the next zero
 
     def feed(self, data: bytes) -> list[WireFrame]:
         """Return the frames that `data` completes; what is damaged is counted and left out."""
         self.received += len(data)
-        *ended, begun = (self._begun + data).split(DELIMITER)
+        *ended, begun = (self._partial + data).split(DELIMITER)
         frames = []
         for piece in ended:
             if self._skipping:
@@ -98,12 +98,12 @@ class FrameDecoder:
         if len(begun) > MAX_ENCODED:
             self.damaged += not self._skipping
             self._skipping = True
-        self._begun = b"" if self._skipping else begun
+        self._partial = b"" if self._skipping else begun
         return frames
 
     def reset(self) -> None:
-        """Forget a frame that was begun: the line was opened anew."""
-        self._begun = b""
+        """Drop an incomplete frame: the line was opened anew."""
+        self._partial = b""
         self._skipping = False
 
 

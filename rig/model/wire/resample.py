@@ -43,7 +43,7 @@ class Resampler:
         self._saturated: Marks = np.empty(0, dtype=np.bool_)
 
     def restart(self) -> None:
-        """Forget the last sample: what comes next does not continue it, nothing is missing."""
+        """Drop the last sample: the next one does not continue it, and none is missing."""
         self._at = None
 
     def add(self, at: float, values: Array, saturated: Marks) -> list[Row]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Mapping
 from contextlib import suppress
@@ -30,7 +29,6 @@ from rig.runs.exchange.settings import EXCHANGE
 from rig.runs.rigs import load_rig
 from rig.runs.runstate import DONE, EventLog, release_ownership, write_state
 
-log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 

@@ -67,12 +67,7 @@ def _around(file: h5py.File, tick: int) -> tuple[list[str], NDArray[np.float64]]
         values = [group[name][rows] for name in channels]
         parts.append(np.column_stack([(ticks[rows] - tick) / rate, ticks[rows], *values]))
     table = np.concatenate(parts)
-    table = table[np.isfinite(table).any(axis=1, where=_measured(table))]
+    table = table[np.isfinite(table[:, 2:]).any(axis=1)]
     # A sample may be in two records; it stands here once, in the order of time.
     _, first = np.unique(table[:, 1], return_index=True)
     return names, table[first]
-
-
-def _measured(table: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Mark the columns of channels, as against those of time."""
-    return np.arange(table.shape[1]) >= 2

@@ -62,7 +62,7 @@ class Commands:
         endpoint = self.link.frame.endpoint
         if endpoint is not None and self._open_to(word):
             self.remark = f"{word}: asking ..."
-            self.link.ask(endpoint, word, value, lambda no: self._heard(word, done, no))
+            self.link.ask(endpoint, word, value, lambda no: self._show_answer(word, done, no))
 
     def _open_to(self, word: str) -> bool:
         """Whether a run is attached that this screen may command; the remark says why not."""
@@ -77,7 +77,7 @@ class Commands:
             return True
         return False
 
-    def _heard(self, word: str, done: str, refusal: str | None) -> None:
+    def _show_answer(self, word: str, done: str, refusal: str | None) -> None:
         said = done or "taken" if refusal is None else refusal.removeprefix(f"{word}: ")
         self.remark = f"{word}: {said}"
         self.redraw()
@@ -167,7 +167,7 @@ class Commands:
         elif not frame.over:
             self.command("acknowledge", alarm.key, alarm.key)
         else:
-            # The run has no ear any more: this screen keeps it, and the run's log.
+            # The run takes no more commands: this screen keeps it, and the run's log.
             self.seen_alarms |= {(frame.snapshot.pid, alarm.key)}
             self._note("alarm acknowledged", alarm)
             self.remark = f"acknowledge: {alarm.key}"

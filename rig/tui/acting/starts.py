@@ -14,7 +14,7 @@ from typing import Final
 
 from rig.runs.listing.summary import RunSummary
 from rig.tui.acting.commands import Commands
-from rig.tui.browse import TABS, Browsed, read_disk
+from rig.tui.browse import TABS, BrowserState, read_disk
 from rig.tui.jobs import VerbJob, begin, rig_of_run
 from rig.tui.look import Dialog
 from rig.tui.run_log import RunLog, read_log
@@ -33,7 +33,7 @@ def display_here() -> bool:
 class Starts(Commands):
     """The part of the screen that starts verbs; each is a process that outlives the screen."""
 
-    browsed: Browsed
+    browsed: BrowserState
     open_page: Callable[[str], None]
     is_web: bool
     deliver_binary: Callable[..., str | None]
@@ -96,7 +96,7 @@ class Starts(Commands):
             other for other in self.browsed.runs if other.path != run.path and other.records > 0
         ]
         report, stored = run.path / REPORT, run.path / STORED
-        beside = run.path.parent / REPORT  # of a set of runs, as the demo writes it
+        shared_report = run.path.parent / REPORT  # of a set of runs, as the demo writes it
 
         def against() -> None:
             acts: dict[str, Callable[[], None]] = {}
@@ -113,7 +113,7 @@ class Starts(Commands):
             "identify its parameters": lambda: self._job(("identify", path, "--json", "-")),
             "trace what its model lacks": against,
             "open its report": lambda: self._open(
-                report if report.is_file() or not beside.is_file() else beside
+                report if report.is_file() or not shared_report.is_file() else shared_report
             ),
             "read its log": lambda: self._open_log(run.path),
             "before and after of its trace": lambda: self._open_trace(run.path),

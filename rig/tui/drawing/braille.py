@@ -117,19 +117,3 @@ def to_cells(dots: Dots) -> Dots:
     rows, columns = dots.shape
     cells = dots.reshape(rows // 4, 4, columns // 2, 2)
     return np.asarray(cells.any(axis=(1, 3)), dtype=np.bool_)
-
-
-def plot(
-    low: Array,
-    high: Array,
-    height: int,
-    scale: Scale,
-    limits: Sequence[float | None] = (),
-) -> list[str]:
-    """Return `height` lines of len(low) / 2 characters: the curve and dashed lines at the limits.
-
-    `low` and `high` have shape (2 width,): two dot columns a character.
-    """
-    rows, columns = 4 * height, len(low)
-    layers = [level_dots(level, columns, rows, scale) for level in limits if level is not None]
-    return to_text(np.logical_or.reduce([curve_dots(low, high, rows, scale), *layers]))

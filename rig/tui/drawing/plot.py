@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rig.tui.drawing import braille
 from rig.tui.drawing.rows import Part, Row, fitted, row
 from rig.tui.drawing.styles import ALARM, DIM, PLAIN, TRIP_LINE, WARN_LINE
-from rig.tui.units import Shown
+from rig.tui.units import Format
 
 Array = NDArray[np.float64]
 Band = tuple[float | None, float | None]
@@ -39,7 +39,7 @@ class PlotTrace:
     start: float
     stop: float
     limits: Band
-    shown: Shown
+    shown: Format
     live: bool = True
     zoomed: bool = False
     warnings: Band = (None, None)
@@ -137,7 +137,12 @@ def _beyond(low: Array, high: Array, limits: Band) -> NDArray[np.int_]:
 
 @lru_cache(maxsize=64)
 def _axis(
-    limits: Band, warnings: Band, zoomed: bool, how: Shown, scale: braille.Scale, height: int
+    limits: Band,
+    warnings: Band,
+    zoomed: bool,
+    how: Format,
+    scale: braille.Scale,
+    height: int,
 ) -> tuple[tuple[Part, ...], ...]:
     """Return the gutter, line by line: numbers of limits on the scale, else of the scale's ends."""
     labels: dict[int, Part] = {}

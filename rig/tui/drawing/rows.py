@@ -93,6 +93,12 @@ def ends(left: Row, right: Row, width: int, style: str = PLAIN) -> Row:
     return (*fit(left, room, style), *right)
 
 
+def window(rows: list[Row], at: int, height: int) -> list[Row]:
+    """Return `height` of the rows with the marked one among them."""
+    first = min(max(at - height // 2, 0), max(len(rows) - height, 0))
+    return rows[first : first + height]
+
+
 def block(rows: Sequence[Row], width: int, height: int, style: str = PLAIN) -> list[Row]:
     """Return exactly `height` rows of `width` cells."""
     kept = [fit(line, width, style) for line in rows[: max(height, 0)]]
@@ -101,7 +107,7 @@ def block(rows: Sequence[Row], width: int, height: int, style: str = PLAIN) -> l
     return kept
 
 
-def beside(blocks: Sequence[tuple[Sequence[Row], int]], height: int, gap: int = 1) -> list[Row]:
+def hstack(blocks: Sequence[tuple[Sequence[Row], int]], height: int, gap: int = 1) -> list[Row]:
     """Return blocks of given widths side by side, each filled up to `height` rows."""
     filled = [block(rows, width, height) for rows, width in blocks]
     space: Row = ((" " * gap, PLAIN),) if gap else ()

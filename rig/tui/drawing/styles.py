@@ -10,7 +10,7 @@ from typing import Final
 PLAIN: Final = ""
 STRONG: Final = "bold"
 DIM: Final = "bright_black"
-NORMAL: Final = "reverse"  # a state that needs nobody
+NORMAL: Final = "reverse"  # a state that needs no action
 ALARM: Final = "bold bright_white on red"  # a limit was passed, or the state is not known
 ALARM_TEXT: Final = "bold red"
 # Black is not bold: many terminals draw bold black as grey, which yellow and cyan swallow.

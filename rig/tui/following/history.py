@@ -1,4 +1,4 @@
-"""What the screen remembers: one numpy ring of buckets for all channels of a run."""
+"""History of the screen: one numpy ring of buckets for all channels of a run."""
 
 from __future__ import annotations
 

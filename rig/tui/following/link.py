@@ -154,8 +154,8 @@ class Link:
         self._history = History()
         self._chosen: Endpoint | None = None
         self._choosing = False
-        self._looked = -float("inf")
-        self._framed = -float("inf")
+        self._last_search = -float("inf")
+        self._last_window = -float("inf")
         self._dirty = False
         self._asked_past = -float("inf")
         self._closing = threading.Event()
@@ -203,7 +203,7 @@ class Link:
     def ask(
         self, endpoint: Endpoint, word: str, value: str, answered: Callable[[str | None], None]
     ) -> None:
-        """Send a command on a thread of its own; `answered` hears why not, or None."""
+        """Send a command on a thread of its own; `answered` gets the refusal, or None."""
 
         def send() -> None:
             try:
@@ -260,16 +260,16 @@ class Link:
         if snapshot is not None:
             self._take(snapshot, now)
             self._fetch_past(now)
-        if self._dirty and (snapshot is None or snapshot.trip or now - self._framed >= FRAME):
+        if self._dirty and (snapshot is None or snapshot.trip or now - self._last_window >= FRAME):
             window = self._history.window(self.window_seconds)
             self._frame = replace(self._frame, window=window)
-            self._framed, self._dirty = now, False
+            self._last_window, self._dirty = now, False
             self.on_window()
 
     def _take(self, snapshot: Snapshot, now: float) -> None:
         before = self._frame
         quiet = before.snapshot is not None and now - before.received > QUIET
-        snapshot = _carried(before.snapshot, snapshot)
+        snapshot = _with_newest_values(before.snapshot, snapshot)
         self._history.add(snapshot, after_gap=quiet)
         lines = new_lines(before.snapshot, snapshot)
         estimates = before.estimates
@@ -317,9 +317,9 @@ class Link:
     def _follow_sessions(self) -> None:
         now = self._clock()
         due = 2 * LOOK if self._source is not None else LOOK
-        if now - self._looked < due and self._chosen is None and not self._choosing:
+        if now - self._last_search < due and self._chosen is None and not self._choosing:
             return
-        self._looked = now
+        self._last_search = now
         live = tuple(self._sessions.find())
         self._frame = replace(self._frame, sessions=live, trouble="")
         chosen, self._chosen = self._chosen, None
@@ -378,7 +378,7 @@ def _has_news(last: Snapshot | None, snapshot: Snapshot) -> bool:
     return last is None or (last.run, last.tick) != (snapshot.run, snapshot.tick)
 
 
-def _carried(last: Snapshot | None, snapshot: Snapshot) -> Snapshot:
+def _with_newest_values(last: Snapshot | None, snapshot: Snapshot) -> Snapshot:
     """Return a snapshot without new samples with the newest values of the one before it."""
     if last is None or _has_news(last, snapshot):
         return snapshot

@@ -12,7 +12,7 @@ import numpy as np
 
 from rig.model.units import plain, with_interval
 from rig.tui.drawing.plot import PlotTrace, draw, time_axis
-from rig.tui.drawing.rows import Row, beside, block, box, fit, row, wrapped
+from rig.tui.drawing.rows import Row, block, box, fit, hstack, row, wrapped
 from rig.tui.drawing.styles import DIM, STRONG, WARN_TEXT
 from rig.tui.following.link import TrackedPoint
 from rig.tui.look import PlotView
@@ -151,7 +151,7 @@ def estimates_page(view: PlotView, width: int, height: int) -> list[Row]:
     for k in range(down):
         share = (room - len(rows)) // (down - k)
         made = boxes[across * k : across * (k + 1)]
-        rows += beside([(draws(view, name, each, share), each) for draws, name in made], share)
+        rows += hstack([(draws(view, name, each, share), each) for draws, name in made], share)
     if hidden > 0:
         text = ", ".join(name for _, name in boxes[-hidden:])
         foot = [fit(row((f" a larger terminal also shows {text}", DIM)), width)]

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from rig.model import channels as ch
-from rig.tui.drawing.rows import Part, Row, beside, block, box, columns, fit, row
+from rig.tui.drawing.rows import Part, Row, block, box, columns, fit, hstack, row
 from rig.tui.drawing.styles import ALARM_TEXT, DIM, STRONG, WARN_TEXT
 from rig.tui.look import PlotView
 from rig.tui.pages.parts import (
-    CURVES,
-    GAUGES,
-    bar_of,
     curve,
     curves,
+    joint_channels,
     joint_title,
     joints_in,
     said_of,
-    short_name,
 )
 from rig.tui.units import age_text, clock_text, limit, shown
 from rig.tui.words import NEARNESS, band_of, run_time, value
@@ -32,18 +29,15 @@ def joint_page(view: PlotView, width: int, height: int) -> list[Row]:
     if not joints:
         return block([row((" this run has no joints", DIM))], width, height)
     joint = joints[min(max(view.look.joint, 1), len(joints)) - 1]
-    have = {kind: ch.channel(kind, joint) for kind in GAUGES}
-    have = {kind: name for kind, name in have.items() if name in snapshot.channels}
     inner = width - 4
-    bars = [bar_of(view, name, short_name(kind), inner) for kind, name in have.items()]
-    names = {have[kind]: short_name(kind) for kind in CURVES if kind in have}
+    bars, names = joint_channels(view, joint, inner)
     room = height - 2 - len(bars)
     if width >= TWO:
         pressures = {n: k for n, k in names.items() if ch.kind_of(n)[0] in (ch.CAP, ch.ROD)}
         motion = {n: k for n, k in names.items() if n not in pressures}
         half = (inner - 2) // 2
         sides = [(curves(view, side, half, room), half) for side in (pressures, motion) if side]
-        above = beside(sides, room, gap=2)
+        above = hstack(sides, room, gap=2)
     else:
         above = curves(view, names, inner, room)
     title = f"{joint_title(view, joint)} of {len(joints)}  ← →"
@@ -80,7 +74,7 @@ def channel_page(view: PlotView, width: int, height: int) -> list[Row]:
         for what, low, high in words
     ]
     plot = curve(view, name, name, room, height - len(text), axis=True)
-    return beside([(listed, LIST), ([*plot, *text], room)], height)
+    return hstack([(listed, LIST), ([*plot, *text], room)], height)
 
 
 def diagnostics_page(view: PlotView, width: int, height: int) -> list[Row]:
@@ -120,7 +114,7 @@ def diagnostics_page(view: PlotView, width: int, height: int) -> list[Row]:
     listed = columns(names)
     if width >= TWO:
         left = max(width // 2, 60)
-        return beside([(table, left), (listed, width - left - 1)], height)
+        return hstack([(table, left), (listed, width - left - 1)], height)
     return block([*table, row(), *listed][:height], width, height)
 
 

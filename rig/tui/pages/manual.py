@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rig.tui.drawing.rows import Row, beside, block, fit, row, wrapped
+from rig.tui.drawing.rows import Row, block, fit, hstack, row, wrapped
 from rig.tui.drawing.styles import ASK, DIM, STRONG, WARN_TEXT
 from rig.tui.look import PlotView
 from rig.tui.pages.parts import bench_bars, joint_box, joints_in
@@ -39,4 +39,4 @@ def manual_page(view: PlotView, width: int, height: int) -> list[Row]:
     others = [joint, *(other for other in joints if other != joint)][: max(width // 38, 1)]
     each = (width - len(others) + 1) // len(others)
     boxes = [(joint_box(view, number, each, room), each) for number in sorted(others)]
-    return [*head, *beside(boxes, room), *bars]
+    return [*head, *hstack(boxes, room), *bars]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from rig.model.alarms.states import Alarm, folded
 from rig.tui.drawing.plot import PlotTrace, draw
-from rig.tui.drawing.rows import Row, beside, block, box, columns, fit, row, wrapped
+from rig.tui.drawing.rows import Row, block, box, columns, fit, hstack, row, window, wrapped
 from rig.tui.drawing.styles import ASK, ASK_TEXT, DIM, NORMAL, STRONG, WARN_TEXT
 from rig.tui.following.event_lines import EventLine
 from rig.tui.look import PlotView
@@ -48,18 +48,12 @@ def alarms_page(view: PlotView, width: int, height: int) -> list[Row]:
         left = width * 2 // 5
         right = width - left - 1
         detail = _detail(view, listed[at][0], right, height)
-        return beside([(_window(rows, at, height), left), (detail, right)], height)
+        return hstack([(window(rows, at, height), left), (detail, right)], height)
     above = min(len(rows), max(height // 3, 1))
     return block(
-        [*_window(rows, at, above), *_detail(view, listed[at][0], width, height - above)],
+        [*window(rows, at, above), *_detail(view, listed[at][0], width, height - above)],
         width, height,
     )  # fmt: skip
-
-
-def _window(rows: list[Row], at: int, height: int) -> list[Row]:
-    """Return `height` of the rows with the marked one among them."""
-    first = min(max(at - height // 2, 0), max(len(rows) - height, 0))
-    return rows[first : first + height]
 
 
 def _detail(view: PlotView, alarm: Alarm, width: int, height: int) -> list[Row]:
@@ -85,11 +79,11 @@ def _detail(view: PlotView, alarm: Alarm, width: int, height: int) -> list[Row]:
     body = columns([[(name, DIM), text] for name, text in facts])
     body = [line for text in wrapped(alarm.sentence, inner, STRONG) for line in (text,)] + body
     body += [row(("do    ", ASK_TEXT), *line) for line in wrapped(alarm.remedy, inner - 6)]
-    plot = _before(view, alarm, inner, height - 2 - len(body))
+    plot = _curve_before(view, alarm, inner, height - 2 - len(body))
     return box(alarm.key, [*body, *plot], width, height)
 
 
-def _before(view: PlotView, alarm: Alarm, width: int, height: int) -> list[Row]:
+def _curve_before(view: PlotView, alarm: Alarm, width: int, height: int) -> list[Row]:
     """Return the 2 s before an alarm as a plot; nothing where they are not known."""
     window = view.frame.window
     if height < 4 or alarm.channel not in window.columns:
@@ -136,7 +130,7 @@ def protocol_page(view: PlotView, width: int, height: int) -> list[Row]:
         )  # fmt: skip
     if not steps:
         steps = [row((" the run has not said which steps it has", DIM))]
-    return block([*head, row(), *_window(steps, at - 1, height - len(head) - 1)], width, height)
+    return block([*head, row(), *window(steps, at - 1, height - len(head) - 1)], width, height)
 
 
 def filtered(lines: Sequence[EventLine], view: PlotView) -> list[EventLine]:

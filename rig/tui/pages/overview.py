@@ -5,7 +5,7 @@ from __future__ import annotations
 from rig.bench.screens.sockets import Snapshot
 from rig.model.alarms.states import Alarm, folded
 from rig.tui.drawing.large import ROWS, large, large_width
-from rig.tui.drawing.rows import Row, beside, block, fit, row
+from rig.tui.drawing.rows import Row, block, fit, hstack, row
 from rig.tui.drawing.styles import (
     ALARM,
     ALARM_TEXT,
@@ -71,7 +71,7 @@ def _band(
     blocks: list[tuple[list[Row], int]] = [(word, room)]
     for (text, below, tile_style), size in zip(tiles, sizes, strict=True):
         blocks.append(([*large(text, tile_style, scale), row((below, DIM))], size))
-    return beside(blocks, high + 1)
+    return hstack(blocks, high + 1)
 
 
 def _step_line(view: PlotView, snapshot: Snapshot, width: int) -> Row:
@@ -114,7 +114,7 @@ def alarm_lines(view: PlotView, width: int, most: int) -> list[Row]:
 
 
 def alarm_mark(view: PlotView, alarm: Alarm) -> Row:
-    """Return an alarm's shape and state; its colour blinks until somebody has acknowledged it."""
+    """Return an alarm's shape and state; its colour blinks until it is acknowledged."""
     shape, style, text = ("■", ALARM, ALARM_TEXT) if alarm.trips else ("▲", WARN, WARN_TEXT)
     bright = alarm.acknowledged or view.look.blink
     word = f"{shape} {alarm.state.upper()}"
@@ -136,7 +136,7 @@ def _joints(view: PlotView, joints: list[int], width: int, height: int) -> list[
         share = (height - len(rows)) // (fits - k)
         each = (width - (across - 1)) // across
         blocks = [(joint_box(view, joint, each, share), each) for joint in group]
-        rows += beside(blocks, share)
+        rows += hstack(blocks, share)
     hidden = len(joints) - sum(map(len, rows_of[:fits]))
     if hidden > 0:
         rows[-1] = fit(row((f" {hidden} more joints: ↑ ↓ ", DIM)), width)

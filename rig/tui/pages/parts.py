@@ -124,19 +124,24 @@ def joint_title(view: PlotView, joint: int) -> str:
     return f"joint {joint} {role}".rstrip()
 
 
-def joint_box(view: PlotView, joint: int, width: int, height: int) -> list[Row]:
-    """Return one joint in a frame: curves where there is room, bars always."""
+def joint_channels(view: PlotView, joint: int, width: int) -> tuple[list[Row], dict[str, str]]:
+    """Return a bar for each channel of a joint, and {channel: short name} of its curves."""
     snapshot = view.frame.snapshot
     assert snapshot is not None
+    names = {kind: ch.channel(kind, joint) for kind in GAUGES}
+    names = {kind: name for kind, name in names.items() if name in snapshot.channels}
+    bars = [bar_of(view, name, short_name(kind), width) for kind, name in names.items()]
+    return bars, {names[kind]: short_name(kind) for kind in CURVES if kind in names}
+
+
+def joint_box(view: PlotView, joint: int, width: int, height: int) -> list[Row]:
+    """Return one joint in a frame: curves where there is room, bars always."""
     title = joint_title(view, joint)
     remark = said_of(view)
     style = DIM if not remark or remark in ("last picture", "held") else WARN_TEXT
     title = f"{title} · {remark}" if remark else title
-    have = {kind: ch.channel(kind, joint) for kind in GAUGES}
-    have = {kind: name for kind, name in have.items() if name in snapshot.channels}
     inner = width - 4
-    bars = [bar_of(view, name, short_name(kind), inner) for kind, name in have.items()]
-    names = {have[kind]: short_name(kind) for kind in CURVES if kind in have}
+    bars, names = joint_channels(view, joint, inner)
     above = curves(view, names, inner, height - 2 - len(bars))
     return box(title, [*above, *bars], width, height, style, f"last {view.look.seconds:g} s")
 

@@ -8,7 +8,7 @@ from typing import Any
 from rig.queue.items import Item
 from rig.runs.listing.summary import RunSummary
 from rig.tui.browse import TABS
-from rig.tui.drawing.rows import Part, Row, beside, block, box, columns, fit, row, wrapped
+from rig.tui.drawing.rows import Part, Row, block, box, columns, fit, hstack, row, window, wrapped
 from rig.tui.drawing.styles import ALARM_TEXT, DIM, NORMAL, STRONG, WARN_TEXT
 from rig.tui.look import PlotView
 
@@ -34,21 +34,16 @@ def runs_page(view: PlotView, width: int, height: int) -> list[Row]:
     ] or [row((" nothing here", DIM))]  # fmt: skip
     room = height - len(head)
     if browsed.job is None:
-        return block([*head, *_around(listed, at, room)], width, height)
+        return block([*head, *window(listed, at, room)], width, height)
     if width >= WIDE:
         left = width * 2 // 5
         right = width - left - 1
-        pair = [(_around(listed, at, room), left), (_job(view, right, room), right)]
-        return [*head, *beside(pair, room)]
+        pair = [(window(listed, at, room), left), (_job(view, right, room), right)]
+        return [*head, *hstack(pair, room)]
     above = max(room // 3, 3)
     return block(
-        [*head, *block(_around(listed, at, above), width, above),
+        [*head, *block(window(listed, at, above), width, above),
          *_job(view, width, room - above)], width, height)  # fmt: skip
-
-
-def _around(rows: list[Row], at: int, height: int) -> list[Row]:
-    first = min(max(at - height // 2, 0), max(len(rows) - height, 0))
-    return rows[first : first + height]
 
 
 def _lines(view: PlotView) -> list[Row]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rig.model.units import plain, typeset, with_interval
 from rig.tui.drawing.plot import GUTTER, PlotTrace, draw
-from rig.tui.drawing.rows import Part, Row, beside, block, columns, fit, row, wrapped
+from rig.tui.drawing.rows import Part, Row, block, columns, fit, hstack, row, wrapped
 from rig.tui.drawing.styles import DIM, STRONG, WARN_TEXT
 from rig.tui.look import PlotView
 from rig.tui.run_trace import StoredCurves, StoredEffect, StoredEstimate, StoredTrace
@@ -43,7 +43,7 @@ def run_trace_page(view: PlotView, width: int, height: int) -> list[Row]:
         right = width - left - 1
         plots = free_run_rows(trace.stored, view.look.channel, right, room)
         text = text[min(view.look.offset, max(len(text) - room, 0)) :]
-        return [*head, *beside([(text, left), (plots, right)], room)]
+        return [*head, *hstack([(text, left), (plots, right)], room)]
     text += [row(), *free_run_rows(trace.stored, view.look.channel, width, 2 * PLOT + 4)]
     at = min(view.look.offset, max(len(text) - room, 0))
     more = len(text) - room - at

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Final
 
-from rig.tui.drawing.rows import Row, beside, block, box, ends, fit, row, wrapped
+from rig.tui.drawing.rows import Row, block, box, ends, fit, hstack, row, wrapped
 from rig.tui.drawing.styles import ASK, DIM, LEVELS, NORMAL, STRONG, SYMBOLS, WARN_TEXT
 from rig.tui.following.link import LinkStage
 from rig.tui.look import OF_A_RECORDED_RUN, PAGES, PlotView
@@ -216,5 +216,5 @@ def _above(rows: list[Row], view: PlotView, width: int) -> list[Row]:
     top, left = max((len(rows) - high) // 2, 0), (width - wide) // 2
     # What stands beside the box is left out: the question is all there is to read on these rows.
     blank = [row()] * high
-    middle = beside([(blank, left), (drawn, wide), (blank, width - wide - left)], high, gap=0)
+    middle = hstack([(blank, left), (drawn, wide), (blank, width - wide - left)], high, gap=0)
     return [*rows[:top], *middle, *rows[top + high :]]

@@ -26,7 +26,7 @@ _LONGEST = 4096  # of a beat's text or of an error, in characters
 
 
 class AttachedScreen(AppService):
-    """Starts `words` with a page for its terminal; `ended` hears in one line how it ended."""
+    """Starts `words` with a page for its terminal; `ended` gets one line on how it ended."""
 
     def __init__(
         self,
@@ -73,11 +73,11 @@ class AttachedScreen(AppService):
         await super().run()
         assert self._process is not None
         await self._wait(self._process)
-        said = self._said()
+        reason = self._end_reason()
         if self._process.returncode != 0 and not self._stopping:
-            log.warning("a screen ended: %s", said)
+            log.warning("a screen ended: %s", reason)
         with suppress(ConnectionError):  # the page may be gone
-            await self._ended(f"The screen ended: {said}" if said else CLOSED)
+            await self._ended(f"The screen ended: {reason}" if reason else CLOSED)
 
     async def stop(self) -> None:
         """Ask the process to end, wait for it, kill it where it does not; then nothing is left."""
@@ -115,7 +115,7 @@ class AttachedScreen(AppService):
             await super().on_meta(data)
 
     async def _leaving(self) -> None:
-        """Let a screen that says it ends do so; the page hears of it when the process is gone."""
+        """Let a screen end that announces its end; the page is told when the process has ended."""
         asyncio.get_running_loop().call_later(GRACE, self._kill)
 
     def _kill(self) -> None:
@@ -130,7 +130,7 @@ class AttachedScreen(AppService):
             self._kill()
             await process.wait()
 
-    def _said(self) -> str:
+    def _end_reason(self) -> str:
         """Return why the process ended, in the words of its last error."""
         if self._process is None or self._process.returncode == 0:
             return ""

@@ -10,13 +10,13 @@ from typing import Annotated, Final
 import typer
 
 from drivers.conformance import CheckVerdict, ConformanceReport, RandomCallBudget, Subject, run
+from rig.cli.bench.faults.figures import quiet
 from rig.cli.errors import WorkError
 from rig.cli.output import progress, table
 from rig.model.parse import InputError
 from tests.drivers.can_bench import can_subject
 from tests.drivers.conformance_benches import FAULTS, on_wire
 from tests.drivers.valve_bus import valves_subject
-from tests.studies.quiet import quiet
 
 SUBJECTS: Final[Mapping[str, Callable[[], Subject]]] = {
     **{wire: partial(on_wire, wire) for wire in FAULTS},

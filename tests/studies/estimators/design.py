@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from analysis.design.predict import Expected
+from analysis.design.predict import ParameterPrediction
 from analysis.identify.identify import identify
 from analysis.identify.result import PLAIN
 from protocols.files import library
@@ -49,7 +49,7 @@ class Studied:
 
     protocol: str
     seeds: int
-    predicted: Mapping[str, Expected]
+    predicted: Mapping[str, ParameterPrediction]
     steady: Mapping[str, DesignScatter]
     swinging: Mapping[str, DesignScatter]
 

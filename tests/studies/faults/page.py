@@ -12,12 +12,11 @@ from hil_sim.device.server import TCP
 from hil_sim.faults.device import DeviceFault
 from hil_sim.faults.wire import WireFault
 from rig.cli.bench.faults.bench import fault_bench
-from rig.cli.bench.faults.figures import RIG, counted
+from rig.cli.bench.faults.figures import RIG, counted, quiet
 from rig.cli.bench.faults.trials import TrialOutcome, kinds, try_fault, wires
 from rig.cli.bench.figures import text
 from rig.model.trips import SafetyTrip
 from rig.runs.rigs import load_rig
-from tests.studies.quiet import quiet
 
 HEADER = ("fault", "wire", "what notices", "after", "what the operator reads", "what is kept")
 _PLACE = re.compile(r"(/tmp/\S*?/line|127\.0\.0\.1:\d+)")
@@ -60,7 +59,7 @@ def noticed(outcomes: Sequence[TrialOutcome]) -> str:
                 outcome.wire if every else "any",
                 _what_notices(outcome),
                 after,
-                _PLACE.sub("ENDPOINT", outcome.says),
+                _PLACE.sub("ENDPOINT", outcome.message),
                 _kept(outcome),
             )
         )
@@ -68,7 +67,7 @@ def noticed(outcomes: Sequence[TrialOutcome]) -> str:
 
 
 def _by_fault(outcomes: Sequence[TrialOutcome]) -> list[tuple[str, ...]]:
-    """Return a row for each fault and wire: how often each naming came, and the slowest end."""
+    """Return a row for each fault and wire: how often each diagnosis came, and the slowest end."""
     groups: dict[tuple[str, str], list[TrialOutcome]] = {}
     for fault in dict.fromkeys(outcome.fault for outcome in outcomes):
         for wire in wires():
@@ -77,10 +76,10 @@ def _by_fault(outcomes: Sequence[TrialOutcome]) -> list[tuple[str, ...]]:
                 groups[fault, wire] = group
     rows: list[tuple[str, ...]] = []
     for (fault, wire), group in groups.items():
-        namings = Counter(str(o.naming) for o in group).most_common()
+        diagnoses = Counter(str(o.diagnosis) for o in group).most_common()
         ends = [o.seconds for o in group if o.seconds is not None]
         rows.append((
-            fault, wire, str(len(group)), ", ".join(f"{count} {name}" for name, count in namings),
+            fault, wire, str(len(group)), ", ".join(f"{count} {name}" for name, count in diagnoses),
             f"{max(ends):.2f} s" if ends else "",
         ))  # fmt: skip
     return rows
@@ -104,10 +103,10 @@ def _what_notices(outcome: TrialOutcome) -> str:
         return f"guard warns: {outcome.alarm.check}"
     if outcome.missing:
         return "driver: counts what is missing"
-    again = [line for line in outcome.warned if "again" in line or "dropped" in line]
+    again = [line for line in outcome.warnings if "again" in line or "dropped" in line]
     if again:
         return f"driver: asks again ({len(again)} times)"
-    return "nothing" if outcome.naming == "unnoticed" else "nothing has to: every sample came"
+    return "nothing" if outcome.diagnosis == "unnoticed" else "nothing has to: every sample came"
 
 
 def _kept(outcome: TrialOutcome) -> str:

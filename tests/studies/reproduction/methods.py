@@ -24,9 +24,9 @@ METHODS = Section(
         "one value. No simulation, no initial guess.",
         "**Sequential** (`--method sequential`): one step after the other. E1 takes a parameter "
         "from the first step that determines it (95 % half-width below 2 %) and treats it as "
-        "known afterwards; rows of which something is still unknown wait for the next step. E2 "
-        "lets every step identify what it can by itself and averages. Both are computed; the "
-        "estimates given out are E1's, E2's and every step's own stand beside them.",
+        "known afterwards; rows with parameters that are still unknown are kept for the next "
+        "step. E2 identifies every step by itself and averages. Both are computed; the "
+        "estimates reported are E1's, those of E2 and of every step are listed as well.",
         "**Simultaneous** (`--method simultaneous`): the coupled rows and solve, but only of "
         "records that excite every joint at once.",
         "**PSO and GA** (`--method pso`, `--method ga`): search the eight parameters of STEP1 (M2 "
@@ -35,8 +35,8 @@ METHODS = Section(
         "relative output error of piston and both pressures; each parameter may lie between a "
         "tenth and ten times its nominal value, searched in the logarithm. A candidate whose "
         "chamber pressure leaves 0..supply has no real state (the orifice's root is complex), one "
-        "that diverges has none either: both are counted, and lose to every living one. The "
-        "algorithms are pymoo's, with a seed.",
+        "that diverges has none either: both are counted and rank below every valid candidate. "
+        "The algorithms are pymoo's, with a seed.",
     ),
 )
 
@@ -78,8 +78,8 @@ def sequential(done: Reproduction) -> Section:
             f"{', '.join(shown('b', v, 2) for v in values)} MPa, {several.get('b', 0.0):.1f} of "
             "their own 95 % intervals apart (column `apart`: difference over the common "
             f"half-width; above 1 are {' '.join(beyond) or 'none'}). {_by_temperature(done)}"
-            "STEP2 alone shows M1 and R12 as a sum only, so that E1 and E2 must carry their rows "
-            "further. With E1's values the torque rows keep "
+            "STEP2 alone determines only the sum of M1 and R12, so that E1 and E2 keep its rows "
+            "for the next step. With E1's values the torque rows keep "
             f"{ratio:.2f} times the residual that the coupled solution leaves.",
             Table("Every step by itself, E1, E2 and coupled", header, rows),
         ),
@@ -97,7 +97,7 @@ def _by_temperature(done: Reproduction) -> str:
     slope = 100.0 * float(np.polyfit(t, b, 1)[0]) / float(b.mean())
     return (
         f"The oil was at {', '.join(f'{x:.1f}' for x in t)} °C in these steps: b moves by "
-        f"{slope:+.2f} % a kelvin, so that each step's value may be right for its own oil. E1 "
+        f"{slope:+.2f} % a kelvin, so that each step's value may be correct for its own oil. E1 "
         "and E2 do not model that; the coupled solution does beside its parameters, and its b is "
         "that of the rig's nominal temperature. "
     )
@@ -136,16 +136,16 @@ def simultaneous(done: Reproduction) -> Section:
         "coupled here", "with the paper's filter",
     ]  # fmt: skip
     return Section(
-        "Simultaneous: what one excitation for all is worth",
+        "Simultaneous: one excitation of all joints",
         (
             "Ten seconds of both joints at 1 Hz per experiment, as many experiments as above; "
             "condition numbers in plain SI, as the paper's. Three steps condition the mechanical "
-            "rows better than one simultaneous motion, here as there. Whether that breaks the "
+            "rows better than one simultaneous motion, here as in the paper. The effect on the "
             f"result depends on the noise in the rows. {_verdict(done, ours, 'this filter')} "
             f"{_verdict(done, own, 'the filter of the paper')}",
             "The paper calls the method's result impossible because `W1 is larger than W2`; its "
-            "own Table III has W1 > W2 too, and masses within their links demand "
-            "W1/l1 >= W2/l2 >= 0. The check `gravity order` tests that.",
+            "own Table III has W1 > W2 too, and masses within their links require W1/l1 >= "
+            "W2/l2 >= 0. The check `gravity order` tests that.",
             _oil_of_both(done),
             Table("Simultaneous and coupled, mean of the experiments", header, rows),
         ),
@@ -218,10 +218,10 @@ def summary(done: Reproduction) -> Section:
         )  # fmt: skip
     header = [
         "method", "values", "with interval", "worst error %", "error of b %",
-        "FIT piston, STEP1 1 Hz", "what it could not do",
+        "FIT piston, STEP1 1 Hz", "failed to",
     ]  # fmt: skip
     return Section(
-        "What each method could do, and could not",
+        "Summary of the methods",
         (Table("All methods on one bench", header, rows),),
     )
 

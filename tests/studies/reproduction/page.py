@@ -85,15 +85,15 @@ def table_iii(done: Reproduction) -> Section:
     return Section(
         "Table III: the parameters",
         (
-            f"{done.each.count} experiments, each identified by itself by coupling its three "
+            f"{done.each.count} experiments, each identified separately from its three coupled "
             "steps. The bench's true parameters are the paper's means, so that the columns can be "
-            "compared; they are hidden from the analysis and stand here for the error of the mean "
+            "compared; the analysis does not know them; they are listed for the error of the mean "
             f"only. The largest error is that of {name}, {off:+.2f} %; the largest RSD here is "
             f"{largest:.2f} %, the paper's "
-            f"{max(p.rsd for p in paper.TABLE_III.values()):.2f} %. The truth of b is that of "
-            f"oil at {done.rig.oil.temperature:g} °C; the oil of these records was at {_oil(done)} "
-            "°C. A simulated bench does not wear, and its sensors have the noise of their data "
-            "sheet and nothing else: scatter is far below a real bench's.",
+            f"{max(p.rsd for p in paper.TABLE_III.values()):.2f} %. The true b is stated for oil "
+            f"at {done.rig.oil.temperature:g} °C; the oil of these records was at {_oil(done)} "
+            "°C. A simulated bench does not wear, and its sensors have only the noise of their "
+            "data sheet: the scatter is far below a real bench's.",
             Table(f"Table III, {done.each.count} experiments", header, rows),
             *_own_filter(done),
         ),
@@ -154,9 +154,9 @@ def conditioning(done: Reproduction) -> Section:
         (
             "The paper does not say how its matrices are scaled. With plain SI columns (1/b in "
             "1/Pa) the numbers come out in the paper's region; with columns of unit length, as "
-            "`bramah identify` reports them, they say what the excitation is worth whatever the "
+            "`bramah identify` reports them, they measure the excitation independently of the "
             "units. One experiment each, least and largest over the experiments. Rows here are "
-            "low-passed and decimated, which is why they are few.",
+            "few because they are low-passed and decimated.",
             Table("Conditioning of one experiment", header, rows),
             f"To solve one experiment took {1e3 * done.each.solve_seconds:.0f} ms (median; with "
             f"every row of the paper's filter {1e3 * done.paper_each.solve_seconds:.0f} ms), all "
@@ -192,10 +192,10 @@ def table_iv(done: Reproduction) -> Section:
         (
             "FIT [%] of the identified model, run freely from the record's first sample under the "
             "measured spool. 3 Hz and both joints at once were never used for the fit. For both "
-            "joints the paper shows figures and prints no numbers. A simulated bench has no effect "
-            "that the model lacks but the plant's own finer physics, so FIT is far above what a "
-            "real machine allows; it shows that the method loses nothing, not that the model is "
-            "complete.",
+            "joints the paper shows figures and prints no numbers. The simulated bench has no "
+            "effect that the model lacks, apart from the plant's more detailed physics, so FIT "
+            "is far above that of a real machine; it evaluates the method, not the completeness "
+            "of the model.",
             Table("Table IV, FIT %", header, rows),
             *(p for cell in paper.TABLE_IV if cell.figure for p in (_figure(done, cell),)),
         ),
@@ -245,13 +245,14 @@ def payload(done: Reproduction) -> Section:
     return Section(
         f"Payload: {PAYLOAD:g} kg at the tip",
         (
-            f"A second bench of the same machine whose scenario file hangs {PAYLOAD:g} kg at the "
+            f"A second bench of the same machine whose scenario file adds {PAYLOAD:g} kg at the "
             f"tip, {done.scale.payload_repeats} repeats, another seed. A point mass adds m·l_i·l_j "
             "to R_ij and m·l_i to W_i, so to M1 m·(l1² + l2²), to M2 m·l2², to R12 m·l1·l2. "
             f"**Responding** (by more than 1 %): {_list(moved)}. **Staying**: {_list(stayed)}.",
             Table("Parameters without and with the payload", header, rows),
             "The paper says that only R12, W1 and W2 respond and prints a new M2 of 12.21 kg·m². "
-            "Rigid bodies cannot have it so: the same mass that changes R12 changes M1 and M2, and "
+            "This contradicts rigid-body mechanics: the same mass that changes R12 changes M1 and "
+            "M2, and "
             f"{PAYLOAD:g} kg at 0.5 m add {M2.expected:.3f} kg·m² to M2, not eleven. Here M2 goes "
             f"from {M2.before:.3f} to {M2.after:.3f} kg·m².",
         ),

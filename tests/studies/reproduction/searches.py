@@ -37,11 +37,11 @@ def searches(done: Reproduction) -> Section:
     return Section(
         "PSO and GA on STEP1",
         (
-            f"At most {done.scale.evaluations} candidates each. The searches see STEP1 only, so "
-            "eight parameters have no value, and none has an interval. What a search finds, it "
-            "finds in combinations: gains, friction, inertia and gravity may shrink or grow "
-            "together with little change of the output over a short window, and 1 Hz hardly "
-            "shows b.",
+            f"At most {done.scale.evaluations} candidates each. The searches use STEP1 only, so "
+            "eight parameters have no value, and none has an interval. A search determines "
+            "combinations: gains, friction, inertia and gravity may change together with little "
+            "change of the output over a short window, and at 1 Hz the output hardly depends on "
+            "b.",
             Table("Parameters of STEP1", header, rows),
             _lost_table(found),
             _fit_table(done),
@@ -79,7 +79,7 @@ def _lost_table(found: Mapping[str, Identification]) -> Table:
             *(f"{d['error']:.3g}" for d in data.values()),
         ),
     ]
-    return Table("Candidates whose state ceased to exist", ["", *(m.upper() for m in data)], rows)
+    return Table("Candidates without a valid state", ["", *(m.upper() for m in data)], rows)
 
 
 def share(data: Mapping[str, Any]) -> float:

@@ -66,8 +66,8 @@ def page(done: Reproduction, line: str) -> list[Section]:
                 f"    {line}",
                 "The bench's physics is written apart from the analysis (spool dynamics, laminar "
                 "orifices, contact, pump and relief, quantised and multiplexed sensors with the "
-                "noise that the rig file states). The machine has no friction but the viscous and "
-                "no leakage, so what is judged here is the method.",
+                "noise that the rig file states). The machine has only viscous friction and no "
+                "leakage; the page therefore evaluates the method alone.",
             ),
         ),
         METHODS,

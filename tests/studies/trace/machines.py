@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from hil_sim.scenario.file import Scenario
-from hil_sim.scenario.random_draw import STRANGE, draw
+from hil_sim.scenario.random_draw import NO_FORMULA, draw
 from protocols.files.schema import Protocol
 from rig.model.parts import Joint
 from rig.model.rig import Rig
@@ -107,7 +107,7 @@ def case_of(seed: int, noise: float) -> Case:
     rig = machine(seed)
     scenario = scenario_of(rig, seed, noise)
     label = f"{rig.name}: " + (" + ".join(f"{e.name} at {e.place}" for e in scenario.effects))
-    if scenario.description.endswith(STRANGE):
+    if scenario.description.endswith(NO_FORMULA):
         moves = MOVES[scenario.effects[0].name]
         return Case(OUTSIDE, label, "", (), seed, (), moves, noise, machine=True)
     told = [e for e in scenario.effects if e.name not in ABSORBED]

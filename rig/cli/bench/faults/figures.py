@@ -12,7 +12,7 @@ from typing import Final
 
 from hil_sim.faults.wire import WireFault
 from rig.cli.bench.faults.bench import fault_bench
-from rig.cli.bench.faults.trials import Naming, TrialOutcome, kinds, try_fault, wires
+from rig.cli.bench.faults.trials import Diagnosis, TrialOutcome, kinds, try_fault, wires
 from rig.cli.bench.figure import Figure
 from rig.model.rig import Rig
 from rig.runs.rigs import load_rig
@@ -42,7 +42,7 @@ def jobs(wire: str, least: int) -> Iterator[tuple[int, str]]:
 
 def fault_trials(folder: Path, least: int, say: Say) -> list[TrialOutcome]:
     """Run at least `least` trials in virtual time, each with a fault of its own."""
-    with _quiet(), ThreadPoolExecutor(len(wires())) as pool:  # they wait more than they work
+    with quiet(), ThreadPoolExecutor(len(wires())) as pool:  # they wait more than they work
         outcomes = pool.map(lambda wire: _on_wire(folder, wire, least, say), wires())
         return [outcome for part in outcomes for outcome in part]
 
@@ -67,7 +67,7 @@ def fault_figures(folder: Path, say: Say, least: int = LEAST) -> list[Figure]:
 
 def counted(outcomes: Sequence[TrialOutcome]) -> list[Figure]:
     """Return the counts of trials as figures."""
-    of = Counter(outcome.naming for outcome in outcomes)
+    of = Counter(outcome.diagnosis for outcome in outcomes)
     known = kinds()
     machine = [o for o in outcomes if not issubclass(known[o.fault], WireFault)]
     frozen = [o for o in outcomes if o.fault in _FROZEN]
@@ -79,18 +79,18 @@ def counted(outcomes: Sequence[TrialOutcome]) -> list[Figure]:
         Figure(GROUP, "outputs left on", sum(not o.zeroed for o in outcomes), "", 0.0),
         Figure(GROUP, "blocks taken", sum(o.blocks for o in outcomes)),
         Figure(GROUP, "of them not in records.h5", sum(o.lost_blocks for o in outcomes), "", 0.0),
-        Figure(GROUP, "harmless: every sample came", of[Naming.HARMLESS]),
-        Figure(GROUP, "samples missing and counted", of[Naming.COUNTED]),
-        Figure(GROUP, "ended, named rightly", of[Naming.NAMED]),
-        Figure(GROUP, "ended, cause left open", of[Naming.UNKNOWN]),
-        Figure(GROUP, "ended, named wrongly", of[Naming.WRONG], "", 0.0),
-        Figure(GROUP, "not noticed", of[Naming.UNNOTICED], "", 0.0),
+        Figure(GROUP, "harmless: every sample came", of[Diagnosis.HARMLESS]),
+        Figure(GROUP, "samples missing and counted", of[Diagnosis.COUNTED]),
+        Figure(GROUP, "ended, named rightly", of[Diagnosis.NAMED]),
+        Figure(GROUP, "ended, cause left open", of[Diagnosis.UNKNOWN]),
+        Figure(GROUP, "ended, named wrongly", of[Diagnosis.WRONG], "", 0.0),
+        Figure(GROUP, "not noticed", of[Diagnosis.UNNOTICED], "", 0.0),
         Figure(GROUP, "frozen or stuck, not within 2 s", len(late), "", 0.0),
     ]
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     """Keep hundreds of provoked warnings off the terminal; they are in the outcomes."""
     root = logging.getLogger()
     handlers, root.handlers = root.handlers, [logging.NullHandler()]

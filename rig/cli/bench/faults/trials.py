@@ -64,7 +64,7 @@ KEYS: Final[Mapping[str, Mapping[str, Any]]] = {
 _ONCE: Final = frozenset({"stall", "link_half_closed", "link_closed"})
 
 
-class Naming(StrEnum):
+class Diagnosis(StrEnum):
     """How well what the operator reads fits what was done."""
 
     HARMLESS = "harmless"  # every sample there, nothing to say
@@ -92,12 +92,12 @@ class TrialOutcome:
     lost_blocks: int = 0
     missing: int = 0
     zeroed: bool = True
-    naming: Naming = Naming.UNKNOWN
-    warned: list[str] = field(default_factory=list)
+    diagnosis: Diagnosis = Diagnosis.UNKNOWN
+    warnings: list[str] = field(default_factory=list)
     alarm: Alarm | None = None  # the first warning of the guard after the fault's begin
 
     @property
-    def says(self) -> str:
+    def message(self) -> str:
         """What the operator reads, '' where nothing is said."""
         if self.error is not None:
             return " ".join(str(self.error).split())
@@ -160,8 +160,8 @@ def try_fault(
     early = () if isinstance(fault, WireFault) else (fault,)
     endpoint = bench.begin(rig, wire, early, seed, realtime=realtime)
     reached = reached_at(rig, endpoint)
-    outcome, warned = TrialOutcome(name, wire), _Warnings()
-    logging.getLogger().addHandler(warned)
+    outcome, warnings = TrialOutcome(name, wire), _Warnings()
+    logging.getLogger().addHandler(warnings)
     try:
         for tries_left in reversed(range(_TRIES)):
             try:
@@ -174,15 +174,15 @@ def try_fault(
                 endpoint = bench.begin(rig, wire, early, seed, realtime=realtime)
                 reached = reached_at(rig, endpoint)
     finally:
-        logging.getLogger().removeHandler(warned)
-        outcome.warned = warned.lines
+        logging.getLogger().removeHandler(warnings)
+        outcome.warnings = warnings.lines
         patience = 2.0 + (rig.wire.watchdog if realtime else SILENCE)
         outcome.zeroed = bench.at_zero(patience)
         if isinstance(fault, WireFault):
             outcome.struck = bench.state().struck
         bench.end()
     outcome.struck = outcome.struck or int(not isinstance(fault, WireFault))
-    outcome.naming = naming(fault, outcome)
+    outcome.diagnosis = diagnosis(fault, outcome)
     return outcome
 
 
@@ -277,7 +277,7 @@ def _not_in(archive: Path, rig: Rig, blocks: Sequence[SampleBlock]) -> int:
 # -- what the operator reads against what was done ----------------------------------------------
 
 
-def naming(fault: Fault, outcome: TrialOutcome) -> Naming:
+def diagnosis(fault: Fault, outcome: TrialOutcome) -> Diagnosis:
     """Return how well the end of a trial fits its fault.
 
     A message names a fault of a sensor or of the machine by its channel, joint or supply, one of
@@ -290,44 +290,44 @@ def naming(fault: Fault, outcome: TrialOutcome) -> Naming:
     trip = error if isinstance(error, SafetyTrip) else None
     if isinstance(fault, WireFault | DeviceFault):
         return _of_wire(fault, error, trip)
-    return Naming.WRONG if trip is None else _of_machine(fault, trip)
+    return Diagnosis.WRONG if trip is None else _of_machine(fault, trip)
 
 
-def _without_end(fault: Fault, outcome: TrialOutcome) -> Naming:
+def _without_end(fault: Fault, outcome: TrialOutcome) -> Diagnosis:
     if outcome.missing:
-        return Naming.COUNTED
+        return Diagnosis.COUNTED
     if isinstance(fault, WireFault | ClockDrift):
-        return Naming.HARMLESS
+        return Diagnosis.HARMLESS
     if outcome.alarm is None or isinstance(fault, DeviceFault):
-        return Naming.UNNOTICED
+        return Diagnosis.UNNOTICED
     return _of_machine(fault, outcome.alarm)
 
 
-def _of_wire(fault: Fault, error: Exception, trip: SafetyTrip | None) -> Naming:
+def _of_wire(fault: Fault, error: Exception, trip: SafetyTrip | None) -> Diagnosis:
     if trip is not None:
-        return Naming.UNKNOWN if trip.limit in (DEVICE, *LATE) else Naming.WRONG
+        return Diagnosis.UNKNOWN if trip.limit in (DEVICE, *LATE) else Diagnosis.WRONG
     text = str(error)
     if isinstance(fault, Reboots):
-        return Naming.NAMED if "restarted" in text else Naming.UNKNOWN
+        return Diagnosis.NAMED if "restarted" in text else Diagnosis.UNKNOWN
     if isinstance(fault, ClockJump | QueueOverrun):
-        return Naming.NAMED if "impossible block" in text else Naming.UNKNOWN
+        return Diagnosis.NAMED if "impossible block" in text else Diagnosis.UNKNOWN
     if isinstance(error, DeviceLost) or "answer" in text or "impossible block" in text:
-        return Naming.NAMED
-    return Naming.UNKNOWN
+        return Diagnosis.NAMED
+    return Diagnosis.UNKNOWN
 
 
-def _of_machine(fault: Fault, trip: SafetyTrip | Alarm) -> Naming:
+def _of_machine(fault: Fault, trip: SafetyTrip | Alarm) -> Diagnosis:
     if isinstance(trip, SafetyTrip) and trip.limit in LATE:
-        return Naming.UNKNOWN
+        return Diagnosis.UNKNOWN
     own = {getattr(fault, key, None) for key in ("channel", "other")} - {None}
     if own:
-        return Naming.NAMED if trip.channel in own else Naming.WRONG
+        return Diagnosis.NAMED if trip.channel in own else Diagnosis.WRONG
     joint = getattr(fault, "joint", None)
     if joint is not None and trip.joint == joint + 1:
-        return Naming.NAMED
+        return Diagnosis.NAMED
     if ch.kind_of(trip.channel)[0] == ch.SUPPLY if trip.channel else False:
-        return Naming.NAMED if joint is None else Naming.UNKNOWN
-    return Naming.WRONG
+        return Diagnosis.NAMED if joint is None else Diagnosis.UNKNOWN
+    return Diagnosis.WRONG
 
 
 def wires() -> tuple[str, ...]:

@@ -101,14 +101,12 @@ def many_stops(
     return delays, failed
 
 
-def stop_figures(
-    runtime: Path, say: Callable[[str], None], count: int, busy: int | None = None
-) -> list[Figure]:
+def stop_figures(runtime: Path, say: Callable[[str], None], count: int) -> list[Figure]:
     """Stop `count` runs of the simulated bench by a key, each from a screen in command.
 
-    `busy` processes keep the cores busy, by default as many as there are cores.
+    As many processes as there are cores keep the cores busy.
     """
-    busy = (os.cpu_count() or 1) if busy is None else busy
+    busy = os.cpu_count() or 1
     say(f"screen: {count} stops by key, in real time, beside {busy} busy processes")
     with busy_cores(busy):
         delays, failed = many_stops(runtime, say, count)

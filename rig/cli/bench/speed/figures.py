@@ -9,14 +9,18 @@ from hil_sim.scenario.file import Scenario
 from rig.cli.bench.figure import Figure
 from rig.cli.bench.plant import hard_laws
 from rig.cli.bench.speed.free_run import free_run_times
-from rig.cli.bench.timing import Spent, spent_together
+from rig.cli.bench.timing import ProcessorTime, processor_times
 from rig.model.rig import Rig
 
 BLOCK, TICKS = 10, 5000
 
 
-def beside(
-    group: str, name: str, own: Spent, anchor: tuple[str, Spent] | None, limit: float | None
+def ratio_figures(
+    group: str,
+    name: str,
+    own: ProcessorTime,
+    anchor: tuple[str, ProcessorTime] | None,
+    limit: float | None,
 ) -> list[Figure]:
     """Return a time, its anchor and their ratio; `limit` bounds that, or the time without one."""
     bound = None if anchor else limit
@@ -40,7 +44,9 @@ def free_run_figures(rig: Rig) -> list[Figure]:
     group, times = "analysis", free_run_times(rig)
     own, hand = times["own"], times["hand"]
     figures = [
-        *beside(group, "free run of 10 s, both joints", own, ("the same by hand", hand), 1.4),
+        *ratio_figures(
+            group, "free run of 10 s, both joints", own, ("the same by hand", hand), 1.4
+        ),
         Figure(group, "free run", times["times_real_time"], "x real time", 500, True),
         Figure(group, "difference of the two", times["difference_to_hand"], "rad", 1e-9),
         Figure(group, "its largest error over a state's range", times["error"]),
@@ -76,10 +82,10 @@ def plant_over_kernel(rig: Rig) -> list[Figure]:
 
         return work
 
-    times = spent_together({"blocks": run(BLOCK), "kernel": run(TICKS)})
+    times = processor_times({"blocks": run(BLOCK), "kernel": run(TICKS)})
     blocks, kernel = times["blocks"], times["kernel"]
     seconds = TICKS / rig.sample_rate
     return [
         Figure("plant", "in blocks of 10", seconds / blocks.least, "x real time", 160, True),
-        *beside("plant", "5 s in blocks of 10", blocks, ("5 s at once", kernel), 1.1),
+        *ratio_figures("plant", "5 s in blocks of 10", blocks, ("5 s at once", kernel), 1.1),
     ]

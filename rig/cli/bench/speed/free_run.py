@@ -27,7 +27,7 @@ from analysis.simulation.twin import holding_state
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from rig.cli.bench.speed import cvodes, hand_fused
-from rig.cli.bench.timing import REPEATS, spent_together
+from rig.cli.bench.timing import REPEATS, processor_times
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
@@ -98,7 +98,7 @@ def free_run_times(rig: Rig, repeats: int = REPEATS) -> dict[str, Any]:
             by_cvodes = cvodes.solver(p, inputs, drive.rate, SCALE, Path(folder))(loosest, y0)
             errors["cvodes_error"] = error(by_cvodes())
             works["cvodes"] = lambda: pistons(by_cvodes())
-        times = spent_together(works, repeats)
+        times = processor_times(works, repeats)
     return {
         **times,
         "simulated_seconds": t[-1],

@@ -12,7 +12,7 @@ from analysis.terms.base import Used
 from rig.cli.bench.analysis import bench_run
 from rig.cli.bench.figure import Figure
 from rig.cli.bench.speed.free_run import both_moving
-from rig.cli.bench.timing import spent
+from rig.cli.bench.timing import processor_time
 from rig.model.rig import Rig
 from rig.runs.rigs import load_rig
 
@@ -30,7 +30,7 @@ def growth_figures(say: Say) -> list[Figure]:
     for name, work in _works(load_rig("shinshu-2dof")):
         say(f"growth: {name}")
         work()  # what loads or compiles first is not growth
-        figures.append(Figure(GROUP, name, 1e3 * spent(work).least, "ms"))
+        figures.append(Figure(GROUP, name, 1e3 * processor_time(work).least, "ms"))
     return figures
 
 

@@ -140,7 +140,7 @@ def _cost(work: Callable[[], int]) -> tuple[_Cost, int]:
     return _Cost(busy / blocks, wall / blocks), blocks
 
 
-def _recorded(rig: Rig) -> tuple[ModbusTcpDriver, list[bytes]]:
+def _recording_driver(rig: Rig) -> tuple[ModbusTcpDriver, list[bytes]]:
     """Return a driver, and the list that gets what it asks for from now on."""
     requests: list[bytes] = []
 
@@ -164,7 +164,7 @@ def _protocol_run(rig: Rig, folder: Path) -> tuple[_Cost, _Conversation]:
     with simulated_bench(RIG, seed=0) as endpoint:
         reached = reached_at(rig, endpoint)
         machine = StateMachine()
-        driver, requests = _recorded(reached)
+        driver, requests = _recording_driver(reached)
         machine.to(EngineState.CHECKING, PROTOCOL)
         recorder, publisher = Recorder(folder, reached), Publisher(f"bench-{rig.name}")
         with Bench(reached, driver, recorder, publisher, signals=False) as bench:
@@ -186,13 +186,13 @@ def _repeated(rig: Rig, conversation: _Conversation) -> _Cost:
         at = TcpSettings.of(reached_at(rig, endpoint).wire)
         client: Any = ModbusTcpClient(at.host, port=at.port, timeout=2.0)
         client.connect()
-        asked = [
-            [_asked(client, request) for request in part]
+        calls = [
+            [_pymodbus_call(client, request) for request in part]
             for part in (conversation.before, conversation.measured, conversation.after)
         ]
 
         def ask(part: int) -> int:
-            for call in asked[part]:
+            for call in calls[part]:
                 call()
             return conversation.blocks
 
@@ -203,7 +203,7 @@ def _repeated(rig: Rig, conversation: _Conversation) -> _Cost:
     return cost
 
 
-def _asked(client: Any, request: bytes) -> Callable[[], object]:
+def _pymodbus_call(client: Any, request: bytes) -> Callable[[], object]:
     """Return the call of pymodbus that sends a request."""
     function, at = request[0], int.from_bytes(request[1:3], "big")
     words = np.frombuffer(request[1:], ">u2", len(request[1:]) // 2).tolist()

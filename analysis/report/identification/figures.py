@@ -10,11 +10,11 @@ from markupsafe import Markup
 
 from analysis.identify.result import Identification
 from analysis.report import format as fm
-from analysis.report.machine import steps
+from analysis.report.identification.machine import steps
+from analysis.report.identification.tables import joints_of
 from analysis.report.plots import arm_plot, interval_plots, record_plots, validation_plots
 from analysis.report.residuals import Residual
 from analysis.report.settings import REPORT
-from analysis.report.tables import joints_of
 from analysis.simulation.validate import RecordValidation
 from rig.model import channels as ch
 from rig.model.records import Record, Run

@@ -31,7 +31,7 @@ log = logging.getLogger(__name__)
 OnPhase = Callable[[str, str, int, int, str], None]
 
 
-class Conductor:
+class PlanRunner:
     """One run of a plan: its session, its state, what is done and what is left."""
 
     def __init__(
@@ -46,14 +46,14 @@ class Conductor:
         self._place = plan.place
         self._parts = len(plan.sequence)
         self._on_phase = on_phase
-        self._taken: dict[str, int] = {}  # complete records by step
-        self._begun: dict[str, int] = {}  # the same, when the step was begun
+        self._complete: dict[str, int] = {}  # complete records by step
+        self._at_begin: dict[str, int] = {}  # the same, when the step was begun
         self._last_record = ""
         self._part: PlannedStep | None = None
         self._part_began = 0.0
-        self._left = 0.0
+        self._later_seconds = 0.0
         self._origin: int | None = None  # tick of the run's first block
-        self._before = 0.0  # [s] until a lost device was connected anew
+        self._elapsed_before = 0.0  # [s] until a lost device was connected anew
 
     # Where it stands
 
@@ -65,31 +65,31 @@ class Conductor:
     @property
     def interrupted(self) -> bool:
         """Whether a person asked for a pause, or to skip the step."""
-        return self.desk.control.wishes.pause or self.desk.control.wishes.skip
+        return self.desk.control.requests.pause or self.desk.control.requests.skip
 
     @property
     def elapsed(self) -> float:
         """Device time [s] since the run's first block."""
         if self._origin is None:
             self._origin = self.session.now or None
-        return self._before + (self.session.now - (self._origin or 0)) / self.session.rate
+        return self._elapsed_before + (self.session.now - (self._origin or 0)) / self.session.rate
 
     def begin(self, part: PlannedStep, rest: Sequence[PlannedStep]) -> None:
         """Begin a step of the plan's sequence; `rest` are those after it."""
         self._part, self._part_began = part, self.elapsed
-        self._left = sum(after.seconds for after in rest)
+        self._later_seconds = sum(after.seconds for after in rest)
         self.bench.status(part=self._parts - len(rest))
 
-    def left(self) -> float:
+    def remaining_seconds(self) -> float:
         """Return the expected time [s] to the end; conditions count as little as they may."""
         if self._part is None:
-            return self._left
+            return self._later_seconds
         own = self._part.seconds - (self.elapsed - self._part_began)
-        return self._left + max(0.0, own)
+        return self._later_seconds + max(0.0, own)
 
     def report_phase(self, step: str, phase: str, repeat: int, repeats: int, message: str) -> None:
         """Report a phase, and when the run is expected to end."""
-        self.bench.status(total_s=self.elapsed + self.left())
+        self.bench.status(total_s=self.elapsed + self.remaining_seconds())
         self._on_phase(step, phase, repeat, repeats, message)
 
     def note_state(self, before: EngineState, after: EngineState, why: str) -> None:
@@ -112,17 +112,17 @@ class Conductor:
     def excite(self, planned: PlannedStep) -> None:
         """Take the records of an excitation, from its place on after every pause."""
         (step,) = planned.excitations
-        before = self._begun.setdefault(step.name, self._taken.get(step.name, 0))
+        before = self._at_begin.setdefault(step.name, self._complete.get(step.name, 0))
         swept = planned.step.parameters if isinstance(planned.step, Step) else {}
         running = ExcitationRun(self.session, self._place, step, self, before + 1, swept)
-        running.taken = self._taken.get(step.name, 0) - before  # after a lost device
+        running.taken = self._complete.get(step.name, 0) - before  # after a lost device
         complete = running.taken >= step.repeats
         while not complete:
             try:
                 complete = running.run()
             finally:
-                self.records += before + running.taken - self._taken.get(step.name, 0)
-                self._taken[step.name] = before + running.taken
+                self.records += before + running.taken - self._complete.get(step.name, 0)
+                self._complete[step.name] = before + running.taken
                 if running.taken:
                     self._last_record = f"{step.name}_r{before + running.taken}"
             if complete or self._skipped(step.name):
@@ -130,7 +130,7 @@ class Conductor:
             self._safe_point()
             if self._skipped(step.name):
                 break
-        self._begun.pop(step.name, None)
+        self._at_begin.pop(step.name, None)
 
     def excite_until(self, planned: PlannedStep, condition: Condition | None, most: float) -> bool:
         """Excite without records until a condition holds; False after `most` seconds."""
@@ -172,7 +172,7 @@ class Conductor:
 
     def _record_at_rest(self, planned: PlannedStep, seconds: float) -> None:
         name = planned.name
-        repeat = self._taken.get(name, 0) + 1
+        repeat = self._complete.get(name, 0) + 1
         joints = tuple(range(1, self.session.joints + 1))
         ticks = round(seconds * self.session.rate)
         meta = RecordMeta(step=name, repeat=repeat, locked=joints, attributes={"excited": ""})
@@ -185,7 +185,7 @@ class Conductor:
                 began = look(self.session, j, first, first + span).piston
                 ended = look(self.session, j, first + ticks - span, first + ticks).piston
                 record.note(**{f"creep_m_{j + 1}": ended - began})
-        self._taken[name] = repeat
+        self._complete[name] = repeat
         self.records += 1
 
     def lock(self, planned: PlannedStep, locks: Sequence[LockPlan]) -> None:
@@ -217,7 +217,7 @@ class Conductor:
         """
         self.rest_now("a question")
         control = self.desk.control
-        control.answers, control.wishes.answer = question.answers, None
+        control.answers, control.requests.answer = question.answers, None
         self.machine.to(EngineState.PROMPTING, question.text)
         self.bench.status(prompt=question.text, answers=list(question.answers))
         choice = f"{question.text} [{'/'.join(question.answers)}]"
@@ -236,9 +236,9 @@ class Conductor:
         began = self.elapsed
         while self.elapsed - began < limit:
             self.session.wait(ENGINE.look_seconds)
-            wish = self.desk.control.wishes.answer
-            if wish is not None:
-                return wish, "from the screen"
+            answer = self.desk.control.requests.answer
+            if answer is not None:
+                return answer, "from the screen"
             typed = None if self.desk.terminal is None else self.desk.terminal()
             if typed is not None:
                 if typed.strip() in question.answers:
@@ -298,41 +298,41 @@ class Conductor:
             self.machine.to(EngineState.IDLE, why)
 
     def reconnect(self, wait: float) -> None:
-        """Connect anew to a lost device and forget what was read of it."""
-        self._before = self.elapsed
+        """Connect anew to a lost device and drop what was read of it."""
+        self._elapsed_before = self.elapsed
         self.bench.reconnect(wait)
         self.session.forget()
         self._origin = None
 
     def _heed(self) -> None:
-        if self.desk.control.wishes.abort:
+        if self.desk.control.requests.abort:
             self.bench.zero_outputs()
-            raise OperatorStop(self.desk.control.wishes.abort)
+            raise OperatorStop(self.desk.control.requests.abort)
 
     def _safe_point(self) -> None:
         """Pause here if a person asked for it; raises RunEnded when nobody resumes."""
-        wishes = self.desk.control.wishes
-        if not wishes.pause:
+        requests = self.desk.control.requests
+        if not requests.pause:
             return
         self.rest_now("a pause was asked for")
-        wishes.pause = wishes.resume = False
+        requests.pause = requests.resume = False
         self.machine.to(EngineState.PAUSED, "until someone resumes")
         self.report_phase("pause", "paused", 0, 0, "outputs at zero until someone resumes")
         began = self.elapsed
-        while not wishes.resume and not wishes.skip:
+        while not requests.resume and not requests.skip:
             if self.elapsed - began > self.desk.longest_pause:
                 raise RunEnded(
                     f"paused for longer than {self.desk.longest_pause:g} s; the run is over"
                 )
             self.session.wait(ENGINE.look_seconds)
-        wishes.resume = False
+        requests.resume = False
         self.machine.to(EngineState.IDLE, "resumed; places and locks are made anew")
 
     def _skipped(self, name: str) -> bool:
-        wishes = self.desk.control.wishes
-        if not wishes.skip:
+        requests = self.desk.control.requests
+        if not requests.skip:
             return False
-        wishes.skip = False
+        requests.skip = False
         self.rest_now(f"{name} is skipped")
         self.mark(f"{name} was skipped by a person")
         self.report_phase(name, "skip", 0, 0, "skipped by a person")
@@ -343,9 +343,9 @@ class Conductor:
         began = self.elapsed
         self.session.wait(min(ENGINE.look_seconds, seconds))
         while done is None or not done():
-            if self.desk.control.wishes.skip:
+            if self.desk.control.requests.skip:
                 return True
-            if self.desk.control.wishes.pause and self.machine.state is EngineState.IDLE:
+            if self.desk.control.requests.pause and self.machine.state is EngineState.IDLE:
                 self._safe_point()
             left = seconds - (self.elapsed - began)
             if left <= 0.5 / self.session.rate:

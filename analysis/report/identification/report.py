@@ -14,8 +14,9 @@ from typing import Any
 
 from analysis.identify.result import Identification
 from analysis.identify.stacked_rows import RecordRows, build_rows
-from analysis.report import facts, figures, machine, paper, tables
 from analysis.report import format as fm
+from analysis.report import paper
+from analysis.report.identification import facts, figures, machine, tables
 from analysis.report.page import page, write
 from analysis.report.residuals import per_repeat, residuals
 from analysis.simulation.validate import RecordValidation

@@ -14,8 +14,8 @@ from analysis.identify.result import Identification
 from analysis.identify.settings import IDENTIFY
 from analysis.report import format as fm
 from analysis.report import paper
+from analysis.report.identification.tables import FitTable, worst_fit
 from analysis.report.plots.interval_plots import relative_half_width
-from analysis.report.tables import FitTable, worst_fit
 from analysis.simulation.model import Estimate
 from analysis.simulation.validate import RecordValidation
 from rig.model.parameters import parameter_names

@@ -1,0 +1,1 @@
+"""The report of an identification: its page, tables and figures."""
