@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
@@ -24,6 +23,7 @@ from analysis.terms.base import (
 )
 from analysis.terms.gravity import Gravity
 from analysis.terms.inertia import Inertia, inertia_map
+from analysis.terms.sine_cosine import sine_cosine
 from rig.model.parameters import inertia_names
 from rig.model.rig import Rig
 
@@ -113,18 +113,21 @@ def _payload(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-de
     ax, ay, rate = 0.0, 0.0, 0.0
     for k in range(N):
         rate += x[QD, k]
-        ax -= par[2 + k] * rate * rate * math.sin(x[THETA, k])
-        ay += par[2 + k] * rate * rate * math.cos(x[THETA, k])
+        sine, cosine = sine_cosine(x[THETA, k])
+        ax -= par[2 + k] * rate * rate * sine
+        ay += par[2 + k] * rate * rate * cosine
     jx_i, jy_i = 0.0, 0.0
     for i in range(N - 1, -1, -1):
-        jx_i += par[2 + i] * math.cos(x[THETA, i])
-        jy_i += par[2 + i] * math.sin(x[THETA, i])
+        sine, cosine = sine_cosine(x[THETA, i])
+        jx_i += par[2 + i] * cosine
+        jy_i += par[2 + i] * sine
         # theta = 0 hangs straight down: the tip's height grows by jy per unit of angle.
         out[TORQUE, i] -= m * (jx_i * ax + jy_i * (ay + g))
         jx_j, jy_j = 0.0, 0.0
         for j in range(N - 1, -1, -1):
-            jx_j += par[2 + j] * math.cos(x[THETA, j])
-            jy_j += par[2 + j] * math.sin(x[THETA, j])
+            sine, cosine = sine_cosine(x[THETA, j])
+            jx_j += par[2 + j] * cosine
+            jy_j += par[2 + j] * sine
             M[i, j] += m * (jx_i * jx_j + jy_i * jy_j)
 
 

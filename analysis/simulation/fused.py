@@ -46,6 +46,7 @@ from analysis.terms.base import (
     U,
     Used,
 )
+from analysis.terms.sine_cosine import sine_cosine
 from analysis.terms.specialise import Helpers, ScalarArray, specialised
 
 Array = NDArray[np.float64]
@@ -137,7 +138,7 @@ def _generated(
         body.add(f"p{k} = par[{k}]")
     for k in range(4 * N, 4 * N + sum(hidden)):
         body.add(f"y{k} = y[{k}]", f"dy{k} = 0.0")
-    _observe(body, electric)
+    _observe(body, electric, helpers.copy(sine_cosine, {}, {})[0])
     for row in range(OUT_ROWS):
         for i in range(N):
             body.add(f"out{row}_{i} = 0.0")
@@ -168,7 +169,7 @@ class _Lines:
         return "".join(f"    {line}\n" for line in self.lines)
 
 
-def _observe(body: _Lines, electric: Sequence[bool]) -> None:
+def _observe(body: _Lines, electric: Sequence[bool], sine_cosine: str) -> None:
     """Write what all terms see: inputs at t, the joints' geometry, chambers, volumes."""
     N = len(electric)
     width = 3 + 4 * N
@@ -219,9 +220,9 @@ def _observe(body: _Lines, electric: Sequence[bool]) -> None:
             f"pin_a = geometry[{g + eq.PIN_A}]",
             f"pin_c = geometry[{g + eq.PIN_C}]",
             f"beta = x{Q}_{i} + geometry[{g + eq.OFFSET}]",
-            "length = math.sqrt("
-            "pin_a * pin_a + pin_c * pin_c - 2.0 * pin_a * pin_c * math.cos(beta))",
-            f"x{G}_{i} = pin_a * pin_c * math.sin(beta) / length",
+            f"sine, cosine = {sine_cosine}(beta)",
+            "length = math.sqrt(pin_a * pin_a + pin_c * pin_c - 2.0 * pin_a * pin_c * cosine)",
+            f"x{G}_{i} = pin_a * pin_c * sine / length",
             f"x{S}_{i} = length - geometry[{g + eq.MID}]",
             f"x{SD}_{i} = x{G}_{i} * x{QD}_{i}",
             f"x{P_CAP}_{i} = y[{2 * N + i}]",

@@ -63,6 +63,7 @@ from analysis.terms.base import (
     U,
     Used,
 )
+from analysis.terms.sine_cosine import sine_cosine
 
 
 @njit(cache=True, error_model="numpy")
@@ -102,8 +103,9 @@ def _observe(t, y, inputs, rate, locked, geometry, bench, x, q_dd):  # type: ign
         x[THETA, i] = angle
         a, c = geometry[i, PIN_A], geometry[i, PIN_C]
         beta = x[Q, i] + geometry[i, OFFSET]
-        length = math.sqrt(a * a + c * c - 2.0 * a * c * math.cos(beta))
-        x[G, i] = a * c * math.sin(beta) / length
+        sine, cosine = sine_cosine(beta)
+        length = math.sqrt(a * a + c * c - 2.0 * a * c * cosine)
+        x[G, i] = a * c * sine / length
         x[S, i] = length - geometry[i, MID]
         x[SD, i] = x[G, i] * x[QD, i]
         x[P_CAP, i] = y[2 * N + i]

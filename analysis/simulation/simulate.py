@@ -22,6 +22,7 @@ from analysis.simulation.model import Model
 from analysis.simulation.settings import SIMULATION
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
+from analysis.terms.sine_cosine import sine_cosine
 from analysis.terms.specialise import NotSpecialisable
 from rig.model import channels as ch
 from rig.model.parse import InputError
@@ -286,26 +287,37 @@ def _output(geometry, inputs, locked, ys, filled, electric, q, qd, cap, rod, pis
     Return how many samples have a pressure outside [0, p_s]; none where the joints are electric.
     """
     n, N = q.shape
+    ys[filled:] = ys[filled - 1]
     count = 0
     for k in range(n):
-        beyond, row = False, ys[min(k, filled - 1)]
+        beyond, p_s = False, inputs[k, 0]
         for i in range(N):
-            q[k, i], qd[k, i] = row[i], row[N + i]
-            cap[k, i], rod[k, i] = row[2 * N + i], row[3 * N + i]
-            if locked[i]:
-                q[k, i], qd[k, i] = inputs[k, 2 + N + i], inputs[k, 2 + 2 * N + i]
-            if electric:
-                continue
-            a, c = geometry[i, eq.PIN_A], geometry[i, eq.PIN_C]
-            beta = q[k, i] + geometry[i, eq.OFFSET]
-            length = math.sqrt(a * a + c * c - 2.0 * a * c * math.cos(beta))
-            piston[k, i] = length - geometry[i, eq.MID]
-            speed[k, i] = a * c * math.sin(beta) / length * qd[k, i]
-            if not locked[i]:
-                for p in (cap[k, i], rod[k, i]):
-                    beyond = beyond or p < 0.0 or p > inputs[k, 0]
-        count += beyond and k < filled
-    return count
+            q[k, i], qd[k, i] = ys[k, i], ys[k, N + i]
+            a, b = ys[k, 2 * N + i], ys[k, 3 * N + i]
+            cap[k, i], rod[k, i] = a, b
+            beyond |= (not locked[i]) & ((a < 0.0) | (a > p_s) | (b < 0.0) | (b > p_s))
+        count += beyond & (k < filled)
+    for i in range(N):
+        if locked[i]:
+            q[:, i], qd[:, i] = inputs[:, 2 + N + i], inputs[:, 2 + 2 * N + i]
+        if electric:
+            continue
+        place, slope = _linkage(q[:, i].copy(), geometry[i])
+        for k in range(n):
+            piston[k, i], speed[k, i] = place[k], slope[k] * qd[k, i]
+    return 0 if electric else count
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _linkage(q, geometry):  # type: ignore[no-untyped-def]
+    """Return a piston's place and ds/dq at angles q (n,), several samples at once."""
+    a, c, mid = geometry[eq.PIN_A], geometry[eq.PIN_C], geometry[eq.MID]
+    place, slope = np.empty((2, len(q)))
+    for k in range(len(q)):
+        sine, cosine = sine_cosine(q[k] + geometry[eq.OFFSET])
+        length = math.sqrt(a * a + c * c - 2.0 * a * c * cosine)
+        place[k], slope[k] = length - mid, a * c * sine / length
+    return place, slope
 
 
 def state_at(signals: Signals, sample: int) -> State:

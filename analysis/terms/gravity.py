@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
@@ -22,6 +21,7 @@ from analysis.terms.base import (
     equation,
     kernel,
 )
+from analysis.terms.sine_cosine import sine_cosine
 from rig.model.rig import Rig
 
 
@@ -60,7 +60,7 @@ def _kernel(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def
         return
     carried = 0.0
     for i in range(x.shape[1] - 1, -1, -1):
-        carried += par[i] * math.sin(x[THETA, i])
+        carried += par[i] * sine_cosine(x[THETA, i])[0]
         out[TORQUE, i] -= carried
 
 

@@ -23,6 +23,7 @@ from analysis.terms.base import (
     equation,
     kernel,
 )
+from analysis.terms.sine_cosine import sine_cosine
 from rig.model.rig import Rig
 
 PARAMETER = "base_inclination"
@@ -106,7 +107,7 @@ def _kernel(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def
     N = x.shape[1]
     carried = 0.0
     for i in range(N - 1, -1, -1):
-        carried += par[i] * math.sin(x[THETA, i] + par[N])
+        carried += par[i] * sine_cosine(x[THETA, i] + par[N])[0]
         out[TORQUE, i] -= carried
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
@@ -24,6 +23,7 @@ from analysis.terms.base import (
     equation,
     kernel,
 )
+from analysis.terms.sine_cosine import sine_cosine
 from rig.model.parameters import inertia_names
 from rig.model.rig import Rig
 
@@ -133,8 +133,8 @@ def _kernel(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def
             rate_j = rate_k
             for m in range(k + 1, j + 1):
                 rate_j += x[QD, m]
-            turn = x[THETA, k] - x[THETA, j]
-            c, s = R * math.cos(turn), R * math.sin(turn)
+            sine, cosine = sine_cosine(x[THETA, k] - x[THETA, j])
+            c, s = R * cosine, R * sine
             # Link k feels + s theta_j'^2, link j feels - s theta_k'^2; joints below carry both.
             for a in range(j + 1):
                 if a <= k:

@@ -146,11 +146,12 @@ def forecast(
     shift = float(np.mean(apart[known][-20:])) if known.any() else 0.0
     slope = 0.0
     if m >= shortest and np.count_nonzero(known) > 2:
-        slope = float(np.polyfit(past[known] / rate, apart[known], 1)[0])
+        since = past[known] - np.mean(past[known])
+        slope = rate * float(since @ apart[known] / (since @ since))
     reach = max(1, min(horizon, m))
     ahead = np.arange(0, reach, max(1, reach // 1000))
     path = reference[(m + ahead) % period] + shift + slope * ahead / rate
-    return BiasForecast(float(np.nanmin(path)), float(np.nanmax(path)), slope, shift)
+    return BiasForecast(float(np.fmin.reduce(path)), float(np.fmax.reduce(path)), slope, shift)
 
 
 def leaves(expected: BiasForecast, low: float, high: float) -> bool:

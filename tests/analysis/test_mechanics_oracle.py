@@ -9,6 +9,7 @@ from analysis.regression.rows import parameters_of
 from analysis.terms import baseline, make
 from analysis.terms.base import Used, equation
 from analysis.terms.inertia import chain_matrix, mass_matrix
+from analysis.terms.sine_cosine import sine_cosine
 from hil_sim.plant.kernel import angular
 from hil_sim.plant.kernel_data import JOINT
 from hil_sim.plant.tables import inertia_matrix
@@ -146,3 +147,10 @@ def test_the_plants_own_mechanics_agree_with_the_oracle(chain: Chain, joints: in
         )  # fmt: skip
         theirs = np.cumsum(pin.aba(chain.model, chain.data, q, qd, torque))
         np.testing.assert_allclose(absolute, theirs, rtol=1e-7, atol=1e-7)
+
+
+@pytest.mark.parametrize("largest", [1e-3, 1.0, 100.0, 1e6])
+def test_the_kernels_sine_and_cosine_are_the_librarys(largest: float) -> None:
+    angles = np.random.default_rng(0).uniform(-largest, largest, 2000)
+    own = np.array([sine_cosine(angle) for angle in angles])
+    np.testing.assert_allclose(own, np.column_stack((np.sin(angles), np.cos(angles))), atol=5e-16)

@@ -36,7 +36,7 @@ def test_the_spool_follows_held_commands_however_the_blocks_are_cut(damping_rati
     rig = rig_with(damping_ratio)
     commands = np.repeat(np.random.default_rng(1).uniform(-12.0, 12.0, (50, 2)), 4, axis=0)
     expected = ExpectedSpool(rig)
-    in_blocks = np.vstack([expected.follow(part) for part in np.split(commands, [70, 80, 81])])
+    in_blocks = np.hstack([expected.follow(part.T) for part in np.split(commands, [9, 10, 20])]).T
     for j, joint in enumerate(rig.joints):
         assert in_blocks[:, j] == pytest.approx(
             response(joint.valve, commands[:, j], rig.sample_rate), abs=1e-11

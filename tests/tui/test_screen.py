@@ -369,6 +369,7 @@ async def test_an_idle_screen_draws_nothing() -> None:
         before = shown.app.pictures
         for _ in range(50):
             shown.clock.now += 0.1
+            shown.app.link.step(0.0)  # it looks for the next run
             shown.app.draw()
         assert shown.app.pictures == before
         await shown.press("4")

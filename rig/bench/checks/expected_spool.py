@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 _SQUARINGS, _TERMS = 10, 8  # of the series for the matrix exponential: exact to rounding below w dt
+_AT_ONCE: Final = 128  # samples
 
 
 class ExpectedSpool:
@@ -22,39 +24,51 @@ class ExpectedSpool:
 
     def __init__(self, rig: Rig) -> None:
         self._valves = [joint.valve for joint in rig.joints]
-        self._steps = []
+        self._maps = []
         for valve in self._valves:
             w = 2.0 * math.pi * valve.natural_frequency
             damping = 2.0 * valve.damping_ratio * w
             system = np.array([[0.0, 1.0, 0.0], [-w * w, -damping, w * w], [0.0, 0.0, 0.0]])
-            self._steps.append(_exponential(system / rig.sample_rate)[:2].tolist())
-        self._state: list[tuple[float, float]] | None = None
+            self._maps.append(_maps(_exponential(system / rig.sample_rate)[:2]))
+        self.forget()
 
     def forget(self) -> None:
         """Begin anew with the spools at rest under the next command."""
-        self._state = None
+        self._states: list[Array] = []  # of each spool: place, speed
 
     def follow(self, commands: Array) -> Array:
-        """Return the expected spools [V] under commands [V], both of shape (n, joints).
+        """Return the expected spools [V] under commands [V], both of shape (joints, n).
 
         The spool at a sample follows from the commands up to the sample before.
         """
+        wanted = [
+            np.minimum(np.maximum(valve.spool_gain * row, -valve.spool_stroke), valve.spool_stroke)
+            for valve, row in zip(self._valves, commands, strict=True)
+        ]
+        # At rest under the first command.
+        self._states = self._states or [np.array([row[0], 0.0]) for row in wanted]
         out = np.empty_like(commands)
-        after = []
-        for j, (step, valve) in enumerate(zip(self._steps, self._valves, strict=True)):
-            stroke = valve.spool_stroke
-            wanted = np.clip(valve.spool_gain * commands[:, j], -stroke, stroke).tolist()
-            # At rest under the first command.
-            place, speed = self._state[j] if self._state else (wanted[0], 0.0)
-            (pp, ps, pu), (sp, ss, su) = step
-            places = []
-            for u in wanted:
-                places.append(place)
-                place, speed = pp * place + ps * speed + pu * u, sp * place + ss * speed + su * u
-            out[:, j] = places
-            after.append((place, speed))
-        self._state = after
+        for first in range(0, commands.shape[1], _AT_ONCE):
+            for j, maps in enumerate(self._maps):
+                part = wanted[j][first : first + _AT_ONCE]
+                n = len(part)
+                known = np.concatenate((self._states[j], part))
+                out[j, first : first + n] = maps[:n, 0, : n + 2] @ known
+                self._states[j] = maps[n, :, : n + 2] @ known
         return out
+
+
+def _maps(step: Array) -> Array:
+    """Return how place and speed after 0 to `_AT_ONCE` samples follow from those and the inputs.
+
+    `step` (2, 3) is that of one sample; the shape is (_AT_ONCE + 1, 2, 2 + _AT_ONCE).
+    """
+    maps = np.zeros((_AT_ONCE + 1, 2, 2 + _AT_ONCE))
+    maps[0, :, :2] = np.eye(2)
+    for k in range(_AT_ONCE):
+        maps[k + 1] = step[:, :2] @ maps[k]
+        maps[k + 1, :, 2 + k] = step[:, 2]
+    return maps
 
 
 def _exponential(matrix: Array) -> Array:

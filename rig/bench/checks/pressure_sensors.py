@@ -92,15 +92,21 @@ def drifting(
     that grows with time [Pa], over the rows. A finding needs a motion that time does not explain,
     a force that it explains, and one chamber alone that shows it.
     """
-    terms, time = _motion(rows[:, joint, PISTON], seconds)
-    leftover = time - terms @ _fit(terms, time)
-    energy = leftover @ leftover
-    if energy < settings.trend_alone * (time @ time):
-        return None
     part = rig.joints[joint].cylinder
     cap, rod = rows[2:-2, joint, CAP], rows[2:-2, joint, ROD]
     force = cap - part.rod_area / part.cap_area * rod
     bound = settings.trend * rig.supply.pressure
+    time = np.linspace(-0.5, 0.5, len(force))
+    least = settings.trend_alone * (time @ time)
+    # By Schwarz' inequality no trend is larger than this, and mostly none needs to be fitted.
+    spread = force - np.add.reduce(force) / len(force)
+    if spread @ spread < (1.0 - 1e-6) * bound**2 * least:
+        return None
+    terms = _motion(rows[:, joint, PISTON], seconds)
+    leftover = time - terms @ _fit(terms, time)
+    energy = leftover @ leftover
+    if energy < least:
+        return None
     # What a fit of motion and time together gives to time (Frisch, Waugh 1933).
     trend = (leftover @ force) / energy
     if abs(trend) < bound:
@@ -152,14 +158,14 @@ class SlowRows:
         return self._rows[-count:] if count <= len(self._rows) else None
 
 
-def _motion(piston: Array, seconds: float) -> tuple[Array, Array]:
-    """Return what a load's force may follow, (rows - 4, 5), and time from -1/2 to 1/2."""
+def _motion(piston: Array, seconds: float) -> Array:
+    """Return what a load's force may follow, (rows - 4, 5)."""
     speed = (piston[2:] - piston[:-2]) / (2.0 * seconds)
     acceleration = (speed[2:] - speed[:-2]) / (2.0 * seconds)
     speed, piston = speed[1:-1], piston[2:-2]
     sign = np.tanh(speed / max(_SLIP * float(np.abs(speed).max()), 1e-9))
     terms = np.column_stack([np.ones_like(piston), piston, speed, sign, acceleration])
-    return terms / np.maximum(np.abs(terms).max(axis=0), 1e-12), np.linspace(-0.5, 0.5, len(piston))
+    return np.asarray(terms / np.maximum(np.abs(terms).max(axis=0), 1e-12))
 
 
 def _fit(terms: Array, values: Array) -> Array:

@@ -321,7 +321,8 @@ class Link:
             return
         self._last_search = now
         live = tuple(self._sessions.find())
-        self._frame = replace(self._frame, sessions=live, trouble="")
+        if (live, "") != (self._frame.sessions, self._frame.trouble):  # a new frame is drawn
+            self._frame = replace(self._frame, sessions=live, trouble="")
         chosen, self._chosen = self._chosen, None
         choosing, self._choosing = self._choosing, False
         if chosen is not None and chosen in live:

@@ -25,7 +25,7 @@ WARM: Final = 4.0  # until the screen has started and its caches are filled [s]
 SETTLE: Final = 3.0  # until the screen has noticed the end of the run [s]
 BLOCK: Final = 0.01  # of samples handed over at once [s]
 LIVE_LIMIT: Final = 15.0  # [% of one core]
-IDLE_LIMIT: Final = 3.0  # [% of one core]
+IDLE_LIMIT: Final = 1.0  # [% of one core]
 
 
 def publish(seconds: float, folder: str) -> None:
