@@ -185,6 +185,9 @@ def force_unit(rig: Rig, joint: int) -> str:
     return str(getattr(rig.joints[joint], "force_unit", "N"))
 
 
+FALLS: Final = 0.5  # of the level, up to the joint's speed limit: a level by Coulomb does not fall
+
+
 @dataclass(frozen=True)
 class CoulombFriction(Friction):
     """F_f = Fc z: dry friction of one level (Coulomb 1785; the contact's state z, see the module).
@@ -220,9 +223,13 @@ class CoulombFriction(Friction):
         return self.row({f"Fc{self.joint + 1}": signals.G[:, self.joint] * z})
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Refuse friction that drives, and more than half of the cylinder's force."""
+        """Refuse friction that drives or falls with speed, and half of the cylinder's force."""
         name = f"Fc{self.joint + 1}"
-        return beyond(name, values[name], "N", force_limit(rig, self.joint))
+        level, joint = values[name], rig.joints[self.joint]
+        viscous = values.get(f"Fv{self.joint + 1}", 0.0) / float(joint.geometry(0.0)[1]) ** 2
+        if viscous * joint.limits.speed < -FALLS * abs(level):
+            return "viscous friction would be negative: this level falls with speed"
+        return beyond(name, level, "N", force_limit(rig, self.joint))
 
 
 @dataclass(frozen=True)

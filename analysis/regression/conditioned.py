@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from analysis.regression.rows import Filtering, default_filtering
-from analysis.signals.conditioning import Signals, condition
+from analysis.regression.settings import REGRESSION
+from analysis.signals.conditioning import Signals, condition, without_rests
 from analysis.signals.locks import moving_by_step
 from analysis.terms.base import FAMILIES
 from rig.model.records import Record, Run
@@ -25,6 +26,11 @@ class ConditionedRecord:
     signals: Signals
     filtering: Filtering
     families: tuple[str, ...] = tuple(FAMILIES)
+
+    def again(self, rig: Rig, record: Record) -> ConditionedRecord:
+        """Return another record (repeats averaged, noise added) made ready as this one was."""
+        signals = condition(rig, record, self.filtering.channels, self.signals.moving)
+        return replace(self, record=record, signals=_counted(signals, self.filtering))
 
     @property
     def group(self) -> tuple[int, str]:
@@ -45,5 +51,10 @@ def condition_runs(
         for record in run.records:
             filters = filtering(record)
             signals = condition(rig, record, filters.channels, moving[record.step])
+            signals = _counted(signals, filters)
             out.append(ConditionedRecord(number, record, signals, filters, families))
     return out
+
+
+def _counted(signals: Signals, filters: Filtering) -> Signals:
+    return signals if filters.rests else without_rests(signals, REGRESSION.rest_speed)

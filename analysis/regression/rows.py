@@ -38,11 +38,15 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Filtering:
-    """The filters of one record: `channels` before, `rows` (or none) after."""
+    """The filters of one record: `channels` before, `rows` (or none) after.
+
+    Without `rests` no torque balance counts the samples at which its joint rests.
+    """
 
     channels: Smoother
     rows: FirSmoother | None
     step: int = 1
+    rests: bool = True
 
 
 @dataclass(frozen=True)
@@ -216,9 +220,18 @@ def term_part(
     raw = used.term.columns(rig, signals, used.shape)
     valid = used.term.valid(rig, measured, used.shape)
     return TermPart(
-        {e: low_passed(raw[e], filtering) for e in equations if raw.get(e)},
+        {e: low_passed(weighted(raw[e], signals, e), filtering) for e in equations if raw.get(e)},
         {e: valid[e] for e in equations if e in valid},
     )
+
+
+def weighted(columns: Mapping[str, Array], signals: Signals, name: str) -> Mapping[str, Array]:
+    """Return an equation's columns (n,) times what each sample counts in it."""
+    kind, number = name.rsplit("_", 1)
+    if signals.weight is None or kind != "torque":
+        return columns
+    weight = signals.weight[:, int(number) - 1]
+    return {parameter: weight * column for parameter, column in columns.items()}
 
 
 def right_parts(
@@ -232,7 +245,7 @@ def right_parts(
         i = int(name.rsplit("_", 1)[1]) - 1
         # Inertia couples: a clipped piston of any joint spoils every torque row.
         joints = slice(None) if family == "mechanical" else slice(i, i + 1)
-        side = low_passed({"": sides[name]}, filtering)[""]
+        side = low_passed(weighted({"": sides[name]}, signals, name), filtering)[""]
         time = instants(signals.t, filtering, len(side))
         sensors = np.asarray(signals.valid[:, joints].all(axis=1))
         out[name] = RightPart(side, time, sensors, _lost(signals, joints))

@@ -33,7 +33,8 @@ class Signals:
     of the joint was clipped within the filter's reach or the filter runs over the record's edge.
     `lost` (n, N) is true where a sample of the joint that never arrived is within that reach: what
     stands there was made up by a straight line, and no row may see it. `moving` (N,) marks the
-    joints whose motion is the measured one; the others stand still.
+    joints whose motion is the measured one; the others stand still. `weight` (n, N), where given,
+    is what each joint's torque balance counts at a sample (see `without_rests`).
     """
 
     rate: float
@@ -59,11 +60,26 @@ class Signals:
     valid: Mask
     lost: Mask | None = None
     moving: Mask | None = None
+    weight: Array | None = None
 
     @property
     def joints(self) -> int:
         """N."""
         return int(self.s.shape[1])
+
+
+def without_rests(signals: Signals, share: float) -> Signals:
+    """Return signals by which no torque balance counts the samples at which its joint rests.
+
+    At rest dry friction is whatever holds the joint, anything up to its breakaway: no law of the
+    speed can be compared with it. A balance that holds at every sample holds under any weight, so
+    that both of its sides are weighted before they are filtered: by 0 up to `share` of the record's
+    rms speed, by 1 from twice that on, smoothly between.
+    """
+    speed = np.abs(signals.sd)
+    least = share * np.sqrt(np.mean(speed**2, axis=0))
+    x = np.clip(speed / np.where(least > 0.0, least, 1.0) - 1.0, 0.0, 1.0)
+    return replace(signals, weight=x * x * (3.0 - 2.0 * x))
 
 
 def aligned_channels(rig: Rig, record: Record) -> dict[str, Array]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import hashlib
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,11 +19,16 @@ from analysis.identify.geometry import wider
 from analysis.identify.identify import identify
 from analysis.identify.result import Identification, by_geometry
 from analysis.regression.conditioned import ConditionedRecord
+from analysis.regression.rows import Filtering, default_filtering
 from analysis.simulation.model import Model
 from analysis.terms import baseline_of
-from analysis.terms.base import FAMILIES, Used
+from analysis.terms.base import FAMILIES, Used, equation
 from analysis.trace.data.candidates import catalogue, free_mechanisms
-from analysis.trace.data.conditioned_record import conditioned_records
+from analysis.trace.data.conditioned_record import (
+    conditioned_records,
+    moving_filtering,
+    trace_filtering,
+)
 from analysis.trace.data.noise_floor import NEIGHBOURS, PERIODS, REPEATS, STATED
 from analysis.trace.data.regression_data import RegressionData, regression_data
 from analysis.trace.data.set_aside import Unseen, set_aside
@@ -100,65 +105,55 @@ def trace(
     _refuse_same(runs, holdout, judge)
     known = tuple(map(Used, baseline_of(rig))) if terms is None else tuple(terms)
     terms = ordered((*known, *temperature_terms(known, runs, [*holdout, *judge])))
-    train = conditioned_records(rig, runs, families=tuple(families))
-    train_data = _laid_out(rig, terms, train)
-    terms = train_data.terms
-    unseen = _unseen(train_data, holdout, judge, tuple(families))
-    holdout_data = unseen.choosing
-    moving = len({s.equation.rsplit("_", 1)[1] for s in train_data.segments})
+    records = TraceRuns(tuple(runs), tuple(holdout), tuple(judge), tuple(families))
+    rows = _rows(rig, terms, records)
+    moving = len({s.equation.rsplit("_", 1)[1] for s in rows.train.segments})
     candidates = _unknown(catalogue(rig) if effects is None else effects, known, moving)
+    free = _unknown(free_mechanisms(rig), known) if free_forms else []
     done = progress or _nobody
-    hypotheses = HypothesisSet(train_data, candidates)
-    baseline = _identified(runs, terms)
+    baseline = _identified(runs, rows.train.terms)
     before = baseline.model
-    notes = [*unseen.notes, *_notes(train_data, holdout_data)]
+    notes = [*rows.unseen.notes, *_notes(rows.train, rows.unseen.choosing)]
     notes += [check.detail for check in baseline.checks if check.name == GEOMETRY]
-    quiet = within(hypotheses.empty.excess_energy, hypotheses.limits)
-    if quiet and not gates.remaining(hypotheses, hypotheses.empty, holdout_data):
-        judged_effects: tuple[JudgedEffect, ...] = ()
-        refused: tuple[JudgedEffect, ...] = ()
-        winner, verdict = hypotheses.empty, CLEAN
-    else:
-        winner = hypotheses.run(lambda share: done(PREPARED + (COLUMNS - PREPARED) * share))
-        free = _unknown(free_mechanisms(rig), known) if free_forms else []
-        hypotheses, judged_all, winner, verdict, rest = _settled(
-            hypotheses, winner, free, holdout_data, np.random.default_rng(seed)
-        )
-        refused = gates.refused(judged_all)
-        judged_effects = tuple(f for f in judged_all if gates.stands(f))
-        notes += _rest_notes(verdict, rest, quiet, bool(judged_effects))
+    finding = _found(rows, candidates, free, seed, done)
+    finding = _without_rests(rig, terms, records, seed, finding)
+    verdict, winner = finding.verdict, finding.winner
+    judged_effects, refused = finding.named, gates.refused(finding.effects)
+    notes += finding.notes
     done(JUDGED)
+    train_data, choosing = finding.rows.train, finding.rows.unseen.choosing
     split = lines(train_data, winner.fit.residual)
     moves, formulas = (
-        ((), ())
-        if verdict in (CLEAN, EXPLAINED)
-        else clues_to(train_data, holdout_data, winner, split)
+        ((), ()) if verdict in (CLEAN, EXPLAINED) else clues_to(train_data, choosing, winner, split)
     )
+    hypotheses = finding.hypotheses
     further = propose(hypotheses, winner, judged_effects, verdict, moves) if look_ahead else None
-    after, unknown = _extended(runs, terms, winner, before, train_data)
-    again = reshaped(runs, unseen.choosing_runs, after, train_data, holdout_data, winner)
+    after, unknown = _extended(runs, winner, before, finding.rows)
+    again = reshaped(runs, rows.unseen.choosing_runs, after, train_data, choosing, winner)
     if again.winner is not winner:
         winner = again.winner
-        after, unknown = _extended(runs, terms, winner, before, train_data)
+        after, unknown = _extended(runs, winner, before, finding.rows)
         split = lines(train_data, winner.fit.residual)
     judged_effects = tuple(
         with_shots(_with_tolerances(f, unknown), again.shots) for f in judged_effects
     )
     # All is settled: from here on the judging rows are read, and nothing is chosen.
+    unseen = rows.unseen
     first, last = (
         held_out.settled(unseen.judging, hypotheses.empty.fit),
         held_out.settled(unseen.judging, winner.fit),
     )
     error = held_out.errors(rig, unseen.members, first, last, unseen.divided)
-    verdict, kept = _judged(verdict, unseen.judging, hypotheses.empty, winner)
-    explained = verdict != UNEXPLAINED
-    hidden = detection_limits(train_data, candidates, winner, after) if explained else []
+    verdict, kept = _judged(rig, terms, records, finding, winner)
+    hidden = (
+        detection_limits(train_data, candidates, winner, after) if verdict != UNEXPLAINED else []
+    )
     notes += [*kept, *_missed_held(verdict, error, [*notes, *kept]), *in_words(hidden)]
     runs_before, runs_after = held_out.free_runs([*holdout, *judge], before, after)
     result = Trace(
         verdict, judged_effects, error.noise, error.before, error.after,
         runs_before.fit, runs_after.fit, before, after,
-        _fraction(hypotheses, winner), moves, further, train_data.floors,
+        _fraction(hypotheses, winner), moves, further, rows.train.floors,
         first, last, tuple(notes), refused=refused, size=error.size,
         rmse_before=runs_before.rmse, rmse_after=runs_after.rmse,
         window_before=runs_before.window_rmse, window_after=runs_after.window_rmse,
@@ -167,6 +162,139 @@ def trace(
         detection_limits=tuple(hidden), seconds=time.perf_counter() - started,
     )  # fmt: skip
     return replace(result, sentence=sentence(result))
+
+
+@dataclass(frozen=True)
+class TraceRuns:
+    """Runs by what they are for, and the families of rows that are looked at."""
+
+    train: tuple[Run, ...]
+    holdout: tuple[Run, ...]
+    judge: tuple[Run, ...]
+    families: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class TraceRows:
+    """Rows that are fitted, and rows that the fit does not see."""
+
+    train: RegressionData
+    unseen: Unseen
+
+    @property
+    def rests(self) -> bool:
+        """Whether the joints' rests count."""
+        return all(conditioned.filtering.rests for conditioned in self.train.records)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What was found on some rows: every effect judged, the set that stands, its verdict."""
+
+    rows: TraceRows
+    hypotheses: HypothesisSet
+    winner: Hypothesis
+    verdict: str
+    effects: tuple[JudgedEffect, ...] = ()
+    rest: tuple[Rest, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def named(self) -> tuple[JudgedEffect, ...]:
+        """The effects that stand."""
+        return tuple(f for f in self.effects if gates.stands(f))
+
+
+def _rows(
+    rig: Rig, terms: tuple[Used, ...], records: TraceRuns,
+    filtering: Callable[[Record], Filtering] = trace_filtering,
+) -> TraceRows:  # fmt: skip
+    """Lay out all rows under the filters of each record."""
+
+    def conditioned(runs: Sequence[Run]) -> list[ConditionedRecord]:
+        return conditioned_records(rig, runs, filtering, records.families)
+
+    train_data = _laid_out(rig, terms, conditioned(records.train))
+    terms, beta = train_data.terms, train_data.beta
+    members = conditioned(records.holdout)
+    data = regression_data(rig, terms, members, beta)
+    if not records.judge:
+        return TraceRows(train_data, set_aside(data, members, records.holdout))
+    members = conditioned(records.judge)
+    judging = regression_data(rig, terms, members, beta)
+    return TraceRows(train_data, Unseen(data, judging, tuple(members), records.holdout))
+
+
+def _found(
+    rows: TraceRows, candidates: Sequence[Effect], free: Sequence[Effect], seed: int,
+    done: Callable[[float], None],
+) -> Finding:  # fmt: skip
+    """Search on the rows, and judge what is found."""
+    hypotheses, holdout_data = HypothesisSet(rows.train, candidates), rows.unseen.choosing
+    quiet = within(hypotheses.empty.excess_energy, hypotheses.limits)
+    if quiet and not gates.remaining(hypotheses, hypotheses.empty, holdout_data):
+        return Finding(rows, hypotheses, hypotheses.empty, CLEAN)
+    winner = hypotheses.run(lambda share: done(PREPARED + (COLUMNS - PREPARED) * share))
+    hypotheses, effects, winner, verdict, rest = _settled(
+        hypotheses, winner, free, holdout_data, np.random.default_rng(seed)
+    )
+    named = any(map(gates.stands, effects))
+    notes = _rest_notes(verdict, rest, quiet, named)
+    return Finding(rows, hypotheses, winner, verdict, effects, tuple(rest), tuple(notes))
+
+
+def _without_rests(
+    rig: Rig, terms: tuple[Used, ...], records: TraceRuns, seed: int, finding: Finding
+) -> Finding:
+    """Ask without the joints' rests what is left where only balances with dry friction keep much.
+
+    At rest dry friction is whatever holds the joint: what stays there speaks against no law of the
+    speed. Where nothing else stays, what stood explains the records, with its sizes in motion.
+    """
+    loud = {r.equation for r in finding.rest if r.veto}
+    if finding.verdict != UNEXPLAINED or not _dry(finding.winner, loud):
+        return finding
+    rows, hypotheses, winner = _in_motion(rig, terms, records, finding.winner)
+    holdout_data = rows.unseen.choosing
+    rest = left_over(hypotheses, winner, holdout_data)
+    judged = gates.judge(hypotheses, winner, holdout_data, np.random.default_rng(seed))
+    if any(r.veto for r in rest) or not all(map(gates.stands, judged)):
+        return finding
+    sizes = {(f.name, f.where): f.parameters for f in judged}
+    named = [replace(f, parameters=sizes[f.name, f.where]) for f in finding.named]
+    others = [f for f in finding.effects if not gates.stands(f)]
+    verdict = CONFOUNDED if _tied(named) else EXPLAINED
+    notes = (*_at_rest(loud), *_rest_notes(verdict, rest, quiet=False, named=True))
+    return Finding(rows, hypotheses, winner, verdict, (*named, *others), tuple(rest), notes)
+
+
+def _dry(winner: Hypothesis, equations: Collection[str]) -> bool:
+    """Return whether dry friction of the set acts in each of some equations, at least one."""
+    dry = {
+        equation("torque", used.term.joint)
+        for used in winner.effects
+        if isinstance(used.term, Effect) and used.term.family == "friction"
+    }
+    return bool(equations) and dry.issuperset(equations)
+
+
+def _in_motion(
+    rig: Rig, terms: tuple[Used, ...], records: TraceRuns, winner: Hypothesis
+) -> tuple[TraceRows, HypothesisSet, Hypothesis]:
+    """Return rows that do not count the joints' rests, and the set's effects fitted to them."""
+    rows = _rows(rig, terms, records, moving_filtering)
+    effects = [u.term for u in winner.effects if isinstance(u.term, Effect)]
+    hypotheses = HypothesisSet(rows.train, effects)
+    hypotheses.run()
+    return rows, hypotheses, hypotheses.exact(winner.effects)
+
+
+def _at_rest(equations: Collection[str]) -> list[str]:
+    return [
+        f"{e}: judged without the samples at which the joint rests, where dry friction is whatever "
+        "holds it; the errors include them"
+        for e in sorted(equations)
+    ]
 
 
 def _laid_out(
@@ -214,45 +342,46 @@ def _digest(record: Record) -> str:
     return digest.hexdigest()
 
 
-def _unseen(
-    train_data: RegressionData,
-    holdout: Sequence[Run],
-    judge: Sequence[Run],
-    families: tuple[str, ...],
-) -> Unseen:
-    """Lay out what the fit does not see: what chooses, and what judges when all is settled."""
-    rig, terms, beta = train_data.rig, train_data.terms, train_data.beta
-    members = conditioned_records(rig, holdout, families=families)
-    data = regression_data(rig, terms, members, beta)
-    if not judge:
-        return set_aside(data, members, holdout)
-    members = conditioned_records(rig, judge, families=families)
-    return Unseen(data, regression_data(rig, terms, members, beta), tuple(members), tuple(holdout))
-
-
 def _judged(
-    verdict: str, judge_data: RegressionData, before: Hypothesis, after: Hypothesis
+    rig: Rig, terms: tuple[Used, ...], records: TraceRuns, finding: Finding, winner: Hypothesis
 ) -> tuple[str, list[str]]:
     """Return the verdict of the rows that judge, and in words what these keep or cannot show."""
-    if verdict == UNEXPLAINED:
-        return verdict, []
+    if finding.verdict == UNEXPLAINED:
+        return UNEXPLAINED, []
+    kept, words = _kept(finding.rows.unseen.judging, finding.hypotheses.empty, winner)
+    if finding.rows.rests and _dry(winner, kept):
+        rows, hypotheses, moving = _in_motion(rig, terms, records, winner)
+        if not _kept(rows.unseen.judging, hypotheses.empty, moving)[0]:
+            kept, words = set(), _at_rest(kept)
+    return (UNEXPLAINED if kept else finding.verdict), words
+
+
+def _kept(
+    judge_data: RegressionData, before: Hypothesis, after: Hypothesis
+) -> tuple[set[str], list[str]]:
+    """Return the equations of which judging rows keep too much, and it all in words."""
     known = within_curves(judge_data, after.fit)
     kept = gates.remaining_held_out(known, before.fit, after.fit)
     words = [f"{e}: {figure} in the records that judge" for e, figure in kept]
-    return (UNEXPLAINED if kept else verdict), [*words, *beyond_in_words(judge_data, known)]
+    return {e for e, _ in kept}, [*words, *beyond_in_words(judge_data, known)]
 
 
 def _refuse_short(train_data: RegressionData, train: Sequence[ConditionedRecord]) -> None:
     for s in train_data.segments:
         count = s.where.stop - s.where.start
         if count < TRACE.least_rows:
-            seconds = next(
-                x.record.samples / x.record.sample_rate for x in train if x.group == s.group
-            )
+            record = next(x.record for x in train if x.group == s.group)
+            k = [x.group for x in train_data.records].index(s.group)
+            masked = train_data.rows[k][s.equation].masked
+            remedy = "take longer records"
+            if masked > count:
+                remedy = (
+                    f"{masked} others are masked, since a pressure lies outside 0 to the supply's, "
+                    "or samples were clipped or lost: move less, or check the sensors' ranges"
+                )
             raise InputError(
-                f"step {s.group[1]!r}: records of {seconds:.3g} s leave {count} rows of "
-                f"{s.equation} after filter edges and masks; the trace needs "
-                f"{TRACE.least_rows}: take longer records"
+                f"step {s.group[1]!r}: records of {record.samples / record.sample_rate:.3g} s "
+                f"leave {count} rows of {s.equation}; the trace needs {TRACE.least_rows}: {remedy}"
             )
 
 
@@ -351,10 +480,7 @@ def _rest_notes(verdict: str, rest: Sequence[Rest], quiet: bool, named: bool) ->
     out = [ELSEWHERE] if quiet and verdict == UNEXPLAINED else []
     if verdict == UNEXPLAINED and (named or quiet):
         out += [f"{r.equation}: {r.words}" for r in rest if r.veto]
-    few = [f"{r.equation}: {r.words}" for r in rest if not r.veto]
-    return out + [
-        f"{words}; within the tolerance for the form of the named effect" for words in few
-    ]
+    return [*out, *(f"{r.equation}: {r.words}" for r in rest if not r.veto)]
 
 
 def _named(
@@ -423,11 +549,7 @@ def _unknown(candidates: Sequence[Effect], known: Sequence[Used], moving: int = 
 
 
 def _extended(
-    runs: Sequence[Run],
-    terms: Sequence[Used],
-    winner: Hypothesis,
-    before: Model,
-    train_data: RegressionData,
+    runs: Sequence[Run], winner: Hypothesis, before: Model, rows: TraceRows
 ) -> tuple[Model, dict[str, float]]:
     """Identify everything again together with the effects, their shapes' errors included.
 
@@ -435,15 +557,20 @@ def _extended(
     """
     if not winner.effects:
         return before, {}
-    found = _identified(runs, (*terms, *winner.effects))
+    train_data = rows.train
+    found = _identified(runs, (*train_data.terms, *winner.effects), rows.rests)
     return stripped(widened(train_data, winner.fit, found.model)), by_geometry(found)
 
 
-def _identified(runs: Sequence[Run], terms: Sequence[Used]) -> Identification:
+def _identified(runs: Sequence[Run], terms: Sequence[Used], rests: bool = True) -> Identification:
     """Identify a model's parameters; what acts beside it is fitted by the estimator itself."""
     beside = (BulkTemperature, SpoolPath)
-    own = [u for u in terms if not isinstance(u.term, beside)]
-    return identify(runs, terms=ordered(own), estimator=ESTIMATOR)
+    own = ordered([u for u in terms if not isinstance(u.term, beside)])
+
+    def filtering(record: Record) -> Filtering:
+        return replace(default_filtering(record), rests=rests)
+
+    return identify(runs, terms=own, filtering=filtering, estimator=ESTIMATOR)
 
 
 def _with_tolerances(effect: JudgedEffect, unknown: Mapping[str, float]) -> JudgedEffect:

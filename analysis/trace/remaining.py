@@ -64,7 +64,8 @@ def left_over(
             words = f"{share} % of the repeatable energy remains, and a formula fits it"
             loud = winner.excess_energy[equation] > hypotheses.limits.band[equation]
             veto = loud and seen[equation] < TRACE.unexplained_share
-            out.append(Rest(equation, f"{words}: {expression.text}", veto))
+            tail = "" if veto else _tolerated(seen[equation])
+            out.append(Rest(equation, f"{words}: {expression.text}{tail}", veto))
     return [*out, *_missed(hypotheses, winner, out)]
 
 
@@ -74,9 +75,17 @@ def _missed(hypotheses: HypothesisSet, winner: Hypothesis, known: Sequence[Rest]
     out = []
     for e, residual in winner.excess_energy.items():
         if winner.effects and e not in listed and not hypotheses.negligible(e, residual):
-            share = 100 * residual / max(hypotheses.empty.excess_energy[e], 1e-30)
-            out.append(Rest(e, f"{plain(share, 2)} % of the repeatable energy remains", False))
+            share = residual / max(hypotheses.empty.excess_energy[e], 1e-30)
+            words = f"{plain(100 * share, 2)} % of the repeatable energy remains"
+            out.append(Rest(e, words + _tolerated(share), False))
     return out
+
+
+def _tolerated(share: float) -> str:
+    """Say why a rest, a share of the energy before, speaks against nothing that is named."""
+    if share < TRACE.unexplained_share:
+        return "; within the tolerance for the form of the named effect"
+    return "; nothing that is named acts there, and it is too near the noise to name more by"
 
 
 def _seen(hypotheses: HypothesisSet, winner: Hypothesis) -> dict[str, float]:

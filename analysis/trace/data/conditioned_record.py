@@ -56,6 +56,11 @@ def trace_filtering(record: Record) -> Filtering:
     return replace(chosen, step=max(step, (chosen.step + 1) // 2))
 
 
+def moving_filtering(record: Record) -> Filtering:
+    """Return the trace's filters, of rows that do not count the joints' rests."""
+    return replace(trace_filtering(record), rests=False)
+
+
 def conditioned_records(
     rig: Rig,
     runs: Sequence[Run],

@@ -17,7 +17,7 @@ and a clean one would never be clean.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,6 @@ from scipy.spatial import cKDTree
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.noise import disturbed
 from analysis.regression.rows import Rows, in_common
-from analysis.signals.conditioning import condition
 from analysis.terms.base import Used
 from analysis.trace.data.conditioned_record import model_rows, row_residual
 from analysis.trace.settings import DATA
@@ -189,10 +188,7 @@ def stated_noise(
 ) -> dict[str, float]:
     """Return the rms that the rig's stated sensor noise alone puts into each residual."""
     rng = np.random.default_rng(0)  # a prediction, the same every time
-    record = disturbed(rig, conditioned.record, rng)
-    filters, moving = conditioned.filtering, conditioned.signals.moving
-    signals = condition(rig, record, filters.channels, moving)
-    again = model_rows(rig, terms, replace(conditioned, record=record, signals=signals))
+    again = model_rows(rig, terms, conditioned.again(rig, disturbed(rig, conditioned.record, rng)))
     out = {}
     for name, before in rows.items():
         a, b = in_common(before, again[name])

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from analysis.effects.base import Evidence
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.rows import Rows
-from analysis.signals.conditioning import Signals, condition
+from analysis.signals.conditioning import Signals
 from analysis.terms.base import Used
 from analysis.trace.data.candidates import Variant
 from analysis.trace.data.conditioned_record import (
@@ -114,10 +114,10 @@ def _average(rig: Rig, repeats: Sequence[ConditionedRecord]) -> ConditionedRecor
         name: np.mean([np.asarray(s.record.channels[name])[:n] for s in repeats], axis=0)
         for name in names
     }
-    record = replace(first.record, channels=channels)
-    signals = condition(rig, record, first.filtering.channels, first.signals.moving)
+    average = first.again(rig, replace(first.record, channels=channels))
     valid = np.all([s.signals.valid[:n] for s in repeats], axis=0)
-    return replace(first, record=record, signals=replace(signals, valid=signals.valid & valid))
+    signals = replace(average.signals, valid=average.signals.valid & valid)
+    return replace(average, signals=signals)
 
 
 def least_squares(rig: Rig, rows: Sequence[Mapping[str, Rows]]) -> dict[str, float]:

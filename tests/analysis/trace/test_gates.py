@@ -273,6 +273,15 @@ def friction_without_a_memory_is_coulomb_friction_too(b: Benches) -> None:
     assert s.vetoes(s.winner) == ""
 
 
+def what_stays_while_a_joint_sticks_speaks_against_no_friction(b: Benches) -> None:
+    hidden = foreign_bench.Hidden(80.0, 80.0, 2e-3, foreign_bench.KARNOPP)
+    runs = b.kept("sticking", lambda: foreign_bench.pair_of_runs(b.rig, hidden))
+    result = b.traced(runs, "coulomb_friction", "stribeck_friction", "asymmetric_friction")
+    assert (result.verdict, [e.name for e in result.effects]) == ("explained", ["coulomb_friction"])
+    assert result.effects[0].parameters["Fc2"].value == pytest.approx(80.0, rel=0.05)
+    assert any("at which the joint rests" in n for n in result.notes)
+
+
 def a_drop_without_a_name_is_drawn_as_a_curve(b: Benches) -> None:
     hidden = foreign_bench.Hidden(sag=2e6)
     runs = b.kept("drop", lambda: foreign_bench.pair_of_runs(b.rig, hidden))
@@ -359,6 +368,7 @@ STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
     (an_effect_that_takes_nothing_is_dropped, ("pruning",)),
     (levels_that_do_not_differ_are_coulomb_friction, ("simpler effect",)),
     (friction_without_a_memory_is_coulomb_friction_too, ("second form",)),
+    (what_stays_while_a_joint_sticks_speaks_against_no_friction, ("rests",)),
     (a_drop_without_a_name_is_drawn_as_a_curve, ("free forms",)),
     (the_floor_is_the_noise_that_is_there, ("floor x 0.3", "floor x 3")),
     (repeats_that_do_not_differ_make_no_floor_of_nothing, ("least floor",)),

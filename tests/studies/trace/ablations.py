@@ -78,7 +78,11 @@ class Kept:
 def decisions_only(kept: Kept) -> Iterator[None]:
     """Trace up to the verdict, columns and fits out of what was `kept`."""
     remembered: tuple[tuple[Any, str, Callable[..., Any]], ...] = (
-        (engine, "conditioned_records", lambda _, runs, **k: tuple(map(id, runs))),
+        (
+            engine,
+            "conditioned_records",
+            lambda _, runs, filtering, *__: (tuple(map(id, runs)), filtering),
+        ),
         (engine, "regression_data", lambda _, terms, members, beta=None: (terms, id(members))),
         (engine, "identify", lambda runs, **k: tuple(map(id, runs))),
         (hypothesis_set, "refine", lambda data, terms, *_: (id(data), terms)),
@@ -87,7 +91,7 @@ def decisions_only(kept: Kept) -> Iterator[None]:
     )
     changes = (
         *((module, name, kept(getattr(module, name), key)) for module, name, key in remembered),
-        (engine, "_extended", lambda runs, terms, winner, before, *_: (before, {})),
+        (engine, "_extended", lambda runs, winner, before, *_: (before, {})),
         (engine, "reshaped", lambda runs, holdout, after, train, judged, one: Reshaped(one, ())),
         (engine, "clues_to", lambda *_: ((), ())),
         (held_out, "free_runs", lambda *_: (held_out.FreeRunErrors({}, {}, {}),) * 2),

@@ -164,6 +164,8 @@ RULES: Final = (
          ((HypothesisSet, "_pairs", lambda *_: []),)),
     Rule("second form", "an effect is tried in its first form only",
          ((Friction, "other_forms", lambda *_: ()),), refits=True),
+    Rule("rests", "what stays while a joint rests speaks against its dry friction",
+         ((engine, "_dry", lambda *_: False),)),
     Rule("free forms", "no mechanism without a named form", ((engine, "_drawn", lambda *_: None),)),
 )  # fmt: skip
 
@@ -203,7 +205,7 @@ FAULTS: Final = (
          ((remaining, "left_over", lambda *_: []), (engine, "left_over", lambda *_: []),
           (gates, "remaining_held_out", lambda *_: []))),
     Rule("judging rows unread", "nobody asks what the judging rows keep",
-         ((engine, "_judged", lambda verdict, *_: (verdict, [])),)),
+         ((engine, "_kept", lambda *_: (set(), [])),)),
 )  # fmt: skip
 
 
