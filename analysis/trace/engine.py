@@ -116,9 +116,9 @@ def trace(
     notes = [*rows.unseen.notes, *_notes(rows.train, rows.unseen.choosing)]
     notes += [check.detail for check in baseline.checks if check.name == GEOMETRY]
     finding = _found(rows, candidates, free, seed, done)
-    finding = _without_rests(rig, terms, records, seed, finding)
+    finding = _without_tied(_without_rests(rig, terms, records, seed, finding))
     verdict, winner = finding.verdict, finding.winner
-    judged_effects, refused = finding.named, gates.refused(finding.effects)
+    judged_effects, refused = finding.named, finding.refused
     notes += finding.notes
     done(JUDGED)
     train_data, choosing = finding.rows.train, finding.rows.unseen.choosing
@@ -202,7 +202,13 @@ class Finding:
     @property
     def named(self) -> tuple[JudgedEffect, ...]:
         """The effects that stand."""
-        return tuple(f for f in self.effects if gates.stands(f))
+        return tuple(f for f in self.effects if _listed(f, self.verdict))
+
+    @property
+    def refused(self) -> tuple[JudgedEffect, ...]:
+        """The effects that fitted best and are not named."""
+        tied = [f for f in self.effects if gates.stands(f) and not _listed(f, self.verdict)]
+        return (*gates.refused(self.effects), *tied)
 
 
 def _rows(
@@ -243,6 +249,24 @@ def _found(
     return Finding(rows, hypotheses, winner, verdict, effects, tuple(rest), tuple(notes))
 
 
+def _without_tied(finding: Finding) -> Finding:
+    """Drop the effects that are not named from the set that stands."""
+    named = {(f.name, f.at) for f in finding.named}
+    hypotheses, winner = finding.hypotheses, finding.winner
+    kept = [u for u in winner.effects if (u.term.name, u.term.where) in named]
+    if len(kept) == len(winner.effects):
+        return finding
+    winner = hypotheses.exact(kept) if kept else hypotheses.empty
+    rest = left_over(hypotheses, winner, finding.rows.unseen.choosing) if kept else []
+    notes = _rest_notes(finding.verdict, rest, quiet=False, named=bool(kept))
+    return replace(finding, winner=winner, rest=tuple(rest), notes=tuple(notes))
+
+
+def _listed(effect: JudgedEffect, verdict: str) -> bool:
+    """Return whether an effect is named: it stands, and beside an unknown one without a rival."""
+    return gates.stands(effect) and not (verdict == UNEXPLAINED and _tied([effect]))
+
+
 def _without_rests(
     rig: Rig, terms: tuple[Used, ...], records: TraceRuns, seed: int, finding: Finding
 ) -> Finding:
@@ -261,7 +285,8 @@ def _without_rests(
     if any(r.veto for r in rest) or not all(map(gates.stands, judged)):
         return finding
     sizes = {(f.name, f.where): f.parameters for f in judged}
-    named = [replace(f, parameters=sizes[f.name, f.where]) for f in finding.named]
+    stand = [f for f in finding.effects if gates.stands(f)]
+    named = [replace(f, parameters=sizes[f.name, f.where]) for f in stand]
     others = [f for f in finding.effects if not gates.stands(f)]
     verdict = CONFOUNDED if _tied(named) else EXPLAINED
     notes = (*_at_rest(loud), *_rest_notes(verdict, rest, quiet=False, named=True))
