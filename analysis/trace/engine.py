@@ -276,8 +276,10 @@ def _without_rests(
     speed. Where nothing else stays, what stood explains the records, with its sizes in motion.
     """
     loud = {r.equation for r in finding.rest if r.veto}
-    if finding.verdict != UNEXPLAINED or not _dry(finding.winner, loud):
+    if finding.verdict != UNEXPLAINED:
         return finding
+    if not _dry(finding.winner, loud):
+        return _drawn_in_motion(rig, terms, records, seed, finding, loud)
     rows, hypotheses, winner = _in_motion(rig, terms, records, finding.winner)
     holdout_data = rows.unseen.choosing
     rest = left_over(hypotheses, winner, holdout_data)
@@ -291,6 +293,35 @@ def _without_rests(
     verdict = CONFOUNDED if _tied(named) else EXPLAINED
     notes = (*_at_rest(loud), *_rest_notes(verdict, rest, quiet=False, named=True))
     return Finding(rows, hypotheses, winner, verdict, (*named, *others), tuple(rest), notes)
+
+
+def _drawn_in_motion(
+    rig: Rig, terms: tuple[Used, ...], records: TraceRuns, seed: int, finding: Finding,
+    loud: Collection[str],
+) -> Finding:  # fmt: skip
+    """Draw friction over speed without the rests where nothing that acts in torques stood.
+
+    A high breakaway hides the law in motion from every name. The curve must take most of what the
+    rests leave too.
+    """
+    free = [f for f in free_mechanisms(rig) if f.family == "friction"]
+    free = [f for f in free if equation("torque", f.joint) in loud]
+    if finding.winner.effects or not free or len(free) < len(loud):
+        return finding
+    rows = _rows(rig, terms, records, moving_filtering)
+    hypotheses = HypothesisSet(rows.train, [])
+    winner = hypotheses.run()
+    rng = np.random.default_rng(seed)
+    drawn = drawn_by_data(hypotheses, free, winner, rows.unseen.choosing, rng, fewer=False)
+    if drawn is None:
+        return finding
+    hypotheses, effects, winner, rest = drawn
+    every = finding.hypotheses.exact(winner.effects).total / finding.hypotheses.empty.total
+    if every > 1.0 - TRACE.least_removed:
+        return finding
+    notes = (*_at_rest(loud), *_rest_notes(EXPLAINED, rest, quiet=False, named=True))
+    others = tuple(f for f in finding.effects if not gates.stands(f))
+    return Finding(rows, hypotheses, winner, EXPLAINED, (*effects, *others), tuple(rest), notes)
 
 
 def _dry(winner: Hypothesis, equations: Collection[str]) -> bool:
