@@ -14,18 +14,19 @@ An effect of this size would have moved the parameters by L d without a trace in
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.effects.base import Effect, shapes_of
+from analysis.effects.base import Effect, shape_values, shapes_of
 from analysis.simulation.model import Model
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.next_experiment.discrimination import ComparisonRows, Explanation, smallest
 from analysis.trace.result import DetectionLimit
 from analysis.trace.search.hypothesis import Hypothesis, parameter_values
-from analysis.trace.search.refinement import rebased
+from analysis.trace.search.refinement import rebased, tangent
 from analysis.trace.settings import TRACE
 from rig.model.channels import place_in_words
 from rig.model.units import plain, typeset
@@ -44,18 +45,17 @@ def detection_limits(
     """
     if any(isinstance(u.term, Effect) and u.term.free for u in winner.effects):
         return []
-    data = rebased(train_data, winner.fit) if winner.effects else train_data
-    rows = ComparisonRows(data)
-    own = {c.parameter for u in train_data.terms for c in u.term.coefficients(data.rig)}
-    half = {
-        name: (p.ci95[1] - p.ci95[0]) / 2 for name, p in model.parameters.items() if name in own
-    }
+    rows = ComparisonRows(rebased(train_data, winner.fit) if winner.effects else train_data)
+    names, columns = tangent(train_data, winner.fit)
+    half = {name: (p.ci95[1] - p.ci95[0]) / 2 for name, p in model.parameters.items()}
+    known = {name for name, p in model.parameters.items() if abs(p.value) > 2.0 * half[name]}
+    fitted = Fitted(names, columns, winner.fit.residual, {n: half[n] for n in known})
     found = [
         limit
         for effect in effects
         if (effect.name, effect.where) not in winner.keys
-        and (what := smallest(effect, data.rig)) is not None
-        and (limit := _limit(rows, what, winner.fit.residual, half)) is not None
+        and (what := smallest(effect, train_data.rig)) is not None
+        and (limit := _limit(rows, what, fitted)) is not None
     ]
     once: dict[str, DetectionLimit] = {}
     for limit in sorted(found, key=lambda f: -f.shift):
@@ -63,29 +63,45 @@ def detection_limits(
     return list(once.values())
 
 
-def _limit(
-    rows: ComparisonRows, what: Explanation, residual: Array, half: Mapping[str, float]
-) -> DetectionLimit | None:
-    """Return the limit of one effect, None where it changes no parameter visibly.
+@dataclass(frozen=True)
+class Fitted:
+    """A fitted model: `columns` (M, p) of `names`, coefficients and shapes, residual (M,).
 
-    `half` holds the half-widths of the parameters' 95 % intervals.
+    `half` are the half-widths of the 95 % intervals of the parameters that are known.
     """
+
+    names: tuple[str, ...]
+    columns: Array
+    residual: Array
+    half: Mapping[str, float]
+
+
+def _limit(rows: ComparisonRows, what: Explanation, fitted: Fitted) -> DetectionLimit | None:
+    """Return the limit of one effect, None where it changes no parameter visibly."""
     data = rows.train_data
     added = rows.adds(what)
-    scale = np.linalg.norm(data.base, axis=0)
+    scale = np.linalg.norm(fitted.columns, axis=0)
     scale[scale == 0] = 1.0
-    taken = np.linalg.lstsq(data.base / scale, added, rcond=TRACE.rank_limit)[0] / scale
-    shown = added - data.base @ taken
+    taken = np.linalg.lstsq(fitted.columns / scale, added, rcond=TRACE.rank_limit)[0] / scale
+    shown = added - fitted.columns @ taken
     energy = float(shown @ shown)
     if not energy > 0.0:
         return None
-    times = (abs(float(shown @ residual)) + TRACE.normal_quantile * energy**0.5) / energy
-    beta = dict(data.beta)
-    moved = beta | {n: beta[n] + times * d for n, d in zip(data.names, taken, strict=True)}
-    before, after = (parameter_values(data.rig, data.terms, b) for b in (beta, moved))
+    seen = abs(float(shown @ fitted.residual))
+    times = (seen + TRACE.normal_quantile * energy**0.5) / energy
+    shapes = {k: v for u in data.terms for k, v in shape_values(data.rig, u).items()}
+    beta = {**data.beta, **shapes}
+    moved = {n: beta.get(n, 0.0) + times * d for n, d in zip(fitted.names, taken, strict=True)}
+    before, after = (
+        {**shapes, **parameter_values(data.rig, data.terms, b), **s}
+        for b, s in (
+            (beta, shapes),
+            (moved, {n: v for n, v in moved.items() if n in shapes}),
+        )
+    )
     shifts = {
         name: abs(after[name] / before[name] - 1.0)
-        for name, width in half.items()
+        for name, width in fitted.half.items()
         if before.get(name) and abs(after[name] - before[name]) > width
     }
     most = max(shifts, key=lambda name: shifts[name], default="")
