@@ -18,10 +18,6 @@ class TraceSettings:
     # Gates of an effect.
     least_removed: float = 0.5
     """Of the held-out energy above noise in the equations it touches: a cause takes most."""
-    least_chosen: float = 0.9
-    """Of half-samples of the repeats in which an effect is chosen (convention)."""
-    rival_share: float = 0.5
-    """Of the half-samples that choose otherwise: what they choose is a rival (tuned)."""
     p_limit: float = 0.01
     """Family-wise p over all candidates and shapes (convention)."""
     tie_ratio: float = 1.10
@@ -75,16 +71,10 @@ class TraceSettings:
     # Chance.
     sign_flips: int = 199
     """Sign flips: p not below 0.005 (convention)."""
-    half_samples: int = 40
-    """Half-samples (convention)."""
     enough_repeats: int = 8
     """Repeats from which whole records are flipped: 2^-7 is below `p_limit` (arithmetic)."""
     flip_block: float = 2.0
     """[s] of a block that is flipped as one: twenty times the row filter's memory (arithmetic)."""
-    least_periods: float = 1.9
-    """Periods that a record must hold to be halved by them: the last may be cut short."""
-    bound_share: float = 1e-3
-    """Of its range: a shape nearer to its bound is at it (arithmetic)."""
     # Others.
     shooting_ratio: float = 0.99
     """Of what held-out windows leave: with less, shapes by shooting are taken (tuned)."""

@@ -39,7 +39,7 @@ def trace(
     equations: Annotated[
         str, typer.Option(help="Equations to trace: all, torque or flow.")
     ] = "all",
-    seed: Annotated[int, typer.Option(min=0, help="Of half-samples and sign flips.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of the sign flips.")] = 0,
 ) -> None:
     """Say what the model lacks: effect, place, size, and the held-out error before and after.
 

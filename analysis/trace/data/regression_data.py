@@ -2,7 +2,7 @@
 
 Repeats of one excitation are averaged channel by channel; the average's rows carry the columns,
 and each repeat keeps its own residual. So 12 records of 10 s become a table of a few thousand
-rows in which the whole catalogue fits, and half-samples and sign flips cost one product each.
+rows in which the whole catalogue fits, and sign flips cost one product each.
 Rows are whitened by the noise floor and weighted by the root of the number of repeats: noise then
 adds 1 per row to a residual's energy, whatever the unit and the number of repeats.
 """

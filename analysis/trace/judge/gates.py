@@ -28,15 +28,14 @@ from analysis.trace.search.hypothesis import Hypothesis, excess_of, parameter_va
 from analysis.trace.search.hypothesis_set import HypothesisSet, effect_of
 from analysis.trace.search.refinement import ExactFit
 from analysis.trace.settings import SEARCH, TRACE
-from rig.model.channels import place_in_words
 from rig.model.units import plain, with_interval
 
 Array = NDArray[np.float64]
 Key = tuple[str, str]
 
 
-REMOVES, PHYSICAL, INVARIANT, STABLE, SIGNIFICANT, DETERMINED, ALONE = (
-    "removes on held-out", "physical", "invariant", "stable", "significant", "determined",
+REMOVES, PHYSICAL, INVARIANT, SIGNIFICANT, DETERMINED, ALONE = (
+    "removes on held-out", "physical", "invariant", "significant", "determined",
     "no rival",
 )  # fmt: skip
 ENTANGLED = "the other effects can stand for all of its numbers"
@@ -67,7 +66,6 @@ def judge(
     null = inference.null_maximum(
         hypotheses.candidates, train_data, _noise_like(train_data, winner.fit.residual), rng
     )
-    steady = inference.stability(hypotheses, winner, rng)
     after = held_left(holdout_data, winner.fit)
     shift = form_shift(train_data, winner.fit)
     out = []
@@ -75,13 +73,7 @@ def judge(
         assert isinstance(used.term, Effect)
         key = (used.term.name, used.term.where)
         rest = _without(hypotheses, winner, used)
-        share, others = steady[key]
-        often = {
-            k
-            for k, n in others.items()
-            if share < TRACE.least_chosen and n >= TRACE.rival_share * sum(others.values())
-        }
-        rivals = _rivals(hypotheses, winner, key, holdout_data, after, often)
+        rivals = _rivals(hypotheses, winner, key, holdout_data, after)
         touched = _touched(hypotheses, winner, rest)
         removed = _removed(holdout_data, rest, after, touched)
         worse = _worse(hypotheses, winner, rest)
@@ -99,11 +91,6 @@ def judge(
             Gate(REMOVES, removed >= TRACE.least_removed and not worse, _taken(removed, worse)),
             Gate(PHYSICAL, not unphysical, unphysical or "sign and size are possible"),
             Gate(INVARIANT, not differing, _differences(differing)),
-            Gate(
-                STABLE,
-                share >= TRACE.least_chosen or bool(tied),
-                _chosen(share, others, bool(tied)),
-            ),
             Gate(SIGNIFICANT, p <= TRACE.p_limit, f"family-wise p = {p:.3g}"),
             Gate(DETERMINED, known, "at least one of its numbers is" if known else ENTANGLED),
             Gate(ALONE, not (tied or twins), _told_apart([*twins, *rivals])),
@@ -273,12 +260,10 @@ def _rivals(
     key: Key,
     holdout_data: RegressionData,
     after: Array,
-    often: Collection[Key],
 ) -> list[Rival]:
     """Return the sets that have another effect in place of one, those that leave least first.
 
-    What half-samples choose `often` in its place is tied whatever it leaves. A simpler reading of
-    the effect is no rival: held-out records have said that it is too simple.
+    A simpler reading of the effect is no rival: held-out records have said that it is too simple.
     """
     others = winner.keys - {key}
     (used,) = (u for u in winner.effects if (u.term.name, u.term.where) == key)
@@ -315,7 +300,6 @@ def _rivals(
             trained.near(hypothesis.fit.residual, TRACE.tie_ratio_training)
             or ratio < TRACE.clear_lead
         )
-        tied = tied or (other.name, other.where) in often
         out.append(
             Rival(
                 other.name,
@@ -410,16 +394,6 @@ def _differences(differing: Sequence[tuple[str, str, float, float]]) -> str:
         f"{name} = {with_interval(value, error)} in {label}"
         for label, name, value, error in differing[:3]
     )
-
-
-def _chosen(share: float, others: Mapping[Key, int], tied: bool) -> str:
-    text = f"chosen in {100 * share:.0f} % of half-samples"
-    if share < TRACE.least_chosen and tied:
-        text = f"not required, since a rival fits as well: {text}"
-    if share < TRACE.least_chosen and others:
-        most = sorted(others, key=lambda k: -others[k])[:2]
-        text += "; otherwise " + ", ".join(f"{n} at {place_in_words(at)}" for n, at in most)
-    return text
 
 
 def _told_apart(rivals: Sequence[Rival]) -> str:

@@ -1,4 +1,4 @@
-"""How sure: sign flips for significance, half-samples for stability, repeats for errors.
+"""How sure: sign flips for significance, repeats for errors.
 
 The unit is the repeat. Under the null hypothesis a residual is noise, symmetric and independent
 from repeat to repeat, so that the signs of whole repeats may be flipped. With few repeats flips of
@@ -15,15 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.effects.base import Effect, shape_values, shapes_of
+from analysis.effects.base import shape_values
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
-from analysis.trace.judge.readings import related
 from analysis.trace.judge.scatter import scatter
-from analysis.trace.search.hypothesis import Hypothesis, excess_of
-from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.linear_fit import CandidateColumns, orthonormal
-from analysis.trace.search.refinement import ExactFit, jacobian, table, tangent
+from analysis.trace.search.refinement import ExactFit, jacobian, tangent
 from analysis.trace.settings import SEARCH, TRACE
 
 Array = NDArray[np.float64]
@@ -99,126 +96,6 @@ def null_maximum(
 def p_value(gain: float, null: Array) -> float:
     """Return the family-wise p of a gain against the flips' largest gains."""
     return float((1 + np.sum(null >= gain)) / (1 + len(null)))
-
-
-@dataclass(frozen=True)
-class Linear:
-    """A fitted set in first order: its tangent space's basis (M, k) and residual (M,)."""
-
-    one: Hypothesis
-    basis: Array
-    residual: Array
-
-
-def linear(train_data: RegressionData, hypothesis: Hypothesis) -> Linear:
-    """Return the tangent of a set: columns of all coefficients and derivatives by the shapes.
-
-    A shape that lies at a bound cannot move freely, and counts as fixed.
-    """
-    rows = table(train_data, hypothesis.fit.terms)
-    extra = []
-    for u in hypothesis.effects:
-        names, J = jacobian(train_data, hypothesis.fit, u)
-        fixed = {
-            s.parameter
-            for s, v in zip(shapes_of(train_data.rig, u), u.shape, strict=True)
-            if not s.low + TRACE.bound_share * (s.high - s.low)
-            < v
-            < s.high - TRACE.bound_share * (s.high - s.low)
-        }
-        extra.append(J[:, [k for k, n in enumerate(names) if n in rows.names or n not in fixed]])
-    return Linear(
-        hypothesis, orthonormal(np.column_stack([rows.matrix, *extra])), hypothesis.fit.residual
-    )
-
-
-def halves(
-    train_data: RegressionData, rng: np.random.Generator, count: int = TRACE.half_samples
-) -> list[tuple[Array, Array, float]]:
-    """Return random half-samples: change (M,) of the averaged residual, weights (M,), noise energy.
-
-    Halves of the repeats of every step; of a step with one repeat, halves of its blocks, the
-    others without weight.
-    """
-    # A part of a period may lack the very speeds that separate two effects.
-    numbers = blocks(train_data, fewest=TRACE.least_periods)
-    mean = train_data.mean
-    out = []
-    for _ in range(count):
-        r, weight = mean.copy(), np.ones(len(mean))
-        noise = 1.0
-        for group in sorted({s.group for s in train_data.segments}):
-            parts = [s for s in train_data.segments if s.group == group]
-            R = parts[0].repeats
-            if R > 1:
-                picked = rng.choice(R, size=R // 2, replace=False)
-                noise = max(noise, R / len(picked))
-                for s in parts:
-                    r[s.where] = train_data.residual[picked, s.where].mean(axis=0) * np.sqrt(R)
-                continue
-            keep = rng.permutation(int(numbers.max()) + 1) % 2 == 0
-            for s in parts:
-                # The kept half takes the other's share.
-                weight[s.where] = np.where(keep[numbers[s.where]], np.sqrt(2.0), 0.0)
-        out.append((r - mean, weight, noise))
-    return out
-
-
-def stability(
-    hypotheses: HypothesisSet, winner: Hypothesis, rng: np.random.Generator
-) -> dict[Key, tuple[float, dict[Key, int]]]:
-    """Return, by effect, in which share of half-samples it is chosen, and who else was."""
-    train_data = hypotheses.train_data
-    near = sorted(hypotheses.fitted.values(), key=lambda o: o.total)
-    near = [o for o in near if not hypotheses.physical(o)][:12]
-    if winner.keys not in [o.keys for o in near]:
-        near.append(winner)
-    tangents = [linear(train_data, o) for o in near]
-    counts = dict.fromkeys(winner.keys, 0)
-    others: dict[Key, int] = {}
-    samples = halves(train_data, rng)
-    for change, weight, noise in samples:
-        refitted = [
-            _again(train_data, t.one, _refitted(t, change, weight), noise) for t in tangents
-        ]
-        best = hypotheses.best(refitted)
-        for key in _said(winner, best):
-            counts[key] += 1
-        for other in best.keys - winner.keys:
-            others[other] = others.get(other, 0) + 1
-    return {key: (count / len(samples), others) for key, count in counts.items()}
-
-
-def _said(winner: Hypothesis, best: Hypothesis) -> set[Key]:
-    """Return the winner's effects that a choice holds too, be it in another reading of theirs.
-
-    Which reading of a mechanism holds is asked on held-out records (`readings`), not here.
-    """
-    chosen = [u.term for u in best.effects if isinstance(u.term, Effect)]
-    return {
-        (u.term.name, u.term.where)
-        for u in winner.effects
-        if isinstance(u.term, Effect)
-        and any(u.term == other or related(u.term, other) for other in chosen)
-    }
-
-
-def _refitted(linear: Linear, change: Array, weight: Array) -> Array:
-    """Return the weighted residual (M,) of a set fitted again to a half-sample."""
-    r = weight * (linear.residual + change)
-    if np.all(weight == 1.0):
-        return np.asarray(r - linear.basis @ (linear.basis.T @ r))
-    basis = weight[:, None] * linear.basis
-    inverse = np.linalg.pinv(basis.T @ basis, rcond=1e-10, hermitian=True)
-    return np.asarray(r - basis @ (inverse @ (basis.T @ r)))
-
-
-def _again(
-    train_data: RegressionData, hypothesis: Hypothesis, residual: Array, noise: float
-) -> Hypothesis:
-    return Hypothesis(
-        hypothesis.effects, hypothesis.fit, excess_of(train_data, residual, noise), hypothesis.size
-    )
 
 
 @dataclass(frozen=True)

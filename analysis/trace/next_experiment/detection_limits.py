@@ -49,7 +49,7 @@ def detection_limits(
     names, columns = tangent(train_data, winner.fit)
     half = {name: (p.ci95[1] - p.ci95[0]) / 2 for name, p in model.parameters.items()}
     known = {name for name, p in model.parameters.items() if abs(p.value) > 2.0 * half[name]}
-    fitted = Fitted(names, columns, winner.fit.residual, {n: half[n] for n in known})
+    fitted = FittedColumns(names, columns, winner.fit.residual, {n: half[n] for n in known})
     found = [
         limit
         for effect in effects
@@ -64,7 +64,7 @@ def detection_limits(
 
 
 @dataclass(frozen=True)
-class Fitted:
+class FittedColumns:
     """A fitted model: `columns` (M, p) of `names`, coefficients and shapes, residual (M,).
 
     `half` are the half-widths of the 95 % intervals of the parameters that are known.
@@ -76,7 +76,7 @@ class Fitted:
     half: Mapping[str, float]
 
 
-def _limit(rows: ComparisonRows, what: Explanation, fitted: Fitted) -> DetectionLimit | None:
+def _limit(rows: ComparisonRows, what: Explanation, fitted: FittedColumns) -> DetectionLimit | None:
     """Return the limit of one effect, None where it changes no parameter visibly."""
     data = rows.train_data
     added = rows.adds(what)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from analysis.effects.base import Effect
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
-from analysis.trace import engine, remaining
+from analysis.trace import engine, finding, remaining
 from analysis.trace.data.candidates import catalogue
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import RegressionData, regression_data
@@ -58,7 +58,7 @@ class Searched:
     def named(self) -> set[str]:
         """Return the names that pass the gates, quiet equations searched again."""
         rng = np.random.default_rng(0)
-        found, *_ = engine._named(self.hypotheses, self.winner, self.holdout_data, rng)
+        found, *_ = finding._named(self.hypotheses, self.winner, self.holdout_data, rng)
         return {f.name for f in found if gates.stands(f)}
 
     def vetoes(self, one: Hypothesis) -> str:

@@ -8,7 +8,7 @@ import pytest
 
 from analysis.effects.measurement import ChannelDelay, SensorLag
 from analysis.effects.valve import SpoolLag
-from analysis.trace import engine
+from analysis.trace import engine, finding
 from analysis.trace.result import CLEAN, Trace
 from rig.runs.rigs import load_rig
 from tests.studies.foreign import plant
@@ -30,7 +30,7 @@ def test_a_spool_that_bends_between_samples_is_nothing_to_name(
 ) -> None:
     result = traced()
     assert (result.verdict, result.effects) == (CLEAN, ())
-    monkeypatch.setattr(engine, "path_terms", lambda _: ())
+    monkeypatch.setattr(finding, "path_terms", lambda _: ())
     assert traced().verdict != CLEAN  # the same records without it
 
 

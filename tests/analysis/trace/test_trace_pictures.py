@@ -142,7 +142,7 @@ def test_a_sensor_s_effect_is_told_with_its_sensor_and_stored_by_its_joint() -> 
     lag = JudgedEffect(
         "sensor_lag", "joint 1", {}, 0.01, 0.4,
         (Rival("sensor_lag", "bench", 1.0, 1.0, True, "bench pressure"),),
-        (Gate("stable", False, ""),), at="joint 1 spool",
+        (Gate("invariant", False, ""),), at="joint 1 spool",
     )  # fmt: skip
     assert (lag.where, lag.location) == ("joint 1", "joint 1, spool")
     assert (lag.rivals[0].where, lag.rivals[0].location) == ("bench", "bench, pressure")
@@ -151,7 +151,7 @@ def test_a_sensor_s_effect_is_told_with_its_sensor_and_stored_by_its_joint() -> 
 
 
 def test_an_effect_that_several_sets_hold_is_refused_once_where_it_removes_most() -> None:
-    failed = (Gate("stable", False, ""),)
+    failed = (Gate("invariant", False, ""),)
     first, second, other = (
         JudgedEffect("sensor_lag", "joint 1", {}, 0.01, removed, (), failed, at=at)
         for removed, at in ((0.1, "joint 1 spool"), (0.4, "joint 1 spool"), (0.2, "joint 1 piston"))

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
-from analysis.trace import engine
+from analysis.trace import engine, finding
 from analysis.trace.judge import held_out
 from analysis.trace.judge.shooting import Reshaped
 from analysis.trace.result import Trace
@@ -79,11 +79,11 @@ def decisions_only(kept: Kept) -> Iterator[None]:
     """Trace up to the verdict, columns and fits out of what was `kept`."""
     remembered: tuple[tuple[Any, str, Callable[..., Any]], ...] = (
         (
-            engine,
+            finding,
             "conditioned_records",
             lambda _, runs, filtering, *__: (tuple(map(id, runs)), filtering),
         ),
-        (engine, "regression_data", lambda _, terms, members, beta=None: (terms, id(members))),
+        (finding, "regression_data", lambda _, terms, members, beta=None: (terms, id(members))),
         (engine, "identify", lambda runs, **k: tuple(map(id, runs))),
         (hypothesis_set, "refine", lambda data, terms, *_: (id(data), terms)),
         (hypothesis_set, "rebased", lambda data, model: (id(data), id(model))),

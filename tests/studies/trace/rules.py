@@ -19,7 +19,7 @@ from analysis.effects.friction import Friction
 from analysis.effects.measurement import SensorOffset
 from analysis.effects.valve import SpoolOffset
 from analysis.regression import solve
-from analysis.trace import engine, remaining
+from analysis.trace import engine, finding, remaining
 from analysis.trace.data import noise_floor, regression_data
 from analysis.trace.judge import gates, inference
 from analysis.trace.search import linear_fit
@@ -134,8 +134,6 @@ RULES: Final = (
          ((HypothesisSet, "physical", lambda *_: ""),)),
     Rule("invariance", "a size may differ between steps, halves, directions and speeds",
          ((gates, "invariance", lambda *_: []),)),
-    Rule("stability", "an effect need not be chosen in half-samples",
-         (setting("least_chosen", -1.0),)),
     Rule("family-wise p", "no significance test", (setting("p_limit", 1.0),)),
     Rule("determined", "an effect may stand for what others stand for as well",
          ((gates, "_determined", lambda *_: True),)),
@@ -165,8 +163,9 @@ RULES: Final = (
     Rule("second form", "an effect is tried in its first form only",
          ((Friction, "other_forms", lambda *_: ()),), refits=True),
     Rule("rests", "what stays while a joint rests speaks against its dry friction",
-         ((engine, "_dry", lambda *_: False),)),
-    Rule("free forms", "no mechanism without a named form", ((engine, "_drawn", lambda *_: None),)),
+         tuple((module, "dry", lambda *_: False) for module in (engine, finding))),
+    Rule("free forms", "no mechanism without a named form",
+         ((finding, "_drawn", lambda *_: None),)),
 )  # fmt: skip
 
 FAULTS: Final = (
@@ -176,8 +175,6 @@ FAULTS: Final = (
          ((inference, "null_maximum", _one_candidate),)),
     Rule("flips by sample", "noise with a memory counts as many independent samples",
          ((inference, "blocks", _single_rows),)),
-    Rule("chosen always", "every half-sample is said to choose the effect",
-         ((inference, "stability", lambda _, one, __: dict.fromkeys(one.keys, (1.0, {}))),)),
     Rule("harm never seen", "no equation is said to get worse",
          ((gates, "_worse", lambda *_: []),)),
     Rule("held-out floor x 2", "held-out errors of 3 times the floor pass",
@@ -191,7 +188,7 @@ FAULTS: Final = (
     Rule("least floor", "the floor may lie anywhere below the stated noise",
          ((DATA, "least_noise", 0.0),), refits=True),
     Rule("fit records judge", "the records that were fitted are those that judge",
-         ((engine, "regression_data", _same_records()),), True),
+         ((finding, "regression_data", _same_records()),), True),
     Rule("same records pass", "a held-out record may be a training record",
          ((engine, "_refuse_same", lambda *_: None),)),
     Rule("first repeat alone", "the average is the first repeat",
@@ -202,7 +199,7 @@ FAULTS: Final = (
     Rule("tolerance x 10", "a size may differ twofold between parts",
          (setting("invariance_tolerance", 2.0),)),
     Rule("nothing is left", "whatever stays counts as nothing",
-         ((remaining, "left_over", lambda *_: []), (engine, "left_over", lambda *_: []),
+         ((remaining, "left_over", lambda *_: []), (finding, "left_over", lambda *_: []),
           (gates, "remaining_held_out", lambda *_: []))),
     Rule("judging rows unread", "nobody asks what the judging rows keep",
          ((engine, "_kept", lambda *_: (set(), [])),)),
