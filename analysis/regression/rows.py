@@ -74,14 +74,6 @@ def in_common(one: Rows, other: Rows) -> tuple[Indices, Indices]:
     return here, there
 
 
-def at_instants(rows: Rows, time: Array) -> Rows:
-    """Return the rows at instants (m,) [s], all of which they have."""
-    if np.array_equal(rows.time, time):  # nearly always
-        return rows
-    at = np.searchsorted(rows.time, time)
-    return replace(rows, matrix=rows.matrix[at], rhs=rows.rhs[at], time=time)
-
-
 def default_filtering(record: Record) -> Filtering:
     """Return the filters that the bias study chose, fitted to the record's excitation."""
     rate = record.sample_rate
@@ -248,6 +240,8 @@ def right_parts(
         side = low_passed(weighted({"": sides[name]}, signals, name), filtering)[""]
         time = instants(signals.t, filtering, len(side))
         sensors = np.asarray(signals.valid[:, joints].all(axis=1))
+        if family == "fluid":  # below zero the oil cavitates, and no balance of flows holds
+            sensors &= (signals.p_cap if "cap" in name else signals.p_rod)[:, i] >= 0.0
         out[name] = RightPart(side, time, sensors, _lost(signals, joints))
     return out
 

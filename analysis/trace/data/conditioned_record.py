@@ -26,8 +26,8 @@ from analysis.regression.rows import (
     Rows,
     TermPart,
     assembled,
-    at_instants,
     default_filtering,
+    in_common,
     instants,
     low_passed,
     parameters_of,
@@ -230,18 +230,21 @@ def candidate_columns(
     changed = shared_rows(rig, (*terms, used), replace(conditioned, families=families), memory)
     own = [c.parameter for c in used.term.coefficients(rig)]
     out: dict[str, dict[str, Array]] = {}
-    for name, before in rows.items():
-        if name not in changed:
+    for name, after in changed.items():
+        if name not in rows:
             continue
-        after = at_instants(changed[name], before.time)
+        before = rows[name]
+        here, there = in_common(before, after)
         # Column by column: where a column is the same the difference is exactly nothing.
         same = [after.names.index(n) for n in before.names]
-        moved = after.matrix[:, same] - before.matrix
-        side = after.rhs - before.rhs
-        columns = {"": moved @ np.array([beta.get(n, 0.0) for n in before.names]) - side}
+        moved = after.matrix[there][:, same] - before.matrix[here]
+        side = after.rhs[there] - before.rhs[here]
+        columns = {"": np.zeros(len(before.rhs))}
+        columns[""][here] = moved @ np.array([beta.get(n, 0.0) for n in before.names]) - side
         for k, parameter in enumerate(after.names):
             if parameter in own and np.any(after.matrix[:, k]):
-                columns[parameter] = after.matrix[:, k]
+                columns[parameter] = np.zeros(len(before.rhs))
+                columns[parameter][here] = after.matrix[there, k]
         columns = {key: column for key, column in columns.items() if np.any(column)}
         if columns:
             out[name] = columns

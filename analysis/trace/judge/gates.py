@@ -26,7 +26,7 @@ from analysis.trace.judge.scatter import form_shift
 from analysis.trace.result import Gate, JudgedEffect, Rival
 from analysis.trace.search.hypothesis import Hypothesis, excess_of, parameter_values
 from analysis.trace.search.hypothesis_set import HypothesisSet, effect_of
-from analysis.trace.search.refinement import ExactFit
+from analysis.trace.search.refinement import ExactFit, table
 from analysis.trace.settings import SEARCH, TRACE
 from rig.model.units import plain, with_interval
 
@@ -148,7 +148,9 @@ def remaining(
     well it is measured.
     """
     out = []
-    for e, residual in winner.excess_energy.items():
+    train_data = hypotheses.train_data
+    left = excess_of(train_data, _liquid(train_data, winner.fit, winner.fit.residual))
+    for e, residual in left.items():
         share = residual / max(hypotheses.empty.excess_energy[e], 1e-30)
         if share > TRACE.training_share and not hypotheses.negligible(e, residual):
             times = residual / hypotheses.limits.band[e]
@@ -164,7 +166,7 @@ def remaining_held_out(
     holdout_data: RegressionData, before: ExactFit, after: ExactFit
 ) -> list[tuple[str, str]]:
     """Return the equations that keep more than the band in these held-out rows, and how much."""
-    left = held_left(holdout_data, after)
+    left = _liquid(holdout_data, after, held_left(holdout_data, after))
     start = excess_of(holdout_data, held_left(holdout_data, before))
     now = excess_of(holdout_data, left)
     return [
@@ -172,6 +174,24 @@ def remaining_held_out(
         for e, r in _held_ratio(holdout_data, left).items()
         if r > TRACE.held_out_band and now[e] > TRACE.held_out_share * start[e]
     ]
+
+
+def _liquid(data: RegressionData, model: ExactFit, residual: Array) -> Array:
+    """Return a residual (M,), zero at the few instants at which the oil cavitates under a model.
+
+    A pressure's true gain puts some below zero, where no flow can be compared: these instants count
+    neither for nor against a model. Where they are many, they count.
+    """
+    outside = np.asarray(~np.any(table(data, model.terms).matrix, axis=1))
+    rows: dict[str, list[int]] = {}
+    for s in data.segments:
+        rows.setdefault(s.equation, []).extend(range(s.where.start, s.where.stop))
+    out = residual.copy()
+    for at in rows.values():
+        own = outside[at]
+        if own.mean() <= TRACE.cavitating_share:
+            out[np.array(at)[own]] = 0.0
+    return out
 
 
 def _rms(data: RegressionData, residual: Array, equations: Collection[str]) -> float:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares as search_shapes
 
 from analysis.effects.base import Effect, Shape, shapes_of
-from analysis.regression.rows import at_instants
+from analysis.regression.rows import in_common
 from analysis.terms.base import Used
 from analysis.trace.data.conditioned_record import shared_rows
 from analysis.trace.data.regression_data import RegressionData
@@ -55,20 +55,28 @@ class ExactFit:
 
 
 def table(data: RegressionData, terms: Sequence[Used]) -> DesignMatrix:
-    """Return the whitened rows of a model on the averaged records and instants."""
+    """Return the whitened rows of a model on the averaged records and instants.
+
+    Of instants that the model masks stays what the data's own model leaves of them, so that no
+    effect explains rows by moving its signals out of the model's domain.
+    """
     built = [shared_rows(data.rig, terms, record, data.memory) for record in data.records]
     names = tuple(dict.fromkeys(c.parameter for u in terms for c in u.term.coefficients(data.rig)))
     M = data.base.shape[0]
-    X, y = np.zeros((M, len(names))), np.zeros(M)
+    X, y = np.zeros((M, len(names))), data.mean.copy()
     index = {conditioned.group: k for k, conditioned in enumerate(data.records)}
     for segment in data.segments:
         k = index[segment.group]
-        before = data.rows[k][segment.equation]
-        rows = at_instants(built[k][segment.equation], before.time)
-        size = np.linalg.norm(before.rhs) / max(float(np.linalg.norm(rows.rhs)), 1e-300)
+        rows, before = built[k][segment.equation], data.rows[k][segment.equation]
+        here, there = in_common(before, rows)
+        size = np.linalg.norm(before.rhs[here]) / max(
+            float(np.linalg.norm(rows.rhs[there])), 1e-300
+        )
         weight = np.sqrt(segment.repeats) / segment.noise * size
-        X[segment.where, [names.index(n) for n in rows.names]] = rows.matrix * weight
-        y[segment.where] = rows.rhs * weight
+        at = segment.where.start + here
+        columns = [names.index(n) for n in rows.names]
+        X[np.ix_(at, columns)] = rows.matrix[there] * weight
+        y[at] = rows.rhs[there] * weight
     return DesignMatrix(names, X, y)
 
 
@@ -273,7 +281,14 @@ def rebased(data: RegressionData, model: ExactFit) -> RegressionData:
     built = []
     for conditioned, before in zip(data.records, data.rows, strict=True):
         now = shared_rows(data.rig, model.terms, conditioned, data.memory)
-        built.append({e: at_instants(now[e], old.time) for e, old in before.items()})
+        kept = {}
+        for equation, old in before.items():
+            here, there = in_common(old, now[equation])
+            matrix = np.zeros((len(old.rhs), len(now[equation].names)))
+            rhs = np.zeros(len(old.rhs))
+            matrix[here], rhs[here] = now[equation].matrix[there], now[equation].rhs[there]
+            kept[equation] = replace(now[equation], matrix=matrix, rhs=rhs, time=old.time)
+        built.append(kept)
     return replace(
         data, terms=model.terms, beta=dict(model.beta), names=rows.names, base=rows.matrix,
         rows=tuple(built),
