@@ -149,7 +149,7 @@ def remaining(
     """
     out = []
     train_data = hypotheses.train_data
-    left = excess_of(train_data, _liquid(train_data, winner.fit, winner.fit.residual))
+    left = excess_of(train_data, liquid(train_data, winner.fit, winner.fit.residual))
     for e, residual in left.items():
         share = residual / max(hypotheses.empty.excess_energy[e], 1e-30)
         if share > TRACE.training_share and not hypotheses.negligible(e, residual):
@@ -166,7 +166,7 @@ def remaining_held_out(
     holdout_data: RegressionData, before: ExactFit, after: ExactFit
 ) -> list[tuple[str, str]]:
     """Return the equations that keep more than the band in these held-out rows, and how much."""
-    left = _liquid(holdout_data, after, held_left(holdout_data, after))
+    left = liquid(holdout_data, after, held_left(holdout_data, after))
     start = excess_of(holdout_data, held_left(holdout_data, before))
     now = excess_of(holdout_data, left)
     return [
@@ -176,7 +176,7 @@ def remaining_held_out(
     ]
 
 
-def _liquid(data: RegressionData, model: ExactFit, residual: Array) -> Array:
+def liquid(data: RegressionData, model: ExactFit, residual: Array) -> Array:
     """Return a residual (M,), zero at the few instants at which the oil cavitates under a model.
 
     A pressure's true gain puts some below zero, where no flow can be compared: these instants count
