@@ -176,6 +176,9 @@ class SearchSettings:
     (tuned)."""
     least_growth: float = 0.1
     """Sum over equations of log ratios of what is left: with less nothing was gained (tuned)."""
+    far_less: float = 2.3
+    """The same by which another pair must leave less than an effect that only the tolerance for its
+    form lets pass (tuned: a tenth)."""
     number_price: float = 20.0
     """Energy that each further free number must take: ten times what noise gives it (tuned)."""
     visible: float = 0.03

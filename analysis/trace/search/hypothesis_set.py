@@ -169,9 +169,11 @@ class HypothesisSet:
         now = self.prune(self.best([self.empty, *singles]))
         if within(now.excess_energy, self.limits):
             return now
-        if self.formed(now):
-            return self.completed(now)
         pairs = self.tried(self._pairs(candidates, r, singles))
+        if self.formed(now):
+            others = [o for o in pairs if not now.keys & o.keys]
+            far = [o for o in others if self.excess(o, now) < -SEARCH.far_less]
+            return self.completed(self.prune(self.best([now, *far])))
         now = self.prune(self.best([self.empty, *singles, *pairs]))
         while not within(now.excess_energy, self.limits) and len(now.effects) < SEARCH.largest_set:
             grown = self.prune(self.best([now, *self.extensions(now)]))
