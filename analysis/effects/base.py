@@ -112,9 +112,10 @@ class Effect(Term):
 
     `variable` names in plain words what the effect's contribution moves with; `confounders` are
     effects whose columns look alike on poor excitation, `separated_by` an excitation on which
-    they differ; `includes` names effects that it becomes at a limit of its own numbers. `stage`
-    orders the terms' `prepare` (see `ordered`): what a sensor distorts is undone first, then comes
-    what acts on the spool, in the oil's own order. `alters` names the families of rows that
+    they differ; `includes` names effects that it becomes at a limit of its own numbers, in whose
+    place it stands, or `beside` which, as another part of their law. `stage` orders the terms'
+    `prepare` (see `ordered`): what a sensor distorts is undone first, then comes what acts on the
+    spool, in the oil's own order. `alters` names the families of rows that
     `prepare` changes: rows of others need not be built again for another shape. `hydraulic` marks
     what acts on oil, valve or cylinder, and is not for electric joints. `least` and `least_shape`
     are the coefficients and shapes [SI] of the smallest size that a person would want to know of on
@@ -136,6 +137,7 @@ class Effect(Term):
     confounders: ClassVar[tuple[str, ...]] = ()
     separated_by: ClassVar[str] = ""
     includes: ClassVar[tuple[str, ...]] = ()
+    beside: ClassVar[bool] = False
     stage: ClassVar[int] = PLANT
     alters: ClassVar[tuple[str, ...]] = tuple(FAMILIES)
     hydraulic: ClassVar[bool] = False

@@ -247,6 +247,7 @@ class StribeckFriction(Friction):
     variable: ClassVar[str] = "the piston's velocity near zero"
     confounders: ClassVar[tuple[str, ...]] = ("coulomb_friction", "asymmetric_friction")
     includes: ClassVar[tuple[str, ...]] = ("coulomb_friction",)  # at a high Stribeck speed
+    beside: ClassVar[bool] = True
     before: ClassVar[int] = 1
     separated_by: ClassVar[str] = (
         "slow sweeps through zero velocity beside fast ones: it is gone above the Stribeck speed"

@@ -117,6 +117,7 @@ class JointSpring(Effect):
     family: ClassVar[str] = "mechanics"
     variable: ClassVar[str] = "the joint's angle"
     confounders: ClassVar[tuple[str, ...]] = ("torque_offset", "base_inclination")
+    includes: ClassVar[tuple[str, ...]] = ("torque_offset",)  # at a rest angle far away
     separated_by: ClassVar[str] = (
         "slow motion over the whole stroke at two poses of the other joints: gravity "
         "depends on the absolute angle, the spring on the joint's angle"

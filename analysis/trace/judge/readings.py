@@ -126,21 +126,20 @@ def _form_error(hypotheses: HypothesisSet, hypothesis: Hypothesis, other: Hypoth
 def _richer(hypotheses: HypothesisSet, hypothesis: Hypothesis) -> list[Hypothesis]:
     """Return the sets with a further number of a mechanism's law.
 
-    A reading with more coefficients takes the place of one that it includes; one with as many is
-    another part of the same law, and stands beside.
+    A reading takes the place of one that it includes; another part of the same law stands beside.
     """
     rig, sets = hypotheses.train_data.rig, dict[frozenset[Key], tuple[Used, ...]]()
     for used in hypothesis.effects:
         assert isinstance(used.term, Effect)
-        count = len(used.term.coefficients(rig))
         for effect in hypotheses.effects:
             if not related(effect, used.term) or (effect.name, effect.where) in hypothesis.keys:
                 continue
             kept = [u for u in hypothesis.effects if u is not used]
-            own = len(effect.coefficients(rig))
-            if own == count and len(hypothesis.effects) < SEARCH.largest_set:
+            if effect.beside or used.term.beside:
                 kept.append(used)
-            elif own <= count:
+            elif used.term.name not in effect.includes:
+                continue
+            if len(kept) == SEARCH.largest_set:
                 continue
             effects = (*kept, Used(effect, effect.shape_of(rig, ())))
             sets[frozenset((u.term.name, u.term.where) for u in effects)] = effects
