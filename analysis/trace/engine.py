@@ -89,9 +89,9 @@ def trace(
     held-out rows is set aside for that (`data.set_aside`).
 
     `effects` are the candidates, by default the whole catalogue at every place. `seed` draws the
-    sign flips; `families` are the equations looked at, mechanical or fluid (they
-    share no parameter, so that what stays unexplained in one need not hide the other); `look_ahead`
-    designs the next experiment; `terms` take the baseline's place: a model's with its effects,
+    sign flips; `families` are the equations looked at, mechanical or fluid (they share no
+    parameter, so that what stays unexplained in one need not hide the other); `look_ahead` designs
+    the next experiment; `terms` take the baseline's place: a model's with its effects,
     whose shapes stay as they are; with `free_forms` a mechanism whose curve the data draw may
     explain what no named effect does; `progress` receives the share of the work done. Raises
     InputError for records of different rigs, without held-out records, with held-out or judging
@@ -117,7 +117,7 @@ def trace(
     notes = [*rows.unseen.notes, *_notes(rows.train, rows.unseen.choosing)]
     notes += [check.detail for check in baseline.checks if check.name == GEOMETRY]
     finding = found_on(rows, candidates, free, seed, columns)
-    finding = without_tied(without_rests(rig, terms, records, seed, finding))
+    finding = without_tied(without_rests(rig, terms, records, free, seed, finding))
     verdict, winner = finding.verdict, finding.winner
     judged_effects, refused = finding.named, finding.refused
     notes += finding.notes

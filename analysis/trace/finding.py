@@ -11,7 +11,6 @@ from analysis.effects.base import Effect
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.rows import Filtering
 from analysis.terms.base import Used, equation
-from analysis.trace.data.candidates import free_mechanisms
 from analysis.trace.data.conditioned_record import (
     conditioned_records,
     moving_filtering,
@@ -147,18 +146,21 @@ def _listed(effect: JudgedEffect, verdict: str) -> bool:
 
 
 def without_rests(
-    rig: Rig, terms: tuple[Used, ...], records: TraceRuns, seed: int, finding: Finding
-) -> Finding:
+    rig: Rig, terms: tuple[Used, ...], records: TraceRuns, free: Sequence[Effect], seed: int,
+    finding: Finding,
+) -> Finding:  # fmt: skip
     """Ask without the joints' rests what is left where only balances with dry friction keep much.
 
     At rest dry friction is whatever holds the joint: what stays there speaks against no law of the
-    speed. Where nothing else stays, what stood explains the records, with its sizes in motion.
+    speed. Where nothing else stays, what stood explains the records, with its sizes in motion; of
+    `free` mechanisms friction over speed is tried where nothing stood.
     """
     loud = {r.equation for r in finding.rest if r.veto}
     if finding.verdict != UNEXPLAINED:
         return finding
     if not dry(finding.winner, loud):
-        return _drawn_in_motion(rig, terms, records, seed, finding, loud)
+        curves = [f for f in free if f.family == "friction"]
+        return _drawn_in_motion(rig, terms, records, curves, seed, finding)
     rows, hypotheses, winner = in_motion(rig, terms, records, finding.winner)
     holdout_data = rows.unseen.choosing
     rest = left_over(hypotheses, winner, holdout_data)
@@ -175,16 +177,16 @@ def without_rests(
 
 
 def _drawn_in_motion(
-    rig: Rig, terms: tuple[Used, ...], records: TraceRuns, seed: int, finding: Finding,
-    loud: Collection[str],
+    rig: Rig, terms: tuple[Used, ...], records: TraceRuns, curves: Sequence[Effect], seed: int,
+    finding: Finding,
 ) -> Finding:  # fmt: skip
     """Draw friction over speed without the rests where nothing that acts in torques stood.
 
     A high breakaway hides the law in motion from every name. The curve must take most of what the
     rests leave too.
     """
-    free = [f for f in free_mechanisms(rig) if f.family == "friction"]
-    free = [f for f in free if equation("torque", f.joint) in loud]
+    loud = {r.equation for r in finding.rest if r.veto}
+    free = [f for f in curves if equation("torque", f.joint) in loud]
     if finding.winner.effects or not free or len(free) < len(loud):
         return finding
     rows = trace_rows(rig, terms, records, moving_filtering)
