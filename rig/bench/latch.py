@@ -23,7 +23,7 @@ from rig.model.parts import LOCALHOST, Wire
 from rig.model.rig import Rig
 from rig.model.trips import Latched, RecordingFailed
 from rig.runs import runstate
-from rig.runs.files import replace_text, sync_folder
+from rig.runs.files import replace_text, sync_to_disk
 
 log = logging.getLogger(__name__)
 
@@ -84,7 +84,7 @@ class BenchState:
         """Make the folder; raises InputError where a trip could not be kept."""
         try:
             self.folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-            sync_folder(self.folder.parent)
+            sync_to_disk(self.folder.parent)
             if not os.access(self.folder, os.W_OK | os.X_OK):
                 raise PermissionError(13, "may not be written")
         except OSError as error:
@@ -155,7 +155,7 @@ class BenchState:
         if trip is not None:
             _note_in_run(trip, entry)
         (self.folder / _TRIP).unlink(missing_ok=True)
-        sync_folder(self.folder)
+        sync_to_disk(self.folder)
         return trip
 
     # The session

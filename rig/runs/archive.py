@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from rig.model import channels as ch
 from rig.model.trips import RecordingFailed
 from rig.runs.archive_reader import FORMAT
-from rig.runs.files import sync_file, sync_folder
+from rig.runs.files import sync_to_disk
 from rig.runs.journal import Journal
 from rig.runs.runstate import BETWEEN, StreamClock, read_events, stream_clocks
 from rig.runs.sections import Assembled, Section, Written, assemble, blocks_of, plan
@@ -137,9 +137,9 @@ def create(path: Path, rig_name: str) -> h5py.File:
 
 def put_in_place(fresh: Path, path: Path) -> None:
     """Give a finished archive its name, on the disk before anything relies on it."""
-    sync_file(fresh)
+    sync_to_disk(fresh)
     os.replace(fresh, path)
-    sync_folder(path.parent)
+    sync_to_disk(path.parent)
 
 
 def write_from_journal(journal: Journal, folder: Path, rig_name: str) -> Written:

@@ -46,13 +46,8 @@ def read_text(path: Path, what: str, limit: int = MAX_TEXT) -> str:
         ) from error
 
 
-def sync_folder(folder: Path) -> None:
-    """Make renames and new names in `folder` survive a power cut; raises OSError."""
-    sync_file(folder)
-
-
-def sync_file(path: Path) -> None:
-    """Force a file's content to the disk; raises OSError."""
+def sync_to_disk(path: Path) -> None:
+    """Make a file's content, or a folder's names, survive a power cut; raises OSError."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -71,4 +66,4 @@ def replace_text(path: Path, text: str) -> None:
         fresh.replace(path)
     finally:
         fresh.unlink(missing_ok=True)
-    sync_folder(path.parent)
+    sync_to_disk(path.parent)

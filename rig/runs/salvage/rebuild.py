@@ -19,7 +19,7 @@ import numpy as np
 
 from drivers.base import SampleBlock
 from rig.model.rig import Rig
-from rig.runs.files import sync_folder
+from rig.runs.files import sync_to_disk
 from rig.runs.journal import Block, Journal, Mark, decode_row, describes_record
 from rig.runs.runstate import read_events
 from rig.runs.salvage.scan import best_marks, block_rows, marks, raw_bytes
@@ -233,5 +233,5 @@ def set_aside(path: Path) -> Path:
             source.unlink(missing_ok=True)
         elif source.exists():
             source.replace(target.with_name(target.name + suffix))
-    sync_folder(path.parent)
+    sync_to_disk(path.parent)
     return target
