@@ -169,7 +169,7 @@ class Effect(Term):
         return 1
 
     def bounded(self, shape: Sequence[float]) -> tuple[float, ...]:
-        """Return a shape whose numbers are within what they leave to each other."""
+        """Return the shape with every number inside a limit that depends on its other numbers."""
         return tuple(shape)
 
     def least_shapes(self) -> tuple[float, ...]:

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from analysis.regression.rows import Filtering, default_filtering
+import numpy as np
+
+from analysis.regression.rows import Array, Filtering, Indices, default_filtering
 from analysis.regression.settings import REGRESSION
 from analysis.signals.conditioning import Signals, condition, without_rests
 from analysis.signals.locks import moving_by_step
@@ -31,6 +33,11 @@ class ConditionedRecord:
         """Return another record (repeats averaged, noise added) made ready as this one was."""
         signals = condition(rig, record, self.filtering.channels, self.signals.moving)
         return replace(self, record=record, signals=_counted(signals, self.filtering))
+
+    def samples_at(self, time: Array) -> Indices:
+        """Return the numbers of the samples (m,) nearest to instants (m,) [s]."""
+        at = np.rint(time * self.record.sample_rate).astype(np.int64)
+        return np.asarray(at.clip(0, len(self.signals.t) - 1))
 
     @property
     def group(self) -> tuple[int, str]:

@@ -69,6 +69,16 @@ def least_squares(X: Array, y: Array) -> Array:
     return np.asarray(factored(X).inverse @ y)
 
 
+def shortest(X: Array, y: Array, rank: float) -> Array:
+    """Return beta (k,) or (k, n) of least |y - X beta| of X (m, k) and y (m,) or (m, n).
+
+    Directions of the scaled columns below `rank` times the largest singular value get no value.
+    """
+    size = np.linalg.norm(X, axis=0)
+    scale = np.where(size > 0.0, size, 1.0)
+    return np.asarray((np.linalg.lstsq(X / scale, y, rcond=rank)[0].T / scale).T)
+
+
 def scaled_inverse(A: Array) -> Array:
     """Invert a matrix A (k, k) of normal or estimating equations, its diagonal scaled to 1.
 

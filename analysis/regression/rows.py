@@ -206,7 +206,7 @@ def term_part(
 ) -> TermPart:
     """Return a term's filtered columns of one family, of signals as all terms see them.
 
-    Where the equations hold is decided by the `measured` signals, whatever a term makes of them.
+    Where the equations hold is decided by the `measured` signals, before any term corrects them.
     """
     equations = _equations(signals, family)
     raw = used.term.columns(rig, signals, used.shape)

@@ -40,6 +40,11 @@ class Estimate:
     note: str = ""
 
     @property
+    def half(self) -> float:
+        """Half the width of the 95 % interval."""
+        return 0.5 * (self.ci95[1] - self.ci95[0])
+
+    @property
     def identified(self) -> bool:
         """Whether the records determine it."""
         return math.isfinite(self.value)

@@ -41,7 +41,7 @@ class Orifice(Term):
     rod: - C_mp sqrt(p_rod - p_t) u [u>0] - C_mm sqrt(p_s - p_rod) u [u<0].
     The paper prints the rod's root for u > 0 as zero and divides one rod term by V_cap; here
     it is from first principles. Outside [p_t, p_s] the root has the drop's sign. Rows are masked
-    where measured pressures lie there: what no sensor should show is no evidence.
+    where measured pressures lie there.
     """
 
     name: ClassVar[str] = "orifice"

@@ -160,7 +160,7 @@ def without_rests(
         return finding
     if not dry(finding.winner, loud):
         curves = [f for f in free if f.family == "friction"]
-        return _drawn_in_motion(rig, terms, records, curves, seed, finding)
+        return _drawn_in_motion(rig, terms, records, curves, seed, finding, loud)
     rows, hypotheses, winner = in_motion(rig, terms, records, finding.winner)
     holdout_data = rows.unseen.choosing
     rest = left_over(hypotheses, winner, holdout_data)
@@ -168,24 +168,24 @@ def without_rests(
     if any(r.veto for r in rest) or not all(map(gates.stands, judged)):
         return finding
     sizes = {(f.name, f.where): f.parameters for f in judged}
-    stand = [f for f in finding.effects if gates.stands(f)]
-    named = [replace(f, parameters=sizes[f.name, f.where]) for f in stand]
-    others = [f for f in finding.effects if not gates.stands(f)]
-    verdict = CONFOUNDED if _tied(named) else EXPLAINED
+    effects = tuple(
+        replace(f, parameters=sizes[f.name, f.where]) if gates.stands(f) else f
+        for f in finding.effects
+    )
+    verdict = CONFOUNDED if _tied([f for f in effects if gates.stands(f)]) else EXPLAINED
     notes = (*at_rest(loud), *_rest_notes(verdict, rest, quiet=False, named=True))
-    return Finding(rows, hypotheses, winner, verdict, (*named, *others), tuple(rest), notes)
+    return Finding(rows, hypotheses, winner, verdict, effects, tuple(rest), notes)
 
 
 def _drawn_in_motion(
     rig: Rig, terms: tuple[Used, ...], records: TraceRuns, curves: Sequence[Effect], seed: int,
-    finding: Finding,
+    finding: Finding, loud: Collection[str],
 ) -> Finding:  # fmt: skip
     """Draw friction over speed without the rests where nothing that acts in torques stood.
 
     A high breakaway hides the law in motion from every name. The curve must take most of what the
     rests leave too.
     """
-    loud = {r.equation for r in finding.rest if r.veto}
     free = [f for f in curves if equation("torque", f.joint) in loud]
     if finding.winner.effects or not free or len(free) < len(loud):
         return finding
@@ -207,12 +207,12 @@ def _drawn_in_motion(
 
 def dry(winner: Hypothesis, equations: Collection[str]) -> bool:
     """Return whether dry friction of the set acts in each of some equations, at least one."""
-    dry = {
+    balances = {
         equation("torque", used.term.joint)
         for used in winner.effects
         if isinstance(used.term, Effect) and used.term.family == "friction"
     }
-    return bool(equations) and dry.issuperset(equations)
+    return bool(equations) and balances.issuperset(equations)
 
 
 def in_motion(
@@ -227,7 +227,7 @@ def in_motion(
 
 
 def at_rest(equations: Collection[str]) -> list[str]:
-    """Say of equations that their joints' rests were not counted."""
+    """Return a note for each equation whose samples at rest were not counted."""
     return [
         f"{e}: judged without the samples at which the joint rests, where dry friction is whatever "
         "holds it; the errors include them"
@@ -240,18 +240,17 @@ def _laid_out(
 ) -> RegressionData:
     """Lay out the training records, spools' paths between samples beside the terms."""
     data = regression_data(rig, terms, train)
-    _refuse_short(data, train)
+    _refuse_short(data)
     paths = path_terms(data)
     return regression_data(rig, (*terms, *paths), train) if paths else data
 
 
-def _refuse_short(train_data: RegressionData, train: Sequence[ConditionedRecord]) -> None:
+def _refuse_short(train_data: RegressionData) -> None:
     for s in train_data.segments:
         count = s.where.stop - s.where.start
         if count < TRACE.least_rows:
-            record = next(x.record for x in train if x.group == s.group)
-            k = [x.group for x in train_data.records].index(s.group)
-            masked = train_data.rows[k][s.equation].masked
+            conditioned, rows = train_data.source(s)
+            record, masked = conditioned.record, rows.masked
             remedy = "take longer records"
             if masked > count:
                 remedy = (

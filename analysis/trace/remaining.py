@@ -17,7 +17,7 @@ from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.spectral_lines import SpectralLines
 from analysis.trace.judge import gates, held_out
 from analysis.trace.result import Dependence, Formula
-from analysis.trace.search.hypothesis import Hypothesis, excess_of
+from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.search.refinement import rebased
 from analysis.trace.settings import TRACE
@@ -71,10 +71,9 @@ def left_over(
 
 def _missed(hypotheses: HypothesisSet, winner: Hypothesis, known: Sequence[Rest]) -> list[Rest]:
     """Return the other equations that keep more than a further effect would leave unasked."""
-    listed, data = {r.equation for r in known}, hypotheses.train_data
+    listed = {r.equation for r in known}
     out = []
-    left = excess_of(data, gates.liquid(data, winner.fit, winner.fit.residual))
-    for e, residual in left.items():
+    for e, residual in gates.left_in_training(hypotheses, winner).items():
         if winner.effects and e not in listed and not hypotheses.negligible(e, residual):
             share = residual / max(hypotheses.empty.excess_energy[e], 1e-30)
             words = f"{plain(100 * share, 2)} % of the repeatable energy remains"
@@ -91,9 +90,7 @@ def _tolerated(share: float) -> str:
 
 def _seen(hypotheses: HypothesisSet, winner: Hypothesis) -> dict[str, float]:
     """Return the share that stays, by equation, where it stands out of the noise's own energy."""
-    rows: dict[str, int] = {}
-    for s in hypotheses.train_data.segments:
-        rows[s.equation] = rows.get(s.equation, 0) + s.where.stop - s.where.start
+    rows = hypotheses.train_data.counts
     shares = {
         e: v / max(hypotheses.empty.excess_energy[e], 1e-30)
         for e, v in winner.excess_energy.items()

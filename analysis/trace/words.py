@@ -87,8 +87,7 @@ def _effect(effect: JudgedEffect) -> str:
 
 def quantity(estimate: Estimate) -> str:
     """Return value ± 95 % half-width with its unit."""
-    half = 0.5 * (estimate.ci95[1] - estimate.ci95[0])
-    return with_interval(estimate.value, half, typeset(estimate.unit))
+    return with_interval(estimate.value, estimate.half, typeset(estimate.unit))
 
 
 def shot_in_words(effect: JudgedEffect) -> str:

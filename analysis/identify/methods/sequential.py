@@ -129,7 +129,7 @@ def _shown(
 
 def disagreement(values: Sequence[Estimate]) -> float:
     """Return the largest difference of two values over their common 95 % half width."""
-    halves = [0.5 * (v.ci95[1] - v.ci95[0]) for v in values]
+    halves = [v.half for v in values]
     return max(
         (
             abs(a.value - b.value) / float(np.hypot(halves[i], halves[j]))

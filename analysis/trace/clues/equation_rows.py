@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.regression.conditioned import ConditionedRecord
+from analysis.regression.least_squares import shortest
 from analysis.regression.rows import Rows
 from analysis.signals.conditioning import Signals
 from analysis.trace.data.conditioned_record import filtered, prepared
@@ -39,15 +40,14 @@ class EquationRows:
 
 def side_of(data: RegressionData, residual: Array, equation: str) -> EquationRows | None:
     """Return the rows of an equation with its `residual` (M,), None where it has no rows."""
-    index = {conditioned.group: k for k, conditioned in enumerate(data.records)}
     parts, rest, base = [], [], []
     for s in data.segments:
         if s.equation != equation:
             continue
-        k = index[s.group]
-        seen = prepared(data.rig, data.terms, data.records[k])
+        conditioned, rows = data.source(s)
+        seen = prepared(data.rig, data.terms, conditioned)
         weight = float(np.sqrt(s.repeats)) / s.noise
-        parts.append(EquationPart(data.records[k], data.rows[k][equation], seen, weight))
+        parts.append(EquationPart(conditioned, rows, seen, weight))
         rest.append(residual[s.where])
         base.append(data.base[s.where])
     if not parts:
@@ -70,9 +70,7 @@ def columns_of(side: EquationRows, made: Sequence[Array]) -> Array:
 
 def fitted_to(columns: Array, side: EquationRows) -> Array:
     """Return the coefficients (k,) of columns (m, k) that leave least of a side."""
-    scale = np.linalg.norm(columns, axis=0)
-    scale[scale == 0] = 1.0
-    return np.asarray(np.linalg.lstsq(columns / scale, side.rest, rcond=1e-2)[0] / scale)
+    return shortest(columns, side.rest, 1e-2)
 
 
 def judged(fitted: Array, side: EquationRows, judging: Array, other: EquationRows) -> float:

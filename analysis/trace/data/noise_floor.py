@@ -126,8 +126,7 @@ def neighbours(conditioned: ConditionedRecord, rows: Rows, residual: Array) -> f
 
 def _states(conditioned: ConditionedRecord, rows: Rows) -> Array:
     """Return the moving joints' states (m, k) at the instants of rows, each of unit deviation."""
-    signals, rate = conditioned.signals, conditioned.record.sample_rate
-    at = np.rint(rows.time * rate).astype(int).clip(0, len(signals.t) - 1)
+    signals, at = conditioned.signals, conditioned.samples_at(rows.time)
     joints = signals.excited if signals.moving is None else signals.moving
     kinds = (signals.q, signals.qd, signals.u, signals.p_cap, signals.p_rod)
     columns = np.column_stack([kind[np.ix_(at, joints)] for kind in kinds])

@@ -10,6 +10,7 @@ adds 1 per row to a residual's energy, whatever the unit and the number of repea
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from analysis.effects.base import Evidence
 from analysis.regression.conditioned import ConditionedRecord
+from analysis.regression.least_squares import shortest
 from analysis.regression.rows import Rows
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import Used
@@ -78,6 +80,19 @@ class RegressionData:
             weights[segment.where] = np.sqrt(segment.repeats)
         return np.asarray(np.nanmean(self.residual, axis=0) * weights)
 
+    @property
+    def counts(self) -> Counter[str]:
+        """How many rows each equation has."""
+        rows: Counter[str] = Counter()
+        for s in self.segments:
+            rows[s.equation] += s.where.stop - s.where.start
+        return rows
+
+    def source(self, segment: Segment) -> tuple[ConditionedRecord, Rows]:
+        """Return the averaged record that a segment is of, and the record's rows behind it."""
+        k = [conditioned.group for conditioned in self.records].index(segment.group)
+        return self.records[k], self.rows[k][segment.equation]
+
     def at(self, mask: NDArray[np.bool_]) -> RegressionData:
         """Return the data with only the rows of a mask (M,), weighed by the floors of all."""
         index = {conditioned.group: k for k, conditioned in enumerate(self.records)}
@@ -130,13 +145,7 @@ def least_squares(rig: Rig, rows: Sequence[Mapping[str, Rows]]) -> dict[str, flo
         if not parts:
             continue
         X, y = np.concatenate([r.matrix for r in parts]), np.concatenate([r.rhs for r in parts])
-        scale = np.linalg.norm(X, axis=0)
-        scale[scale == 0] = 1.0
-        out |= zip(
-            parts[0].names,
-            np.linalg.lstsq(X / scale, y, rcond=TRACE.rank_limit)[0] / scale,
-            strict=True,
-        )
+        out |= zip(parts[0].names, shortest(X, y, TRACE.rank_limit), strict=True)
     return out
 
 

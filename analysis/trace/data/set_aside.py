@@ -56,17 +56,16 @@ def set_aside(
     either side: all its rows then choose and judge.
     """
     judge = np.zeros(data.base.shape[0], dtype=bool)
-    index = {conditioned.group: k for k, conditioned in enumerate(data.records)}
     short = set()
     for s in data.segments:
-        judge[s.where] = here = judging(data.rows[index[s.group]][s.equation].time)
+        judge[s.where] = here = judging(data.source(s)[1].time)
         if min(here.sum(), (~here).sum()) < TRACE.least_rows:
             short.add(s.group)
     choose = ~judge
     for s in data.segments:
         if s.group in short:
             judge[s.where] = choose[s.where] = True
-    divided = frozenset(index) - short
+    divided = frozenset(conditioned.group for conditioned in data.records) - short
     return Unseen(
         data.at(choose), data.at(judge), tuple(members), _without_blocks(runs, divided), divided,
         (_said(divided, sorted({step for _, step in short})),),

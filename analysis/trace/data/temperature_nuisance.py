@@ -104,5 +104,5 @@ def _at(b: Estimate, kappa: Estimate, kelvin: float) -> tuple[Estimate, float]:
     value = b.value / (1.0 + b.value * slope * kelvin)
     more = (value**2 * kelvin * spread) ** 2 * (1.0 - weight)
     std = math.hypot(b.std, math.sqrt(more))
-    half = 0.5 * (b.ci95[1] - b.ci95[0]) * (std / b.std if b.std > 0 else 1.0)
+    half = b.half * (std / b.std if b.std > 0 else 1.0)
     return replace(b, value=value, std=std, ci95=(value - half, value + half)), more

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -60,7 +58,7 @@ def within_curves(data: RegressionData, model: ExactFit) -> RegressionData:
 
 def beyond_in_words(whole: RegressionData, known: RegressionData) -> list[str]:
     """Return a sentence for every equation of which `known` lacks rows (see `within_curves`)."""
-    rows, left = _counts(whole), _counts(known)
+    rows, left = whole.counts, known.counts
     return [
         f"{e}: {plain(100 * (1 - left[e] / rows[e]), 2)} % of the judging rows lie beyond the "
         "range of the fitted curve: they are in the errors, but speak neither for nor against it; "
@@ -70,14 +68,6 @@ def beyond_in_words(whole: RegressionData, known: RegressionData) -> list[str]:
     ]
 
 
-def _counts(data: RegressionData) -> Counter[str]:
-    """Return how many rows each equation has."""
-    rows: Counter[str] = Counter()
-    for s in data.segments:
-        rows[s.equation] += s.where.stop - s.where.start
-    return rows
-
-
 def _between_knots(data: RegressionData, used: Used) -> NDArray[np.bool_]:
     """Return in which rows (M,) the variable of a curve lies between its outermost knots."""
     inside, effect = np.ones(len(data.base), dtype=bool), used.term
@@ -85,17 +75,14 @@ def _between_knots(data: RegressionData, used: Used) -> NDArray[np.bool_]:
     named = zip(shapes_of(data.rig, used), used.shape, strict=True)
     knots = [value for shape, value in named if "_knot_" in shape.parameter]
     margin = TRACE.beyond_knots * (knots[-1] - knots[0])
-    for conditioned, rows in zip(data.records, data.rows, strict=True):
-        signals = conditioned.signals
-        for equation, values in effect.abscissa(data.rig, signals).items():
-            at = [
-                s for s in data.segments if (s.group, s.equation) == (conditioned.group, equation)
-            ]
-            for segment in at:
-                x = values[np.searchsorted(signals.t, rows[equation].time - 1e-9)]
-                # A curve of an amount begins at zero.
-                x = np.abs(x) if knots[0] == 0.0 else x
-                inside[segment.where] = (x >= knots[0] - margin) & (x <= knots[-1] + margin)
+    for segment in data.segments:
+        conditioned, rows = data.source(segment)
+        values = effect.abscissa(data.rig, conditioned.signals).get(segment.equation)
+        if values is not None:
+            x = values[conditioned.samples_at(rows.time)]
+            # A curve of an amount begins at zero.
+            x = np.abs(x) if knots[0] == 0.0 else x
+            inside[segment.where] = (x >= knots[0] - margin) & (x <= knots[-1] + margin)
     return inside
 
 

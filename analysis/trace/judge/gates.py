@@ -148,9 +148,7 @@ def remaining(
     well it is measured.
     """
     out = []
-    train_data = hypotheses.train_data
-    left = excess_of(train_data, liquid(train_data, winner.fit, winner.fit.residual))
-    for e, residual in left.items():
+    for e, residual in left_in_training(hypotheses, winner).items():
         share = residual / max(hypotheses.empty.excess_energy[e], 1e-30)
         if share > TRACE.training_share and not hypotheses.negligible(e, residual):
             times = residual / hypotheses.limits.band[e]
@@ -162,11 +160,17 @@ def remaining(
     return out + remaining_held_out(holdout_data, hypotheses.empty.fit, winner.fit)
 
 
+def left_in_training(hypotheses: HypothesisSet, winner: Hypothesis) -> dict[str, float]:
+    """Return the energy above noise by equation, without the few instants of cavitating oil."""
+    data = hypotheses.train_data
+    return excess_of(data, _liquid(data, winner.fit, winner.fit.residual))
+
+
 def remaining_held_out(
     holdout_data: RegressionData, before: ExactFit, after: ExactFit
 ) -> list[tuple[str, str]]:
     """Return the equations that keep more than the band in these held-out rows, and how much."""
-    left = liquid(holdout_data, after, held_left(holdout_data, after))
+    left = _liquid(holdout_data, after, held_left(holdout_data, after))
     start = excess_of(holdout_data, held_left(holdout_data, before))
     now = excess_of(holdout_data, left)
     return [
@@ -176,13 +180,15 @@ def remaining_held_out(
     ]
 
 
-def liquid(data: RegressionData, model: ExactFit, residual: Array) -> Array:
+def _liquid(data: RegressionData, model: ExactFit, residual: Array) -> Array:
     """Return a residual (M,), zero at the few instants at which the oil cavitates under a model.
 
     A pressure's true gain puts some below zero, where no flow can be compared: these instants count
     neither for nor against a model. Where they are many, they count.
     """
     outside = np.asarray(~np.any(table(data, model.terms).matrix, axis=1))
+    if not outside.any():  # nearly always
+        return residual
     rows: dict[str, list[int]] = {}
     for s in data.segments:
         rows.setdefault(s.equation, []).extend(range(s.where.start, s.where.stop))

@@ -27,23 +27,19 @@ Array = NDArray[np.float64]
 Key = tuple[str, str]
 
 
-def blocks(
-    train_data: RegressionData, seconds: float = TRACE.flip_block, fewest: float = 3.0
-) -> NDArray[np.int64]:
+def blocks(train_data: RegressionData) -> NDArray[np.int64]:
     """Return for each row the number of its block within its record (M,).
 
-    A block is a period of a record that holds the `fewest` of them.
+    A block is a period of a record that holds three of them.
     """
     out = np.zeros(train_data.base.shape[0], dtype=np.int64)
-    index = {conditioned.group: k for k, conditioned in enumerate(train_data.records)}
     for segment in train_data.segments:
         if segment.repeats >= TRACE.enough_repeats:
             continue
-        conditioned = train_data.records[index[segment.group]]
+        conditioned, rows = train_data.source(segment)
         rate, period = conditioned.record.sample_rate, conditioned.record.period
-        time = train_data.rows[index[segment.group]][segment.equation].time
-        length = seconds
-        if period and fewest * period <= conditioned.record.samples:
+        time, length = rows.time, TRACE.flip_block
+        if period and 3 * period <= conditioned.record.samples:
             length = period / rate
         out[segment.where] = np.floor((time - time[0]) / length).astype(np.int64)
     return out

@@ -25,23 +25,18 @@ def subsets(train_data: RegressionData, joint: int | None) -> dict[str, Array]:
     """Return masks (M,) of rows: each step, each half of the records, each direction of motion."""
     M = train_data.base.shape[0]
     out: dict[str, Array] = {}
-    index = {conditioned.group: k for k, conditioned in enumerate(train_data.records)}
     early, ahead = np.zeros(M, dtype=bool), np.zeros(M, dtype=bool)
     outer = np.zeros(M, dtype=bool)
     for s in train_data.segments:
         name = f"step {s.group[1]}"
         out.setdefault(name, np.zeros(M, dtype=bool))[s.where] = True
-        conditioned = train_data.records[index[s.group]]
-        time = train_data.rows[index[s.group]][s.equation].time
+        conditioned, rows = train_data.source(s)
+        time = rows.time
         early[s.where] = time < 0.5 * (time[0] + time[-1])
         own = joint if joint is not None else int(s.equation.rsplit("_", 1)[1]) - 1
-        at = np.clip(
-            np.rint(time * conditioned.record.sample_rate).astype(int),
-            0,
-            len(conditioned.signals.t) - 1,
-        )
-        ahead[s.where] = conditioned.signals.sd[at, own] > 0
-        size = np.abs(conditioned.signals.sd[at, own])
+        speed = conditioned.signals.sd[conditioned.samples_at(time), own]
+        ahead[s.where] = speed > 0
+        size = np.abs(speed)
         outer[s.where] = size > np.median(size)
     out |= {
         "first half": early, "second half": ~early, "extending": ahead, "retracting": ~ahead,

@@ -61,12 +61,10 @@ def scatter(train_data: RegressionData, columns: Array, residual: Array) -> Cova
 def _pieces(train_data: RegressionData, columns: Array, residual: Array, by: str) -> Pieces:
     """Return scores and information of every step, repeat and group of rows."""
     strata = {g: k for k, g in enumerate(sorted({s.group for s in train_data.segments}))}
-    records = {conditioned.group: k for k, conditioned in enumerate(train_data.records)}
     pieces: dict[tuple[int, int, int], tuple[Array, Array]] = {}
     for number, s in enumerate(train_data.segments):
-        k = records[s.group]
-        time = train_data.rows[k][s.equation].time
-        label = _labels(train_data.records[k], s, time, by)
+        conditioned, rows = train_data.source(s)
+        label = _labels(conditioned, s, rows.time, by)
         # In period the equations of one instant belong together; a level is an equation's own.
         label = label if by == PERIOD else label + number * IDENTIFY.state_levels
         own = columns[s.where] / np.sqrt(s.repeats)
@@ -92,8 +90,7 @@ def _labels(conditioned: ConditionedRecord, s: Segment, time: Array, by: str) ->
     record = conditioned.record
     if by == PERIOD:
         return segments(time, record.period / record.sample_rate)
-    signals = conditioned.signals
-    at = np.rint(time * record.sample_rate).astype(int).clip(0, len(signals.t) - 1)
+    signals, at = conditioned.signals, conditioned.samples_at(time)
     kind, joint = s.equation.rsplit("_", 1)
     i = int(joint) - 1
     state = {"flow_cap": signals.p_cap, "flow_rod": signals.p_rod}.get(kind, signals.s)
@@ -168,7 +165,7 @@ def widened(train_data: RegressionData, fit: ExactFit, model: Model) -> Model:
         # The rows may hold the reciprocal: relative sizes are the same.
         relative = np.hypot(np.sqrt(more[k]) / size[k], shift.get(name, 0.0)) / abs(fit.beta[name])
         grown = abs(old.value) * float(relative)
-        half = float(np.hypot(0.5 * (old.ci95[1] - old.ci95[0]), TRACE.normal_quantile * grown))
+        half = float(np.hypot(old.half, TRACE.normal_quantile * grown))
         std = float(np.hypot(old.std, grown))
         parameters[name] = replace(old, std=std, ci95=(old.value - half, old.value + half))
         covariance[names.index(name), names.index(name)] += grown**2

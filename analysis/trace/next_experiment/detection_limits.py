@@ -14,14 +14,13 @@ An effect of this size would have moved the parameters by L d without a trace in
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analysis.effects.base import Effect, shape_values, shapes_of
+from analysis.regression.least_squares import shortest
 from analysis.simulation.model import Model
-from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.next_experiment.discrimination import ComparisonRows, Explanation, smallest
 from analysis.trace.result import DetectionLimit
@@ -46,77 +45,67 @@ def detection_limits(
     if any(isinstance(u.term, Effect) and u.term.free for u in winner.effects):
         return []
     rows = ComparisonRows(rebased(train_data, winner.fit) if winner.effects else train_data)
-    names, columns = tangent(train_data, winner.fit)
-    half = {name: (p.ci95[1] - p.ci95[0]) / 2 for name, p in model.parameters.items()}
-    known = {name for name, p in model.parameters.items() if abs(p.value) > 2.0 * half[name]}
-    fitted = FittedColumns(names, columns, winner.fit.residual, {n: half[n] for n in known})
-    found = [
-        limit
-        for effect in effects
-        if (effect.name, effect.where) not in winner.keys
-        and (what := smallest(effect, train_data.rig)) is not None
-        and (limit := _limit(rows, what, fitted)) is not None
-    ]
+    asked = [effect for effect in effects if (effect.name, effect.where) not in winner.keys]
+    small = [what for effect in asked if (what := smallest(effect, train_data.rig)) is not None]
+    if not small:
+        return []
+    names, X = tangent(train_data, winner.fit)
+    added = np.column_stack([rows.adds(what) for what in small])
+    taken = shortest(X, added, TRACE.rank_limit)
+    shown = added - X @ taken
+    known = {n: p.half for n, p in model.parameters.items() if abs(p.value) > 2.0 * p.half}
+    found = []
+    for k, what in enumerate(small):
+        times = _times(shown[:, k], winner.fit.residual)
+        moved = dict(zip(names, times * taken[:, k], strict=True))
+        shifts = _shifts(rows.train_data, moved, known)
+        most = max(shifts, key=lambda name: shifts[name], default="")
+        if most and shifts[most] >= TRACE.visible_shift:
+            key, size = what.keys[0], _size(rows.train_data, what, times)
+            found.append(
+                DetectionLimit(key["name"], key["where"], key["at"], *size, most, shifts[most])
+            )
     once: dict[str, DetectionLimit] = {}
     for limit in sorted(found, key=lambda f: -f.shift):
         once.setdefault(limit.name, limit)
     return list(once.values())
 
 
-@dataclass(frozen=True)
-class FittedColumns:
-    """A fitted model: `columns` (M, p) of `names`, coefficients and shapes, residual (M,).
+def _times(shown: Array, residual: Array) -> float:
+    """Return how many times its smallest size an effect may have that shows `shown` (M,) of it.
 
-    `half` are the half-widths of the 95 % intervals of the parameters that are known.
+    Zero where it shows nothing at all: then no size can be stated.
     """
-
-    names: tuple[str, ...]
-    columns: Array
-    residual: Array
-    half: Mapping[str, float]
-
-
-def _limit(rows: ComparisonRows, what: Explanation, fitted: FittedColumns) -> DetectionLimit | None:
-    """Return the limit of one effect, None where it changes no parameter visibly."""
-    data = rows.train_data
-    added = rows.adds(what)
-    scale = np.linalg.norm(fitted.columns, axis=0)
-    scale[scale == 0] = 1.0
-    taken = np.linalg.lstsq(fitted.columns / scale, added, rcond=TRACE.rank_limit)[0] / scale
-    shown = added - fitted.columns @ taken
     energy = float(shown @ shown)
     if not energy > 0.0:
-        return None
-    seen = abs(float(shown @ fitted.residual))
-    times = (seen + TRACE.normal_quantile * energy**0.5) / energy
-    shapes = {k: v for u in data.terms for k, v in shape_values(data.rig, u).items()}
-    beta = {**data.beta, **shapes}
-    moved = {n: beta.get(n, 0.0) + times * d for n, d in zip(fitted.names, taken, strict=True)}
-    before, after = (
-        {**shapes, **parameter_values(data.rig, data.terms, b), **s}
-        for b, s in (
-            (beta, shapes),
-            (moved, {n: v for n, v in moved.items() if n in shapes}),
-        )
+        return 0.0
+    return float((abs(shown @ residual) + TRACE.normal_quantile * energy**0.5) / energy)
+
+
+def _shifts(
+    data: RegressionData, moved: Mapping[str, float], known: Mapping[str, float]
+) -> dict[str, float]:
+    """Return how much of themselves parameters change that are moved beyond their interval.
+
+    `moved` holds changes of the rows' coefficients and of shapes, `known` half-widths.
+    """
+    shapes = {n: v for u in data.terms for n, v in shape_values(data.rig, u).items()}
+    before = {**data.beta, **shapes}
+    after = {n: v + moved.get(n, 0.0) for n, v in before.items()}
+    old, new = (
+        {**{n: b[n] for n in shapes}, **parameter_values(data.rig, data.terms, b)}
+        for b in (before, after)
     )
-    shifts = {
-        name: abs(after[name] / before[name] - 1.0)
-        for name, width in fitted.half.items()
-        if before.get(name) and abs(after[name] - before[name]) > width
+    return {
+        name: abs(new[name] / old[name] - 1.0)
+        for name, half in known.items()
+        if old.get(name) and abs(new[name] - old[name]) > half
     }
-    most = max(shifts, key=lambda name: shifts[name], default="")
-    if not most or shifts[most] < TRACE.visible_shift:
-        return None
-    (used,) = what.effects
-    term, (quantity, size, unit) = used.term, _size(data, used, what, times)
-    place = str(getattr(term, "place", term.where))
-    return DetectionLimit(term.name, place, term.where, quantity, size, unit, most, shifts[most])
 
 
-def _size(
-    data: RegressionData, used: Used, what: Explanation, times: float
-) -> tuple[str, float, str]:
+def _size(data: RegressionData, what: Explanation, times: float) -> tuple[str, float, str]:
     """Return name, value and unit of the number that says how large an effect is."""
+    (used,) = what.effects
     for c in used.term.coefficients(data.rig):
         if what.beta.get(c.parameter):
             return c.parameter, abs(what.beta[c.parameter]) * times, c.unit

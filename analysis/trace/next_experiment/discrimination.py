@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from analysis.design.twin_records import ideal
 from analysis.effects.base import Effect, shapes_of
 from analysis.regression.conditioned import ConditionedRecord
+from analysis.regression.least_squares import shortest
 from analysis.regression.rows import Rows
 from analysis.signals.conditioning import Signals, condition
 from analysis.terms.base import Used
@@ -237,9 +238,7 @@ class ComparisonRows:
     def residual(self, true: Explanation, wrong: Explanation) -> Array:
         """Return the residual (m,) that `wrong` leaves where `true` is there, without noise."""
         X, y = self.spans(wrong), self.adds(true)
-        scale = np.linalg.norm(X, axis=0)
-        scale[scale == 0] = 1.0
-        return np.asarray(y - X @ (np.linalg.lstsq(X / scale, y, rcond=1e-6)[0] / scale))
+        return np.asarray(y - X @ shortest(X, y, 1e-6))
 
     def energy(self, residual: Array) -> dict[str, float]:
         """Return a residual's energy by equation."""

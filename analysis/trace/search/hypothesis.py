@@ -73,11 +73,10 @@ def excess_of(data: RegressionData, residual: Array, noise: float = 1.0) -> dict
 def limits(data: RegressionData) -> NoiseBand:
     """Return the band of every equation (`SEARCH.band` times the noise, and chance)."""
     band: dict[str, float] = {}
-    rows: dict[str, int] = {}
+    rows = data.counts
     for s in data.segments:
         count = s.where.stop - s.where.start
         band[s.equation] = band.get(s.equation, 0.0) + SEARCH.band**2 * s.repeats * count
-        rows[s.equation] = rows.get(s.equation, 0) + count
     return NoiseBand({e: max(v, 4 * np.sqrt(2 * rows[e])) for e, v in band.items()})
 
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.regression.least_squares import shortest
 from analysis.trace.data.regression_data import RegressionData, VariantColumns
 from analysis.trace.settings import SEARCH, TRACE
 
@@ -127,9 +128,7 @@ def judged(
     residual, parts = r, []
     if columns:
         D = candidates.columns[:, columns]
-        scale = np.sqrt(np.sum(D**2, axis=0))
-        scale[scale == 0] = 1.0
-        fit = np.linalg.lstsq(D / scale, r, rcond=1e-6)[0] / scale
+        fit = shortest(D, r, 1e-6)
         residual = r - D @ fit
         at = 0
         for m in members:
