@@ -82,6 +82,11 @@ def reduce_task(task: RecordTask) -> RecordReduction:
         )  # fmt: skip
 
 
+def reduce_tasks(tasks: Sequence[RecordTask]) -> list[RecordReduction]:
+    """Reduce records of run folders one after the other; raises InputError as `reduce_task`."""
+    return [reduce_task(task) for task in tasks]
+
+
 @dataclass(frozen=True)
 class StepTask:
     """The repeats of one step of a run folder, to find which joints move in it."""

@@ -35,6 +35,7 @@ class DaskCluster:
         self._timeout = timeout
         self._client: Any = None
         self._lost: tuple[type[BaseException], ...] = ()
+        self._holders: dict[str, list[str]] = {}  # workers that see a path, by path
 
     def __enter__(self) -> Self:
         try:
@@ -68,6 +69,7 @@ class DaskCluster:
 
     def __exit__(self, *_: object) -> None:
         client, self._client = self._client, None
+        self._holders = {}
         if client is not None:
             client.close()
 
@@ -85,13 +87,9 @@ class DaskCluster:
         """
         if self._client is None:
             raise ValueError("use the cluster in a `with` block")
-        holders: dict[str, list[str]] = {}
 
         def submit(item: T) -> Any:
-            where = None
-            if reads is not None:
-                path = reads(item)
-                where = holders.get(path) or holders.setdefault(path, self._holders(path))
+            where = None if reads is None else self._holders_of(reads(item))
             return self._client.submit(function, item, workers=where, pure=False)
 
         try:
@@ -101,8 +99,10 @@ class DaskCluster:
                 f"the cluster at {self.address} lost the work: {error}"
             ) from error
 
-    def _holders(self, path: str) -> list[str]:
-        """Return the workers that see a path."""
+    def _holders_of(self, path: str) -> list[str]:
+        """Return the workers that see a path, asked for once: busy workers answer late."""
+        if path in self._holders:
+            return self._holders[path]
         answers = self._client.run(_exists, path)
         holders = [worker for worker, exists in answers.items() if exists]
         if not holders:
@@ -110,6 +110,7 @@ class DaskCluster:
                 f"{path}: no worker of the cluster sees it ({len(answers)} asked); give the path "
                 "as the workers see it"
             )
+        self._holders[path] = holders
         return holders
 
 

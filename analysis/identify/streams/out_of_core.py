@@ -9,11 +9,12 @@ from analysis.identify import checks as ck
 from analysis.identify.coupled import conclude
 from analysis.identify.geometry import shifts_of_reductions
 from analysis.identify.reduction import (
+    RecordReduction,
     RecordTask,
     first_of_steps,
     moving_task,
     path_of,
-    reduce_task,
+    reduce_tasks,
     steps_of,
 )
 from analysis.identify.result import Identification
@@ -26,6 +27,8 @@ from rig.model.parse import InputError
 from rig.model.records import Record
 from rig.model.rig import Rig
 from rig.runs.stream import read_run_head
+
+RECORDS_TOGETHER = 6  # at most handed to a worker at once: progress is heard between them
 
 
 def identify_folders(
@@ -82,15 +85,34 @@ def identify_folders(
         for first in (first_of_steps(head.records),)
         for record in head.records
     ]
-    reductions = []
-    for reduction in workers.map(reduce_task, tasks, reads=path_of):
-        reductions.append(reduction)
+    reductions: list[RecordReduction] = []
+    for group in workers.map(reduce_tasks, _groups(tasks, workers.workers), reads=_folder_of):
+        reductions += group
         if progress is not None:
             progress(len(reductions) / len(tasks))
     count = len(tasks) // len(rigs)
     own, *moved = (reductions[k : k + count] for k in range(0, len(tasks), count))
     geometry = shifts_of_reductions(rig, used, own, moved)
     return conclude(rig, [h.source for h in heads], used, own, reject_noise, geometry=geometry)
+
+
+def _groups(tasks: Sequence[RecordTask], workers: int) -> list[list[RecordTask]]:
+    """Return the tasks in groups of one folder, at least four groups for each worker.
+
+    A cluster spends some milliseconds on each item that it hands out, which is as much as a short
+    record takes to be reduced.
+    """
+    most = max(1, min(RECORDS_TOGETHER, len(tasks) // (4 * workers)))
+    groups: list[list[RecordTask]] = []
+    for task in tasks:
+        if not groups or len(groups[-1]) == most or path_of(groups[-1][0]) != path_of(task):
+            groups.append([])
+        groups[-1].append(task)
+    return groups
+
+
+def _folder_of(group: Sequence[RecordTask]) -> str:
+    return path_of(group[0])
 
 
 def _refuse_open(rig: Rig, terms: Sequence[Used]) -> None:
