@@ -206,6 +206,10 @@ class Effect(Term):
         """Return the shapes of first look of an effect that takes them from the data."""
         raise NotImplementedError
 
+    def further_points(self, rig: Rig) -> tuple[tuple[float, ...], ...]:
+        """Return shapes of first look beside the grid, in another form of the effect."""
+        return ()
+
     def branches(self, rig: Rig, shape: Sequence[float]) -> tuple[Branch, ...]:
         """Return the lines of the effect's curve, none by default."""
         return ()

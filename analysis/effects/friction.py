@@ -61,8 +61,8 @@ class Friction(Effect):
     """What the four forms share: joint, the state z of the contact, with memory or without.
 
     Where the contact `stiffens` the stiffening is a detail: a shape without it does not stiffen.
-    A shape with a transition speed, its last detail, has no memory, and 0 for distance and
-    stiffening. `before` counts the shape parameters that stand before the contact's own.
+    A shape with a transition speed has no memory, and 0 for distance and stiffening. `before` and
+    `after` count the shape parameters that stand before and behind the contact's own.
     """
 
     mechanism: ClassVar[str] = "friction_curve"
@@ -71,6 +71,7 @@ class Friction(Effect):
     per_joint: ClassVar[bool] = True
     stiffens: ClassVar[bool] = False
     before: ClassVar[int] = 0
+    after: ClassVar[int] = 0
     where: str = "joint 1"
 
     def distance_names(self) -> tuple[str, ...]:
@@ -103,8 +104,13 @@ class Friction(Effect):
         """Return the contact without memory, of a shape that has one."""
         if not len(shape) or not self.remembers(shape):
             return ()
-        none = len(self.shape_names()) - self.before - 1
-        return ((*shape[: self.before], *(0.0,) * none, TRANSITION_START),)
+        place = self._speed_place()
+        none = (0.0,) * (place - self.before)
+        return ((*shape[: self.before], *none, TRANSITION_START, *shape[place + 1 :]),)
+
+    def _speed_place(self) -> int:
+        """Return the place of the transition speed in a shape, the last of the contact's own."""
+        return len(self.shape_names()) - self.after - 1
 
     def remembers(self, shape: Sequence[float]) -> bool:
         """Whether the contact has a memory: a presliding distance above 0."""
@@ -117,8 +123,8 @@ class Friction(Effect):
         """
         own = shape[self.before :]
         rate = own[1] if self.stiffens and len(own) > 1 else 0.0
-        last = len(self.shape_names()) - self.before - 1
-        speed = own[last] if len(own) > last else TRANSITION
+        last = self._speed_place()
+        speed = shape[last] if len(shape) > last else TRANSITION
         return (own[0] if len(own) else 0.0), rate, speed
 
     def path(self, signals: Signals, shape: Sequence[float]) -> Array:

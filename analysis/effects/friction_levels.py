@@ -12,7 +12,7 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from analysis.effects.base import Array, beyond
+from analysis.effects.base import Array, Shape, beyond
 from analysis.effects.contact import (
     FASTEST,
     contact_levels,
@@ -35,6 +35,7 @@ from analysis.terms.base import (
 from rig.model.rig import Rig
 
 DIFFERENCE: Final = 0.1  # of the mean level: with less between directions it is not asymmetric
+DIFFERENCE_LOAD: Final = -1.0  # weight of the rod pressure where the difference presses the seal
 
 
 @dataclass(frozen=True)
@@ -129,17 +130,20 @@ class AsymmetricFriction(Friction):
 class PressureDependentFriction(Friction):
     """F_f = k w: seals pressed on by the chamber pressures (Jelali and Kroll 2003).
 
-    k [m^2] is the friction coefficient times the seals' area under pressure. w [Pa] builds up to
-    the load p_cap + p_rod at a contact stiffness that does not depend on it, only on speed
-    (`contact`): dw/ds = (1 + k_s |s'|) (p_S / d) (sign(s') - w / (p_cap + p_rod)), d the presliding
-    distance at supply pressure, k_s the stiffening.
+    k [m^2] is the friction coefficient times the seals' area under pressure. The load is
+    p = |p_cap + a p_rod|: the sum where each seal has one chamber's pressure on it (a = 1), the
+    difference where the piston's seal has both (a = -1). w [Pa] builds up to it at a contact
+    stiffness that does not depend on it, only on speed (`contact`):
+    dw/ds = (1 + k_s |s'|) (p_S / d) (sign(s') - w / p), d the presliding distance at supply
+    pressure, k_s the stiffening.
     """
 
     hydraulic: ClassVar[bool] = True
     name: ClassVar[str] = "pressure_dependent_friction"
     least: ClassVar[tuple[float, ...]] = (5e-6,)  # [m^2]
     stiffens: ClassVar[bool] = True
-    variable: ClassVar[str] = "the sum of the chamber pressures, with the velocity's sign"
+    after: ClassVar[int] = 1
+    variable: ClassVar[str] = "the chamber pressures, with the velocity's sign"
     confounders: ClassVar[tuple[str, ...]] = ("coulomb_friction", "asymmetric_friction")
     separated_by: ClassVar[str] = (
         "the same motion at two levels of chamber pressure (supply setting, load or inclination)"
@@ -154,6 +158,38 @@ class PressureDependentFriction(Friction):
         """Return k [m^2]."""
         return (Coefficient(f"k_friction_{self.joint + 1}", "m^2", "mechanical"),)
 
+    def shape_names(self) -> tuple[str, ...]:
+        """Name the contact's numbers and the rod pressure's weight in the load."""
+        return (*super().shape_names(), f"rod_weight_{self.joint + 1}")
+
+    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
+        """Return the contact's shapes and the weight: -1 for the difference; without it the sum."""
+        name, only = self.shape_names()[-1], DIFFERENCE_LOAD
+        weight = Shape(name, "1", only, only, (only,), detail=True, fixed=True)
+        return (*super().shapes(rig), weight)
+
+    def further_points(self, rig: Rig) -> tuple[tuple[float, ...], ...]:
+        """Return a contact with memory under the difference of the pressures."""
+        (distance,) = self.shape_of(rig, ())
+        return ((distance, 0.0, 0.0, DIFFERENCE_LOAD),)
+
+    def in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[float, ...]:
+        """Return the shape with a stiffening where its load is the sum."""
+        return tuple(shape) if self._weight(shape) < 0.0 else super().in_detail(rig, shape)
+
+    def other_forms(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+        """Return the contact without memory, and the load by the difference of the pressures."""
+        forms = super().other_forms(rig, shape)
+        if self._weight(shape) < 0.0:
+            return forms
+        contact = self.contact_of(shape)
+        memory = (contact[0], 0.0, 0.0) if self.remembers(shape) else (0.0, 0.0, contact[2])
+        return (*forms, (*memory, DIFFERENCE_LOAD))
+
+    def _weight(self, shape: Sequence[float]) -> float:
+        """Return the weight of the rod pressure in the load."""
+        return DIFFERENCE_LOAD if tuple(shape[3:]) == (DIFFERENCE_LOAD,) else 1.0
+
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return G w."""
         i = self.joint
@@ -161,13 +197,14 @@ class PressureDependentFriction(Friction):
             path = self.deflection(rig, signals, {}, shape)
             level = path * rig.supply.pressure / shape[0]
         else:
-            level = self._load(signals) * self.contact(rig, signals, shape)
+            level = self._load(signals, shape) * self.contact(rig, signals, shape)
         return self.row({f"k_friction_{i + 1}": signals.G[:, i] * level})
 
-    def _load(self, signals: Signals) -> Array:
-        """Return p_cap + p_rod (n,) [Pa], never below zero."""
+    def _load(self, signals: Signals, shape: Sequence[float]) -> Array:
+        """Return the load |p_cap + a p_rod| (n,) [Pa]."""
         i = self.joint
-        return np.asarray(np.maximum(signals.p_cap[:, i] + signals.p_rod[:, i], 0.0))
+        weight = self._weight(shape)
+        return np.asarray(np.abs(signals.p_cap[:, i] + weight * signals.p_rod[:, i]))
 
     def deflection(
         self, rig: Rig, signals: Signals, values: Mapping[str, float], shape: Sequence[float]
@@ -175,12 +212,14 @@ class PressureDependentFriction(Friction):
         """Return w d / p_S (n,) [m]."""
         stiffness = rig.supply.pressure / shape[0]
         path = self.path(signals, shape)
-        return np.asarray(contact_under_load(path, self._load(signals), stiffness) / stiffness)
+        return np.asarray(
+            contact_under_load(path, self._load(signals, shape), stiffness) / stiffness
+        )
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
-        """Return joint (0-based), k, distance (0 where none), stiffening, transition speed, p_S."""
-        k = values[f"k_friction_{self.joint + 1}"]
-        return np.array([self.joint, k, *self.contact_of(shape), rig.supply.pressure])
+        """Return joint (0-based), k, distance, stiffening, transition speed, p_S, rod's weight."""
+        k, weight = values[f"k_friction_{self.joint + 1}"], self._weight(shape)
+        return np.array([self.joint, k, *self.contact_of(shape), rig.supply.pressure, weight])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Refuse friction that drives, and more than half of the cylinder's force."""
@@ -210,7 +249,7 @@ def _by_pressure(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untype
     # The hidden state is w times d over p_S [m].
     if phase == CONTRIBUTE:
         i = int(par[0])
-        v, load = x[SD, i], max(x[P_CAP, i] + x[P_ROD, i], 0.0)
+        v, load = x[SD, i], abs(x[P_CAP, i] + par[6] * x[P_ROD, i])
         if par[2] <= 0.0:
             out[TORQUE, i] -= par[1] * load * x[G, i] * math.erf(v / par[4])
             return

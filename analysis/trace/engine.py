@@ -117,7 +117,7 @@ def trace(
     notes = [*rows.unseen.notes, *_notes(rows.train, rows.unseen.choosing)]
     notes += [check.detail for check in baseline.checks if check.name == GEOMETRY]
     finding = found_on(rows, candidates, free, seed, columns)
-    finding = without_tied(without_rests(rig, terms, records, free, seed, finding))
+    finding = without_tied(without_rests(rig, terms, records, candidates, free, seed, finding))
     verdict, winner = finding.verdict, finding.winner
     judged_effects, refused = finding.named, finding.refused
     notes += finding.notes

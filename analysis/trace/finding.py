@@ -146,21 +146,21 @@ def _listed(effect: JudgedEffect, verdict: str) -> bool:
 
 
 def without_rests(
-    rig: Rig, terms: tuple[Used, ...], records: TraceRuns, free: Sequence[Effect], seed: int,
-    finding: Finding,
+    rig: Rig, terms: tuple[Used, ...], records: TraceRuns, candidates: Sequence[Effect],
+    free: Sequence[Effect], seed: int, finding: Finding,
 ) -> Finding:  # fmt: skip
     """Ask without the joints' rests what is left where only balances with dry friction keep much.
 
     At rest dry friction is whatever holds the joint: what stays there speaks against no law of the
-    speed. Where nothing else stays, what stood explains the records, with its sizes in motion; of
-    `free` mechanisms friction over speed is tried where nothing stood.
+    speed. Where nothing else stays, what stood explains the records, with its sizes in motion.
+    Where nothing stood, friction is searched anew, among the candidates and `free` mechanisms.
     """
     loud = {r.equation for r in finding.rest if r.veto}
     if finding.verdict != UNEXPLAINED:
         return finding
     if not dry(finding.winner, loud):
-        curves = [f for f in free if f.family == "friction"]
-        return _drawn_in_motion(rig, terms, records, curves, seed, finding, loud)
+        friction = [e for e in (*candidates, *free) if e.family == "friction"]
+        return _searched_in_motion(rig, terms, records, friction, seed, finding, loud)
     rows, hypotheses, winner = in_motion(rig, terms, records, finding.winner)
     holdout_data = rows.unseen.choosing
     rest = left_over(hypotheses, winner, holdout_data)
@@ -177,32 +177,32 @@ def without_rests(
     return Finding(rows, hypotheses, winner, verdict, effects, tuple(rest), notes)
 
 
-def _drawn_in_motion(
-    rig: Rig, terms: tuple[Used, ...], records: TraceRuns, curves: Sequence[Effect], seed: int,
+def _searched_in_motion(
+    rig: Rig, terms: tuple[Used, ...], records: TraceRuns, friction: Sequence[Effect], seed: int,
     finding: Finding, loud: Collection[str],
 ) -> Finding:  # fmt: skip
-    """Draw friction over speed without the rests where nothing that acts in torques stood.
+    """Search friction without the rests where nothing that acts in torques stood.
 
-    A high breakaway hides the law in motion from every name. The curve must take most of what the
-    rests leave too.
+    A high breakaway, or levels that hold a joint at rest for long, hide the law in motion from
+    every name. What is found must take most of what the rests leave too.
     """
-    free = [f for f in curves if equation("torque", f.joint) in loud]
-    if finding.winner.effects or not free or len(free) < len(loud):
+    here = [f for f in friction if equation("torque", f.joint) in loud]
+    if finding.winner.effects or {equation("torque", f.joint) for f in here} != set(loud):
         return finding
     rows = trace_rows(rig, terms, records, moving_filtering)
-    hypotheses = HypothesisSet(rows.train, [])
-    winner = hypotheses.run()
-    rng = np.random.default_rng(seed)
-    drawn = drawn_by_data(hypotheses, free, winner, rows.unseen.choosing, rng, fewer=False)
-    if drawn is None:
+    hypotheses = HypothesisSet(rows.train, [f for f in here if not f.free])
+    hypotheses, effects, winner, verdict, rest = _settled(
+        hypotheses, hypotheses.run(), [f for f in here if f.free], rows.unseen.choosing,
+        np.random.default_rng(seed),
+    )  # fmt: skip
+    if verdict not in (EXPLAINED, CONFOUNDED):
         return finding
-    hypotheses, effects, winner, rest = drawn
     every = finding.hypotheses.exact(winner.effects).total / finding.hypotheses.empty.total
     if every > 1.0 - TRACE.least_removed:
         return finding
-    notes = (*at_rest(loud), *_rest_notes(EXPLAINED, rest, quiet=False, named=True))
+    notes = (*at_rest(loud), *_rest_notes(verdict, rest, quiet=False, named=True))
     others = tuple(f for f in finding.effects if not gates.stands(f))
-    return Finding(rows, hypotheses, winner, EXPLAINED, (*effects, *others), tuple(rest), notes)
+    return Finding(rows, hypotheses, winner, verdict, (*effects, *others), tuple(rest), notes)
 
 
 def dry(winner: Hypothesis, equations: Collection[str]) -> bool:

@@ -68,7 +68,7 @@ def test_a_seed_draws_the_same_bench_again_and_another_seed_another() -> None:
 
 
 def _case(kind: str, *hidden: Wrong) -> Case:
-    return Case(kind, 0, replace(case_of(0, clean=True).bench), hidden)
+    return Case(kind, 0, replace(case_of(0, kind=NONE).bench), hidden)
 
 
 @pytest.mark.parametrize(

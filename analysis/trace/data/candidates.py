@@ -67,7 +67,7 @@ def points(effect: Effect, rig: Rig, evidence: Evidence | None = None) -> list[t
             for axis in axes
         ]
         grid = list(itertools.product(*thinned))
-    return grid
+    return [*grid, *effect.further_points(rig)]
 
 
 def variants(

@@ -13,7 +13,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from analysis.effects.base import Effect
+from analysis.effects.base import Effect, shape_values
 from analysis.identify.output_error.hidden_states import (
     Shot,
     completed,
@@ -30,6 +30,7 @@ from analysis.trace.search import refinement
 from analysis.trace.search.hypothesis import Hypothesis, excess_of
 from analysis.trace.settings import TRACE
 from rig.model.records import Run
+from rig.model.rig import Rig
 
 log = logging.getLogger(__name__)
 
@@ -61,11 +62,11 @@ def reshaped(
         shot_effect = shot(runs, after, effect)
         if shot_effect is None:
             continue
-        other = _with(after.terms, effect, shot_effect)
+        other = _with(after.rig, after.terms, effect, shot_effect)
         before, now = (
             rest_of(holdout, model, effect) for model in (after, replace(after, terms=other))
         )
-        fitted = refinement.fit(train_data, _with(winner.fit.terms, effect, shot_effect))
+        fitted = refinement.fit(train_data, _with(after.rig, winner.fit.terms, effect, shot_effect))
         rows, again = (rms_of(holdout_data, fit) for fit in (winner.fit, fitted))
         better = now < TRACE.shooting_ratio * before and all(
             again[e] <= TRACE.shooting_cost * rows[e] for e in rows
@@ -75,16 +76,20 @@ def reshaped(
         )
         if shots[-1].taken:
             winner = replace(
-                winner, effects=_with(winner.effects, effect, shot_effect), fit=fitted,
+                winner, effects=_with(after.rig, winner.effects, effect, shot_effect), fit=fitted,
                 excess_energy=excess_of(train_data, fitted.residual),
             )  # fmt: skip
             after = replace(after, terms=other)
     return Reshaped(winner, tuple(shots))
 
 
-def _with(terms: Sequence[Used], effect: Effect, shot: Shot) -> tuple[Used, ...]:
-    shape = tuple(e.value for e in shot.shapes.values())
-    return tuple(Used(u.term, shape) if u.term == effect else u for u in terms)
+def _with(rig: Rig, terms: Sequence[Used], effect: Effect, shot: Shot) -> tuple[Used, ...]:
+    """Return the terms with the shapes of a shot; shapes that it did not search stay."""
+    found = {name: estimate.value for name, estimate in shot.shapes.items()}
+    return tuple(
+        Used(u.term, tuple({**shape_values(rig, u), **found}.values())) if u.term == effect else u
+        for u in terms
+    )
 
 
 def with_shots(judged: JudgedEffect, shots: Sequence[Shot]) -> JudgedEffect:

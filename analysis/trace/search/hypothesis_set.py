@@ -173,7 +173,7 @@ class HypothesisSet:
         if self.formed(now):
             others = [o for o in pairs if not now.keys & o.keys]
             far = [o for o in others if self.excess(o, now) < -SEARCH.far_less]
-            return self.completed(self.prune(self.best([now, *far])))
+            return self.rerouted(self.completed(self.prune(self.best([now, *far]))))
         now = self.prune(self.best([self.empty, *singles, *pairs]))
         while not within(now.excess_energy, self.limits) and len(now.effects) < SEARCH.largest_set:
             grown = self.prune(self.best([now, *self.extensions(now)]))
@@ -181,8 +181,9 @@ class HypothesisSet:
                 break
             now = grown
             if self.formed(now):
-                return self.completed(now)
-        return now
+                now = self.completed(now)
+                break
+        return self.rerouted(now)
 
     def formed(self, hypothesis: Hypothesis) -> bool:
         """Return whether the rest may be the difference of form between effect and catalogue."""
@@ -257,6 +258,39 @@ class HypothesisSet:
 
         With `equations` the search looks at these alone, with `free` at free mechanisms alone.
         """
+        candidates, r = self._beside(now, equations, free)
+        more = linear_fit.options(candidates, (), r, 1.0)
+        out: dict[Key, tuple[Used, ...]] = {}
+        for trial in more:
+            variant = candidates.entries[trial.members[0]].variant
+            if len(out) < SEARCH.refined_extensions:
+                out.setdefault(variant.key, (*now.effects, variant.used))
+        return self.tried(list(out.values()))
+
+    def rerouted(self, now: Hypothesis) -> Hypothesis:
+        """Return the set, or a better one that extends a pair with fewer free numbers.
+
+        Friction of two levels does most of what an offset and one level do, so that the right pair
+        leaves more at first than the wrong one does, and less with its third effect.
+        """
+        if within(now.excess_energy, self.limits):
+            return now
+        starts = [
+            o
+            for o in self.fitted.values()
+            if len(o.effects) == SEARCH.largest_set - 1
+            and o.size[1] < now.size[1]
+            and self.excess(o, now) < SEARCH.other_starts_excess
+            and not self.physical(o)
+        ]
+        starts = sorted(starts, key=lambda o: o.total)[: SEARCH.other_starts]
+        grown = [o for start in starts for o in self.extensions(start)]
+        return self.prune(self.best([now, *grown]))
+
+    def _beside(
+        self, now: Hypothesis, equations: Collection[str] = (), free: bool = False
+    ) -> tuple[linear_fit.CandidateColumns, Array]:
+        """Return candidates on data that have a set in their model, and what the set leaves (M,)."""
         data = rebased(self.train_data, now.fit)
         taken = now.keys
         looks = self._variants(data, now.fit.residual)
@@ -271,16 +305,7 @@ class HypothesisSet:
             replace(data, base=np.hstack((data.base, *moves))), columns, mask
         )
         r = now.fit.residual * mask
-        r = r - candidates.basis @ (candidates.basis.T @ r)
-        more = linear_fit.options(candidates, (), r, 1.0)
-        out: list[tuple[Used, ...]] = []
-        seen: set[Key] = set()
-        for trial in more:
-            variant = candidates.entries[trial.members[0]].variant
-            if variant.key not in seen and len(seen) < SEARCH.refined_extensions:
-                seen.add(variant.key)
-                out.append((*now.effects, variant.used))
-        return self.tried(out)
+        return candidates, r - candidates.basis @ (candidates.basis.T @ r)
 
     def closer(self, now: Hypothesis, equations: Collection[str]) -> Hypothesis | None:
         """Return the set with the effect added that some equations ask for, None where none is.

@@ -102,9 +102,7 @@ def refine(data: RegressionData, terms: Sequence[Used], steps: int = SEARCH.step
         used = fit.terms[k]
         if used in data.terms or not isinstance(used.term, Effect):
             continue
-        for shape in used.term.other_forms(data.rig, used.shape):
-            other = _searched(data, _with(fit.terms, used, Used(used.term, shape)), steps)
-            fit = other if other.energy < fit.energy else fit
+        fit = _in_best_form(data, fit, k, steps)
         used = fit.terms[k]
         opened = _in_detail(data.rig, used)
         asked = max(SEARCH.number_price, SEARCH.detail_share * (fit.energy - len(fit.residual)))
@@ -114,6 +112,21 @@ def refine(data: RegressionData, terms: Sequence[Used], steps: int = SEARCH.step
         more = _searched(data, _with(fit.terms, used, opened), steps)
         fit = more if fit.energy - more.energy > asked else fit
     return fit
+
+
+def _in_best_form(data: RegressionData, fit: ExactFit, place: int, steps: int) -> ExactFit:
+    """Return the fit with one term in the form that leaves least, changed as long as that helps."""
+    while True:
+        used = fit.terms[place]
+        assert isinstance(used.term, Effect)
+        others = [
+            _searched(data, _with(fit.terms, used, Used(used.term, shape)), steps)
+            for shape in used.term.other_forms(data.rig, used.shape)
+        ]
+        best = min(others, key=lambda other: other.energy, default=fit)
+        if best.energy >= fit.energy:
+            return fit
+        fit = best
 
 
 def _promise(data: RegressionData, fit: ExactFit, used: Used, opened: Used) -> float:

@@ -73,7 +73,10 @@ def residual(rows: Sequence[Rows], values: dict[str, float]) -> dict[str, float]
 
 
 def fitted(data: Data, effect: Effect, floor: dict[str, float], tries: int = 60) -> Fit:
-    """Search the effect's shape from its grid and solve; residuals are weighed by `floor`."""
+    """Search the effect's shape from its grid and solve; residuals are weighed by `floor`.
+
+    The effect's other forms are taken as they are.
+    """
 
     def solved(shape: Sequence[float]) -> Fit:
         return data.solved([Used(effect, tuple(shape))])
@@ -82,7 +85,8 @@ def fitted(data: Data, effect: Effect, floor: dict[str, float], tries: int = 60)
         fit = solved(shape)
         return sum((fit.rms[name] / floor[name]) ** 2 for name in floor)
 
-    return solved(searched(effect.shapes(data.rig), cost, tries))
+    forms = (searched(effect.shapes(data.rig), cost, tries), *effect.further_points(data.rig))
+    return solved(min(forms, key=cost))
 
 
 def model_of(rig: Rig, effect: Effect, values: dict[str, float], shape: Sequence[float]) -> Model:

@@ -25,14 +25,14 @@ Array = NDArray[np.float64]
 FLOW = 11.7e-3 / 60  # the pump's [m^3/s]
 P0 = 101_325.0
 NAMES = (
-    "Fc", "Fs", "v_stribeck", "F_ext", "F_ret", "k_friction", "presliding", "stiffening",
-    "inclination", "k_spring", "rest", "T_offset",
+    "Fc", "Fs", "v_stribeck", "F_ext", "F_ret", "k_friction", "k_seal", "presliding",
+    "stiffening", "inclination", "k_spring", "rest", "T_offset",
     "w_ahead", "w_astern", "u_null", "w_underlap", "tau_spool",
     "c_internal", "c_cap", "c_rod", "dp_supply", "p_tank", "p_back",
     "alpha_air", "V_cap", "V_rod", "m_payload",
 )  # fmt: skip
 (
-    FC, FS, VS, FE, FR, KF, DELTA, STIFFENING, INCLINATION, SPRING, REST, TORQUE, AHEAD, ASTERN,
+    FC, FS, VS, FE, FR, KF, KD, DELTA, STIFFENING, INCLINATION, SPRING, REST, TORQUE, AHEAD, ASTERN,
     NULL, UNDERLAP,
     TAU, C_INT, C_CAP, C_ROD, SAG, TANK, BACK, AIR, V_CAP, V_ROD, LOAD,
 ) = range(len(NAMES))  # fmt: skip
@@ -99,7 +99,9 @@ def _ports(cap, rod, ahead, astern, par, e):
 @njit(cache=True)
 def _friction(v, cap, rod, deflection, e):
     z = deflection / e[DELTA]
-    level = e[FC] + e[FS] * math.exp(-((v / e[VS]) ** 2)) + e[KF] * (cap + rod)
+    level = (
+        e[FC] + e[FS] * math.exp(-((v / e[VS]) ** 2)) + e[KF] * (cap + rod) + e[KD] * abs(cap - rod)
+    )
     level += e[FE] if z > 0 else e[FR]
     rate = 0.0 if level == 0.0 else v - abs(v) * deflection / e[DELTA]
     return level * z, (1.0 + e[STIFFENING] * abs(v)) * rate

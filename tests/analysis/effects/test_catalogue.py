@@ -145,9 +145,10 @@ def hidden_state(e: Effect, rig: Rig, signals: Signals, shape: tuple[float, ...]
         ahead, back = contact_levels(s, *shape)
         return np.asarray(0.5 * (ahead - back) * shape[0])
     if e.name == "pressure_dependent_friction":
-        load = signals.p_cap[:, e.joint] + signals.p_rod[:, e.joint]
+        rod_weight = -1.0 if len(shape) > 3 else 1.0
+        load = np.abs(signals.p_cap[:, e.joint] + rod_weight * signals.p_rod[:, e.joint])
         stiffness = rig.supply.pressure / shape[0]
-        path = worked(s, signals.sd[:, e.joint], sum(shape[1:]))
+        path = worked(s, signals.sd[:, e.joint], sum(shape[1:2]))
         return np.asarray(contact_under_load(path, load, stiffness) / stiffness)
     if e.name == "stribeck_friction":
         level = np.exp(-((signals.sd[:, e.joint] / shape[0]) ** 2))

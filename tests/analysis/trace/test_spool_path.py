@@ -13,12 +13,12 @@ from analysis.trace.result import CLEAN, Trace
 from rig.runs.rigs import load_rig
 from tests.studies.foreign import plant
 from tests.studies.foreign.bench import runs_of
-from tests.studies.foreign.cases import case_of
+from tests.studies.foreign.cases import NONE, case_of
 
 
 def traced() -> Trace:
     """Trace a machine with nothing wrong whose first-order spools take 1.2 ms."""
-    bench = case_of(41, clean=True, spool=plant.FIRST_ORDER).bench
+    bench = case_of(41, kind=NONE, spool=plant.FIRST_ORDER).bench
     joints = tuple({**own, "spool_time": 1.2e-3} for own in bench.joints)
     bench = replace(bench, joints=joints, noise=0.25, repeats=4, rms=0.05)
     train, held_out = runs_of(bench, 41)

@@ -328,11 +328,20 @@ def _tapered(rng: np.random.Generator, i: int) -> Wrong:
 STRANGERS: Final[tuple[Draw, ...]] = (_hardening, _drag, _worn, _tapered)
 
 
-def case_of(seed: int, only: str = "", clean: bool = False, spool: int | None = None) -> Case:
+def _same_cause(one: Wrong, other: Wrong) -> bool:
+    """Return whether two effects set the same sensor or the same number of a joint."""
+    own = one.joint[0] == other.joint[0] and bool(set(one.joint[1]) & set(other.joint[1]))
+    return own or bool(set(one.sensors) & set(other.sensors))
+
+
+def case_of(
+    seed: int, only: str = "", kind: str = "", spool: int | None = None, alone: int | None = None
+) -> Case:
     """Return the case of a seed.
 
-    With `only` an effect of that name alone is hidden; `spool` is how the spool follows its command
-    (`plant.CONTINUOUS` …), drawn where it is None.
+    With `only` an effect of that name alone is hidden; `kind` and how the spool follows its command
+    (`spool`, `plant.CONTINUOUS` …) are drawn where they are not given. `alone` is the position of
+    the one effect that is left of those drawn, on the same bench.
     """
     rng = np.random.default_rng([seed, STREAM])
     rig, truth = drawn_rig(rng)
@@ -347,8 +356,8 @@ def case_of(seed: int, only: str = "", clean: bool = False, spool: int | None = 
     own = {"spool_time": _size(rng, 1e-3, 3e-3), "spool_hertz": _size(rng, 50, 120),
            "spool_damping": float(rng.uniform(0.6, 0.9))}  # fmt: skip
     names = list(SINGLES)
-    kind = str(rng.choice([k for k, _ in MIX], p=[p for _, p in MIX]))
-    kind = NONE if clean else SINGLE if only else kind
+    drawn = str(rng.choice([k for k, _ in MIX], p=[p for _, p in MIX]))
+    kind = kind or (SINGLE if only else drawn)
     if kind == SINGLE:
         draws = [SINGLES[only or names[int(rng.integers(len(names)))]]]
     elif kind == PAIR:
@@ -356,6 +365,9 @@ def case_of(seed: int, only: str = "", clean: bool = False, spool: int | None = 
     else:
         draws = [STRANGERS[int(rng.integers(len(STRANGERS)))]] if kind == OUTSIDE else []
     hidden = tuple(draw(rng, int(rng.integers(2))) for draw in draws)
+    while len(hidden) == 2 and _same_cause(*hidden):
+        hidden = (hidden[0], draws[1](rng, int(rng.integers(2))))
+    hidden = hidden if alone is None else hidden[alone : alone + 1]
     machine: dict[str, float] = {}
     joints: tuple[dict[str, float], dict[str, float]] = ({**own}, {**own})
     sensors: dict[str, Sensor] = {}

@@ -20,7 +20,7 @@ def foreign(
     count: Annotated[int, typer.Option(min=1, help="Of benches.")] = 30,
     stride: Annotated[int, typer.Option(min=1, help="Between seeds: 2 takes odd or even.")] = 2,
     only: Annotated[str, typer.Option(help="Hide this effect alone, by name.")] = "",
-    clean: Annotated[bool, typer.Option("--clean", help="Hide nothing.")] = False,
+    kind: Annotated[str, typer.Option(help="none, single, pair or outside; else drawn.")] = "",
     spool: Annotated[
         int | None, typer.Option(min=0, max=2, help="0 continuous, 1 or 2 held and lagging.")
     ] = None,
@@ -56,7 +56,7 @@ def foreign(
 
     kept = Kept(keep, _name, asdict, loaded) if keep else None
     work = [
-        Job(seed + stride * k, only, clean, spool, how)
+        Job(seed + stride * k, only, kind, spool, how)
         for k in range(count)
         for how in ("", *(BETTER if better else ()))
     ]

@@ -8,7 +8,7 @@ from typing import Any
 
 from rig.cli.output import table
 from tests.studies.foreign.bench import TRAIN, records_of
-from tests.studies.foreign.cases import case_of
+from tests.studies.foreign.cases import NONE, case_of
 from tests.studies.foreign.study import bounds
 
 FOLLOWING = ("continuous", "first-order, held command", "second-order, held command")
@@ -37,7 +37,7 @@ def perform(job: tuple[int, str]) -> Covered:
     from analysis.identify.identify import identify
 
     seed, estimator = job
-    case = case_of(seed, clean=True)
+    case = case_of(seed, kind=NONE)
     train = records_of(case.bench, TRAIN, 10 * seed, 1.0, case.bench.repeats)
     found = identify([train], estimator=estimator).model.parameters
     ratio, width = {}, {}

@@ -11,9 +11,14 @@ from typing import Any
 
 from scipy.stats import beta as beta_distribution
 
+from analysis.terms import baseline_of
+from analysis.terms.base import Used
+from analysis.trace.data.conditioned_record import conditioned_records
+from analysis.trace.data.noise_floor import Floor
+from analysis.trace.data.regression_data import regression_data
 from rig.cli.output import table
 from tests.studies.foreign.bench import Bench, runs_of
-from tests.studies.foreign.cases import NONE, OUTSIDE, Case, case_of
+from tests.studies.foreign.cases import NONE, OUTSIDE, PAIR, Case, case_of
 
 ABSTAINED_RIGHT = "abstained, truth found"
 BESIDE = "wrong beside unexplained"
@@ -30,7 +35,7 @@ class Job:
 
     seed: int
     only: str = ""
-    clean: bool = False
+    kind: str = ""  # one of `cases.MIX`, drawn where empty
     spool: int | None = None
     better: str = ""  # how the same bench is measured better: one of `BETTER`
 
@@ -48,7 +53,7 @@ class Outcome:
     named: tuple[tuple[str, str], ...]
     tied: tuple[tuple[str, str], ...]
     refused: tuple[str, ...]
-    loudness: float
+    loudness: float  # of a pair, of the quieter effect hidden alone
     size_error: float
     hits: tuple[int, int]  # sizes within their 95 % interval, sizes
     parameter_hits: tuple[int, int]
@@ -71,7 +76,7 @@ def perform(job: Job) -> Outcome:
     """Make a case's records and trace them."""
     from analysis.trace.engine import trace
 
-    case = case_of(job.seed, job.only, job.clean, job.spool)
+    case = case_of(job.seed, job.only, job.kind, job.spool)
     case = replace(case, bench=measured_better(case.bench, job.better))
     train, held_out = runs_of(case.bench, job.seed)
     started = time.process_time()
@@ -88,11 +93,33 @@ def perform(job: Job) -> Outcome:
         answer_of(case, found.verdict, set(named), set(found.tied)), found.verdict,
         named, tuple(found.tied),
         tuple(f"{e.name} at {e.where} ({_failed(e)})" for e in found.refused),
-        max(f.ratio for f in found.floors), max(errors, default=math.nan), hits,
+        _loudness(job, case, found.floors), max(errors, default=math.nan), hits,
         (sum(_within(after[n], v) for n, v in truth.items()), len(truth)),
         max(abs(after[n].value / v - 1) for n, v in truth.items()),
         found.worst(found.after), found.notes, seconds,
     )  # fmt: skip
+
+
+def _loudness(job: Job, case: Case, floors: Iterable[Floor]) -> float:
+    """Return the largest repeatable residual over its noise; of a pair, of the quieter effect.
+
+    A pair's quieter effect is hidden alone in the same bench: whether it can be found does not
+    depend on how loud its partner is.
+    """
+    if case.kind != PAIR:
+        return max(f.ratio for f in floors)
+    return min(
+        max(f.ratio for f in _floors_alone(job, position)) for position in range(len(case.hidden))
+    )
+
+
+def _floors_alone(job: Job, position: int) -> tuple[Floor, ...]:
+    """Return the noise floors of the baseline where one effect of a pair is hidden alone."""
+    case = case_of(job.seed, job.only, job.kind, job.spool, alone=position)
+    bench = measured_better(case.bench, job.better)
+    train, _ = runs_of(bench, job.seed)
+    terms = tuple(map(Used, baseline_of(bench.rig)))
+    return regression_data(bench.rig, terms, conditioned_records(bench.rig, [train])).floors
 
 
 def _failed(found: Any) -> str:
