@@ -26,6 +26,7 @@ from analysis.trace.data.noise_floor import NEIGHBOURS, PERIODS, REPEATS, STATED
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.spectral_lines import lines
 from analysis.trace.data.temperature_nuisance import stripped, temperature_terms
+from analysis.trace.data.unrepeated import unrepeated
 from analysis.trace.finding import (
     Finding,
     TraceRows,
@@ -115,6 +116,7 @@ def trace(
     baseline = _identified(runs, rows.train.terms)
     before = baseline.model
     notes = [*rows.unseen.notes, *_notes(rows.train, rows.unseen.choosing)]
+    notes += [*unrepeated(rows.train), *_undetermined(baseline)]
     notes += [check.detail for check in baseline.checks if check.name == GEOMETRY]
     finding = found_on(rows, candidates, free, seed, columns)
     finding = without_tied(without_rests(rig, terms, records, candidates, free, seed, finding))
@@ -241,6 +243,17 @@ def _notes(train_data: RegressionData, holdout_data: RegressionData) -> list[str
     if all(f.source == STATED for f in holdout_data.floors):
         out.append("the held-out noise floor is the rig file's stated sensor noise")
     return out
+
+
+def _undetermined(baseline: Identification) -> list[str]:
+    """Name the baseline's parameters that the records do not show: their part stays a residual."""
+    missing = [n for n, e in baseline.model.parameters.items() if not e.identified]
+    if not missing:
+        return []
+    return [
+        f"the records do not determine {', '.join(missing)} (see `bramah identify`): the share of "
+        "the motion that belongs to it may show as a residual"
+    ]
 
 
 def _missed_held(verdict: str, error: held_out.Errors, failures: Sequence[str]) -> list[str]:

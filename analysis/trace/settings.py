@@ -114,6 +114,11 @@ class DataSettings:
     filter's memory, and a short record still has several)."""
     least_noise: float = 0.2
     """Of the noise that the rig file states: a floor measured lower is chance (tuned)."""
+    unrepeated_ratio: float = 5.0
+    """Scatter between repeats over what the stated sensor noise makes: more is no sensor's noise
+    that a data sheet would state (tuned: clean benches stay below 2)."""
+    unrepeated_share: float = 0.5
+    """Of that scatter's energy: with more at one frequency, this is stated (convention)."""
     # Noise by neighbouring states.
     pair_apart: float = 0.5
     """[s] between the two rows of a pair: the row filter's memory is a tenth of a second."""

@@ -43,6 +43,7 @@ class Floor:
     """The split of one equation's residual in one group of records, SI.
 
     `source` says what the noise was computed from; `count` repeats or periods stand behind it.
+    `stated` is what the rig file's sensor noise alone makes.
     """
 
     group: Group
@@ -52,6 +53,7 @@ class Floor:
     total: float
     count: int
     source: str
+    stated: float
 
     @property
     def ratio(self) -> float:
@@ -86,19 +88,22 @@ def floors(
             residual = [row_residual(r, beta) for r in parts]
             every = np.concatenate(residual)
             total = float(np.sqrt(np.mean(every**2))) if len(every) else 0.0  # all rows masked
+            sensors = stated[equation]
             table, source = repeats_of(members[indices[0]], parts, residual)
             if table is not None:
                 noise, repeatable = split(table)
-                noise = max(noise, DATA.least_noise * stated[equation])
-                out.append(Floor(group, equation, noise, repeatable, total, len(table), source))
+                noise = max(noise, DATA.least_noise * sensors)
+                out.append(
+                    Floor(group, equation, noise, repeatable, total, len(table), source, sensors)
+                )
                 continue
-            noise, source = stated[equation], STATED
+            noise, source = sensors, STATED
             if len(parts) == 1:
                 near = neighbours(members[indices[0]], parts[0], residual[0])
                 if near is not None:
                     noise, source = max(near, DATA.least_noise * noise), NEIGHBOURS
             rest = float(np.sqrt(max(0.0, total**2 - noise**2)))
-            out.append(Floor(group, equation, noise, rest, total, 1, source))
+            out.append(Floor(group, equation, noise, rest, total, 1, source, sensors))
     return out
 
 

@@ -75,7 +75,7 @@ def judge(
         rest = _without(hypotheses, winner, used)
         rivals = _rivals(hypotheses, winner, key, holdout_data, after)
         touched = _touched(hypotheses, winner, rest)
-        removed = _removed(holdout_data, rest, after, touched)
+        removed = _removed(holdout_data, rest, winner, after)
         worse = _worse(hypotheses, winner, rest)
         p = inference.p_value(rest.fit.energy - winner.fit.energy, null)
         errors = inference.spread(train_data, winner.fit, used, values)
@@ -247,18 +247,27 @@ def _place(effect: Effect) -> str:
 
 def _touched(hypotheses: HypothesisSet, winner: Hypothesis, rest: Hypothesis) -> set[str]:
     """Return the equations in which an effect changes the training residual visibly."""
+    return set(_changes(winner, rest))
+
+
+def _changes(winner: Hypothesis, rest: Hypothesis) -> dict[str, float]:
+    """Return the energy that an effect removes in training, by equation where that is visible."""
     change = {e: rest.excess_energy[e] - winner.excess_energy[e] for e in rest.excess_energy}
     most = max(change.values())
-    return {e for e, v in change.items() if v > SEARCH.touched * most}
+    return {e: v for e, v in change.items() if v > SEARCH.touched * most}
 
 
 def _worse(hypotheses: HypothesisSet, winner: Hypothesis, rest: Hypothesis) -> list[str]:
-    """Return equations that were quieter under the baseline and that this effect disturbs."""
+    """Return equations that were quieter under the baseline and that this effect disturbs.
+
+    What it adds would alone be more than the noise's band.
+    """
+    before = {e: max(0.0, v) for e, v in hypotheses.empty.excess_energy.items()}
     return [
         e
         for e, now in winner.excess_energy.items()
-        if not hypotheses.negligible(e, now)
-        and now > TRACE.harm_ratio * max(0.0, hypotheses.empty.excess_energy[e])
+        if now > before[e] + hypotheses.limits.band[e]
+        and now > TRACE.harm_ratio * before[e]
         and now > rest.excess_energy[e]
     ]
 
@@ -271,13 +280,23 @@ def _taken(removed: float, worse: Sequence[str]) -> str:
 
 
 def _removed(
-    holdout_data: RegressionData, rest: Hypothesis, after: Array, touched: set[str]
+    holdout_data: RegressionData, rest: Hypothesis, winner: Hypothesis, after: Array
 ) -> float:
+    """Return the share of held-out energy above noise that an effect removes.
+
+    It is the mean over equations, weighed by what the effect removes there in training: what a
+    baseline that was badly determined leaves in another equation does not count against it.
+    """
     before = excess_of(holdout_data, held_left(holdout_data, rest.fit))
     now = excess_of(holdout_data, after)
-    start = sum(max(0.0, before[e]) for e in touched if e in before)
-    end = sum(max(0.0, now[e]) for e in touched if e in now)
-    return (start - end) / start if start > 0 else 0.0
+    weights = {e: v for e, v in _changes(winner, rest).items() if before.get(e, 0.0) > 0.0}
+    total = sum(weights.values())
+    if total <= 0.0:
+        return 0.0
+    return (
+        sum(weight * max(-1.0, 1.0 - max(0.0, now[e]) / before[e]) for e, weight in weights.items())
+        / total
+    )
 
 
 def _rivals(
@@ -316,6 +335,7 @@ def _rivals(
             hypothesis.size[1] > winner.size[1]
             or related(mine, other)
             or hypotheses.physical(hypothesis)
+            or _worse(hypotheses, hypothesis, rest)
         ):
             continue
         held = held_left(holdout_data, hypothesis.fit)
@@ -407,10 +427,13 @@ def _determined(train_data: RegressionData, used: Used, errors: inference.Effect
     """Return whether one number of an effect at least is known to be something.
 
     What the others of a set can stand for (a torque offset beside a spring's rest angle) is not.
+    The shape of an effect without a size is nothing: of one with coefficients these are asked.
     """
+    sizes = {c.parameter for c in used.term.coefficients(train_data.rig)}
+    asked = np.array([not sizes or name in sizes for name in errors.names])
     neutral = {s.parameter: s.neutral or 0.0 for s in shapes_of(train_data.rig, used)}
     value = errors.value - np.array([neutral.get(name, 0.0) for name in errors.names])
-    return bool(np.any(np.abs(value) > TRACE.normal_quantile * errors.std))
+    return bool(np.any(asked & (np.abs(value) > TRACE.normal_quantile * errors.std)))
 
 
 def _differences(differing: Sequence[tuple[str, str, float, float]]) -> str:

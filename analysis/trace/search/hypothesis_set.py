@@ -165,6 +165,10 @@ class HypothesisSet:
         candidates = self.candidates = self._candidate_columns(self.train_data, self.columns)
         r = self.train_data.mean
         r = r - candidates.basis @ (candidates.basis.T @ r)
+        return self.reread(self._found(candidates, r))
+
+    def _found(self, candidates: linear_fit.CandidateColumns, r: Array) -> Hypothesis:
+        """Return the set found on the candidates for what the baseline leaves (M,)."""
         singles = self.tried(self._singles(candidates, r))
         now = self.prune(self.best([self.empty, *singles]))
         if within(now.excess_energy, self.limits):
@@ -287,10 +291,28 @@ class HypothesisSet:
         grown = [o for start in starts for o in self.extensions(start)]
         return self.prune(self.best([now, *grown]))
 
+    def reread(self, now: Hypothesis) -> Hypothesis:
+        """Return the set, or a better one with another effect in place of one that looks like it.
+
+        What was chosen before the last effect joined may be the wrong one beside it.
+        """
+        sets: list[tuple[Used, ...]] = []
+        for used in now.effects if len(now.effects) > 1 else ():
+            others = tuple(u for u in now.effects if u is not used)
+            sets += [
+                (*others, Used(effect, effect.shape_of(self.train_data.rig, ())))
+                for effect in self.effects
+                if (effect.name, effect.where) not in now.keys and _alike(effect, used)
+            ]
+        if not sets:
+            return now
+        other = self.prune(self.best([now, *self.tried(sets)]))
+        return now if other.keys == now.keys else self.reread(other)
+
     def _beside(
         self, now: Hypothesis, equations: Collection[str] = (), free: bool = False
     ) -> tuple[linear_fit.CandidateColumns, Array]:
-        """Return candidates on data that have a set in their model, and what the set leaves (M,)."""
+        """Return candidates on data that have a set in their model, and what it leaves (M,)."""
         data = rebased(self.train_data, now.fit)
         taken = now.keys
         looks = self._variants(data, now.fit.residual)
@@ -351,6 +373,14 @@ class HypothesisSet:
     def idle(self, without: Hypothesis, hypothesis: Hypothesis) -> bool:
         """Return whether the effect that `without` lacks takes too small a share away."""
         return self.excess(without, hypothesis) < -float(np.log(1.0 - SEARCH.add_share))
+
+
+def _alike(effect: Effect, used: Used) -> bool:
+    """Return whether a named effect is easily taken for a used one, at the same place."""
+    own = used.term
+    assert isinstance(own, Effect)
+    alike = effect.mechanism == own.mechanism or effect.name in own.confounders
+    return alike and effect.where == own.where and not effect.free
 
 
 def effect_of(name: str, where: str) -> Effect:

@@ -178,7 +178,7 @@ def a_null_and_its_sensors_offset_are_confounded(b: Benches) -> None:
 
 
 def a_gain_and_a_crosstalk_that_fit_alike_are_confounded(b: Benches) -> None:
-    s = b.searched(b.runs(gain_cap_pressure=1.02), "sensor_gain", "sensor_crosstalk")
+    s = b.searched(b.runs(gain_cap_pressure=1.01), "sensor_gain", "sensor_crosstalk")
     assert not gate(s.judged(), gates.ALONE)
 
 

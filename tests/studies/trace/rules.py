@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass, is_dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -95,12 +95,7 @@ def _floors(factor: float) -> Callable[..., list[noise_floor.Floor]]:
     true = noise_floor.floors
 
     def scaled(*arguments: Any) -> list[noise_floor.Floor]:
-        return [
-            noise_floor.Floor(
-                f.group, f.equation, factor * f.noise, f.repeatable, f.total, f.count, f.source
-            )
-            for f in true(*arguments)
-        ]
+        return [replace(f, noise=factor * f.noise) for f in true(*arguments)]
 
     return scaled
 

@@ -1,0 +1,67 @@
+"""What differs between repeats and is no sensor noise: a cause that does not follow the excitation.
+
+A pump, a neighbouring machine or a fault that comes and goes acts with another phase in every
+repeat. It is then part of the noise floor, and no residual stands out of it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lombscargle
+
+from analysis.trace.data.noise_floor import PERIODS, REPEATS, Floor
+from analysis.trace.data.regression_data import RegressionData, Segment
+from analysis.trace.settings import DATA
+from rig.model.units import plain
+
+Array = NDArray[np.float64]
+
+
+def unrepeated(data: RegressionData) -> list[str]:
+    """State, for each equation, a scatter between repeats that the stated sensor noise is not."""
+    loudest: dict[str, Floor] = {}
+    for floor in data.floors:
+        measured = floor.source in (REPEATS, PERIODS)
+        if measured and floor.noise > DATA.unrepeated_ratio * floor.stated:
+            best = loudest.get(floor.equation)
+            if best is None or floor.noise / floor.stated > best.noise / best.stated:
+                loudest[floor.equation] = floor
+    return [_words(data, floor) for floor in loudest.values()]
+
+
+def _words(data: RegressionData, floor: Floor) -> str:
+    segment = next(
+        s for s in data.segments if (s.group, s.equation) == (floor.group, floor.equation)
+    )
+    frequency, share = _line(data, segment)
+    at = ""
+    if share > DATA.unrepeated_share:
+        at = f", {plain(100 * share, 2)} % of it at {plain(frequency, 3)} Hz"
+    return (
+        f"{floor.equation}: what differs between repeats is {plain(floor.noise / floor.stated, 2)} "
+        f"times what the stated sensor noise makes{at}: a sensor is noisier than stated, or "
+        "something acts that does not follow the excitation, which the trace cannot see"
+    )
+
+
+def _line(data: RegressionData, segment: Segment) -> tuple[float, float]:
+    """Return the frequency [Hz] at which most of the scatter between repeats lies, and its share.
+
+    The share is of the energy, 0 with fewer than two repeats (periods hold no other frequency).
+    """
+    if segment.repeats < 2:
+        return 0.0, 0.0
+    time = data.source(segment)[1].time
+    rows = data.residual[: segment.repeats, segment.where]
+    scatter = rows - rows.mean(axis=0)
+    length = float(time[-1] - time[0])
+    highest = 0.5 / float(np.median(np.diff(time)))
+    frequency = np.arange(2.0 / length, highest, 0.25 / length)
+    power = sum(
+        lombscargle(time, r - r.mean(), 2 * np.pi * frequency, normalize=True) * np.sum(r**2)
+        for r in scatter
+    )
+    share = np.asarray(power) / float(np.sum(scatter**2))
+    best = int(np.argmax(share))
+    return float(frequency[best]), float(share[best])
