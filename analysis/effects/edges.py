@@ -23,12 +23,13 @@ CORNER_BOUNDS: Final = (0.0, 10.0)  # beyond, all is nearer to straight lines th
 
 
 def rounding(name: str, stroke: float) -> Shape:
-    """Return an edge's rounding [V], from sharp to 10 % of the spool's stroke [V].
+    """Return an edge's rounding [V], from sharp to 20 % of the spool's stroke [V].
 
     Clearances of some micrometres on a stroke of some tenths of a millimetre, and the notches of a
-    proportional valve's edges, which open over a tenth of it.
+    proportional valve's edges: an edge is open by half of its rounding, up to a tenth of the stroke
+    as by an underlap.
     """
-    return Shape(name, "V", 0.0, 0.1 * stroke, (0.002 * stroke,), resolution=True)
+    return Shape(name, "V", 0.0, 0.2 * stroke, (0.002 * stroke,), resolution=True)
 
 
 def corner(name: str) -> Shape:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.effects.base import Effect, ordered
+from analysis.effects.free_forces import PositionForce
 from analysis.identify import checks as ck
 from analysis.identify.estimators.nuisance import BulkTemperature, SpoolPath
 from analysis.identify.geometry import NAME as GEOMETRY
@@ -151,6 +152,7 @@ def trace(
     hidden = (
         detection_limits(train_data, candidates, winner, after) if verdict != UNEXPLAINED else []
     )
+    notes += _weighed_with_a_curve(winner, after)
     notes += [*kept, *_missed_held(verdict, error, [*notes, *kept]), *in_words(hidden)]
     runs_before, runs_after = held_out.free_runs([*holdout, *judge], before, after)
     result = Trace(
@@ -253,6 +255,17 @@ def _undetermined(baseline: Identification) -> list[str]:
     return [
         f"the records do not determine {', '.join(missing)} (see `bramah identify`): the share of "
         "the motion that belongs to it may show as a residual"
+    ]
+
+
+def _weighed_with_a_curve(winner: Hypothesis, after: Model) -> list[str]:
+    """Name weights that a free force over position leaves undetermined in one pose."""
+    joints = [u.term.joint + 1 for u in winner.effects if isinstance(u.term, PositionForce)]
+    return [
+        f"W{joint} is no measured weight: in one pose of the other joints gravity is a force over "
+        f"position too, and position_force at joint {joint} shares it"
+        for joint in joints
+        if f"W{joint}" in after.parameters
     ]
 
 

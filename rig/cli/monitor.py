@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
@@ -57,6 +59,11 @@ def monitor(
         return
     if web:
         raise typer.Exit(_serve(rig, runs, endpoint, port or 0))
+    if not sys.stdin.isatty() and "TEXTUAL_DRIVER" not in os.environ:  # the browser's page has one
+        raise InputError(
+            "the screen needs a terminal, and standard input is none: use --plain for lines of "
+            "text, or --web for a page"
+        )
     from rig.tui.app import main
     from rig.tui.browse import BrowserState
 

@@ -102,3 +102,14 @@ def test_as_a_process_it_ends_with_an_interrupt(folder: str) -> None:
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 130
     assert "Traceback" not in errors
+
+
+def test_a_screen_without_a_terminal_is_refused_and_uses_no_processor() -> None:
+    """A cron job's standard input has ended: a screen that reads it would read for ever."""
+    ended = subprocess.run(
+        [sys.executable, "-c", "from rig.cli.main import run; run()", "monitor"],
+        stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=60, cwd=ROOT, check=False,
+    )  # fmt: skip
+    assert ended.returncode == 2
+    assert "needs a terminal" in ended.stderr
+    assert "--plain" in ended.stderr

@@ -7,6 +7,7 @@ coefficient everywhere, whichever repeats are taken, and better than anything el
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
@@ -101,7 +102,7 @@ def judge(
                 _place(used.term),
                 _parameters(train_data, used, errors, shift),
                 p,
-                removed,
+                0.0 if math.isnan(removed) else removed,
                 (*twins, *rivals),
                 gates,
                 used.term.variable,
@@ -274,6 +275,8 @@ def _worse(hypotheses: HypothesisSet, winner: Hypothesis, rest: Hypothesis) -> l
 
 def _taken(removed: float, worse: Sequence[str]) -> str:
     text = f"{100 * removed:.0f} % of the energy above noise"
+    if math.isnan(removed):
+        text = "held-out records have nothing above the noise to remove: hold out larger motions"
     if not worse:
         return text
     return f"{text}, but the residual of {' '.join(worse)} is larger than under the baseline"
@@ -285,7 +288,8 @@ def _removed(
     """Return the share of held-out energy above noise that an effect removes.
 
     It is the mean over equations, weighed by what the effect removes there in training: what a
-    baseline that was badly determined leaves in another equation does not count against it.
+    baseline that was badly determined leaves in another equation does not count against it. NaN
+    where held-out records show nothing above noise in these equations, and no share is removed.
     """
     before = excess_of(holdout_data, held_left(holdout_data, rest.fit))
     now = excess_of(holdout_data, after)
