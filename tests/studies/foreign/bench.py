@@ -281,11 +281,16 @@ def records_of(bench: Bench, steps: tuple[str, ...], seed: int, scale: float, re
     return Run(bench.rig, tuple(records), f"foreign bench, seed {seed}")
 
 
+def training_of(bench: Bench, seed: int) -> Run:
+    """Return the training records alone."""
+    return records_of(bench, TRAIN, 10 * seed, 1.0, bench.repeats)
+
+
 def runs_of(bench: Bench, seed: int) -> tuple[Run, list[Run]]:
     """Return training records and held-out ones: another waveform, seven tenths; both joints."""
     held_out = replace(bench, repeats=min(bench.repeats, 2))
     return (
-        records_of(bench, TRAIN, 10 * seed, 1.0, bench.repeats),
+        training_of(bench, seed),
         [
             records_of(held_out, TRAIN, 10 * seed + 1, 0.7, held_out.repeats),
             records_of(held_out, ("both",), 10 * seed + 2, 0.8, held_out.repeats),

@@ -17,7 +17,7 @@ from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.noise_floor import Floor
 from analysis.trace.data.regression_data import regression_data
 from rig.cli.output import table
-from tests.studies.foreign.bench import Bench, runs_of
+from tests.studies.foreign.bench import Bench, runs_of, training_of
 from tests.studies.foreign.cases import NONE, OUTSIDE, PAIR, Case, case_of
 
 ABSTAINED_RIGHT = "abstained, truth found"
@@ -117,7 +117,7 @@ def _floors_alone(job: Job, position: int) -> tuple[Floor, ...]:
     """Return the noise floors of the baseline where one effect of a pair is hidden alone."""
     case = case_of(job.seed, job.only, job.kind, job.spool, alone=position)
     bench = measured_better(case.bench, job.better)
-    train, _ = runs_of(bench, job.seed)
+    train = training_of(bench, job.seed)
     terms = tuple(map(Used, baseline_of(bench.rig)))
     return regression_data(bench.rig, terms, conditioned_records(bench.rig, [train])).floors
 
