@@ -207,8 +207,6 @@ class SearchSettings:
     """Extensions of a set that are refined exactly."""
     other_starts: int = 3
     """Pairs with fewer free numbers than the set found, that are extended too."""
-    other_starts_excess: float = 1.1
-    """Sum over equations of log ratios by which these may leave more (tuned: three times)."""
     near_gain: float = 0.25
     """Of the best gain: a single candidate with less is no rival (tuned)."""
     shape_starts: int = 3

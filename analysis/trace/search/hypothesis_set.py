@@ -284,7 +284,6 @@ class HypothesisSet:
             for o in self.fitted.values()
             if len(o.effects) == SEARCH.largest_set - 1
             and o.size[1] < now.size[1]
-            and self.excess(o, now) < SEARCH.other_starts_excess
             and not self.physical(o)
         ]
         starts = sorted(starts, key=lambda o: o.total)[: SEARCH.other_starts]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from analysis.terms.base import Used
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.noise_floor import NEIGHBOURS, REPEATS, STATED, Floor, floors, stated_noise
 from analysis.trace.data.regression_data import regression_data
+from analysis.trace.data.unrepeated import unrepeated
 from analysis.trace.settings import DATA
 from rig.model.records import Run
 from rig.model.rig import Rig
@@ -93,3 +95,31 @@ def test_a_motion_that_comes_back_shows_noise_that_the_rig_file_does_not_state()
     assert (once.source, thrice.source, known.source) == (STATED, NEIGHBOURS, REPEATS)
     assert once.noise < 0.3 * known.noise
     assert thrice.noise == pytest.approx(known.noise, rel=0.35)
+
+
+def test_a_pump_that_does_not_follow_the_excitation_is_noted_with_its_frequency(rig: Rig) -> None:
+    """7.3 Hz on joint 2, in another phase in every repeat: part of the floor, no residual."""
+    wave = multisine(np.random.default_rng(1), rig.sample_rate, 4.0, 9.5)
+    quiet = synthetic_run(rig, np.random.default_rng(2), wave, rms=0.025, repeats=4)
+    rng = np.random.default_rng(5)
+
+    def shaken(run: Run) -> Run:
+        records = []
+        for record in run.records:
+            time = np.arange(record.samples) / record.sample_rate
+            pulse = 3e4 * np.sin(2 * np.pi * 7.3 * time + rng.uniform(0, 2 * np.pi))
+            cap = record.channels["cap_pressure_2"] + pulse
+            records.append(replace(record, channels={**record.channels, "cap_pressure_2": cap}))
+        return replace(run, records=tuple(records))
+
+    terms = tuple(map(Used, baseline_of(rig)))
+    before, after = (
+        unrepeated(regression_data(rig, terms, conditioned_records(rig, [run])))
+        for run in (quiet, shaken(quiet))
+    )
+    assert before == []
+    torque = next(note for note in after if note.startswith("torque_2"))
+    at = re.search(r"at ([\d.]+) Hz", torque)
+    assert at is not None
+    assert float(at[1]) == pytest.approx(7.3, abs=0.05)
+    assert not any(note.startswith("flow_cap_1") for note in after)
