@@ -87,7 +87,8 @@ class SampleBlock:
     measured part; `backlog` counts the blocks still waiting in the device; `tripped` says that
     the device itself has zeroed its outputs (watchdog or fault). A host-timed driver adds
     `read_at`, shape (n,): when each row's own sample was taken [s since tick 0], NaN for a row
-    that has none of its own.
+    that has none of its own. `armed` is False where the device says that no law may put out a
+    voltage: after laws that may, another client has zeroed the outputs.
     """
 
     sequence: int
@@ -97,6 +98,7 @@ class SampleBlock:
     backlog: int
     tripped: bool
     read_at: Array | None = None
+    armed: bool = True
 
 
 class WireSettings(Part):

@@ -269,7 +269,7 @@ class Bench:
         """
         bounded = self._outputs.bounded(laws)
         self._heed()
-        return self._outputs.safely(lambda: self._driver.apply(bounded, restart=restart))
+        return self._outputs.apply(bounded, restart=restart)
 
     # Samples
 
@@ -299,6 +299,9 @@ class Bench:
             self._note_alarms(violation)
         self.observers.block(block)
         self._display.show(block, late or 0.0, self.lost_samples, self._guard.roles)
+        if self._outputs.zeroed_elsewhere(block):
+            # The next law would move the joints again: whoever zeroed them does not expect it.
+            self._stop.request("stopped: another program has put the outputs to zero")
         if trip is not None:
             self._report(trip)
             raise trip

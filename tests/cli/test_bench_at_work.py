@@ -11,7 +11,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from drivers import make_driver, wire_at
 from rig.cli.main import app
+from rig.runs.rigs import load_rig
 from rig.runs.store import load_run
 from tests.cli.bench import (
     ENDLESS,
@@ -89,6 +91,43 @@ def test_ctrl_c_twice_zeroes_the_outputs_and_keeps_the_records(
             _, errors = process.communicate(timeout=LONG)
             assert process.returncode == 130
             assert "Traceback" not in errors
+        assert outputs_are_zero(endpoint)
+    assert (run / "state").read_text().strip() == "aborted"
+    assert len(load_run(run).records) >= 2
+
+
+def test_stop_from_another_terminal_ends_the_run_and_keeps_the_records(
+    endless: Path, tmp_path: Path
+) -> None:
+    run = tmp_path / "stopped"
+    with simulated() as (endpoint, _):
+        line = ("run", endless, "--rig", RIG, "--out", run, "--endpoint", endpoint)
+        with started(*line) as process:
+            wait_for("record 3 of", process)
+            stopped = bramah("stop", "--rig", RIG, "--endpoint", endpoint)
+            assert stopped.returncode == 0, stopped.stderr
+            assert stopped.stdout.startswith("outputs at zero, confirmed by the device")
+            assert str(run) in stopped.stderr
+            _, errors = process.communicate(timeout=LONG)
+        assert process.returncode == 130, errors
+        assert outputs_are_zero(endpoint)
+    assert (run / "state").read_text().strip() == "aborted"
+    assert len(load_run(run).records) >= 2
+
+
+def test_stop_from_another_computer_ends_the_run(endless: Path, tmp_path: Path) -> None:
+    run = tmp_path / "stopped"
+    rig = load_rig(RIG)
+    with simulated() as (endpoint, _):
+        line = ("run", endless, "--rig", RIG, "--out", run, "--endpoint", endpoint)
+        with started(*line) as process:
+            wait_for("record 3 of", process)
+            other = make_driver(wire_at(endpoint, rig.wire), rig)
+            other.zero_outputs()
+            other.close()
+            _, errors = process.communicate(timeout=LONG)
+        assert process.returncode == 130, errors
+        assert "another program has put the outputs to zero" in errors.splitlines()[-1]
         assert outputs_are_zero(endpoint)
     assert (run / "state").read_text().strip() == "aborted"
     assert len(load_run(run).records) >= 2
