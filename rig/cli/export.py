@@ -84,6 +84,7 @@ def _write_units(run: Path, out: Path, path: Path | None) -> Path:
         compiler_missing,
         write_fmus,
     )
+    from rig.runs.files import new_folder
     from rig.runs.store import refuse_occupied
 
     if compiler_missing():
@@ -97,7 +98,8 @@ def _write_units(run: Path, out: Path, path: Path | None) -> Path:
     about = f"{model.rig.name}, identified: {source}"
     progress("Linux and Windows, FMI 2 and 3: about a minute the first time")
     try:
-        files = write_fmus(model, out, model.rig.name, about, TARGETS, progress)
+        with new_folder(out) as folder:
+            files = write_fmus(model, folder, model.rig.name, about, TARGETS, progress)
     except CompilationError as error:
         raise WorkError(str(error)) from error
     progress(" ".join(file.name for file in files))

@@ -128,7 +128,11 @@ def run_folders(folder: str | Path) -> list[Path]:
     if not root.is_dir():
         raise InputError(f"{root}: no such folder")
     try:
-        return [root] if is_run(root) else [c for c in root.iterdir() if is_run(c)]
+        return (
+            [root]
+            if is_run(root)
+            else [c for c in root.iterdir() if is_run(c) and not c.name.startswith(".")]
+        )
     except OSError as error:
         raise InputError(f"{root}: cannot be read: {error.strerror}") from error
 
