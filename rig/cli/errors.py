@@ -103,7 +103,7 @@ def guarded(work: Callable[[], int | None], *, debug: bool) -> int:
         _say("stopped")
         return INTERRUPTED
     except TyperException as error:
-        _say(f"{error.format_message()}; see --help")
+        _say(f"{error.format_message().rstrip('.')}; see --help")
         return BAD_INPUT
     except BrokenPipeError:
         # The reader of our output went away (`| head`): not an error, and nothing more to say.

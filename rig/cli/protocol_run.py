@@ -30,6 +30,7 @@ from rig.cli.twin_choice import twin_source
 from rig.model.rig import Rig
 from rig.runs.recorder import Recorder
 from rig.runs.rigs import load_bench
+from rig.runs.store import refuse_occupied
 
 if TYPE_CHECKING:
     from rig.cli.tracking import Tracking
@@ -120,6 +121,7 @@ def run_protocol(job: ProtocolJob, say: Say) -> Path:
     """Run a protocol into its folder and return that; raises what ended it, outputs at zero."""
     rig, plan = _plan(job.protocol, job.rig, job.overrides)
     rig = reached_at(rig, job.endpoint)
+    refuse_occupied(job.out)
     desk_machine = StateMachine()
     desk_machine.to(EngineState.CHECKING, plan.protocol.name)
     say(plan_text(plan))

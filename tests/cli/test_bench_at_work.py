@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from drivers import make_driver, wire_at
 from rig.cli.main import app
-from rig.runs.rigs import load_rig
+from rig.runs.rigs import load_rig, rig_text
 from rig.runs.store import load_run
 from tests.cli.bench import (
     ENDLESS,
@@ -56,7 +56,7 @@ def test_a_protocol_is_checked_run_listed_and_identified(short: Path, tmp_path: 
         assert done.stdout.strip() == str(run)
         again = bramah("run", short, "--rig", RIG, "--out", run, "--endpoint", endpoint)
         assert again.returncode == 2
-        assert "not empty" in again.stderr
+        assert again.stderr.startswith(f"bramah: {run}: is not empty")  # before the twin's minutes
 
     listed = bramah("runs", tmp_path)
     assert "monday" in listed.stdout
@@ -213,7 +213,8 @@ def test_a_passed_limit_trips_with_limit_value_and_joint(short: Path, tmp_path: 
             (("import", "manifest.yaml", "--out", "x"), 2, "manifest.yaml"),
             (("recover", "nowhere"), 2, "nowhere"),
             (("sim", "--rig", RIG, "--wire", "smoke-signals"), 2, "modbus-tcp"),
-            (("nonsense",), 2, "nonsense"),
+            (("nonsense",), 2, "No such command 'nonsense'; see --help"),
+            (("export", "nowhere", "--format", "xls"), 2, "csv mat parquet mf4 fmu ro-crate"),
         ]
     ),
 )
@@ -225,6 +226,17 @@ def test_bad_input_is_one_line_that_names_it(
     assert words in done.stderr
     assert done.stderr.count("\n") == 1, done.stderr
     assert not list(tmp_path.iterdir())
+
+
+def test_a_wire_that_no_driver_serves_is_named_with_its_rig(tmp_path: Path) -> None:
+    text, _ = rig_text(RIG)
+    for right, wrong in (("kind: modbus-tcp", "kind: modbus-tpc"), ("port: 5020", "port: 502000")):
+        path = tmp_path / "bench.yaml"
+        path.write_text(text.replace(right, wrong))
+        done = bramah("probe", "--rig", path)
+        assert done.returncode == 2
+        assert f"rig '{RIG}': wire: {wrong.split(':')[0]}: " in done.stderr
+        assert wrong.split()[1] in done.stderr
 
 
 def test_nobody_at_the_other_end_is_exit_code_4(tmp_path: Path) -> None:
