@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from rig.model.parse import InputError
+from rig.model.parse import InputError, problem_text
 from rig.model.parts import Part, Wire
 from rig.model.rig import Rig
 
@@ -119,7 +119,7 @@ class WireSettings(Part):
             elif first["type"] == "missing":
                 text = f"wire {wire.kind} needs it"
             else:
-                text = f"{first['msg'].removeprefix('Value error, ')}, found {first['input']!r}"
+                text = problem_text(first)
             raise InputError(f"wire: {key}: {text}") from error
 
     @classmethod

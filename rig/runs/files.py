@@ -31,6 +31,8 @@ def read_text(path: Path, what: str, limit: int = MAX_TEXT) -> str:
             raise InputError(f"{path}: is no regular file; expected {what}")
         with path.open("rb") as stream:
             raw = stream.read(limit + 1)
+    except InputError:
+        raise
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; expected {what}") from None
     except (OSError, ValueError) as error:  # ValueError: a NUL in the path
