@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
-from rig.model.parse import InputError, read_quantity, problem_text
+from rig.model.parse import InputError, problem_text, read_quantity
 from rig.model.parts import Part
 from rig.model.rig import Rig
 

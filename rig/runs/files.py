@@ -69,6 +69,9 @@ def replace_text(path: Path, text: str) -> None:
             stream.flush()
             os.fsync(stream.fileno())
         fresh.replace(path)
+    except OSError as error:
+        error.filename = os.fspath(path)  # a person knows no other, and a failed write names none
+        raise
     finally:
         fresh.unlink(missing_ok=True)
     sync_to_disk(path.parent)
@@ -96,6 +99,10 @@ def new_folder(out: Path) -> Iterator[Path]:
                 path.replace(place / path.name)
         else:
             fresh.replace(place)
+    except OSError as error:
+        if error.errno is not None and error.filename is None:  # a failed write
+            error.filename = os.fspath(out)
+        raise
     finally:
         shutil.rmtree(fresh, ignore_errors=True)
     sync_to_disk(place if empty else place.parent)

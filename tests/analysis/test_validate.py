@@ -96,7 +96,7 @@ def test_a_damaged_model_file_says_where(model_file: Path, tmp_path: Path, chang
 def test_a_file_that_is_no_model_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "x.json"
     path.write_text(text)
-    with pytest.raises(InputError, match="not a model file|expected a model file"):
+    with pytest.raises(InputError, match=r"not a model file|expected a model file"):
         load_model(path)
 
 
