@@ -96,7 +96,10 @@ def _with_notes(error: BaseException, message: str) -> str:
 def guarded(work: Callable[[], int | None], *, debug: bool) -> int:
     """Run `work` and return the process's exit code; no traceback leaves without `debug`."""
     try:
-        return work() or OK
+        code = work() or OK
+        if code == INTERRUPTED:
+            _say("stopped")
+        return code
     except typer.Exit as error:
         return error.exit_code
     except typer.Abort:

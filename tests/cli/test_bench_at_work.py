@@ -96,6 +96,20 @@ def test_ctrl_c_twice_zeroes_the_outputs_and_keeps_the_records(
     assert len(load_run(run).records) >= 2
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_before_the_bench_is_driven_ends_in_a_line(
+    endless: Path, tmp_path: Path, number: signal.Signals
+) -> None:
+    with simulated() as (endpoint, _):
+        line = ("run", endless, "--rig", RIG, "--out", tmp_path / "run", "--endpoint", endpoint)
+        with started(*line) as process:
+            wait_for("checking endless", process)
+            process.send_signal(number)
+            _, errors = process.communicate(timeout=LONG)
+    assert process.returncode == 130, errors
+    assert errors.strip().splitlines()[-1].startswith("bramah: stopped")
+
+
 def test_stop_from_another_terminal_ends_the_run_and_keeps_the_records(
     endless: Path, tmp_path: Path
 ) -> None:
