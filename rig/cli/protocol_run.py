@@ -74,7 +74,8 @@ class _PhaseReport:
         recorder = self._bench.recorder
         at = 0.0 if recorder is None else recorder.elapsed
         left = self._bench.expected - at
-        more = f"  ({clock_text(left)} left)" if left > 0.0 else ""
+        # The time was estimated: what has ended early has none left.
+        more = f"  ({clock_text(left)} left)" if left > 0.0 and phase != "done" else ""
         self._say(f"{at:8.1f} s  {step:10s} {phase:8s}  {message}{more}")
         self._message = message
         self._bench.event("phase", self._bench.tick, step=step, phase=phase, message=message)

@@ -54,6 +54,7 @@ def test_a_protocol_is_checked_run_listed_and_identified(short: Path, tmp_path: 
         done = bramah("run", short, "--rig", RIG, "--out", run, "--endpoint", endpoint)
         assert done.returncode == 0, done.stderr
         assert done.stdout.strip() == str(run)
+        assert done.stderr.rstrip().endswith("done      2 records")  # and no time left
         again = bramah("run", short, "--rig", RIG, "--out", run, "--endpoint", endpoint)
         assert again.returncode == 2
         assert again.stderr.startswith(f"bramah: {run}: is not empty")  # before the twin's minutes
