@@ -132,13 +132,7 @@ class Bench:
         try:
             return self._outputs.connect()
         except DeviceBusy as error:
-            holder = self.state.holder()
-            if holder is None:
-                raise DeviceBusy(f"{error}; no process of this computer is known to") from error
-            run = f", which writes {holder.run}" if holder.run else ""
-            raise DeviceBusy(
-                f"{error}: process {holder.pid}{run}; wait for its end or stop it"
-            ) from error
+            raise self.state.in_use(error) from error
 
     def restart(self) -> None:
         """Start (again) the device's stream of blocks and its waveforms."""
