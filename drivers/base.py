@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from rig.model.parse import InputError
+from rig.model.parse import InputError, problem_text
 from rig.model.parts import Part, Wire
 from rig.model.rig import Rig
 
@@ -87,7 +87,8 @@ class SampleBlock:
     measured part; `backlog` counts the blocks still waiting in the device; `tripped` says that
     the device itself has zeroed its outputs (watchdog or fault). A host-timed driver adds
     `read_at`, shape (n,): when each row's own sample was taken [s since tick 0], NaN for a row
-    that has none of its own.
+    that has none of its own. `armed` is False where the device says that no law may put out a
+    voltage: after laws that may, another client has zeroed the outputs.
     """
 
     sequence: int
@@ -97,6 +98,7 @@ class SampleBlock:
     backlog: int
     tripped: bool
     read_at: Array | None = None
+    armed: bool = True
 
 
 class WireSettings(Part):
@@ -117,7 +119,7 @@ class WireSettings(Part):
             elif first["type"] == "missing":
                 text = f"wire {wire.kind} needs it"
             else:
-                text = f"{first['msg'].removeprefix('Value error, ')}, found {first['input']!r}"
+                text = problem_text(first)
             raise InputError(f"wire: {key}: {text}") from error
 
     @classmethod

@@ -22,6 +22,7 @@ Flags = NDArray[np.bool_]
 Codes = NDArray[np.uint16]
 
 _ONE = np.uint16(1)
+_ARMED: Final = int(Status.ARMED)
 _TRIPPED: Final = int(Status.TRIPPED)  # an operation on a flag takes as long as one on an array
 
 
@@ -112,6 +113,7 @@ class BlockDecoder:
             saturated=ends[:, : self.layout.channels],
             backlog=header.backlog,
             tripped=bool(header.status & _TRIPPED),
+            armed=bool(header.status & _ARMED),
         )
 
     def _follow(self, header: BlockHeader) -> tuple[int, int]:

@@ -30,7 +30,10 @@ def driver_class(kind: str) -> type[Driver]:
 
 def make_driver(wire: Wire, rig: Rig) -> Driver:
     """Return the unconnected driver of a wire; raises InputError for settings it cannot read."""
-    return driver_class(wire.kind)(wire, rig)
+    try:
+        return driver_class(wire.kind)(wire, rig)
+    except InputError as error:
+        raise InputError(f"rig {rig.name!r}: {error}") from error
 
 
 def wire_at(endpoint: str, wire: Wire) -> Wire:

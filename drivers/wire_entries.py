@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
-from rig.model.parse import InputError, read_quantity
+from rig.model.parse import InputError, problem_text, read_quantity
 from rig.model.parts import Part
 from rig.model.rig import Rig
 
@@ -38,7 +38,7 @@ def read_entry(model: type[Entry], raw: Any, key: str) -> Entry:
         elif problem["type"] == "missing":
             text = f"is missing; expected: {known}"
         else:
-            text = f"{problem['msg'].removeprefix('Value error, ')}, found {problem['input']!r}"
+            text = problem_text(problem)
         raise InputError(f"wire: {where}: {text}") from error
 
 

@@ -31,8 +31,9 @@ from protocols.steps.base import StepKind
 from rig.cli.proofs import PlanProof, proved
 from rig.cli.protocol_run import ProtocolJob, run_protocol
 from rig.cli.simulated_bench import simulated_bench
-from rig.model.parse import InputError
+from rig.model.parse import InputError, problem_text
 from rig.model.records import Record, Run
+from rig.runs.files import replace_text
 from rig.runs.rigs import load_bench, load_rig
 from rig.runs.store import load_run
 
@@ -162,8 +163,7 @@ def changed(protocol: Protocol, step: str, changes: Mapping[str, Any]) -> Protoc
         except ValidationError as error:
             problem = error.errors()[0]
             where = ".".join(map(str, problem["loc"]))
-            text = problem["msg"].removeprefix("Value error, ")
-            raise InputError(f"step {step!r}: {where}: {text}") from error
+            raise InputError(f"step {step!r}: {where}: {problem_text(problem)}") from error
 
     return protocol.model_copy(update={"steps": mapped(protocol.steps, change)})
 
@@ -217,7 +217,7 @@ def take(
     if isinstance(protocol, Protocol):
         file = folder.with_name(f"{folder.name}.yaml")
         file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(protocol_text(protocol, "Made in a notebook."), encoding="utf-8")
+        replace_text(file, protocol_text(protocol, "Made in a notebook."))
         protocol = str(file)
     job = ProtocolJob(protocol, rig, folder, endpoint, overrides or Overrides())
     return load_run(run_protocol(job, log.info))

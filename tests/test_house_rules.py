@@ -61,5 +61,20 @@ def test_no_two_public_classes_share_a_name() -> None:
     assert shared == {}
 
 
+def test_a_file_of_a_user_is_written_whole_or_not_at_all() -> None:
+    """What is written directly lies in a folder that appears whole, or in one of this process."""
+    direct = {
+        path.relative_to(ROOT).as_posix()
+        for path in _modules()
+        if ".write_text(" in path.read_text(encoding="utf-8")
+    }
+    assert direct == {
+        "analysis/simulation/compiled_sources.py",
+        "analysis/simulation/fmu/archive.py",
+        "rig/runs/exchange/export.py",
+        "rig/runs/exchange/ro_crate.py",
+    }
+
+
 def _modules() -> list[Path]:
     return [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]

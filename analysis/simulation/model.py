@@ -19,14 +19,15 @@ from pydantic import ValidationError
 from analysis.effects.base import shapes_of
 from analysis.terms import make
 from analysis.terms.base import Used
-from rig.model.parse import InputError
+from rig.model.parse import InputError, problem_text
 from rig.model.rig import Rig
-from rig.runs.files import replace_text
+from rig.runs.files import read_text, replace_text
 
 Array = NDArray[np.float64]
 
 FORMAT: Final = "bramah-model"
 VERSION: Final = 1
+_MOST_BYTES: Final = 1 << 26  # nine joints with curves have far fewer
 
 
 @dataclass(frozen=True)
@@ -143,9 +144,7 @@ def load_model(path: str | Path) -> Model:
     """Read a model file; raises InputError saying what is wrong with it."""
     path = Path(path)
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read the model file {path}: {error}") from error
+        data = json.loads(read_text(path, "a model file", limit=_MOST_BYTES))
     except (json.JSONDecodeError, RecursionError) as error:
         raise InputError(f"{path} is not a model file: not valid JSON ({error})") from error
     if not isinstance(data, dict) or data.get("format") != FORMAT:
@@ -162,7 +161,7 @@ def load_model(path: str | Path) -> Model:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
-        raise InputError(f"{path}: rig.{where}: {first['msg']}") from error
+        raise InputError(f"{path}: rig.{where}: {problem_text(first)}") from error
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path} is damaged: {type(error).__name__} at {error}") from error
 

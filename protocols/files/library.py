@@ -130,7 +130,10 @@ class _Includes:
 
     def __call__(self, name: str, values: Mapping[str, Any], line: int) -> Sequence[Any]:
         """Return the raw steps of a protocol; InputError for a cycle, or what is wrong in it."""
-        text, shown, folder = _text(name, self._folder)
+        try:
+            text, shown, folder = _text(name, self._folder)
+        except InputError as error:
+            raise InputError(f"{self._source}:{line}: include: {error}") from error
         same = [seen for seen in self._chain if _same_file(seen, shown)]
         if same:
             circle = " -> ".join((*self._chain[self._chain.index(same[0]) :], shown))

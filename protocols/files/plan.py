@@ -14,9 +14,9 @@ import numpy as np
 
 from protocols.files.schema import Protocol
 from protocols.language.conditions import Condition, parse_condition, require_known
-from protocols.language.waveforms import Waveform
+from protocols.language.waveforms import LONGEST_PERIOD, Waveform, highest_line
 from protocols.steps.base import PlannedStep, StepKind
-from protocols.steps.excite import Step
+from protocols.steps.excite import MAX_REPEATS, Step
 from protocols.steps.lock import LockStep
 from protocols.steps.parts import CLOSED, END_MAX, Excite, Lock, Place
 from protocols.steps.plans import ExcitePlan, LockPlan, StepPlan
@@ -25,8 +25,7 @@ from rig.model.parse import InputError
 from rig.model.rig import Rig
 
 TRIAL_SECONDS = 3.0  # drift is judged over about this long, or one period if that is longer
-LONGEST_PERIOD = 600.0  # [s] a common period of two joints beyond this is a mistake
-NYQUIST_SHARE = 4.0  # excited lines stay below Nyquist / 4
+LONGEST_RECORD = 86400.0  # [s]
 
 
 @dataclass(frozen=True)
@@ -121,8 +120,8 @@ def resolve(protocol: Protocol, rig: Rig, overrides: Overrides | None = None) ->
 
 def override(protocol: Protocol, overrides: Overrides) -> Protocol:
     """Return the protocol with what was overridden; raises InputError for what does not fit."""
-    if overrides.repeats is not None and overrides.repeats < 1:
-        raise InputError(f"repeats is {overrides.repeats}; expected at least 1")
+    if overrides.repeats is not None and not 1 <= overrides.repeats <= MAX_REPEATS:
+        raise InputError(f"repeats is {overrides.repeats}; expected 1 to {MAX_REPEATS}")
     if not overrides.amplitude_scale > 0.0 or not math.isfinite(overrides.amplitude_scale):
         raise InputError(f"the amplitude's scale is {overrides.amplitude_scale:g}; expected > 0")
     if overrides.seed is not None and overrides.seed < 0:
@@ -261,6 +260,10 @@ class _RigPlanner:
 
 
 def _whole(step: str, duration: float, period: int, rate: float) -> int:
+    if duration > LONGEST_RECORD:
+        raise InputError(
+            f"step {step!r}: duration {duration:g} s; expected at most {LONGEST_RECORD:g} s"
+        )
     count = duration * rate / period
     if round(count) < 1 or abs(count - round(count)) > 1e-6 * count:
         raise InputError(
@@ -331,7 +334,7 @@ def _excite(part: Excite, step: str, wave: Waveform, rig: Rig) -> ExcitePlan:
             f"{peak * joint.valve.spool_gain:.3g} V; its stroke is {joint.valve.spool_stroke:g} V"
         )
     highest = wave.lines[-1] * rig.sample_rate / wave.period
-    allowed = rig.sample_rate / 2.0 / NYQUIST_SHARE
+    allowed = highest_line(rig.sample_rate)
     if highest >= allowed:
         raise InputError(
             f"{where}: excites {highest:g} Hz; at {rig.sample_rate:g} samples a second "

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 LineNumbers = NDArray[np.int64]
 MAX_CYCLES = 1000  # of a sine in one waveform; beyond, its frequency does not suit the clock
+LONGEST_PERIOD = 600.0  # [s] a waveform beyond this is a mistake, and so is a common period of two
+NYQUIST_SHARE = 4.0  # excited lines stay below Nyquist / 4
 FAINT = 1e-3  # of the largest line; a fainter one is no excitation
 SMOOTH = 8.0  # lines of a shape with edges end at this many times 1 / the edge's time
 
@@ -39,16 +41,32 @@ class Waveform:
         return float(0.5 * np.ptp(moved))
 
 
+def highest_line(sample_rate: float) -> float:
+    """Return the frequency [Hz] below which the lines of an excitation stay."""
+    return sample_rate / 2.0 / NYQUIST_SHARE
+
+
 def whole_period(frequency: float, sample_rate: float) -> tuple[int, int]:
     """Return the least (cycles, samples) with cycles / frequency = samples / sample_rate.
 
     A period of 3 Hz is 333.3 samples of 1 ms, but three periods are exactly 1000.
-    Raises ValueError where more than `MAX_CYCLES` cycles were needed.
+    Raises ValueError where more than `MAX_CYCLES` cycles were needed, where a cycle has two samples
+    or fewer, and where one is longer than `LONGEST_PERIOD`.
     """
+    if frequency * LONGEST_PERIOD < 1.0:
+        raise ValueError(
+            f"{frequency:g} Hz has a period of {1.0 / frequency:g} s; expected at most "
+            f"{LONGEST_PERIOD:g} s"
+        )
     ratio = Fraction(sample_rate).limit_denominator(10**9) / Fraction(frequency).limit_denominator(
         10**6
     )
     cycles, samples = ratio.denominator, ratio.numerator
+    if samples <= 2 * cycles:
+        raise ValueError(
+            f"excites {frequency:g} Hz; at {sample_rate:g} samples a second stay below "
+            f"{highest_line(sample_rate):g} Hz"
+        )
     if cycles > MAX_CYCLES:
         raise ValueError(
             f"{frequency:g} Hz never meets the sample clock of {sample_rate:g} Hz within "
@@ -112,7 +130,9 @@ def shaped(samples: Array, highest: float, sample_rate: float) -> Waveform:
 
 
 def seconds_to_samples(seconds: float, sample_rate: float, what: str) -> int:
-    """Return a time in samples; ValueError naming `what` where it is not a whole number."""
+    """Return a time in samples; ValueError naming `what` where it is no whole number."""
+    if seconds > LONGEST_PERIOD:
+        raise ValueError(f"{what} {seconds:g} s; expected at most {LONGEST_PERIOD:g} s")
     n = seconds * sample_rate
     if round(n) < 1 or abs(n - round(n)) > 1e-6 * max(n, 1.0):
         raise ValueError(f"{what} {seconds:g} s is {n:.6g} samples; expected a whole number")

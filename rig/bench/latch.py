@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from drivers.base import Driver
+from drivers.base import DeviceBusy, Driver
 from rig.model.parse import InputError
 from rig.model.parts import LOCALHOST, Wire
 from rig.model.rig import Rig
@@ -185,6 +185,14 @@ class BenchState:
             return None
         return owner if runstate.process_alive(owner.pid, owner.started) else None
 
+    def in_use(self, error: DeviceBusy) -> DeviceBusy:
+        """Return an error with the process of this computer that has the bench, if one is known."""
+        holder = self.holder()
+        if holder is None:
+            return DeviceBusy(f"{error}; no process of this computer is known to")
+        run = f", which writes {holder.run}" if holder.run else ""
+        return DeviceBusy(f"{error}: process {holder.pid}{run}; wait for its end or stop it")
+
 
 def _note_in_run(trip: LatchedTrip, entry: dict[str, Any]) -> None:
     """Append the reset to the events of the run that tripped, if its folder is still there."""
@@ -216,6 +224,8 @@ def reset_bench(rig: Rig, driver: Driver, reason: str) -> str:
         driver.connect()
         cause = driver.trip_cause()
         driver.reset()
+    except DeviceBusy as error:
+        raise bench.in_use(error) from error
     finally:
         driver.close()
     cleared = bench.clear(reason.strip(), cause)

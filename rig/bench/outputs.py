@@ -9,7 +9,15 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import Final, TypeVar
 
-from drivers.base import DeviceError, DeviceInfo, DeviceLost, Driver, LatchesTrip, OutputLaw
+from drivers.base import (
+    DeviceError,
+    DeviceInfo,
+    DeviceLost,
+    Driver,
+    LatchesTrip,
+    OutputLaw,
+    SampleBlock,
+)
 from rig.bench.settings import BENCH
 from rig.model.rig import Rig
 
@@ -28,6 +36,7 @@ class Outputs:
         self._connected = False
         self._silent = False
         self._told = False  # that zero is not confirmed: once, until it is
+        self._armed_from: int | None = None  # tick from which a law may put out a voltage
 
     @property
     def connected(self) -> bool:
@@ -53,6 +62,7 @@ class Outputs:
 
     def zero(self) -> bool:
         """Put the outputs to zero now; False (and logged once) if the device does not answer."""
+        self._armed_from = None
         if not self._connected:
             return False
         problem: Exception | None = None
@@ -94,6 +104,17 @@ class Outputs:
         self.zero()  # says first what matters most: whether they are at zero
         if isinstance(error, DeviceLost):
             log.error("%s", error)
+
+    def apply(self, laws: Sequence[OutputLaw], *, restart: bool) -> int:
+        """Set the laws of all joints at one tick, which it returns; outputs at zero if it fails."""
+        tick = self.safely(lambda: self.driver.apply(laws, restart=restart))
+        self._armed_from = tick if any(law.limit > 0.0 for law in laws) else None
+        return tick
+
+    def zeroed_elsewhere(self, block: SampleBlock) -> bool:
+        """Return whether a block shows that another client has zeroed what `apply` set."""
+        due = self._armed_from is not None and block.tick >= self._armed_from
+        return due and not block.armed and not block.tripped
 
     def bounded(self, laws: Sequence[OutputLaw]) -> list[OutputLaw]:
         """Return the laws with their limit no wider than each joint's; ValueError if unfit."""

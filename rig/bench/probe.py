@@ -49,11 +49,15 @@ def probe(driver: Driver, rig: Rig) -> list[Reading]:
     return probe_timed(driver, rig)[0]
 
 
-def probe_timed(driver: Driver, rig: Rig) -> tuple[list[Reading], Lateness | None]:
-    """Read one block as `probe` does; of a host-timed device more, for the lateness of samples."""
+def probe_timed(driver: Driver, rig: Rig) -> tuple[list[Reading], Lateness | None, str | None]:
+    """Read one block as `probe` does; of a host-timed device more, for the lateness of samples.
+
+    Also returns why the device has tripped, None if it has not.
+    """
     late: list[NDArray[np.float64]] = []
     try:
         driver.connect()
+        cause = driver.trip_cause()
         driver.start()
         block = driver.read_block()
         taken = block
@@ -74,7 +78,7 @@ def probe_timed(driver: Driver, rig: Rig) -> tuple[list[Reading], Lateness | Non
         replace(reading, mark=doubts.get(reading.channel, reading.mark))
         for reading in readings(block, rig)
     ]
-    return marked, timing
+    return marked, timing, cause
 
 
 def readings(block: SampleBlock, rig: Rig) -> list[Reading]:

@@ -132,13 +132,7 @@ class Bench:
         try:
             return self._outputs.connect()
         except DeviceBusy as error:
-            holder = self.state.holder()
-            if holder is None:
-                raise DeviceBusy(f"{error}; no process of this computer is known to") from error
-            run = f", which writes {holder.run}" if holder.run else ""
-            raise DeviceBusy(
-                f"{error}: process {holder.pid}{run}; wait for its end or stop it"
-            ) from error
+            raise self.state.in_use(error) from error
 
     def restart(self) -> None:
         """Start (again) the device's stream of blocks and its waveforms."""
@@ -269,7 +263,7 @@ class Bench:
         """
         bounded = self._outputs.bounded(laws)
         self._heed()
-        return self._outputs.safely(lambda: self._driver.apply(bounded, restart=restart))
+        return self._outputs.apply(bounded, restart=restart)
 
     # Samples
 
@@ -299,6 +293,9 @@ class Bench:
             self._note_alarms(violation)
         self.observers.block(block)
         self._display.show(block, late or 0.0, self.lost_samples, self._guard.roles)
+        if self._outputs.zeroed_elsewhere(block):
+            # The next law would move the joints again: whoever zeroed them does not expect it.
+            self._stop.request("stopped: another program has put the outputs to zero")
         if trip is not None:
             self._report(trip)
             raise trip

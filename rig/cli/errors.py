@@ -96,14 +96,17 @@ def _with_notes(error: BaseException, message: str) -> str:
 def guarded(work: Callable[[], int | None], *, debug: bool) -> int:
     """Run `work` and return the process's exit code; no traceback leaves without `debug`."""
     try:
-        return work() or OK
+        code = work() or OK
+        if code == INTERRUPTED:
+            _say("stopped")
+        return code
     except typer.Exit as error:
         return error.exit_code
     except typer.Abort:
         _say("stopped")
         return INTERRUPTED
     except TyperException as error:
-        _say(f"{error.format_message()}; see --help")
+        _say(f"{error.format_message().rstrip('.')}; see --help")
         return BAD_INPUT
     except BrokenPipeError:
         # The reader of our output went away (`| head`): not an error, and nothing more to say.

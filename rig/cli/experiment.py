@@ -13,7 +13,8 @@ from pathlib import Path
 from analysis.identify.identify import identify
 from analysis.identify.result import Identification
 from analysis.identify.result import to_json as identification_json
-from analysis.report.identification.report import write_report
+from analysis.report.identification.report import render_report
+from analysis.report.page import write
 from analysis.simulation.model import save_model
 from analysis.simulation.validate import RecordValidation, validate
 from analysis.simulation.validate import to_json as validation_json
@@ -119,8 +120,7 @@ def run_demo(out: Path, seed: int, repeats: int | None) -> None:
 
 def write_experiment(path: Path, done: Experiment, command: str, seed: int) -> None:
     """Write the report of a whole loop on a simulated bench."""
-    write_report(
-        path,
+    text = render_report(
         runs=done.runs,
         identification=done.identification,
         validation=done.validation,
@@ -129,3 +129,4 @@ def write_experiment(path: Path, done: Experiment, command: str, seed: int) -> N
         title="A simulated bench, identified and validated",
         provenance=provenance(command, {"simulated bench": seed}),
     )
+    write(path, text)

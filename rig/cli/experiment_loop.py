@@ -28,6 +28,7 @@ from rig.cli.twin_choice import load_twin, twin_source
 from rig.model.parse import InputError
 from rig.model.records import Run
 from rig.model.rig import Rig
+from rig.runs.files import replace_text
 from rig.runs.rigs import load_bench
 from rig.runs.store import load_run
 
@@ -129,7 +130,7 @@ class Loop:
         files = {kind: self.request.out / f"{kind}-{number}.yaml" for kind in ("next", "judge")}
         for path, key in ((files["next"], "protocol"), (files["judge"], "holdout")):
             text = yaml.safe_dump(dict(experiment[key]), sort_keys=False, allow_unicode=True)
-            path.write_text(text, encoding="utf-8")
+            replace_text(path, text)
         # A twin that lacks something does not know how far the bench will go: leave it room.
         scale = SMALLER if self.rounds[-1].result.verdict == UNEXPLAINED else 1.0
         for _ in range(TRIES):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
@@ -14,6 +14,8 @@ from rig.cli.simulate import channel_simulator
 if TYPE_CHECKING:
     from analysis.simulation.model import Model
 
+UNITS: Final = "fmu"
+CRATE: Final = "ro-crate"
 RunArgument = Annotated[Path, typer.Argument(help="A run folder.")]
 ModelOption = Annotated[
     Path | None,
@@ -46,21 +48,23 @@ def export(
     Example: bramah export runs/monday --format mat
     """
     from rig.model.parse import InputError
-    from rig.runs.exchange.export import export_run, library_missing
+    from rig.runs.exchange.export import WRITERS, export_run, library_missing
     from rig.runs.stream import read_run_head
 
     folder = run if run.name not in ("", "..") else run.resolve()
     wanted = folder.with_name(f"{folder.name}-{kind}") if out is None else out
-    if kind == "fmu":
+    if kind == UNITS:
         typer.echo(str(_write_units(run, wanted, model)))
         return
+    if kind not in (*WRITERS, CRATE):
+        raise InputError(f"--format {kind}: expected one of: {' '.join((*WRITERS, UNITS, CRATE))}")
     missing = library_missing(kind)
     if missing:
         raise WorkError(
             f"--format {kind} needs the package {missing}, which is not installed: "
             "pip install 'bramah[export]'"
         )
-    if kind == "ro-crate":
+    if kind == CRATE:
         if model is not None:
             raise InputError(
                 "--model does not go with --format ro-crate: it holds the run as it is"
@@ -84,6 +88,7 @@ def _write_units(run: Path, out: Path, path: Path | None) -> Path:
         compiler_missing,
         write_fmus,
     )
+    from rig.runs.files import new_folder
     from rig.runs.store import refuse_occupied
 
     if compiler_missing():
@@ -97,7 +102,8 @@ def _write_units(run: Path, out: Path, path: Path | None) -> Path:
     about = f"{model.rig.name}, identified: {source}"
     progress("Linux and Windows, FMI 2 and 3: about a minute the first time")
     try:
-        files = write_fmus(model, out, model.rig.name, about, TARGETS, progress)
+        with new_folder(out) as folder:
+            files = write_fmus(model, folder, model.rig.name, about, TARGETS, progress)
     except CompilationError as error:
         raise WorkError(str(error)) from error
     progress(" ".join(file.name for file in files))

@@ -6,11 +6,13 @@ import ast
 import importlib
 import logging
 import os
+import signal
 import sys
 from collections.abc import Sequence
 from importlib.util import find_spec
 from keyword import iskeyword
 from pathlib import Path
+from types import FrameType
 from typing import Annotated, Any, Final
 
 import typer
@@ -133,6 +135,10 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(name)
 
 
+def _as_ctrl_c(number: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
+
+
 def run(arguments: list[str] | None = None) -> None:
     """Run the command line and exit with the contract's code; `--debug` may stand anywhere."""
     words = list(sys.argv[1:] if arguments is None else arguments)
@@ -141,6 +147,8 @@ def run(arguments: list[str] | None = None) -> None:
     handler = logging.StreamHandler()
     handler.setFormatter(LogFormatter("%(levelname)s %(name)s: %(message)s"))
     logging.basicConfig(level=logging.DEBUG if debug else logging.WARNING, handlers=[handler])
+    # What a verb has begun it then takes away; a bench has handlers of its own while it is driven.
+    signal.signal(signal.SIGTERM, _as_ctrl_c)
     verb = next((word for word in _typed(words) if not word.startswith("-")), "")
 
     def work() -> int | None:

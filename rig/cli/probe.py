@@ -24,11 +24,18 @@ def probe(rig: RigOption, endpoint: EndpointOption = None, json: JsonOption = No
 
     Example: bramah probe --rig shinshu-2dof
     """
+    from drivers.base import DeviceBusy
     from rig.bench import probe as bench
+    from rig.bench.latch import BenchState
     from rig.cli.errors import WorkError
+    from rig.model.trips import reset_command
 
     described, driver = device_of(rig, endpoint)
-    readings, timing = bench.probe_timed(driver, described)
+    state = BenchState(described.wire)
+    try:
+        readings, timing, cause = bench.probe_timed(driver, described)
+    except DeviceBusy as error:
+        raise state.in_use(error) from error
     write_json(json, [asdict(reading) for reading in readings])
     if json != Path("-"):
         header = ("channel", "mean", "least", "most", "unit", "codes", "")
@@ -38,6 +45,13 @@ def probe(rig: RigOption, endpoint: EndpointOption = None, json: JsonOption = No
             f"host-timed: {timing.samples} samples taken {1e3 * timing.mean:.3g} ms late, standard "
             f"deviation {1e3 * timing.jitter:.3g} ms; in the rig file: wire: jitter: "
             f"{1e3 * timing.jitter:.3g} ms",
+            err=json == Path("-"),
+        )
+    latched = state.read_trip()
+    trips = [text for text in (latched and latched.trip, cause) if text]
+    if trips:
+        typer.echo(
+            f"tripped: {'; '.join(trips)}; clear it with `{reset_command(described)}`",
             err=json == Path("-"),
         )
     print_pressure(bench.pressurised(readings), aside=json == Path("-"))

@@ -30,6 +30,7 @@ from rig.cli.twin_choice import twin_source
 from rig.model.rig import Rig
 from rig.runs.recorder import Recorder
 from rig.runs.rigs import load_bench
+from rig.runs.store import refuse_occupied
 
 if TYPE_CHECKING:
     from rig.cli.tracking import Tracking
@@ -73,7 +74,8 @@ class _PhaseReport:
         recorder = self._bench.recorder
         at = 0.0 if recorder is None else recorder.elapsed
         left = self._bench.expected - at
-        more = f"  ({clock_text(left)} left)" if left > 0.0 else ""
+        # The time was estimated: what has ended early has none left.
+        more = f"  ({clock_text(left)} left)" if left > 0.0 and phase != "done" else ""
         self._say(f"{at:8.1f} s  {step:10s} {phase:8s}  {message}{more}")
         self._message = message
         self._bench.event("phase", self._bench.tick, step=step, phase=phase, message=message)
@@ -120,6 +122,7 @@ def run_protocol(job: ProtocolJob, say: Say) -> Path:
     """Run a protocol into its folder and return that; raises what ended it, outputs at zero."""
     rig, plan = _plan(job.protocol, job.rig, job.overrides)
     rig = reached_at(rig, job.endpoint)
+    refuse_occupied(job.out)
     desk_machine = StateMachine()
     desk_machine.to(EngineState.CHECKING, plan.protocol.name)
     say(plan_text(plan))

@@ -9,8 +9,9 @@ from datetime import datetime
 from pathlib import Path
 
 from analysis.identify.result import Identification
-from analysis.report.identification.report import Provenance, write_report
+from analysis.report.identification.report import Provenance, render_report
 from analysis.report.loop import write_loop_report
+from analysis.report.page import write
 from analysis.report.trace import write_trace_report
 from analysis.trace.loop_rounds import Round
 from analysis.trace.result import Trace
@@ -29,13 +30,13 @@ def provenance(
 
 def write_identification(path: Path, runs: Sequence[Run], result: Identification) -> None:
     """Write the report of an identification alone."""
-    write_report(
-        path,
+    text = render_report(
         runs=runs,
         identification=result,
         title=f"Identification of {result.model.rig.name}",
         provenance=provenance(),
     )
+    write(path, text)
 
 
 def write_trace(path: Path, holdout: Sequence[Run], result: Trace) -> None:

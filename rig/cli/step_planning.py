@@ -13,6 +13,7 @@ from protocols.files import library
 from protocols.files.schema import Protocol
 from protocols.files.writer import protocol_text
 from rig.model.parse import InputError
+from rig.runs.files import replace_text
 from rig.runs.rigs import load_bench
 
 Say = Callable[[str], None]
@@ -62,5 +63,5 @@ def plan_steps(request: PlanRequest, say: Say) -> Proof:
 
 def _write(path: Path, protocol: Protocol, comment: str, say: Say) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(protocol_text(protocol, comment), encoding="utf-8")
+    replace_text(path, protocol_text(protocol, comment))
     say(f"wrote {path}")

@@ -122,7 +122,7 @@ def _problems(
     for problem in _causes(error):
         if isinstance(problem["input"], Unresolved):
             continue
-        path, text = tuple(problem["loc"]), _problem_text(problem)
+        path, text = tuple(problem["loc"]), problem_text(problem)
         # A tagged union puts its tag into the path; drop parts that the file does not have.
         known: Path = ()
         for part in path:
@@ -158,7 +158,8 @@ def _causes(error: ValidationError) -> list[ErrorDetails]:
     ]
 
 
-def _problem_text(problem: ErrorDetails) -> str:
+def problem_text(problem: ErrorDetails) -> str:
+    """Return what pydantic found wrong with a value, in the words of a file's author."""
     text = problem["msg"].removeprefix("Value error, ")
     if problem["type"] == "extra_forbidden":
         return "unknown key; remove it or correct its spelling"
@@ -166,6 +167,18 @@ def _problem_text(problem: ErrorDetails) -> str:
         return "is missing here"
     if problem["type"] == "value_error":
         return text
+    context = problem.get("ctx", {})
+    if problem["type"] == "union_tag_invalid":
+        name = context["discriminator"].strip("'")
+        return f"{name}: expected one of {context['expected_tags']}, found {context['tag']!r}"
+    if problem["type"] == "union_tag_not_found":
+        text = f"a key {context['discriminator']}"
+    elif problem["type"] in ("too_short", "too_long"):
+        most = problem["type"] == "too_long"
+        number = context["max_length" if most else "min_length"]
+        text = f"{'at most' if most else 'at least'} {number} of them"
+    elif problem["type"] == "string_pattern_mismatch":
+        text = f"text that matches {context['pattern']}"
     text = text.removeprefix("Input should be ")
     wanted = next((wanted for kind, wanted in WANTED.items() if problem["type"] in kind), text)
     return f"expected {wanted}, found {shorten(repr(problem['input']), FOUND_AT_MOST)}"

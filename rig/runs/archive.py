@@ -122,12 +122,17 @@ def _attributes(
     }
 
 
-def create(path: Path, rig_name: str) -> h5py.File:
-    """Open a fresh archive for writing, its root attributes set.
+def create(path: Path, rig_name: str, values: int) -> h5py.File:
+    """Open a fresh archive for writing, its root attributes set, with space for `values` numbers.
+
+    Raises OSError where the disk has not got it: HDF5 may crash the process at a full disk.
 
     Without HDF5's file lock: nobody else knows the file until `put_in_place`, and a lock would pass
     to a child process started meanwhile and refuse the check that follows.
     """
+    needed = 8 * values
+    if shutil.disk_usage(path.parent).free < needed:
+        raise OSError(f"{needed / 1e6:.1f} MB are needed and not free")
     file = h5py.File(path, "w", libver=("earliest", "v110"), locking=False)
     file.attrs["format"] = FORMAT
     file.attrs["creator"] = "bramah"
@@ -151,13 +156,11 @@ def write_from_journal(journal: Journal, folder: Path, rig_name: str) -> Written
     sections = plan(journal, spans)
     columns, rate = journal.meta("columns"), float(journal.meta("sample_rate"))
     clocks = stream_clocks(read_events(folder))
-    needed = sum(section.ticks for section in sections) * len(columns) * 8
+    values = sum(section.ticks for section in sections) * len(columns)
     fresh = folder / f"{NAME}.tmp"
     lost = 0
     try:
-        if shutil.disk_usage(folder).free < needed:
-            raise OSError(f"{needed / 1e6:.1f} MB are needed and not free")
-        with create(fresh, rig_name) as file:
+        with create(fresh, rig_name, values) as file:
             for section in sections:
                 assembled = assemble(journal, spans, section)
                 attributes = _attributes(section, rate, assembled, clocks.get(section.stream))

@@ -1,8 +1,11 @@
-"""Small files that must be whole or absent: read with limits, replaced atomically, synced."""
+"""Files and folders that must be whole or absent: read with limits, replaced atomically, synced."""
 
 from __future__ import annotations
 
 import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from rig.model.parse import InputError
@@ -28,6 +31,8 @@ def read_text(path: Path, what: str, limit: int = MAX_TEXT) -> str:
             raise InputError(f"{path}: is no regular file; expected {what}")
         with path.open("rb") as stream:
             raw = stream.read(limit + 1)
+    except InputError:
+        raise
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; expected {what}") from None
     except (OSError, ValueError) as error:  # ValueError: a NUL in the path
@@ -64,6 +69,40 @@ def replace_text(path: Path, text: str) -> None:
             stream.flush()
             os.fsync(stream.fileno())
         fresh.replace(path)
+    except OSError as error:
+        error.filename = os.fspath(path)  # a person knows no other, and a failed write names none
+        raise
     finally:
         fresh.unlink(missing_ok=True)
     sync_to_disk(path.parent)
+
+
+@contextmanager
+def new_folder(out: Path) -> Iterator[Path]:
+    """Give a folder to be filled with files, which are in `out` when all of them are written.
+
+    `out` is absent or an empty folder, and stays so where this fails or the process is killed.
+    Raises OSError.
+    """
+    place = out.resolve()
+    empty = place.exists()
+    place.parent.mkdir(parents=True, exist_ok=True)
+    fresh = (place if empty else place.parent) / f".{place.name}.{os.getpid()}.tmp"
+    fresh.mkdir()
+    try:
+        yield fresh
+        files = list(fresh.iterdir())
+        for path in (*files, fresh):
+            sync_to_disk(path)
+        if empty:
+            for path in files:
+                path.replace(place / path.name)
+        else:
+            fresh.replace(place)
+    except OSError as error:
+        if error.errno is not None and error.filename is None:  # a failed write
+            error.filename = os.fspath(out)
+        raise
+    finally:
+        shutil.rmtree(fresh, ignore_errors=True)
+    sync_to_disk(place if empty else place.parent)

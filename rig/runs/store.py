@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from rig.model.parse import InputError, load_yaml
+from rig.model.parse import InputError, load_yaml, problem_text
 from rig.model.records import Record, RecordHead, Run
 from rig.model.rig import Rig
 from rig.runs.files import read_text, replace_text
@@ -141,7 +141,7 @@ def parse_header(text: str, source: str) -> Header:
     except ValidationError as error:
         problem = error.errors()[0]
         where = ".".join(str(part) for part in problem["loc"])
-        raise InputError(f"{source}: {where}: {problem['msg']}") from error
+        raise InputError(f"{source}: {where}: {problem_text(problem)}") from error
 
 
 def finished(folder: Path) -> tuple[Header, str]:

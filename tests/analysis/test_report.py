@@ -12,7 +12,8 @@ import pytest
 from analysis.identify.checks import Check
 from analysis.identify.identify import identify
 from analysis.identify.result import Identification
-from analysis.report.identification.report import Provenance, render_report, write_report
+from analysis.report.identification.report import Provenance, render_report
+from analysis.report.page import write
 from analysis.simulation.validate import RecordValidation, validate
 from rig.model.parse import InputError
 from rig.model.records import Run
@@ -302,8 +303,9 @@ def test_a_report_is_written_whole_and_one_that_cannot_be_says_where(
     tmp_path: Path, multisine_run: Run, found: Identification
 ) -> None:
     path = tmp_path / "r.html"
-    write_report(path, runs=[multisine_run], identification=found)
+    text = render_report(runs=[multisine_run], identification=found)
+    write(path, text)
     with pytest.raises(InputError, match=re.escape("cannot write the report")):
-        write_report(tmp_path / "no" / "r.html", runs=[multisine_run], identification=found)
+        write(tmp_path / "no" / "r.html", text)
     assert path.read_text(encoding="utf-8").lstrip().startswith("<!DOCTYPE html>")
     assert [p.name for p in tmp_path.iterdir()] == ["r.html"]

@@ -96,13 +96,15 @@ def test_a_damaged_model_file_says_where(model_file: Path, tmp_path: Path, chang
 def test_a_file_that_is_no_model_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "x.json"
     path.write_text(text)
-    with pytest.raises(InputError, match="not a model file"):
+    with pytest.raises(InputError, match=r"not a model file|expected a model file"):
         load_model(path)
 
 
 def test_a_missing_model_file_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="cannot read the model file"):
+    with pytest.raises(InputError, match="no such file; expected a model file"):
         load_model(tmp_path / "none.json")
+    with pytest.raises(InputError, match="is a folder; expected a model file"):
+        load_model(tmp_path)
 
 
 def test_a_model_of_another_rig_is_refused(found: Identification, both_run: Run, rig: Rig) -> None:

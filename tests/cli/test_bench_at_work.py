@@ -11,7 +11,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from drivers import make_driver, wire_at
 from rig.cli.main import app
+from rig.runs.rigs import load_rig, rig_text
 from rig.runs.store import load_run
 from tests.cli.bench import (
     ENDLESS,
@@ -52,9 +54,10 @@ def test_a_protocol_is_checked_run_listed_and_identified(short: Path, tmp_path: 
         done = bramah("run", short, "--rig", RIG, "--out", run, "--endpoint", endpoint)
         assert done.returncode == 0, done.stderr
         assert done.stdout.strip() == str(run)
+        assert done.stderr.rstrip().endswith("done      2 records")  # and no time left
         again = bramah("run", short, "--rig", RIG, "--out", run, "--endpoint", endpoint)
         assert again.returncode == 2
-        assert "not empty" in again.stderr
+        assert again.stderr.startswith(f"bramah: {run}: is not empty")  # before the twin's minutes
 
     listed = bramah("runs", tmp_path)
     assert "monday" in listed.stdout
@@ -89,6 +92,57 @@ def test_ctrl_c_twice_zeroes_the_outputs_and_keeps_the_records(
             _, errors = process.communicate(timeout=LONG)
             assert process.returncode == 130
             assert "Traceback" not in errors
+        assert outputs_are_zero(endpoint)
+    assert (run / "state").read_text().strip() == "aborted"
+    assert len(load_run(run).records) >= 2
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_before_the_bench_is_driven_ends_in_a_line(
+    endless: Path, tmp_path: Path, number: signal.Signals
+) -> None:
+    with simulated() as (endpoint, _):
+        line = ("run", endless, "--rig", RIG, "--out", tmp_path / "run", "--endpoint", endpoint)
+        with started(*line) as process:
+            wait_for("checking endless", process)
+            process.send_signal(number)
+            _, errors = process.communicate(timeout=LONG)
+    assert process.returncode == 130, errors
+    assert errors.strip().splitlines()[-1].startswith("bramah: stopped")
+
+
+def test_stop_from_another_terminal_ends_the_run_and_keeps_the_records(
+    endless: Path, tmp_path: Path
+) -> None:
+    run = tmp_path / "stopped"
+    with simulated() as (endpoint, _):
+        line = ("run", endless, "--rig", RIG, "--out", run, "--endpoint", endpoint)
+        with started(*line) as process:
+            wait_for("record 3 of", process)
+            stopped = bramah("stop", "--rig", RIG, "--endpoint", endpoint)
+            assert stopped.returncode == 0, stopped.stderr
+            assert stopped.stdout.startswith("outputs at zero, confirmed by the device")
+            assert str(run) in stopped.stderr
+            _, errors = process.communicate(timeout=LONG)
+        assert process.returncode == 130, errors
+        assert outputs_are_zero(endpoint)
+    assert (run / "state").read_text().strip() == "aborted"
+    assert len(load_run(run).records) >= 2
+
+
+def test_stop_from_another_computer_ends_the_run(endless: Path, tmp_path: Path) -> None:
+    run = tmp_path / "stopped"
+    rig = load_rig(RIG)
+    with simulated() as (endpoint, _):
+        line = ("run", endless, "--rig", RIG, "--out", run, "--endpoint", endpoint)
+        with started(*line) as process:
+            wait_for("record 3 of", process)
+            other = make_driver(wire_at(endpoint, rig.wire), rig)
+            other.zero_outputs()
+            other.close()
+            _, errors = process.communicate(timeout=LONG)
+        assert process.returncode == 130, errors
+        assert "another program has put the outputs to zero" in errors.splitlines()[-1]
         assert outputs_are_zero(endpoint)
     assert (run / "state").read_text().strip() == "aborted"
     assert len(load_run(run).records) >= 2
@@ -174,7 +228,8 @@ def test_a_passed_limit_trips_with_limit_value_and_joint(short: Path, tmp_path: 
             (("import", "manifest.yaml", "--out", "x"), 2, "manifest.yaml"),
             (("recover", "nowhere"), 2, "nowhere"),
             (("sim", "--rig", RIG, "--wire", "smoke-signals"), 2, "modbus-tcp"),
-            (("nonsense",), 2, "nonsense"),
+            (("nonsense",), 2, "No such command 'nonsense'; see --help"),
+            (("export", "nowhere", "--format", "xls"), 2, "csv mat parquet mf4 fmu ro-crate"),
         ]
     ),
 )
@@ -186,6 +241,17 @@ def test_bad_input_is_one_line_that_names_it(
     assert words in done.stderr
     assert done.stderr.count("\n") == 1, done.stderr
     assert not list(tmp_path.iterdir())
+
+
+def test_a_wire_that_no_driver_serves_is_named_with_its_rig(tmp_path: Path) -> None:
+    text, _ = rig_text(RIG)
+    for right, wrong in (("kind: modbus-tcp", "kind: modbus-tpc"), ("port: 5020", "port: 502000")):
+        path = tmp_path / "bench.yaml"
+        path.write_text(text.replace(right, wrong))
+        done = bramah("probe", "--rig", path)
+        assert done.returncode == 2
+        assert f"rig '{RIG}': wire: {wrong.split(':')[0]}: " in done.stderr
+        assert wrong.split()[1] in done.stderr
 
 
 def test_nobody_at_the_other_end_is_exit_code_4(tmp_path: Path) -> None:

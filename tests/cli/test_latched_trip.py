@@ -72,6 +72,11 @@ def test_after_a_trip_nothing_moves_until_a_reset_with_a_reason(
     assert "the device tripped earlier" in elsewhere.stderr
     note.write_text(kept)
 
+    asked = bramah("probe", "--rig", RIG, "--endpoint", faulty)
+    said = next(line for line in asked.stdout.splitlines() if line.startswith("tripped: "))
+    for word in ("cap_pressure_2", "the host's connection ended", f"--endpoint {faulty} --reason"):
+        assert word in said
+
     unsaid = bramah("reset", "--rig", RIG, "--endpoint", faulty)
     assert unsaid.returncode == 2
     assert "--reason TEXT is missing" in unsaid.stderr
@@ -95,12 +100,17 @@ def test_a_second_run_on_a_bench_in_use_names_the_run_that_has_it(tmp_path: Path
         line = ("run", endless, "--rig", RIG, "--endpoint", endpoint, "--out")
         with started(*line, run) as process:
             wait_for("record 1 of", process)
-            second = bramah(*line, tmp_path / "second")
-            assert second.returncode == 4, second.stderr
-            assert f"in use: another client has control of the device at {endpoint[13:]}" in (
-                second.stderr
-            )
-            assert f"process {process.pid}, which writes {run}" in second.stderr
+            at = ("--rig", RIG, "--endpoint", endpoint)
+            for second in (
+                bramah(*line, tmp_path / "second"),
+                bramah("probe", *at),
+                bramah("reset", *at, "--reason", "none"),
+            ):
+                assert second.returncode == 4, second.stderr
+                assert f"in use: another client has control of the device at {endpoint[13:]}" in (
+                    second.stderr
+                )
+                assert f"process {process.pid}, which writes {run}" in second.stderr
             assert process.poll() is None
             process.terminate()
             process.communicate(timeout=LONG)

@@ -131,6 +131,16 @@ def test_a_circle_of_includes_is_refused_with_its_chain(tmp_path: Path) -> None:
         load(tmp_path / "a.yaml")
 
 
+def test_an_included_file_that_is_missing_is_named_with_the_line_that_includes_it(
+    tmp_path: Path,
+) -> None:
+    outer = tmp_path / "outer.yaml"
+    outer.write_text(f"{HEAD}steps:\n  - include: inner.yaml\n", encoding="utf-8")
+    line = HEAD.count("\n") + 2
+    with pytest.raises(InputError, match=rf"outer\.yaml:{line}: include: .*inner\.yaml: cannot be"):
+        load(outer)
+
+
 def test_what_is_wrong_in_an_included_file_names_that_file(tmp_path: Path) -> None:
     (tmp_path / "inner.yaml").write_text(f"{HEAD}steps:\n  - pause: 5 V\n", encoding="utf-8")
     (tmp_path / "outer.yaml").write_text(

@@ -62,10 +62,19 @@ REFUSED = [
     ("joint: 1", "joint: 2", "mine.yaml:5: .*joint 2 stands more than once"),
     ("joint: 1", "joint: 3", "joint 3 does not exist"),
     ("joints: 2", "joints: 3", "joint 3 is neither locked nor excited"),
-    ("kind: sine", "kind: square", "mine.yaml:10: .*'multisine'"),
+    (
+        "kind: sine",
+        "kind: square",
+        "mine.yaml:10: .*kind: expected one of .*'sine'.* found 'square'",
+    ),
+    ("kind: sine, ", "", "mine.yaml:10: .*expected a key 'kind', found"),
     ("limit: 500 mV", "limit: 100 mV", "mine.yaml:3: .*push 0.4 V is above the limit 0.1 V"),
     ("repeats: 3", "repeats: 0", "mine.yaml:12: steps.0.repeats"),
-    ("name: step1", "name: Step 1", "mine.yaml:5: steps.0.name"),
+    (
+        "name: step1",
+        "name: Step 1",
+        "mine.yaml:5: steps.0.name: expected text that matches .*Step 1",
+    ),
 ]
 
 

@@ -105,11 +105,19 @@ def test_overrides_change_a_protocol_without_its_file(rig: Rig) -> None:
 REFUSED = [
     ("amplitude: 1 V", "amplitude: 5 V", "step 'step1', joint 2: the command reaches 5 V.*4 V"),
     ("frequency: 2 Hz", "frequency: 125 Hz", "excites 125 Hz.*below 125 Hz"),
+    ("frequency: 2 Hz", "frequency: 900 Hz", "joint 2: excites 900 Hz.*below 125 Hz"),
+    ("frequency: 2 Hz", "frequency: 1e-7 Hz", r"joint 2: 1e-07 Hz has a period of 1e\+07 s.*600 s"),
     ("frequency: 2 Hz", "frequency: 2.00013 Hz", "joint 2: 2.00013 Hz never meets"),
     ("piston: 5 mm", "piston: 38 mm", r"joint 1 .* 38 mm, outside its stroke of \+-37.5 mm"),
     ("centre: 3 mm", "centre: -37 mm", "centre -37 mm is outside limits.piston, -36 to 36 mm"),
     ("duration: 4 s", "duration: 4.2 s", "duration 4.2 s is 8.4 periods of 0.5 s"),
     ("duration: 4 s", "duration: 0.1 s", "expected a whole number"),
+    ("duration: 4 s", "duration: 1e12 s", r"duration 1e\+12 s; expected at most 86400 s"),
+    (
+        "kind: sine, frequency: 2 Hz",
+        "kind: ramp, rise: 1 s, hold: 1e9 s, rest: 0 s",
+        "hold 1e.09 s",
+    ),
     ("joints: 2\n", "joints: 2\nplace: {limit: 5 V}\n", "place.limit 5 V is above.*'boom'"),
 ]
 
@@ -141,6 +149,7 @@ def test_a_rig_of_another_size_is_refused(rig: Rig) -> None:
     ("overrides", "message"),
     [
         ({"repeats": 0}, "repeats is 0"),
+        ({"repeats": 10**9}, "repeats is 1000000000; expected 1 to 1000"),
         ({"amplitude_scale": -1.0}, "amplitude's scale is -1"),
         ({"seed": -3}, "seed is -3"),
         ({"steps": ("step9",)}, "no step 'step9'; it has: step1"),

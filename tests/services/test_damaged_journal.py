@@ -187,6 +187,15 @@ def test_a_journal_of_nothing_but_zeros_is_no_run_of_0_samples(run: Path) -> Non
     assert not (run / "records.h5").exists()
 
 
+def test_a_run_copied_without_its_samples_is_no_run_of_0_samples(run: Path) -> None:
+    for path in run.glob("journal.sqlite*"):
+        path.unlink()
+    before = sorted(path.name for path in run.iterdir())
+    with pytest.raises(RecordingFailed, match=r"neither journal\.sqlite nor records\.h5 is here"):
+        recover(run)
+    assert sorted(path.name for path in run.iterdir()) == before
+
+
 def test_blocks_longer_than_a_page_are_read_by_number(tmp_path: Path) -> None:
     run = tmp_path / "long"
     bench = Bench(RIG, FakeDriver(RIG, block_samples=100), Recorder(run, RIG), signals=False)

@@ -127,3 +127,24 @@ def test_half_an_export_does_not_stay_and_pass_for_a_whole_one(run: Path, tmp_pa
         export_run(run, tmp_path / "out", "csv", fails)
     assert not (tmp_path / "out").exists()
     assert export_run(run, tmp_path / "out", "csv")
+
+
+@pytest.mark.parametrize("made_before", [False, True])
+def test_the_files_of_an_export_appear_together(
+    run: Path, tmp_path: Path, *, made_before: bool
+) -> None:
+    # A process killed meanwhile removes nothing: until the last file is written none is there.
+    out = tmp_path / "out"
+    if made_before:
+        out.mkdir()
+    seen = []
+
+    def looks(record: Record) -> dict[str, np.ndarray]:
+        seen.append(sorted(path.name for path in out.glob("[!.]*")))
+        return {}
+
+    files = export_run(run, out, "csv", looks)
+    assert seen == [[]] * len(seen)
+    assert len(seen) > 1
+    assert sorted(out.iterdir()) == sorted(files)
+    assert list(tmp_path.glob(".*")) == []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,8 @@ from hypothesis import strategies as st
 from scipy.io import savemat
 
 from rig.model.parse import InputError
+from rig.model.trips import RecordingFailed
+from rig.runs.exchange.fixtures import write_run
 from rig.runs.exchange.importer import import_records
 from rig.runs.listing.index import indexed_runs
 from rig.runs.rigs import load_rig
@@ -378,3 +381,22 @@ def test_channels_of_a_locked_joint_may_stand_still(tmp_path: Path) -> None:
     still = np.zeros(4000)
     data = moving(spool_1=still, piston_1=still, oil_temperature=np.full(4000, 40.0))
     assert bring(tmp_path, ONE, a__csv=csv(data=data)).warnings == ()
+
+
+def test_a_full_disk_is_said_and_leaves_no_half_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usage = shutil.disk_usage(tmp_path)._replace(free=1000)
+    with monkeypatch.context() as full:
+        full.setattr(shutil, "disk_usage", lambda _: usage)
+        with pytest.raises(RecordingFailed, match=r"run: cannot be written: .*MB are needed"):
+            bring(tmp_path, ONE, a__csv=csv())
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["a.csv", "manifest.yaml"]
+    assert import_records(tmp_path / "manifest.yaml", tmp_path / "run").records == 1
+    # So is a run that is simulated.
+    with monkeypatch.context() as full:
+        full.setattr(shutil, "disk_usage", lambda _: usage)
+        with pytest.raises(RecordingFailed, match=r"again: cannot be written"):
+            write_run(tmp_path / "again", load_run(tmp_path / "run"))
+    assert not (tmp_path / "again").exists()
+    assert list(tmp_path.glob(".*")) == []

@@ -6,10 +6,8 @@ script, and the same arguments give the same bytes.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 from analysis.identify.result import Identification
@@ -17,13 +15,11 @@ from analysis.identify.stacked_rows import RecordRows, build_rows
 from analysis.report import format as fm
 from analysis.report import paper
 from analysis.report.identification import facts, figures, machine, tables
-from analysis.report.page import page, write
+from analysis.report.page import page
 from analysis.report.residuals import per_repeat, residuals
 from analysis.simulation.validate import RecordValidation
 from rig.model.records import Run
 from rig.model.rig import Rig
-
-log = logging.getLogger(__name__)
 
 TEMPLATE = "report.html"
 
@@ -49,29 +45,6 @@ class _RunLine:
     role: str
     state: str
     records: int
-
-
-def write_report(
-    path: Path,
-    *,
-    runs: Sequence[Run],
-    identification: Identification,
-    validation: Sequence[RecordValidation] = (),
-    validation_runs: Sequence[Run] = (),
-    truth: Mapping[str, float] | None = None,
-    title: str = "Identification report",
-    provenance: Provenance | None = None,
-) -> None:
-    """Write the report as one HTML file, replacing an old one only when the new one is complete.
-
-    See `render_report` for the arguments; raises InputError where the file cannot be written.
-    """
-    text = render_report(
-        runs=runs, identification=identification, validation=validation,
-        validation_runs=validation_runs, truth=truth, title=title, provenance=provenance,
-    )  # fmt: skip
-    write(path, text)
-    log.info("wrote %s, %d kB", path, len(text) // 1000)
 
 
 def render_report(

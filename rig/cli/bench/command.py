@@ -36,10 +36,11 @@ def bench(
     Example: bramah bench --minutes 0.5 --seeds 2
     """
     from rig.cli.bench.figures import as_json, measure, page, text
+    from rig.runs.files import replace_text
 
     figures = measure(minutes, seeds, only, progress, quick=quick)
     write_json(json, as_json(figures))
     if docs is not None:
-        docs.write_text(page(figures), encoding="utf-8")
+        replace_text(docs, page(figures))
     if json != Path("-"):
         typer.echo(text(figures))

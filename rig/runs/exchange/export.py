@@ -8,7 +8,6 @@ from __future__ import annotations
 import csv
 import importlib.util
 import json
-import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +21,7 @@ from rig.model.parse import InputError
 from rig.model.records import Record
 from rig.model.rig import Rig
 from rig.runs import store
+from rig.runs.files import new_folder
 from rig.runs.stream import RunHead, iterate_records, read_run_head
 
 Array = NDArray[np.float64]
@@ -65,19 +65,15 @@ def export_run(
         raise InputError(f"--format {kind}: expected one of: {' '.join(WRITERS)}")
     head = read_run_head(run)
     store.refuse_occupied(out)
-    out.mkdir(parents=True, exist_ok=True)
-    try:
-        files = []
+    names = []
+    with new_folder(out) as folder:  # half an export would pass for a whole one
         for record in iterate_records(run):
-            files.append(out / f"{record.name}.{kind}")
+            names.append(f"{record.name}.{kind}")
             added = {} if more is None else more(record)
-            WRITERS[kind](files[-1], sheet(head.rig, record, added))
+            WRITERS[kind](folder / names[-1], sheet(head.rig, record, added))
         if kind in ("csv", "mat"):
-            files += _way_back(run, out, head, kind)
-    except BaseException:
-        shutil.rmtree(out)  # it was empty: half an export would pass for a whole one
-        raise
-    return files
+            names += _way_back(run, folder, head, kind)
+    return [out / name for name in names]
 
 
 def sheet(rig: Rig, record: Record, more: Mapping[str, Array]) -> Sheet:
@@ -156,8 +152,8 @@ WRITERS: Final[Mapping[str, Callable[[Path, Sheet], None]]] = {
 }
 
 
-def _way_back(run: Path, out: Path, head: RunHead, kind: str) -> list[Path]:
-    """Write the rig and the manifest that `import` takes."""
+def _way_back(run: Path, out: Path, head: RunHead, kind: str) -> list[str]:
+    """Write the rig and the manifest that `import` takes; returns their names."""
     header = store.read_header(run)
     resolved = {
         "format": header.format,
@@ -175,11 +171,11 @@ def _way_back(run: Path, out: Path, head: RunHead, kind: str) -> list[Path]:
         records.append(entry)
     manifest = {"rig": RIG_FILE, "records": records}
     written = {
-        out / RIG_FILE: _RIG_NOTE + yaml.safe_dump(resolved, sort_keys=False),
-        out / MANIFEST: _MANIFEST_NOTE.format(name=MANIFEST) + yaml.safe_dump(
+        RIG_FILE: _RIG_NOTE + yaml.safe_dump(resolved, sort_keys=False),
+        MANIFEST: _MANIFEST_NOTE.format(name=MANIFEST) + yaml.safe_dump(
             manifest, sort_keys=False, default_flow_style=None, width=100
         ),
     }  # fmt: skip
-    for path, text in written.items():
-        path.write_text(text, encoding="utf-8")
+    for name, text in written.items():
+        (out / name).write_text(text, encoding="utf-8")
     return list(written)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from contextlib import suppress
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,6 +26,7 @@ from rig.runs.exchange.manifest import (
     load_manifest,
 )
 from rig.runs.exchange.settings import EXCHANGE
+from rig.runs.files import new_folder
 from rig.runs.rigs import load_rig
 from rig.runs.runstate import DONE, EventLog, release_ownership, write_state
 
@@ -242,27 +243,25 @@ def _write(
     source: _Source, records: list[_Imported], folder: Path, warnings: tuple[str, ...]
 ) -> None:
     about = f"imported from {source.path.name}"
-    store.create_run(folder, source.rig, source=about)
     try:
-        events = EventLog(folder)
-        events.append("import", None, {"manifest": str(source.path), "warnings": warnings})
-        _write_archive(source, records, folder)
-        for r in records:
-            events.append("record complete", None, {"record": r.entry.meta().name})
-        write_state(folder, DONE)
-        events.append("end", None, {"state": DONE, "message": "", "records": len(records)})
-        events.close()
+        with new_folder(folder) as fresh:
+            store.create_run(fresh, source.rig, source=about)
+            with closing(EventLog(fresh)) as events:
+                about_import = {"manifest": str(source.path), "warnings": warnings}
+                events.append("import", None, about_import)
+                _write_archive(source, records, fresh)
+                for r in records:
+                    events.append("record complete", None, {"record": r.entry.meta().name})
+                write_state(fresh, DONE)
+                events.append("end", None, {"state": DONE, "message": "", "records": len(records)})
+            release_ownership(fresh)
     except (OSError, RuntimeError) as error:  # h5py reports a failed flush as RuntimeError
         raise RecordingFailed(f"{folder}: cannot be written: {error}") from error
-    finally:
-        with suppress(OSError):
-            release_ownership(folder)
 
 
 def _write_archive(source: _Source, records: list[_Imported], folder: Path) -> None:
-
-    fresh = folder / f"{archive.NAME}.tmp"
-    with archive.create(fresh, source.rig.name) as file:
+    values = sum(c.size for r in records for c in r.channels.values())
+    with archive.create(folder / archive.NAME, source.rig.name, values) as file:
         for order, r in enumerate(records):
             meta = r.entry.meta()
             about = archive.record_attributes(
@@ -285,4 +284,3 @@ def _write_archive(source: _Source, records: list[_Imported], folder: Path) -> N
                 "file": r.entry.file,
             }
             archive.write_group(file, meta.name, r.channels, {**about, **more}, source.rig.unit_of)
-    archive.put_in_place(fresh, folder / archive.NAME)

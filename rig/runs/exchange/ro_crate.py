@@ -16,6 +16,7 @@ from typing import Any, Final
 
 from rig.model.parse import InputError
 from rig.runs import store
+from rig.runs.files import new_folder
 from rig.runs.runstate import ABORTED, DONE, EVENTS, HEADER, read_events
 from rig.runs.store import ARCHIVE, Header
 from rig.runs.stream import RunHead, read_run_head
@@ -55,14 +56,14 @@ def export_crate(run: Path, out: Path, licence: str = "") -> list[Path]:
     store.refuse_occupied(out)
     names = [name for name in _FILES if (run / name).is_file()]
     try:
-        out.mkdir(parents=True, exist_ok=True)
-        files = [Path(shutil.copyfile(run / name, out / name)) for name in names]
-        text = json.dumps(describe(out, head, header, names, licence), indent=2) + "\n"
-        (out / METADATA).write_text(text, encoding="utf-8")
+        with new_folder(out) as folder:
+            for name in names:
+                shutil.copyfile(run / name, folder / name)
+            text = json.dumps(describe(folder, head, header, names, licence), indent=2) + "\n"
+            (folder / METADATA).write_text(text, encoding="utf-8")
     except OSError as error:
-        shutil.rmtree(out, ignore_errors=True)
         raise InputError(f"{out}: the crate cannot be written: {error.strerror}") from error
-    return [*files, out / METADATA]
+    return [out / name for name in (*names, METADATA)]
 
 
 def describe(

@@ -128,7 +128,8 @@ def run_folders(folder: str | Path) -> list[Path]:
     if not root.is_dir():
         raise InputError(f"{root}: no such folder")
     try:
-        return [root] if is_run(root) else [c for c in root.iterdir() if is_run(c)]
+        # A hidden folder is an export whose process was killed.
+        return [root] if is_run(root) else [c for c in root.glob("[!.]*") if is_run(c)]
     except OSError as error:
         raise InputError(f"{root}: cannot be read: {error.strerror}") from error
 

@@ -70,11 +70,14 @@ def channel_page(view: PlotView, width: int, height: int) -> list[Row]:
         ("warns beyond", how.short(limit(channel.warn_low)), how.short(limit(channel.warn_high))),
     ]
     text = [
-        fit(row((f"{what}  ", DIM), f"{low or '–'} … {high or '–'} {how.unit}"), room)
-        for what, low, high in words
+        fit(row((f"{what}  ", DIM), _band(low, high, how.unit)), room) for what, low, high in words
     ]
     plot = curve(view, name, name, room, height - len(text), axis=True)
     return hstack([(listed, LIST), ([*plot, *text], room)], height)
+
+
+def _band(low: str, high: str, unit: str) -> str:
+    return f"{low or '–'} … {high or '–'} {unit}" if low or high else "no limit"
 
 
 def diagnostics_page(view: PlotView, width: int, height: int) -> list[Row]:

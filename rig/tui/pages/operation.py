@@ -123,7 +123,7 @@ def protocol_page(view: PlotView, width: int, height: int) -> list[Row]:
     steps: list[Row] = []
     for k, line in enumerate(view.newest.plan, 1):
         mark, style = ("✓", DIM) if k < at else ("▸", STRONG) if k == at else (" ", "")
-        state = " now" if k == at and not view.newest.over else ""
+        state = "  now" if k == at and not view.newest.over else ""
         steps.append(
             row((f" {mark}{k:3d} {line.name:<14} ", style),
                 (f"{clock_text(line.seconds):>7}  ", DIM), (line.title, style), (state, NORMAL))
