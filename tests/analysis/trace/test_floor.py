@@ -105,11 +105,11 @@ def test_a_pump_that_does_not_follow_the_excitation_is_noted_with_its_frequency(
 
     def shaken(run: Run) -> Run:
         records = []
-        for record in run.records:
-            time = np.arange(record.samples) / record.sample_rate
+        for taken in run.records:
+            time = np.arange(taken.samples) / taken.sample_rate
             pulse = 3e4 * np.sin(2 * np.pi * 7.3 * time + rng.uniform(0, 2 * np.pi))
-            cap = record.channels["cap_pressure_2"] + pulse
-            records.append(replace(record, channels={**record.channels, "cap_pressure_2": cap}))
+            cap = taken.channels["cap_pressure_2"] + pulse
+            records.append(replace(taken, channels={**taken.channels, "cap_pressure_2": cap}))
         return replace(run, records=tuple(records))
 
     terms = tuple(map(Used, baseline_of(rig)))
