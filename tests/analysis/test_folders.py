@@ -29,8 +29,9 @@ def test_samples_lost_on_the_wire_are_masked_in_both_ways(
     shares: list[float] = []
     streamed = identify_folders([str(folder)], progress=shares.append)
     assert_same(streamed, identify([holed], estimator=PLAIN))
-    n = len(holed.records)  # how far it is, record by record
-    assert shares == [(k + 1) / n for k in range(n)]
+    assert len(shares) >= 4  # how far it is, a few records at a time
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
 
 
 def test_a_lock_that_gives_is_decided_for_all_repeats_in_both_ways(

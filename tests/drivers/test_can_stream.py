@@ -399,8 +399,8 @@ def test_a_wrong_file_ends_a_verb_with_one_line_and_code_2(
     assert ended.value.code == 2
     said = capsys.readouterr().err.strip().splitlines()
     assert said == [
-        f"bramah: {file}: signal piston_2 is missing; the bench needs it (`bramah dbc` writes the "
-        "whole file of a rig)"
+        f"bramah: rig 'shinshu-2dof': {file}: signal piston_2 is missing; the bench needs it "
+        "(`bramah dbc` writes the whole file of a rig)"
     ]
 
 

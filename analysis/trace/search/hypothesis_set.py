@@ -375,11 +375,17 @@ class HypothesisSet:
 
 
 def _alike(effect: Effect, used: Used) -> bool:
-    """Return whether a named effect is easily taken for a used one, at the same place."""
+    """Return whether a named effect at the same joint is easily taken for a used one."""
     own = used.term
     assert isinstance(own, Effect)
-    alike = effect.mechanism == own.mechanism or effect.name in own.confounders
-    return alike and effect.where == own.where and not effect.free
+    same = effect.mechanism == own.mechanism and effect.where == own.where
+    confused = effect.name in own.confounders and _joint(effect) == _joint(own)
+    return (same or confused) and not effect.free
+
+
+def _joint(effect: Effect) -> list[str]:
+    """Return the joint of an effect's place, or the bench."""
+    return effect.where.split()[:2]
 
 
 def effect_of(name: str, where: str) -> Effect:
