@@ -336,10 +336,36 @@ def intervals_are_as_wide_as_estimates_scatter(b: Benches) -> None:
 
 
 Story = Callable[[Benches], None]
+
+
+def a_level_taken_for_friction_by_pressure_is_put_right_beside_a_leak(b: Benches) -> None:
+    runs = b.runs(Fc=60.0, c_internal=LEAK)
+    s = b.searched(runs, "coulomb_friction", "pressure_dependent_friction", "internal_leakage")
+    again = s.hypotheses.reread(s.set_of("pressure_dependent_friction", "internal_leakage"))
+    assert {name for name, _ in again.keys} == {"coulomb_friction", "internal_leakage"}
+    assert again.fit.beta["Fc2"] == pytest.approx(60.0, rel=0.1)
+
+
+def two_levels_give_way_to_one_level_and_an_offset(b: Benches) -> None:
+    """Breakaway, level and offset: two levels with a breakaway need more and leave as much."""
+    runs = b.runs(Fc=40.0, Fs=40.0, T_offset=2.0)
+    four = ("coulomb_friction", "stribeck_friction", "asymmetric_friction", "torque_offset")
+    s = b.searched(runs, *four)
+    wrong = s.set_of("asymmetric_friction", "stribeck_friction")
+    s.set_of("stribeck_friction", "torque_offset")
+    again = s.hypotheses.rerouted(wrong)
+    right = {"coulomb_friction", "stribeck_friction", "torque_offset"}
+    assert {name for name, _ in again.keys} == right
+    assert again.size[1] < wrong.size[1]
+    assert again.fit.beta["T_offset_2"] == pytest.approx(2.0, rel=0.1)
+
+
 STORIES: Final[tuple[tuple[Story, tuple[str, ...]], ...]] = (
     (noise_names_nothing, ("p always 0", "no family")),
     (noise_with_a_memory_names_nothing_either, ("flips by sample",)),
     (a_leak_is_named_alone_and_for_certain, ()),
+    (a_level_taken_for_friction_by_pressure_is_put_right_beside_a_leak, ("look-alikes",)),
+    (two_levels_give_way_to_one_level_and_an_offset, ("other pairs",)),
     (a_leak_gone_on_the_held_out_day_is_refused, ("removes on held-out",)),
     (what_training_alone_shows_is_not_explained, ("fit records judge",)),
     (a_training_record_cannot_judge, ("same records pass",)),
