@@ -165,7 +165,7 @@ class HypothesisSet:
         candidates = self.candidates = self._candidate_columns(self.train_data, self.columns)
         r = self.train_data.mean
         r = r - candidates.basis @ (candidates.basis.T @ r)
-        return self.reread(self._found(candidates, r))
+        return self.exchanged(self._found(candidates, r))
 
     def _found(self, candidates: linear_fit.CandidateColumns, r: Array) -> Hypothesis:
         """Return the set found on the candidates for what the baseline leaves (M,)."""
@@ -177,7 +177,7 @@ class HypothesisSet:
         if self.formed(now):
             others = [o for o in pairs if not now.keys & o.keys]
             far = [o for o in others if self.excess(o, now) < -SEARCH.far_less]
-            return self.rerouted(self.completed(self.prune(self.best([now, *far]))))
+            return self.from_other_pairs(self.completed(self.prune(self.best([now, *far]))))
         now = self.prune(self.best([self.empty, *singles, *pairs]))
         while not within(now.excess_energy, self.limits) and len(now.effects) < SEARCH.largest_set:
             grown = self.prune(self.best([now, *self.extensions(now)]))
@@ -187,7 +187,7 @@ class HypothesisSet:
             if self.formed(now):
                 now = self.completed(now)
                 break
-        return self.rerouted(now)
+        return self.from_other_pairs(now)
 
     def formed(self, hypothesis: Hypothesis) -> bool:
         """Return whether the rest may be the difference of form between effect and catalogue."""
@@ -271,7 +271,7 @@ class HypothesisSet:
                 out.setdefault(variant.key, (*now.effects, variant.used))
         return self.tried(list(out.values()))
 
-    def rerouted(self, now: Hypothesis) -> Hypothesis:
+    def from_other_pairs(self, now: Hypothesis) -> Hypothesis:
         """Return the set, or a better one that extends a pair with fewer free numbers.
 
         Friction of two levels does most of what an offset and one level do, so that the right pair
@@ -290,7 +290,7 @@ class HypothesisSet:
         grown = [o for start in starts for o in self.extensions(start)]
         return self.prune(self.best([now, *grown]))
 
-    def reread(self, now: Hypothesis) -> Hypothesis:
+    def exchanged(self, now: Hypothesis) -> Hypothesis:
         """Return the set, or a better one with another effect in place of one that looks like it.
 
         What was chosen before the last effect joined may be the wrong one beside it.
@@ -306,7 +306,7 @@ class HypothesisSet:
         if not sets:
             return now
         other = self.prune(self.best([now, *self.tried(sets)]))
-        return now if other.keys == now.keys else self.reread(other)
+        return now if other.keys == now.keys else self.exchanged(other)
 
     def _beside(
         self, now: Hypothesis, equations: Collection[str] = (), free: bool = False

@@ -341,7 +341,7 @@ Story = Callable[[Benches], None]
 def a_level_taken_for_friction_by_pressure_is_put_right_beside_a_leak(b: Benches) -> None:
     runs = b.runs(Fc=60.0, c_internal=LEAK)
     s = b.searched(runs, "coulomb_friction", "pressure_dependent_friction", "internal_leakage")
-    again = s.hypotheses.reread(s.set_of("pressure_dependent_friction", "internal_leakage"))
+    again = s.hypotheses.exchanged(s.set_of("pressure_dependent_friction", "internal_leakage"))
     assert {name for name, _ in again.keys} == {"coulomb_friction", "internal_leakage"}
     assert again.fit.beta["Fc2"] == pytest.approx(60.0, rel=0.1)
 
@@ -353,7 +353,7 @@ def two_levels_give_way_to_one_level_and_an_offset(b: Benches) -> None:
     s = b.searched(runs, *four)
     wrong = s.set_of("asymmetric_friction", "stribeck_friction")
     s.set_of("stribeck_friction", "torque_offset")
-    again = s.hypotheses.rerouted(wrong)
+    again = s.hypotheses.from_other_pairs(wrong)
     right = {"coulomb_friction", "stribeck_friction", "torque_offset"}
     assert {name for name, _ in again.keys} == right
     assert again.size[1] < wrong.size[1]
