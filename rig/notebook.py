@@ -31,7 +31,7 @@ from protocols.steps.base import StepKind
 from rig.cli.proofs import PlanProof, proved
 from rig.cli.protocol_run import ProtocolJob, run_protocol
 from rig.cli.simulated_bench import simulated_bench
-from rig.model.parse import InputError, problem_text
+from rig.model.parse import InputError, first_problem
 from rig.model.records import Record, Run
 from rig.runs.files import replace_text
 from rig.runs.rigs import load_bench, load_rig
@@ -161,9 +161,7 @@ def changed(protocol: Protocol, step: str, changes: Mapping[str, Any]) -> Protoc
         try:
             return type(part).model_validate(data)
         except ValidationError as error:
-            problem = error.errors()[0]
-            where = ".".join(map(str, problem["loc"]))
-            raise InputError(f"step {step!r}: {where}: {problem_text(problem)}") from error
+            raise InputError(f"step {step!r}: {first_problem(error)}") from error
 
     return protocol.model_copy(update={"steps": mapped(protocol.steps, change)})
 

@@ -19,7 +19,7 @@ from pydantic import ValidationError
 from analysis.effects.base import shapes_of
 from analysis.terms import make
 from analysis.terms.base import Used
-from rig.model.parse import InputError, problem_text
+from rig.model.parse import InputError, first_problem
 from rig.model.rig import Rig
 from rig.runs.files import read_text, replace_text
 
@@ -159,9 +159,7 @@ def load_model(path: str | Path) -> Model:
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise InputError(f"{path}: rig.{where}: {problem_text(first)}") from error
+        raise InputError(f"{path}: rig.{first_problem(error)}") from error
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path} is damaged: {type(error).__name__} at {error}") from error
 

@@ -158,6 +158,12 @@ def _causes(error: ValidationError) -> list[ErrorDetails]:
     ]
 
 
+def first_problem(error: ValidationError) -> str:
+    """Return the key of the first thing that pydantic found wrong, and what it is."""
+    problem = error.errors()[0]
+    return f"{'.'.join(map(str, problem['loc']))}: {problem_text(problem)}"
+
+
 def problem_text(problem: ErrorDetails) -> str:
     """Return what pydantic found wrong with a value, in the words of a file's author."""
     text = problem["msg"].removeprefix("Value error, ")

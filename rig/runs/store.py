@@ -5,17 +5,19 @@ from __future__ import annotations
 import hashlib
 import json
 import socket
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from rig.model.parse import InputError, load_yaml, problem_text
+from rig.model.parse import InputError, first_problem, load_yaml
 from rig.model.records import Record, RecordHead, Run
 from rig.model.rig import Rig
-from rig.runs.files import read_text, replace_text
+from rig.model.trips import RecordingFailed
+from rig.runs.files import new_folder, read_text, replace_text
 from rig.runs.runstate import (
     DONE,
     HEADER,
@@ -25,6 +27,7 @@ from rig.runs.runstate import (
     now,
     read_owner,
     read_state,
+    release_ownership,
     take_ownership,
     user_name,
     write_state,
@@ -114,6 +117,23 @@ def create_run(
     return folder
 
 
+@contextmanager
+def whole_run(out: Path, rig: Rig, source: str) -> Iterator[Path]:
+    """Give the folder of a run that no bench records, in `out` when it is filled and finished.
+
+    It is whole or not there. Raises InputError if `out` is occupied, RecordingFailed if the disk
+    does not take it.
+    """
+    refuse_occupied(out)
+    try:
+        with new_folder(out) as folder:
+            create_run(folder, rig, source=source)
+            yield folder
+            release_ownership(folder)
+    except (OSError, RuntimeError) as error:  # h5py reports a failed flush as RuntimeError
+        raise RecordingFailed(f"{out}: cannot be written: {error}") from error
+
+
 def is_run(folder: Path) -> bool:
     """Whether a folder holds a run."""
     return (folder / HEADER).is_file()
@@ -139,9 +159,7 @@ def parse_header(text: str, source: str) -> Header:
     try:
         return Header.model_validate(data)
     except ValidationError as error:
-        problem = error.errors()[0]
-        where = ".".join(str(part) for part in problem["loc"])
-        raise InputError(f"{source}: {where}: {problem_text(problem)}") from error
+        raise InputError(f"{source}: {first_problem(error)}") from error
 
 
 def finished(folder: Path) -> tuple[Header, str]:

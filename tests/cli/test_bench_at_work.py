@@ -6,6 +6,9 @@ import json
 import os
 import signal
 import socket
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -42,6 +45,21 @@ def endless(tmp_path: Path) -> Path:
     path = tmp_path / "endless.yaml"
     path.write_text(ENDLESS)
     return path
+
+
+@contextmanager
+def third_record(endless: Path, run: Path, endpoint: str) -> Iterator[subprocess.Popen[str]]:
+    """A run without an end, in its third record."""
+    line = ("run", endless, "--rig", RIG, "--out", run, "--endpoint", endpoint)
+    with started(*line) as process:
+        wait_for("record 3 of", process)
+        yield process
+
+
+def aborted_with_its_records(run: Path) -> None:
+    """A stopped run says so and has what it recorded."""
+    assert (run / "state").read_text().strip() == "aborted"
+    assert len(load_run(run).records) >= 2
 
 
 def test_a_protocol_is_checked_run_listed_and_identified(short: Path, tmp_path: Path) -> None:
@@ -84,17 +102,14 @@ def test_ctrl_c_twice_zeroes_the_outputs_and_keeps_the_records(
 ) -> None:
     run = tmp_path / "stopped"
     with simulated() as (endpoint, _):
-        line = ("run", endless, "--rig", RIG, "--out", run, "--endpoint", endpoint)
-        with started(*line) as process:
-            wait_for("record 3 of", process)
+        with third_record(endless, run, endpoint) as process:
             process.send_signal(signal.SIGINT)
             process.send_signal(signal.SIGINT)
             _, errors = process.communicate(timeout=LONG)
             assert process.returncode == 130
             assert "Traceback" not in errors
         assert outputs_are_zero(endpoint)
-    assert (run / "state").read_text().strip() == "aborted"
-    assert len(load_run(run).records) >= 2
+    aborted_with_its_records(run)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -116,9 +131,7 @@ def test_stop_from_another_terminal_ends_the_run_and_keeps_the_records(
 ) -> None:
     run = tmp_path / "stopped"
     with simulated() as (endpoint, _):
-        line = ("run", endless, "--rig", RIG, "--out", run, "--endpoint", endpoint)
-        with started(*line) as process:
-            wait_for("record 3 of", process)
+        with third_record(endless, run, endpoint) as process:
             stopped = bramah("stop", "--rig", RIG, "--endpoint", endpoint)
             assert stopped.returncode == 0, stopped.stderr
             assert stopped.stdout.startswith("outputs at zero, confirmed by the device")
@@ -126,17 +139,14 @@ def test_stop_from_another_terminal_ends_the_run_and_keeps_the_records(
             _, errors = process.communicate(timeout=LONG)
         assert process.returncode == 130, errors
         assert outputs_are_zero(endpoint)
-    assert (run / "state").read_text().strip() == "aborted"
-    assert len(load_run(run).records) >= 2
+    aborted_with_its_records(run)
 
 
 def test_stop_from_another_computer_ends_the_run(endless: Path, tmp_path: Path) -> None:
     run = tmp_path / "stopped"
     rig = load_rig(RIG)
     with simulated() as (endpoint, _):
-        line = ("run", endless, "--rig", RIG, "--out", run, "--endpoint", endpoint)
-        with started(*line) as process:
-            wait_for("record 3 of", process)
+        with third_record(endless, run, endpoint) as process:
             other = make_driver(wire_at(endpoint, rig.wire), rig)
             other.zero_outputs()
             other.close()
@@ -144,16 +154,13 @@ def test_stop_from_another_computer_ends_the_run(endless: Path, tmp_path: Path) 
         assert process.returncode == 130, errors
         assert "another program has put the outputs to zero" in errors.splitlines()[-1]
         assert outputs_are_zero(endpoint)
-    assert (run / "state").read_text().strip() == "aborted"
-    assert len(load_run(run).records) >= 2
+    aborted_with_its_records(run)
 
 
 def test_a_killed_run_leaves_valves_closed_and_is_recovered(endless: Path, tmp_path: Path) -> None:
     run = tmp_path / "killed"
     with simulated() as (endpoint, _):
-        line = ("run", endless, "--rig", RIG, "--out", run, "--endpoint", endpoint)
-        with started(*line) as process:
-            wait_for("record 3 of", process)
+        with third_record(endless, run, endpoint) as process:
             process.kill()
             process.wait(LONG)
         assert outputs_are_zero(endpoint)
@@ -181,9 +188,7 @@ def test_a_bench_that_dies_mid_run_is_reported_and_its_data_kept(
 ) -> None:
     run = tmp_path / "lost"
     with simulated() as (endpoint, bench):
-        line = ("run", endless, "--rig", RIG, "--out", run, "--endpoint", endpoint)
-        with started(*line) as process:
-            wait_for("record 3 of", process)
+        with third_record(endless, run, endpoint) as process:
             os.kill(bench.pid, signal.SIGKILL)
             _, errors = process.communicate(timeout=LONG)
         assert process.returncode == 4, errors

@@ -7,7 +7,6 @@ coefficient everywhere, whichever repeats are taken, and better than anything el
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
@@ -72,11 +71,12 @@ def judge(
     out = []
     for used in winner.effects:
         assert isinstance(used.term, Effect)
-        key = (used.term.name, used.term.where)
         rest = _without(hypotheses, winner, used)
-        rivals = _rivals(hypotheses, winner, key, holdout_data, after)
-        touched = _touched(hypotheses, winner, rest)
-        removed = _removed(holdout_data, rest, winner, after)
+        without = held_left(holdout_data, rest.fit)
+        changes = _changes(winner, rest)
+        near = _Near(holdout_data, changes, after, without)
+        rivals = _rivals(hypotheses, winner, used, rest, holdout_data, near)
+        removed = _removed(holdout_data, changes, without, after)
         worse = _worse(hypotheses, winner, rest)
         p = inference.p_value(rest.fit.energy - winner.fit.energy, null)
         errors = inference.spread(train_data, winner.fit, used, values)
@@ -102,15 +102,15 @@ def judge(
                 _place(used.term),
                 _parameters(train_data, used, errors, shift),
                 p,
-                0.0 if math.isnan(removed) else removed,
+                removed,
                 (*twins, *rivals),
                 gates,
                 used.term.variable,
                 mechanism=used.term.mechanism,
                 free=used.term.free,
                 curves=curves_of(train_data, winner.fit, used),
-                left_without=_rms(holdout_data, held_left(holdout_data, rest.fit), touched),
-                left_with=_rms(holdout_data, after, touched),
+                left_without=_rms(holdout_data, without, changes),
+                left_with=_rms(holdout_data, after, changes),
                 at=used.term.where,
             )
         )
@@ -246,11 +246,6 @@ def _place(effect: Effect) -> str:
     return str(getattr(effect, "place", effect.where))
 
 
-def _touched(hypotheses: HypothesisSet, winner: Hypothesis, rest: Hypothesis) -> set[str]:
-    """Return the equations in which an effect changes the training residual visibly."""
-    return set(_changes(winner, rest))
-
-
 def _changes(winner: Hypothesis, rest: Hypothesis) -> dict[str, float]:
     """Return the energy that an effect removes in training, by equation where that is visible."""
     change = {e: rest.excess_energy[e] - winner.excess_energy[e] for e in rest.excess_energy}
@@ -275,25 +270,21 @@ def _worse(hypotheses: HypothesisSet, winner: Hypothesis, rest: Hypothesis) -> l
 
 def _taken(removed: float, worse: Sequence[str]) -> str:
     text = f"{100 * removed:.0f} % of the energy above noise"
-    if math.isnan(removed):
-        text = "held-out records have nothing above the noise to remove: hold out larger motions"
     if not worse:
         return text
     return f"{text}, but the residual of {' '.join(worse)} is larger than under the baseline"
 
 
 def _removed(
-    holdout_data: RegressionData, rest: Hypothesis, winner: Hypothesis, after: Array
+    holdout_data: RegressionData, changes: Mapping[str, float], without: Array, after: Array
 ) -> float:
     """Return the share of held-out energy above noise that an effect removes.
 
-    It is the mean over equations, weighed by what the effect removes there in training: what a
-    baseline that was badly determined leaves in another equation does not count against it. NaN
-    where held-out records show nothing above noise in these equations, and no share is removed.
+    It is the mean over equations, weighed by what the effect removes there in training (`changes`):
+    what a baseline that was badly determined leaves in another equation does not count against it.
     """
-    before = excess_of(holdout_data, held_left(holdout_data, rest.fit))
-    now = excess_of(holdout_data, after)
-    weights = {e: v for e, v in _changes(winner, rest).items() if before.get(e, 0.0) > 0.0}
+    before, now = excess_of(holdout_data, without), excess_of(holdout_data, after)
+    weights = {e: v for e, v in changes.items() if before.get(e, 0.0) > 0.0}
     total = sum(weights.values())
     if total <= 0.0:
         return 0.0
@@ -306,25 +297,18 @@ def _removed(
 def _rivals(
     hypotheses: HypothesisSet,
     winner: Hypothesis,
-    key: Key,
+    used: Used,
+    rest: Hypothesis,
     holdout_data: RegressionData,
-    after: Array,
+    judged: _Near,
 ) -> list[Rival]:
     """Return the sets that have another effect in place of one, those that leave least first.
 
     A simpler reading of the effect is no rival: held-out records have said that it is too simple.
     """
-    others = winner.keys - {key}
-    (used,) = (u for u in winner.effects if (u.term.name, u.term.where) == key)
-    mine, rest = used.term, _without(hypotheses, winner, used)
-    equations = _touched(hypotheses, winner, rest)
-    judged, trained = (
-        _Near(data, equations, left, without)
-        for data, left, without in (
-            (holdout_data, after, held_left(holdout_data, rest.fit)),
-            (hypotheses.train_data, winner.fit.residual, rest.fit.residual),
-        )
-    )
+    mine, key = used.term, (used.term.name, used.term.where)
+    others, train_data = winner.keys - {key}, hypotheses.train_data
+    trained = _Near(train_data, _changes(winner, rest), winner.fit.residual, rest.fit.residual)
     out = []
     for hypothesis in hypotheses.fitted.values():
         fresh = [
@@ -385,7 +369,7 @@ class _Near:
     """
 
     def __init__(
-        self, data: RegressionData, equations: set[str], left: Array, without: Array
+        self, data: RegressionData, equations: Collection[str], left: Array, without: Array
     ) -> None:
         self.rows = np.zeros(len(left), dtype=bool)
         for s in data.segments:

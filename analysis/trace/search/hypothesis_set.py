@@ -165,7 +165,7 @@ class HypothesisSet:
         candidates = self.candidates = self._candidate_columns(self.train_data, self.columns)
         r = self.train_data.mean
         r = r - candidates.basis @ (candidates.basis.T @ r)
-        return self.exchanged(self._found(candidates, r))
+        return self.exchanged(self.from_other_pairs(self._found(candidates, r)))
 
     def _found(self, candidates: linear_fit.CandidateColumns, r: Array) -> Hypothesis:
         """Return the set found on the candidates for what the baseline leaves (M,)."""
@@ -177,7 +177,7 @@ class HypothesisSet:
         if self.formed(now):
             others = [o for o in pairs if not now.keys & o.keys]
             far = [o for o in others if self.excess(o, now) < -SEARCH.far_less]
-            return self.from_other_pairs(self.completed(self.prune(self.best([now, *far]))))
+            return self.completed(self.prune(self.best([now, *far])))
         now = self.prune(self.best([self.empty, *singles, *pairs]))
         while not within(now.excess_energy, self.limits) and len(now.effects) < SEARCH.largest_set:
             grown = self.prune(self.best([now, *self.extensions(now)]))
@@ -185,9 +185,8 @@ class HypothesisSet:
                 break
             now = grown
             if self.formed(now):
-                now = self.completed(now)
-                break
-        return self.from_other_pairs(now)
+                return self.completed(now)
+        return now
 
     def formed(self, hypothesis: Hypothesis) -> bool:
         """Return whether the rest may be the difference of form between effect and catalogue."""
@@ -262,10 +261,23 @@ class HypothesisSet:
 
         With `equations` the search looks at these alone, with `free` at free mechanisms alone.
         """
-        candidates, r = self._beside(now, equations, free)
-        more = linear_fit.options(candidates, (), r, 1.0)
+        data = rebased(self.train_data, now.fit)
+        taken = now.keys
+        looks = self._variants(data, now.fit.residual)
+        looks = [v for v in looks if v.key not in taken and (v.effect.free or not free)]
+        columns = variant_columns(data, looks)
+        mask = np.ones(len(now.fit.residual))
+        for s in data.segments:
+            mask[s.where] = not equations or s.equation in equations
+        # The set's shapes move too when another effect joins: what they can take is not its gain.
+        moves = [jacobian(self.train_data, now.fit, used)[1] for used in now.effects]
+        candidates = self._candidate_columns(
+            replace(data, base=np.hstack((data.base, *moves))), columns, mask
+        )
+        r = now.fit.residual * mask
+        r = r - candidates.basis @ (candidates.basis.T @ r)
         out: dict[Key, tuple[Used, ...]] = {}
-        for trial in more:
+        for trial in linear_fit.options(candidates, (), r, 1.0):
             variant = candidates.entries[trial.members[0]].variant
             if len(out) < SEARCH.refined_extensions:
                 out.setdefault(variant.key, (*now.effects, variant.used))
@@ -307,26 +319,6 @@ class HypothesisSet:
             return now
         other = self.prune(self.best([now, *self.tried(sets)]))
         return now if other.keys == now.keys else self.exchanged(other)
-
-    def _beside(
-        self, now: Hypothesis, equations: Collection[str] = (), free: bool = False
-    ) -> tuple[linear_fit.CandidateColumns, Array]:
-        """Return candidates on data that have a set in their model, and what it leaves (M,)."""
-        data = rebased(self.train_data, now.fit)
-        taken = now.keys
-        looks = self._variants(data, now.fit.residual)
-        looks = [v for v in looks if v.key not in taken and (v.effect.free or not free)]
-        columns = variant_columns(data, looks)
-        mask = np.ones(len(now.fit.residual))
-        for s in data.segments:
-            mask[s.where] = not equations or s.equation in equations
-        # The set's shapes move too when another effect joins: what they can take is not its gain.
-        moves = [jacobian(self.train_data, now.fit, used)[1] for used in now.effects]
-        candidates = self._candidate_columns(
-            replace(data, base=np.hstack((data.base, *moves))), columns, mask
-        )
-        r = now.fit.residual * mask
-        return candidates, r - candidates.basis @ (candidates.basis.T @ r)
 
     def closer(self, now: Hypothesis, equations: Collection[str]) -> Hypothesis | None:
         """Return the set with the effect added that some equations ask for, None where none is.

@@ -5,10 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from rig.model.records import Run
-from rig.model.trips import RecordingFailed
 from rig.runs import archive, store
-from rig.runs.files import new_folder
-from rig.runs.runstate import release_ownership
 
 
 def write_run(folder: str | Path, run: Run) -> Path:
@@ -17,20 +14,14 @@ def write_run(folder: str | Path, run: Run) -> Path:
     Raises InputError if it is occupied, RecordingFailed if the disk does not take it.
     """
     out = Path(folder)
-    store.refuse_occupied(out)
     values = sum(c.size for r in run.records for c in r.channels.values())
-    try:
-        with new_folder(out) as path:
-            store.create_run(path, run.rig, source=run.source)
-            with archive.create(path / archive.NAME, run.rig.name, values) as file:
-                for order, r in enumerate(run.records):
-                    about = archive.record_attributes(
-                        r.step, r.repeat, r.locked, r.sample_rate, r.start, r.period, r.lines, True
-                    )
-                    more = {**r.attributes, **about, "stream": order, "start_tick": 0}
-                    archive.write_group(file, r.name, r.channels, more, run.rig.unit_of)
-            store.mark_done(path)
-            release_ownership(path)
-    except (OSError, RuntimeError) as error:  # h5py reports a failed flush as RuntimeError
-        raise RecordingFailed(f"{out}: cannot be written: {error}") from error
+    with store.whole_run(out, run.rig, run.source) as path:
+        with archive.create(path / archive.NAME, run.rig.name, values) as file:
+            for order, r in enumerate(run.records):
+                about = archive.record_attributes(
+                    r.step, r.repeat, r.locked, r.sample_rate, r.start, r.period, r.lines, True
+                )
+                more = {**r.attributes, **about, "stream": order, "start_tick": 0}
+                archive.write_group(file, r.name, r.channels, more, run.rig.unit_of)
+        store.mark_done(path)
     return out

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from rig.model.parse import InputError
 from rig.model.rig import Rig
-from rig.model.trips import RecordingFailed
 from rig.runs import archive, store
 from rig.runs.exchange.columns import read_table
 from rig.runs.exchange.dead_sensors import silent_sensors
@@ -26,9 +25,8 @@ from rig.runs.exchange.manifest import (
     load_manifest,
 )
 from rig.runs.exchange.settings import EXCHANGE
-from rig.runs.files import new_folder
 from rig.runs.rigs import load_rig
-from rig.runs.runstate import DONE, EventLog, release_ownership, write_state
+from rig.runs.runstate import DONE, EventLog, write_state
 
 Array = NDArray[np.float64]
 
@@ -243,20 +241,16 @@ def _write(
     source: _Source, records: list[_Imported], folder: Path, warnings: tuple[str, ...]
 ) -> None:
     about = f"imported from {source.path.name}"
-    try:
-        with new_folder(folder) as fresh:
-            store.create_run(fresh, source.rig, source=about)
-            with closing(EventLog(fresh)) as events:
-                about_import = {"manifest": str(source.path), "warnings": warnings}
-                events.append("import", None, about_import)
-                _write_archive(source, records, fresh)
-                for r in records:
-                    events.append("record complete", None, {"record": r.entry.meta().name})
-                write_state(fresh, DONE)
-                events.append("end", None, {"state": DONE, "message": "", "records": len(records)})
-            release_ownership(fresh)
-    except (OSError, RuntimeError) as error:  # h5py reports a failed flush as RuntimeError
-        raise RecordingFailed(f"{folder}: cannot be written: {error}") from error
+    with (
+        store.whole_run(folder, source.rig, about) as fresh,
+        closing(EventLog(fresh)) as events,
+    ):
+        events.append("import", None, {"manifest": str(source.path), "warnings": warnings})
+        _write_archive(source, records, fresh)
+        for r in records:
+            events.append("record complete", None, {"record": r.entry.meta().name})
+        write_state(fresh, DONE)
+        events.append("end", None, {"state": DONE, "message": "", "records": len(records)})
 
 
 def _write_archive(source: _Source, records: list[_Imported], folder: Path) -> None:
