@@ -60,7 +60,7 @@ class Desk:
             for endpoint in Attachment.find(RIG):
                 if endpoint.pid == self.process.pid:
                     return endpoint
-            assert self.process.poll() is None
+            assert self.process.poll() is None, self.process.communicate()[1]
             time.sleep(0.02)
         raise AssertionError("the run opened no socket")
 
@@ -73,7 +73,7 @@ class Desk:
         deadline = time.monotonic() + LONG
         while not holds(read_events(self.folder)):
             assert time.monotonic() < deadline, what
-            assert self.process.poll() is None, what
+            assert self.process.poll() is None, (what, self.process.communicate()[1])
             time.sleep(0.02)
 
     def until_state(self, state: EngineState) -> None:

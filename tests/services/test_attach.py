@@ -163,15 +163,16 @@ def test_a_killed_runs_sockets_are_swept_away(folder: Path, tmp_path: Path) -> N
     attachment.close()
 
 
-def test_a_file_of_a_reused_process_number_is_stale_because_nobody_listens(folder: Path) -> None:
+def test_a_socket_without_a_listener_is_no_session(folder: Path) -> None:
+    """A run that is starting binds before it listens; a reused process number never listens."""
     Attachment.find()
-    path = folder / f"old-{os.getpid()}.pub"
-    with socket.socket(socket.AF_UNIX) as gone:
-        gone.bind(str(path))
-        gone.listen()
-        assert [e.rig for e in Attachment.find()] == ["old"]
+    path = folder / f"new-{os.getpid()}.pub"
+    with socket.socket(socket.AF_UNIX) as starting:
+        starting.bind(str(path))
+        assert Attachment.find() == []
+        starting.listen()
+        assert [e.rig for e in Attachment.find()] == ["new"]
     assert Attachment.find() == []
-    assert not path.exists()
 
 
 def test_only_the_owner_may_enter_the_folder(folder: Path, monkeypatch) -> None:

@@ -109,18 +109,21 @@ def _listening(path: Path) -> bool:
 
 
 def _sessions(folder: Path) -> list[Endpoint]:
-    """Return the live sessions; files of dead ones are removed."""
+    """Return the live sessions; files of dead processes are removed.
+
+    A live process that does not listen yet may be starting: its files stay.
+    """
     sessions = []
     for pub in sorted(folder.glob("*.pub")):
         match = _FILE.match(pub.name)
         if match is None:
             continue
         cmd = pub.with_suffix(".cmd")
-        if process_alive(int(match["pid"])) and _listening(pub):
-            sessions.append(Endpoint(match["rig"], int(match["pid"]), pub, cmd))
-        else:
+        if not process_alive(int(match["pid"])):
             pub.unlink(missing_ok=True)
             cmd.unlink(missing_ok=True)
+        elif _listening(pub):
+            sessions.append(Endpoint(match["rig"], int(match["pid"]), pub, cmd))
     return sessions
 
 
