@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from analysis.regression.rows import Array, Filtering, Indices, default_filtering
-from analysis.regression.settings import REGRESSION
 from analysis.signals.conditioning import Signals, condition, without_rests
 from analysis.signals.locks import moving_by_step
 from analysis.terms.base import FAMILIES
@@ -30,9 +29,15 @@ class ConditionedRecord:
     families: tuple[str, ...] = tuple(FAMILIES)
 
     def again(self, rig: Rig, record: Record) -> ConditionedRecord:
-        """Return another record (repeats averaged, noise added) made ready as this one was."""
+        """Return another record (repeats averaged, noise added) made ready as this one was.
+
+        Its samples have the weights of this one: noise in a weight is none in the balance.
+        """
         signals = condition(rig, record, self.filtering.channels, self.signals.moving)
-        return replace(self, record=record, signals=_counted(signals, self.filtering))
+        weight = self.signals.weight
+        if weight is not None:
+            signals = replace(signals, weight=weight[: record.samples])
+        return replace(self, record=record, signals=signals)
 
     def samples_at(self, time: Array) -> Indices:
         """Return the numbers of the samples (m,) nearest to instants (m,) [s]."""
@@ -58,10 +63,7 @@ def condition_runs(
         for record in run.records:
             filters = filtering(record)
             signals = condition(rig, record, filters.channels, moving[record.step])
-            signals = _counted(signals, filters)
+            if filters.in_motion:
+                signals = without_rests(signals, filters.in_motion)
             out.append(ConditionedRecord(number, record, signals, filters, families))
     return out
-
-
-def _counted(signals: Signals, filters: Filtering) -> Signals:
-    return signals if filters.rests else without_rests(signals, REGRESSION.rest_speed)

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.rows import Rows, record_rows
-from analysis.signals.conditioning import condition
 from analysis.terms.base import Used, family_of
 from rig.model import channels as ch
 from rig.model.records import Record
@@ -54,10 +53,8 @@ def record_moments(
     """
     if rng is None:
         rng = np.random.default_rng([0, zlib.crc32(conditioned.record.step.encode())])
-    filters, moving = conditioned.filtering, conditioned.signals.moving
-    record = disturbed(rig, conditioned.record, rng)
-    signals = condition(rig, record, filters.channels, moving)
-    after = record_rows(rig, terms, signals, filters)
+    again = conditioned.again(rig, disturbed(rig, conditioned.record, rng))
+    after = record_rows(rig, terms, again.signals, again.filtering)
     out: dict[str, Array] = {}
     for name, rows in before.items():
         D = _difference(rows, after[name])

@@ -40,13 +40,13 @@ Indices = NDArray[np.int64]
 class Filtering:
     """The filters of one record: `channels` before, `rows` (or none) after.
 
-    Without `rests` no torque balance counts the samples at which its joint rests.
+    The torque balances of joints `in_motion` (0-based) do not count samples at which these rest.
     """
 
     channels: Smoother
     rows: FirSmoother | None
     step: int = 1
-    rests: bool = True
+    in_motion: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -18,9 +18,6 @@ class RegressionSettings:
     # An electric joint's rows need one derivative less of anything noisy, and its friction reverses
     # within milliseconds: narrower loses of the reversals (`python -m tests.studies emps`).
     row_cutoff_electric: float = 30.0
-    # Speed of a joint over its rms of a record, below which it rests: its dry friction then follows
-    # no law (tuned on contacts by Karnopp, LuGre and Dahl; 0.1 takes too much of slow records).
-    rest_speed: float = 0.03
     # A row is dropped where more than this share of the filter's weight is on masked samples.
     masked_share: float = 1e-3
 

@@ -8,6 +8,7 @@ pressures [Pa gauge], `V_cap V_rod` chamber volumes [m^3], `p_s p_tank` supply a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -68,18 +69,21 @@ class Signals:
         return int(self.s.shape[1])
 
 
-def without_rests(signals: Signals, share: float) -> Signals:
-    """Return signals by which no torque balance counts the samples at which its joint rests.
+def without_rests(signals: Signals, joints: Sequence[int]) -> Signals:
+    """Return signals by which the balances of some joints do not count samples at which they rest.
 
     At rest dry friction is whatever holds the joint, anything up to its breakaway: no law of the
     speed can be compared with it. A balance that holds at every sample holds under any weight, so
-    that both of its sides are weighted before they are filtered: by 0 up to `share` of the record's
-    rms speed, by 1 from twice that on, smoothly between.
+    that both of its sides are weighted before they are filtered: by 0 at rest, by 1 from the
+    record's rms speed on, smoothly between. A steeper weight would carry noise of the acceleration
+    from high frequencies into the filter's band.
     """
-    speed = np.abs(signals.sd)
-    least = share * np.sqrt(np.mean(speed**2, axis=0))
-    x = np.clip(speed / np.where(least > 0.0, least, 1.0) - 1.0, 0.0, 1.0)
-    return replace(signals, weight=x * x * (3.0 - 2.0 * x))
+    weight = np.ones_like(signals.sd)
+    for i in joints:
+        speed = np.abs(signals.sd[:, i])
+        x = np.minimum(speed / max(float(np.sqrt(np.mean(speed**2))), 1e-300), 1.0)
+        weight[:, i] = x * x * (3.0 - 2.0 * x)
+    return replace(signals, weight=weight)
 
 
 def aligned_channels(rig: Rig, record: Record) -> dict[str, Array]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -117,7 +117,7 @@ def trace(
     baseline = _identified(runs, rows.train.terms)
     before = baseline.model
     notes = [*rows.unseen.notes, *_notes(rows.train, rows.unseen.choosing)]
-    notes += [*unrepeated(rows.train), *_undetermined(baseline)]
+    notes += [*unrepeated(rows.train), *_undetermined(before)]
     notes += [check.detail for check in baseline.checks if check.name == GEOMETRY]
     finding = found_on(rows, candidates, free, seed, columns)
     finding = without_tied(without_rests(rig, terms, records, candidates, free, seed, finding))
@@ -142,7 +142,7 @@ def trace(
         with_shots(_with_tolerances(f, unknown), again.shots) for f in judged_effects
     )
     # All is settled: from here on the judging rows are read, and nothing is chosen.
-    unseen = rows.unseen
+    unseen = finding.rows.unseen
     first, last = (
         held_out.settled(unseen.judging, hypotheses.empty.fit),
         held_out.settled(unseen.judging, winner.fit),
@@ -153,6 +153,7 @@ def trace(
         detection_limits(train_data, candidates, winner, after) if verdict != UNEXPLAINED else []
     )
     notes += _weighed_with_a_curve(winner, after)
+    notes += _undetermined(after, [n for n, e in before.parameters.items() if not e.identified])
     notes += [*kept, *_missed_held(verdict, error, [*notes, *kept]), *in_words(hidden)]
     runs_before, runs_after = held_out.free_runs([*holdout, *judge], before, after)
     result = Trace(
@@ -211,10 +212,11 @@ def _judged(
     if finding.verdict == UNEXPLAINED:
         return UNEXPLAINED, []
     kept, words = _kept(finding.rows.unseen.judging, finding.hypotheses.empty, winner)
-    if finding.rows.rests and dry(winner, kept):
-        rows, hypotheses, moving = in_motion(rig, terms, records, winner)
+    joints = dry(winner, kept)
+    if joints and not finding.rows.in_motion:
+        rows, hypotheses, moving = in_motion(rig, terms, records, winner, joints)
         if not _kept(rows.unseen.judging, hypotheses.empty, moving)[0]:
-            kept, words = set(), at_rest(kept)
+            kept, words = set(), at_rest(joints, "include")
     return (UNEXPLAINED if kept else finding.verdict), words
 
 
@@ -247,9 +249,9 @@ def _notes(train_data: RegressionData, holdout_data: RegressionData) -> list[str
     return out
 
 
-def _undetermined(baseline: Identification) -> list[str]:
-    """Name the baseline's parameters that the records do not show: their part stays a residual."""
-    missing = [n for n, e in baseline.model.parameters.items() if not e.identified]
+def _undetermined(model: Model, known: Collection[str] = ()) -> list[str]:
+    """Name the parameters, but those `known`, that the records do not show."""
+    missing = [n for n, e in model.parameters.items() if not e.identified and n not in known]
     if not missing:
         return []
     return [
@@ -310,17 +312,19 @@ def _extended(
     if not winner.effects:
         return before, {}
     train_data = rows.train
-    found = _identified(runs, (*train_data.terms, *winner.effects), rows.rests)
+    found = _identified(runs, (*train_data.terms, *winner.effects), rows.in_motion)
     return stripped(widened(train_data, winner.fit, found.model)), by_geometry(found)
 
 
-def _identified(runs: Sequence[Run], terms: Sequence[Used], rests: bool = True) -> Identification:
+def _identified(
+    runs: Sequence[Run], terms: Sequence[Used], in_motion: tuple[int, ...] = ()
+) -> Identification:
     """Identify a model's parameters; what acts beside it is fitted by the estimator itself."""
     beside = (BulkTemperature, SpoolPath)
     own = ordered([u for u in terms if not isinstance(u.term, beside)])
 
     def filtering(record: Record) -> Filtering:
-        return replace(default_filtering(record), rests=rests)
+        return replace(default_filtering(record), in_motion=in_motion)
 
     return identify(runs, terms=own, filtering=filtering, estimator=ESTIMATOR)
 

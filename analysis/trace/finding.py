@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -60,9 +60,9 @@ class TraceRows:
     unseen: Unseen
 
     @property
-    def rests(self) -> bool:
-        """Whether the joints' rests count."""
-        return all(conditioned.filtering.rests for conditioned in self.train.records)
+    def in_motion(self) -> tuple[int, ...]:
+        """The joints (0-based) whose rests do not count."""
+        return self.train.records[0].filtering.in_motion
 
 
 @dataclass(frozen=True)
@@ -149,89 +149,83 @@ def without_rests(
     rig: Rig, terms: tuple[Used, ...], records: TraceRuns, candidates: Sequence[Effect],
     free: Sequence[Effect], seed: int, finding: Finding,
 ) -> Finding:  # fmt: skip
-    """Ask without the joints' rests what is left where only balances with dry friction keep much.
+    """Search friction again without the joints' rests where only torque balances keep much.
 
     At rest dry friction is whatever holds the joint: what stays there speaks against no law of the
-    speed. Where nothing else stays, what stood explains the records, with its sizes in motion.
-    Where nothing stood, friction is searched anew, among the candidates and `free` mechanisms.
+    speed, and hides the law in motion. Candidates are friction in these balances, named ones before
+    `free` curves, beside what else stood. It must act in each of them that is looked at without
+    rests, and take most of what the rests leave too.
     """
     loud = {r.equation for r in finding.rest if r.veto}
-    if finding.verdict != UNEXPLAINED:
+    friction = [e for e in (*candidates, *free) if e.family == "friction"]
+    joints = {e.joint for e in friction if equation("torque", e.joint) in loud}
+    if finding.verdict != UNEXPLAINED or {equation("torque", i) for i in joints} != loud:
         return finding
-    if not dry(finding.winner, loud):
-        friction = [e for e in (*candidates, *free) if e.family == "friction"]
-        return _searched_in_motion(rig, terms, records, friction, seed, finding, loud)
-    rows, hypotheses, winner = in_motion(rig, terms, records, finding.winner)
-    holdout_data = rows.unseen.choosing
-    rest = left_over(hypotheses, winner, holdout_data)
-    judged = gates.judge(hypotheses, winner, holdout_data, np.random.default_rng(seed))
-    if any(r.veto for r in rest) or not all(map(gates.stands, judged)):
+    others = [u.term for u in finding.winner.effects if isinstance(u.term, Effect)]
+    others = [e for e in others if e.family != "friction"]
+
+    def searched(joints: Collection[int]) -> Finding:
+        rows = trace_rows(rig, terms, records, moving_filtering(joints))
+        here = [*others, *(e for e in friction if e.joint in joints)]
+        return _searched(rows, here, seed, at_rest(joints, "leave out"))
+
+    found = searched(joints)
+    acts = dry(found.winner, loud)
+    if acts and acts != joints:  # a parameter of several balances took friction into others
+        found = searched(acts)
+    if found.verdict not in (EXPLAINED, CONFOUNDED) or dry(found.winner, loud) != acts or not acts:
         return finding
-    sizes = {(f.name, f.where): f.parameters for f in judged}
-    effects = tuple(
-        replace(f, parameters=sizes[f.name, f.where]) if gates.stands(f) else f
-        for f in finding.effects
-    )
-    verdict = CONFOUNDED if _tied([f for f in effects if gates.stands(f)]) else EXPLAINED
-    notes = (*at_rest(loud), *_rest_notes(verdict, rest, quiet=False, named=True))
+    every = finding.hypotheses.exact(found.winner.effects).total / finding.hypotheses.empty.total
+    if every > 1.0 - TRACE.least_removed:
+        return finding
+    fallen = tuple(f for f in finding.effects if not gates.stands(f))
+    return replace(found, effects=(*found.effects, *fallen))
+
+
+def _searched(
+    rows: TraceRows, candidates: Sequence[Effect], seed: int, notes: Sequence[str]
+) -> Finding:
+    """Search among a few candidates, free ones last; `notes` come first."""
+    hypotheses = HypothesisSet(rows.train, [e for e in candidates if not e.free])
+    hypotheses, effects, winner, verdict, rest = _settled(
+        hypotheses, hypotheses.run(), [e for e in candidates if e.free], rows.unseen.choosing,
+        np.random.default_rng(seed),
+    )  # fmt: skip
+    notes = (*notes, *_rest_notes(verdict, rest, quiet=False, named=True))
     return Finding(rows, hypotheses, winner, verdict, effects, tuple(rest), notes)
 
 
-def _searched_in_motion(
-    rig: Rig, terms: tuple[Used, ...], records: TraceRuns, friction: Sequence[Effect], seed: int,
-    finding: Finding, loud: Collection[str],
-) -> Finding:  # fmt: skip
-    """Search friction without the rests where nothing that acts in torques stood.
-
-    A high breakaway, or levels that hold a joint at rest for long, hide the law in motion from
-    every name. What is found must take most of what the rests leave too.
-    """
-    here = [f for f in friction if equation("torque", f.joint) in loud]
-    if finding.winner.effects or {equation("torque", f.joint) for f in here} != set(loud):
-        return finding
-    rows = trace_rows(rig, terms, records, moving_filtering)
-    hypotheses = HypothesisSet(rows.train, [f for f in here if not f.free])
-    hypotheses, effects, winner, verdict, rest = _settled(
-        hypotheses, hypotheses.run(), [f for f in here if f.free], rows.unseen.choosing,
-        np.random.default_rng(seed),
-    )  # fmt: skip
-    if verdict not in (EXPLAINED, CONFOUNDED):
-        return finding
-    every = finding.hypotheses.exact(winner.effects).total / finding.hypotheses.empty.total
-    if every > 1.0 - TRACE.least_removed:
-        return finding
-    notes = (*at_rest(loud), *_rest_notes(verdict, rest, quiet=False, named=True))
-    others = tuple(f for f in finding.effects if not gates.stands(f))
-    return Finding(rows, hypotheses, winner, verdict, (*effects, *others), tuple(rest), notes)
-
-
-def dry(winner: Hypothesis, equations: Collection[str]) -> bool:
-    """Return whether dry friction of the set acts in each of some equations, at least one."""
-    balances = {
-        equation("torque", used.term.joint)
+def dry(winner: Hypothesis, equations: Collection[str]) -> set[int]:
+    """Return the joints (0-based) with dry friction of the set in one of some torque balances."""
+    return {
+        used.term.joint
         for used in winner.effects
-        if isinstance(used.term, Effect) and used.term.family == "friction"
+        if isinstance(used.term, Effect)
+        and used.term.family == "friction"
+        and equation("torque", used.term.joint) in equations
     }
-    return bool(equations) and balances.issuperset(equations)
 
 
 def in_motion(
-    rig: Rig, terms: tuple[Used, ...], records: TraceRuns, winner: Hypothesis
+    rig: Rig, terms: tuple[Used, ...], records: TraceRuns, winner: Hypothesis, joints: Iterable[int]
 ) -> tuple[TraceRows, HypothesisSet, Hypothesis]:
-    """Return rows that do not count the joints' rests, and the set's effects fitted to them."""
-    rows = trace_rows(rig, terms, records, moving_filtering)
+    """Return rows that do not count the rests of some joints, and the set's effects fitted."""
+    rows = trace_rows(rig, terms, records, moving_filtering(joints))
     effects = [u.term for u in winner.effects if isinstance(u.term, Effect)]
     hypotheses = HypothesisSet(rows.train, effects)
     hypotheses.run()
     return rows, hypotheses, hypotheses.exact(winner.effects)
 
 
-def at_rest(equations: Collection[str]) -> list[str]:
-    """Return a note for each equation whose samples at rest were not counted."""
+def at_rest(joints: Iterable[int], errors: str) -> list[str]:
+    """Return a note for each joint (0-based) whose samples at rest were not counted.
+
+    `errors` is what the errors do with them: "include" or "leave out".
+    """
     return [
-        f"{e}: judged without the samples at which the joint rests, where dry friction is whatever "
-        "holds it; the errors include them"
-        for e in sorted(equations)
+        f"{equation('torque', joint)}: judged without the samples at which the joint rests, where "
+        f"dry friction is whatever holds it; the errors {errors} them"
+        for joint in sorted(joints)
     ]
 
 

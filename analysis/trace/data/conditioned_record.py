@@ -10,7 +10,7 @@ which to first order in the change is what the effect puts into the residual.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -56,9 +56,9 @@ def trace_filtering(record: Record) -> Filtering:
     return replace(chosen, step=max(step, (chosen.step + 1) // 2))
 
 
-def moving_filtering(record: Record) -> Filtering:
-    """Return the trace's filters, of rows that do not count the joints' rests."""
-    return replace(trace_filtering(record), rests=False)
+def moving_filtering(joints: Iterable[int]) -> Callable[[Record], Filtering]:
+    """Return the trace's filters, of rows that do not count the rests of some joints (0-based)."""
+    return lambda record: replace(trace_filtering(record), in_motion=tuple(sorted(joints)))
 
 
 def conditioned_records(

@@ -131,7 +131,12 @@ def _average(rig: Rig, repeats: Sequence[ConditionedRecord]) -> ConditionedRecor
     }
     average = first.again(rig, replace(first.record, channels=channels))
     valid = np.all([s.signals.valid[:n] for s in repeats], axis=0)
-    signals = replace(average.signals, valid=average.signals.valid & valid)
+    weights = [s.signals.weight[:n] for s in repeats if s.signals.weight is not None]
+    signals = replace(
+        average.signals,
+        valid=average.signals.valid & valid,
+        weight=np.mean(weights, axis=0) if weights else None,
+    )
     return replace(average, signals=signals)
 
 

@@ -110,7 +110,11 @@ def refine(data: RegressionData, terms: Sequence[Used], steps: int = SEARCH.step
         if opened == used or _promise(data, fit, used, opened) < 0.5 * asked:
             continue
         more = _searched(data, _with(fit.terms, used, opened), steps)
-        fit = more if fit.energy - more.energy > asked else fit
+        # A detail that drives the shape to its bounds stands for something else.
+        last = more.terms[k]
+        assert isinstance(last.term, Effect)
+        in_bounds = not last.term.outside(data.rig, last.shape)
+        fit = more if in_bounds and fit.energy - more.energy > asked else fit
     return fit
 
 

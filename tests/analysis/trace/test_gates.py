@@ -273,7 +273,7 @@ def what_stays_while_a_joint_sticks_speaks_against_no_friction(b: Benches) -> No
     runs = b.kept("sticking", lambda: foreign_bench.pair_of_runs(b.rig, hidden))
     result = b.traced(runs, "coulomb_friction", "stribeck_friction", "asymmetric_friction")
     assert (result.verdict, [e.name for e in result.effects]) == ("explained", ["coulomb_friction"])
-    assert result.effects[0].parameters["Fc2"].value == pytest.approx(80.0, rel=0.05)
+    assert result.effects[0].parameters["Fc2"].value == pytest.approx(80.0, rel=0.01)
     assert any("at which the joint rests" in n for n in result.notes)
 
 

@@ -162,7 +162,7 @@ RULES: Final = (
     Rule("second form", "an effect is tried in its first form only",
          ((Friction, "other_forms", lambda *_: ()),), refits=True),
     Rule("rests", "what stays while a joint rests speaks against its dry friction",
-         tuple((module, "dry", lambda *_: False) for module in (engine, finding))),
+         ((engine, "without_rests", lambda *given: given[-1]), (engine, "dry", lambda *_: set()))),
     Rule("free forms", "no mechanism without a named form",
          ((finding, "_drawn", lambda *_: None),)),
 )  # fmt: skip
