@@ -139,13 +139,16 @@ class JointSpring(Effect):
         return (f"rest_{self.joint + 1}",)
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return the rest angle [rad], anywhere in the joint's reach.
+        """Return the rest angle [rad], in the joint's reach or as far again beyond its ends.
 
-        Far from the true one a search ends at a spring that pushes away: several are looked at.
+        A preloaded spring rests where the joint does not come. Far from the true angle a search
+        ends at a spring that pushes away: several are looked at.
         """
         low, high = _reach(rig, self.joint)
-        looks = tuple(map(float, np.linspace(low, high, RESTS + 2)[1:-1]))
-        return (Shape(f"rest_{self.joint + 1}", "rad", low, high, looks),)
+        reach = high - low
+        inside = map(float, np.linspace(low, high, RESTS + 2)[1:-1])
+        looks = (low - 0.5 * reach, *inside, high + 0.5 * reach)
+        return (Shape(f"rest_{self.joint + 1}", "rad", low - reach, high + reach, looks),)
 
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
         """Return q - rest."""
@@ -159,10 +162,11 @@ class JointSpring(Effect):
         return np.array([self.joint, k, self.shape_of(rig, shape)[0]])
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
-        """Refuse a spring that pushes away, one too stiff to move, a rest out of reach."""
+        """Refuse a spring that pushes away, one too stiff to move, a rest far out of reach."""
         name = f"k_spring_{self.joint + 1}"
-        low, high = _reach(rig, self.joint)
-        stiffest = torque_limit(rig, self.joint) / (0.5 * (high - low))
+        rest = self.shape_of(rig, shape)[0]
+        farthest = max(abs(q - rest) for q in _reach(rig, self.joint))
+        stiffest = torque_limit(rig, self.joint) / farthest
         return beyond(name, values[name], "N*m/rad", stiffest) or self.outside(rig, shape)
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:

@@ -317,10 +317,11 @@ def _rivals(
         if key in hypothesis.keys or not others <= hypothesis.keys or len(fresh) != 1:
             continue
         (other,) = fresh
+        more = hypothesis.size[1] - winner.size[1]  # free numbers, which must earn their price
         assert isinstance(other, Effect)
         assert isinstance(mine, Effect)
         if (
-            hypothesis.size[1] > winner.size[1]
+            (more > 0 and hypothesis.total > winner.total - SEARCH.number_price * more)
             or related(mine, other)
             or hypotheses.physical(hypothesis)
             or _worse(hypotheses, hypothesis, rest)

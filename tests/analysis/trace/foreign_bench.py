@@ -36,8 +36,8 @@ TANH, SIGMOID, KARNOPP = range(3)
 (
     AHEAD, ASTERN, WIDTH, FORM, BREAKAWAY, STRIBECK, LEAK, SAG, DRAG_AHEAD, DRAG_ASTERN, DRAG_CUBED,
     SPRING, HARDENING, HUM, HUM_FREQUENCY, HUM_POWER, LEAK_ROOT, TAPER, PLAY, BACK, SAG_LAG,
-    STIFFER, BACK_POWER,
-) = range(23)  # fmt: skip
+    STIFFER, BACK_POWER, SPRING_REST,
+) = range(24)  # fmt: skip
 MIDDLE = -1.44  # [rad] where springs are at rest
 
 
@@ -52,8 +52,8 @@ class Hidden:
 
     `drag_ahead`, `drag_astern` [N s/m] are slopes of viscous friction by direction, `drag_cubed`
     [N s^3/m^3] goes with the cube of the speed; `spring` [N m/rad] and `hardening` [N m/rad^3] pull
-    at the joint about -1.44 rad; `hum` [N m] is a torque of `hum_frequency` [Hz] that begins with
-    the record, its sine raised to `hum_power`; `leak_root` [m^3/(s Pa^0.5)]; `taper` [1/V]: an
+    at the joint about `spring_rest` [rad]; `hum` [N m] is a torque of `hum_frequency` [Hz]
+    that begins with the record, its sine raised to `hum_power`; `leak_root` [m^3/(s Pa^0.5)]; `taper` [1/V]: an
     opening of x + taper x |x|; `play` [V] of the spool behind its sensor, half of it either way;
     `back` [Pa] is the return's pressure at the pump's flow, which rises with the flow to the
     `back_power`; `stiffer` [1/Pa] is the relative growth of the bulk modulus with pressure.
@@ -82,6 +82,7 @@ class Hidden:
     sag_lag: float = 0.0
     stiffer: float = 0.0
     back_power: float = 1.0
+    spring_rest: float = MIDDLE
 
     @property
     def array(self) -> Array:
@@ -195,7 +196,7 @@ def _rates(y, t, q1, par, hidden, drive, held, out):
         into_cap = par[5] * u * _root(cap - p_t) - leak
         into_rod = leak - par[7] * u * _root(p_s - rod)
     torque = G * (7.0e-4 * cap - 5.4e-4 * rod) - par[1] * w - par[2] * 9.8 * math.sin(q1 + q)
-    turn = q - MIDDLE
+    turn = q - hidden[SPRING_REST]
     torque -= hidden[SPRING] * turn + hidden[HARDENING] * turn**3
     if hidden[HUM] > 0.0:
         wave_now = math.sin(2.0 * math.pi * hidden[HUM_FREQUENCY] * (t - SETTLE))

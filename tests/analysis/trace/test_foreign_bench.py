@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from analysis.effects.mechanics import BaseInclination, JointSpring
 from analysis.simulation.model import load_model, save_model
 from analysis.trace.engine import trace
 from analysis.trace.result import Trace, to_json
@@ -180,6 +181,26 @@ def test_friction_with_a_cube_of_the_speed_is_a_curve_without_a_name(
     assert again.terms == result.model_after.terms
     knots = json.loads((tmp_path / "model.json").read_text())["terms"][-1]["shape_parameters"]
     assert {k["unit"] for n, k in knots.items() if "knot" in n} == {"m/s"}
+
+
+def test_a_preloaded_spring_rests_where_the_joint_does_not_come(rig: Rig) -> None:
+    """The joint reaches from -1.83 to -0.96 rad."""
+    result = traced(rig, Hidden(spring=30.0, spring_rest=-0.7), free_forms=False)
+    assert [e.name for e in result.effects] == ["joint_spring"]
+    found = result.effects[0].parameters
+    assert found["k_spring_2"].value == pytest.approx(30.0, rel=0.02)
+    assert found["rest_2"].value == pytest.approx(-0.7, abs=0.05)
+
+
+def test_a_spring_with_one_number_more_is_a_rival_where_it_leaves_clearly_less(rig: Rig) -> None:
+    """In that noise both a tilted base and the spring leave no more than the band."""
+    hidden = Hidden(spring=5.0, spring_rest=-0.3)
+    train, held_out = pair_of_runs(rig, hidden, noise=4.0)
+    both = [BaseInclination(), JointSpring("joint 2")]
+    result = trace([train], [held_out], both, look_ahead=False, free_forms=False)
+    assert result.verdict == "confounded"
+    assert [e.name for e in result.effects] == ["base_inclination"]
+    assert result.tied == [("joint_spring", "joint 2")]
 
 
 @pytest.mark.slow
