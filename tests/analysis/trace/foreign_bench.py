@@ -52,11 +52,11 @@ class Hidden:
 
     `drag_ahead`, `drag_astern` [N s/m] are slopes of viscous friction by direction, `drag_cubed`
     [N s^3/m^3] goes with the cube of the speed; `spring` [N m/rad] and `hardening` [N m/rad^3] pull
-    at the joint about `spring_rest` [rad]; `hum` [N m] is a torque of `hum_frequency` [Hz]
-    that begins with the record, its sine raised to `hum_power`; `leak_root` [m^3/(s Pa^0.5)]; `taper` [1/V]: an
-    opening of x + taper x |x|; `play` [V] of the spool behind its sensor, half of it either way;
-    `back` [Pa] is the return's pressure at the pump's flow, which rises with the flow to the
-    `back_power`; `stiffer` [1/Pa] is the relative growth of the bulk modulus with pressure.
+    at the joint about `spring_rest` [rad]; `hum` [N m] is a torque of `hum_frequency` [Hz] that
+    begins with the record, its sine raised to `hum_power`; `leak_root` [m^3/(s Pa^0.5)]; `taper`
+    [1/V]: an opening of x + taper x |x|; `play` [V] of the spool behind its sensor, half of it
+    either way; `back` [Pa] is the return's pressure at the pump's flow, which rises with the flow
+    to the `back_power`; `stiffer` [1/Pa] is the relative growth of the bulk modulus with pressure.
     """
 
     ahead: float = 0.0
