@@ -9,29 +9,32 @@ import pytest
 from analysis.effects.measurement import ChannelDelay, SensorLag
 from analysis.effects.valve import SpoolLag
 from analysis.trace import engine, finding
-from analysis.trace.result import CLEAN, Trace
+from analysis.trace.data.candidates import catalogue
+from analysis.trace.result import CLEAN
 from rig.runs.rigs import load_rig
 from tests.studies.foreign import plant
-from tests.studies.foreign.bench import runs_of
+from tests.studies.foreign.bench import records_of
 from tests.studies.foreign.cases import NONE, case_of
-
-
-def traced() -> Trace:
-    """Trace a machine with nothing wrong whose first-order spools take 1.2 ms."""
-    bench = case_of(41, kind=NONE, spool=plant.FIRST_ORDER).bench
-    joints = tuple({**own, "spool_time": 1.2e-3} for own in bench.joints)
-    bench = replace(bench, joints=joints, noise=0.25, repeats=4, rms=0.05)
-    train, held_out = runs_of(bench, 41)
-    return engine.trace([train], held_out, look_ahead=False, free_forms=False)
 
 
 def test_a_spool_that_bends_between_samples_is_nothing_to_name(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    result = traced()
+    """Joint 1 of a machine with nothing wrong, whose first-order spools take 1.2 ms."""
+    bench = case_of(41, kind=NONE, spool=plant.FIRST_ORDER).bench
+    joints = tuple({**own, "spool_time": 1.2e-3} for own in bench.joints)
+    bench = replace(bench, joints=joints, noise=0.25, rms=0.05, seconds=4.0)
+    train = records_of(bench, ("step2",), 410, 1.0, repeats=8)
+    held_out = records_of(bench, ("step2",), 411, 0.7, repeats=2)
+    late = catalogue(bench.rig, (ChannelDelay.name,))
+
+    result = engine.trace([train], [held_out], late, look_ahead=False, free_forms=False)
     assert (result.verdict, result.effects) == (CLEAN, ())
     monkeypatch.setattr(finding, "path_terms", lambda _: ())
-    assert traced().verdict != CLEAN  # the same records without it
+    without = engine.trace([train], [held_out], late, look_ahead=False, free_forms=False)
+    assert without.verdict != CLEAN  # what stays of its path passes for a late channel
+    found = (*without.effects, *without.refused)
+    assert (ChannelDelay.name, "joint 1") in [(e.name, e.where) for e in found]
 
 
 @pytest.mark.parametrize("late", [SpoolLag("joint 1"), ChannelDelay("joint 1 spool"),
