@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import os
 
 # As the command line does: threads of a linear solver wait busily for cores that others use.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+from collections.abc import Generator
 from pathlib import Path
 
 import pytest
@@ -28,6 +30,17 @@ def pytest_configure(config: pytest.Config) -> None:
     """Compile for all workers before the first starts."""
     if config.getoption("numprocesses", None) and not hasattr(config, "workerinput"):
         compile_all(CACHE)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Collect no garbage among what is imported: it stays, and every later search leaves it out."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.enable()
+        gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)
