@@ -1,18 +1,25 @@
-"""The command as a user has it, and a simulated bench beside it, each a process of its own."""
+"""The command as a user has it, and a simulated bench beside it, each a process of its own.
+
+What ends by itself and needs no process runs in this one too (`bramah_here`), without the half
+second of imports that each process begins with.
+"""
 
 from __future__ import annotations
 
+import io
+import logging
 import os
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 
 from drivers import wire_at
 from drivers.modbus_tcp import ModbusTcpDriver
+from rig.cli.main import run
 from rig.runs.rigs import load_rig
 
 START = "from rig.cli.main import run; run()"
@@ -50,6 +57,31 @@ def bramah(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedP
     return subprocess.run(
         words(*arguments), capture_output=True, text=True, timeout=LONG, cwd=cwd, check=False
     )
+
+
+def bramah_here(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """Run `bramah` to its end in this process: the same words, the same exit code."""
+    line = [str(word) for word in arguments]
+    said, told, code = io.StringIO(), io.StringIO(), 0
+    with _as_a_process_begins(), redirect_stdout(said), redirect_stderr(told), chdir(cwd or "."):
+        try:
+            run(line)
+        except SystemExit as end:
+            code = int(end.code or 0)
+    return subprocess.CompletedProcess(line, code, said.getvalue(), told.getvalue())
+
+
+@contextmanager
+def _as_a_process_begins() -> Iterator[None]:
+    """Nobody listens to the log yet, and nobody has changed what a signal does."""
+    root, ended = logging.getLogger(), signal.getsignal(signal.SIGTERM)
+    handlers, level = root.handlers, root.level
+    root.handlers = []
+    try:
+        yield
+    finally:
+        root.handlers, root.level = handlers, level
+        signal.signal(signal.SIGTERM, ended)
 
 
 def study(*arguments: object) -> subprocess.CompletedProcess[str]:

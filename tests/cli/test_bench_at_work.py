@@ -23,6 +23,7 @@ from tests.cli.bench import (
     LONG,
     SHORT,
     bramah,
+    bramah_here,
     outputs_are_zero,
     simulated,
     started,
@@ -63,7 +64,7 @@ def aborted_with_its_records(run: Path) -> None:
 
 
 def test_a_protocol_is_checked_run_listed_and_identified(short: Path, tmp_path: Path) -> None:
-    checked = bramah("check", short, "--rig", RIG)
+    checked = bramah_here("check", short, "--rig", RIG)
     assert checked.returncode == 0, checked.stderr
     assert "step1 joint 2 piston" in checked.stdout
 
@@ -73,25 +74,25 @@ def test_a_protocol_is_checked_run_listed_and_identified(short: Path, tmp_path: 
         assert done.returncode == 0, done.stderr
         assert done.stdout.strip() == str(run)
         assert done.stderr.rstrip().endswith("done      2 records")  # and no time left
-        again = bramah("run", short, "--rig", RIG, "--out", run, "--endpoint", endpoint)
+        again = bramah_here("run", short, "--rig", RIG, "--out", run, "--endpoint", endpoint)
         assert again.returncode == 2
         assert again.stderr.startswith(f"bramah: {run}: is not empty")  # before the twin's minutes
 
-    listed = bramah("runs", tmp_path)
+    listed = bramah_here("runs", tmp_path)
     assert "monday" in listed.stdout
     assert "done" in listed.stdout
     records = load_run(run).records
     assert [record.name for record in records] == ["step1_r1", "step1_r2"]
     assert all(record.attributes["lost_samples"] == 0 for record in records)
 
-    found = bramah("identify", run, "--json", "-", "--model", tmp_path / "model.json")
+    found = bramah_here("identify", run, "--json", "-", "--model", tmp_path / "model.json")
     assert found.returncode == 0, found.stderr
     result = json.loads(found.stdout)
     assert result["method"] == "coupled"
     assert result["parameters"]["C_pp_2"]["value"] == pytest.approx(6.28e-7, rel=0.05)
     # Joint 1 was never excited: its gains are not numbers that look fine.
     assert result["parameters"]["C_pp_1"]["value"] is None
-    judged = bramah("validate", tmp_path / "model.json", run)
+    judged = bramah_here("validate", tmp_path / "model.json", run)
     assert judged.returncode == 2
     assert "C_pp_1" in judged.stderr
     assert judged.stderr.count("\n") == 1
@@ -164,21 +165,21 @@ def test_a_killed_run_leaves_valves_closed_and_is_recovered(endless: Path, tmp_p
             process.kill()
             process.wait(LONG)
         assert outputs_are_zero(endpoint)
-        refused = bramah(
+        refused = bramah_here(
             "run", endless, "--rig", RIG, "--out", tmp_path / "next", "--endpoint", endpoint
         )
         assert refused.returncode == 3, refused.stderr
         assert "bramah reset" in refused.stderr
-        cleared = bramah(
+        cleared = bramah_here(
             "reset", "--rig", RIG, "--endpoint", endpoint, "--reason", "the run was killed"
         )
         assert cleared.returncode == 0, cleared.stderr
         assert not (tmp_path / "next").exists()
-    assert "interrupted" in bramah("runs", tmp_path).stdout
-    unread = bramah("identify", run)
+    assert "interrupted" in bramah_here("runs", tmp_path).stdout
+    unread = bramah_here("identify", run)
     assert unread.returncode == 2
     assert "bramah recover" in unread.stderr
-    recovered = bramah("recover", run)
+    recovered = bramah_here("recover", run)
     assert recovered.returncode == 0, recovered.stderr
     assert len(load_run(run).records) >= 2
 
@@ -241,7 +242,7 @@ def test_a_passed_limit_trips_with_limit_value_and_joint(short: Path, tmp_path: 
 def test_bad_input_is_one_line_that_names_it(
     arguments: tuple[str, ...], code: int, words: str, tmp_path: Path
 ) -> None:
-    done = bramah(*arguments, cwd=tmp_path)
+    done = bramah_here(*arguments, cwd=tmp_path)
     assert done.returncode == code, done.stderr
     assert words in done.stderr
     assert done.stderr.count("\n") == 1, done.stderr
@@ -253,7 +254,7 @@ def test_a_wire_that_no_driver_serves_is_named_with_its_rig(tmp_path: Path) -> N
     for right, wrong in (("kind: modbus-tcp", "kind: modbus-tpc"), ("port: 5020", "port: 502000")):
         path = tmp_path / "bench.yaml"
         path.write_text(text.replace(right, wrong))
-        done = bramah("probe", "--rig", path)
+        done = bramah_here("probe", "--rig", path)
         assert done.returncode == 2
         assert f"rig '{RIG}': wire: {wrong.split(':')[0]}: " in done.stderr
         assert wrong.split()[1] in done.stderr

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from rig.runs.store import load_run
-from tests.cli.bench import LONG, SHORT, bramah, simulated, started, wait_for
+from tests.cli.bench import LONG, SHORT, bramah, bramah_here, simulated, started, wait_for
 from tests.services.test_after_zero import commands
 
 RIG = "shinshu-2dof"
@@ -35,10 +35,10 @@ def faulty(tmp_path: Path) -> Iterator[str]:
 def test_after_a_trip_nothing_moves_until_a_reset_with_a_reason(
     short: Path, faulty: str, tmp_path: Path, state: Path
 ) -> None:
-    def run(name: str):
-        return bramah("run", short, "--rig", RIG, "--out", tmp_path / name, "--endpoint", faulty)
+    def line(name: str) -> tuple[object, ...]:
+        return ("run", short, "--rig", RIG, "--out", tmp_path / name, "--endpoint", faulty)
 
-    first = run("first")
+    first = bramah(*line("first"))
     assert first.returncode == 3, first.stderr
     assert f"bramah reset --rig {RIG} --endpoint {faulty} --reason" in first.stderr
     put_out = commands(tmp_path / "first")
@@ -57,7 +57,7 @@ def test_after_a_trip_nothing_moves_until_a_reset_with_a_reason(
     # Over the wire, on the device's clock: from the offending sample to zero at most two blocks.
     assert max(moved, default=0) - offending < 2 * 10
 
-    refused = run("second")
+    refused = bramah_here(*line("second"))
     assert refused.returncode == 3, refused.stderr
     for word in ("cap_pressure_2", str(tmp_path / "first"), f"--endpoint {faulty} --reason"):
         assert word in refused.stderr
@@ -67,26 +67,26 @@ def test_after_a_trip_nothing_moves_until_a_reset_with_a_reason(
     (note,) = state.rglob("trip.json")
     kept = note.read_text()
     note.unlink()
-    elsewhere = run("third")
+    elsewhere = bramah_here(*line("third"))
     assert elsewhere.returncode == 3, elsewhere.stderr
     assert "the device tripped earlier" in elsewhere.stderr
     note.write_text(kept)
 
-    asked = bramah("probe", "--rig", RIG, "--endpoint", faulty)
+    asked = bramah_here("probe", "--rig", RIG, "--endpoint", faulty)
     said = next(line for line in asked.stdout.splitlines() if line.startswith("tripped: "))
     for word in ("cap_pressure_2", "the host's connection ended", f"--endpoint {faulty} --reason"):
         assert word in said
 
-    unsaid = bramah("reset", "--rig", RIG, "--endpoint", faulty)
+    reset = ("reset", "--rig", RIG, "--endpoint", faulty)
+    unsaid = bramah_here(*reset)
     assert unsaid.returncode == 2
     assert "--reason TEXT is missing" in unsaid.stderr
-    assert run("fourth").returncode == 3
+    assert bramah_here(*line("fourth")).returncode == 3
 
-    line = ("reset", "--rig", RIG, "--endpoint", faulty, "--reason", "sensor looked at")
-    cleared = bramah(*line)
+    cleared = bramah_here(*reset, "--reason", "sensor looked at")
     assert cleared.returncode == 0, cleared.stderr
     assert "cap_pressure_2" in cleared.stdout
-    again = run("fifth")  # it drives the machine, and trips anew
+    again = bramah(*line("fifth"))  # it drives the machine, and trips anew
     assert again.returncode == 3, again.stderr
     assert "still" not in again.stderr
     assert (tmp_path / "fifth" / "state").read_text() == "tripped\n"
@@ -102,9 +102,9 @@ def test_a_second_run_on_a_bench_in_use_names_the_run_that_has_it(tmp_path: Path
             wait_for("record 1 of", process)
             at = ("--rig", RIG, "--endpoint", endpoint)
             for second in (
-                bramah(*line, tmp_path / "second"),
-                bramah("probe", *at),
-                bramah("reset", *at, "--reason", "none"),
+                bramah_here(*line, tmp_path / "second"),
+                bramah_here("probe", *at),
+                bramah_here("reset", *at, "--reason", "none"),
             ):
                 assert second.returncode == 4, second.stderr
                 assert f"in use: another client has control of the device at {endpoint[13:]}" in (

@@ -22,7 +22,7 @@ from rig.cli.experiment_loop import DECLINED, FLOOR, NOTHING, REFUSED, ROUNDS, L
 from rig.cli.trace_text import rounds_text
 from rig.runs.rigs import load_rig
 from tests.analysis.page import Page
-from tests.cli.bench import bramah
+from tests.cli.bench import bramah, bramah_here
 from tests.cli.loops import SINE, WAVES, Inside, looped
 
 RIG = "shinshu-2dof"
@@ -172,7 +172,7 @@ def test_a_trip_ends_the_loop_with_its_code_and_what_was_known(tmp_path: Path) -
 def test_what_does_not_go_together_is_said(
     more: tuple[str, ...], words: str, tmp_path: Path
 ) -> None:
-    done = bramah("loop", "--rig", RIG, "--out", tmp_path / "x", *more)
+    done = bramah_here("loop", "--rig", RIG, "--out", tmp_path / "x", *more)
     assert done.returncode == 2
     assert words in done.stderr
     assert not (tmp_path / "x").exists()

@@ -15,7 +15,7 @@ from rig.bench.probe import GOOD, pressurised, readings
 from rig.cli.simulated_bench import simulated_bench
 from rig.model.rig import Rig
 from rig.runs.rigs import load_rig
-from tests.cli.bench import bramah
+from tests.cli.bench import bramah_here
 
 RIG = "shinshu-2dof"
 
@@ -30,7 +30,7 @@ def test_probe_shows_every_channel_with_its_codes_and_moves_nothing(
     endpoint: str, tmp_path: Path
 ) -> None:
     out = tmp_path / "probe.json"
-    shown = bramah("probe", "--rig", RIG, "--endpoint", endpoint, "--json", out)
+    shown = bramah_here("probe", "--rig", RIG, "--endpoint", endpoint, "--json", out)
     assert shown.returncode == 0, shown.stderr
     found = {one["channel"]: one for one in json.loads(out.read_text())}
     assert tuple(found) == load_rig(RIG).channels
@@ -45,7 +45,7 @@ def test_probe_shows_every_channel_with_its_codes_and_moves_nothing(
 
 
 def test_a_program_reads_json_alone_while_chambers_are_under_pressure(endpoint: str) -> None:
-    shown = bramah("probe", "--rig", RIG, "--endpoint", endpoint, "--json", "-")
+    shown = bramah_here("probe", "--rig", RIG, "--endpoint", endpoint, "--json", "-")
     assert shown.returncode == 0, shown.stderr
     assert {one["channel"] for one in json.loads(shown.stdout)} == set(load_rig(RIG).channels)
     assert "still under pressure: joint 1 cap" in shown.stderr
@@ -58,7 +58,7 @@ def test_stop_zeroes_what_another_host_has_put_out(endpoint: str) -> None:
     other.start()
     other.apply([OutputLaw(bias=0.5, limit=1.0), OFF])
     assert other.read_block().data[:, 10].min() > 0.4
-    stopped = bramah("stop", "--rig", RIG, "--endpoint", endpoint)
+    stopped = bramah_here("stop", "--rig", RIG, "--endpoint", endpoint)
     assert stopped.returncode == 0, stopped.stderr
     assert stopped.stdout.startswith("outputs at zero, confirmed by the device")
     assert "another client has control" in stopped.stderr
@@ -67,14 +67,14 @@ def test_stop_zeroes_what_another_host_has_put_out(endpoint: str) -> None:
 
 
 def test_what_could_not_be_confirmed_is_said_first() -> None:
-    gone = bramah("stop", "--rig", RIG, "--endpoint", "modbus-tcp://127.0.0.1:9")
+    gone = bramah_here("stop", "--rig", RIG, "--endpoint", "modbus-tcp://127.0.0.1:9")
     assert gone.returncode == 4
     assert "outputs not confirmed at zero" in gone.stderr
     assert "emergency stop" in gone.stderr
 
 
 def test_pressure_that_the_rig_cannot_let_out_is_named(endpoint: str) -> None:
-    left = bramah("depressurise", "--rig", RIG, "--endpoint", endpoint)
+    left = bramah_here("depressurise", "--rig", RIG, "--endpoint", endpoint)
     assert left.returncode == 1
     assert "no way to let the pressure out" in left.stderr
     assert "supply 7.0" in left.stderr

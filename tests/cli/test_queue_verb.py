@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.bench import SHORT, bramah, simulated
+from tests.cli.bench import SHORT, bramah, bramah_here, simulated
 
 RIG = "shinshu-2dof"
 
@@ -18,7 +18,7 @@ def test_a_night_on_a_bench_from_add_to_its_page(tmp_path: Path) -> None:
 
         def add(*more: object) -> tuple[int, str, str]:
             words = ("queue", "add", "short.yaml", "--rig", RIG, "--endpoint", endpoint, *more)
-            done = bramah(*words, cwd=tmp_path)
+            done = bramah_here(*words, cwd=tmp_path)
             return done.returncode, done.stdout, done.stderr
 
         code, said, error = add("--when", "oil_temperature > 5 degC")
@@ -38,19 +38,19 @@ def test_a_night_on_a_bench_from_add_to_its_page(tmp_path: Path) -> None:
         assert states == ["done", "done"]
         # The file changes while the item waits: what counts is the proof when it starts.
         (tmp_path / "short.yaml").write_text(SHORT.replace("0.8 V", "8 V"))
-        assert bramah("queue", "retry", 2).returncode == 0
+        assert bramah_here("queue", "retry", 2).returncode == 0
         again = bramah("queue", "run")
     assert again.returncode == 1
-    shown = bramah("queue", "show", 2, "--json", "-")
+    shown = bramah_here("queue", "show", 2, "--json", "-")
     found = json.loads(shown.stdout)
     assert found["state"] == "refused"
     assert "limits.command allows 4 V" in found["reason"]
-    first = json.loads(bramah("queue", "show", 1, "--json", "-").stdout)
+    first = json.loads(bramah_here("queue", "show", 1, "--json", "-").stdout)
     assert first["found"]["parameters"]["C_pp_2"]["value"] == pytest.approx(6.28e-7, rel=0.05)
     page = (tmp_path / "night.html").read_text()
     assert "2 of 2 items completed" in page
     assert "C_pp_2" in page
-    runs = json.loads(bramah("runs", tmp_path / "runs", "--json", "-").stdout)
+    runs = json.loads(bramah_here("runs", tmp_path / "runs", "--json", "-").stdout)
     assert [run["state"] for run in runs] == ["done", "done"]
     assert [run["records"] for run in runs] == [2, 1]
     held = (Path(runs[0]["path"]) / "run.yaml").read_text()

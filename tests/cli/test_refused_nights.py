@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.bench import bramah, outputs_are_zero, simulated
+from tests.cli.bench import bramah_here, outputs_are_zero, simulated
 
 RIG = "shinshu-2dof"
 HEAD = "version: 2\nname: night\njoints: 2\n"
@@ -48,12 +48,12 @@ def test_what_cannot_run_is_refused_before_a_bench_is_asked_for(
         ("run", *night, "--out", "run", "--endpoint", nowhere),
         ("queue", "add", *night),
     ):
-        done = bramah(*command, cwd=tmp_path)
+        done = bramah_here(*command, cwd=tmp_path)
         assert done.returncode == 2, command
         assert said in done.stderr.replace(f"{tmp_path}/", "")
         assert "Traceback" not in done.stderr
     assert not (tmp_path / "run").exists()
-    assert json.loads(bramah("queue", "list", "--json", "-").stdout)["items"] == []
+    assert json.loads(bramah_here("queue", "list", "--json", "-").stdout)["items"] == []
 
 
 @pytest.fixture(scope="module")
@@ -80,12 +80,14 @@ def test_what_never_comes_ends_the_run_with_its_reason_and_a_safe_bench(
     step: str, said: str, endpoint: str, tmp_path: Path
 ) -> None:
     (tmp_path / "night.yaml").write_text(f"{HEAD}steps:\n  - {step}\n    timeout: 2 s\n")
-    done = bramah(
+    done = bramah_here(
         "run", "night.yaml", "--rig", RIG, "--out", "run", "--endpoint", endpoint, cwd=tmp_path
     )
     assert done.returncode == 1
     last = re.sub(r"oil_temperature [\d.]+ °", "oil_temperature N °", done.stderr.splitlines()[-1])
     assert last == f"bramah: {said}"
     assert outputs_are_zero(endpoint)
-    (line,) = [line for line in bramah("runs", tmp_path).stdout.splitlines() if "night" in line]
+    (line,) = [
+        line for line in bramah_here("runs", tmp_path).stdout.splitlines() if "night" in line
+    ]
     assert "aborted" in line

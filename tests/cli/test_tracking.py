@@ -25,7 +25,7 @@ from rig.runs.recorder import RecordMeta
 from rig.runs.rigs import load_rig
 from rig.runs.runstate import read_events
 from tests.analysis import small_bench
-from tests.cli.bench import SHORT, bramah, simulated
+from tests.cli.bench import SHORT, bramah, bramah_here, simulated
 from tests.services.fake_driver import FakeDriver
 
 RIG = "shinshu-2dof"
@@ -193,7 +193,9 @@ def test_a_run_is_tracked_to_what_identify_finds(tmp_path: Path) -> None:
         assert kept[name]["value"] == pytest.approx(expected[name].value, rel=1e-9)
     records = [e["record"] for e in read_events(run) if e["event"] == "tracked"]
     assert records == ["step1_r1", "step1_r2"]
-    wrong = bramah("run", protocol, "--rig", RIG, "--out", tmp_path / "x", "--track", "--memory", 0)
+    wrong = bramah_here(
+        "run", protocol, "--rig", RIG, "--out", tmp_path / "x", "--track", "--memory", 0
+    )
     assert wrong.returncode == 2
     assert "--memory 0: expected more than 0 s" in wrong.stderr
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from rig.runs.store import load_run
-from tests.cli.bench import SHORT, bramah, simulated
+from tests.cli.bench import SHORT, bramah, bramah_here, simulated
 
 RIG = "shinshu-2dof"
 
@@ -45,7 +45,7 @@ def test_a_cable_pulled_out_in_a_run_ends_it_by_name_and_keeps_what_came(
 
 
 def test_a_wire_fault_nobody_knows_is_refused_before_anything_is_served() -> None:
-    done = bramah("sim", "--rig", RIG, "--port", 0, "--wire-faults", "frame_gone")
+    done = bramah_here("sim", "--rig", RIG, "--port", 0, "--wire-faults", "frame_gone")
     assert done.returncode == 2
     assert "frame_gone" in done.stderr
     assert "frame_lost" in done.stderr

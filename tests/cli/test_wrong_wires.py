@@ -19,7 +19,7 @@ from hil_sim.link.served import ServedDevice
 from rig.model.wire import registers as reg
 from rig.runs.rigs import load_rig
 from tests.cli import strange_peers
-from tests.cli.bench import bramah, words
+from tests.cli.bench import bramah, bramah_here, words
 from tests.drivers.plain_module import WIRE, module_process
 from tests.drivers.test_modbus_map import rig_text
 from tests.hil_sim.integrator import IntegratorPlant
@@ -41,7 +41,7 @@ def refused(done: subprocess.CompletedProcess[str], code: int, *says: str) -> st
 
 
 def probed(endpoint: str) -> subprocess.CompletedProcess[str]:
-    return bramah("probe", "--rig", RIG, "--endpoint", endpoint)
+    return bramah_here("probe", "--rig", RIG, "--endpoint", endpoint)
 
 
 @contextmanager
@@ -85,7 +85,7 @@ def test_a_server_that_greets_is_named_as_no_socketcand() -> None:
 def test_a_register_map_at_a_web_server_is_named(tmp_path: Path) -> None:
     quick = ("timeout: 5 s", "timeout: 0.5 s")
     with strange_peers.web_server() as port, rig_file(tmp_path, port, quick) as path:
-        refused(bramah("probe", "--rig", path), LOST, f"127.0.0.1:{port}", "another program")
+        refused(bramah_here("probe", "--rig", path), LOST, f"127.0.0.1:{port}", "another program")
 
 
 @pytest.mark.parametrize(
@@ -142,7 +142,7 @@ def test_a_wrong_word_order_is_suspected_by_probe(tmp_path: Path) -> None:
         "cap_pressure_1: {function: 3, address: 2, type: float32, word_order: big",
     )
     with module_process() as (_, port), rig_file(tmp_path, port, wrong) as path:
-        shown = bramah("probe", "--rig", path)
+        shown = bramah_here("probe", "--rig", path)
     assert shown.returncode == 1, shown.stderr
     (row,) = (line for line in shown.stdout.splitlines() if line.startswith("cap_pressure_1"))
     assert "word order?" in row
@@ -165,7 +165,7 @@ def test_a_wrong_unit_or_register_is_named(
 ) -> None:
     quick = ("timeout: 5 s", "timeout: 0.5 s")
     with module_process() as (_, port), rig_file(tmp_path, port, change, quick) as path:
-        refused(bramah("probe", "--rig", path), LOST, *says)
+        refused(bramah_here("probe", "--rig", path), LOST, *says)
 
 
 # -- the device's own protocol --------------------------------------------------------------
@@ -203,7 +203,9 @@ def test_a_device_of_another_protocol_version_is_refused_with_both_versions(
     rig = load_rig(RIG)
     device = Device(rig, IntegratorPlant(rig), realtime=False)
     with ServedDevice(device, wire) as served:
-        line = refused(probed(served.link.endpoint), LOST, "version 2", "update the older")
+        # A process of its own: this one has the device's version, not the program's.
+        done = bramah("probe", "--rig", RIG, "--endpoint", served.link.endpoint)
+    line = refused(done, LOST, "version 2", "update the older")
     assert "this program version 1" in line
 
 
@@ -211,7 +213,7 @@ def test_a_device_of_another_protocol_version_is_refused_with_both_versions(
 
 
 def test_a_dbc_file_without_a_needed_signal_is_refused_by_the_signals_name(tmp_path: Path) -> None:
-    made = bramah("dbc", "--rig", RIG)
+    made = bramah_here("dbc", "--rig", RIG)
     assert made.returncode == 0, made.stderr
     lines = made.stdout.splitlines(keepends=True)
     left = [line for line in lines if " cap_pressure_1 " not in line]
