@@ -28,6 +28,7 @@ from tests.analysis.small_bench import TRUTH, angle
 Array = NDArray[np.float64]
 
 STEP = 4e-5  # [s] of the integrator: a tenth of the time in which the sharpest friction settles
+PERIOD = 4.0  # [s] of the excitation
 SETTLE = 4.0  # [s] before the record begins
 CENTRING = 0.3  # [V/m] that keep the piston about mid-stroke
 PUMP = 11.7e-3 / 60  # [m^3/s]
@@ -165,6 +166,15 @@ def _excited(t, wave):
 
 
 @njit(cache=True)
+def _period(wave):
+    """The excitation [V] of a period at every half step of the integrator."""
+    out = np.zeros(round(2.0 * PERIOD / STEP))
+    for k in range(len(out)):
+        out[k] = _excited(0.5 * STEP * k, wave)
+    return out
+
+
+@njit(cache=True)
 def _command(t, s, wave, bias):
     return bias - CENTRING * s + _excited(t, wave)
 
@@ -212,17 +222,20 @@ def _rates(y, t, q1, par, hidden, drive, held, out):
 
 
 @njit(cache=True)
-def _integrated(start, steps, q1, par, hidden, wave, bias):
-    """States (steps + 1, 5): angle [rad], speed [rad/s], cap and rod pressure, sag [Pa]."""
+def _integrated(start, steps, q1, par, hidden, drive, bias):
+    """States (steps + 1, 5): angle [rad], speed [rad/s], cap and rod pressure, sag [Pa].
+
+    `drive` [V] is a period of the excitation at every half step.
+    """
     y, z, out = start.copy(), start.copy(), np.zeros((steps + 1, 5))
     out[0] = y
     a, b, c, d = np.zeros(5), np.zeros(5), np.zeros(5), np.zeros(5)
-    after = bias + _excited(0.0, wave)
+    after = bias + drive[0]
     held = after - CENTRING * _linkage(y[0])[0]
     for k in range(steps):
         t = k * STEP
-        before, middle = after, bias + _excited(t + 0.5 * STEP, wave)
-        after = bias + _excited(t + STEP, wave)
+        before, middle = after, bias + drive[(2 * k + 1) % len(drive)]
+        after = bias + drive[(2 * k + 2) % len(drive)]
         _rates(y, t, q1, par, hidden, before, held, a)
         for i in range(5):
             z[i] = y[i] + 0.5 * STEP * a[i]
@@ -240,13 +253,13 @@ def _integrated(start, steps, q1, par, hidden, wave, bias):
     return out
 
 
-def _states(hidden: Hidden, wave: Array, bias: float, seconds: float) -> Array:
+def _states(hidden: Hidden, drive: Array, bias: float, seconds: float) -> Array:
     q1, q2 = angle(0.0, 0), angle(0.0, 1)
     par = np.array([TRUTH[name] for name in NAMES_1])
     hold = TRUTH["W2"] * 9.8 * math.sin(q1 + q2) / _linkage(q2)[1]
     start = np.array([q2, 0.0, (hold + 5.4e-4 * 3.5e6) / 7.0e-4, 3.5e6, 0.0])
     steps = round((SETTLE + seconds) / STEP)
-    return np.asarray(_integrated(start, steps, q1, par, hidden.array, wave, bias))
+    return np.asarray(_integrated(start, steps, q1, par, hidden.array, drive, bias))
 
 
 def _pistons(q: Array) -> Array:
@@ -284,10 +297,10 @@ def channels(
     sensors: Sensors = Sensors(),
 ) -> dict[str, Array]:
     """Return noise-free channels, each at its own instants; the mean stroke is at the middle."""
-    bias = 0.0
+    bias, drive = 0.0, _period(wave)
     for _ in range(2):
-        bias -= CENTRING * float(_pistons(_states(hidden, wave, bias, 4.0)[100_000:, 0]).mean())
-    y = _states(hidden, wave, bias, seconds)
+        bias -= CENTRING * float(_pistons(_states(hidden, drive, bias, 4.0)[100_000:, 0]).mean())
+    y = _states(hidden, drive, bias, seconds)
     time = STEP * np.arange(len(y))
     n = round(seconds * rig.sample_rate)
     tick = SETTLE + np.arange(n) / rig.sample_rate
