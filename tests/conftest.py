@@ -34,7 +34,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
-    """Collect no garbage among what is imported: it stays, and every later search leaves it out."""
+    """Leave imported objects, which stay, out of all later garbage collections."""
     gc.disable()
     try:
         return (yield)

@@ -73,7 +73,7 @@ def bramah_here(*arguments: object, cwd: Path | None = None) -> subprocess.Compl
 
 @contextmanager
 def _as_a_process_begins() -> Iterator[None]:
-    """Nobody listens to the log yet, and nobody has changed what a signal does."""
+    """Take handlers off the log, and give the log and SIGTERM theirs back afterwards."""
     root, ended = logging.getLogger(), signal.getsignal(signal.SIGTERM)
     handlers, level = root.handlers, root.level
     root.handlers = []
