@@ -15,10 +15,14 @@ from rig.cli.options import EndpointOption, RigOption
 from rig.cli.output import progress
 
 if TYPE_CHECKING:
+    from rig.bench.latch import Holder
     from rig.model.parts import Wire
 
 # A run that was told to stop records its outputs at zero, for 6 s and two answer times at most.
 RECORDS_ZERO: Final = 15.0  # [s]
+# A run of another computer that is about to put out its next law does not see one zero.
+ZEROS: Final = 6
+BETWEEN_ZEROS: Final = 0.2  # [s]
 
 
 def stop(rig: RigOption, endpoint: EndpointOption = None) -> None:
@@ -31,8 +35,12 @@ def stop(rig: RigOption, endpoint: EndpointOption = None) -> None:
     from rig.bench.outputs import UNSURE
 
     described, driver = device_of(rig, endpoint)
+    elsewhere = _holder(described.wire) is None
     try:
         driver.zero_outputs()
+        for _ in range(ZEROS - 1 if elsewhere else 0):
+            time.sleep(BETWEEN_ZEROS)
+            driver.zero_outputs()
     except DeviceError as error:
         watchdog = described.wire.watchdog
         raise type(error)(
@@ -55,22 +63,28 @@ def _end_run(wire: Wire) -> None:
     Raises DeviceBusy where it goes on.
     """
     from drivers.base import DeviceBusy
-    from rig.bench.latch import BenchState
     from rig.bench.outputs import UNSURE
 
-    state = BenchState(wire)
-    holder = state.holder()
-    if holder is None or holder.pid == os.getpid():
+    holder = _holder(wire)
+    if holder is None:
         return
     run = f", which writes {holder.run}," if holder.run else ""
     progress(f"stopping process {holder.pid}{run} as well")
     with suppress(ProcessLookupError):  # it ended by itself
         os.kill(holder.pid, signal.SIGTERM)
     deadline = time.monotonic() + RECORDS_ZERO
-    while state.holder() == holder:
+    while _holder(wire) == holder:
         if time.monotonic() > deadline:
             raise DeviceBusy(
                 f"{UNSURE}: process {holder.pid}{run or ','} was told to stop and goes on; use the "
                 "emergency stop"
             )
         time.sleep(0.05)
+
+
+def _holder(wire: Wire) -> Holder | None:
+    """Return the other process of this computer that has the bench, None where there is none."""
+    from rig.bench.latch import BenchState
+
+    holder = BenchState(wire).holder()
+    return None if holder is None or holder.pid == os.getpid() else holder

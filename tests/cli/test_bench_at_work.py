@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from drivers import make_driver, wire_at
+from rig.bench.latch import STATE_VARIABLE
 from rig.cli.main import app
-from rig.runs.rigs import load_rig, rig_text
+from rig.runs.rigs import rig_text
 from rig.runs.store import load_run
 from tests.cli.bench import (
     ENDLESS,
@@ -143,14 +143,16 @@ def test_stop_from_another_terminal_ends_the_run_and_keeps_the_records(
     aborted_with_its_records(run)
 
 
-def test_stop_from_another_computer_ends_the_run(endless: Path, tmp_path: Path) -> None:
+def test_stop_from_another_computer_ends_the_run(
+    endless: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another computer knows nothing of the process that drives the bench."""
     run = tmp_path / "stopped"
-    rig = load_rig(RIG)
     with simulated() as (endpoint, _):
         with third_record(endless, run, endpoint) as process:
-            other = make_driver(wire_at(endpoint, rig.wire), rig)
-            other.zero_outputs()
-            other.close()
+            monkeypatch.setenv(STATE_VARIABLE, str(tmp_path / "elsewhere"))
+            stopped = bramah_here("stop", "--rig", RIG, "--endpoint", endpoint)
+            assert stopped.returncode == 0, stopped.stderr
             _, errors = process.communicate(timeout=LONG)
         assert process.returncode == 130, errors
         assert "another program has put the outputs to zero" in errors.splitlines()[-1]
