@@ -31,6 +31,12 @@ def found(multisine_run: Run) -> Identification:
 
 
 @pytest.fixture(scope="module")
+def brief(multisine_run: Run) -> Run:
+    """One record of a step, where the page's other parts are looked at."""
+    return replace(multisine_run, records=multisine_run.records[:1])
+
+
+@pytest.fixture(scope="module")
 def sine_validation(rig: Rig) -> Run:
     """Two records named as columns of the paper's Table IV, and both joints at once."""
     steps = (
@@ -137,13 +143,13 @@ def test_validation_table_and_table_four_hold_the_fit(
 
 
 def test_a_cell_below_the_paper_is_marked_below(
-    multisine_run: Run, found: Identification, validated: list[RecordValidation]
+    brief: Run, found: Identification, validated: list[RecordValidation]
 ) -> None:
     worse = replace(
         validated[0], fit={"piston_2": 50.0, "cap_pressure_2": 40.0, "rod_pressure_2": -2e4}
     )
     page = Page(
-        render_report(runs=[multisine_run], identification=found, validation=[worse])
+        render_report(runs=[brief], identification=found, validation=[worse])
     )  # the spool's record is not given either
     row = page.table("Table IV").row("step1_1hz")
     assert row[2:11] == [
@@ -153,13 +159,13 @@ def test_a_cell_below_the_paper_is_marked_below(
 
 
 def test_a_simulation_that_failed_is_said_aloud(
-    multisine_run: Run, found: Identification, validated: list[RecordValidation]
+    brief: Run, found: Identification, validated: list[RecordValidation]
 ) -> None:
     why = "the state diverged 0.500 s after the start"
     broken = replace(
         validated[0], failure=why, simulation=replace(validated[0].simulation, filled=500)
     )
-    page = Page(render_report(runs=[multisine_run], identification=found, validation=[broken]))
+    page = Page(render_report(runs=[brief], identification=found, validation=[broken]))
     assert f"failed: {why}" in page.table("Validation").row("step1_1hz_r1")[-1]
     assert "1 free runs that failed" in page.text
 
@@ -300,12 +306,11 @@ def test_one_joint_alone(multisine_run: Run) -> None:
 
 
 def test_a_report_is_written_whole_and_one_that_cannot_be_says_where(
-    tmp_path: Path, multisine_run: Run, found: Identification
+    tmp_path: Path, html: str
 ) -> None:
     path = tmp_path / "r.html"
-    text = render_report(runs=[multisine_run], identification=found)
-    write(path, text)
+    write(path, html)
     with pytest.raises(InputError, match=re.escape("cannot write the report")):
-        write(tmp_path / "no" / "r.html", text)
+        write(tmp_path / "no" / "r.html", html)
     assert path.read_text(encoding="utf-8").lstrip().startswith("<!DOCTYPE html>")
     assert [p.name for p in tmp_path.iterdir()] == ["r.html"]

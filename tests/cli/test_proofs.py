@@ -22,7 +22,7 @@ from rig.model.parse import InputError
 from rig.model.rig import Rig
 from rig.runs.files import CACHE_VARIABLE, cache_folder
 from rig.runs.rigs import load_rig
-from tests.cli.bench import ROOT, SHORT, bramah
+from tests.cli.bench import ROOT, SHORT, bramah_here
 
 RIG = "shinshu-2dof"
 
@@ -190,8 +190,8 @@ def test_a_step_that_no_amplitude_saves_says_so(rig: Rig) -> None:
 def test_check_says_that_nothing_changed_and_so_does_a_run_folder(tmp_path: Path) -> None:
     file = tmp_path / "short.yaml"
     file.write_text(SHORT)
-    first = bramah("check", file, "--rig", RIG)
-    again = bramah("check", file, "--rig", RIG)
+    first = bramah_here("check", file, "--rig", RIG)
+    again = bramah_here("check", file, "--rig", RIG)
     assert (first.returncode, again.returncode) == (0, 0), first.stderr + again.stderr
     assert "the kept proof stands" not in first.stdout
     assert again.stdout.strip() == (

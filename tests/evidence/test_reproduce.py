@@ -19,7 +19,7 @@ from rig.model.rig import Rig
 from rig.runs.exchange.importer import import_records
 from tests.analysis import small_bench as bench
 from tests.analysis.small_bench import TRUTH
-from tests.cli.bench import bramah
+from tests.cli.bench import bramah_here
 from tests.studies.pages import Section, Table, markdown, text, write_page
 from tests.studies.reproduction.bench import Reproduction, Runs, Scale, analyse
 from tests.studies.reproduction.story import TITLE, as_dict, command, page
@@ -187,6 +187,8 @@ def run_folder(done: Reproduction, tmp_path_factory: pytest.TempPathFactory) -> 
 def test_identify_by_another_method_from_the_command_line(
     method: str, word: str, run_folder: Path
 ) -> None:
-    shown = bramah("identify", run_folder, "--method", method, "--evaluations", 40, "--seed", 7)
+    shown = bramah_here(
+        "identify", run_folder, "--method", method, "--evaluations", 40, "--seed", 7
+    )
     assert shown.returncode == 0, shown.stderr
     assert word in shown.stdout
