@@ -13,7 +13,6 @@ from contextlib import ExitStack, contextmanager
 from itertools import count, islice
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from analysis.identify.identify import identify
@@ -24,30 +23,11 @@ from analysis.workers.pool import Pool, Processes, Serial
 from rig.model.parse import InputError
 from rig.model.records import Run
 from rig.runs.exchange.fixtures import write_run
+from tests.analysis.pool_work import about, broken, gone, noise, square
 from tests.analysis.test_accumulate import assert_same
 from tests.studies.pool import Kept, performed
 
 END_SECONDS = 20.0
-
-
-def square(x: int) -> int:
-    return x * x
-
-
-def broken(x: int) -> int:
-    raise InputError(f"item {x} cannot be used")
-
-
-def about(_: int) -> tuple[int, str | None]:
-    return os.getpid(), os.environ.get("OPENBLAS_NUM_THREADS")
-
-
-def gone(_: int) -> None:
-    os._exit(1)
-
-
-def noise(seed: int) -> float:
-    return float(np.random.default_rng(seed).standard_normal())
 
 
 def alive(pid: int) -> bool:
