@@ -73,15 +73,18 @@ def bramah_here(*arguments: object, cwd: Path | None = None) -> subprocess.Compl
 
 @contextmanager
 def _as_a_process_begins() -> Iterator[None]:
-    """Take handlers off the log, and give the log and SIGTERM theirs back afterwards."""
+    """Take handlers off the log; restore log, SIGTERM and hidden modules afterwards."""
     root, ended = logging.getLogger(), signal.getsignal(signal.SIGTERM)
-    handlers, level = root.handlers, root.level
+    handlers, level, modules = root.handlers, root.level, set(sys.modules)
     root.handlers = []
     try:
         yield
     finally:
         root.handlers, root.level = handlers, level
         signal.signal(signal.SIGTERM, ended)
+        for name in set(sys.modules) - modules:
+            if sys.modules[name] is None:  # a library that the command does without
+                del sys.modules[name]
 
 
 def study(*arguments: object) -> subprocess.CompletedProcess[str]:
