@@ -35,9 +35,9 @@ def stop(rig: RigOption, endpoint: EndpointOption = None) -> None:
     from rig.bench.outputs import UNSURE
 
     described, driver = device_of(rig, endpoint)
-    elsewhere = _holder(described.wire) is None
     try:
-        driver.zero_outputs()
+        driver.zero_outputs()  # before anything else is looked at
+        elsewhere = _holder(described.wire) is None
         for _ in range(ZEROS - 1 if elsewhere else 0):
             time.sleep(BETWEEN_ZEROS)
             driver.zero_outputs()
