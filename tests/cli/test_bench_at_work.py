@@ -7,7 +7,7 @@ import os
 import signal
 import socket
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -57,10 +57,17 @@ def third_record(endless: Path, run: Path, endpoint: str) -> Iterator[subprocess
         yield process
 
 
-def aborted_with_its_records(run: Path) -> None:
-    """A stopped run says so and has what it recorded."""
+def ended_by(act: Callable[[subprocess.Popen[str], str], None], endless: Path, run: Path) -> str:
+    """What a run says that `act` ends in its third record, outputs at zero and records kept."""
+    with simulated() as (endpoint, _):
+        with third_record(endless, run, endpoint) as process:
+            act(process, endpoint)
+            _, errors = process.communicate(timeout=LONG)
+        assert process.returncode == 130, errors
+        assert outputs_are_zero(endpoint)
     assert (run / "state").read_text().strip() == "aborted"
     assert len(load_run(run).records) >= 2
+    return errors
 
 
 def test_a_protocol_is_checked_run_listed_and_identified(short: Path, tmp_path: Path) -> None:
@@ -101,16 +108,11 @@ def test_a_protocol_is_checked_run_listed_and_identified(short: Path, tmp_path: 
 def test_ctrl_c_twice_zeroes_the_outputs_and_keeps_the_records(
     endless: Path, tmp_path: Path
 ) -> None:
-    run = tmp_path / "stopped"
-    with simulated() as (endpoint, _):
-        with third_record(endless, run, endpoint) as process:
-            process.send_signal(signal.SIGINT)
-            process.send_signal(signal.SIGINT)
-            _, errors = process.communicate(timeout=LONG)
-            assert process.returncode == 130
-            assert "Traceback" not in errors
-        assert outputs_are_zero(endpoint)
-    aborted_with_its_records(run)
+    def twice(process: subprocess.Popen[str], _: str) -> None:
+        process.send_signal(signal.SIGINT)
+        process.send_signal(signal.SIGINT)
+
+    assert "Traceback" not in ended_by(twice, endless, tmp_path / "stopped")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -131,33 +133,28 @@ def test_stop_from_another_terminal_ends_the_run_and_keeps_the_records(
     endless: Path, tmp_path: Path
 ) -> None:
     run = tmp_path / "stopped"
-    with simulated() as (endpoint, _):
-        with third_record(endless, run, endpoint) as process:
-            stopped = bramah("stop", "--rig", RIG, "--endpoint", endpoint)
-            assert stopped.returncode == 0, stopped.stderr
-            assert stopped.stdout.startswith("outputs at zero, confirmed by the device")
-            assert str(run) in stopped.stderr
-            _, errors = process.communicate(timeout=LONG)
-        assert process.returncode == 130, errors
-        assert outputs_are_zero(endpoint)
-    aborted_with_its_records(run)
+
+    def stop(_: subprocess.Popen[str], endpoint: str) -> None:
+        stopped = bramah("stop", "--rig", RIG, "--endpoint", endpoint)
+        assert stopped.returncode == 0, stopped.stderr
+        assert stopped.stdout.startswith("outputs at zero, confirmed by the device")
+        assert str(run) in stopped.stderr
+
+    ended_by(stop, endless, run)
 
 
 def test_stop_from_another_computer_ends_the_run(
     endless: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Another computer knows nothing of the process that drives the bench."""
-    run = tmp_path / "stopped"
-    with simulated() as (endpoint, _):
-        with third_record(endless, run, endpoint) as process:
-            monkeypatch.setenv(STATE_VARIABLE, str(tmp_path / "elsewhere"))
-            stopped = bramah_here("stop", "--rig", RIG, "--endpoint", endpoint)
-            assert stopped.returncode == 0, stopped.stderr
-            _, errors = process.communicate(timeout=LONG)
-        assert process.returncode == 130, errors
-        assert "another program has put the outputs to zero" in errors.splitlines()[-1]
-        assert outputs_are_zero(endpoint)
-    aborted_with_its_records(run)
+
+    def stop(_: subprocess.Popen[str], endpoint: str) -> None:
+        monkeypatch.setenv(STATE_VARIABLE, str(tmp_path / "elsewhere"))
+        stopped = bramah_here("stop", "--rig", RIG, "--endpoint", endpoint)
+        assert stopped.returncode == 0, stopped.stderr
+
+    errors = ended_by(stop, endless, tmp_path / "stopped")
+    assert "another program has put the outputs to zero" in errors.splitlines()[-1]
 
 
 def test_a_killed_run_leaves_valves_closed_and_is_recovered(endless: Path, tmp_path: Path) -> None:

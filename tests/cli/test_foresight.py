@@ -5,14 +5,11 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import pytest
-
 from analysis.simulation.model import save_model
 from protocols.files import library
 from protocols.files.plan import resolve
-from rig.cli.main import run
 from rig.runs.rigs import load_rig
-from tests.cli.bench import SHORT
+from tests.cli.bench import SHORT, bramah_here
 from tests.cli.test_twin_model import identified
 
 RIG = "shinshu-2dof"
@@ -42,21 +39,13 @@ steps:
 """
 
 
-def bramah(*words: object) -> int:
-    with pytest.raises(SystemExit) as ended:
-        run([str(word) for word in words])
-    return int(ended.value.code or 0)
-
-
-def test_check_predicts_the_errors_and_names_what_a_protocol_leaves_open(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_check_predicts_the_errors_and_names_what_a_protocol_leaves_open(tmp_path: Path) -> None:
     file = tmp_path / "short.yaml"
     file.write_text(SHORT)
-    assert bramah("check", file, "--rig", RIG, "--json", tmp_path / "check.json") == 0
-    said = capsys.readouterr().out
-    assert "std. error %" in said
-    assert "NOT determined W1" in said
+    done = bramah_here("check", file, "--rig", RIG, "--json", tmp_path / "check.json")
+    assert done.returncode == 0
+    assert "std. error %" in done.stdout
+    assert "NOT determined W1" in done.stdout
     told = json.loads((tmp_path / "check.json").read_text())
     assert told["ok"]
     found = told["identification"]
@@ -65,15 +54,14 @@ def test_check_predicts_the_errors_and_names_what_a_protocol_leaves_open(
     assert found["rank"]["fluid"] == [5, 9]
 
 
-def test_a_designed_protocol_is_a_file_like_any_other(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_designed_protocol_is_a_file_like_any_other(tmp_path: Path) -> None:
     source, out = tmp_path / "quick.yaml", tmp_path / "made" / "b.yaml"
     source.write_text(QUICK)
     told = tmp_path / "design.json"
     line = ["design", source, "--rig", RIG, "--criterion", "b", "--budget", 8, "--out", out]
-    assert bramah(*line, "--json", told) == 0
-    assert f"written to {out}" in capsys.readouterr().out
+    done = bramah_here(*line, "--json", told)
+    assert done.returncode == 0
+    assert f"written to {out}" in done.stdout
     text = out.read_text()
     assert text.startswith("# Made by: bramah design ")
     before, after = json.loads(told.read_text())["parameters"]["b"].values()
@@ -88,26 +76,24 @@ def test_a_designed_protocol_is_a_file_like_any_other(
         empty = theirs.excite[0].wave.detection_lines
         assert empty == ours.excite[0].wave.detection_lines
         assert not set(empty) & set(ours.lines)
-    assert bramah("check", out, "--rig", RIG) == 0
+    assert bramah_here("check", out, "--rig", RIG).returncode == 0
 
 
-def test_a_design_keeps_the_limits_of_the_machine_that_was_identified(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_design_keeps_the_limits_of_the_machine_that_was_identified(tmp_path: Path) -> None:
     source, out, fast = tmp_path / "quick.yaml", tmp_path / "b.yaml", tmp_path / "fast.json"
     source.write_text(QUICK)
     save_model(identified(load_rig(RIG), 1.3), fast)
     line = ["design", source, "--rig", RIG, "--criterion", "b", "--budget", 4, "--out", out]
-    assert bramah(*line, "--model", fast) == 0
-    assert f"predicted on: model {fast}" in capsys.readouterr().out
-    assert bramah("check", out, "--rig", RIG, "--model", fast) == 0
+    done = bramah_here(*line, "--model", fast)
+    assert done.returncode == 0
+    assert f"predicted on: model {fast}" in done.stdout
+    assert bramah_here("check", out, "--rig", RIG, "--model", fast).returncode == 0
 
 
-def test_a_criterion_that_does_not_exist_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_criterion_that_does_not_exist_is_refused(tmp_path: Path) -> None:
     out = tmp_path / "no.yaml"
     line = ["design", "lock-and-excite-multisine", "--rig", RIG, "--criterion", "c", "--out", out]
-    assert bramah(*line) == 2
-    assert "expected D, E or a parameter" in capsys.readouterr().err
+    done = bramah_here(*line)
+    assert done.returncode == 2
+    assert "expected D, E or a parameter" in done.stderr
     assert not out.exists()
