@@ -226,6 +226,16 @@ def test_intervals_of_a_single_repeat_hold_the_truth_as_often_as_they_say() -> N
     assert 0.90 < np.mean(hits) < 0.99
 
 
+def test_a_parameter_that_no_row_shows_has_no_scatter_and_costs_no_other_its_own() -> None:
+    """A shape may make a column vanish; a single repeat is then judged by the others."""
+    blocks = line(np.random.default_rng(4), 0.0, repeats=1)
+    wide = [replace(b, X=np.column_stack((b.X, np.zeros(len(b.y))))) for b in blocks]
+    one, two = (least_squares(b) for b in (blocks, wide))
+    alone, beside = (by_parts(pieces(fit), fit.inverse) for fit in (one, two))
+    assert beside.covariance[0, 0] == pytest.approx(alone.covariance[0, 0], rel=1e-9)
+    assert beside.covariance[1, 1] == 0.0
+
+
 def test_coverage_is_counted_with_its_own_uncertainty() -> None:
     rng = np.random.default_rng(3)
     z = 0.01 * rng.standard_normal(200)

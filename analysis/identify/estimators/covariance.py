@@ -17,7 +17,7 @@ MacKinnon, Nielsen and Webb (2023), section 2.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ from scipy.special import fdtrc
 
 from analysis.identify.estimators.equations import Pieces
 from analysis.identify.settings import IDENTIFY
+from analysis.regression.least_squares import scaled_inverse
 from analysis.regression.solve import satterthwaite, stratified
 
 Array = NDArray[np.float64]
@@ -85,10 +86,18 @@ def lack_of_fit(pieces: Pieces, inverse: Array) -> Array:
 
 
 def by_parts(pieces: Pieces, inverse: Array) -> CovarianceParts:
-    """Return the jackknife over the parts of the period, all repeats of a part together."""
+    """Return the jackknife over the parts of the period, all repeats of a part together.
+
+    A direction that the rows do not determine, zero in `inverse` (k, k), gets no variance.
+    """
+    seen = np.diag(inverse) > 0.0
+    if not seen.all():
+        return _embedded(by_parts(_of_parameters(pieces, seen), inverse[np.ix_(seen, seen)]), seen)
     stratum, score, information = pieces.grouped(pieces.part)
-    A: Array = np.asarray(np.linalg.inv(inverse))
-    left_out = np.array([_without(A, part, g) for part, g in zip(information, score, strict=True)])
+    A = scaled_inverse(inverse)
+    left_out = np.array(
+        [_without(A, inverse, part, g) for part, g in zip(information, score, strict=True)]
+    )
     k = len(A)
     total, squares = np.zeros((k, k)), np.zeros(k)
     for s in np.unique(stratum):
@@ -100,11 +109,26 @@ def by_parts(pieces: Pieces, inverse: Array) -> CovarianceParts:
     return CovarianceParts(total, satterthwaite(np.diag(total), squares), np.zeros(k))
 
 
-def _without(A: Array, part: Array, score: Array) -> Array:
+def _of_parameters(pieces: Pieces, chosen: NDArray[np.bool_]) -> Pieces:
+    """Return the pieces of the parameters (k,) that are chosen."""
+    information = pieces.information[:, chosen][:, :, chosen]
+    return replace(pieces, score=pieces.score[:, chosen], information=information)
+
+
+def _embedded(inner: CovarianceParts, chosen: NDArray[np.bool_]) -> CovarianceParts:
+    """Return the parts of all parameters (k,): those not chosen have no variance."""
+    k = len(chosen)
+    covariance, dof, systematic = np.zeros((k, k)), np.ones(k), np.zeros(k)
+    covariance[np.ix_(chosen, chosen)] = inner.covariance
+    dof[chosen], systematic[chosen] = inner.dof, inner.systematic
+    return CovarianceParts(covariance, dof, systematic)
+
+
+def _without(A: Array, inverse: Array, part: Array, score: Array) -> Array:
     """Return the change of beta when a part is left out: (A - A_c)^-1 g_c."""
     scale = np.sqrt(np.abs(np.diag(A)))
     reduced = (A - part) / np.outer(scale, scale)
     if np.linalg.cond(reduced) > 1e10:
-        # That part alone determines some direction: its influence to first order.
-        reduced = A / np.outer(scale, scale)
+        # That part alone determines some direction, or none does: its influence to first order.
+        return np.asarray(inverse @ score)
     return np.asarray(np.linalg.solve(reduced, score / scale) / scale)
