@@ -236,8 +236,10 @@ def candidate_columns(
         before = rows[name]
         here, there = in_common(before, after)
         # Column by column: where a column is the same the difference is exactly nothing.
-        same = [after.names.index(n) for n in before.names]
-        moved = after.matrix[there][:, same] - before.matrix[here]
+        moved = -before.matrix[here]
+        for k, n in enumerate(before.names):
+            if n in after.names:  # a column of zeros is left out of rows
+                moved[:, k] += after.matrix[there, after.names.index(n)]
         side = after.rhs[there] - before.rhs[here]
         columns = {"": np.zeros(len(before.rhs))}
         columns[""][here] = moved @ np.array([beta.get(n, 0.0) for n in before.names]) - side
