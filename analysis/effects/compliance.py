@@ -30,6 +30,7 @@ from rig.model.rig import Rig
 ATMOSPHERE: Final = 101_325.0  # [Pa]
 DEEPEST: Final = 0.95 * ATMOSPHERE  # below gauge zero: a colder vacuum is a sensor's error
 MOST_AIR: Final = 0.2
+EXPONENTS: Final = (1.0, 1.4)
 MOST_VOLUME: Final = 10.0  # of the pipes' volume
 
 
@@ -37,9 +38,9 @@ MOST_VOLUME: Final = 10.0  # of the pipes' volume
 class EntrainedAir(Effect):
     """A share alpha of free air at atmospheric pressure p0 makes the oil softer at low pressure.
 
-    1/b_eff = 1/b + alpha p0 / (p + p0)^2, p gauge: an isothermal gas (Merritt 1967, chapter 2;
-    Wylie and Streeter 1993, with polytropic exponent 1: bubbles of less than a
-    millimetre have the oil's temperature). Linear in alpha.
+    1/b_eff = 1/b + alpha / (n (p + p0)) (p0 / (p + p0))^(1/n), p gauge (Merritt 1967, chapter 2).
+    The polytropic exponent n, a shape, is 1 where bubbles keep the oil's temperature and 1.4 where
+    they keep their heat (Wylie and Streeter 1993). Linear in alpha.
     """
 
     mechanism: ClassVar[str] = "bulk_modulus_curve"
@@ -68,22 +69,46 @@ class EntrainedAir(Effect):
         """Return alpha [-]."""
         return (Coefficient("alpha_air", "", "fluid"),)
 
+    def shape_names(self) -> tuple[str, ...]:
+        """Name the exponent."""
+        return ("air_exponent",)
+
+    def shapes(self, rig: Rig) -> tuple[Shape, ...]:
+        """Return n [-], from isothermal to adiabatic."""
+        low, high = EXPONENTS
+        name = self.shape_names()[0]
+        return (Shape(name, "", low, high, (1.2,), resolution=True, saturates=True, detail=True),)
+
+    def other_forms(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+        """Return the gas with an exponent to be found."""
+        return () if len(shape) else ((1.2,),)
+
+    def in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[float, ...]:
+        """Return the shape as it is: the exponent belongs to another form."""
+        return tuple(shape)
+
     def columns(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Columns:
-        """Return - V dp/dt p0 / (p + p0)^2 of each chamber."""
+        """Return - V dp/dt times the softness of each chamber's gas per alpha."""
         out: Columns = {}
+        n = _exponent(shape)
         for i in range(signals.joints):
             for side, V, p, rate in (
                 ("flow_cap", signals.V_cap, signals.p_cap, signals.pd_cap),
                 ("flow_rod", signals.V_rod, signals.p_rod, signals.pd_rod),
             ):
                 absolute = np.maximum(p[:, i], -DEEPEST) + ATMOSPHERE
-                column = -V[:, i] * rate[:, i] * ATMOSPHERE / absolute**2
+                softness = (ATMOSPHERE / absolute) ** (1.0 / n) / (n * absolute)
+                column = -V[:, i] * rate[:, i] * softness
                 out[equation(side, i)] = {"alpha_air": column}
         return out
 
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Refuse air that stiffens, and froth."""
         return beyond("alpha_air", values["alpha_air"], "", MOST_AIR)
+
+    def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
+        """Return alpha and n."""
+        return np.array([values["alpha_air"], _exponent(shape)])
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return each chamber's pressure [Pa]."""
@@ -171,14 +196,20 @@ class DeadVolume(Effect):
         return {equation(f"flow_{self.side}", self.joint): rate[:, self.joint]}
 
 
+def _exponent(shape: Sequence[float]) -> float:
+    """Return n, 1 of a model without a shape."""
+    return shape[0] if len(shape) else EXPONENTS[0]
+
+
 @kernel
 def _air(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untyped-def]
     if phase == CONTRIBUTE:
+        n = par[1]
         for i in range(x.shape[1]):
             cap = max(x[P_CAP, i], -DEEPEST) + ATMOSPHERE
             rod = max(x[P_ROD, i], -DEEPEST) + ATMOSPHERE
-            out[COMP_CAP, i] += par[0] * x[V_CAP, i] * ATMOSPHERE / (cap * cap)
-            out[COMP_ROD, i] += par[0] * x[V_ROD, i] * ATMOSPHERE / (rod * rod)
+            out[COMP_CAP, i] += par[0] * x[V_CAP, i] * (ATMOSPHERE / cap) ** (1 / n) / (n * cap)
+            out[COMP_ROD, i] += par[0] * x[V_ROD, i] * (ATMOSPHERE / rod) ** (1 / n) / (n * rod)
 
 
 @kernel

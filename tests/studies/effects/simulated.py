@@ -191,7 +191,8 @@ def searched(
     if not shapes:
         return ()
     details = tuple(s.middle for s in shapes if s.detail)
-    best = nearby(min(itertools.product(*(s.grid for s in shapes if not s.detail)), key=cost))
+    best = min(itertools.product(*(s.grid for s in shapes if not s.detail)), key=cost)
+    best = nearby(best) if best else best
     return min(best, nearby((*best, *details)), key=cost) if details else best
 
 
