@@ -28,6 +28,7 @@ from analysis.effects.base import Array, Shape
 
 PRESLIDING: Final = (5e-6, 40e-6, 150e-6)  # [m] seals give a few hundredths of a millimetre
 PRESLIDING_BOUNDS: Final = (2e-6, 5e-4)
+SHEAR: Final = 0.02  # of the bore: a third of a seal's section, which is a fifteenth of the bore
 STIFFENING: Final = 30.0  # [s/m] where a search begins
 STIFFENING_BOUNDS: Final = (1.0, 3e3)  # [s/m] less is a tenth at 0.1 m/s: nothing
 FASTEST: Final = 3e3  # [1/s] relaxation in simulation; faster changes nothing that is seen
@@ -40,9 +41,13 @@ TRANSITION_BOUNDS: Final = (TRANSITION, 2e-2)  # [m/s] wider is viscous friction
 TRANSITION_START: Final = 1e-3  # [m/s] where a search begins
 
 
-def presliding(name: str) -> Shape:
-    """Return a presliding distance's shape [m]; a contact may be stiffer than sensors resolve."""
-    return Shape(name, "m", *PRESLIDING_BOUNDS, PRESLIDING, resolution=True)
+def presliding(name: str, bore: float = 0.0) -> Shape:
+    """Return a presliding distance's shape [m]; a contact may be stiffer than sensors resolve.
+
+    A seal's section grows with the cylinder's `bore` [m], and with it what it yields in shear.
+    """
+    low, high = PRESLIDING_BOUNDS
+    return Shape(name, "m", low, max(high, SHEAR * bore), PRESLIDING, resolution=True)
 
 
 def stiffening(name: str) -> Shape:

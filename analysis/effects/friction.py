@@ -91,7 +91,7 @@ class Friction(Effect):
         """
         joint = self.joint + 1
         rate = (stiffening(f"stiffening_{joint}"),) if self.stiffens else ()
-        distances = map(presliding, self.distance_names())
+        distances = (presliding(name, bore(rig, self.joint)) for name in self.distance_names())
         return (*distances, *rate, transition(f"transition_{joint}"))
 
     def in_detail(self, rig: Rig, shape: Sequence[float]) -> tuple[float, ...]:
@@ -179,6 +179,11 @@ class Friction(Effect):
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return the piston's speed [m/s]."""
         return {equation("torque", self.joint): signals.sd[:, self.joint]}
+
+
+def bore(rig: Rig, joint: int) -> float:
+    """Return the bore of a joint's cylinder [m], 0 of an electric joint."""
+    return 0.0 if rig.electric else 2.0 * math.sqrt(rig.joints[joint].cylinder.cap_area / math.pi)
 
 
 def force_limit(rig: Rig, joint: int) -> float:

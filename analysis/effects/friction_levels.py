@@ -35,6 +35,7 @@ from analysis.terms.base import (
 from rig.model.rig import Rig
 
 DIFFERENCE: Final = 0.1  # of the mean level: with less between directions it is not asymmetric
+LEAST_SHARE: Final = 0.1  # of the other level: with less the difference is no seal's
 DIFFERENCE_LOAD: Final = -1.0  # weight of the rod pressure where the difference presses the seal
 
 
@@ -110,9 +111,9 @@ class AsymmetricFriction(Friction):
         """Refuse a driving direction, too much, and directions that do not differ."""
         limit = force_limit(rig, self.joint)
         levels = [values[name] for name in self._names()]
-        mean = 0.5 * sum(levels)
+        least = LEAST_SHARE * max(map(abs, levels))
         for name, level in zip(self._names(), levels, strict=True):
-            too_large = beyond(name, level, "N", limit, -DIFFERENCE * abs(mean))
+            too_large = beyond(name, level, "N", limit, least)
             if too_large:
                 return too_large
         if self.simpler(rig, values):

@@ -101,6 +101,7 @@ def _inclination(phase, bench, x, z, par, out, M, dz):  # type: ignore[no-untype
             x[THETA, i] += par[0]
 
 
+LEAST_REACH: Final = 0.1  # of the joint's reach: against a stiffer spring it cannot move so far
 RESTS: Final = 5  # rest angles of first look, evenly in the joint's reach
 
 
@@ -164,9 +165,8 @@ class JointSpring(Effect):
     def problem(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> str:
         """Refuse a spring that pushes away, one too stiff to move, a rest far out of reach."""
         name = f"k_spring_{self.joint + 1}"
-        rest = self.shape_of(rig, shape)[0]
-        farthest = max(abs(q - rest) for q in _reach(rig, self.joint))
-        stiffest = torque_limit(rig, self.joint) / farthest
+        low, high = _reach(rig, self.joint)
+        stiffest = torque_limit(rig, self.joint) / (LEAST_REACH * (high - low))
         return beyond(name, values[name], "N*m/rad", stiffest) or self.outside(rig, shape)
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
