@@ -31,10 +31,11 @@ class Shape:
     """A shape parameter: its parameter name, SI unit, physical bounds and points of first look.
 
     At `neutral` the effect is not there; None where its size is a linear coefficient. With
-    `resolution` the low bound is only what data resolve: to lie there contradicts nothing. A
-    `detail` of the form stands last, and a shape may do without it: it is searched only where the
-    records ask for it, makes no explanation less simple than another, and at a bound refuses none.
-    What is `fixed`, a knot of a curve, is placed by the data beforehand and never searched.
+    `resolution` the low bound is only what data resolve: to lie there contradicts nothing. Where a
+    shape `saturates` so is the high one, beyond which its curve hardly changes. A `detail` of the
+    form stands last, and a shape may do without it: it is searched only where the records ask for
+    it, makes no explanation less simple than another, and at a bound refuses none. What is `fixed`,
+    a knot of a curve, is placed by the data beforehand and never searched.
     """
 
     parameter: str
@@ -44,6 +45,7 @@ class Shape:
     grid: tuple[float, ...]
     neutral: float | None = None
     resolution: bool = False
+    saturates: bool = False
     detail: bool = False
     fixed: bool = False
 
@@ -266,7 +268,8 @@ class Effect(Term):
             margin = 1e-3 * (s.high - s.low)
             allowed = s.resolution or s.neutral == s.low
             low = s.low if allowed else s.low + margin
-            if not low <= value <= s.high - margin:
+            high = s.high if s.saturates else s.high - margin
+            if not low <= value <= high:
                 return (
                     f"{s.parameter} = {plain(value, 4)} {s.unit} lies at the edge of what is "
                     f"physical, {plain(s.low, 4)} to {plain(s.high, 4)}"

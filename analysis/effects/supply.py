@@ -1,12 +1,13 @@
 """Effects on the pressures at the valves' ports: supply sag, return pressure.
 
 Both follow the flow that all valves together take or give. The rows have that flow from the
-chambers' continuity, A s' + V p' / b with the rig's nominal b (the correction of a correction; left
-out where the rig states none); the simulation solves the orifices for it.
+chambers' continuity, A s' + V p' / b with the rig's nominal b, or a usual one where the rig states
+none (the correction of a correction); the simulation solves the orifices for it.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -15,7 +16,7 @@ from typing import ClassVar, Final
 import numpy as np
 from numba import njit
 
-from analysis.effects.base import SUPPLY, Array, Effect, Shape
+from analysis.effects.base import SUPPLY, Array, Effect, Evidence, Shape
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import (
     P_CAP,
@@ -35,6 +36,10 @@ from rig.model.rig import Rig
 
 NEWTON: Final = 12  # steps; the equation is monotone and smooth but for u = 0
 LONGEST: Final = 100.0  # [s] of the pump's flow: as soft as an accumulator in the line
+# Of the pump's flow: a line that takes all of the pressure at so little is the steepest looked for.
+LEAST_FLOW: Final = 0.05
+BULK_MODULUS: Final = 1e9  # [Pa] with hoses and some air (Jelali and Kroll 2003, section 2.3)
+NOTHING: Final = 1e-4  # of the supply pressure, at the pump's whole flow
 
 
 @dataclass(frozen=True)
@@ -65,9 +70,54 @@ class PortEffect(Effect):
         return self.outside(rig, shape)
 
 
+def bulk_modulus(rig: Rig) -> float:
+    """Return the rig's nominal bulk modulus [Pa], or a usual one of oil in hoses."""
+    return rig.nominal.get("b", BULK_MODULUS)
+
+
+def line_drop(name: str, rig: Rig, shares: tuple[float, ...]) -> Shape:
+    """Return a line's drop at the pump's whole flow [Pa]; `shares` of the supply pressure at first.
+
+    A pump is often rated for far more than an arm draws: the drop at its whole flow is then a
+    number only, and may be many times the supply pressure.
+    """
+    p = rig.supply.pressure
+    nothing, first = NOTHING * p, tuple(share * p for share in shares)
+    return Shape(name, "Pa", nothing, 0.9 * p / LEAST_FLOW**2, first, neutral=nothing)
+
+
+def turning(name: str, first: tuple[float, ...]) -> Shape:
+    """Return the share of the pump's flow at which a line's flow turns turbulent."""
+    return Shape(name, "", 0.0, 3.0, first, resolution=True, saturates=True)
+
+
+def packed_line(rig: Rig, dp: float, share: float) -> tuple[float, float]:
+    """Return the turbulent part's drop over Q^2 [Pa s^2/m^6] and where it begins [m^3/s]."""
+    flow = rig.supply.flow
+    return dp / math.cbrt(1.0 + share**3) / flow**2, share * flow
+
+
+def looks(
+    rig: Rig, effect: Effect, evidence: Evidence, drawn: bool, powers: Sequence[int]
+) -> tuple[tuple[float, ...], ...]:
+    """Return a grid of first look that means the same at the largest flow that the records have.
+
+    `powers` say how each shape changes with the pump's flow over that flow.
+    """
+    flow = max((float(port_flow(rig, s, drawn).max()) for s in evidence.signals), default=0.0)
+    if flow <= 0.0:
+        return ()
+    times = min(max(rig.supply.flow / flow, 1.0), 1.0 / LEAST_FLOW)
+    axes = [
+        [value * times**power for value in shape.grid]
+        for shape, power in zip(effect.shapes(rig), powers, strict=False)
+    ]
+    return tuple(itertools.product(*axes))
+
+
 def port_flow(rig: Rig, signals: Signals, drawn: bool) -> Array:
     """Return the flow (n,) [m^3/s] that all valves draw from the supply, or give to the tank."""
-    softness = 1.0 / rig.nominal["b"] if "b" in rig.nominal else 0.0
+    softness = 1.0 / bulk_modulus(rig)
     total = np.zeros(len(signals.t))
     for i, joint in enumerate(rig.joints):
         cap, rod = joint.cylinder.cap_area, joint.cylinder.rod_area
@@ -84,20 +134,22 @@ def port_flow(rig: Rig, signals: Signals, drawn: bool) -> Array:
 
 @dataclass(frozen=True)
 class SupplySag(PortEffect):
-    """The valves see a lower pressure: p_s - dp r (r^3 + r_t^3)^(1/3), r = Q / Q_pump.
+    """The valves see p_s - dp r ((r^3 + r_t^3) / (1 + r_t^3))^(1/3), r = Q / Q_pump.
 
-    Where the rig measures its supply, this is the line between sensor and valves: laminar below
-    the share r_t of the pump's flow, turbulent above (Merritt 1967, chapter 3; the two asymptotes
-    joined as in Churchill and Usagi 1972). Where it does not, the pressure of pump or relief valve
-    falls nearly in proportion to the flow. A sudden demand is met by the oil V_supply between
-    sensor and valves, or an accumulator of equal capacity, until the line follows:
-    dQ/dt = (Q_drawn - Q) b / (V_supply d dp/dQ); the simulation leaves that out.
-    dp, r_t and V_supply are shapes.
+    dp is the drop at the pump's whole flow. Where the rig measures its supply, this is the line
+    between sensor and valves: laminar below the share r_t of the pump's flow, turbulent above
+    (Merritt 1967, chapter 3; the two asymptotes joined as in Churchill and Usagi 1972). Where it
+    does not, the pressure of pump or relief valve falls nearly in proportion to the flow. A sudden
+    demand is met by the oil V_supply between sensor and valves, or an accumulator of equal
+    capacity, until the line follows: dQ/dt = (Q_drawn - Q) b / (V_supply d dp/dQ); the simulation
+    leaves that out.
+    dp, r_t and V_supply are shapes; a line that is laminar throughout has any large r_t.
     """
 
     mechanism: ClassVar[str] = "supply_curve"
     element: ClassVar[str] = "supply"
     name: ClassVar[str] = "supply_sag"
+    by_data: ClassVar[bool] = True
     least_shape: ClassVar[tuple[float, ...]] = (0.2e6, 0.0, 0.0)  # [Pa] at the rated flow
     variable: ClassVar[str] = "the flow drawn from the supply"
     confounders: ClassVar[tuple[str, ...]] = ("tank_pressure", "sensor_gain", "sensor_offset")
@@ -115,27 +167,31 @@ class SupplySag(PortEffect):
         return ("dp_supply", "laminar_share", "V_supply")
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return the turbulent drop at the pump's whole flow [Pa], r_t and the volume [m^3]."""
-        p, most = rig.supply.pressure, LONGEST * rig.supply.flow
+        """Return the drop at the pump's whole flow [Pa], r_t and the volume [m^3]."""
+        most = LONGEST * rig.supply.flow
         return (
-            Shape("dp_supply", "Pa", 0.0, 0.9 * p, (0.05 * p, 0.2 * p), 0.0),
-            Shape("laminar_share", "", 0.0, 1.5, (0.1, 0.3), resolution=True),
+            line_drop("dp_supply", rig, (0.05, 0.2)),
+            turning("laminar_share", (0.2, 1.2)),
             Shape("V_supply", "m^3", 0.0, most, (0.005 * most, 0.1 * most), resolution=True),
         )
+
+    def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
+        """Return drops, shares and volumes of first look at the flow drawn."""
+        return looks(rig, self, evidence, drawn=True, powers=(2, -1, -1))
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Take the drop from the supply pressure."""
         dp, share, volume = self.shape_of(rig, shape)
+        turbulent = dp / math.cbrt(1.0 + share**3)
         ratio = np.ascontiguousarray(port_flow(rig, signals, drawn=True) / rig.supply.flow)
-        capacity = volume / (rig.nominal["b"] * rig.supply.flow) if "b" in rig.nominal else 0.0
-        drop = _line(ratio, 1.0 / signals.rate, dp, share, capacity)
+        capacity = volume / (bulk_modulus(rig) * rig.supply.flow)
+        drop = _line(ratio, 1.0 / signals.rate, turbulent, share, capacity)
         return replace(signals, p_s=signals.p_s - drop)
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
-        """Return dp / Q_pump^2, the flow where it turns turbulent, C_pp and C_mm of each joint."""
+        """Return the line (`packed_line`), C_pp and C_mm of each joint."""
         dp, share, _ = self.shape_of(rig, shape)
-        flow = rig.supply.flow
-        return np.array([dp / flow**2, share * flow, *edge_gains(rig, values, (0, 3))])
+        return np.array([*packed_line(rig, dp, share), *edge_gains(rig, values, (0, 3))])
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return the flow drawn [m^3/s]."""
@@ -209,13 +265,15 @@ class TankPressure(PortEffect):
 
 @dataclass(frozen=True)
 class ReturnLine(PortEffect):
-    """The return pressure is the drop of its line: dp r (r^3 + r_t^3)^(1/3), r = Q / Q_pump.
+    """The return pressure is its line's drop, dp r ((r^3 + r_t^3) / (1 + r_t^3))^(1/3).
 
-    Laminar below the share r_t of the pump's flow, turbulent above (as `supply_sag`; Merritt 1967,
-    chapter 3). A pressure that is there at zero flow too is `tank_pressure`.
+    r = Q / Q_pump, and dp is the drop at the pump's whole flow. Laminar below the share r_t of the
+    pump's flow, turbulent above (as `supply_sag`; Merritt 1967, chapter 3). A pressure that is
+    there at zero flow too is `tank_pressure`.
     """
 
     name: ClassVar[str] = "return_line"
+    by_data: ClassVar[bool] = True
     mechanism: ClassVar[str] = "return_line"
     element: ClassVar[str] = "tank"
     least_shape: ClassVar[tuple[float, ...]] = (0.2e6,)  # [Pa] at the rated flow
@@ -235,24 +293,27 @@ class ReturnLine(PortEffect):
         return ("dp_return", "return_laminar")
 
     def shapes(self, rig: Rig) -> tuple[Shape, ...]:
-        """Return the turbulent drop at the pump's whole flow [Pa], and r_t."""
-        p = rig.supply.pressure
+        """Return the drop at the pump's whole flow [Pa], and r_t."""
         return (
-            Shape("dp_return", "Pa", 0.0, 0.9 * p, (0.03 * p, 0.15 * p), 0.0),
-            Shape("return_laminar", "", 0.0, 1.5, (0.5,), resolution=True, detail=True),
+            line_drop("dp_return", rig, (0.03, 0.15)),
+            replace(turning("return_laminar", (0.5,)), detail=True),
         )
+
+    def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
+        """Return drops of first look at the flow given back."""
+        return looks(rig, self, evidence, drawn=False, powers=(2,))
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Raise the tank pressure."""
         dp, share = self.whole(rig, shape)
         ratio = port_flow(rig, signals, drawn=False) / rig.supply.flow
-        return replace(signals, p_tank=signals.p_tank + dp * ratio * np.cbrt(ratio**3 + share**3))
+        drop = dp * ratio * np.cbrt((ratio**3 + share**3) / (1.0 + share**3))
+        return replace(signals, p_tank=signals.p_tank + drop)
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:
-        """Return dp / Q_pump^2, the flow where it turns turbulent, C_mp and C_pm of each joint."""
-        dp, share = self.whole(rig, shape)
-        flow = rig.supply.flow
-        return np.array([dp / flow**2, share * flow, *edge_gains(rig, values, (2, 1))])
+        """Return the line (`packed_line`), C_mp and C_pm of each joint."""
+        line = packed_line(rig, *self.whole(rig, shape))
+        return np.array([*line, *edge_gains(rig, values, (2, 1))])
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return the flow given back [m^3/s]."""
@@ -281,19 +342,19 @@ def lost(Q, turbulent, turning):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _line(ratio, step, dp, share, capacity):  # type: ignore[no-untyped-def]
+def _line(ratio, step, turbulent, share, capacity):  # type: ignore[no-untyped-def]
     # Between two samples the demand is a straight line and the time constant stands still.
     drop = np.zeros_like(ratio)
     through = ratio[0]
     for k in range(len(ratio)):
         if k and capacity > 0.0:
-            late = max(capacity * lost(through, dp, share)[1], 1e-9)
+            late = max(capacity * lost(through, turbulent, share)[1], 1e-9)
             kept = math.exp(-step / late)
             rise = ratio[k] - ratio[k - 1]
             through = ratio[k] - rise * (1 - kept) * late / step + kept * (through - ratio[k - 1])
         else:
             through = ratio[k]
-        drop[k] = lost(max(through, 0.0), dp, share)[0]
+        drop[k] = lost(max(through, 0.0), turbulent, share)[0]
     return drop
 
 

@@ -9,7 +9,8 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from analysis.effects.supply import SupplySag
+from analysis.effects.base import Evidence
+from analysis.effects.supply import PortEffect, ReturnLine, SupplySag
 from analysis.signals.conditioning import Signals
 from rig.model.rig import Rig
 from tests.analysis.test_terms import signals_of
@@ -36,7 +37,8 @@ def dropped(rig: Rig, signals: Signals, volume: float) -> np.ndarray:
 
 def through(drop: float, flow: float) -> float:
     """The line's flow at a drop, from its law by a root finder."""
-    law = lambda Q: DROP * (Q / flow) * np.cbrt((Q / flow) ** 3 + SHARE**3) - drop  # noqa: E731
+    whole = DROP / np.cbrt(1.0 + SHARE**3)
+    law = lambda Q: whole * (Q / flow) * np.cbrt((Q / flow) ** 3 + SHARE**3) - drop  # noqa: E731
     return float(brentq(law, 0.0, 10 * flow)) if drop > 0 else 0.0
 
 
@@ -56,6 +58,26 @@ def test_without_oil_between_the_drop_is_that_of_the_flow_at_each_instant(
     assert dropped(rig, more, 0.0).max() == pytest.approx(
         4 * dropped(rig, huge, 0.0).max(), rel=0.01
     )  # turbulent: as its square
+
+
+@pytest.mark.parametrize("effect", [SupplySag("bench"), ReturnLine("bench")])
+def test_a_pump_rated_for_far_more_than_the_arm_draws_changes_no_first_look(
+    rig: Rig, lifting: Signals, effect: PortEffect
+) -> None:
+    """The drops that a search begins with are those at the flow that is there."""
+
+    def looked_at(rig: Rig) -> np.ndarray:
+        seen = [
+            effect.prepare(rig, lifting, p) for p in effect.points(rig, Evidence([lifting], []))
+        ]
+        return np.array([np.abs(s.p_s - s.p_tank - lifting.p_s + lifting.p_tank) for s in seen])
+
+    some, other = (
+        looked_at(rig.model_copy(update={"supply": rig.supply.model_copy(update={"flow": flow})}))
+        for flow in (0.6 * rig.supply.flow, 9.0 * rig.supply.flow)
+    )
+    assert some.max() > 0.1 * rig.supply.pressure
+    assert other.max(axis=1) == pytest.approx(some.max(axis=1), rel=0.4)
 
 
 def test_the_oil_between_sensor_and_valves_is_continuity_in_its_volume(
