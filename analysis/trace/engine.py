@@ -34,8 +34,8 @@ from analysis.trace.finding import (
     TraceRuns,
     at_rest,
     dry,
+    fitted_in_motion,
     found_on,
-    in_motion,
     trace_rows,
     without_rests,
     without_tied,
@@ -57,6 +57,7 @@ from analysis.trace.result import (
 )
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.hypothesis_set import HypothesisSet
+from analysis.trace.search.refinement import ExactFit
 from analysis.trace.settings import TRACE
 from analysis.trace.words import sentence
 from rig.model.parse import InputError
@@ -152,7 +153,7 @@ def trace(
     hidden = (
         detection_limits(train_data, candidates, winner, after) if verdict != UNEXPLAINED else []
     )
-    notes += _weighed_with_a_curve(winner, after)
+    notes += [*_better_known(winner.fit, last, after), *_weighed_with_a_curve(winner, after)]
     notes += _undetermined(after, [n for n, e in before.parameters.items() if not e.identified])
     notes += [*kept, *_missed_held(verdict, error, [*notes, *kept]), *in_words(hidden)]
     runs_before, runs_after = held_out.free_runs([*holdout, *judge], before, after)
@@ -214,7 +215,7 @@ def _judged(
     kept, words = _kept(finding.rows.unseen.judging, finding.hypotheses.empty, winner)
     joints = dry(winner, kept)
     if joints and not finding.rows.in_motion:
-        rows, hypotheses, moving = in_motion(rig, terms, records, winner, joints)
+        rows, hypotheses, moving = fitted_in_motion(rig, terms, records, winner, joints)
         if not _kept(rows.unseen.judging, hypotheses.empty, moving)[0]:
             kept, words = set(), at_rest(joints, "include")
     return (UNEXPLAINED if kept else finding.verdict), words
@@ -246,7 +247,25 @@ def _notes(train_data: RegressionData, holdout_data: RegressionData) -> list[str
         out.append(f"one repeat per step: the noise floor comes from {where} within the record")
     if all(f.source == STATED for f in holdout_data.floors):
         out.append("the held-out noise floor is the rig file's stated sensor noise")
-    return out
+    return [*out, *_masked("training", train_data), *_masked("held-out", holdout_data)]
+
+
+def _masked(kind: str, data: RegressionData) -> list[str]:
+    """State which equations many rows are missing of: an effect that acts there alone is unseen."""
+    kept: dict[str, int] = {}
+    missing: dict[str, int] = {}
+    for s in data.segments:
+        _, rows = data.source(s)
+        kept[s.equation] = kept.get(s.equation, 0) + len(rows.rhs)
+        missing[s.equation] = missing.get(s.equation, 0) + rows.masked
+    shares = {e: missing[e] / max(missing[e] + kept[e], 1) for e in sorted(kept)}
+    return [
+        f"{equation}: {plain(100 * share, 2)} % of the {kind} rows are left out, since a pressure "
+        "lies outside 0 to the supply's, or samples were clipped or lost: an effect that acts only "
+        "there is not seen"
+        for equation, share in shares.items()
+        if share >= TRACE.masked_share
+    ]
 
 
 def _undetermined(model: Model, known: Collection[str] = ()) -> list[str]:
@@ -257,6 +276,19 @@ def _undetermined(model: Model, known: Collection[str] = ()) -> list[str]:
     return [
         f"the records do not determine {', '.join(missing)} (see `bramah identify`): the share of "
         "the motion that belongs to it may show as a residual"
+    ]
+
+
+def _better_known(fit: ExactFit, judged: ExactFit, model: Model) -> list[str]:
+    """Name the parameters that the records which judge had to show themselves."""
+    names = [n for n in held_out.fitted_anew(fit, judged) if n in model.parameters]
+    if not names:
+        return []
+    return [
+        f"the held-out records show {', '.join(names)} at least "
+        f"{plain(TRACE.better_known**0.5, 1)} times more exactly than the training records: their "
+        "errors are those with this fitted to them; train on records that move the same joints at "
+        "once"
     ]
 
 

@@ -39,9 +39,16 @@ class TraceSettings:
     """Held-out rms over the noise floor, by equation (tuned on clean benches: none is above)."""
     beyond_knots: float = 0.05
     """Of a free curve's range: so far beyond its outermost knots it is still compared (tuned)."""
+    better_known: float = 10.0
+    """Times: what held-out rows know of a direction of the baseline's coefficients over what the
+    training rows do, from which it is fitted to them (tuned: joints locked in turn, then moved
+    together, give 30 to 50 for the coupling inertia, all others 0.3 to 3)."""
     cavitating_share: float = 0.2
     """Of an equation's rows at which the oil cavitates under a model: up to here they speak neither
     way (tuned: a gain of 5 % put 8 % of the rows below zero pressure, a cross-talk of 3 % 14 %)."""
+    masked_share: float = 0.05
+    """Of an equation's rows: from here on a note says that they are left out (tuned: an end cushion
+    that shows only while its pressure is beyond its sensor left out 10 %)."""
     noted_ratio: float = 1.3
     """The same, from which an explanation says what stays (contract)."""
     visible_deviations: float = 8.0
@@ -205,8 +212,6 @@ class SearchSettings:
     """Pairs refined exactly."""
     refined_extensions: int = 6
     """Extensions of a set that are refined exactly."""
-    other_starts: int = 3
-    """Pairs with fewer free numbers than the set found, that are extended too."""
     near_gain: float = 0.25
     """Of the best gain: a single candidate with less is no rival (tuned)."""
     shape_starts: int = 3
@@ -216,6 +221,9 @@ class SearchSettings:
     """Relative change of cost and shapes at which a refinement ends (arithmetic)."""
     steps: int = 10
     """Of a refinement, at most."""
+    shape_error: float = 0.25
+    """Relative standard error of a shape beside its effect's details, at most (tuned: contacts that
+    stiffen have 0.01 to 0.07, noise at rest that passes for one 0.4 to 1)."""
     detail_share: float = 0.05
     """Of what is left above noise: less does not earn a detail of the form (tuned)."""
     # Free forms.

@@ -8,7 +8,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import eigh
 
+from analysis.effects.base import Effect
 from analysis.identify.estimators.nuisance import KAPPA
 from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.rows import Rows
@@ -45,19 +47,53 @@ class Errors:
 def residual(holdout_data: RegressionData, model: ExactFit) -> Array:
     """Return the whitened held-out residual (M,) of a model fitted to other records."""
     rows = table(holdout_data, model.terms)
-    return rows.residual(_settled(rows, model).beta)
+    return rows.residual(_settled(holdout_data.rig, rows, model).beta)
 
 
 def settled(holdout_data: RegressionData, model: ExactFit) -> ExactFit:
-    """Return the model with the oil's temperature part of 1/b as the held-out records have it.
+    """Return the model with what its own records hardly show as the held-out records have it.
 
-    Records at one temperature say nothing of it, and others then warm up: it is no parameter of
-    the model and no effect, so that one number may be fitted on either side.
+    That is the oil's temperature part of 1/b, which is no parameter of the model and no effect
+    (records at one temperature say nothing of it, and others then warm up), and every direction of
+    the baseline's coefficients that the held-out rows know `TRACE.better_known` times better: two
+    joints that move at once show an inertia that joints locked in turn hide in noise, and its error
+    would be taken for one of the model. No coefficient of an effect is fitted anew.
     """
-    return _settled(table(holdout_data, model.terms), model)
+    return _settled(holdout_data.rig, table(holdout_data, model.terms), model)
 
 
-def _settled(rows: DesignMatrix, model: ExactFit) -> ExactFit:
+def _settled(rig: Rig, rows: DesignMatrix, model: ExactFit) -> ExactFit:
+    return _with_better_known(rig, rows, _at_temperature(rows, model))
+
+
+def _with_better_known(rig: Rig, rows: DesignMatrix, model: ExactFit) -> ExactFit:
+    """Return the model with the coefficients fitted to rows where these know them much better."""
+    baseline = [u.term for u in model.terms if not isinstance(u.term, Effect)]
+    names = {c.parameter for term in baseline for c in term.coefficients(rig)} - {KAPPA}
+    at = [k for k, name in enumerate(rows.names) if name in names]
+    X, known = rows.matrix[:, at], model.information[np.ix_(at, at)]
+    seen = X.T @ X
+    scale = np.sqrt(np.maximum(np.diag(seen) + np.diag(known), 1e-300))
+    least = TRACE.dependent_share * np.eye(len(at))
+    ratio, directions = eigh(seen / np.outer(scale, scale), known / np.outer(scale, scale) + least)
+    free = directions[:, ratio > TRACE.better_known] / scale[:, None]
+    if not free.shape[1]:  # nearly always
+        return model
+    step = free @ np.linalg.lstsq(X @ free, rows.residual(model.beta), rcond=None)[0]
+    changed = {rows.names[k]: float(v) for k, v in zip(at, step, strict=True)}
+    return replace(model, beta={n: v + changed.get(n, 0.0) for n, v in model.beta.items()})
+
+
+def fitted_anew(before: ExactFit, after: ExactFit) -> list[str]:
+    """Name the coefficients that held-out records have changed visibly (`settled`)."""
+    return [
+        name
+        for name, value in before.beta.items()
+        if name != KAPPA and abs(after.beta[name] - value) > TRACE.visible_shift * abs(value)
+    ]
+
+
+def _at_temperature(rows: DesignMatrix, model: ExactFit) -> ExactFit:
     if KAPPA not in rows.names:
         return model
     column = rows.matrix[:, rows.names.index(KAPPA)]

@@ -8,6 +8,7 @@ side's size before the change.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -42,11 +43,16 @@ class DesignMatrix:
 
 @dataclass(frozen=True)
 class ExactFit:
-    """A model with shapes found: terms, the rows' coefficients, residual (M,)."""
+    """A model with shapes found: terms, the rows' coefficients, residual (M,).
+
+    `information` (k, k) is what the fitted rows say of the coefficients, in their order: the
+    inverse of their covariance from noise.
+    """
 
     terms: tuple[Used, ...]
     beta: Mapping[str, float]
     residual: Array
+    information: Array
 
     @property
     def energy(self) -> float:
@@ -88,7 +94,7 @@ def fit(data: RegressionData, terms: Sequence[Used]) -> ExactFit:
     Q, R = np.linalg.qr(rows.matrix / scale)
     value = np.linalg.lstsq(R, Q.T @ rows.rhs, rcond=TRACE.rank_limit)[0] / scale
     beta = dict(zip(rows.names, value, strict=True))
-    return ExactFit(tuple(terms), beta, rows.residual(beta))
+    return ExactFit(tuple(terms), beta, rows.residual(beta), (R * scale).T @ (R * scale))
 
 
 def refine(data: RegressionData, terms: Sequence[Used], steps: int = SEARCH.steps) -> ExactFit:
@@ -110,12 +116,37 @@ def refine(data: RegressionData, terms: Sequence[Used], steps: int = SEARCH.step
         if opened == used or _promise(data, fit, used, opened) < 0.5 * asked:
             continue
         more = _searched(data, _with(fit.terms, used, opened), steps)
-        # A detail that drives the shape to its bounds stands for something else.
-        last = more.terms[k]
-        assert isinstance(last.term, Effect)
-        in_bounds = not last.term.outside(data.rig, last.shape)
-        fit = more if in_bounds and fit.energy - more.energy > asked else fit
+        if fit.energy - more.energy > asked and _shaped(data, more, more.terms[k]):
+            fit = more
     return fit
+
+
+def _shaped(data: RegressionData, fit: ExactFit, used: Used) -> bool:
+    """Return whether the rows still determine an effect's shapes beside its details.
+
+    A detail that leaves them open, or drives them or itself to a bound, stands for something else:
+    noise that reverses a contact at rest looks like a long presliding distance that shrinks with
+    speed.
+    """
+    assert isinstance(used.term, Effect)
+    shapes = shapes_of(data.rig, used)
+    at_end = any(
+        s.detail and not s.saturates and v > s.high - 1e-3 * (s.high - s.low)
+        for s, v in zip(shapes, used.shape, strict=True)
+    )
+    if at_end or used.term.outside(data.rig, used.shape):
+        return False
+    names, columns = tangent(data, fit)
+    misfit = math.sqrt(max(1.0, fit.energy / len(fit.residual)))
+    for shape, value in zip(shapes, used.shape, strict=True):
+        if shape.detail or shape.fixed or not shape.given(value):
+            continue
+        own = names.index(shape.parameter)
+        basis = orthonormal(np.delete(columns, own, axis=1))
+        left = columns[:, own] - basis @ (basis.T @ columns[:, own])
+        if misfit > SEARCH.shape_error * abs(value) * float(np.linalg.norm(left)):
+            return False
+    return True
 
 
 def _in_best_form(data: RegressionData, fit: ExactFit, place: int, steps: int) -> ExactFit:

@@ -12,12 +12,14 @@ from typer.testing import CliRunner
 
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
+from analysis.trace import engine
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import RegressionData, regression_data
 from analysis.trace.data.set_aside import judging, set_aside
 from analysis.trace.engine import trace
+from analysis.trace.judge import held_out
 from analysis.trace.result import Trace
-from analysis.trace.search.refinement import table
+from analysis.trace.search.refinement import fit, table
 from analysis.trace.settings import TRACE
 from rig.cli.main import app
 from rig.model.parse import InputError
@@ -186,3 +188,45 @@ def test_a_record_too_short_to_be_divided_chooses_and_judges(
     same(unseen.judging, data)
     assert unseen.divided == frozenset()
     assert "too short to set rows aside" in unseen.notes[0]
+
+
+def test_what_the_judging_records_know_far_better_is_no_error_of_the_model(
+    rig: Rig, leaky: tuple[Run, Run]
+) -> None:
+    """An inertia lost in noise while joints were locked in turn: its error is not the model's."""
+    data = {}
+    for name, run in zip(("train", "held"), leaky, strict=True):
+        terms = tuple(map(Used, baseline_of(rig)))
+        data[name] = regression_data(rig, terms, conditioned_records(rig, [run]))
+    model = fit(data["train"], data["train"].terms)
+    at = list(model.beta).index("M2")
+    wrong = replace(model, beta={**model.beta, "M2": 1.5 * model.beta["M2"]})
+    poor = wrong.information.copy()
+    poor[at, :], poor[:, at] = 0.1 * poor[at, :], 0.1 * poor[:, at]
+    poor[at, at] *= 0.1
+    sizes = [
+        float(np.linalg.norm(held_out.residual(data["held"], m)))
+        for m in (model, wrong, replace(wrong, information=poor))
+    ]
+    assert sizes[1] > 2 * sizes[0]
+    assert sizes[2] == pytest.approx(sizes[0], rel=0.02)
+    settled = held_out.settled(data["held"], replace(wrong, information=poor))
+    assert held_out.fitted_anew(wrong, settled) == ["M2"]
+
+
+def test_rows_that_are_left_out_are_spoken_of(rig: Rig, leaky: tuple[Run, Run]) -> None:
+    terms = tuple(map(Used, baseline_of(rig)))
+    data = regression_data(rig, terms, conditioned_records(rig, [leaky[0]]))
+    few, many = (
+        replace(
+            data,
+            rows=tuple(
+                {e: replace(r, masked=round(share * len(r.rhs))) for e, r in rows.items()}
+                for rows in data.rows
+            ),
+        )
+        for share in (0.01, 0.1)
+    )
+    assert engine._masked("training", few) == []
+    notes = engine._masked("training", many)
+    assert any(n.startswith("flow_cap_2: 9 % of the training rows") for n in notes), notes

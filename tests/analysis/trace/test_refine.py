@@ -27,7 +27,8 @@ def test_a_gain_is_found_from_the_wrong_side_of_one_too(
     def fit(train_data: Any, terms: Sequence[Used]) -> refinement.ExactFit:
         gain = terms[-1].shape[0]
         residual = 50.0 * (gain - 1.01) if gain >= 1.0 else 9.0 / (1.6 - gain)
-        return refinement.ExactFit(tuple(terms), {}, np.array([residual, 0.1]))
+        left = np.array([residual, 0.1])
+        return refinement.ExactFit(tuple(terms), {}, left, np.zeros((0, 0)))
 
     monkeypatch.setattr(refinement, "fit", fit)
     train_data: Any = SimpleNamespace(rig=rig, terms=())
@@ -69,3 +70,21 @@ def test_a_chamber_below_the_tanks_pressure_draws_oil_from_the_tank(rig: Rig) ->
     found = refinement.refine(train_data, (*train_data.terms, start))
     assert found.terms[-1].shape[0] == pytest.approx(tank, rel=0.01)
     assert found.energy < 2 * len(found.residual)
+
+
+def test_a_detail_at_its_bound_or_one_that_leaves_the_shape_open_is_no_form(rig: Rig) -> None:
+    """A contact that stiffens without limit is none, and a distance must stay known beside it."""
+    records = conditioned_records(rig, [bench.run(rig, bench.Wrong.of(Fc=80), 0.03, 1)])
+    train_data = regression_data(rig, tuple(map(Used, baseline())), records)
+    friction = make("coulomb_friction", "joint 2")
+
+    def shaped(*shape: float) -> bool:
+        used = Used(friction, shape)
+        return refinement._shaped(
+            train_data, refinement.fit(train_data, (*train_data.terms, used)), used
+        )
+
+    assert shaped(100e-6, 30.0)
+    assert not shaped(100e-6, 3e3)
+    # So short a distance that no sample lies within a reversal says nothing of how it shortens.
+    assert not shaped(2e-6, 30.0)
