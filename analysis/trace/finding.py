@@ -206,14 +206,12 @@ def dry(winner: Hypothesis, equations: Collection[str]) -> set[int]:
     }
 
 
-def in_motion(
+def fitted_in_motion(
     rig: Rig, terms: tuple[Used, ...], records: TraceRuns, winner: Hypothesis, joints: Iterable[int]
 ) -> tuple[TraceRows, HypothesisSet, Hypothesis]:
     """Return rows that do not count the rests of some joints, and the set's effects fitted."""
     rows = trace_rows(rig, terms, records, moving_filtering(joints))
-    effects = [u.term for u in winner.effects if isinstance(u.term, Effect)]
-    hypotheses = HypothesisSet(rows.train, effects)
-    hypotheses.run()
+    hypotheses = HypothesisSet(rows.train, [])
     return rows, hypotheses, hypotheses.exact(winner.effects)
 
 

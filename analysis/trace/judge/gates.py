@@ -34,11 +34,9 @@ Array = NDArray[np.float64]
 Key = tuple[str, str]
 
 
-REMOVES, PHYSICAL, INVARIANT, SIGNIFICANT, DETERMINED, ALONE = (
-    "removes on held-out", "physical", "invariant", "significant", "determined",
-    "no rival",
+REMOVES, PHYSICAL, INVARIANT, SIGNIFICANT, ALONE = (
+    "removes on held-out", "physical", "invariant", "significant", "no rival",
 )  # fmt: skip
-ENTANGLED = "the other effects can stand for all of its numbers"
 
 
 def stands(effect: JudgedEffect) -> bool:
@@ -81,7 +79,6 @@ def judge(
         p = inference.p_value(rest.fit.energy - winner.fit.energy, null)
         errors = inference.spread(train_data, winner.fit, used, values)
         differing = invariance(train_data, winner.fit, used, errors, _joint(used.term))
-        known = _determined(train_data, used, errors)
         unphysical = hypotheses.physical(winner, used)
         tied = [r for r in rivals if r.tied]
         twins = [
@@ -93,7 +90,6 @@ def judge(
             Gate(PHYSICAL, not unphysical, unphysical or "sign and size are possible"),
             Gate(INVARIANT, not differing, _differences(differing)),
             Gate(SIGNIFICANT, p <= TRACE.p_limit, f"family-wise p = {p:.3g}"),
-            Gate(DETERMINED, known, "at least one of its numbers is" if known else ENTANGLED),
             Gate(ALONE, not (tied or twins), _told_apart([*twins, *rivals])),
         )
         out.append(
@@ -323,7 +319,7 @@ def _rivals(
         if (
             (more > 0 and hypothesis.total > winner.total - SEARCH.number_price * more)
             or related(mine, other)
-            or hypotheses.physical(hypothesis)
+            or hypotheses.physical(hypothesis, formed=others)
             or _worse(hypotheses, hypothesis, rest)
         ):
             continue
@@ -410,19 +406,6 @@ def _parameters(
         name: Estimate(float(v), units.get(name, ""), float(s), (float(v - h), float(v + h)))
         for name, v, s, h in zip(errors.names, errors.value, std, half, strict=True)
     }
-
-
-def _determined(train_data: RegressionData, used: Used, errors: inference.EffectErrors) -> bool:
-    """Return whether one number of an effect at least is known to be something.
-
-    What the others of a set can stand for (a torque offset beside a spring's rest angle) is not.
-    The shape of an effect without a size is nothing: of one with coefficients these are asked.
-    """
-    sizes = {c.parameter for c in used.term.coefficients(train_data.rig)}
-    asked = np.array([not sizes or name in sizes for name in errors.names])
-    neutral = {s.parameter: s.neutral or 0.0 for s in shapes_of(train_data.rig, used)}
-    value = errors.value - np.array([neutral.get(name, 0.0) for name in errors.names])
-    return bool(np.any(asked & (np.abs(value) > TRACE.normal_quantile * errors.std)))
 
 
 def _differences(differing: Sequence[tuple[str, str, float, float]]) -> str:

@@ -32,11 +32,11 @@ def settled(
 
     First each effect is tried as one that it includes. A richer reading then takes the place of
     one that it includes, or stands beside it. It must be physical, which asks that its own number
-    is more than a form's tolerance; training and held-out records must lose by the restriction
-    more than `TRACE.standard_errors` of their noise; where its numbers differ little, the further
-    one must take more than the richer form itself leaves; beside a name it must take the share of
-    what is left that a further effect must. Of several that leave about as little the one with the
-    fewest numbers stays.
+    is more than a form's tolerance. By the restriction training records must lose more than
+    `TRACE.standard_errors` of their noise for each number, held-out ones once. Where the numbers
+    differ little, the further one must take more than the richer form itself leaves; beside a name
+    it must take the share of what is left that a further effect must. Of several that leave about
+    as little the one with the fewest numbers stays.
     """
     winner = _restricted(hypotheses, winner, holdout_data)
     while winner.effects:
@@ -57,9 +57,12 @@ def _restricted(
     hypotheses: HypothesisSet, winner: Hypothesis, holdout_data: RegressionData
 ) -> Hypothesis:
     """Return the winner with every effect as the one it includes, where nothing is lost by that."""
+    known = {(u.term.name, u.term.where) for u in hypotheses.base if isinstance(u.term, Effect)}
     for used in winner.effects:
         assert isinstance(used.term, Effect)
         for name in used.term.includes:
+            if (name, used.term.where) in known:  # the model has it: it is no new name
+                continue
             effects = [u for u in winner.effects if u is not used]
             if (name, used.term.where) not in winner.keys:
                 simple = effect_of(name, used.term.where)
@@ -97,11 +100,11 @@ def _lost(
     holdout_data: RegressionData,
 ) -> bool:  # fmt: skip
     """Return whether training and held-out records lose by taking `one` for the richer `other`."""
+    more = other.size[1] - hypothesis.size[1]
     if len(other.effects) > len(hypothesis.effects):
-        price = SEARCH.number_price * (other.size[1] - hypothesis.size[1])
-        least = max(price, SEARCH.add_share * hypothesis.total)
+        least = max(SEARCH.number_price * more, SEARCH.add_share * hypothesis.total)
     else:
-        least = max(TRACE.standard_errors**2, _form_error(hypotheses, hypothesis, other))
+        least = max(TRACE.standard_errors**2 * more, _form_error(hypotheses, hypothesis, other))
     if hypothesis.fit.energy - other.fit.energy <= least:
         return False
     return loss(held, held_left(holdout_data, other.fit)) > TRACE.standard_errors

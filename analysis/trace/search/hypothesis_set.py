@@ -76,18 +76,21 @@ class HypothesisSet:
         seen = evidence(data, residual) if any(e.by_data for e in self.effects) else None
         return variants(data.rig, self.effects, seen)
 
-    def physical(self, hypothesis: Hypothesis, of: Used | None = None) -> str:
+    def physical(
+        self, hypothesis: Hypothesis, of: Used | None = None, formed: Collection[Key] = ()
+    ) -> str:
         """Say whose number makes a set unphysical, and why ('' if none does).
 
-        The effect `of` is asked first; its own number is stated without its name.
+        The effect `of` is asked first; its own number is stated without its name. The shapes of
+        effects `formed` (name, where) are a matter of form, and may lie at their bounds.
         """
         rig = self.train_data.rig
         values = parameter_values(rig, hypothesis.fit.terms, dict(hypothesis.fit.beta))
         for used in sorted(hypothesis.effects, key=lambda used: used is not of):
             assert isinstance(used.term, Effect)
-            problem = used.term.problem(rig, values, used.shape) or used.term.outside(
-                rig, used.shape
-            )
+            problem = used.term.problem(rig, values, used.shape)
+            if (used.term.name, used.term.where) not in formed:
+                problem = problem or used.term.outside(rig, used.shape)
             if problem:
                 whose = f"of {used.term.name} at {place_in_words(used.term.where)}: "
                 return problem if used is of else whose + problem
@@ -102,26 +105,8 @@ class HypothesisSet:
         return self.fitted[key]
 
     def tried(self, sets: Sequence[tuple[Used, ...]]) -> list[Hypothesis]:
-        """Return the sets refined exactly; one whose effect has become a simpler one, also so."""
-        out = [self.exact(effects) for effects in sets]
-        return out + [
-            simpler for hypothesis in out if (simpler := self._simplified(hypothesis)) is not None
-        ]
-
-    def _simplified(self, hypothesis: Hypothesis) -> Hypothesis | None:
-        """Return the set with the simpler effects that its own have become, None where none has."""
-        rig = self.train_data.rig
-        values = parameter_values(rig, hypothesis.fit.terms, dict(hypothesis.fit.beta))
-        effects: dict[Key, Used] = {}
-        for used in hypothesis.effects:
-            assert isinstance(used.term, Effect)
-            term, shape = used.term, used.shape
-            if term.simpler(rig, values):
-                term = effect_of(term.simpler(rig, values), term.where)
-                shape = term.shape_of(rig, ())
-            effects.setdefault((term.name, term.where), Used(term, shape))
-        changed = frozenset(effects) != hypothesis.keys
-        return self.exact(tuple(effects.values())) if changed else None
+        """Return the sets refined exactly."""
+        return [self.exact(effects) for effects in sets]
 
     def excess(self, hypothesis: Hypothesis, other: Hypothesis) -> float:
         """Return how much more one set leaves than another: the sum of log ratios over equations.
@@ -152,7 +137,7 @@ class HypothesisSet:
             return self.empty
         least = min(allowed, key=lambda o: o.total)
         near = [o for o in allowed if o is least or self.better(o, least)]
-        return min(near, key=lambda o: (o.size[1], o.size[0], o.total))
+        return min(near, key=lambda o: (sum(o.size), o.size[0], o.total))
 
     def run(self, progress: Callable[[float], None] | None = None) -> Hypothesis:
         """Search: singles and pairs beside the baseline, then extensions; returns the winner.
@@ -165,7 +150,7 @@ class HypothesisSet:
         candidates = self.candidates = self._candidate_columns(self.train_data, self.columns)
         r = self.train_data.mean
         r = r - candidates.basis @ (candidates.basis.T @ r)
-        return self.exchanged(self.from_other_pairs(self._found(candidates, r)))
+        return self.exchanged(self._found(candidates, r))
 
     def _found(self, candidates: linear_fit.CandidateColumns, r: Array) -> Hypothesis:
         """Return the set found on the candidates for what the baseline leaves (M,)."""
@@ -283,25 +268,6 @@ class HypothesisSet:
                 out.setdefault(variant.key, (*now.effects, variant.used))
         return self.tried(list(out.values()))
 
-    def from_other_pairs(self, now: Hypothesis) -> Hypothesis:
-        """Return the set, or a better one that extends a pair with fewer free numbers.
-
-        Friction of two levels does most of what an offset and one level do, so that the right pair
-        leaves more at first than the wrong one does, and less with its third effect.
-        """
-        if within(now.excess_energy, self.limits):
-            return now
-        starts = [
-            o
-            for o in self.fitted.values()
-            if len(o.effects) == SEARCH.largest_set - 1
-            and o.size[1] < now.size[1]
-            and not self.physical(o)
-        ]
-        starts = sorted(starts, key=lambda o: o.total)[: SEARCH.other_starts]
-        grown = [o for start in starts for o in self.extensions(start)]
-        return self.prune(self.best([now, *grown]))
-
     def exchanged(self, now: Hypothesis) -> Hypothesis:
         """Return the set, or a better one with another effect in place of one that looks like it.
 
@@ -310,11 +276,14 @@ class HypothesisSet:
         sets: list[tuple[Used, ...]] = []
         for used in now.effects if len(now.effects) > 1 else ():
             others = tuple(u for u in now.effects if u is not used)
-            sets += [
-                (*others, Used(effect, effect.shape_of(self.train_data.rig, ())))
-                for effect in self.effects
-                if (effect.name, effect.where) not in now.keys and _alike(effect, used)
-            ]
+            for effect in self.effects:
+                if (effect.name, effect.where) in now.keys or not _alike(effect, used):
+                    continue
+                fresh = Used(effect, effect.shape_of(self.train_data.rig, ()))
+                sets.append((*others, fresh))
+                if used.term.name in effect.includes and effect.where == used.term.where:
+                    # What a richer law needs no longer may have stood for what the simpler lacks.
+                    sets += [(*(u for u in others if u is not one), fresh) for one in others]
         if not sets:
             return now
         other = self.prune(self.best([now, *self.tried(sets)]))
