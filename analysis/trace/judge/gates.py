@@ -150,9 +150,8 @@ def remaining(
         if share > TRACE.training_share and not hypotheses.negligible(e, residual):
             times = residual / hypotheses.limits.band[e]
             stays = f"{plain(100 * share, 2)} % of the repeatable energy remains"
-            words = (
-                stays if share <= 1.0 else "the repeatable energy is larger than under the baseline"
-            )
+            grown = share > 1.0 + SEARCH.tolerance
+            words = "the repeatable energy is larger than under the baseline" if grown else stays
             out.append((e, f"{words}, {plain(times, 2)} times the band"))
     return out + remaining_held_out(holdout_data, hypotheses.empty.fit, winner.fit)
 

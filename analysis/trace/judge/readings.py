@@ -32,11 +32,12 @@ def settled(
 
     First each effect is tried as one that it includes. A richer reading then takes the place of
     one that it includes, or stands beside it. It must be physical, which asks that its own number
-    is more than a form's tolerance. By the restriction training records must lose more than
-    `TRACE.standard_errors` of their noise for each number, held-out ones once. Where the numbers
-    differ little, the further one must take more than the richer form itself leaves; beside a name
-    it must take the share of what is left that a further effect must. Of several that leave about
-    as little the one with the fewest numbers stays.
+    is more than a form's tolerance. By the restriction training records must lose
+    `TRACE.reading_share` of what it leaves and more than `TRACE.standard_errors` of their noise for
+    each number, held-out ones as much of theirs. Where the numbers differ little, the further one
+    must take more than the richer form itself leaves; beside a name it must take the share of what
+    is left that a further effect must. Of several that leave about as little the one with the
+    fewest numbers stays.
     """
     winner = _restricted(hypotheses, winner, holdout_data)
     while winner.effects:
@@ -104,7 +105,10 @@ def _lost(
     if len(other.effects) > len(hypothesis.effects):
         least = max(SEARCH.number_price * more, SEARCH.add_share * hypothesis.total)
     else:
-        least = max(TRACE.standard_errors**2 * more, _form_error(hypotheses, hypothesis, other))
+        # What a law leaves is no noise alone: a number that takes a little of it bends the form.
+        share = TRACE.reading_share * hypothesis.total
+        noise = TRACE.standard_errors**2 * more
+        least = max(noise, share, _form_error(hypotheses, hypothesis, other))
     if hypothesis.fit.energy - other.fit.energy <= least:
         return False
     return loss(held, held_left(holdout_data, other.fit)) > TRACE.standard_errors
