@@ -223,6 +223,10 @@ class Effect(Term):
         """
         return ""
 
+    def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
+        """Say what a parameter means in the records where that is far from it ('' elsewhere)."""
+        return ""
+
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:
         """Return, by equation, the variable (n,) to plot that equation's residual against."""
         raise NotImplementedError

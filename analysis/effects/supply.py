@@ -33,12 +33,14 @@ from analysis.terms.base import (
 )
 from rig.model.parameters import gain_names
 from rig.model.rig import Rig
+from rig.model.units import plain
 
 NEWTON: Final = 12  # steps; the equation is monotone and smooth but for u = 0
 LONGEST: Final = 100.0  # [s] of the pump's flow: as soft as an accumulator in the line
 # Of the pump's flow: a line that takes all of the pressure at so little is the steepest looked for.
 LEAST_FLOW: Final = 0.05
 BULK_MODULUS: Final = 1e9  # [Pa] with hoses and some air (Jelali and Kroll 2003, section 2.3)
+WHOLE: Final = 0.5  # of the pump's flow: records that reach it need no word on the drop there
 NOTHING: Final = 1e-4  # of the supply pressure, at the pump's whole flow
 
 
@@ -97,6 +99,22 @@ def packed_line(rig: Rig, dp: float, share: float) -> tuple[float, float]:
     return dp / math.cbrt(1.0 + share**3) / flow**2, share * flow
 
 
+def line_remark(rig: Rig, flow: float, name: str, dp: float, share: float) -> str:
+    """State a line's drop at the largest flow [m^3/s] of the records where that is not the pump's.
+
+    `name` is of the drop `dp` [Pa] at the pump's whole flow, `share` is r_t.
+    """
+    ratio = flow / rig.supply.flow
+    if not 0.0 < ratio < WHOLE:
+        return ""
+    drop = dp * ratio * math.cbrt((ratio**3 + share**3) / (1.0 + share**3))
+    return (
+        f"{name} is the drop at the pump's whole {plain(6e4 * rig.supply.flow, 2)} l/min; at the "
+        f"largest flow of these records, {plain(6e4 * flow, 2)} l/min, it is "
+        f"{plain(drop / 1e6, 2)} MPa"
+    )
+
+
 def looks(
     rig: Rig, effect: Effect, evidence: Evidence, drawn: bool, powers: Sequence[int]
 ) -> tuple[tuple[float, ...], ...]:
@@ -104,7 +122,7 @@ def looks(
 
     `powers` say how each shape changes with the pump's flow over that flow.
     """
-    flow = max((float(port_flow(rig, s, drawn).max()) for s in evidence.signals), default=0.0)
+    flow = largest_flow(rig, evidence.signals, drawn)
     if flow <= 0.0:
         return ()
     times = min(max(rig.supply.flow / flow, 1.0), 1.0 / LEAST_FLOW)
@@ -113,6 +131,11 @@ def looks(
         for shape, power in zip(effect.shapes(rig), powers, strict=False)
     ]
     return tuple(itertools.product(*axes))
+
+
+def largest_flow(rig: Rig, signals: Sequence[Signals], drawn: bool) -> float:
+    """Return the largest flow [m^3/s] of records that all valves draw, or give to the tank."""
+    return max((float(port_flow(rig, s, drawn).max()) for s in signals), default=0.0)
 
 
 def port_flow(rig: Rig, signals: Signals, drawn: bool) -> Array:
@@ -178,6 +201,11 @@ class SupplySag(PortEffect):
     def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
         """Return drops, shares and volumes of first look at the flow drawn."""
         return looks(rig, self, evidence, drawn=True, powers=(2, -1, -1))
+
+    def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
+        """State the drop at the largest flow drawn."""
+        dp, share, _ = self.shape_of(rig, shape)
+        return line_remark(rig, largest_flow(rig, signals, drawn=True), "dp_supply", dp, share)
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Take the drop from the supply pressure."""
@@ -302,6 +330,11 @@ class ReturnLine(PortEffect):
     def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
         """Return drops of first look at the flow given back."""
         return looks(rig, self, evidence, drawn=False, powers=(2,))
+
+    def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
+        """State the drop at the largest flow given back."""
+        dp, share = self.whole(rig, shape)
+        return line_remark(rig, largest_flow(rig, signals, drawn=False), "dp_return", dp, share)
 
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Raise the tank pressure."""

@@ -24,7 +24,7 @@ from analysis.terms import baseline_of
 from analysis.terms.base import FAMILIES, Used
 from analysis.trace.data.candidates import catalogue, free_mechanisms
 from analysis.trace.data.noise_floor import NEIGHBOURS, PERIODS, REPEATS, STATED
-from analysis.trace.data.regression_data import RegressionData
+from analysis.trace.data.regression_data import RegressionData, evidence
 from analysis.trace.data.spectral_lines import lines
 from analysis.trace.data.temperature_nuisance import stripped, temperature_terms
 from analysis.trace.data.unrepeated import unrepeated
@@ -154,6 +154,7 @@ def trace(
         detection_limits(train_data, candidates, winner, after) if verdict != UNEXPLAINED else []
     )
     notes += [*_better_known(winner.fit, last, after), *_weighed_with_a_curve(winner, after)]
+    notes += _remarks(train_data, winner)
     notes += _undetermined(after, [n for n, e in before.parameters.items() if not e.identified])
     notes += [*kept, *_missed_held(verdict, error, [*notes, *kept]), *in_words(hidden)]
     runs_before, runs_after = held_out.free_runs([*holdout, *judge], before, after)
@@ -277,6 +278,14 @@ def _undetermined(model: Model, known: Collection[str] = ()) -> list[str]:
         f"the records do not determine {', '.join(missing)} (see `bramah identify`): the share of "
         "the motion that belongs to it may show as a residual"
     ]
+
+
+def _remarks(train_data: RegressionData, winner: Hypothesis) -> list[str]:
+    """State what parameters mean in the records where that is far from what they are given at."""
+    signals = evidence(train_data, winner.fit.residual).signals
+    terms = [(u.term, u.shape) for u in winner.effects if isinstance(u.term, Effect)]
+    said = [(term.name, term.remark(train_data.rig, signals, shape)) for term, shape in terms]
+    return [f"{name}: {text}" for name, text in said if text]
 
 
 def _better_known(fit: ExactFit, judged: ExactFit, model: Model) -> list[str]:

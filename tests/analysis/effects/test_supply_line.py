@@ -100,3 +100,18 @@ def test_the_oil_between_sensor_and_valves_is_continuity_in_its_volume(
     swing = np.ptp(theirs[settled])
     assert np.abs(ours - theirs)[settled].max() < 0.02 * swing
     assert np.abs(dropped(rig, lifting, 0.0) - theirs)[settled].max() > 0.1 * swing
+
+
+def test_a_drop_at_a_flow_that_no_record_reaches_is_given_at_the_flow_that_is_reached(
+    rig: Rig, lifting: Signals
+) -> None:
+    """The swing draws 0.6 of a matched pump, and a fifteenth of one fifteen times as large."""
+    rated = rig.model_copy(
+        update={"supply": rig.supply.model_copy(update={"flow": 9.0 * rig.supply.flow})}
+    )
+    shape = (81.0 * DROP, 3.0, 0.0)  # nearly laminar
+    assert SupplySag("bench").remark(rig, [lifting], shape) == ""
+    said = SupplySag("bench").remark(rated, [lifting], shape)
+    litres = 6e4 * 0.6 * rig.supply.flow
+    assert f"{litres:.2g} l/min" in said
+    assert f"{81.0 * DROP / 15.0 / 1e6:.2g} MPa" in said
