@@ -39,6 +39,8 @@ def drawn_by_data(
     tried: list[Hypothesis] = []
     for start in _starts(wide, winner, fewer):
         for single in wide.extensions(start, free=True):
+            if wide.idle(start, single):  # it would be dropped beside a further effect
+                continue
             hypothesis = single if wide.formed(single) else _with_more(wide, single)
             simpler = mechanisms(hypothesis) < mechanisms(winner)
             less = simpler and hypothesis.total < SEARCH.free_energy * winner.total
