@@ -224,7 +224,7 @@ class Effect(Term):
         return ""
 
     def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
-        """Say what a parameter means in the records where that is far from it ('' elsewhere)."""
+        """State a size at the conditions of the records ('' where its parameter is given there)."""
         return ""
 
     def abscissa(self, rig: Rig, signals: Signals) -> Mapping[str, Array]:

@@ -35,7 +35,7 @@ from analysis.terms.base import (
 from rig.model.rig import Rig
 
 DIFFERENCE: Final = 0.1  # of the mean level: with less between directions it is not asymmetric
-LEAST_SHARE: Final = 0.1  # of the other level: with less the difference is no seal's
+LEAST_SHARE: Final = 0.1  # of the other level: those of a seal do not differ by more
 DIFFERENCE_LOAD: Final = -1.0  # weight of the rod pressure where the difference presses the seal
 
 

@@ -115,7 +115,7 @@ def line_remark(rig: Rig, flow: float, name: str, dp: float, share: float) -> st
     )
 
 
-def looks(
+def grid_at_flow(
     rig: Rig, effect: Effect, evidence: Evidence, drawn: bool, powers: Sequence[int]
 ) -> tuple[tuple[float, ...], ...]:
     """Return a grid of first look that means the same at the largest flow that the records have.
@@ -200,7 +200,7 @@ class SupplySag(PortEffect):
 
     def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
         """Return drops, shares and volumes of first look at the flow drawn."""
-        return looks(rig, self, evidence, drawn=True, powers=(2, -1, -1))
+        return grid_at_flow(rig, self, evidence, drawn=True, powers=(2, -1, -1))
 
     def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
         """State the drop at the largest flow drawn."""
@@ -329,7 +329,7 @@ class ReturnLine(PortEffect):
 
     def points(self, rig: Rig, evidence: Evidence) -> tuple[tuple[float, ...], ...]:
         """Return drops of first look at the flow given back."""
-        return looks(rig, self, evidence, drawn=False, powers=(2,))
+        return grid_at_flow(rig, self, evidence, drawn=False, powers=(2,))
 
     def remark(self, rig: Rig, signals: Sequence[Signals], shape: Sequence[float]) -> str:
         """State the drop at the largest flow given back."""

@@ -252,7 +252,7 @@ def _notes(train_data: RegressionData, holdout_data: RegressionData) -> list[str
 
 
 def _masked(kind: str, data: RegressionData) -> list[str]:
-    """State which equations many rows are missing of: an effect that acts there alone is unseen."""
+    """Name the equations of which many rows are left out."""
     kept: dict[str, int] = {}
     missing: dict[str, int] = {}
     for s in data.segments:
@@ -281,7 +281,7 @@ def _undetermined(model: Model, known: Collection[str] = ()) -> list[str]:
 
 
 def _remarks(train_data: RegressionData, winner: Hypothesis) -> list[str]:
-    """State what parameters mean in the records where that is far from what they are given at."""
+    """State sizes at the conditions of the records where their parameters are given at others."""
     signals = evidence(train_data, winner.fit.residual).signals
     terms = [(u.term, u.shape) for u in winner.effects if isinstance(u.term, Effect)]
     said = [(term.name, term.remark(train_data.rig, signals, shape)) for term, shape in terms]
@@ -289,15 +289,14 @@ def _remarks(train_data: RegressionData, winner: Hypothesis) -> list[str]:
 
 
 def _better_known(fit: ExactFit, judged: ExactFit, model: Model) -> list[str]:
-    """Name the parameters that the records which judge had to show themselves."""
+    """Name the parameters that the errors are given with as the judging records show them."""
     names = [n for n in held_out.fitted_anew(fit, judged) if n in model.parameters]
     if not names:
         return []
     return [
         f"the held-out records show {', '.join(names)} at least "
-        f"{plain(TRACE.better_known**0.5, 1)} times more exactly than the training records: their "
-        "errors are those with this fitted to them; train on records that move the same joints at "
-        "once"
+        f"{plain(TRACE.better_known**0.5, 1)} times more exactly than the training records do: the "
+        "errors are given with their values; record training motions like the held-out ones"
     ]
 
 

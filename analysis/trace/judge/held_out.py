@@ -68,9 +68,11 @@ def _settled(rig: Rig, rows: DesignMatrix, model: ExactFit) -> ExactFit:
 
 def _with_better_known(rig: Rig, rows: DesignMatrix, model: ExactFit) -> ExactFit:
     """Return the model with the coefficients fitted to rows where these know them much better."""
-    baseline = [u.term for u in model.terms if not isinstance(u.term, Effect)]
-    names = {c.parameter for term in baseline for c in term.coefficients(rig)} - {KAPPA}
-    at = [k for k, name in enumerate(rows.names) if name in names]
+    of_effects = {
+        c.parameter for u in model.terms if isinstance(u.term, Effect)
+        for c in u.term.coefficients(rig)
+    }  # fmt: skip
+    at = [k for k, name in enumerate(rows.names) if name not in {KAPPA, *of_effects}]
     X, known = rows.matrix[:, at], model.information[np.ix_(at, at)]
     seen = X.T @ X
     scale = np.sqrt(np.maximum(np.diag(seen) + np.diag(known), 1e-300))
