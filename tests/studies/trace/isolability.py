@@ -27,6 +27,7 @@ from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import (
     RegressionData,
     VariantColumns,
+    evidence,
     regression_data,
     variant_columns,
 )
@@ -78,7 +79,7 @@ def isolability(run: Run, joint: int = 2) -> Isolability:
     least = {e: found for e in here if (found := _least(data, e)) is not None}
     changes = {e: change for e, (change, _) in least.items()}
     grids: dict[Effect, list[Array]] = {e: [columns] for e, (_, columns) in least.items()}
-    for entry in variant_columns(data, variants(rig, list(changes))):
+    for entry in variant_columns(data, variants(rig, list(changes), evidence(data, data.mean))):
         if entry.variant.effect in grids:
             grids[entry.variant.effect].append(entry.columns)
     base = orthonormal(data.base)
