@@ -77,7 +77,7 @@ class EntrainedAir(Effect):
         """Return n [-], from isothermal to adiabatic."""
         low, high = EXPONENTS
         name = self.shape_names()[0]
-        return (Shape(name, "", low, high, (1.2,), resolution=True, saturates=True, detail=True),)
+        return (Shape(name, "", low, high, (1.2,), resolution=True, detail=True),)
 
     def other_forms(self, rig: Rig, shape: Sequence[float]) -> tuple[tuple[float, ...], ...]:
         """Return the gas with an exponent to be found."""

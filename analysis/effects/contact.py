@@ -41,7 +41,7 @@ TRANSITION_BOUNDS: Final = (TRANSITION, 2e-2)  # [m/s] wider is viscous friction
 TRANSITION_START: Final = 1e-3  # [m/s] where a search begins
 
 
-def presliding(name: str, bore: float = 0.0) -> Shape:
+def presliding(name: str, bore: float) -> Shape:
     """Return a presliding distance's shape [m]; a contact may be stiffer than sensors resolve.
 
     A seal's section grows with the cylinder's `bore` [m], and with it what it yields in shear.

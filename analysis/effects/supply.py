@@ -96,7 +96,12 @@ def turning(name: str, first: tuple[float, ...]) -> Shape:
 def packed_line(rig: Rig, dp: float, share: float) -> tuple[float, float]:
     """Return the turbulent part's drop over Q^2 [Pa s^2/m^6] and where it begins [m^3/s]."""
     flow = rig.supply.flow
-    return dp / math.cbrt(1.0 + share**3) / flow**2, share * flow
+    return turbulent_part(dp, share) / flow**2, share * flow
+
+
+def turbulent_part(dp: float, share: float) -> float:
+    """Return the drop [Pa] at the pump's whole flow that a line has without its laminar part."""
+    return dp / math.cbrt(1.0 + share**3)
 
 
 def line_remark(rig: Rig, flow: float, name: str, dp: float, share: float) -> str:
@@ -107,7 +112,7 @@ def line_remark(rig: Rig, flow: float, name: str, dp: float, share: float) -> st
     ratio = flow / rig.supply.flow
     if not 0.0 < ratio < WHOLE:
         return ""
-    drop = dp * ratio * math.cbrt((ratio**3 + share**3) / (1.0 + share**3))
+    drop, _ = lost(ratio, turbulent_part(dp, share), share)
     return (
         f"{name} is the drop at the pump's whole {plain(6e4 * rig.supply.flow, 2)} l/min; at the "
         f"largest flow of these records, {plain(6e4 * flow, 2)} l/min, it is "
@@ -210,7 +215,7 @@ class SupplySag(PortEffect):
     def prepare(self, rig: Rig, signals: Signals, shape: Sequence[float]) -> Signals:
         """Take the drop from the supply pressure."""
         dp, share, volume = self.shape_of(rig, shape)
-        turbulent = dp / math.cbrt(1.0 + share**3)
+        turbulent = turbulent_part(dp, share)
         ratio = np.ascontiguousarray(port_flow(rig, signals, drawn=True) / rig.supply.flow)
         capacity = volume / (bulk_modulus(rig) * rig.supply.flow)
         drop = _line(ratio, 1.0 / signals.rate, turbulent, share, capacity)
@@ -340,7 +345,7 @@ class ReturnLine(PortEffect):
         """Raise the tank pressure."""
         dp, share = self.whole(rig, shape)
         ratio = port_flow(rig, signals, drawn=False) / rig.supply.flow
-        drop = dp * ratio * np.cbrt((ratio**3 + share**3) / (1.0 + share**3))
+        drop = turbulent_part(dp, share) * ratio * np.cbrt(ratio**3 + share**3)
         return replace(signals, p_tank=signals.p_tank + drop)
 
     def pack(self, rig: Rig, values: Mapping[str, float], shape: Sequence[float]) -> Array:

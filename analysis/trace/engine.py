@@ -24,7 +24,7 @@ from analysis.terms import baseline_of
 from analysis.terms.base import FAMILIES, Used
 from analysis.trace.data.candidates import catalogue, free_mechanisms
 from analysis.trace.data.noise_floor import NEIGHBOURS, PERIODS, REPEATS, STATED
-from analysis.trace.data.regression_data import RegressionData, evidence
+from analysis.trace.data.regression_data import RegressionData, signals_of
 from analysis.trace.data.spectral_lines import lines
 from analysis.trace.data.temperature_nuisance import stripped, temperature_terms
 from analysis.trace.data.unrepeated import unrepeated
@@ -282,8 +282,10 @@ def _undetermined(model: Model, known: Collection[str] = ()) -> list[str]:
 
 def _remarks(train_data: RegressionData, winner: Hypothesis) -> list[str]:
     """State sizes at the conditions of the records where their parameters are given at others."""
-    signals = evidence(train_data, winner.fit.residual).signals
     terms = [(u.term, u.shape) for u in winner.effects if isinstance(u.term, Effect)]
+    if not terms:
+        return []
+    signals = signals_of(train_data)
     said = [(term.name, term.remark(train_data.rig, signals, shape)) for term, shape in terms]
     return [f"{name}: {text}" for name, text in said if text]
 

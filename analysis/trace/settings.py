@@ -40,9 +40,9 @@ class TraceSettings:
     beyond_knots: float = 0.05
     """Of a free curve's range: so far beyond its outermost knots it is still compared (tuned)."""
     better_known: float = 10.0
-    """Times: what held-out rows know of a direction of the baseline's coefficients over what the
-    training rows do, from which it is fitted to them (tuned: joints locked in turn, then moved
-    together, give 20 to 50 for the coupling inertia, all others 0.3 to 6)."""
+    """Ratio of what held-out rows know of a direction of the baseline's coefficients to what the
+    training rows know: from here on it is fitted to the held-out rows (tuned: joints locked in
+    turn, then moved together, give 20 to 50 for the coupling inertia, all others 0.3 to 6)."""
     cavitating_share: float = 0.2
     """Of an equation's rows at which the oil cavitates under a model: up to here they speak neither
     way (tuned: a gain of 5 % put 8 % of the rows below zero pressure, a cross-talk of 3 % 14 %)."""

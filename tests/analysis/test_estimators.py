@@ -226,7 +226,7 @@ def test_intervals_of_a_single_repeat_hold_the_truth_as_often_as_they_say() -> N
     assert 0.90 < np.mean(hits) < 0.99
 
 
-def test_a_parameter_that_no_row_shows_has_no_scatter_and_costs_no_other_its_own() -> None:
+def test_a_parameter_that_no_row_shows_has_no_scatter_and_changes_no_other() -> None:
     """A shape may make a column vanish; a single repeat is then judged by the others."""
     blocks = line(np.random.default_rng(4), 0.0, repeats=1)
     wide = [replace(b, X=np.column_stack((b.X, np.zeros(len(b.y))))) for b in blocks]

@@ -17,7 +17,7 @@ MacKinnon, Nielsen and Webb (2023), section 2.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,9 +90,6 @@ def by_parts(pieces: Pieces, inverse: Array) -> CovarianceParts:
 
     A direction that the rows do not determine, zero in `inverse` (k, k), gets no variance.
     """
-    seen = np.diag(inverse) > 0.0
-    if not seen.all():
-        return _embedded(by_parts(_of_parameters(pieces, seen), inverse[np.ix_(seen, seen)]), seen)
     stratum, score, information = pieces.grouped(pieces.part)
     A = scaled_inverse(inverse)
     left_out = np.array(
@@ -109,25 +106,12 @@ def by_parts(pieces: Pieces, inverse: Array) -> CovarianceParts:
     return CovarianceParts(total, satterthwaite(np.diag(total), squares), np.zeros(k))
 
 
-def _of_parameters(pieces: Pieces, chosen: NDArray[np.bool_]) -> Pieces:
-    """Return the pieces of the parameters (k,) that are chosen."""
-    information = pieces.information[:, chosen][:, :, chosen]
-    return replace(pieces, score=pieces.score[:, chosen], information=information)
-
-
-def _embedded(inner: CovarianceParts, chosen: NDArray[np.bool_]) -> CovarianceParts:
-    """Return the parts of all parameters (k,): those not chosen have no variance."""
-    k = len(chosen)
-    covariance, dof, systematic = np.zeros((k, k)), np.ones(k), np.zeros(k)
-    covariance[np.ix_(chosen, chosen)] = inner.covariance
-    dof[chosen], systematic[chosen] = inner.dof, inner.systematic
-    return CovarianceParts(covariance, dof, systematic)
-
-
 def _without(A: Array, inverse: Array, part: Array, score: Array) -> Array:
     """Return the change of beta when a part is left out: (A - A_c)^-1 g_c."""
-    scale = np.sqrt(np.abs(np.diag(A)))
-    reduced = (A - part) / np.outer(scale, scale)
+    size = np.sqrt(np.abs(np.diag(A)))
+    scale = np.where(size > 0.0, size, 1.0)
+    # A parameter that no row shows has a score of zero, and does not change.
+    reduced = (A - part) / np.outer(scale, scale) + np.diag(np.where(size > 0.0, 0.0, 1.0))
     if np.linalg.cond(reduced) > 1e10:
         # That part alone determines some direction, or none does: its influence to first order.
         return np.asarray(inverse @ score)

@@ -240,8 +240,12 @@ def evidence(data: RegressionData, residual: Array) -> Evidence:
     for conditioned, rows in zip(data.records, data.rows, strict=True):
         own = [s for s in data.segments if s.group == conditioned.group]
         left.append({s.equation: (rows[s.equation].time, residual[s.where]) for s in own})
-    signals = [prepared(data.rig, data.terms, conditioned) for conditioned in data.records]
-    return Evidence(signals, left)
+    return Evidence(signals_of(data), left)
+
+
+def signals_of(data: RegressionData) -> list[Signals]:
+    """Return the signals of every record as the data's own terms see them."""
+    return [prepared(data.rig, data.terms, conditioned) for conditioned in data.records]
 
 
 def variant_columns(
@@ -251,7 +255,7 @@ def variant_columns(
 
     `progress` receives after each which share of them is done.
     """
-    seen = [prepared(data.rig, data.terms, conditioned) for conditioned in data.records]
+    seen = signals_of(data)
     columns = []
     for variant in chosen:
         columns.append(_entry(data, variant, seen))
