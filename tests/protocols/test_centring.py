@@ -75,9 +75,9 @@ def test_one_trim_stops_the_drift_and_takes_out_half_the_offset(
     better = trim(bias, seen.drift, wanted, gain)
     after = motion(integrate(gain, null, wave + better, float(before[-1])), 1000, RATE)
     assert after.drift == pytest.approx(wanted, abs=1e-7)
-    # `ends` is half a sample past the last sample, the next record starts at the last sample
-    half_a_sample = 0.5 * (abs(seen.drift) + abs(wanted)) / RATE
-    assert after.ends == pytest.approx(0.5 * seen.ends, abs=half_a_sample + 1e-9)
+    # `ends` holds half a sample past the last sample, at which the next record starts.
+    shift = 0.5 * (wanted - seen.drift) / RATE
+    assert after.ends == pytest.approx(0.5 * seen.ends + shift, abs=1e-9)
 
 
 def test_recentring_never_looks_like_a_drift() -> None:
