@@ -23,12 +23,12 @@ from analysis.trace.next_experiment.discrimination import (
     ComparisonRows,
     Explanation,
     OpenQuestion,
-    present,
-    smallest,
+    present_separation,
+    smallest_effect,
 )
 from analysis.trace.next_experiment.proposal import SHOW
 from analysis.trace.result import Trace, to_json
-from analysis.trace.search.hypothesis import excess_of
+from analysis.trace.search.hypothesis import energy_above_noise
 from analysis.trace.search.refinement import refine
 from rig.model.records import Run
 from rig.model.rig import Rig
@@ -77,16 +77,17 @@ def achieved(
     both = regression_data(rig, terms, conditioned_records(rig, [*before, new]))
     if experiment["kind"] == SHOW:
         rows = ComparisonRows(both)
-        asked = [_small(q["one"], rig) for q in experiment["questions"]]
-        return min(present(q, rows) for q in asked)
+        asked = [_visibility_question(q["one"], rig) for q in experiment["questions"]]
+        return min(present_separation(q, rows) for q in asked)
     old = regression_data(rig, terms, conditioned_records(rig, before))
     rounds = [
-        _one(old, both, terms, len(before), q["one"], q["other"]) for q in experiment["questions"]
+        _question_separation(old, both, terms, len(before), q["one"], q["other"])
+        for q in experiment["questions"]
     ]
     return min(rounds)
 
 
-def _one(
+def _question_separation(
     old: RegressionData, both: RegressionData, terms: tuple[Used, ...], index: int,
     first: Sequence[Mapping[str, Any]], other: Sequence[Mapping[str, Any]],
 ) -> float:  # fmt: skip
@@ -96,7 +97,7 @@ def _one(
         residual = [
             refine(train_data, (*terms, *effects_of(side))).residual for side in (first, other)
         ]
-        ends = [excess_of(train_data, part) for part in residual]
+        ends = [energy_above_noise(train_data, part) for part in residual]
         gap[train_data is both] = {e: ends[1][e] - ends[0][e] for e in ends[0]}
     rows: dict[str, int] = {}
     for s in both.segments:
@@ -112,10 +113,12 @@ def _one(
     )
 
 
-def _small(effects: Sequence[Mapping[str, Any]], rig: Rig) -> OpenQuestion:
+def _visibility_question(effects: Sequence[Mapping[str, Any]], rig: Rig) -> OpenQuestion:
     (used,) = effects_of(effects)
     assert isinstance(used.term, Effect)
-    return OpenQuestion(smallest(used.term, rig) or Explanation((used,)), Explanation(), False)
+    return OpenQuestion(
+        smallest_effect(used.term, rig) or Explanation((used,)), Explanation(), False
+    )
 
 
 def effects_of(side: Sequence[Mapping[str, Any]]) -> list[Used]:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from analysis.trace.clues import dependence
-from analysis.trace.clues.formula import formula, surest
+from analysis.trace.clues.formula import formula, surest_formula
 from analysis.trace.clues.frequency import frequency_clue
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.spectral_lines import SpectralLines
@@ -24,7 +24,7 @@ from analysis.trace.settings import TRACE
 from rig.model.units import plain
 
 
-class Rest(NamedTuple):
+class Remainder(NamedTuple):
     """What an equation keeps, in words; whether it speaks against what was named (`veto`).
 
     What does not may still be another effect's.
@@ -35,23 +35,25 @@ class Rest(NamedTuple):
     veto: bool
 
 
-def left_over(
+def remainders(
     hypotheses: HypothesisSet, winner: Hypothesis, holdout_data: RegressionData
-) -> list[Rest]:
+) -> list[Remainder]:
     """Return the equations that keep more than is nothing, and say what.
 
     Beside those that keep more than the noise floor's band (`gates.remaining`), those whose rest
     one formula holds: it is no noise, and no form that is only a little simpler. It speaks against
     an effect that acts in this equation, where a bench with as much left would not be clean.
     """
-    out = [Rest(*r, True) for r in gates.remaining(hypotheses, winner, holdout_data)]
-    seen = _seen(hypotheses, winner) if winner.effects else {}
+    out = [
+        Remainder(*r, True) for r in gates.equations_above_band(hypotheses, winner, holdout_data)
+    ]
+    seen = _visible_shares(hypotheses, winner) if winner.effects else {}
     known = {r.equation for r in out}
     asked = [equation for equation in seen if equation not in known]
     if not asked:
-        return [*out, *_missed(hypotheses, winner, out)]
+        return [*out, *_tolerated_remainders(hypotheses, winner, out)]
     now, later = rebased(hypotheses.train_data, winner.fit), rebased(holdout_data, winner.fit)
-    held = held_out.residual(holdout_data, winner.fit)
+    held = held_out.held_out_residual(holdout_data, winner.fit)
     for equation in asked:
         expression = formula(now, winner.fit.residual, later, held, equation)
         # A constant is no law of another cause: it is what a form has too little or too much.
@@ -62,35 +64,37 @@ def left_over(
         ):
             share = plain(100 * seen[equation], 2)
             words = f"{share} % of the repeatable energy remains, and a formula fits it"
-            loud = winner.excess_energy[equation] > hypotheses.limits.band[equation]
+            loud = winner.excess_energy[equation] > hypotheses.noise_band.band[equation]
             veto = loud and seen[equation] < TRACE.unexplained_share
-            tail = "" if veto else _tolerated(seen[equation])
-            out.append(Rest(equation, f"{words}: {expression.text}{tail}", veto))
-    return [*out, *_missed(hypotheses, winner, out)]
+            tail = "" if veto else _tolerance_words(seen[equation])
+            out.append(Remainder(equation, f"{words}: {expression.text}{tail}", veto))
+    return [*out, *_tolerated_remainders(hypotheses, winner, out)]
 
 
-def _missed(hypotheses: HypothesisSet, winner: Hypothesis, known: Sequence[Rest]) -> list[Rest]:
+def _tolerated_remainders(
+    hypotheses: HypothesisSet, winner: Hypothesis, known: Sequence[Remainder]
+) -> list[Remainder]:
     """Return the other equations that keep more than a further effect would leave unasked."""
     listed = {r.equation for r in known}
     out = []
-    for e, residual in gates.left_in_training(hypotheses, winner).items():
+    for e, residual in gates.training_excess(hypotheses, winner).items():
         if winner.effects and e not in listed and not hypotheses.negligible(e, residual):
             share = residual / max(hypotheses.empty.excess_energy[e], 1e-30)
             words = f"{plain(100 * share, 2)} % of the repeatable energy remains"
-            out.append(Rest(e, words + _tolerated(share), False))
+            out.append(Remainder(e, words + _tolerance_words(share), False))
     return out
 
 
-def _tolerated(share: float) -> str:
+def _tolerance_words(share: float) -> str:
     """Say why a rest, a share of the energy before, speaks against nothing that is named."""
     if share < TRACE.unexplained_share:
         return "; within the tolerance for the form of the named effect"
     return "; nothing that is named acts there, and it is too near the noise to name more by"
 
 
-def _seen(hypotheses: HypothesisSet, winner: Hypothesis) -> dict[str, float]:
+def _visible_shares(hypotheses: HypothesisSet, winner: Hypothesis) -> dict[str, float]:
     """Return the share that stays, by equation, where it stands out of the noise's own energy."""
-    rows = hypotheses.train_data.counts
+    rows = hypotheses.train_data.row_counts
     shares = {
         e: v / max(hypotheses.empty.excess_energy[e], 1e-30)
         for e, v in winner.excess_energy.items()
@@ -98,8 +102,8 @@ def _seen(hypotheses: HypothesisSet, winner: Hypothesis) -> dict[str, float]:
     return {
         e: share
         for e, share in shares.items()
-        if share > TRACE.formula_least_energy
-        and winner.excess_energy[e] > TRACE.visible_deviations * np.sqrt(2 * rows[e])
+        if share > TRACE.formula_least_share
+        and winner.excess_energy[e] > TRACE.formula_deviations * np.sqrt(2 * rows[e])
     }
 
 
@@ -110,23 +114,23 @@ def clues_to(
     split: Sequence[SpectralLines],
 ) -> tuple[tuple[Dependence, ...], tuple[Formula, ...]]:
     """Return what the remaining residual moves with, most telling first, and formulas for it."""
-    residual, held = winner.fit.residual, held_out.residual(holdout_data, winner.fit)
+    residual, held = winner.fit.residual, held_out.held_out_residual(holdout_data, winner.fit)
     now, later = rebased(train_data, winner.fit), rebased(holdout_data, winner.fit)
     loud = [e for e, v in sorted(winner.excess_energy.items(), key=lambda kv: -kv[1]) if v > 0]
     total = sum(winner.excess_energy[e] for e in loud)
     loud = [e for e in loud if winner.excess_energy[e] > TRACE.clue_share * total]
-    moves = dependence.dependence(now, residual, later, held, loud)
+    moves = dependence.dependences(now, residual, later, held, loud)
     hum = frequency_clue(split, train_data, residual, holdout_data, held)
     candidates = [formula(now, residual, later, held, e) for e in loud]
     formulas = tuple(expression for expression in candidates if expression is not None)
-    first = _leading(formulas) if hum is None else [hum]
+    first = _formula_clue(formulas) if hum is None else [hum]
     there = {d.variable for d in first}
     return (*first, *(d for d in moves if d.variable not in there)), formulas
 
 
-def _leading(formulas: Sequence[Formula]) -> list[Dependence]:
+def _formula_clue(formulas: Sequence[Formula]) -> list[Dependence]:
     """Return the variable of the formula that leaves least, where one leaves next to nothing."""
-    best = surest(formulas)
+    best = surest_formula(formulas)
     if best is None:
         return []
     variable, by = (*best.variables, "")[:2]

@@ -55,8 +55,8 @@ class Formula:
     def sure(self) -> bool:
         """Whether it goes before free curves: a few monomials that leave next to nothing."""
         return (
-            self.share >= CLUES.sure
-            and len(self.terms) <= CLUES.few_monomials
+            self.share >= CLUES.leading_share
+            and len(self.terms) <= CLUES.leading_monomials
             and bool(self.variables)
         )
 
@@ -375,7 +375,8 @@ def _shot(shot: Shot) -> dict[str, Any]:
 
 def _lines(lines: SpectralLines) -> dict[str, Any]:
     return {
-        "step": lines.group[1], "equation": lines.equation, "above_noise": finite(lines.loud),
+        "step": lines.group[1], "equation": lines.equation,
+        "above_noise": finite(lines.above_noise),
         "shares": _numbers(lines.shares), "shares_after": _numbers(lines.shares_after),
         "text": lines.text,
     }  # fmt: skip

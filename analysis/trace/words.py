@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from analysis.simulation.model import Estimate
-from analysis.trace.clues.formula import surest
+from analysis.trace.clues.formula import surest_formula
 from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, JudgedEffect, Trace
 from rig.model.channels import place_in_words
 from rig.model.rig import Rig
@@ -34,7 +34,7 @@ def sentence(result: Trace) -> str:
     named = "; ".join(_effect(e) for e in result.effects)
     errors = _errors(result)
     if result.verdict == EXPLAINED:
-        return f"{_moves(result.effects)}: {named}. {errors}"
+        return f"{_variables_in_words(result.effects)}: {named}. {errors}"
     if result.verdict == CONFOUNDED:
         rivals = ", ".join(
             f"{name.replace('_', ' ')} at {place_in_words(at)}" for name, at in result.tied_at
@@ -57,19 +57,19 @@ def sentence(result: Trace) -> str:
 
 def _formula(result: Trace) -> str:
     """Return the sparse fit that leaves least in words ('' where none is sure)."""
-    best = surest(result.formulas)
+    best = surest_formula(result.formulas)
     return f"; a sparse fit is {best.text}" if best else ""
 
 
 def _symmetry(result: Trace) -> str:
     """Say what the lines of the loudest remainder show of its cause ('' without such lines)."""
-    loud = max(result.lines, key=lambda lines: lines.loud_after, default=None)
-    if loud is None or loud.loud_after < 1.0:
+    loud = max(result.lines, key=lambda lines: lines.above_noise_after, default=None)
+    if loud is None or loud.above_noise_after < 1.0:
         return ""
     return f"; its spectral lines in {loud.equation} show that it is {loud.meaning_after}"
 
 
-def _moves(effects: tuple[JudgedEffect, ...]) -> str:
+def _variables_in_words(effects: tuple[JudgedEffect, ...]) -> str:
     variables = [e.variable for e in effects if e.variable and not _constant(e.variable)]
     if len(variables) < len(effects) and variables:
         variables.append("a constant")

@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 from analysis.trace.clues.equation_rows import (
     EquationPart,
     EquationRows,
-    columns_of,
-    judged,
-    side_of,
+    equation_rows,
+    explained_share,
+    whitened_columns,
 )
 from analysis.trace.clues.variables import factor_of, factors, variables
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.result import Dependence
-from analysis.trace.search.hypothesis import excess_of
+from analysis.trace.search.hypothesis import energy_above_noise
 from analysis.trace.settings import CLUES
 from rig.model import channels as ch
 from rig.model.rig import Rig
@@ -33,10 +33,10 @@ from rig.model.rig import Rig
 Array = NDArray[np.float64]
 
 # An equation's own balance makes these follow whatever it lacks: they answer and are no cause.
-ANSWERS = {"torque": ("pressure", ch.DRIVE), "flow": ("velocity",)}
+FOLLOW_BY_BALANCE = {"torque": ("pressure", ch.DRIVE), "flow": ("velocity",)}
 
 
-def hats(v: Array, knots: Array) -> Array:
+def hat_functions(v: Array, knots: Array) -> Array:
     """Return the hat functions (n, k) of a piecewise linear curve with the given knots."""
     out = np.zeros((len(v), len(knots)))
     place = np.clip(np.searchsorted(knots, v) - 1, 0, len(knots) - 2)
@@ -47,23 +47,28 @@ def hats(v: Array, knots: Array) -> Array:
     return out
 
 
-def dependence(
+def dependences(
     train: RegressionData,
     residual: Array,
     holdout_data: RegressionData,
-    judge_left: Array,
+    holdout_residual: Array,
     equations: Sequence[str],
 ) -> list[Dependence]:
     """Return what the residual moves with by share of the energy above noise, most telling first.
 
     `residual` (M,) and `judge_left` are residuals under the model of `train` (rebased to it).
     """
-    weight = {e: max(0.0, v) for e, v in excess_of(train, residual).items() if e in equations}
+    weight = {
+        e: max(0.0, v) for e, v in energy_above_noise(train, residual).items() if e in equations
+    }
     total = sum(weight.values()) or 1.0
     shares: dict[tuple[str, str], dict[str, float]] = {}
     for equation in equations:
-        sides = side_of(train, residual, equation), side_of(holdout_data, judge_left, equation)
-        for key, share in _shares(train.rig, equation, *sides).items():
+        sides = (
+            equation_rows(train, residual, equation),
+            equation_rows(holdout_data, holdout_residual, equation),
+        )
+        for key, share in _curve_shares(train.rig, equation, *sides).items():
             shares.setdefault(key, {})[equation] = share
     sums = {k: sum(s * weight[e] / total for e, s in by.items()) for k, by in shares.items()}
     out: list[tuple[float, Dependence]] = []
@@ -74,19 +79,21 @@ def dependence(
         if share < CLUES.least_share or (product and share < max(parts) + CLUES.product_gain):
             continue
         equation = max(by, key=lambda e: by[e])
-        independence = 1.0 if factor else _telling(name, equation, sums)
-        out.append((share * independence, _dependence(name, factor, share, equation, independence)))
+        independence = 1.0 if factor else _independence_weight(name, equation, sums)
+        out.append(
+            (share * independence, _dependence_of(name, factor, share, equation, independence))
+        )
     best: dict[str, Dependence] = {}
     for _, clue in sorted(out, key=lambda pair: -pair[0]):
         best.setdefault(clue.variable, clue)
     return list(best.values())
 
 
-def _dependence(
+def _dependence_of(
     name: str, factor: str, share: float, equation: str, independence: float
 ) -> Dependence:  # fmt: skip
     if not factor:
-        words = f"{name} by balance" if independence == CLUES.answer_weight else ""
+        words = f"{name} by balance" if independence == CLUES.by_balance_weight else ""
         return Dependence(name, share, equation, words=words)
     by = factors(equation)[factor]
     if not name:
@@ -94,7 +101,9 @@ def _dependence(
     return Dependence(name, share, equation, by.variable, f"{name} times {by.words}")
 
 
-def _telling(name: str, equation: str, shares: Mapping[tuple[str, str], float]) -> float:
+def _independence_weight(
+    name: str, equation: str, shares: Mapping[tuple[str, str], float]
+) -> float:
     """Return a variable's weight: what an equation's balance makes follow counts little.
 
     A torque's balance makes the difference of the pressures follow; one chamber's pressure that
@@ -109,12 +118,12 @@ def _telling(name: str, equation: str, shares: Mapping[tuple[str, str], float]) 
         if shares[name, ""] > difference + CLUES.chamber_lead:
             return 1.0
     kind = kind.split("_", 1)[0]
-    if any(word in name for word in ANSWERS[kind]):
-        return CLUES.answer_weight
+    if any(word in name for word in FOLLOW_BY_BALANCE[kind]):
+        return CLUES.by_balance_weight
     return CLUES.spool_weight if kind == "torque" and name.startswith(ch.SPOOL) else 1.0
 
 
-def _shares(
+def _curve_shares(
     rig: Rig, equation: str, first: EquationRows | None, second: EquationRows | None
 ) -> dict[tuple[str, str], float]:
     """Return the share of every curve alone, factor alone (variable ''), and product of both.
@@ -138,7 +147,7 @@ def _shares(
         moving = [v[name] for v, p in zip(values, every, strict=True) if _moves(p, joint)]
         knots = _knots(np.concatenate(moving)) if moving else None
         if knots is not None:
-            curves[name] = [hats(v[name], knots) for v in values]
+            curves[name] = [hat_functions(v[name], knots) for v in values]
     count = len(first.parts)
     out = {}
     for name, curve in curves.items():
@@ -148,9 +157,11 @@ def _shares(
                 if factor
                 else curve
             )
-            one, two = columns_of(first, made[:count]), columns_of(second, made[count:])
+            one, two = whitened_columns(first, made[:count]), whitened_columns(second, made[count:])
             out[name, factor] = max(
-                0.0, judged(one, first, two, second), judged(two, second, one, first)
+                0.0,
+                explained_share(one, first, two, second),
+                explained_share(two, second, one, first),
             )
     return out
 

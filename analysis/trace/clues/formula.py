@@ -16,7 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.signals.conditioning import Signals
-from analysis.trace.clues.equation_rows import EquationRows, columns_of, fitted_to, judged, side_of
+from analysis.trace.clues.equation_rows import (
+    EquationRows,
+    equation_rows,
+    explained_share,
+    fitted_coefficients,
+    whitened_columns,
+)
 from analysis.trace.clues.variables import factor_of
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.result import Formula
@@ -27,7 +33,7 @@ from rig.model.rig import Rig
 Array = NDArray[np.float64]
 
 
-def surest(formulas: Sequence[Formula]) -> Formula | None:
+def surest_formula(formulas: Sequence[Formula]) -> Formula | None:
     """Return the sure formula that leaves least, None where none is sure."""
     return max((f for f in formulas if f.sure), key=lambda f: f.share, default=None)
 
@@ -36,24 +42,24 @@ def formula(
     train: RegressionData,
     residual: Array,
     holdout_data: RegressionData,
-    judge_left: Array,
+    holdout_residual: Array,
     equation: str,
 ) -> Formula | None:
     """Return the formula of what is left of an equation, None where none takes half of it.
 
     `residual` (M,) and `judge_left` are residuals under the model of `train` (rebased to it).
     """
-    first = side_of(train, residual, equation)
-    second = side_of(holdout_data, judge_left, equation)
+    first = equation_rows(train, residual, equation)
+    second = equation_rows(holdout_data, holdout_residual, equation)
     if first is None or second is None:
         return None
-    names, fitted, checked = _library(train.rig, equation, first, second)
-    both = EquationRows((), np.concatenate((first.rest, second.rest)), np.zeros((0, 0)))
-    chosen = _selected(np.concatenate((fitted, checked)), both)
-    share = judged(fitted[:, chosen], first, checked[:, chosen], second) if chosen else 0.0
-    if share < CLUES.offered:
+    names, fitted, checked = _candidate_monomials(train.rig, equation, first, second)
+    both = EquationRows((), np.concatenate((first.residual, second.residual)), np.zeros((0, 0)))
+    chosen = _selected_columns(np.concatenate((fitted, checked)), both)
+    share = explained_share(fitted[:, chosen], first, checked[:, chosen], second) if chosen else 0.0
+    if share < CLUES.shown_share:
         return None
-    values = fitted_to(fitted[:, chosen], first)
+    values = fitted_coefficients(fitted[:, chosen], first)
     terms = {names[k]: float(v) for k, v in zip(chosen, values, strict=True)}
     if is_balance(equation, terms):
         return None
@@ -76,7 +82,7 @@ def is_balance(equation: str, terms: Mapping[str, float]) -> bool:
     return kind == "torque" and any(cap[by] * rod[by] < 0.0 for by in cap.keys() & rod.keys())
 
 
-def _library(
+def _candidate_monomials(
     rig: Rig, equation: str, fitted: EquationRows, judged: EquationRows
 ) -> tuple[list[str], Array, Array]:  # fmt: skip
     """Return the monomials' names and their columns on either side, what is one left out."""
@@ -87,13 +93,16 @@ def _library(
     names = list(made[0])
     stacks = [np.column_stack([m[n] for n in names]) for m in made]
     count = len(fitted.parts)
-    first, second = columns_of(fitted, stacks[:count]), columns_of(judged, stacks[count:])
+    first, second = (
+        whitened_columns(fitted, stacks[:count]),
+        whitened_columns(judged, stacks[count:]),
+    )
     both = np.concatenate((first, second))
     size = np.linalg.norm(both, axis=0)
     kept: list[int] = []
     for k in np.flatnonzero(size > 1e-12):
         unit = both[:, k] / size[k]
-        if all(abs(float(unit @ both[:, j])) < CLUES.alike * size[j] for j in kept):
+        if all(abs(float(unit @ both[:, j])) < CLUES.duplicate_correlation * size[j] for j in kept):
             kept.append(int(k))
     return [names[k] for k in kept], first[:, kept], second[:, kept]
 
@@ -134,24 +143,24 @@ def _monomials(
     return out | {f"{place} {spool}": x * u, f"{spool} time": u * t}
 
 
-def _selected(columns: Array, side: EquationRows) -> list[int]:
+def _selected_columns(columns: Array, side: EquationRows) -> list[int]:
     """Return the columns chosen, in the order they were; none idle."""
     chosen: list[int] = []
     share = 0.0
     while len(chosen) < min(CLUES.monomials, columns.shape[1]):
         free = [k for k in range(columns.shape[1]) if k not in chosen]
-        shares = {k: _share([*chosen, k], columns, side) for k in free}
+        shares = {k: _joint_share([*chosen, k], columns, side) for k in free}
         best = max(free, key=lambda k: shares[k])
         if shares[best] < share + CLUES.monomial_gain:
             break
         chosen, share = [*chosen, best], shares[best]
     for k in list(chosen):
         rest = [j for j in chosen if j != k]
-        if rest and _share(rest, columns, side) > share - CLUES.monomial_gain:
+        if rest and _joint_share(rest, columns, side) > share - CLUES.monomial_gain:
             chosen = rest
     return chosen
 
 
-def _share(chosen: list[int], columns: Array, side: EquationRows) -> float:
+def _joint_share(chosen: list[int], columns: Array, side: EquationRows) -> float:
     """Return the share of a side's energy above noise that the chosen columns take of it."""
-    return judged(columns[:, chosen], side, columns[:, chosen], side)
+    return explained_share(columns[:, chosen], side, columns[:, chosen], side)

@@ -43,9 +43,9 @@ def factor_of(name: str, signals: Signals, joint: int, travel: float) -> Array:
     if name == "direction":
         speed = signals.sd[:, joint]
         rms = float(np.sqrt(np.mean(speed**2)))
-        return np.asarray(np.tanh(speed / max(CLUES.slow * rms, 1e-12)))
+        return np.asarray(np.tanh(speed / max(CLUES.direction_speed * rms, 1e-12)))
     place = np.ascontiguousarray(signals.s[:, joint])
-    return np.asarray(contact_state(place, max(CLUES.memory * travel, 1e-12)))
+    return np.asarray(contact_state(place, max(CLUES.direction_memory * travel, 1e-12)))
 
 
 def variables(rig: Rig, signals: Signals, joint: int) -> dict[str, Array]:

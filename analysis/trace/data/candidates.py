@@ -49,7 +49,9 @@ def free_mechanisms(rig: Rig) -> list[Effect]:
     return [kind(where) for kind in kinds for where in kind.places(rig)]
 
 
-def points(effect: Effect, rig: Rig, evidence: Evidence | None = None) -> list[tuple[float, ...]]:
+def shape_grid(
+    effect: Effect, rig: Rig, evidence: Evidence | None = None
+) -> list[tuple[float, ...]]:
     """Return the shape grid of an effect, thinned where it has too many points.
 
     Of an effect that takes its points from the data, those; none without `evidence`.
@@ -74,7 +76,9 @@ def variants(
     rig: Rig, effects: Sequence[Effect], evidence: Evidence | None = None
 ) -> list[Variant]:
     """Return every candidate at every point of its grid."""
-    return [Variant(effect, shape) for effect in effects for shape in points(effect, rig, evidence)]
+    return [
+        Variant(effect, shape) for effect in effects for shape in shape_grid(effect, rig, evidence)
+    ]
 
 
 def complexity(rig: Rig, used: Sequence[Used]) -> tuple[int, int]:

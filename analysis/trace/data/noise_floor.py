@@ -61,7 +61,7 @@ class Floor:
         return self.repeatable / self.noise if self.noise > 0 else float("inf")
 
 
-def split(repeats: Array) -> tuple[float, float]:
+def noise_and_repeatable(repeats: Array) -> tuple[float, float]:
     """Return noise and repeatable rms of residuals (n, m) of n repeats."""
     n = len(repeats)
     noise2 = float(np.mean(np.var(repeats, axis=0, ddof=1)))
@@ -89,9 +89,9 @@ def floors(
             every = np.concatenate(residual)
             total = float(np.sqrt(np.mean(every**2))) if len(every) else 0.0  # all rows masked
             sensors = stated[equation]
-            table, source = repeats_of(members[indices[0]], parts, residual)
+            table, source = stacked_repeats(members[indices[0]], parts, residual)
             if table is not None:
-                noise, repeatable = split(table)
+                noise, repeatable = noise_and_repeatable(table)
                 noise = max(noise, DATA.least_noise * sensors)
                 out.append(
                     Floor(group, equation, noise, repeatable, total, len(table), source, sensors)
@@ -99,7 +99,7 @@ def floors(
                 continue
             noise, source = sensors, STATED
             if len(parts) == 1:
-                near = neighbours(members[indices[0]], parts[0], residual[0])
+                near = noise_by_neighbours(members[indices[0]], parts[0], residual[0])
                 if near is not None:
                     noise, source = max(near, DATA.least_noise * noise), NEIGHBOURS
             rest = float(np.sqrt(max(0.0, total**2 - noise**2)))
@@ -107,7 +107,9 @@ def floors(
     return out
 
 
-def neighbours(conditioned: ConditionedRecord, rows: Rows, residual: Array) -> float | None:
+def noise_by_neighbours(
+    conditioned: ConditionedRecord, rows: Rows, residual: Array
+) -> float | None:
     """Return the noise (rms, SI) of a residual (m,) by pairs of rows at neighbouring states.
 
     A state is position, velocity, spool (or drive) and pressures of every moving joint, each over
@@ -118,12 +120,12 @@ def neighbours(conditioned: ConditionedRecord, rows: Rows, residual: Array) -> f
     x = _states(conditioned, rows)
     count = min(len(x), DATA.neighbours_asked)
     distance, other = cKDTree(x).query(x, k=count)
-    apart = np.abs(rows.time[other] - rows.time[:, None]) > DATA.pair_apart
+    apart = np.abs(rows.time[other] - rows.time[:, None]) > DATA.pair_time
     first = np.argmax(apart, axis=1)  # the nearest neighbour that is no close predecessor
     here = np.flatnonzero(apart.any(axis=1))
     d = distance[here, first[here]] ** 2
     half = 0.5 * (residual[other[here, first[here]]] - residual[here]) ** 2
-    nearest = np.argsort(d)[: int(DATA.nearest_pairs * len(x))]
+    nearest = np.argsort(d)[: int(DATA.nearest_pair_share * len(x))]
     if len(nearest) < DATA.least_pairs or d[nearest[-1]] > DATA.pair_distance**2:
         return None
     return float(np.sqrt(np.mean(half[nearest])))
@@ -139,7 +141,7 @@ def _states(conditioned: ConditionedRecord, rows: Rows) -> Array:
     return np.asarray(columns[:, spread > 0] / spread[spread > 0])
 
 
-def repeats_of(
+def stacked_repeats(
     conditioned: ConditionedRecord, parts: Sequence[Rows], residual: Sequence[Array]
 ) -> tuple[Array | None, str]:
     """Return residuals of repeats, or of one record's periods, one under the other (n, m)."""

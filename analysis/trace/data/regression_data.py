@@ -23,15 +23,15 @@ from analysis.regression.least_squares import shortest
 from analysis.regression.rows import Rows
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import Used
+from analysis.trace.data.cache import RowCache
 from analysis.trace.data.candidates import Variant
 from analysis.trace.data.conditioned_record import (
     candidate_columns,
-    held,
+    is_hidden_by_lock,
     model_rows,
-    prepared,
+    prepared_signals,
     row_residual,
 )
-from analysis.trace.data.memory import RowMemory
 from analysis.trace.data.noise_floor import Floor, Group, floors
 from analysis.trace.settings import TRACE
 from rig.model.parse import InputError
@@ -70,10 +70,10 @@ class RegressionData:
     floors: tuple[Floor, ...]
     records: tuple[ConditionedRecord, ...]
     rows: tuple[Mapping[str, Rows], ...]
-    memory: RowMemory = field(default_factory=RowMemory, repr=False, compare=False)
+    cache: RowCache = field(default_factory=RowCache, repr=False, compare=False)
 
     @property
-    def mean(self) -> Array:
+    def mean_residual(self) -> Array:
         """The averaged residual (M,), in units of its own noise."""
         weights = np.zeros(self.residual.shape[1])
         for segment in self.segments:
@@ -81,7 +81,7 @@ class RegressionData:
         return np.asarray(np.nanmean(self.residual, axis=0) * weights)
 
     @property
-    def counts(self) -> Counter[str]:
+    def row_counts(self) -> Counter[str]:
         """How many rows each equation has."""
         rows: Counter[str] = Counter()
         for s in self.segments:
@@ -102,16 +102,16 @@ class RegressionData:
             kept, k = mask[s.where], index[s.group]
             if kept.any():
                 whole = self.rows[k][s.equation]
-                rows[k][s.equation] = _at(whole, whole.time[kept])
+                rows[k][s.equation] = _rows_at(whole, whole.time[kept])
                 segments.append(replace(s, where=slice(start, start + int(kept.sum()))))
                 start = segments[-1].where.stop
         return replace(
             self, base=self.base[mask], residual=self.residual[:, mask],
-            segments=tuple(segments), rows=rows, memory=RowMemory(),
+            segments=tuple(segments), rows=rows, cache=RowCache(),
         )  # fmt: skip
 
 
-def averaged(rig: Rig, members: Sequence[ConditionedRecord]) -> list[ConditionedRecord]:
+def averaged_records(rig: Rig, members: Sequence[ConditionedRecord]) -> list[ConditionedRecord]:
     """Return one scene per group: the repeats' channels averaged, filtered as they were."""
     groups: dict[Group, list[ConditionedRecord]] = {}
     for conditioned in members:
@@ -164,7 +164,7 @@ def regression_data(
     every = [model_rows(rig, terms, conditioned) for conditioned in members]
     beta = least_squares(rig, every) if beta is None else beta
     split = floors(rig, terms, members, every, beta)
-    mean_scenes = averaged(rig, members)
+    mean_scenes = averaged_records(rig, members)
     mean_rows = [model_rows(rig, terms, conditioned) for conditioned in mean_scenes]
     names = tuple(
         dict.fromkeys(n for record in mean_rows for r in record.values() for n in r.names)
@@ -184,13 +184,13 @@ def regression_data(
                 time = np.intersect1d(time, record[equation].time)
             if len(time) < 5:
                 continue
-            cut = _at(mean, time)
+            cut = _rows_at(mean, time)
             kept_rows[-1][equation] = cut
             sigma = max(noise[conditioned.group, equation], 1e-30)
-            base.append(_spread(cut, names) * np.sqrt(len(own)) / sigma)
+            base.append(_matrix_of(cut, names) * np.sqrt(len(own)) / sigma)
             table = np.full((most, len(time)), np.nan)
             for k, record in enumerate(own):
-                table[k] = row_residual(_at(record[equation], time), beta) / sigma
+                table[k] = row_residual(_rows_at(record[equation], time), beta) / sigma
             residual.append(table)
             where = slice(start, start + len(time))
             segments.append(
@@ -209,12 +209,12 @@ def regression_data(
     )  # fmt: skip
 
 
-def _at(rows: Rows, time: Array) -> Rows:
+def _rows_at(rows: Rows, time: Array) -> Rows:
     kept = np.isin(rows.time, time)
     return replace(rows, matrix=rows.matrix[kept], rhs=rows.rhs[kept], time=rows.time[kept])
 
 
-def _spread(rows: Rows, names: Sequence[str]) -> Array:
+def _matrix_of(rows: Rows, names: Sequence[str]) -> Array:
     """Return the rows' matrix under a longer list of names."""
     out = np.zeros((len(rows.rhs), len(names)))
     out[:, [names.index(n) for n in rows.names]] = rows.matrix
@@ -245,7 +245,7 @@ def evidence(data: RegressionData, residual: Array) -> Evidence:
 
 def signals_of(data: RegressionData) -> list[Signals]:
     """Return the signals of every record as the data's own terms see them."""
-    return [prepared(data.rig, data.terms, conditioned) for conditioned in data.records]
+    return [prepared_signals(data.rig, data.terms, conditioned) for conditioned in data.records]
 
 
 def variant_columns(
@@ -258,20 +258,20 @@ def variant_columns(
     seen = signals_of(data)
     columns = []
     for variant in chosen:
-        columns.append(_entry(data, variant, seen))
+        columns.append(_columns_of_variant(data, variant, seen))
         if progress is not None:
             progress(len(columns) / len(chosen))
     return [entry for entry in columns if entry is not None]
 
 
-def _entry(
+def _columns_of_variant(
     data: RegressionData, variant: Variant, seen: Sequence[Signals]
 ) -> VariantColumns | None:
     columns: dict[str, Array] = {}
     touched = set()
     M = data.base.shape[0]
     for index, conditioned in enumerate(data.records):
-        if held(variant.effect, conditioned):
+        if is_hidden_by_lock(variant.effect, conditioned):
             continue
         rows = data.rows[index]
         candidate = candidate_columns(
@@ -282,7 +282,7 @@ def _entry(
             rows,
             data.beta,
             variant.used,
-            data.memory,
+            data.cache,
         )
         for segment in data.segments:
             if segment.group == conditioned.group and segment.equation in candidate:

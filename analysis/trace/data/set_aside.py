@@ -1,7 +1,7 @@
 """What the fit does not see: rows that choose between effects, and rows that judge at the end.
 
 Where no records are given to judge alone, held-out ones are divided. What chooses has been looked
-at many times, and its error flatters what was chosen. Of every three blocks of `DATA.judge_block`
+at many times, and its error flatters what was chosen. Of every three blocks of `DATA.judging_block`
 by time in the record the second is therefore set aside: its rows are read once, when everything is
 settled. The noise floor that rows are weighed by stays that of the whole record, for periods and
 neighbouring states are not found within blocks.
@@ -26,13 +26,13 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
-def judging(time: Array) -> Mask:
+def in_judging_block(time: Array) -> Mask:
     """Return which instants (n,) of a record [s] lie in a block that is set aside."""
-    return np.asarray(np.floor(time / DATA.judge_block) % 3 == 1)
+    return np.asarray(np.floor(time / DATA.judging_block) % 3 == 1)
 
 
 @dataclass(frozen=True)
-class Unseen:
+class UnseenRows:
     """Rows that choose and rows that judge; `members` are the records of these, repeats apart.
 
     Of the groups that are `divided` only the judging blocks of a member count. `choosing_runs` are
@@ -49,7 +49,7 @@ class Unseen:
 
 def set_aside(
     data: RegressionData, members: Sequence[ConditionedRecord], runs: Sequence[Run]
-) -> Unseen:
+) -> UnseenRows:
     """Divide held-out `runs`, of which `data` are the rows.
 
     A group is not divided where an equation of it would have fewer than `TRACE.least_rows` on
@@ -58,7 +58,7 @@ def set_aside(
     judge = np.zeros(data.base.shape[0], dtype=bool)
     short = set()
     for s in data.segments:
-        judge[s.where] = here = judging(data.source(s)[1].time)
+        judge[s.where] = here = in_judging_block(data.source(s)[1].time)
         if min(here.sum(), (~here).sum()) < TRACE.least_rows:
             short.add(s.group)
     choose = ~judge
@@ -66,15 +66,15 @@ def set_aside(
         if s.group in short:
             judge[s.where] = choose[s.where] = True
     divided = frozenset(conditioned.group for conditioned in data.records) - short
-    return Unseen(
+    return UnseenRows(
         data.at(choose), data.at(judge), tuple(members), _without_blocks(runs, divided), divided,
-        (_said(divided, sorted({step for _, step in short})),),
+        (_division_note(divided, sorted({step for _, step in short})),),
     )  # fmt: skip
 
 
 def judging_rows(rows: Rows) -> Rows:
     """Return a record's rows in the blocks that are set aside."""
-    kept = judging(rows.time)
+    kept = in_judging_block(rows.time)
     return replace(rows, matrix=rows.matrix[kept], rhs=rows.rhs[kept], time=rows.time[kept])
 
 
@@ -83,19 +83,20 @@ def _without_blocks(runs: Sequence[Run], divided: Collection[Group]) -> tuple[Ru
     out = []
     for number, run in enumerate(runs):
         records = [
-            _lost(record) if (number, record.step) in divided else record for record in run.records
+            _without_judging_samples(record) if (number, record.step) in divided else record
+            for record in run.records
         ]
         out.append(replace(run, records=tuple(records)))
     return tuple(out)
 
 
-def _lost(record: Record) -> Record:
-    aside = judging(np.asarray(record.time))
+def _without_judging_samples(record: Record) -> Record:
+    aside = in_judging_block(np.asarray(record.time))
     channels = {name: np.where(aside, np.nan, x) for name, x in record.channels.items()}
     return replace(record, channels=channels)
 
 
-def _said(divided: Collection[Group], short: Sequence[str]) -> str:
+def _division_note(divided: Collection[Group], short: Sequence[str]) -> str:
     """Say in a sentence what judges where no records were given for it."""
     if not divided:
         return (
@@ -104,6 +105,6 @@ def _said(divided: Collection[Group], short: Sequence[str]) -> str:
         )
     rest = f"; too short for that, {' '.join(short)} does both" if short else ""
     return (
-        f"a third of the held-out rows (every third block of {DATA.judge_block:g} s) judges and "
+        f"a third of the held-out rows (every third block of {DATA.judging_block:g} s) judges and "
         f"the rest chooses; `--judge RUN` gives both in full{rest}"
     )

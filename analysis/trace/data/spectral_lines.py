@@ -56,11 +56,11 @@ class SpectralLines:
     excited: NDArray[np.bool_]
     shares: Mapping[str, float]
     shares_after: Mapping[str, float]
-    own: Mapping[str, float]
-    loud: float
+    velocity_shares: Mapping[str, float]
+    above_noise: float
 
     @property
-    def loud_after(self) -> float:
+    def above_noise_after(self) -> float:
         """What repeats after, rms over the noise of one repeat, both over all lines."""
         return float(np.sqrt(max(0.0, self.after.sum()) / max(float(self.noise.sum()), 1e-300)))
 
@@ -70,19 +70,19 @@ class SpectralLines:
         where = ", ".join(
             f"{100 * share:.0f} % {WORDS[kind]}"
             for kind, share in self.shares.items()
-            if share >= DATA.noted_share
+            if share >= DATA.noted_line_share
         )
         return f"{self.equation} in {self.group[1]}: {where or 'no line'}: {self.meaning}"
 
     @property
     def meaning(self) -> str:
         """What the lines say of the cause of the whole residual."""
-        return meaning(self.shares, self.own)
+        return meaning(self.shares, self.velocity_shares)
 
     @property
     def meaning_after(self) -> str:
         """What the lines say of the cause of what is left."""
-        return meaning(self.shares_after, self.own)
+        return meaning(self.shares_after, self.velocity_shares)
 
 
 def meaning(shares: Mapping[str, float], own: Mapping[str, float]) -> str:
@@ -90,12 +90,12 @@ def meaning(shares: Mapping[str, float], own: Mapping[str, float]) -> str:
     if not any(shares.values()):
         return "not above the noise"
     moving = 1.0 - shares[CONSTANT]
-    if moving < DATA.asymmetric:
+    if moving < DATA.asymmetric_share:
         return "constant"
     meanings = []
     for kind, least, word in (
-        (EVEN, DATA.asymmetric, "asymmetric"),
-        (ODD, DATA.symmetric, "a symmetric nonlinearity"),
+        (EVEN, DATA.asymmetric_share, "asymmetric"),
+        (ODD, DATA.symmetric_share, "a symmetric nonlinearity"),
     ):
         share = shares[kind] / moving
         if share > least and share > DATA.velocity_ratio * own[kind]:
@@ -108,7 +108,7 @@ def meaning(shares: Mapping[str, float], own: Mapping[str, float]) -> str:
     return " and ".join(word for _, word in meanings)
 
 
-def lines(data: RegressionData, after: Array) -> tuple[SpectralLines, ...]:
+def spectral_lines(data: RegressionData, after: Array) -> tuple[SpectralLines, ...]:
     """Return the lines of every equation and group excited by odd lines, the loudest first.
 
     `after` (M,) is the averaged whitened residual of the model that the trace ended with.
@@ -125,13 +125,13 @@ def lines(data: RegressionData, after: Array) -> tuple[SpectralLines, ...]:
                 rest = after[s.where] * s.noise / np.sqrt(s.repeats)
                 both = np.vstack((residual, rest))
                 excited = loud[s.group, s.equation]
-                of_segment = _of_segment(s, conditioned, rows[s.equation], both, excited)
+                of_segment = _segment_lines(s, conditioned, rows[s.equation], both, excited)
                 if of_segment is not None:
                     out.append(of_segment)
-    return tuple(sorted(out, key=lambda equation_lines: -equation_lines.loud))
+    return tuple(sorted(out, key=lambda equation_lines: -equation_lines.above_noise))
 
 
-def _of_segment(
+def _segment_lines(
     s: Segment, conditioned: ConditionedRecord, rows: Rows, residuals: Array, loud: float
 ) -> SpectralLines | None:
     """Return the lines of residuals (repeats + 1, m), the last of them what is left."""
@@ -139,7 +139,7 @@ def _of_segment(
     highest = max(record.lines)
     per = record.period // conditioned.filtering.step
     place = np.rint((rows.time - rows.time[0]) * record.sample_rate / conditioned.filtering.step)
-    pairs = _pairs(place.astype(np.int64), per)
+    pairs = _half_period_pairs(place.astype(np.int64), per)
     base = record.sample_rate / record.period
     beyond = DATA.line_band * lines_cutoff(record) / base
     K = int(min([beyond, *(DATA.lines_per_pair * len(p) for p in pairs)]))
@@ -166,7 +166,7 @@ def _of_segment(
     )  # fmt: skip
 
 
-def _pairs(place: NDArray[np.int64], per: int) -> list[NDArray[np.int64]]:
+def _half_period_pairs(place: NDArray[np.int64], per: int) -> list[NDArray[np.int64]]:
     """Return, for each period that is there nearly whole, its rows half a period apart (p, 2)."""
     if per % 2:
         return []
@@ -174,7 +174,7 @@ def _pairs(place: NDArray[np.int64], per: int) -> list[NDArray[np.int64]]:
     at[place] = np.arange(len(place))
     whole = at[: len(at) // per * per].reshape(-1, 2, per // 2).transpose(0, 2, 1)
     complete = [p[(p >= 0).all(axis=1)] for p in whole]
-    return [p for p in complete if len(p) >= DATA.period_present * per / 2]
+    return [p for p in complete if len(p) >= DATA.least_period_share * per / 2]
 
 
 def spectrum(phase: Array, series: Array, K: int) -> NDArray[np.complex128]:
@@ -196,7 +196,7 @@ def spectrum(phase: Array, series: Array, K: int) -> NDArray[np.complex128]:
     return out
 
 
-def members(excited: NDArray[np.bool_]) -> dict[str, NDArray[np.bool_]]:
+def lines_by_kind(excited: NDArray[np.bool_]) -> dict[str, NDArray[np.bool_]]:
     """Return which of the lines 0..K are of which kind, each (K + 1,)."""
     number = np.arange(len(excited))
     odd = (number % 2 == 1) & ~excited
@@ -207,7 +207,7 @@ def members(excited: NDArray[np.bool_]) -> dict[str, NDArray[np.bool_]]:
 def _shares(power: Array, noise: Array, excited: NDArray[np.bool_]) -> dict[str, float]:
     """Return the share of the power by kind of line; 0 of a kind that noise would explain."""
     sums = {}
-    for kind, own in members(excited).items():
+    for kind, own in lines_by_kind(excited).items():
         total = float(power[own].sum())
         scatter = float(np.sqrt(np.sum(noise[own] ** 2)))
         sums[kind] = total if total > DATA.line_deviations * scatter else 0.0
@@ -221,6 +221,6 @@ def loudest(
     """Return the loudest, one of each equation, where the residual is above its noise."""
     best: dict[str, SpectralLines] = {}
     for equation_lines in lines:
-        if equation_lines.loud >= least:
+        if equation_lines.above_noise >= least:
             best.setdefault(equation_lines.equation, equation_lines)
     return list(best.values())[:most]

@@ -59,7 +59,7 @@ def _temperatures(runs: Sequence[Run]) -> list[float]:
     ]
 
 
-def plausible(kappa: float, beta: Mapping[str, float]) -> float:
+def within_plausible_slope(kappa: float, beta: Mapping[str, float]) -> float:
     """Return 1/b's change per kelvin [1/(Pa K)], held to what oil and hoses can do."""
     size = abs(beta.get("b", 0.0))  # of the rows: 1/b
     low, high = (
@@ -70,7 +70,7 @@ def plausible(kappa: float, beta: Mapping[str, float]) -> float:
     return float(np.clip(kappa, low, high))
 
 
-def stripped(model: Model) -> Model:
+def at_nominal_temperature(model: Model) -> Model:
     """Return the model at the rig's nominal temperature: the parameters without the nuisance."""
     (term,) = [u.term for u in model.terms if isinstance(u.term, BulkTemperature)] or (None,)
     names = list(model.parameters)
@@ -81,7 +81,7 @@ def stripped(model: Model) -> Model:
     covariance = model.covariance.copy()
     if bulk.identified and term.reference is not None:
         kelvin = model.rig.oil.temperature - term.reference
-        bulk, more = _at(bulk, model.parameters[KAPPA], kelvin)
+        bulk, more = _bulk_modulus_at(bulk, model.parameters[KAPPA], kelvin)
         covariance[b, b] += more
     kept = [k for k in range(len(names)) if k != kappa]
     return replace(
@@ -92,7 +92,7 @@ def stripped(model: Model) -> Model:
     )
 
 
-def _at(b: Estimate, kappa: Estimate, kelvin: float) -> tuple[Estimate, float]:
+def _bulk_modulus_at(b: Estimate, kappa: Estimate, kelvin: float) -> tuple[Estimate, float]:
     """Return b `kelvin` warmer, and by how much its variance grows.
 
     1/b(T) = 1/b + kappa (T - T0); kappa is the records' joined to what is known beforehand.

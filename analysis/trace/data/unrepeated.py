@@ -18,7 +18,7 @@ from rig.model.units import plain
 Array = NDArray[np.float64]
 
 
-def unrepeated(data: RegressionData) -> list[str]:
+def unrepeated_notes(data: RegressionData) -> list[str]:
     """State, for each equation, a scatter between repeats that the stated sensor noise is not."""
     loudest: dict[str, Floor] = {}
     for floor in data.floors:
@@ -27,14 +27,14 @@ def unrepeated(data: RegressionData) -> list[str]:
             best = loudest.get(floor.equation)
             if best is None or floor.noise / floor.stated > best.noise / best.stated:
                 loudest[floor.equation] = floor
-    return [_words(data, floor) for floor in loudest.values()]
+    return [_unrepeated_note(data, floor) for floor in loudest.values()]
 
 
-def _words(data: RegressionData, floor: Floor) -> str:
+def _unrepeated_note(data: RegressionData, floor: Floor) -> str:
     segment = next(
         s for s in data.segments if (s.group, s.equation) == (floor.group, floor.equation)
     )
-    frequency, share = _line(data, segment)
+    frequency, share = _dominant_frequency(data, segment)
     at = ""
     if share > DATA.unrepeated_share:
         at = f", {plain(100 * share, 2)} % of it at {plain(frequency, 3)} Hz"
@@ -45,7 +45,7 @@ def _words(data: RegressionData, floor: Floor) -> str:
     )
 
 
-def _line(data: RegressionData, segment: Segment) -> tuple[float, float]:
+def _dominant_frequency(data: RegressionData, segment: Segment) -> tuple[float, float]:
     """Return the frequency [Hz] at which most of the scatter between repeats lies, and its share.
 
     The share is of the energy, 0 with fewer than two repeats (periods hold no other frequency).

@@ -39,7 +39,7 @@ def curves_of(data: RegressionData, model: ExactFit, used: Used) -> tuple[Curve,
     return tuple(out)
 
 
-def within_curves(data: RegressionData, model: ExactFit) -> RegressionData:
+def rows_within_curves(data: RegressionData, model: ExactFit) -> RegressionData:
     """Return data with only the rows where every free curve of a model is known.
 
     Beyond its outermost knots a curve is a guess, a straight line, that speaks neither for nor
@@ -56,9 +56,9 @@ def within_curves(data: RegressionData, model: ExactFit) -> RegressionData:
     return data if inside.all() or least < TRACE.least_rows else data.at(inside)
 
 
-def beyond_in_words(whole: RegressionData, known: RegressionData) -> list[str]:
+def beyond_curve_notes(whole: RegressionData, known: RegressionData) -> list[str]:
     """Return a sentence for every equation of which `known` lacks rows (see `within_curves`)."""
-    rows, left = whole.counts, known.counts
+    rows, left = whole.row_counts, known.row_counts
     return [
         f"{e}: {plain(100 * (1 - left[e] / rows[e]), 2)} % of the judging rows lie beyond the "
         "range of the fitted curve: they are in the errors, but speak neither for nor against it; "
@@ -74,7 +74,7 @@ def _between_knots(data: RegressionData, used: Used) -> NDArray[np.bool_]:
     assert isinstance(effect, Effect)
     named = zip(shapes_of(data.rig, used), used.shape, strict=True)
     knots = [value for shape, value in named if "_knot_" in shape.parameter]
-    margin = TRACE.beyond_knots * (knots[-1] - knots[0])
+    margin = TRACE.knot_margin * (knots[-1] - knots[0])
     for segment in data.segments:
         conditioned, rows = data.source(segment)
         values = effect.abscissa(data.rig, conditioned.signals).get(segment.equation)

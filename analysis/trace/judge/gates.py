@@ -19,14 +19,14 @@ from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge import inference
 from analysis.trace.judge.curves import curves_of
-from analysis.trace.judge.held_out import residual as held_left
+from analysis.trace.judge.held_out import held_out_residual
 from analysis.trace.judge.invariance import invariance
-from analysis.trace.judge.readings import loss, related
+from analysis.trace.judge.readings import loss_in_deviations, of_one_law
 from analysis.trace.judge.scatter import form_shift
 from analysis.trace.result import Gate, JudgedEffect, Rival
-from analysis.trace.search.hypothesis import Hypothesis, excess_of, parameter_values
+from analysis.trace.search.hypothesis import Hypothesis, energy_above_noise, parameter_values
 from analysis.trace.search.hypothesis_set import HypothesisSet, effect_of
-from analysis.trace.search.refinement import ExactFit, table
+from analysis.trace.search.refinement import ExactFit, design_matrix
 from analysis.trace.settings import SEARCH, TRACE
 from rig.model.units import plain, with_interval
 
@@ -34,25 +34,25 @@ Array = NDArray[np.float64]
 Key = tuple[str, str]
 
 
-REMOVES, PHYSICAL, INVARIANT, SIGNIFICANT, ALONE = (
+REMOVES, PHYSICAL, INVARIANT, SIGNIFICANT, NO_RIVAL = (
     "removes on held-out", "physical", "invariant", "significant", "no rival",
 )  # fmt: skip
 
 
-def stands(effect: JudgedEffect) -> bool:
+def passes_gates(effect: JudgedEffect) -> bool:
     """Return whether an effect passes every gate but that of rivals, which makes it confounded."""
-    return all(gate.ok for gate in effect.gates if gate.name != ALONE)
+    return all(gate.ok for gate in effect.gates if gate.name != NO_RIVAL)
 
 
-def refused(effects: Sequence[JudgedEffect]) -> tuple[JudgedEffect, ...]:
+def refused_effects(effects: Sequence[JudgedEffect]) -> tuple[JudgedEffect, ...]:
     """Return the effects that stand in no set, each once where it removes most, in that order."""
     once: dict[Key, JudgedEffect] = {}
-    for effect in sorted(effects, key=lambda f: (not stands(f), -f.removed_fraction)):
+    for effect in sorted(effects, key=lambda f: (not passes_gates(f), -f.removed_fraction)):
         once.setdefault((effect.name, effect.at or effect.where), effect)
-    return tuple(f for f in once.values() if not stands(f))
+    return tuple(f for f in once.values() if not passes_gates(f))
 
 
-def judge(
+def judge_effects(
     hypotheses: HypothesisSet,
     winner: Hypothesis,
     holdout_data: RegressionData,
@@ -62,35 +62,39 @@ def judge(
     train_data = hypotheses.train_data
     values = parameter_values(train_data.rig, winner.fit.terms, dict(winner.fit.beta))
     null = inference.null_maximum(
-        hypotheses.candidates, train_data, _noise_like(train_data, winner.fit.residual), rng
+        hypotheses.candidates, train_data, _noise_samples(train_data, winner.fit.residual), rng
     )
-    after = held_left(holdout_data, winner.fit)
+    after = held_out_residual(holdout_data, winner.fit)
     shift = form_shift(train_data, winner.fit)
     out = []
     for used in winner.effects:
         assert isinstance(used.term, Effect)
-        rest = _without(hypotheses, winner, used)
-        without = held_left(holdout_data, rest.fit)
-        changes = _changes(winner, rest)
-        near = _Near(holdout_data, changes, after, without)
+        rest = _set_without(hypotheses, winner, used)
+        without = held_out_residual(holdout_data, rest.fit)
+        changes = _removed_energy(winner, rest)
+        near = _TieTest(holdout_data, changes, after, without)
         rivals = _rivals(hypotheses, winner, used, rest, holdout_data, near)
-        removed = _removed(holdout_data, changes, without, after)
-        worse = _worse(hypotheses, winner, rest)
+        removed = _removed_share(holdout_data, changes, without, after)
+        worse = _disturbed_equations(hypotheses, winner, rest)
         p = inference.p_value(rest.fit.energy - winner.fit.energy, null)
-        errors = inference.spread(train_data, winner.fit, used, values)
-        differing = invariance(train_data, winner.fit, used, errors, _joint(used.term))
-        unphysical = hypotheses.physical(winner, used)
+        errors = inference.effect_errors(train_data, winner.fit, used, values)
+        differing = invariance(train_data, winner.fit, used, errors, _joint_index(used.term))
+        unphysical = hypotheses.physical_problem(winner, used)
         tied = [r for r in rivals if r.tied]
         twins = [
             Rival(name, _place(effect_of(name, at)), 1.0, 1.0, True, at)
             for name, at in used.term.twins()
         ]
         gates = (
-            Gate(REMOVES, removed >= TRACE.least_removed and not worse, _taken(removed, worse)),
+            Gate(
+                REMOVES,
+                removed >= TRACE.least_removed and not worse,
+                _removal_in_words(removed, worse),
+            ),
             Gate(PHYSICAL, not unphysical, unphysical or "sign and size are possible"),
-            Gate(INVARIANT, not differing, _differences(differing)),
+            Gate(INVARIANT, not differing, _differences_in_words(differing)),
             Gate(SIGNIFICANT, p <= TRACE.p_limit, f"family-wise p = {p:.3g}"),
-            Gate(ALONE, not (tied or twins), _told_apart([*twins, *rivals])),
+            Gate(NO_RIVAL, not (tied or twins), _rivals_in_words([*twins, *rivals])),
         )
         out.append(
             JudgedEffect(
@@ -113,30 +117,32 @@ def judge(
     return tuple(out)
 
 
-def _without(hypotheses: HypothesisSet, winner: Hypothesis, used: Used) -> Hypothesis:
+def _set_without(hypotheses: HypothesisSet, winner: Hypothesis, used: Used) -> Hypothesis:
     """Return the set without one effect, or the best physical one of readings of the others.
 
     Two levels of friction of opposite signs make a torque offset: what physics refuses is no
     alternative to an effect. Two readings of one law go together: whether both are needed is
     asked in `readings`.
     """
-    kept = [u for u in winner.effects if u is not used and not related(u.term, used.term)]  # type: ignore[arg-type]
-    rest = hypotheses.exact(kept)
+    kept = [u for u in winner.effects if u is not used and not of_one_law(u.term, used.term)]  # type: ignore[arg-type]
+    rest = hypotheses.refined(kept)
     rig = hypotheses.train_data.rig
     # A shape at its bound is a matter of form.
     at_bound = any(u.term.outside(rig, u.shape) for u in rest.effects)  # type: ignore[attr-defined]
-    if at_bound or not hypotheses.physical(rest):
+    if at_bound or not hypotheses.physical_problem(rest):
         return rest
     simpler = [
         o
         for o in hypotheses.fitted.values()
-        if not hypotheses.physical(o)
-        and all(any(u.term == k.term or related(u.term, k.term) for k in kept) for u in o.effects)  # type: ignore[arg-type]
+        if not hypotheses.physical_problem(o)
+        and all(
+            any(u.term == k.term or of_one_law(u.term, k.term) for k in kept) for u in o.effects
+        )  # type: ignore[arg-type]
     ]
     return min([hypotheses.empty, *simpler], key=lambda o: o.total)
 
 
-def remaining(
+def equations_above_band(
     hypotheses: HypothesisSet, winner: Hypothesis, holdout_data: RegressionData
 ) -> list[tuple[str, str]]:
     """Return the equations that keep more than the noise floor's band, and say on which records.
@@ -145,44 +151,44 @@ def remaining(
     well it is measured.
     """
     out = []
-    for e, residual in left_in_training(hypotheses, winner).items():
+    for e, residual in training_excess(hypotheses, winner).items():
         share = residual / max(hypotheses.empty.excess_energy[e], 1e-30)
         if share > TRACE.training_share and not hypotheses.negligible(e, residual):
-            times = residual / hypotheses.limits.band[e]
+            times = residual / hypotheses.noise_band.band[e]
             stays = f"{plain(100 * share, 2)} % of the repeatable energy remains"
             grown = share > 1.0 + SEARCH.tolerance
             words = "the repeatable energy is larger than under the baseline" if grown else stays
             out.append((e, f"{words}, {plain(times, 2)} times the band"))
-    return out + remaining_held_out(holdout_data, hypotheses.empty.fit, winner.fit)
+    return out + held_out_above_band(holdout_data, hypotheses.empty.fit, winner.fit)
 
 
-def left_in_training(hypotheses: HypothesisSet, winner: Hypothesis) -> dict[str, float]:
+def training_excess(hypotheses: HypothesisSet, winner: Hypothesis) -> dict[str, float]:
     """Return the energy above noise by equation, without the few instants of cavitating oil."""
     data = hypotheses.train_data
-    return excess_of(data, _liquid(data, winner.fit, winner.fit.residual))
+    return energy_above_noise(data, _zeroed_where_cavitating(data, winner.fit, winner.fit.residual))
 
 
-def remaining_held_out(
+def held_out_above_band(
     holdout_data: RegressionData, before: ExactFit, after: ExactFit
 ) -> list[tuple[str, str]]:
     """Return the equations that keep more than the band in these held-out rows, and how much."""
-    left = _liquid(holdout_data, after, held_left(holdout_data, after))
-    start = excess_of(holdout_data, held_left(holdout_data, before))
-    now = excess_of(holdout_data, left)
+    left = _zeroed_where_cavitating(holdout_data, after, held_out_residual(holdout_data, after))
+    start = energy_above_noise(holdout_data, held_out_residual(holdout_data, before))
+    now = energy_above_noise(holdout_data, left)
     return [
         (e, f"held-out error {r:.2f} times the noise floor")
-        for e, r in _held_ratio(holdout_data, left).items()
+        for e, r in _error_over_floor(holdout_data, left).items()
         if r > TRACE.held_out_band and now[e] > TRACE.held_out_share * start[e]
     ]
 
 
-def _liquid(data: RegressionData, model: ExactFit, residual: Array) -> Array:
+def _zeroed_where_cavitating(data: RegressionData, model: ExactFit, residual: Array) -> Array:
     """Return a residual (M,), zero at the few instants at which the oil cavitates under a model.
 
     A pressure's true gain puts some below zero, where no flow can be compared: these instants count
     neither for nor against a model. Where they are many, they count.
     """
-    outside = np.asarray(~np.any(table(data, model.terms).matrix, axis=1))
+    outside = np.asarray(~np.any(design_matrix(data, model.terms).matrix, axis=1))
     if not outside.any():  # nearly always
         return residual
     rows: dict[str, list[int]] = {}
@@ -202,7 +208,7 @@ def _rms(data: RegressionData, residual: Array, equations: Collection[str]) -> f
     return float(np.sqrt(np.mean(np.concatenate(parts) ** 2))) if parts else float("nan")
 
 
-def _held_ratio(holdout_data: RegressionData, residual: Array) -> dict[str, float]:
+def _error_over_floor(holdout_data: RegressionData, residual: Array) -> dict[str, float]:
     """Return the held-out error of single records over the noise floor, by equation."""
     floor: dict[str, float] = {}
     energy: dict[str, float] = {}
@@ -216,7 +222,7 @@ def _held_ratio(holdout_data: RegressionData, residual: Array) -> dict[str, floa
     return {e: float(np.sqrt(energy[e] / floor[e])) for e in floor}
 
 
-def _noise_like(train_data: RegressionData, residual: Array) -> Array:
+def _noise_samples(train_data: RegressionData, residual: Array) -> Array:
     """Return the repeats' residuals without what repeats: (R, M), scaled to the full noise.
 
     Of a step with one repeat, what the winner leaves (M,).
@@ -232,7 +238,7 @@ def _noise_like(train_data: RegressionData, residual: Array) -> Array:
     return out
 
 
-def _joint(effect: Effect) -> int | None:
+def _joint_index(effect: Effect) -> int | None:
     words = effect.where.split()
     return int(words[1]) - 1 if words[0] == "joint" else None
 
@@ -241,14 +247,16 @@ def _place(effect: Effect) -> str:
     return str(getattr(effect, "place", effect.where))
 
 
-def _changes(winner: Hypothesis, rest: Hypothesis) -> dict[str, float]:
+def _removed_energy(winner: Hypothesis, rest: Hypothesis) -> dict[str, float]:
     """Return the energy that an effect removes in training, by equation where that is visible."""
     change = {e: rest.excess_energy[e] - winner.excess_energy[e] for e in rest.excess_energy}
     most = max(change.values())
-    return {e: v for e, v in change.items() if v > SEARCH.touched * most}
+    return {e: v for e, v in change.items() if v > SEARCH.acting_share * most}
 
 
-def _worse(hypotheses: HypothesisSet, winner: Hypothesis, rest: Hypothesis) -> list[str]:
+def _disturbed_equations(
+    hypotheses: HypothesisSet, winner: Hypothesis, rest: Hypothesis
+) -> list[str]:
     """Return equations that were quieter under the baseline and that this effect disturbs.
 
     What it adds would alone be more than the noise's band.
@@ -257,20 +265,20 @@ def _worse(hypotheses: HypothesisSet, winner: Hypothesis, rest: Hypothesis) -> l
     return [
         e
         for e, now in winner.excess_energy.items()
-        if now > before[e] + hypotheses.limits.band[e]
+        if now > before[e] + hypotheses.noise_band.band[e]
         and now > TRACE.harm_ratio * before[e]
         and now > rest.excess_energy[e]
     ]
 
 
-def _taken(removed: float, worse: Sequence[str]) -> str:
+def _removal_in_words(removed: float, worse: Sequence[str]) -> str:
     text = f"{100 * removed:.0f} % of the energy above noise"
     if not worse:
         return text
     return f"{text}, but the residual of {' '.join(worse)} is larger than under the baseline"
 
 
-def _removed(
+def _removed_share(
     holdout_data: RegressionData, changes: Mapping[str, float], without: Array, after: Array
 ) -> float:
     """Return the share of held-out energy above noise that an effect removes.
@@ -278,7 +286,7 @@ def _removed(
     It is the mean over equations, weighed by what the effect removes there in training (`changes`):
     what a baseline that was badly determined leaves in another equation does not count against it.
     """
-    before, now = excess_of(holdout_data, without), excess_of(holdout_data, after)
+    before, now = energy_above_noise(holdout_data, without), energy_above_noise(holdout_data, after)
     weights = {e: v for e, v in changes.items() if before.get(e, 0.0) > 0.0}
     total = sum(weights.values())
     if total <= 0.0:
@@ -295,7 +303,7 @@ def _rivals(
     used: Used,
     rest: Hypothesis,
     holdout_data: RegressionData,
-    judged: _Near,
+    judged: _TieTest,
 ) -> list[Rival]:
     """Return the sets that have another effect in place of one, those that leave least first.
 
@@ -303,7 +311,9 @@ def _rivals(
     """
     mine, key = used.term, (used.term.name, used.term.where)
     others, train_data = winner.keys - {key}, hypotheses.train_data
-    trained = _Near(train_data, _changes(winner, rest), winner.fit.residual, rest.fit.residual)
+    trained = _TieTest(
+        train_data, _removed_energy(winner, rest), winner.fit.residual, rest.fit.residual
+    )
     out = []
     for hypothesis in hypotheses.fitted.values():
         fresh = [
@@ -317,18 +327,18 @@ def _rivals(
         assert isinstance(mine, Effect)
         if (
             (more > 0 and hypothesis.total > winner.total - SEARCH.number_price * more)
-            or related(mine, other)
-            or hypotheses.physical(hypothesis, formed=others)
-            or _worse(hypotheses, hypothesis, rest)
+            or of_one_law(mine, other)
+            or hypotheses.physical_problem(hypothesis, formed=others)
+            or _disturbed_equations(hypotheses, hypothesis, rest)
         ):
             continue
-        held = held_left(holdout_data, hypothesis.fit)
-        if _refused_already(hypotheses, holdout_data, (mine, other), others, held):
+        held = held_out_residual(holdout_data, hypothesis.fit)
+        if _is_refused_simpler_name(hypotheses, holdout_data, (mine, other), others, held):
             continue
         ratio = judged.ratio(held)
-        tied = judged.near(held, TRACE.tie_ratio) and (
-            trained.near(hypothesis.fit.residual, TRACE.tie_ratio_training)
-            or ratio < TRACE.clear_lead
+        tied = judged.ties(held, TRACE.tie_ratio) and (
+            trained.ties(hypothesis.fit.residual, TRACE.tie_ratio_training)
+            or ratio < TRACE.decisive_ratio
         )
         out.append(
             Rival(
@@ -344,7 +354,7 @@ def _rivals(
     return out[: TRACE.most_rivals]
 
 
-def _refused_already(
+def _is_refused_simpler_name(
     hypotheses: HypothesisSet, holdout_data: RegressionData, pair: tuple[Effect, Effect],
     others: frozenset[Key], held: Array,
 ) -> bool:  # fmt: skip
@@ -353,12 +363,12 @@ def _refused_already(
     for name in set(other.includes) & set(mine.includes) if other.where == mine.where else ():
         simple = hypotheses.fitted.get(others | {(name, other.where)})
         if simple is not None:
-            more = loss(held_left(holdout_data, simple.fit), held)
+            more = loss_in_deviations(held_out_residual(holdout_data, simple.fit), held)
             return more <= TRACE.standard_errors
     return False
 
 
-class _Near:
+class _TieTest:
     """Whether another fit leaves about as little as the best in the equations of an effect.
 
     `left` (M,) is what the best leaves, `without` (M,) what is left without the effect.
@@ -379,7 +389,7 @@ class _Near:
         energy = float(other[self.rows] @ other[self.rows])
         return float(np.sqrt(energy / self.energy)) if self.energy > 0 else float("nan")
 
-    def near(self, other: Array, tie: float) -> bool:
+    def ties(self, other: Array, tie: float) -> bool:
         """Return whether another fit (M,) loses no more than noise, or than `tie` times the rms.
 
         Of an effect that takes less than is left, what it takes is the measure, not the noise.
@@ -387,7 +397,9 @@ class _Near:
         change = other[self.rows] - self.left
         lost = float(change @ (other[self.rows] + self.left))
         share = (tie**2 - 1.0) * min(self.energy, max(self.taken, 0.0))
-        return lost < share or loss(other[self.rows], self.left) <= TRACE.standard_errors
+        return (
+            lost < share or loss_in_deviations(other[self.rows], self.left) <= TRACE.standard_errors
+        )
 
 
 def _parameters(
@@ -407,7 +419,7 @@ def _parameters(
     }
 
 
-def _differences(differing: Sequence[tuple[str, str, float, float]]) -> str:
+def _differences_in_words(differing: Sequence[tuple[str, str, float, float]]) -> str:
     if not differing:
         return "the same in every step, half, direction and speed"
     return "; ".join(
@@ -416,7 +428,7 @@ def _differences(differing: Sequence[tuple[str, str, float, float]]) -> str:
     )
 
 
-def _told_apart(rivals: Sequence[Rival]) -> str:
+def _rivals_in_words(rivals: Sequence[Rival]) -> str:
     if not rivals:
         return "no other set fits nearly as well"
     nearest = rivals[0]

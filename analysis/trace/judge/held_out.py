@@ -20,9 +20,9 @@ from analysis.trace.data.conditioned_record import model_rows, row_residual
 from analysis.trace.data.noise_floor import Group, floors
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.set_aside import judging_rows
-from analysis.trace.data.temperature_nuisance import plausible
+from analysis.trace.data.temperature_nuisance import within_plausible_slope
 from analysis.trace.result import FreeCurves
-from analysis.trace.search.refinement import DesignMatrix, ExactFit, table
+from analysis.trace.search.refinement import DesignMatrix, ExactFit, design_matrix
 from analysis.trace.settings import TRACE
 from rig.model.parse import InputError
 from rig.model.records import Run
@@ -44,25 +44,25 @@ class Errors:
     after: Mapping[str, float]
 
 
-def residual(holdout_data: RegressionData, model: ExactFit) -> Array:
+def held_out_residual(holdout_data: RegressionData, model: ExactFit) -> Array:
     """Return the whitened held-out residual (M,) of a model fitted to other records."""
-    rows = table(holdout_data, model.terms)
-    return rows.residual(_settled(holdout_data.rig, rows, model).beta)
+    rows = design_matrix(holdout_data, model.terms)
+    return rows.residual(_refitted(holdout_data.rig, rows, model).beta)
 
 
-def settled(holdout_data: RegressionData, model: ExactFit) -> ExactFit:
+def refitted_to_held_out(holdout_data: RegressionData, model: ExactFit) -> ExactFit:
     """Return the model with what its own records hardly show as the held-out records have it.
 
     That is the oil's temperature part of 1/b, which is no parameter of the model and no effect
     (records at one temperature say nothing of it, and others then warm up), and every direction of
-    the baseline's coefficients that the held-out rows know `TRACE.better_known` times better: two
+    the baseline's coefficients that the held-out rows know `TRACE.information_ratio` times better: two
     joints that move at once show an inertia that joints locked in turn hide in noise, and its error
     would be taken for one of the model. No coefficient of an effect is fitted anew.
     """
-    return _settled(holdout_data.rig, table(holdout_data, model.terms), model)
+    return _refitted(holdout_data.rig, design_matrix(holdout_data, model.terms), model)
 
 
-def _settled(rig: Rig, rows: DesignMatrix, model: ExactFit) -> ExactFit:
+def _refitted(rig: Rig, rows: DesignMatrix, model: ExactFit) -> ExactFit:
     return _with_better_known(rig, rows, _at_temperature(rows, model))
 
 
@@ -76,9 +76,9 @@ def _with_better_known(rig: Rig, rows: DesignMatrix, model: ExactFit) -> ExactFi
     X, known = rows.matrix[:, at], model.information[np.ix_(at, at)]
     seen = X.T @ X
     scale = np.sqrt(np.maximum(np.diag(seen) + np.diag(known), 1e-300))
-    least = TRACE.dependent_share * np.eye(len(at))
+    least = TRACE.eigenvalue_ratio * np.eye(len(at))
     ratio, directions = eigh(seen / np.outer(scale, scale), known / np.outer(scale, scale) + least)
-    free = directions[:, ratio > TRACE.better_known] / scale[:, None]
+    free = directions[:, ratio > TRACE.information_ratio] / scale[:, None]
     if not free.shape[1]:  # nearly always
         return model
     step = free @ np.linalg.lstsq(X @ free, rows.residual(model.beta), rcond=None)[0]
@@ -86,12 +86,12 @@ def _with_better_known(rig: Rig, rows: DesignMatrix, model: ExactFit) -> ExactFi
     return replace(model, beta={n: v + changed.get(n, 0.0) for n, v in model.beta.items()})
 
 
-def fitted_anew(before: ExactFit, after: ExactFit) -> list[str]:
+def refitted_names(before: ExactFit, after: ExactFit) -> list[str]:
     """Name the coefficients that held-out records have changed visibly (`settled`)."""
     return [
         name
         for name, value in before.beta.items()
-        if name != KAPPA and abs(after.beta[name] - value) > TRACE.visible_shift * abs(value)
+        if name != KAPPA and abs(after.beta[name] - value) > TRACE.noted_shift * abs(value)
     ]
 
 
@@ -101,7 +101,7 @@ def _at_temperature(rows: DesignMatrix, model: ExactFit) -> ExactFit:
     column = rows.matrix[:, rows.names.index(KAPPA)]
     size = float(column @ column)
     step = float(column @ rows.residual(model.beta)) / size if size > 0 else 0.0
-    kappa = plausible(model.beta.get(KAPPA, 0.0) + step, model.beta)
+    kappa = within_plausible_slope(model.beta.get(KAPPA, 0.0) + step, model.beta)
     return replace(model, beta={**model.beta, KAPPA: kappa})
 
 
@@ -163,7 +163,7 @@ def _by_equation(
 
 def rms_of(holdout_data: RegressionData, model: ExactFit) -> dict[str, float]:
     """Return the rms of every equation's held-out residual, SI, repeats averaged."""
-    rest = residual(holdout_data, model)
+    rest = held_out_residual(holdout_data, model)
     collected: dict[str, list[Array]] = {}
     for s in holdout_data.segments:
         collected.setdefault(s.equation, []).append(rest[s.where] * s.noise / np.sqrt(s.repeats))

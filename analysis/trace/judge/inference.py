@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from analysis.effects.base import shape_values
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
-from analysis.trace.judge.scatter import scatter
+from analysis.trace.judge.scatter import parameter_covariance
 from analysis.trace.search.linear_fit import CandidateColumns, orthonormal
 from analysis.trace.search.refinement import ExactFit, jacobian, tangent
 from analysis.trace.settings import SEARCH, TRACE
@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 Key = tuple[str, str]
 
 
-def blocks(train_data: RegressionData) -> NDArray[np.int64]:
+def flip_blocks(train_data: RegressionData) -> NDArray[np.int64]:
     """Return for each row the number of its block within its record (M,).
 
     A block is a period of a record that holds three of them.
@@ -45,11 +45,11 @@ def blocks(train_data: RegressionData) -> NDArray[np.int64]:
     return out
 
 
-def flipped(
+def sign_flipped(
     train_data: RegressionData, count: int, rng: np.random.Generator, residual: Array
 ) -> Array:
     """Return residuals (M, count), averaged after random signs of every repeat's blocks."""
-    numbers = blocks(train_data)
+    numbers = flip_blocks(train_data)
     M = train_data.base.shape[0]
     out = np.zeros((M, count))
     groups = sorted({s.group for s in train_data.segments})
@@ -71,11 +71,11 @@ def null_maximum(
     rng: np.random.Generator,
 ) -> Array:
     """Return the largest gain of any candidate at any shape under each flip (flips,)."""
-    r = flipped(train_data, TRACE.sign_flips, rng, residual)
+    r = sign_flipped(train_data, TRACE.sign_flips, rng, residual)
     r = r - candidates.basis @ (candidates.basis.T @ r)
     c = candidates.columns.T @ r
     diagonal = np.diag(candidates.K)
-    shows = (diagonal > SEARCH.visible**2 * candidates.raw) & (candidates.raw > 0)
+    shows = (diagonal > SEARCH.least_projected_length**2 * candidates.raw) & (candidates.raw > 0)
     best = (
         np.max(c[shows] ** 2 / diagonal[shows, None], axis=0)
         if shows.any()
@@ -104,22 +104,22 @@ class EffectErrors:
     dof: Array
 
 
-def spread(
+def effect_errors(
     train_data: RegressionData, model: ExactFit, used: Used, values: Mapping[str, float]
 ) -> EffectErrors:
     """Return an effect's parameters with errors: scatter between repeats, and lack of fit."""
     names, J = jacobian(train_data, model, used)
-    base = others(train_data, model, names)
+    base = basis_of_others(train_data, model, names)
     J_p = J - base @ (base.T @ J)
     scale = np.linalg.norm(J_p, axis=0)  # units differ by many powers of ten
     scale[scale == 0] = 1.0
-    error = scatter(train_data, J_p / scale, model.residual)
+    error = parameter_covariance(train_data, J_p / scale, model.residual)
     known = {**shape_values(train_data.rig, used), **values}
     value = np.array([known.get(n, np.nan) for n in names])
     return EffectErrors(names, value, np.sqrt(np.diag(error.covariance)) / scale, error.dof)
 
 
-def others(train_data: RegressionData, model: ExactFit, own: Sequence[str]) -> Array:
+def basis_of_others(train_data: RegressionData, model: ExactFit, own: Sequence[str]) -> Array:
     """Return a basis of everything in the model but the named parameters, other shapes included."""
     names, X = tangent(train_data, model)
     return orthonormal(X[:, [k for k, n in enumerate(names) if n not in own]])

@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 from analysis.effects.base import Effect, shapes_of
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
-from analysis.trace.judge.inference import EffectErrors, blocks, others
+from analysis.trace.judge.inference import EffectErrors, basis_of_others, flip_blocks
 from analysis.trace.search.linear_fit import orthonormal
-from analysis.trace.search.refinement import ExactFit, contribution, jacobian, table
+from analysis.trace.search.refinement import ExactFit, contribution, design_matrix, jacobian
 from analysis.trace.settings import SEARCH, TRACE
 
 Array = NDArray[np.float64]
 
 
-def subsets(train_data: RegressionData, joint: int | None) -> dict[str, Array]:
+def row_subsets(train_data: RegressionData, joint: int | None) -> dict[str, Array]:
     """Return masks (M,) of rows: each step, each half of the records, each direction of motion."""
     M = train_data.base.shape[0]
     out: dict[str, Array] = {}
@@ -45,32 +45,34 @@ def subsets(train_data: RegressionData, joint: int | None) -> dict[str, Array]:
     return out
 
 
-def _unmeasured(train_data: RegressionData) -> NDArray[np.int64] | None:
+def _blocks_as_noise(train_data: RegressionData) -> NDArray[np.int64] | None:
     """Return the block of every row (M,), None where all steps have repeats or periods.
 
     Else what is left has to stand for the noise, block by block.
     """
     if all(floor.count > 1 for floor in train_data.floors):
         return None
-    numbers = blocks(train_data)
+    numbers = flip_blocks(train_data)
     for k, s in enumerate(train_data.segments):
         numbers[s.where] += (int(numbers.max()) + 1) * k
     return numbers
 
 
-def _clustered(own: Array, residual: Array, clusters: NDArray[np.int64]) -> float:
+def _blockwise_deviation(own: Array, residual: Array, clusters: NDArray[np.int64]) -> float:
     """Return the root of the sum over blocks of (own . left)^2."""
     _, index = np.unique(clusters, return_inverse=True)
     return float(np.linalg.norm(np.bincount(index, weights=own * residual)))
 
 
-def _larger(model: ExactFit, train_data: RegressionData, used: Used, mask: Array) -> float:
+def _energy_of_larger_effect(
+    model: ExactFit, train_data: RegressionData, used: Used, mask: Array
+) -> float:
     """Return the energy that the largest other effect has on a subset, 0 if none is larger.
 
     What its catalogue form misses of it (`SEARCH.form_share`) spills onto a smaller effect's
     coefficient.
     """
-    rows = table(train_data, model.terms)
+    rows = design_matrix(train_data, model.terms)
     energy = {}
     for u in model.terms:
         if isinstance(u.term, Effect):
@@ -83,7 +85,7 @@ def _larger(model: ExactFit, train_data: RegressionData, used: Used, mask: Array
     return most if most > mine else 0.0
 
 
-def _alone(columns: Array, k: int) -> Array:
+def _column_off_others(columns: Array, k: int) -> Array:
     """Return column k (m,) without what the others say."""
     rest, own = np.delete(columns, k, axis=1), columns[:, k]
     if not rest.shape[1]:
@@ -97,9 +99,9 @@ def invariance(
 ) -> list[tuple[str, str, float, float]]:
     """Return where a parameter disagrees with itself: (subset, parameter, value there, error)."""
     names, J = jacobian(train_data, model, used)
-    base = others(train_data, model, names)
+    base = basis_of_others(train_data, model, names)
     if isinstance(used.term, Effect) and used.term.free:
-        return _of_whole(train_data, model, used, base, joint)
+        return _whole_effect_differences(train_data, model, used, base, joint)
     residual = model.residual
     # A shape such as the presliding distance is the form's, not the effect's size.
     sizes = {c.parameter for c in used.term.coefficients(train_data.rig)}
@@ -109,9 +111,9 @@ def invariance(
     nothing = {s.parameter: s.neutral or 0.0 for s in shapes_of(train_data.rig, used)}
     neutral = np.array([nothing.get(n, 0.0) for n in names])
     out = []
-    clusters = _unmeasured(train_data)
+    clusters = _blocks_as_noise(train_data)
     J_all = J - base @ (base.T @ J)
-    whole = [float(np.sum(_alone(J_all, k) ** 2)) for k in range(len(names))]
+    whole = [float(np.sum(_column_off_others(J_all, k) ** 2)) for k in range(len(names))]
     # What the effect's other numbers can stand for is no size of its own: then the whole is judged.
     ridge = {
         name
@@ -119,9 +121,9 @@ def invariance(
         if name in sizes and whole[k] < TRACE.separable_share * float(J_all[:, k] @ J_all[:, k])
     }
     if ridge:
-        out += _of_whole(train_data, model, used, base, joint)
+        out += _whole_effect_differences(train_data, model, used, base, joint)
         sizes -= ridge
-    for label, mask in subsets(train_data, joint).items():
+    for label, mask in row_subsets(train_data, joint).items():
         if not mask.any():
             continue
         B = orthonormal(base[mask])
@@ -131,7 +133,7 @@ def invariance(
                 continue
             if np.linalg.norm(J_s[:, k]) < 0.1 * np.linalg.norm(J[mask][:, k]):
                 continue
-            own = _alone(J_s, k)
+            own = _column_off_others(J_s, k)
             size = float(own @ own)
             # What hardly acts there shows its form's tail, not its size.
             if (
@@ -144,8 +146,10 @@ def invariance(
             error = 1.0 / np.sqrt(size)
             if clusters is not None:
                 rest_of = residual[mask] - B @ (B.T @ residual[mask]) - own * shift
-                error = max(error, _clustered(own, rest_of, clusters[mask]) / size)
-            spill = np.sqrt(SEARCH.form_share * _larger(model, train_data, used, mask) / size)
+                error = max(error, _blockwise_deviation(own, rest_of, clusters[mask]) / size)
+            spill = np.sqrt(
+                SEARCH.form_share * _energy_of_larger_effect(model, train_data, used, mask) / size
+            )
             # Two levels of one effect are judged by the larger: 2 N beside 100 N is a detail.
             alike = [j for j, n in enumerate(names) if n in sizes and units[n] == units[name]]
             full = float(np.max(np.abs(value.value[alike] - neutral[alike])))
@@ -158,7 +162,7 @@ def invariance(
     return out
 
 
-def _of_whole(
+def _whole_effect_differences(
     train_data: RegressionData, model: ExactFit, used: Used, base: Array,
     joint: int | None,
 ) -> list[tuple[str, str, float, float]]:  # fmt: skip
@@ -169,8 +173,8 @@ def _of_whole(
     """
     whole = contribution(train_data, model, used)
     start = float(np.sum((whole - base @ (base.T @ whole)) ** 2))
-    clusters, out = _unmeasured(train_data), []
-    for label, mask in subsets(train_data, joint).items():
+    clusters, out = _blocks_as_noise(train_data), []
+    for label, mask in row_subsets(train_data, joint).items():
         if not mask.any():
             continue
         B = orthonormal(base[mask])
@@ -184,7 +188,7 @@ def _of_whole(
         error = 1.0 / np.sqrt(size)
         if clusters is not None:
             rest = model.residual[mask] - B @ (B.T @ model.residual[mask]) - own * shift
-            error = max(error, _clustered(own, rest, clusters[mask]) / size)
+            error = max(error, _blockwise_deviation(own, rest, clusters[mask]) / size)
         if error <= TRACE.subset_error and abs(shift) > TRACE.standard_errors * np.hypot(
             error, TRACE.invariance_tolerance / TRACE.standard_errors
         ):

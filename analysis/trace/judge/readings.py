@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from analysis.effects.base import Effect
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
-from analysis.trace.judge.held_out import residual as held_left
+from analysis.trace.judge.held_out import held_out_residual
 from analysis.trace.search.hypothesis import Hypothesis, Key, parameter_values
 from analysis.trace.search.hypothesis_set import HypothesisSet, effect_of
 from analysis.trace.settings import SEARCH, TRACE
@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
 
-def settled(
+def best_readings(
     hypotheses: HypothesisSet, winner: Hypothesis, holdout_data: RegressionData
 ) -> Hypothesis:
     """Return the winner with the simplest reading of every mechanism that loses no more than noise.
@@ -33,17 +33,17 @@ def settled(
     First each effect is tried as one that it includes. A richer reading then takes the place of
     one that it includes, or stands beside it. It must be physical, which asks that its own number
     is more than a form's tolerance. By the restriction training records must lose
-    `TRACE.reading_share` of what it leaves and more than `TRACE.standard_errors` of their noise for
+    `TRACE.richer_name_share` of what it leaves and more than `TRACE.standard_errors` of their noise for
     each number, held-out ones as much of theirs. Where the numbers differ little, the further one
     must take more than the richer form itself leaves; beside a name it must take the share of what
     is left that a further effect must. Of several that leave about as little the one with the
     fewest numbers stays.
     """
-    winner = _restricted(hypotheses, winner, holdout_data)
+    winner = _simplified(hypotheses, winner, holdout_data)
     while winner.effects:
-        held = held_left(holdout_data, winner.fit)
-        richer = [o for o in _richer(hypotheses, winner) if not hypotheses.physical(o)]
-        kept = [o for o in richer if _lost(hypotheses, winner, o, held, holdout_data)]
+        held = held_out_residual(holdout_data, winner.fit)
+        richer = [o for o in _richer_sets(hypotheses, winner) if not hypotheses.physical_problem(o)]
+        kept = [o for o in richer if _needs_richer(hypotheses, winner, o, held, holdout_data)]
         if not kept:
             break
         least = min(o.fit.energy for o in kept)
@@ -54,7 +54,7 @@ def settled(
     return winner
 
 
-def _restricted(
+def _simplified(
     hypotheses: HypothesisSet, winner: Hypothesis, holdout_data: RegressionData
 ) -> Hypothesis:
     """Return the winner with every effect as the one it includes, where nothing is lost by that."""
@@ -69,17 +69,17 @@ def _restricted(
                 simple = effect_of(name, used.term.where)
                 shape = simple.shape_of(hypotheses.train_data.rig, ())
                 effects.append(Used(simple, shape))
-            other = hypotheses.exact(effects)
-            held = held_left(holdout_data, other.fit)
-            if not hypotheses.physical(other) and not _lost(
+            other = hypotheses.refined(effects)
+            held = held_out_residual(holdout_data, other.fit)
+            if not hypotheses.physical_problem(other) and not _needs_richer(
                 hypotheses, other, winner, held, holdout_data
             ):
                 log.info("simpler reading: %s for %s", sorted(other.keys), sorted(winner.keys))
-                return _restricted(hypotheses, other, holdout_data)
+                return _simplified(hypotheses, other, holdout_data)
     return winner
 
 
-def loss(restricted: Array, richer: Array) -> float:
+def loss_in_deviations(restricted: Array, richer: Array) -> float:
     """Return by how many standard deviations of noise residuals (M,) lose by a restriction.
 
     Both are whitened and of records that neither was fitted to. Noise alone gives a normal number;
@@ -90,13 +90,13 @@ def loss(restricted: Array, richer: Array) -> float:
     return float(restricted @ change) / size if size > 0 else 0.0
 
 
-def related(effect: Effect, other: Effect) -> bool:
+def of_one_law(effect: Effect, other: Effect) -> bool:
     """Return whether one of two effects is a reading of the other's law at the same place."""
     near = effect.name in other.includes or other.name in effect.includes
     return near and effect.where == other.where
 
 
-def _lost(
+def _needs_richer(
     hypotheses: HypothesisSet, hypothesis: Hypothesis, other: Hypothesis, held: Array,
     holdout_data: RegressionData,
 ) -> bool:  # fmt: skip
@@ -106,31 +106,35 @@ def _lost(
         least = max(SEARCH.number_price * more, SEARCH.add_share * hypothesis.total)
     else:
         # What a law leaves is no noise alone: a number that takes a little of it bends the form.
-        share = TRACE.reading_share * hypothesis.total
+        share = TRACE.richer_name_share * hypothesis.total
         noise = TRACE.standard_errors**2 * more
-        least = max(noise, share, _form_error(hypotheses, hypothesis, other))
+        least = max(noise, share, _form_error_energy(hypotheses, hypothesis, other))
     if hypothesis.fit.energy - other.fit.energy <= least:
         return False
-    return loss(held, held_left(holdout_data, other.fit)) > TRACE.standard_errors
+    return (
+        loss_in_deviations(held, held_out_residual(holdout_data, other.fit)) > TRACE.standard_errors
+    )
 
 
-def _form_error(hypotheses: HypothesisSet, hypothesis: Hypothesis, other: Hypothesis) -> float:
+def _form_error_energy(
+    hypotheses: HypothesisSet, hypothesis: Hypothesis, other: Hypothesis
+) -> float:
     """Return the energy that the richer of two readings leaves, where it is nearly the simpler one.
 
     Where its numbers differ little, so much may be the form's error and no further number.
     """
     values = parameter_values(hypotheses.train_data.rig, other.fit.terms, dict(other.fit.beta))
     near = any(
-        (u.term.simpler(hypotheses.train_data.rig, values, TRACE.nearly), u.term.where)
+        (u.term.simpler(hypotheses.train_data.rig, values, TRACE.near_tolerance), u.term.where)
         in hypothesis.keys
         for u in other.effects
         if isinstance(u.term, Effect)
     )
-    left = sum(max(0.0, v - hypotheses.limits.band[e]) for e, v in other.excess_energy.items())
+    left = sum(max(0.0, v - hypotheses.noise_band.band[e]) for e, v in other.excess_energy.items())
     return left if near else 0.0
 
 
-def _richer(hypotheses: HypothesisSet, hypothesis: Hypothesis) -> list[Hypothesis]:
+def _richer_sets(hypotheses: HypothesisSet, hypothesis: Hypothesis) -> list[Hypothesis]:
     """Return the sets with a further number of a mechanism's law.
 
     A reading takes the place of one that it includes; another part of the same law stands beside.
@@ -139,7 +143,7 @@ def _richer(hypotheses: HypothesisSet, hypothesis: Hypothesis) -> list[Hypothesi
     for used in hypothesis.effects:
         assert isinstance(used.term, Effect)
         for effect in hypotheses.effects:
-            if not related(effect, used.term) or (effect.name, effect.where) in hypothesis.keys:
+            if not of_one_law(effect, used.term) or (effect.name, effect.where) in hypothesis.keys:
                 continue
             kept = [u for u in hypothesis.effects if u is not used]
             if effect.beside or used.term.beside:
@@ -150,4 +154,4 @@ def _richer(hypotheses: HypothesisSet, hypothesis: Hypothesis) -> list[Hypothesi
                 continue
             effects = (*kept, Used(effect, effect.shape_of(rig, ())))
             sets[frozenset((u.term.name, u.term.where) for u in effects)] = effects
-    return [hypotheses.exact(effects) for effects in sets.values()]
+    return [hypotheses.refined(effects) for effects in sets.values()]

@@ -23,9 +23,9 @@ from analysis.simulation.model import Model
 from analysis.trace.data.regression_data import RegressionData, Segment
 from analysis.trace.search.refinement import (
     ExactFit,
-    alternatives,
     contribution,
-    table,
+    design_matrix,
+    fits_in_other_forms,
     tangent,
 )
 from analysis.trace.settings import SEARCH, TRACE
@@ -36,35 +36,37 @@ Indices = NDArray[np.int64]
 PERIOD, STATE, SPEED = "period", "state", "speed"
 
 
-def scatter(train_data: RegressionData, columns: Array, residual: Array) -> CovarianceParts:
+def parameter_covariance(
+    train_data: RegressionData, columns: Array, residual: Array
+) -> CovarianceParts:
     """Return the covariance of coefficients of `columns` (M, k), all else projected off them.
 
     `residual` (M,) is what the fitted model leaves of the averaged records. Of columns that depend
     on each other what the rows determine counts, and every coefficient has its least dof.
     """
     size, V = np.linalg.eigh(columns.T @ columns)
-    determined = V[:, size > TRACE.dependent_share * max(float(size[-1]), 1e-300)]
+    determined = V[:, size > TRACE.eigenvalue_ratio * max(float(size[-1]), 1e-300)]
     if determined.shape[1] < len(V):
         k = len(V)
         if not determined.shape[1]:
             return CovarianceParts(np.zeros((k, k)), np.ones(k), np.zeros(k))
-        inner = scatter(train_data, columns @ determined, residual)
+        inner = parameter_covariance(train_data, columns @ determined, residual)
         whole = determined @ inner.covariance @ determined.T
         return CovarianceParts(
             whole, np.full(k, inner.dof.min()), np.full(k, inner.systematic.max())
         )
     inverse = np.asarray((V / size) @ V.T, dtype=np.float64)
-    groupings = [_pieces(train_data, columns, residual, by) for by in (PERIOD, STATE, SPEED)]
+    groupings = [_scores(train_data, columns, residual, by) for by in (PERIOD, STATE, SPEED)]
     return spread(groupings, inverse)
 
 
-def _pieces(train_data: RegressionData, columns: Array, residual: Array, by: str) -> Pieces:
+def _scores(train_data: RegressionData, columns: Array, residual: Array, by: str) -> Pieces:
     """Return scores and information of every step, repeat and group of rows."""
     strata = {g: k for k, g in enumerate(sorted({s.group for s in train_data.segments}))}
     pieces: dict[tuple[int, int, int], tuple[Array, Array]] = {}
     for number, s in enumerate(train_data.segments):
         conditioned, rows = train_data.source(s)
-        label = _labels(conditioned, s, rows.time, by)
+        label = _row_groups(conditioned, s, rows.time, by)
         # In period the equations of one instant belong together; a level is an equation's own.
         label = label if by == PERIOD else label + number * IDENTIFY.state_levels
         own = columns[s.where] / np.sqrt(s.repeats)
@@ -85,7 +87,7 @@ def _pieces(train_data: RegressionData, columns: Array, residual: Array, by: str
     )  # fmt: skip
 
 
-def _labels(conditioned: ConditionedRecord, s: Segment, time: Array, by: str) -> Indices:
+def _row_groups(conditioned: ConditionedRecord, s: Segment, time: Array, by: str) -> Indices:
     """Return the group of each row (m,): part of the period, or level of a state."""
     record = conditioned.record
     if by == PERIOD:
@@ -111,8 +113,8 @@ def form_shift(train_data: RegressionData, fit: ExactFit) -> dict[str, float]:
     """
     noise = len(fit.residual)
     own = max(fit.energy - noise, np.sqrt(2.0 * noise))
-    squares = _by_growth(train_data, fit)
-    for other in alternatives(train_data, fit):
+    squares = _growth_shift_squares(train_data, fit)
+    for other in fits_in_other_forms(train_data, fit):
         left = max(other.energy - noise, np.sqrt(2.0 * noise))
         share = min(1.0, own / left)
         for name, value in other.beta.items():
@@ -121,7 +123,7 @@ def form_shift(train_data: RegressionData, fit: ExactFit) -> dict[str, float]:
     return {name: float(np.sqrt(v)) for name, v in squares.items()}
 
 
-def _by_growth(train_data: RegressionData, fit: ExactFit) -> dict[str, float]:
+def _growth_shift_squares(train_data: RegressionData, fit: ExactFit) -> dict[str, float]:
     """Return the squares of what effects that grow otherwise shift, by name."""
     names, X = tangent(train_data, fit)
     scale = np.linalg.norm(X, axis=0)
@@ -136,7 +138,7 @@ def _by_growth(train_data: RegressionData, fit: ExactFit) -> dict[str, float]:
         moved = np.linalg.lstsq(X / scale, column, rcond=1e-6)[0]
         own = column - X @ (moved / scale)
         energy = float(own @ own)
-        if energy <= SEARCH.visible**2 * float(column @ column):
+        if energy <= SEARCH.least_projected_length**2 * float(column @ column):
             continue
         e = float(own @ fit.residual) / energy
         if abs(e) * np.sqrt(energy) > TRACE.standard_errors:
@@ -145,16 +147,18 @@ def _by_growth(train_data: RegressionData, fit: ExactFit) -> dict[str, float]:
     return squares
 
 
-def widened(train_data: RegressionData, fit: ExactFit, model: Model) -> Model:
+def with_form_errors(train_data: RegressionData, fit: ExactFit, model: Model) -> Model:
     """Return the model with what is not known of its effects' shapes and forms in every interval.
 
     A model is identified with its shapes taken for exact. With the covariance S of shapes t, and
     to first order beta(t) = beta - A^-1 X' J_t (t - t0), its variances grow by that of beta(t), and
     by the square of `form_shift`.
     """
-    rows = table(train_data, fit.terms)
+    rows = design_matrix(train_data, fit.terms)
     size = np.linalg.norm(rows.matrix, axis=0)
-    more = _by_shapes(train_data, fit, rows.matrix / np.where(size > 0, size, 1.0), rows.names)
+    more = _variance_from_shapes(
+        train_data, fit, rows.matrix / np.where(size > 0, size, 1.0), rows.names
+    )
     shift = form_shift(train_data, fit)
     parameters, covariance = dict(model.parameters), model.covariance.copy()
     names = list(parameters)
@@ -172,7 +176,9 @@ def widened(train_data: RegressionData, fit: ExactFit, model: Model) -> Model:
     return replace(model, parameters=parameters, covariance=covariance)
 
 
-def _by_shapes(train_data: RegressionData, fit: ExactFit, X: Array, own: Sequence[str]) -> Array:
+def _variance_from_shapes(
+    train_data: RegressionData, fit: ExactFit, X: Array, own: Sequence[str]
+) -> Array:
     """Return what the shapes' covariance adds to the variance of each coefficient of X (M, k)."""
     names, columns = tangent(train_data, fit)
     shapes = columns[:, [k for k, n in enumerate(names) if n not in own]]
@@ -181,6 +187,6 @@ def _by_shapes(train_data: RegressionData, fit: ExactFit, X: Array, own: Sequenc
         return np.zeros(X.shape[1])
     unit = shapes / np.linalg.norm(shapes, axis=0)
     moved = np.linalg.lstsq(X, unit, rcond=1e-6)[0]
-    error = scatter(train_data, unit - X @ moved, fit.residual)
+    error = parameter_covariance(train_data, unit - X @ moved, fit.residual)
     variance = np.einsum("ki,ij,kj->k", moved, error.covariance, moved)
     return np.asarray(np.maximum(variance, 0.0))

@@ -26,8 +26,8 @@ from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.held_out import rms_of
 from analysis.trace.result import JudgedEffect
-from analysis.trace.search import refinement
-from analysis.trace.search.hypothesis import Hypothesis, excess_of
+from analysis.trace.search.refinement import fit_coefficients
+from analysis.trace.search.hypothesis import Hypothesis, energy_above_noise
 from analysis.trace.settings import TRACE
 from rig.model.records import Run
 from rig.model.rig import Rig
@@ -36,37 +36,39 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Reshaped:
+class ShootingResult:
     """The set with the shapes that stay, and every effect's shapes by shooting."""
 
     winner: Hypothesis
     shots: tuple[Shot, ...]
 
 
-def reshaped(
+def shoot_hidden_states(
     runs: Sequence[Run],
     holdout: Sequence[Run],
     after: Model,
     train_data: RegressionData,
     holdout_data: RegressionData,
     winner: Hypothesis,
-) -> Reshaped:
+) -> ShootingResult:
     """Shoot every effect of the winner that has a hidden state; `after` is its model."""
     if after.rig.electric or not hidden_effects(after):
-        return Reshaped(winner, ())
+        return ShootingResult(winner, ())
     ready = completed([*runs, *holdout], after)
     if ready is None:
-        return Reshaped(winner, ())
+        return ShootingResult(winner, ())
     shots, after = [], ready
     for effect in hidden_effects(after):
         shot_effect = shot(runs, after, effect)
         if shot_effect is None:
             continue
-        other = _with(after.rig, after.terms, effect, shot_effect)
+        other = _with_shapes_of(after.rig, after.terms, effect, shot_effect)
         before, now = (
             rest_of(holdout, model, effect) for model in (after, replace(after, terms=other))
         )
-        fitted = refinement.fit(train_data, _with(after.rig, winner.fit.terms, effect, shot_effect))
+        fitted = fit_coefficients(
+            train_data, _with_shapes_of(after.rig, winner.fit.terms, effect, shot_effect)
+        )
         rows, again = (rms_of(holdout_data, fit) for fit in (winner.fit, fitted))
         better = now < TRACE.shooting_ratio * before and all(
             again[e] <= TRACE.shooting_cost * rows[e] for e in rows
@@ -76,14 +78,16 @@ def reshaped(
         )
         if shots[-1].taken:
             winner = replace(
-                winner, effects=_with(after.rig, winner.effects, effect, shot_effect), fit=fitted,
-                excess_energy=excess_of(train_data, fitted.residual),
+                winner, effects=_with_shapes_of(after.rig, winner.effects, effect, shot_effect),
+                fit=fitted, excess_energy=energy_above_noise(train_data, fitted.residual),
             )  # fmt: skip
             after = replace(after, terms=other)
-    return Reshaped(winner, tuple(shots))
+    return ShootingResult(winner, tuple(shots))
 
 
-def _with(rig: Rig, terms: Sequence[Used], effect: Effect, shot: Shot) -> tuple[Used, ...]:
+def _with_shapes_of(
+    rig: Rig, terms: Sequence[Used], effect: Effect, shot: Shot
+) -> tuple[Used, ...]:
     """Return the terms with the shapes of a shot; shapes that it did not search stay."""
     found = {name: estimate.value for name, estimate in shot.shapes.items()}
     return tuple(
@@ -98,14 +102,14 @@ def with_shots(judged: JudgedEffect, shots: Sequence[Shot]) -> JudgedEffect:
         if (result.name, result.where) == (judged.name, judged.where):
             shapes = {
                 name: new if result.taken
-                else _wide(judged.parameters[name], new)
+                else _interval_including(judged.parameters[name], new)
                 for name, new in result.shapes.items()
             }  # fmt: skip
             return replace(judged, parameters={**judged.parameters, **shapes}, shot=result)
     return judged
 
 
-def _wide(rows: Estimate, new: Estimate) -> Estimate:
+def _interval_including(rows: Estimate, new: Estimate) -> Estimate:
     """Return the rows' estimate with an interval that holds the other's value too."""
     low, high = rows.ci95
     return replace(rows, ci95=(min(low, new.value), max(high, new.value)))

@@ -22,7 +22,11 @@ from analysis.effects.base import Effect, shape_values, shapes_of
 from analysis.regression.least_squares import shortest
 from analysis.simulation.model import Model
 from analysis.trace.data.regression_data import RegressionData
-from analysis.trace.next_experiment.discrimination import ComparisonRows, Explanation, smallest
+from analysis.trace.next_experiment.discrimination import (
+    ComparisonRows,
+    Explanation,
+    smallest_effect,
+)
 from analysis.trace.result import DetectionLimit
 from analysis.trace.search.hypothesis import Hypothesis, parameter_values
 from analysis.trace.search.refinement import rebased, tangent
@@ -46,22 +50,24 @@ def detection_limits(
         return []
     rows = ComparisonRows(rebased(train_data, winner.fit) if winner.effects else train_data)
     asked = [effect for effect in effects if (effect.name, effect.where) not in winner.keys]
-    small = [what for effect in asked if (what := smallest(effect, train_data.rig)) is not None]
+    small = [
+        what for effect in asked if (what := smallest_effect(effect, train_data.rig)) is not None
+    ]
     if not small:
         return []
     names, X = tangent(train_data, winner.fit)
-    added = np.column_stack([rows.adds(what) for what in small])
+    added = np.column_stack([rows.prediction(what) for what in small])
     taken = shortest(X, added, TRACE.rank_limit)
     shown = added - X @ taken
     known = {n: p.half for n, p in model.parameters.items() if abs(p.value) > 2.0 * p.half}
     found = []
     for k, what in enumerate(small):
-        times = _times(shown[:, k], winner.fit.residual)
+        times = _largest_multiple(shown[:, k], winner.fit.residual)
         moved = dict(zip(names, times * taken[:, k], strict=True))
-        shifts = _shifts(rows.train_data, moved, known)
+        shifts = _parameter_shifts(rows.train_data, moved, known)
         most = max(shifts, key=lambda name: shifts[name], default="")
-        if most and shifts[most] >= TRACE.visible_shift:
-            key, size = what.keys[0], _size(rows.train_data, what, times)
+        if most and shifts[most] >= TRACE.noted_shift:
+            key, size = what.keys[0], _effect_size(rows.train_data, what, times)
             found.append(
                 DetectionLimit(key["name"], key["where"], key["at"], *size, most, shifts[most])
             )
@@ -71,7 +77,7 @@ def detection_limits(
     return list(once.values())
 
 
-def _times(shown: Array, residual: Array) -> float:
+def _largest_multiple(shown: Array, residual: Array) -> float:
     """Return how many times its smallest size an effect may have that shows `shown` (M,) of it.
 
     Zero where it shows nothing at all: then no size can be stated.
@@ -82,7 +88,7 @@ def _times(shown: Array, residual: Array) -> float:
     return float((abs(shown @ residual) + TRACE.normal_quantile * energy**0.5) / energy)
 
 
-def _shifts(
+def _parameter_shifts(
     data: RegressionData, moved: Mapping[str, float], known: Mapping[str, float]
 ) -> dict[str, float]:
     """Return how much of themselves parameters change that are moved beyond their interval.
@@ -103,7 +109,7 @@ def _shifts(
     }
 
 
-def _size(data: RegressionData, what: Explanation, times: float) -> tuple[str, float, str]:
+def _effect_size(data: RegressionData, what: Explanation, times: float) -> tuple[str, float, str]:
     """Return name, value and unit of the number that says how large an effect is."""
     (used,) = what.effects
     for c in used.term.coefficients(data.rig):
@@ -115,11 +121,11 @@ def _size(data: RegressionData, what: Explanation, times: float) -> tuple[str, f
     return shapes[k].parameter, abs(used.shape[k] - neutral) * times, shapes[k].unit
 
 
-def in_words(limits: Sequence[DetectionLimit]) -> list[str]:
+def detection_limit_notes(limits: Sequence[DetectionLimit]) -> list[str]:
     """Return a sentence for each of the largest limits."""
     return [
         f"not excluded by these records: {d.name} at {place_in_words(d.at)} up to {d.quantity} = "
         f"{f'{plain(d.size, 2)} {typeset(d.unit)}'.strip()}, which would change {d.parameter} by "
         f"{plain(100 * d.shift, 2)} % without a residual above the noise"
-        for d in limits[: TRACE.most_limits]
+        for d in limits[: TRACE.most_detection_limits]
     ]

@@ -29,15 +29,15 @@ from analysis.regression.least_squares import shortest
 from analysis.regression.rows import Rows
 from analysis.signals.conditioning import Signals, condition
 from analysis.terms.base import Used
+from analysis.trace.data.cache import RowCache
 from analysis.trace.data.candidates import Variant
 from analysis.trace.data.conditioned_record import (
     candidate_columns,
-    held,
+    is_hidden_by_lock,
     model_rows,
-    prepared,
+    prepared_signals,
     trace_filtering,
 )
-from analysis.trace.data.memory import RowMemory
 from analysis.trace.data.noise_floor import stated_noise
 from analysis.trace.data.regression_data import RegressionData, variant_columns
 from analysis.trace.next_experiment.excitations import CandidateExcitation
@@ -68,7 +68,7 @@ class Explanation:
         )
 
 
-def smallest(effect: Effect, rig: Rig) -> Explanation | None:
+def smallest_effect(effect: Effect, rig: Rig) -> Explanation | None:
     """Return an effect at its smallest size of interest, None where it has none or cannot show.
 
     On poor excitation an effect of this size may leave nothing in the residual; then `clean` says
@@ -105,15 +105,15 @@ class MeasurementView:
     seen: Signals
     rows: Mapping[str, Rows]
     noise: Mapping[str, float]
-    memory: RowMemory = field(default_factory=RowMemory, repr=False, compare=False)
+    cache: RowCache = field(default_factory=RowCache, repr=False, compare=False)
 
     def columns(self, used: Used) -> Mapping[str, Mapping[str, Array]]:
         """Return what an effect would add in SI: equation -> name -> column."""
-        if held(used.term, self.conditioned):
+        if is_hidden_by_lock(used.term, self.conditioned):
             return {}
         return candidate_columns(
             self.rig, self.terms, self.conditioned, self.seen, self.rows, self.beta, used,
-            self.memory,
+            self.cache,
         )  # fmt: skip
 
     def weight(self, equation: str) -> float:
@@ -121,7 +121,7 @@ class MeasurementView:
         return float(np.sqrt(EXPERIMENT.repeats) / max(self.noise[equation], 1e-30))
 
 
-def calibration(train_data: RegressionData) -> dict[str, float]:
+def noise_ratios(train_data: RegressionData) -> dict[str, float]:
     """Return, by equation, the measured noise over what the rig's stated sensor noise would make.
 
     A faster excitation is filtered wider and so is noisier: the stated noise gives by how much.
@@ -137,7 +137,7 @@ def calibration(train_data: RegressionData) -> dict[str, float]:
     return {e: float(np.sqrt(np.mean(np.square(v)))) for e, v in by_family.items()}
 
 
-def view(
+def measurement_view(
     train_data: RegressionData, excitation: CandidateExcitation, measured: Mapping[str, float]
 ) -> MeasurementView:
     """Build the rows of an excitation as the trace would of its record.
@@ -153,7 +153,7 @@ def view(
     rows = {e: r for e, r in every.items() if e in measured and len(r.rhs)}
     stated = stated_noise(rig, train_data.terms, conditioned, rows, train_data.beta)
     noise = {e: measured[e] * stated[e] for e in rows}
-    seen = prepared(rig, train_data.terms, conditioned)
+    seen = prepared_signals(rig, train_data.terms, conditioned)
     return MeasurementView(
         rig, tuple(train_data.terms), train_data.beta, conditioned, seen, rows, noise
     )
@@ -188,16 +188,20 @@ class ComparisonRows:
     def columns(self, used: Used) -> dict[str, Array]:
         """Return an effect's columns (m,) by name; '' is the change of the signals it makes."""
         if used not in self._known:
-            before = self._old.columns(used) if self._old is not None else self._on_board(used)
-            self._known[used] = before if self.seen is None else self._extended(used, before)
+            before = (
+                self._old.columns(used) if self._old is not None else self._training_columns(used)
+            )
+            self._known[used] = (
+                before if self.seen is None else self._with_view_columns(used, before)
+            )
         return self._known[used]
 
-    def _on_board(self, used: Used) -> dict[str, Array]:
+    def _training_columns(self, used: Used) -> dict[str, Array]:
         assert isinstance(used.term, Effect)
         columns = variant_columns(self.train_data, [Variant(used.term, used.shape)])
         return dict(zip(columns[0].names, columns[0].columns.T, strict=True)) if columns else {}
 
-    def _extended(self, used: Used, before: Mapping[str, Array]) -> dict[str, Array]:
+    def _with_view_columns(self, used: Used, before: Mapping[str, Array]) -> dict[str, Array]:
         assert self.seen is not None
         new = self.seen.columns(used)
         out = {}
@@ -209,7 +213,7 @@ class ComparisonRows:
             out[name] = np.concatenate(parts)
         return out
 
-    def adds(self, what: Explanation) -> Array:
+    def prediction(self, what: Explanation) -> Array:
         """Return what a hypothesis adds to the rows (m,) at its sizes."""
         total = np.zeros(len(self.equation))
         for used in what.effects:
@@ -219,7 +223,7 @@ class ComparisonRows:
                     total += column * (what.beta.get(name, 0.0) if name else 1.0)
         return total
 
-    def spans(self, what: Explanation) -> Array:
+    def imitation_columns(self, what: Explanation) -> Array:
         """Return what a hypothesis can imitate with: its columns and its shapes' derivatives."""
         blocks = [self.base]
         for used in what.effects:
@@ -231,13 +235,13 @@ class ComparisonRows:
                 step = EXPERIMENT.shape_step * (abs(value) or shape.high - shape.low)
                 near = value + step if value + step <= shape.high else value - step
                 moved = Used(used.term, (*used.shape[:j], near, *used.shape[j + 1 :]))
-                ends = [self.adds(Explanation((u,), what.beta)) for u in (moved, used)]
+                ends = [self.prediction(Explanation((u,), what.beta)) for u in (moved, used)]
                 blocks.append((ends[0] - ends[1])[:, None])
         return np.column_stack(blocks)
 
     def residual(self, true: Explanation, wrong: Explanation) -> Array:
         """Return the residual (m,) that `wrong` leaves where `true` is there, without noise."""
-        X, y = self.spans(wrong), self.adds(true)
+        X, y = self.imitation_columns(wrong), self.prediction(true)
         return np.asarray(y - X @ shortest(X, y, 1e-6))
 
     def energy(self, residual: Array) -> dict[str, float]:
@@ -254,7 +258,7 @@ def separation(
     """Return what an experiment separates [noise], and in which equation (see the module)."""
     assert new.seen is not None
     distances = []
-    for true, wrong in _ways(question):
+    for true, wrong in _directions(question):
         before = old.energy(old.residual(true, wrong))
         after = new.energy(new.residual(true, wrong))
         by_equation = {
@@ -268,20 +272,21 @@ def separation(
     return min(distances)
 
 
-def present(question: OpenQuestion, old: ComparisonRows) -> float:
+def present_separation(question: OpenQuestion, old: ComparisonRows) -> float:
     """Return the same figure [noise] of the records already taken: their loudest segment's."""
     return min(
-        loudest(old.train_data, old.residual(true, wrong)) for true, wrong in _ways(question)
+        largest_rms(old.train_data, old.residual(true, wrong))
+        for true, wrong in _directions(question)
     )
 
 
-def loudest(train_data: RegressionData, residual: Array) -> float:
+def largest_rms(train_data: RegressionData, residual: Array) -> float:
     """Return the largest rms of a residual (M,) in one step and equation [noise of a record]."""
     return max(
         float(np.sqrt(np.mean(residual[s.where] ** 2) / s.repeats)) for s in train_data.segments
     )
 
 
-def _ways(question: OpenQuestion) -> Sequence[tuple[Explanation, Explanation]]:
+def _directions(question: OpenQuestion) -> Sequence[tuple[Explanation, Explanation]]:
     there = (question.one, question.other)
     return (there, there[::-1]) if question.both_ways else (there,)

@@ -69,7 +69,7 @@ FAMILIES: Final = (
 
 
 @dataclass(frozen=True)
-class Setting:
+class JointSetting:
     """Which joints (0-based) stand where [m], behind a closed valve or at an end; others move."""
 
     closed: Mapping[int, float]
@@ -87,7 +87,7 @@ class CandidateExcitation:
     """One candidate as played on the twin, with what makes a protocol of it."""
 
     family: Family
-    setting: Setting
+    setting: JointSetting
     tones: Mapping[int, Tone]
     played: Played
 
@@ -111,20 +111,20 @@ class CandidateExcitation:
         return ", ".join([f"{which} {self.family.words}", *stand])
 
 
-def settings(rig: Rig, records: Sequence[ConditionedRecord]) -> list[Setting]:
+def joint_settings(rig: Rig, records: Sequence[ConditionedRecord]) -> list[JointSetting]:
     """Return how the joints stood in each step of the records, and all of them free."""
-    out: list[Setting] = []
+    out: list[JointSetting] = []
     for conditioned in records:
         closed, held = {}, {}
         for joint in conditioned.record.locked:
             piston = float(np.nanmean(conditioned.record.channels[ch.channel(ch.PISTON, joint)]))
             half = 0.5 * rig.joints[joint - 1].cylinder.stroke
-            if half - abs(piston) < EXPERIMENT.at_end:
+            if half - abs(piston) < EXPERIMENT.end_distance:
                 held[joint - 1] = float(np.copysign(half, piston))
             else:
                 closed[joint - 1] = round(piston, 3) + 0.0  # no -0
-        out.append(Setting(closed, held))
-    out.append(Setting({}, {}))
+        out.append(JointSetting(closed, held))
+    out.append(JointSetting({}, {}))
     return [s for k, s in enumerate(out) if s.moving(rig) and s not in out[:k]]
 
 
@@ -138,7 +138,7 @@ def excitations(
     """
     if rig.electric:
         return
-    for setting in settings(rig, records):
+    for setting in joint_settings(rig, records):
         for family in families:
             candidate = excitation(rig, setting, family, rng)
             if candidate is not None:
@@ -146,7 +146,7 @@ def excitations(
 
 
 def excitation(
-    rig: Rig, setting: Setting, family: Family, rng: np.random.Generator
+    rig: Rig, setting: JointSetting, family: Family, rng: np.random.Generator
 ) -> CandidateExcitation | None:
     """Return a family in a setting, scaled to its share of the limits; None where impossible."""
     tones = {j: _tone(j, family, k, rng) for k, j in enumerate(setting.moving(rig))}
@@ -185,7 +185,7 @@ def _tone(joint: int, family: Family, turn: int, rng: np.random.Generator) -> To
 
 
 def _step(
-    rig: Rig, setting: Setting, family: Family, tones: Mapping[int, Tone]
+    rig: Rig, setting: JointSetting, family: Family, tones: Mapping[int, Tone]
 ) -> TwinStep:  # fmt: skip
     period = round(rig.sample_rate / family.base)
     places = {j: family.centre * 0.5 * rig.joints[j].cylinder.stroke for j in tones}

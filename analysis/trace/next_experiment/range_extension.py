@@ -20,7 +20,7 @@ TIME: Final = "time"  # goes on by itself
 
 
 @dataclass(frozen=True)
-class Beyond:
+class RangeExtension:
     """An excitation (its index) that carries a variable so many `times` as far as the records."""
 
     index: int
@@ -30,12 +30,12 @@ class Beyond:
     words: str
 
 
-def farther(
+def wider_range(
     train_data: RegressionData,
     moves: Sequence[Dependence],
     views: Sequence[MeasurementView],
     least: float,
-) -> Beyond | None:
+) -> RangeExtension | None:
     """Return what carries a clue's variable farthest, for the first clue that can be carried so.
 
     `least` times as far as the records, at least.
@@ -50,7 +50,8 @@ def farther(
                 continue
             low, high = np.percentile(np.concatenate(values), [1, 99])
             reach = [
-                _reach(train_data, view, joint, name, float(low), float(high)) for view in views
+                _range_ratio(train_data, view, joint, name, float(low), float(high))
+                for view in views
             ]
             k = int(np.argmax(reach))
             if reach[k] >= least:
@@ -58,11 +59,11 @@ def farther(
                     f"covers {reach[k]:.1f} times the range of {name}, on which the remaining "
                     "residual depends"
                 )
-                return Beyond(k, name, reach[k], clue.equation, words)
+                return RangeExtension(k, name, reach[k], clue.equation, words)
     return None
 
 
-def _reach(
+def _range_ratio(
     train_data: RegressionData,
     view: MeasurementView,
     joint: int,
@@ -77,9 +78,9 @@ def _reach(
     return float((max(most, high) - min(least, low)) / max(high - low, 1e-30))
 
 
-def richer(
+def more_lines(
     train_data: RegressionData, moves: Sequence[Dependence], tried: Sequence[CandidateExcitation]
-) -> Beyond | None:
+) -> RangeExtension | None:
     """Return the excitation of most lines where the records of the clue's joint hold few.
 
     One sine shows one path through every nonlinearity: many forms pass through it alike.
@@ -97,4 +98,4 @@ def richer(
     if times < EXPERIMENT.line_ratio:
         return None
     words = f"excites joint {joint + 1} at {counts[k]} frequencies instead of {max(held)}"
-    return Beyond(k, LINES, times, equation, words)
+    return RangeExtension(k, LINES, times, equation, words)

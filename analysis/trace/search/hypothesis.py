@@ -60,7 +60,9 @@ def parameter_values(rig: Rig, terms: Sequence[Used], beta: dict[str, float]) ->
     return out
 
 
-def excess_of(data: RegressionData, residual: Array, noise: float = 1.0) -> dict[str, float]:
+def energy_above_noise(
+    data: RegressionData, residual: Array, noise: float = 1.0
+) -> dict[str, float]:
     """Return the energy above noise that a residual (M,) has in each equation."""
     out: dict[str, float] = {}
     for segment in data.segments:
@@ -70,16 +72,16 @@ def excess_of(data: RegressionData, residual: Array, noise: float = 1.0) -> dict
     return out
 
 
-def limits(data: RegressionData) -> NoiseBand:
+def noise_band(data: RegressionData) -> NoiseBand:
     """Return the band of every equation (`SEARCH.band` times the noise, and chance)."""
     band: dict[str, float] = {}
-    rows = data.counts
+    rows = data.row_counts
     for s in data.segments:
         count = s.where.stop - s.where.start
         band[s.equation] = band.get(s.equation, 0.0) + SEARCH.band**2 * s.repeats * count
     return NoiseBand({e: max(v, 4 * np.sqrt(2 * rows[e])) for e, v in band.items()})
 
 
-def within(excess_energy: dict[str, float], limit: NoiseBand) -> bool:
+def within_band(excess_energy: dict[str, float], limit: NoiseBand) -> bool:
     """Return whether nothing is left above the band in any equation."""
     return all(value <= limit.band[e] for e, value in excess_energy.items())

@@ -29,12 +29,12 @@ from analysis.trace.search import linear_fit
 from analysis.trace.search.hypothesis import (
     Hypothesis,
     Key,
-    excess_of,
-    limits,
+    energy_above_noise,
+    noise_band,
     parameter_values,
-    within,
+    within_band,
 )
-from analysis.trace.search.refinement import ExactFit, fit, jacobian, rebased, refine
+from analysis.trace.search.refinement import ExactFit, fit_coefficients, jacobian, rebased, refine
 from analysis.trace.settings import SEARCH
 from rig.model.channels import place_in_words
 
@@ -49,22 +49,25 @@ class HypothesisSet:
         self.train_data = train_data
         self.base = tuple(train_data.terms)
         self.effects = tuple(effects)
-        self.limits = limits(train_data)
+        self.noise_band = noise_band(train_data)
         self.fitted: dict[frozenset[Key], Hypothesis] = {}
-        self.empty = self._hypothesis((), fit(train_data, self.base))
+        self.empty = self._hypothesis((), fit_coefficients(train_data, self.base))
 
     def _hypothesis(self, effects: tuple[Used, ...], fit: ExactFit) -> Hypothesis:
         rig = self.train_data.rig
         return Hypothesis(
-            effects, fit, excess_of(self.train_data, fit.residual), complexity(rig, effects)
+            effects,
+            fit,
+            energy_above_noise(self.train_data, fit.residual),
+            complexity(rig, effects),
         )
 
-    def widened(self, effects: Sequence[Effect]) -> HypothesisSet:
+    def with_candidates(self, effects: Sequence[Effect]) -> HypothesisSet:
         """Return the sets with more candidates beside those that were searched already."""
         wide = copy.copy(self)
         wide.effects = tuple(effects)
         more = variant_columns(
-            self.train_data, wide._variants(self.train_data, self.train_data.mean)
+            self.train_data, wide._variants(self.train_data, self.train_data.mean_residual)
         )
         wide.columns = [*self.columns, *more]
         wide.candidates = self._candidate_columns(self.train_data, wide.columns)
@@ -76,7 +79,7 @@ class HypothesisSet:
         seen = evidence(data, residual) if any(e.by_data for e in self.effects) else None
         return variants(data.rig, self.effects, seen)
 
-    def physical(
+    def physical_problem(
         self, hypothesis: Hypothesis, of: Used | None = None, formed: Collection[Key] = ()
     ) -> str:
         """Say whose number makes a set unphysical, and why ('' if none does).
@@ -96,7 +99,7 @@ class HypothesisSet:
                 return problem if used is of else whose + problem
         return ""
 
-    def exact(self, effects: Sequence[Used]) -> Hypothesis:
+    def refined(self, effects: Sequence[Used]) -> Hypothesis:
         """Return the set refined exactly (once per set of names and places)."""
         key = frozenset((u.term.name, u.term.where) for u in effects)
         if key not in self.fitted:
@@ -106,9 +109,9 @@ class HypothesisSet:
 
     def tried(self, sets: Sequence[tuple[Used, ...]]) -> list[Hypothesis]:
         """Return the sets refined exactly."""
-        return [self.exact(effects) for effects in sets]
+        return [self.refined(effects) for effects in sets]
 
-    def excess(self, hypothesis: Hypothesis, other: Hypothesis) -> float:
+    def log_energy_ratio(self, hypothesis: Hypothesis, other: Hypothesis) -> float:
         """Return how much more one set leaves than another: the sum of log ratios over equations.
 
         What the form of a loud effect leaves in its own equations must not hide a quiet one in
@@ -117,13 +120,13 @@ class HypothesisSet:
         return sum(
             float(np.log((max(0.0, v) + band) / (max(0.0, other.excess_energy[e]) + band)))
             for e, v in hypothesis.excess_energy.items()
-            for band in (self.limits.band[e],)
+            for band in (self.noise_band.band[e],)
         )
 
-    def better(self, hypothesis: Hypothesis, other: Hypothesis) -> bool:
+    def is_preferred(self, hypothesis: Hypothesis, other: Hypothesis) -> bool:
         """Return whether `one` is to be preferred: much less left, or as little and simpler."""
         slack = SEARCH.number_price * max(1, abs(hypothesis.size[1] - other.size[1]))
-        more, near = self.excess(hypothesis, other), float(np.log(SEARCH.simpler_ratio))
+        more, near = self.log_energy_ratio(hypothesis, other), float(np.log(SEARCH.simpler_ratio))
         if hypothesis.size < other.size:
             return more <= near or hypothesis.total <= other.total + slack
         if hypothesis.size > other.size:
@@ -132,11 +135,11 @@ class HypothesisSet:
 
     def best(self, among: Sequence[Hypothesis]) -> Hypothesis:
         """Return the preferred of several physical sets."""
-        allowed = [o for o in among if not self.physical(o)]
+        allowed = [o for o in among if not self.physical_problem(o)]
         if not allowed:
             return self.empty
         least = min(allowed, key=lambda o: o.total)
-        near = [o for o in allowed if o is least or self.better(o, least)]
+        near = [o for o in allowed if o is least or self.is_preferred(o, least)]
         return min(near, key=lambda o: (sum(o.size), o.size[0], o.total))
 
     def run(self, progress: Callable[[float], None] | None = None) -> Hypothesis:
@@ -145,48 +148,56 @@ class HypothesisSet:
         `progress` receives which share of the first columns is there.
         """
         self.columns = variant_columns(
-            self.train_data, self._variants(self.train_data, self.train_data.mean), progress
+            self.train_data,
+            self._variants(self.train_data, self.train_data.mean_residual),
+            progress,
         )
         candidates = self.candidates = self._candidate_columns(self.train_data, self.columns)
-        r = self.train_data.mean
+        r = self.train_data.mean_residual
         r = r - candidates.basis @ (candidates.basis.T @ r)
-        return self.exchanged(self._found(candidates, r))
+        return self.exchanged(self._searched(candidates, r))
 
-    def _found(self, candidates: linear_fit.CandidateColumns, r: Array) -> Hypothesis:
+    def _searched(self, candidates: linear_fit.CandidateColumns, r: Array) -> Hypothesis:
         """Return the set found on the candidates for what the baseline leaves (M,)."""
         singles = self.tried(self._singles(candidates, r))
         now = self.prune(self.best([self.empty, *singles]))
-        if within(now.excess_energy, self.limits):
+        if within_band(now.excess_energy, self.noise_band):
             return now
         pairs = self.tried(self._pairs(candidates, r, singles))
-        if self.formed(now):
+        if self.within_form_tolerance(now):
             others = [o for o in pairs if not now.keys & o.keys]
-            far = [o for o in others if self.excess(o, now) < -SEARCH.far_less]
-            return self.completed(self.prune(self.best([now, *far])))
+            far = [o for o in others if self.log_energy_ratio(o, now) < -SEARCH.far_log_gain]
+            return self.completed_to_noise(self.prune(self.best([now, *far])))
         now = self.prune(self.best([self.empty, *singles, *pairs]))
-        while not within(now.excess_energy, self.limits) and len(now.effects) < SEARCH.largest_set:
+        while (
+            not within_band(now.excess_energy, self.noise_band)
+            and len(now.effects) < SEARCH.largest_set
+        ):
             grown = self.prune(self.best([now, *self.extensions(now)]))
-            if grown.keys == now.keys or self.excess(now, grown) < SEARCH.least_growth:
+            if grown.keys == now.keys or self.log_energy_ratio(now, grown) < SEARCH.least_log_gain:
                 break
             now = grown
-            if self.formed(now):
-                return self.completed(now)
+            if self.within_form_tolerance(now):
+                return self.completed_to_noise(now)
         return now
 
-    def formed(self, hypothesis: Hypothesis) -> bool:
+    def within_form_tolerance(self, hypothesis: Hypothesis) -> bool:
         """Return whether the rest may be the difference of form between effect and catalogue."""
         return all(self.negligible(e, residual) for e, residual in hypothesis.excess_energy.items())
 
     def negligible(self, equation: str, residual: float) -> bool:
         """Return whether so much energy above noise may be left in an equation."""
-        allowed = (SEARCH.residual_limit / SEARCH.band) ** 2 * self.limits.band[equation]
+        allowed = (SEARCH.residual_limit / SEARCH.band) ** 2 * self.noise_band.band[equation]
         return residual <= max(allowed, SEARCH.form_share * self.empty.excess_energy[equation])
 
-    def completed(self, now: Hypothesis) -> Hypothesis:
+    def completed_to_noise(self, now: Hypothesis) -> Hypothesis:
         """Add one more effect only if that leaves nothing but noise: else it fits a form."""
-        if within(now.excess_energy, self.limits) or len(now.effects) >= SEARCH.largest_set:
+        if (
+            within_band(now.excess_energy, self.noise_band)
+            or len(now.effects) >= SEARCH.largest_set
+        ):
             return now
-        more = [o for o in self.extensions(now) if within(o.excess_energy, self.limits)]
+        more = [o for o in self.extensions(now) if within_band(o.excess_energy, self.noise_band)]
         best = self.best(more) if more else now
         return best if best.effects and self.prune(best).keys == best.keys else now
 
@@ -262,7 +273,7 @@ class HypothesisSet:
         r = now.fit.residual * mask
         r = r - candidates.basis @ (candidates.basis.T @ r)
         out: dict[Key, tuple[Used, ...]] = {}
-        for trial in linear_fit.options(candidates, (), r, 1.0):
+        for trial in linear_fit.sets_with_one_more(candidates, (), r, 1.0):
             variant = candidates.entries[trial.members[0]].variant
             if len(out) < SEARCH.refined_extensions:
                 out.setdefault(variant.key, (*now.effects, variant.used))
@@ -277,7 +288,7 @@ class HypothesisSet:
         for used in now.effects if len(now.effects) > 1 else ():
             others = tuple(u for u in now.effects if u is not used)
             for effect in self.effects:
-                if (effect.name, effect.where) in now.keys or not _alike(effect, used):
+                if (effect.name, effect.where) in now.keys or not _is_confusable(effect, used):
                     continue
                 fresh = Used(effect, effect.shape_of(self.train_data.rig, ()))
                 sets.append((*others, fresh))
@@ -289,7 +300,7 @@ class HypothesisSet:
         other = self.prune(self.best([now, *self.tried(sets)]))
         return now if other.keys == now.keys else self.exchanged(other)
 
-    def closer(self, now: Hypothesis, equations: Collection[str]) -> Hypothesis | None:
+    def extended_in(self, now: Hypothesis, equations: Collection[str]) -> Hypothesis | None:
         """Return the set with the effect added that some equations ask for, None where none is.
 
         What is left of a loud equation, the form of its effect, hides what a quiet one lacks as
@@ -303,12 +314,14 @@ class HypothesisSet:
 
         def earned(hypothesis: Hypothesis) -> bool:
             drop = {e: now.excess_energy[e] - hypothesis.excess_energy[e] for e in equations}
-            here = [e for e, v in drop.items() if v >= SEARCH.touched * max(drop.values())]
+            here = [e for e, v in drop.items() if v >= SEARCH.acting_share * max(drop.values())]
             start = sum(max(0.0, now.excess_energy[e]) for e in here)
             least = SEARCH.number_price * (hypothesis.size[1] - now.size[1])
             return sum(drop[e] for e in here) > max(least, SEARCH.add_share * start)
 
-        more = [o for o in self.extensions(now, equations) if earned(o) and not self.physical(o)]
+        more = [
+            o for o in self.extensions(now, equations) if earned(o) and not self.physical_problem(o)
+        ]
         if not more:
             return None
         best = min(map(residual, more))
@@ -320,22 +333,26 @@ class HypothesisSet:
         """Drop effects without which about as little is left."""
         while len(hypothesis.effects) > 1:
             rest = [
-                self.exact(tuple(u for u in hypothesis.effects if u is not used))
+                self.refined(tuple(u for u in hypothesis.effects if u is not used))
                 for used in hypothesis.effects
             ]
-            rest = [o for o in rest if not self.physical(o)]
-            simpler = [o for o in rest if self.better(o, hypothesis) or self.idle(o, hypothesis)]
+            rest = [o for o in rest if not self.physical_problem(o)]
+            simpler = [
+                o
+                for o in rest
+                if self.is_preferred(o, hypothesis) or self.removes_too_little(o, hypothesis)
+            ]
             if not simpler:
                 break
             hypothesis = min(simpler, key=lambda o: o.total)
         return hypothesis
 
-    def idle(self, without: Hypothesis, hypothesis: Hypothesis) -> bool:
+    def removes_too_little(self, without: Hypothesis, hypothesis: Hypothesis) -> bool:
         """Return whether the effect that `without` lacks takes too small a share away."""
-        return self.excess(without, hypothesis) < -float(np.log(1.0 - SEARCH.add_share))
+        return self.log_energy_ratio(without, hypothesis) < -float(np.log(1.0 - SEARCH.add_share))
 
 
-def _alike(effect: Effect, used: Used) -> bool:
+def _is_confusable(effect: Effect, used: Used) -> bool:
     """Return whether a named effect at the same joint is easily taken for a used one."""
     own = used.term
     assert isinstance(own, Effect)

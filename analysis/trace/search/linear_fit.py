@@ -103,24 +103,26 @@ def gains(K: Array, c: Array, groups: Sequence[tuple[int, ...]], raw: Array) -> 
     for g, group in enumerate(groups):
         if len(group) == 1:
             j = group[0]
-            if K[j, j] > SEARCH.visible**2 * raw[j] and raw[j] > 0:
+            if K[j, j] > SEARCH.least_projected_length**2 * raw[j] and raw[j] > 0:
                 out[g] = c[j] ** 2 / K[j, j]
             continue
-        seen = [j for j in group if K[j, j] > SEARCH.visible**2 * raw[j] and raw[j] > 0]
+        seen = [
+            j for j in group if K[j, j] > SEARCH.least_projected_length**2 * raw[j] and raw[j] > 0
+        ]
         if seen:
             index = np.ix_(seen, seen)
             out[g] = c[seen] @ np.linalg.pinv(K[index], rcond=1e-6, hermitian=True) @ c[seen]
     return out
 
 
-def without(K: Array, c: Array, group: Sequence[int]) -> tuple[Array, Array]:
+def schur_complement(K: Array, c: Array, group: Sequence[int]) -> tuple[Array, Array]:
     """Return K and c after the group's columns were taken into the set (Schur complement)."""
     j = list(group)
     inverse = np.linalg.pinv(K[np.ix_(j, j)], rcond=1e-8, hermitian=True)
     return K - K[:, j] @ inverse @ K[j], c - K[:, j] @ (inverse @ c[j])
 
 
-def judged(
+def fit_members(
     candidates: CandidateColumns, members: Sequence[int], r: Array, noise: float
 ) -> LinearFit:
     """Fit a set to the projected residual r (M,); `noise` is its noise energy per row."""
@@ -148,14 +150,14 @@ def in_band(candidates: CandidateColumns, chosen: LinearFit, noise: float) -> bo
     )
 
 
-def touched(candidates: CandidateColumns, member: int, chosen: LinearFit) -> float:
+def energy_touched(candidates: CandidateColumns, member: int, chosen: LinearFit) -> float:
     """Return the energy above noise that a set leaves in the equations an entry touches."""
     return sum(
         max(0.0, chosen.excess_energy.get(e, 0.0)) for e in candidates.entries[member].touched
     )
 
 
-def options(
+def sets_with_one_more(
     candidates: CandidateColumns, members: Sequence[int], r: Array, noise: float
 ) -> list[LinearFit]:
     """Return the sets with one more entry that earn their place, the best choice first.
@@ -163,19 +165,19 @@ def options(
     Among sets that leave about equally little the simplest stands first, then the others by what
     they leave.
     """
-    now = judged(candidates, members, r, noise)
+    now = fit_members(candidates, members, r, noise)
     K, c = candidates.K, candidates.columns.T @ r
     for m in members:
-        K, c = without(K, c, candidates.groups[m])
+        K, c = schur_complement(K, c, candidates.groups[m])
     g = gains(K, c, candidates.groups, candidates.raw)
     taken = {candidates.entries[m].variant.key for m in members}
     trials: list[LinearFit] = []
     for i in map(int, np.argsort(-g)[: SEARCH.full_fits]):
         if g[i] <= 0 or candidates.entries[i].variant.key in taken:
             continue
-        if g[i] < SEARCH.add_share * touched(candidates, i, now):
+        if g[i] < SEARCH.add_share * energy_touched(candidates, i, now):
             continue
-        trial = judged(candidates, (*members, i), r, noise)
+        trial = fit_members(candidates, (*members, i), r, noise)
         if admissible(candidates, trial):
             trials.append(trial)
     if not trials:
@@ -202,21 +204,21 @@ def admissible(candidates: CandidateColumns, choice: LinearFit) -> bool:
 
 def search(candidates: CandidateColumns, r: Array, noise: float = 1.0) -> LinearFit:
     """Find the set: forward with swaps and backward pruning, from nothing and from pairs."""
-    empty = judged(candidates, (), r, noise)
+    empty = fit_members(candidates, (), r, noise)
     if in_band(candidates, empty, noise) or not candidates.entries:
         return empty
     greedy = grow(candidates, (), r, noise)
     if len(greedy.members) == 1 and in_band(candidates, greedy, noise):
         return greedy
     best, seen = greedy, set[Key]()
-    for first in options(candidates, (), r, noise)[: 3 * SEARCH.pair_starts] or _blind(
-        candidates, r
-    ):
+    for first in sets_with_one_more(candidates, (), r, noise)[
+        : 3 * SEARCH.pair_starts
+    ] or _best_singles(candidates, r):
         key = candidates.entries[first.members[0]].variant.key
         if key in seen or len(seen) >= SEARCH.pair_starts:
             continue
         seen.add(key)
-        for pair in options(candidates, first.members, r, noise)[:1]:
+        for pair in sets_with_one_more(candidates, first.members, r, noise)[:1]:
             other = grow(candidates, pair.members, r, noise)
             if len(other.members) <= max(2, len(best.members)) and other.total < 0.7 * best.total:
                 best = other
@@ -226,22 +228,22 @@ def search(candidates: CandidateColumns, r: Array, noise: float = 1.0) -> Linear
 def best_pairs(candidates: CandidateColumns, r: Array, count: int) -> list[LinearFit]:
     """Return the pairs of different candidates that leave least, whatever they are alone."""
     starts: dict[Key, LinearFit] = {}
-    for first in _blind(candidates, r):
+    for first in _best_singles(candidates, r):
         starts.setdefault(candidates.entries[first.members[0]].variant.key, first)
     pairs: dict[frozenset[Key], LinearFit] = {}
     for first in list(starts.values())[: SEARCH.pair_starts]:
-        for pair in options(candidates, first.members, r, 1.0)[:3]:
+        for pair in sets_with_one_more(candidates, first.members, r, 1.0)[:3]:
             keys = frozenset(candidates.entries[m].variant.key for m in pair.members)
             if keys not in pairs or pair.total < pairs[keys].total:
                 pairs[keys] = pair
     return sorted(pairs.values(), key=lambda p: p.total)[:count]
 
 
-def _blind(candidates: CandidateColumns, r: Array) -> list[LinearFit]:
+def _best_singles(candidates: CandidateColumns, r: Array) -> list[LinearFit]:
     """Return the best single entries although none earns a place alone: a pair may."""
     g = gains(candidates.K, candidates.columns.T @ r, candidates.groups, candidates.raw)
     return [
-        judged(candidates, (int(i),), r, 1.0)
+        fit_members(candidates, (int(i),), r, 1.0)
         for i in np.argsort(-g)[: 6 * SEARCH.pair_starts]
         if g[i] > 0
     ]
@@ -249,9 +251,9 @@ def _blind(candidates: CandidateColumns, r: Array) -> list[LinearFit]:
 
 def grow(candidates: CandidateColumns, members: Sequence[int], r: Array, noise: float) -> LinearFit:
     """Add entries while they earn their place, swapping and dropping earlier ones."""
-    now = judged(candidates, members, r, noise)
+    now = fit_members(candidates, members, r, noise)
     while not in_band(candidates, now, noise) and len(now.members) < SEARCH.largest_linear_set:
-        more = options(candidates, now.members, r, noise)
+        more = sets_with_one_more(candidates, now.members, r, noise)
         if not more:
             break
         grown = prune(candidates, swap(candidates, more[0], r, noise), r, noise)
@@ -267,7 +269,7 @@ def swap(candidates: CandidateColumns, chosen: LinearFit, r: Array, noise: float
         before = chosen
         for m in chosen.members[:-1]:
             others = tuple(k for k in chosen.members if k != m)
-            for trial in options(candidates, others, r, noise)[:1]:
+            for trial in sets_with_one_more(candidates, others, r, noise)[:1]:
                 if trial.total < 0.9 * chosen.total:
                     chosen = trial
                     break
@@ -279,18 +281,21 @@ def swap(candidates: CandidateColumns, chosen: LinearFit, r: Array, noise: float
 def prune(candidates: CandidateColumns, chosen: LinearFit, r: Array, noise: float) -> LinearFit:
     """Drop members without which about as little is left in the equations they touch."""
     while len(chosen.members) > 1:
-        shares = {m: share(candidates, chosen, m, r, noise) for m in chosen.members}
+        shares = {m: removed_share(candidates, chosen, m, r, noise) for m in chosen.members}
         worst = min(shares, key=lambda m: shares[m])
         if shares[worst] >= SEARCH.add_share:
             break
-        chosen = judged(candidates, tuple(m for m in chosen.members if m != worst), r, noise)
+        chosen = fit_members(candidates, tuple(m for m in chosen.members if m != worst), r, noise)
     return chosen
 
 
-def share(
+def removed_share(
     candidates: CandidateColumns, chosen: LinearFit, member: int, r: Array, noise: float
 ) -> float:
     """Return which share of the energy above noise goes with a member, the others kept."""
-    rest = judged(candidates, tuple(m for m in chosen.members if m != member), r, noise)
-    before, after = touched(candidates, member, rest), touched(candidates, member, chosen)
+    rest = fit_members(candidates, tuple(m for m in chosen.members if m != member), r, noise)
+    before, after = (
+        energy_touched(candidates, member, rest),
+        energy_touched(candidates, member, chosen),
+    )
     return (before - after) / before if before > 0 else 0.0

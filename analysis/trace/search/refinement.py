@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares as search_shapes
+from scipy.optimize import least_squares as minimise
 
 from analysis.effects.base import Effect, Shape, shapes_of
 from analysis.regression.rows import in_common
@@ -60,16 +60,16 @@ class ExactFit:
         return float(self.residual @ self.residual)
 
 
-def table(data: RegressionData, terms: Sequence[Used]) -> DesignMatrix:
+def design_matrix(data: RegressionData, terms: Sequence[Used]) -> DesignMatrix:
     """Return the whitened rows of a model on the averaged records and instants.
 
     Of instants that the model masks stays what the data's own model leaves of them, so that no
     effect explains rows by moving its signals out of the model's domain.
     """
-    built = [shared_rows(data.rig, terms, record, data.memory) for record in data.records]
+    built = [shared_rows(data.rig, terms, record, data.cache) for record in data.records]
     names = tuple(dict.fromkeys(c.parameter for u in terms for c in u.term.coefficients(data.rig)))
     M = data.base.shape[0]
-    X, y = np.zeros((M, len(names))), data.mean.copy()
+    X, y = np.zeros((M, len(names))), data.mean_residual.copy()
     index = {conditioned.group: k for k, conditioned in enumerate(data.records)}
     for segment in data.segments:
         k = index[segment.group]
@@ -86,9 +86,9 @@ def table(data: RegressionData, terms: Sequence[Used]) -> DesignMatrix:
     return DesignMatrix(names, X, y)
 
 
-def fit(data: RegressionData, terms: Sequence[Used]) -> ExactFit:
+def fit_coefficients(data: RegressionData, terms: Sequence[Used]) -> ExactFit:
     """Solve a model's coefficients on regression data, shapes as they are."""
-    rows = table(data, terms)
+    rows = design_matrix(data, terms)
     scale = np.linalg.norm(rows.matrix, axis=0)
     scale[scale == 0] = 1.0
     Q, R = np.linalg.qr(rows.matrix / scale)
@@ -103,25 +103,25 @@ def refine(data: RegressionData, terms: Sequence[Used], steps: int = SEARCH.step
     Where an effect has another form, the one that leaves less stays. Then details of forms join,
     one after another, that take more away than chance, and a share of what is left.
     """
-    fit = _searched(data, terms, steps)
+    fit = _with_searched_shapes(data, terms, steps)
     for k in range(len(terms)):
         used = fit.terms[k]
         if used in data.terms or not isinstance(used.term, Effect):
             continue
         fit = _in_best_form(data, fit, k, steps)
         used = fit.terms[k]
-        opened = _in_detail(data.rig, used)
+        opened = _with_details(data.rig, used)
         asked = max(SEARCH.number_price, SEARCH.detail_share * (fit.energy - len(fit.residual)))
         # Half, since in a straight line a detail promises less than it takes.
-        if opened == used or _promise(data, fit, used, opened) < 0.5 * asked:
+        if opened == used or _predicted_gain(data, fit, used, opened) < 0.5 * asked:
             continue
-        more = _searched(data, _with(fit.terms, used, opened), steps)
-        if fit.energy - more.energy > asked and _shaped(data, more, more.terms[k]):
+        more = _with_searched_shapes(data, _with_term(fit.terms, used, opened), steps)
+        if fit.energy - more.energy > asked and _determines_shapes(data, more, more.terms[k]):
             fit = more
     return fit
 
 
-def _shaped(data: RegressionData, fit: ExactFit, used: Used) -> bool:
+def _determines_shapes(data: RegressionData, fit: ExactFit, used: Used) -> bool:
     """Return whether the rows still determine an effect's shapes beside its details.
 
     A detail that leaves them open, or drives them or itself to a bound, stands for something else:
@@ -155,7 +155,7 @@ def _in_best_form(data: RegressionData, fit: ExactFit, place: int, steps: int) -
         used = fit.terms[place]
         assert isinstance(used.term, Effect)
         others = [
-            _searched(data, _with(fit.terms, used, Used(used.term, shape)), steps)
+            _with_searched_shapes(data, _with_term(fit.terms, used, Used(used.term, shape)), steps)
             for shape in used.term.other_forms(data.rig, used.shape)
         ]
         best = min(others, key=lambda other: other.energy, default=fit)
@@ -164,33 +164,35 @@ def _in_best_form(data: RegressionData, fit: ExactFit, place: int, steps: int) -
         fit = best
 
 
-def _promise(data: RegressionData, fit: ExactFit, used: Used, opened: Used) -> float:
+def _predicted_gain(data: RegressionData, fit: ExactFit, used: Used, opened: Used) -> float:
     """Return the energy that a term with its details would take, were all linear in them."""
-    column = table(data, _with(fit.terms, used, opened)).residual(fit.beta) - fit.residual
-    absorbed = np.hstack((table(data, fit.terms).matrix, jacobian(data, fit, used)[1]))
+    column = (
+        design_matrix(data, _with_term(fit.terms, used, opened)).residual(fit.beta) - fit.residual
+    )
+    absorbed = np.hstack((design_matrix(data, fit.terms).matrix, jacobian(data, fit, used)[1]))
     basis = orthonormal(absorbed)
     column = column - basis @ (basis.T @ column)
     size = float(column @ column)
     return float(column @ fit.residual) ** 2 / size if size > 0 else 0.0
 
 
-def _with(terms: Sequence[Used], used: Used, other: Used) -> tuple[Used, ...]:
+def _with_term(terms: Sequence[Used], used: Used, other: Used) -> tuple[Used, ...]:
     """Return the terms with another in the place of one."""
     return tuple(other if u is used else u for u in terms)
 
 
-def _in_detail(rig: Rig, used: Used) -> Used:
+def _with_details(rig: Rig, used: Used) -> Used:
     """Return a term with the details that its shape does without, at their first look."""
     if not isinstance(used.term, Effect) or not len(used.shape):
         return used
     return Used(used.term, used.term.in_detail(rig, used.shape))
 
 
-def _searched(data: RegressionData, terms: Sequence[Used], steps: int) -> ExactFit:
-    free = _free(data, terms)
+def _with_searched_shapes(data: RegressionData, terms: Sequence[Used], steps: int) -> ExactFit:
+    free = _free_shapes(data, terms)
     if not free:
-        return fit(data, terms)
-    terms = _on_the_right_side(data, terms, free)
+        return fit_coefficients(data, terms)
+    terms = _on_better_side(data, terms, free)
     start = np.array([_to_unit(terms[k].shape[j], s) for k, j, s in free])
 
     def at(x: Array) -> tuple[Used, ...]:
@@ -202,15 +204,15 @@ def _searched(data: RegressionData, terms: Sequence[Used], steps: int) -> ExactF
             for u, v in zip(terms, shapes, strict=True)
         )
 
-    search = search_shapes(
-        lambda x: fit(data, at(x)).residual, np.clip(start, 1e-6, 1 - 1e-6), bounds=(0.0, 1.0),
-        diff_step=1e-3, xtol=SEARCH.tolerance, ftol=SEARCH.tolerance, gtol=1e-12,
+    search = minimise(
+        lambda x: fit_coefficients(data, at(x)).residual, np.clip(start, 1e-6, 1 - 1e-6),
+        bounds=(0.0, 1.0), diff_step=1e-3, xtol=SEARCH.tolerance, ftol=SEARCH.tolerance, gtol=1e-12,
         max_nfev=steps,
     )  # fmt: skip
-    return fit(data, at(search.x))
+    return fit_coefficients(data, at(search.x))
 
 
-def _free(data: RegressionData, terms: Sequence[Used]) -> list[tuple[int, int, Shape]]:
+def _free_shapes(data: RegressionData, terms: Sequence[Used]) -> list[tuple[int, int, Shape]]:
     """Return the shapes to be searched: place of the term, of the shape in it, and what it is."""
     return [
         (k, j, s)
@@ -221,7 +223,7 @@ def _free(data: RegressionData, terms: Sequence[Used]) -> list[tuple[int, int, S
     ]
 
 
-def _on_the_right_side(
+def _on_better_side(
     data: RegressionData, terms: Sequence[Used], free: Sequence[tuple[int, int, Shape]]
 ) -> tuple[Used, ...]:
     """Return the terms with every free shape on the side of its neutral value that leaves less.
@@ -238,8 +240,8 @@ def _on_the_right_side(
         shape = (*used.shape[:j], mirrored, *used.shape[j + 1 :])
         other = (*terms[:k], Used(used.term, shape), *terms[k + 1 :])
         if np.isnan(least):  # few effects lie on either side of nothing
-            least = fit(data, terms).energy
-        energy = fit(data, other).energy
+            least = fit_coefficients(data, terms).energy
+        energy = fit_coefficients(data, other).energy
         if energy < least:
             terms, least = other, energy
     return terms
@@ -267,7 +269,7 @@ def jacobian(data: RegressionData, model: ExactFit, used: Used) -> tuple[tuple[s
 
     A column is what a unit more of the parameter adds to the model's side of the rows.
     """
-    rows = table(data, model.terms)
+    rows = design_matrix(data, model.terms)
     own = [c.parameter for c in used.term.coefficients(data.rig)]
     names, columns = list(own), [rows.matrix[:, rows.names.index(n)] for n in own]
     for j, shape in enumerate(shapes_of(data.rig, used)):
@@ -281,7 +283,9 @@ def jacobian(data: RegressionData, model: ExactFit, used: Used) -> tuple[tuple[s
         ends = []
         for value in (up, down):
             changed = Used(used.term, (*used.shape[:j], value, *used.shape[j + 1 :]))
-            ends.append(table(data, _with(model.terms, used, changed)).residual(model.beta))
+            ends.append(
+                design_matrix(data, _with_term(model.terms, used, changed)).residual(model.beta)
+            )
         names.append(shape.parameter)
         columns.append(-(ends[0] - ends[1]) / (up - down))
     stack = np.column_stack(columns) if columns else np.zeros((len(model.residual), 0))
@@ -290,7 +294,7 @@ def jacobian(data: RegressionData, model: ExactFit, used: Used) -> tuple[tuple[s
 
 def tangent(data: RegressionData, model: ExactFit) -> tuple[tuple[str, ...], Array]:
     """Return names and whitened columns (M, p) of all that is free in a model, shapes included."""
-    rows = table(data, model.terms)
+    rows = design_matrix(data, model.terms)
     names, columns = list(rows.names), [rows.matrix]
     for used in model.terms:
         if used.shape and isinstance(used.term, Effect):
@@ -311,24 +315,24 @@ def contribution(data: RegressionData, model: ExactFit, used: Used) -> Array:
     return np.asarray(J @ np.array(amounts))
 
 
-def alternatives(data: RegressionData, fit: ExactFit) -> list[ExactFit]:
+def fits_in_other_forms(data: RegressionData, fit: ExactFit) -> list[ExactFit]:
     """Return the fit with each effect in its other forms, one after another."""
     out = []
     for used in fit.terms:
         if used in data.terms or not isinstance(used.term, Effect):
             continue
         for shape in used.term.other_forms(data.rig, used.shape):
-            terms = _with(fit.terms, used, Used(used.term, shape))
-            out.append(_searched(data, terms, SEARCH.steps))
+            terms = _with_term(fit.terms, used, Used(used.term, shape))
+            out.append(_with_searched_shapes(data, terms, SEARCH.steps))
     return out
 
 
 def rebased(data: RegressionData, model: ExactFit) -> RegressionData:
     """Return regression data with a fitted model in place of their own."""
-    rows = table(data, model.terms)
+    rows = design_matrix(data, model.terms)
     built = []
     for conditioned, before in zip(data.records, data.rows, strict=True):
-        now = shared_rows(data.rig, model.terms, conditioned, data.memory)
+        now = shared_rows(data.rig, model.terms, conditioned, data.cache)
         kept = {}
         for equation, old in before.items():
             here, there = in_common(old, now[equation])

@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 from analysis.effects.base import Effect, Shape, open_shapes, shapes_of
 from analysis.identify import checks as ck
 from analysis.terms.base import Used
-from analysis.trace.data.candidates import points
+from analysis.trace.data.candidates import shape_grid
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import evidence, regression_data
 from analysis.trace.data.temperature_nuisance import temperature_terms
-from analysis.trace.search.refinement import fit, refine
+from analysis.trace.search.refinement import fit_coefficients, refine
 from analysis.trace.settings import SEARCH
 from rig.model.records import Run
 from rig.model.rig import Rig
@@ -32,14 +32,16 @@ def with_shapes(runs: Sequence[Run], terms: Sequence[Used]) -> tuple[Used, ...]:
         rig, (*known, *temperature_terms(known, runs)), conditioned_records(rig, runs)
     )
     refined: tuple[Used, ...] = ()
-    seen = evidence(data, data.mean)
+    seen = evidence(data, data.mean_residual)
     for used in wanted:
         assert isinstance(used.term, Effect)
-        looks = points(used.term, rig, seen)
+        looks = shape_grid(used.term, rig, seen)
         trials = [(*data.terms, *refined, Used(used.term, p)) for p in looks]
         # The least before the search need not be it afterwards: edges that no spool reaches leave
         # little, and nothing to search along.
-        near = sorted(trials, key=lambda trial: fit(data, trial).energy)[: SEARCH.shape_starts]
+        near = sorted(trials, key=lambda trial: fit_coefficients(data, trial).energy)[
+            : SEARCH.shape_starts
+        ]
         best = min((refine(data, trial) for trial in near), key=lambda candidate: candidate.energy)
         refined = best.terms[len(data.terms) :]
     shaped = dict(zip(wanted, refined, strict=True))
