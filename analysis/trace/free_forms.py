@@ -75,7 +75,7 @@ def _sets_with_free_form(wide: HypothesisSet, winner: Hypothesis, fewer: bool) -
 
 
 def _simplest_first(sets: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Return the `SEARCH.free_forms_judged` sets to judge: near the least energy, simplest first."""
+    """Return the sets to judge: those near the least energy first, the simplest of them first."""
     least = min((hypothesis.total for hypothesis in sets), default=0.0)
     near = SEARCH.free_form_near * least
     ordered = sorted(sets, key=lambda o: (o.total > near, o.size[1], o.total))

@@ -1,8 +1,8 @@
-"""Rounds of a loop: what was run, what the trace then said, what the experiment was worth.
+"""Rounds of a loop: the runs, the trace after them, and the separation that they achieved.
 
-An experiment's worth is measured as it was predicted (`discriminate`): both explanations are
-fitted to all records before and after it, and what one leaves more than the other in its rows is
-counted in units of one record's noise.
+The separation is measured as it was predicted (`next_experiment.discrimination`): both explanations
+are fitted to all records without and with the new ones. The energy that one leaves more than the
+other, per new row, is given as an rms in units of one record's noise.
 """
 
 from __future__ import annotations
@@ -66,10 +66,10 @@ class Round:
 def achieved(
     rig: Rig, before: Sequence[Run], new: Run, experiment: Mapping[str, Any]
 ) -> float | None:
-    """Return the separation [noise] that an experiment's records brought, None if none was asked.
+    """Return the separation [noise] that an experiment's records achieved, None if none was asked.
 
-    What it was to make visible is not there to be measured; then this is how large it would stand
-    on the records as they were taken.
+    An experiment that was to make a small effect visible has no such effect to measure: then this
+    is the rms that the effect would have in the records as they were taken.
     """
     if not experiment.get("questions"):
         return None

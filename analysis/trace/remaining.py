@@ -1,6 +1,6 @@
-"""What stays when a search has ended: whether it is nothing, and what describes it.
+"""What remains after a search: equations that keep too much, and clues to their residual.
 
-Clues describe it: variables, a frequency, a formula.
+A clue is a variable, a frequency or a formula that the residual follows.
 """
 
 from __future__ import annotations
@@ -25,9 +25,10 @@ from rig.model.units import plain
 
 
 class Remainder(NamedTuple):
-    """What an equation keeps, in words; whether it speaks against what was named (`veto`).
+    """An equation that keeps more than noise, and how much in `words`.
 
-    What does not may still be another effect's.
+    `veto`: it speaks against the named effects, and makes the verdict `unexplained`. Without a veto
+    a further effect may still act in the equation.
     """
 
     equation: str
@@ -38,11 +39,13 @@ class Remainder(NamedTuple):
 def remainders(
     hypotheses: HypothesisSet, winner: Hypothesis, holdout_data: RegressionData
 ) -> list[Remainder]:
-    """Return the equations that keep more than is nothing, and say what.
+    """Return the equations in which a set leaves more than noise and tolerances allow.
 
-    Beside those that keep more than the noise floor's band (`gates.remaining`), those whose rest
-    one formula holds: it is no noise, and no form that is only a little simpler. It speaks against
-    an effect that acts in this equation, where a bench with as much left would not be clean.
+    These are, in this order: equations above the band (`gates.equations_above_band`); equations in
+    which the set removes energy and whose residual one formula fits, which the simpler form of an
+    effect does not cause; equations that keep more than `HypothesisSet.negligible` allows. The
+    first speak against the set, the second do where the residual is above the noise's band and an
+    effect of the set acts there, the third do not.
     """
     out = [
         Remainder(*r, True) for r in gates.equations_above_band(hypotheses, winner, holdout_data)
@@ -56,7 +59,7 @@ def remainders(
     held = held_out.held_out_residual(holdout_data, winner.fit)
     for equation in asked:
         expression = formula(now, winner.fit.residual, later, held, equation)
-        # A constant is no law of another cause: it is what a form has too little or too much.
+        # A constant is no law of another cause: a form that is slightly off leaves one.
         if (
             expression is not None
             and expression.share >= TRACE.formula_share
@@ -64,7 +67,7 @@ def remainders(
         ):
             share = plain(100 * seen[equation], 2)
             words = f"{share} % of the repeatable energy remains, and a formula fits it"
-            loud = winner.excess_energy[equation] > hypotheses.noise_band.band[equation]
+            loud = winner.excess_energy[equation] > hypotheses.noise_band.by_equation[equation]
             veto = loud and seen[equation] < TRACE.unexplained_share
             tail = "" if veto else _tolerance_words(seen[equation])
             out.append(Remainder(equation, f"{words}: {expression.text}{tail}", veto))
@@ -74,7 +77,7 @@ def remainders(
 def _tolerated_remainders(
     hypotheses: HypothesisSet, winner: Hypothesis, known: Sequence[Remainder]
 ) -> list[Remainder]:
-    """Return the other equations that keep more than a further effect would leave unasked."""
+    """Return the equations beside `known` that keep more than `HypothesisSet.negligible` allows."""
     listed = {r.equation for r in known}
     out = []
     for e, residual in gates.training_excess(hypotheses, winner).items():
@@ -86,14 +89,18 @@ def _tolerated_remainders(
 
 
 def _tolerance_words(share: float) -> str:
-    """Say why a rest, a share of the energy before, speaks against nothing that is named."""
+    """Say why a remaining share of the energy does not speak against the named effects."""
     if share < TRACE.unexplained_share:
         return "; within the tolerance for the form of the named effect"
     return "; nothing that is named acts there, and it is too near the noise to name more by"
 
 
 def _visible_shares(hypotheses: HypothesisSet, winner: Hypothesis) -> dict[str, float]:
-    """Return the share that stays, by equation, where it stands out of the noise's own energy."""
+    """Return the remaining share of the baseline's energy, of equations that stand out of noise.
+
+    These keep more than `TRACE.formula_least_share`, and more energy than
+    `TRACE.formula_deviations` standard deviations of the noise's own.
+    """
     rows = hypotheses.train_data.row_counts
     shares = {
         e: v / max(hypotheses.empty.excess_energy[e], 1e-30)
@@ -113,7 +120,10 @@ def clues_to(
     winner: Hypothesis,
     split: Sequence[SpectralLines],
 ) -> tuple[tuple[Dependence, ...], tuple[Formula, ...]]:
-    """Return what the remaining residual moves with, most telling first, and formulas for it."""
+    """Return the variables that the remaining residual follows, strongest first, and formulas.
+
+    `split` are the spectral lines of the training residual.
+    """
     residual, held = winner.fit.residual, held_out.held_out_residual(holdout_data, winner.fit)
     now, later = rebased(train_data, winner.fit), rebased(holdout_data, winner.fit)
     loud = [e for e, v in sorted(winner.excess_energy.items(), key=lambda kv: -kv[1]) if v > 0]
@@ -129,7 +139,7 @@ def clues_to(
 
 
 def _formula_clue(formulas: Sequence[Formula]) -> list[Dependence]:
-    """Return the variable of the formula that leaves least, where one leaves next to nothing."""
+    """Return the variable of the best formula as a clue, none where no formula is sure."""
     best = surest_formula(formulas)
     if best is None:
         return []

@@ -202,8 +202,8 @@ class DataSettings:
     """Power of a kind of lines over the standard deviation that noise alone gives it, below which
     the kind counts as empty (convention)."""
     asymmetric_share: float = 0.25
-    """Share of the power on even lines from which an asymmetric nonlinearity is reported; the same
-    share of moving power below which the residual counts as constant (tuned)."""
+    """Share of the power on even lines from which an asymmetric nonlinearity is reported; also the
+    share of the power off line 0 below which the residual counts as constant (tuned)."""
     symmetric_share: float = 0.1
     """Share of the power on empty odd lines from which a symmetric nonlinearity is reported
     (tuned)."""

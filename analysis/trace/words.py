@@ -25,7 +25,7 @@ def unit_of_equation(rig: Rig, equation: str) -> str:
 
 
 def sentence(result: Trace) -> str:
-    """Return one paragraph that a person can act on."""
+    """Return the verdict, the effects and the errors of a trace in one paragraph."""
     if result.verdict == CLEAN:
         return (
             "No residual exceeds the noise: the baseline model explains these records; no effect "
@@ -56,13 +56,13 @@ def sentence(result: Trace) -> str:
 
 
 def _formula(result: Trace) -> str:
-    """Return the sparse fit that leaves least in words ('' where none is sure)."""
+    """Return the sure formula that leaves least, in words ('' where none is sure)."""
     best = surest_formula(result.formulas)
     return f"; a sparse fit is {best.text}" if best else ""
 
 
 def _symmetry(result: Trace) -> str:
-    """Say what the lines of the loudest remainder show of its cause ('' without such lines)."""
+    """Say what spectral lines show of the largest remaining residual ('' if none exceeds noise)."""
     loud = max(result.lines, key=lambda lines: lines.above_noise_after, default=None)
     if loud is None or loud.above_noise_after < 1.0:
         return ""
@@ -91,7 +91,7 @@ def quantity(estimate: Estimate) -> str:
 
 
 def shot_in_words(effect: JudgedEffect) -> str:
-    """Return what multiple shooting makes of an effect's shapes ('' where it has no such state)."""
+    """Return an effect's shapes from multiple shooting in words ('' without a hidden state)."""
     if effect.shot is None:
         return ""
     shot = effect.shot

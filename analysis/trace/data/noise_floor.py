@@ -2,16 +2,16 @@
 
 With n repeats r_k(t) of one excitation,
  noise^2 = mean_t var_k r_k (ddof 1),   repeatable^2 = mean_t (mean_k r_k)^2 - noise^2 / n.
-A record that is the only repeat of its step is cut into its periods, which repeat one another as
-records do. Where there is neither, but the motion comes back to states x where it was before,
+A record that is the only repeat of its step is cut into its periods, which serve as repeats. Where
+there are no periods either, but the motion comes back to states x where it was before,
  noise^2 = mean 1/2 (r(x') - r(x))^2 over the nearest pairs of states
 (a difference estimator: Rice 1984; Evans and Jones 2002). Where the motion does not come back, the
-rig's stated sensor noise, put through the same rows, stands in: that holds no noise that the rig
+rig's stated sensor noise, put through the same rows, is used. It lacks every noise that the rig
 file does not state, and a note says so.
 
-The floor lies no lower than `DATA.least_noise` of the stated noise: with sensors so much better
-than their data sheet (or simulated without noise) repeats separate what no bench would ask about,
-and a clean one would never be clean.
+The floor is at least `DATA.least_noise` of the stated noise: with sensors much better than their
+data sheet (or simulated without noise), repeats would resolve differences of no practical interest,
+and a clean bench would never be `clean`.
 """
 
 from __future__ import annotations
@@ -35,15 +35,16 @@ Array = NDArray[np.float64]
 
 REPEATS, PERIODS, NEIGHBOURS, STATED = "repeats", "periods", "neighbouring states", "stated noise"
 Group = tuple[int, str]
-NO_ROWS = 1e-30  # SI: where every row is masked nothing is weighed by it
+NO_ROWS = 1e-30  # SI: noise of an equation whose rows are all masked; it weights no row
 
 
 @dataclass(frozen=True)
 class Floor:
     """The split of one equation's residual in one group of records, SI.
 
-    `source` says what the noise was computed from; `count` repeats or periods stand behind it.
-    `stated` is what the rig file's sensor noise alone makes.
+    `noise`, `repeatable` and `total` are rms values of the residual. `source` says what the noise
+    was computed from, `count` from how many repeats or periods. `stated` is the rms that the rig
+    file's sensor noise alone makes.
     """
 
     group: Group
@@ -121,7 +122,7 @@ def noise_by_neighbours(
     count = min(len(x), DATA.neighbours_asked)
     distance, other = cKDTree(x).query(x, k=count)
     apart = np.abs(rows.time[other] - rows.time[:, None]) > DATA.pair_time
-    first = np.argmax(apart, axis=1)  # the nearest neighbour that is no close predecessor
+    first = np.argmax(apart, axis=1)  # the nearest neighbour at least `pair_time` away
     here = np.flatnonzero(apart.any(axis=1))
     d = distance[here, first[here]] ** 2
     half = 0.5 * (residual[other[here, first[here]]] - residual[here]) ** 2
@@ -144,7 +145,7 @@ def _states(conditioned: ConditionedRecord, rows: Rows) -> Array:
 def stacked_repeats(
     conditioned: ConditionedRecord, parts: Sequence[Rows], residual: Sequence[Array]
 ) -> tuple[Array | None, str]:
-    """Return residuals of repeats, or of one record's periods, one under the other (n, m)."""
+    """Return the residuals (n, m) of n repeats, or of one record's n periods, and their source."""
     if len(parts) > 1:
         common = parts[0].time
         for rows in parts[1:]:
@@ -160,10 +161,10 @@ def stacked_repeats(
 
 
 def _periods(conditioned: ConditionedRecord, rows: Rows, residual: Array) -> Array | None:
-    """Cut a record's residual into whole periods, one under the other.
+    """Return a record's residual cut into whole periods (n, m), None where there are too few.
 
-    Of a record of less than three, what the first two have in common, if that is a quarter of a
-    period or more; None where there is less than that, or periods of fewer than five rows.
+    A record of less than three periods gives the part that the first two have in common, if that is
+    at least a quarter of a period. A period needs at least five rows.
     """
     period, step = conditioned.record.period, conditioned.filtering.step
     if not period or period % step or not len(rows.time):
@@ -193,7 +194,7 @@ def stated_noise(
     beta: Mapping[str, float],
 ) -> dict[str, float]:
     """Return the rms that the rig's stated sensor noise alone puts into each residual."""
-    rng = np.random.default_rng(0)  # a prediction, the same every time
+    rng = np.random.default_rng(0)  # fixed seed: the prediction is the same every time
     again = model_rows(rig, terms, conditioned.again(rig, disturbed(rig, conditioned.record, rng)))
     out = {}
     for name, before in rows.items():

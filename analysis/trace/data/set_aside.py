@@ -1,10 +1,10 @@
-"""What the fit does not see: rows that choose between effects, and rows that judge at the end.
+"""Rows that no parameter is fitted to: those that choose between effects, those that judge.
 
-Where no records are given to judge alone, held-out ones are divided. What chooses has been looked
-at many times, and its error flatters what was chosen. Of every three blocks of `DATA.judging_block`
-by time in the record the second is therefore set aside: its rows are read once, when everything is
-settled. The noise floor that rows are weighed by stays that of the whole record, for periods and
-neighbouring states are not found within blocks.
+Rows that choose are read many times, so that their error is smaller for what was chosen than on
+other rows. Where no records are given to judge, the second of every three blocks of
+`DATA.judging_block` of each held-out record is therefore set aside: its rows are read once, after
+everything is chosen. Rows are weighted by the noise floor of the whole record, since periods and
+neighbouring states cannot be found within blocks.
 """
 
 from __future__ import annotations
@@ -27,16 +27,17 @@ Mask = NDArray[np.bool_]
 
 
 def in_judging_block(time: Array) -> Mask:
-    """Return which instants (n,) of a record [s] lie in a block that is set aside."""
+    """Return whether each instant (n,) [s] of a record lies in a block that is set aside."""
     return np.asarray(np.floor(time / DATA.judging_block) % 3 == 1)
 
 
 @dataclass(frozen=True)
 class UnseenRows:
-    """Rows that choose and rows that judge; `members` are the records of these, repeats apart.
+    """Rows that choose between effects and rows that judge.
 
-    Of the groups that are `divided` only the judging blocks of a member count. `choosing_runs` are
-    the records that choose, to be simulated.
+    `members` are the records of the judging rows, each repeat by itself; of those whose group is in
+    `divided`, only the judging blocks count. `choosing_runs` are the records that choose, for
+    simulations. `notes` say how the rows were divided.
     """
 
     choosing: RegressionData
@@ -50,7 +51,7 @@ class UnseenRows:
 def set_aside(
     data: RegressionData, members: Sequence[ConditionedRecord], runs: Sequence[Run]
 ) -> UnseenRows:
-    """Divide held-out `runs`, of which `data` are the rows.
+    """Divide the rows `data` of held-out `runs` into choosing and judging rows.
 
     A group is not divided where an equation of it would have fewer than `TRACE.least_rows` on
     either side: all its rows then choose and judge.
@@ -79,7 +80,7 @@ def judging_rows(rows: Rows) -> Rows:
 
 
 def _without_blocks(runs: Sequence[Run], divided: Collection[Group]) -> tuple[Run, ...]:
-    """Return the runs with the samples that are set aside lost, and what filters spread of them."""
+    """Return the runs with NaN at the samples that are set aside in `divided` groups."""
     out = []
     for number, run in enumerate(runs):
         records = [
@@ -97,7 +98,7 @@ def _without_judging_samples(record: Record) -> Record:
 
 
 def _division_note(divided: Collection[Group], short: Sequence[str]) -> str:
-    """Say in a sentence what judges where no records were given for it."""
+    """Return a note on which rows judge where no records were given for it."""
     if not divided:
         return (
             "the held-out records are too short to set rows aside: the same rows choose and "

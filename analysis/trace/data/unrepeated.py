@@ -1,7 +1,7 @@
-"""What differs between repeats and is no sensor noise: a cause that does not follow the excitation.
+"""Notes on scatter between repeats that is not sensor noise.
 
 A pump, a neighbouring machine or a fault that comes and goes acts with another phase in every
-repeat. It is then part of the noise floor, and no residual stands out of it.
+repeat. It is then part of the noise floor and leaves no repeatable residual.
 """
 
 from __future__ import annotations
@@ -19,7 +19,10 @@ Array = NDArray[np.float64]
 
 
 def unrepeated_notes(data: RegressionData) -> list[str]:
-    """State, for each equation, a scatter between repeats that the stated sensor noise is not."""
+    """Return a note for each equation whose scatter between repeats exceeds stated sensor noise.
+
+    The limit is `DATA.unrepeated_ratio`; of several groups the one with the largest ratio is noted.
+    """
     loudest: dict[str, Floor] = {}
     for floor in data.floors:
         measured = floor.source in (REPEATS, PERIODS)

@@ -1,8 +1,9 @@
-"""Naming gates: significance is not naming, so a name must pass all of these.
+"""Gates: the conditions that an effect must meet to be named.
 
-A deterministic misfit makes every correlated candidate significant. The cause differs from its
-look-alikes in that it works on records of another excitation, at a physical size, with the same
-coefficient everywhere, whichever repeats are taken, and better than anything else.
+Significance is not enough, since a model error makes every correlated candidate significant. The
+cause differs from these in that it reduces the error of records with another excitation, has a
+physically possible size, has the same size in all parts of the records, and fits better than any
+other effect.
 """
 
 from __future__ import annotations
@@ -45,7 +46,10 @@ def passes_gates(effect: JudgedEffect) -> bool:
 
 
 def refused_effects(effects: Sequence[JudgedEffect]) -> tuple[JudgedEffect, ...]:
-    """Return the effects that stand in no set, each once where it removes most, in that order."""
+    """Return the effects that fail a gate, each once, those that remove most first.
+
+    An effect that passes the gates in one of its judgements is left out.
+    """
     once: dict[Key, JudgedEffect] = {}
     for effect in sorted(effects, key=lambda f: (not passes_gates(f), -f.removed_fraction)):
         once.setdefault((effect.name, effect.at or effect.where), effect)
@@ -58,7 +62,10 @@ def judge_effects(
     holdout_data: RegressionData,
     rng: np.random.Generator,
 ) -> tuple[JudgedEffect, ...]:
-    """Put every effect of the winner through the gates."""
+    """Return every effect of the set `winner` with its gates, rivals, parameters and intervals.
+
+    `holdout_data` are the choosing rows; `rng` draws the sign flips.
+    """
     train_data = hypotheses.train_data
     values = parameter_values(train_data.rig, winner.fit.terms, dict(winner.fit.beta))
     null = inference.null_maximum(
@@ -118,43 +125,43 @@ def judge_effects(
 
 
 def _set_without(hypotheses: HypothesisSet, winner: Hypothesis, used: Used) -> Hypothesis:
-    """Return the set without one effect, or the best physical one of readings of the others.
+    """Return the set without one effect and its other readings, as the alternative to the effect.
 
-    Two levels of friction of opposite signs make a torque offset: what physics refuses is no
-    alternative to an effect. Two readings of one law go together: whether both are needed is
-    asked in `readings`.
+    An unphysical set is no alternative (two levels of friction of opposite signs make a torque
+    offset): then the best physical set of the other effects or readings of them is returned. Two
+    readings of one law are removed together, since `readings` decides whether both are needed.
     """
     kept = [u for u in winner.effects if u is not used and not of_one_law(u.term, used.term)]  # type: ignore[arg-type]
     rest = hypotheses.refined(kept)
     rig = hypotheses.train_data.rig
-    # A shape at its bound is a matter of form.
+    # A shape at its bound is an error of the form, not of physics.
     at_bound = any(u.term.outside(rig, u.shape) for u in rest.effects)  # type: ignore[attr-defined]
     if at_bound or not hypotheses.physical_problem(rest):
         return rest
-    simpler = [
-        o
-        for o in hypotheses.fitted.values()
-        if not hypotheses.physical_problem(o)
-        and all(
-            any(u.term == k.term or of_one_law(u.term, k.term) for k in kept) for u in o.effects
-        )  # type: ignore[arg-type]
-    ]
+
+    def is_kept(other: Used) -> bool:
+        """Return whether a kept effect, or one of its readings, is another set's effect."""
+        return any(other.term == k.term or of_one_law(other.term, k.term) for k in kept)  # type: ignore[arg-type]
+
+    physical = [o for o in hypotheses.fitted.values() if not hypotheses.physical_problem(o)]
+    simpler = [o for o in physical if all(map(is_kept, o.effects))]
     return min([hypotheses.empty, *simpler], key=lambda o: o.total)
 
 
 def equations_above_band(
     hypotheses: HypothesisSet, winner: Hypothesis, holdout_data: RegressionData
 ) -> list[tuple[str, str]]:
-    """Return the equations that keep more than the noise floor's band, and say on which records.
+    """Return the equations that keep more than the band, and in words how much in which records.
 
-    What a catalogue's simpler form misses of an effect is a share of what was there before, however
-    well it is measured.
+    The band of training records is noise or `TRACE.training_share` of the baseline's energy,
+    whichever is larger; for held-out records see `held_out_above_band`. The error of an effect's
+    form is a share of the effect, which better sensors do not make smaller.
     """
     out = []
     for e, residual in training_excess(hypotheses, winner).items():
         share = residual / max(hypotheses.empty.excess_energy[e], 1e-30)
         if share > TRACE.training_share and not hypotheses.negligible(e, residual):
-            times = residual / hypotheses.noise_band.band[e]
+            times = residual / hypotheses.noise_band.by_equation[e]
             stays = f"{plain(100 * share, 2)} % of the repeatable energy remains"
             grown = share > 1.0 + SEARCH.tolerance
             words = "the repeatable energy is larger than under the baseline" if grown else stays
@@ -163,7 +170,7 @@ def equations_above_band(
 
 
 def training_excess(hypotheses: HypothesisSet, winner: Hypothesis) -> dict[str, float]:
-    """Return the energy above noise by equation, without the few instants of cavitating oil."""
+    """Return the training energy above noise by equation, cavitating instants left out."""
     data = hypotheses.train_data
     return energy_above_noise(data, _zeroed_where_cavitating(data, winner.fit, winner.fit.residual))
 
@@ -171,7 +178,11 @@ def training_excess(hypotheses: HypothesisSet, winner: Hypothesis) -> dict[str, 
 def held_out_above_band(
     holdout_data: RegressionData, before: ExactFit, after: ExactFit
 ) -> list[tuple[str, str]]:
-    """Return the equations that keep more than the band in these held-out rows, and how much."""
+    """Return the equations that keep more than the band in held-out rows, and in words how much.
+
+    The band is an rms of `TRACE.held_out_band` noise floors or `TRACE.held_out_share` of the energy
+    above noise that the model `before` leaves, whichever is larger.
+    """
     left = _zeroed_where_cavitating(holdout_data, after, held_out_residual(holdout_data, after))
     start = energy_above_noise(holdout_data, held_out_residual(holdout_data, before))
     now = energy_above_noise(holdout_data, left)
@@ -183,13 +194,14 @@ def held_out_above_band(
 
 
 def _zeroed_where_cavitating(data: RegressionData, model: ExactFit, residual: Array) -> Array:
-    """Return a residual (M,), zero at the few instants at which the oil cavitates under a model.
+    """Return a residual (M,) set to zero where the oil cavitates under a model.
 
-    A pressure's true gain puts some below zero, where no flow can be compared: these instants count
-    neither for nor against a model. Where they are many, they count.
+    A true gain of a pressure sensor puts some pressures below zero, where no flow can be compared:
+    these instants count neither for nor against the model. An equation with more than
+    `TRACE.cavitating_share` of them keeps its residual.
     """
     outside = np.asarray(~np.any(design_matrix(data, model.terms).matrix, axis=1))
-    if not outside.any():  # nearly always
+    if not outside.any():  # the usual case
         return residual
     rows: dict[str, list[int]] = {}
     for s in data.segments:
@@ -215,7 +227,7 @@ def _error_over_floor(holdout_data: RegressionData, residual: Array) -> dict[str
     for s in holdout_data.segments:
         count = (s.where.stop - s.where.start) * s.repeats
         floor[s.equation] = floor.get(s.equation, 0.0) + count * s.noise**2
-        # Averaging has taken noise out: put back what a single record would show.
+        # The average has less noise than a record: the difference is added.
         part = residual[s.where]
         excess = float(part @ part) + count * (1 - 1 / s.repeats)
         energy[s.equation] = energy.get(s.equation, 0.0) + excess * s.noise**2
@@ -223,9 +235,9 @@ def _error_over_floor(holdout_data: RegressionData, residual: Array) -> dict[str
 
 
 def _noise_samples(train_data: RegressionData, residual: Array) -> Array:
-    """Return the repeats' residuals without what repeats: (R, M), scaled to the full noise.
+    """Return samples (R, M) of the noise: the repeats' residuals without their mean.
 
-    Of a step with one repeat, what the winner leaves (M,).
+    They are scaled to the full noise. A step with one repeat has the `residual` (M,) of the winner.
     """
     out = train_data.residual.copy()
     for s in train_data.segments:
@@ -248,7 +260,7 @@ def _place(effect: Effect) -> str:
 
 
 def _removed_energy(winner: Hypothesis, rest: Hypothesis) -> dict[str, float]:
-    """Return the energy that an effect removes in training, by equation where that is visible."""
+    """Return the training energy that an effect removes, by equation in which it acts."""
     change = {e: rest.excess_energy[e] - winner.excess_energy[e] for e in rest.excess_energy}
     most = max(change.values())
     return {e: v for e, v in change.items() if v > SEARCH.acting_share * most}
@@ -257,15 +269,15 @@ def _removed_energy(winner: Hypothesis, rest: Hypothesis) -> dict[str, float]:
 def _disturbed_equations(
     hypotheses: HypothesisSet, winner: Hypothesis, rest: Hypothesis
 ) -> list[str]:
-    """Return equations that were quieter under the baseline and that this effect disturbs.
+    """Return the equations in which an effect leaves more energy than the baseline.
 
-    What it adds would alone be more than the noise's band.
+    It must be more by the noise's band and by `TRACE.harm_ratio`, and more than without the effect.
     """
     before = {e: max(0.0, v) for e, v in hypotheses.empty.excess_energy.items()}
     return [
         e
         for e, now in winner.excess_energy.items()
-        if now > before[e] + hypotheses.noise_band.band[e]
+        if now > before[e] + hypotheses.noise_band.by_equation[e]
         and now > TRACE.harm_ratio * before[e]
         and now > rest.excess_energy[e]
     ]
@@ -283,8 +295,8 @@ def _removed_share(
 ) -> float:
     """Return the share of held-out energy above noise that an effect removes.
 
-    It is the mean over equations, weighed by what the effect removes there in training (`changes`):
-    what a baseline that was badly determined leaves in another equation does not count against it.
+    It is the mean over equations, weighted by the training energy that the effect removes in each
+    (`changes`): an error of the baseline in another equation does not count against the effect.
     """
     before, now = energy_above_noise(holdout_data, without), energy_above_noise(holdout_data, after)
     weights = {e: v for e, v in changes.items() if before.get(e, 0.0) > 0.0}
@@ -305,9 +317,10 @@ def _rivals(
     holdout_data: RegressionData,
     judged: _TieTest,
 ) -> list[Rival]:
-    """Return the sets that have another effect in place of one, those that leave least first.
+    """Return the rivals of an effect: fitted sets with another effect in its place.
 
-    A simpler reading of the effect is no rival: held-out records have said that it is too simple.
+    Tied rivals come first, then by held-out rms. A simpler reading of the effect is no rival, since
+    held-out records have shown that it is too simple.
     """
     mine, key = used.term, (used.term.name, used.term.where)
     others, train_data = winner.keys - {key}, hypotheses.train_data
@@ -322,13 +335,13 @@ def _rivals(
         if key in hypothesis.keys or not others <= hypothesis.keys or len(fresh) != 1:
             continue
         (other,) = fresh
-        more = hypothesis.size[1] - winner.size[1]  # free numbers, which must earn their price
+        more = hypothesis.size[1] - winner.size[1]  # further free numbers, each with its price
         assert isinstance(other, Effect)
         assert isinstance(mine, Effect)
         if (
             (more > 0 and hypothesis.total > winner.total - SEARCH.number_price * more)
             or of_one_law(mine, other)
-            or hypotheses.physical_problem(hypothesis, formed=others)
+            or hypotheses.physical_problem(hypothesis, may_be_at_bounds=others)
             or _disturbed_equations(hypotheses, hypothesis, rest)
         ):
             continue
@@ -358,7 +371,10 @@ def _is_refused_simpler_name(
     hypotheses: HypothesisSet, holdout_data: RegressionData, pair: tuple[Effect, Effect],
     others: frozenset[Key], held: Array,
 ) -> bool:  # fmt: skip
-    """Return whether a rival says no more than a simpler reading of both, which is refused."""
+    """Return whether a rival fits no better than a simpler reading of both, which is too simple.
+
+    `held` (M,) is the rival's held-out residual, `others` the set's other effects.
+    """
     mine, other = pair
     for name in set(other.includes) & set(mine.includes) if other.where == mine.where else ():
         simple = hypotheses.fitted.get(others | {(name, other.where)})
@@ -369,9 +385,9 @@ def _is_refused_simpler_name(
 
 
 class _TieTest:
-    """Whether another fit leaves about as little as the best in the equations of an effect.
+    """Comparison of other fits with the best one, in the equations in which an effect acts.
 
-    `left` (M,) is what the best leaves, `without` (M,) what is left without the effect.
+    `left` (M,) is the whitened residual of the best fit, `without` (M,) that without the effect.
     """
 
     def __init__(
@@ -385,14 +401,14 @@ class _TieTest:
         self.taken = float(without[self.rows] @ without[self.rows]) - self.energy
 
     def ratio(self, other: Array) -> float:
-        """Return the rms of what another fit leaves over that of the best."""
+        """Return the residual rms of another fit (M,) over that of the best."""
         energy = float(other[self.rows] @ other[self.rows])
         return float(np.sqrt(energy / self.energy)) if self.energy > 0 else float("nan")
 
     def ties(self, other: Array, tie: float) -> bool:
-        """Return whether another fit (M,) loses no more than noise, or than `tie` times the rms.
+        """Return whether another fit (M,) has less than `tie` times the rms, or loses only noise.
 
-        Of an effect that takes less than is left, what it takes is the measure, not the noise.
+        For an effect that removes less energy than remains, the ratio is of the removed energy.
         """
         change = other[self.rows] - self.left
         lost = float(change @ (other[self.rows] + self.left))

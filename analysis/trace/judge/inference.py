@@ -1,10 +1,10 @@
-"""How sure: sign flips for significance, repeats for errors.
+"""Significance of an effect by sign flips, and standard errors of its parameters.
 
-The unit is the repeat. Under the null hypothesis a residual is noise, symmetric and independent
-from repeat to repeat, so that the signs of whole repeats may be flipped. With few repeats flips of
-whole records cannot give a small p (4 repeats: not below 1/8); then blocks of a record are
-flipped, each a whole period where the record holds several, else several of the longest excited
-wave: the noise that passes the row filter forgets itself within a tenth of a second.
+Under the null hypothesis a residual is noise, symmetric and independent from repeat to repeat, so
+that the signs of whole repeats may be flipped. With few repeats, flips of whole records cannot give
+a small p (4 repeats: not below 1/8). Then blocks of a record are flipped: whole periods where the
+record holds at least three, else `TRACE.flip_block` seconds. The noise behind the row filter is
+uncorrelated after a tenth of a second.
 """
 
 from __future__ import annotations
@@ -28,9 +28,10 @@ Key = tuple[str, str]
 
 
 def flip_blocks(train_data: RegressionData) -> NDArray[np.int64]:
-    """Return for each row the number of its block within its record (M,).
+    """Return for each row (M,) the number of its block within its record.
 
-    A block is a period of a record that holds three of them.
+    With `TRACE.enough_repeats` a record is one block; else a block is a period if the record holds
+    at least three, or `TRACE.flip_block` seconds.
     """
     out = np.zeros(train_data.base.shape[0], dtype=np.int64)
     for segment in train_data.segments:
@@ -48,7 +49,7 @@ def flip_blocks(train_data: RegressionData) -> NDArray[np.int64]:
 def sign_flipped(
     train_data: RegressionData, count: int, rng: np.random.Generator, residual: Array
 ) -> Array:
-    """Return residuals (M, count), averaged after random signs of every repeat's blocks."""
+    """Return averages (M, count) of `residual` (R, M) after random sign flips of its blocks."""
     numbers = flip_blocks(train_data)
     M = train_data.base.shape[0]
     out = np.zeros((M, count))
@@ -70,7 +71,7 @@ def null_maximum(
     residual: Array,
     rng: np.random.Generator,
 ) -> Array:
-    """Return the largest gain of any candidate at any shape under each flip (flips,)."""
+    """Return the largest energy (flips,) that any candidate at any shape removes, by flip."""
     r = sign_flipped(train_data, TRACE.sign_flips, rng, residual)
     r = r - candidates.basis @ (candidates.basis.T @ r)
     c = candidates.columns.T @ r
@@ -90,13 +91,13 @@ def null_maximum(
 
 
 def p_value(gain: float, null: Array) -> float:
-    """Return the family-wise p of a gain against the flips' largest gains."""
+    """Return the family-wise p of a removed energy `gain` against those under flips (`null`)."""
     return float((1 + np.sum(null >= gain)) / (1 + len(null)))
 
 
 @dataclass(frozen=True)
 class EffectErrors:
-    """An effect's parameters (k,) with standard errors, and the t distributions' dof (k,)."""
+    """An effect's parameters (k,), standard errors (k,) and degrees of freedom (k,) of their t."""
 
     names: tuple[str, ...]
     value: Array
@@ -107,7 +108,10 @@ class EffectErrors:
 def effect_errors(
     train_data: RegressionData, model: ExactFit, used: Used, values: Mapping[str, float]
 ) -> EffectErrors:
-    """Return an effect's parameters with errors: scatter between repeats, and lack of fit."""
+    """Return an effect's parameters with errors from repeats and lack of fit.
+
+    `values` are the values of the model's parameters by name (b itself, not 1/b).
+    """
     names, J = jacobian(train_data, model, used)
     base = basis_of_others(train_data, model, names)
     J_p = J - base @ (base.T @ J)
@@ -120,6 +124,6 @@ def effect_errors(
 
 
 def basis_of_others(train_data: RegressionData, model: ExactFit, own: Sequence[str]) -> Array:
-    """Return a basis of everything in the model but the named parameters, other shapes included."""
+    """Return an orthonormal basis (M, r) of a model's tangent without the parameters `own`."""
     names, X = tangent(train_data, model)
     return orthonormal(X[:, [k for k, n in enumerate(names) if n not in own]])

@@ -1,8 +1,8 @@
-"""Sets of effects fitted exactly, found by a linear search on the regression data.
+"""The search for a set of effects: a linear search on columns, then exact fits of the best sets.
 
-The columns searched are first-order; a set found there is refined exactly and, where something is
-left, extended from data that have the set among their terms. Every set fitted on the way stays
-on the list: the rivals of the winner come from it.
+The columns are of first order in a change of signals. A set found with them is refined exactly and,
+where more than noise remains, extended from data that have the set among their terms. Every set
+fitted on the way is kept, since the rivals of the winner are taken from these sets.
 """
 
 from __future__ import annotations
@@ -43,7 +43,12 @@ log = logging.getLogger(__name__)
 
 
 class HypothesisSet:
-    """Sets of effects on the same training data, fitted exactly once each."""
+    """Sets of effects on the same training data, each fitted exactly once.
+
+    `base` are the model's own terms, `effects` the candidates, `fitted` all sets fitted so far by
+    names and places, `empty` the set without effects (the baseline), `noise_band` the energy that
+    counts as nothing. `columns` and `candidates` are set by `run`.
+    """
 
     def __init__(self, train_data: RegressionData, effects: Sequence[Effect]) -> None:
         self.train_data = train_data
@@ -63,7 +68,7 @@ class HypothesisSet:
         )
 
     def with_candidates(self, effects: Sequence[Effect]) -> HypothesisSet:
-        """Return the sets with more candidates beside those that were searched already."""
+        """Return a copy with further candidates; sets that were fitted already are shared."""
         wide = copy.copy(self)
         wide.effects = tuple(effects)
         more = variant_columns(
@@ -75,56 +80,58 @@ class HypothesisSet:
         return wide
 
     def _variants(self, data: RegressionData, residual: Array) -> list[Variant]:
-        """Return the candidates' points of first look on data that leave a residual (M,)."""
+        """Return the candidates at every point of their shape grids.
+
+        `residual` (M,) of the data places the points of effects whose grid depends on the data.
+        """
         seen = evidence(data, residual) if any(e.by_data for e in self.effects) else None
         return variants(data.rig, self.effects, seen)
 
     def physical_problem(
-        self, hypothesis: Hypothesis, of: Used | None = None, formed: Collection[Key] = ()
+        self,
+        hypothesis: Hypothesis,
+        first: Used | None = None,
+        may_be_at_bounds: Collection[Key] = (),
     ) -> str:
-        """Say whose number makes a set unphysical, and why ('' if none does).
+        """Return in words which number of a set is physically impossible ('' if none is).
 
-        The effect `of` is asked first; its own number is stated without its name. The shapes of
-        effects `formed` (name, where) are a matter of form, and may lie at their bounds.
+        The effect `first` is asked first, and its number is stated without its name. Shapes of the
+        effects `may_be_at_bounds` (name, where) may lie at their bounds.
         """
         rig = self.train_data.rig
         values = parameter_values(rig, hypothesis.fit.terms, dict(hypothesis.fit.beta))
-        for used in sorted(hypothesis.effects, key=lambda used: used is not of):
+        for used in sorted(hypothesis.effects, key=lambda used: used is not first):
             assert isinstance(used.term, Effect)
             problem = used.term.problem(rig, values, used.shape)
-            if (used.term.name, used.term.where) not in formed:
+            if (used.term.name, used.term.where) not in may_be_at_bounds:
                 problem = problem or used.term.outside(rig, used.shape)
             if problem:
                 whose = f"of {used.term.name} at {place_in_words(used.term.where)}: "
-                return problem if used is of else whose + problem
+                return problem if used is first else whose + problem
         return ""
 
     def refined(self, effects: Sequence[Used]) -> Hypothesis:
-        """Return the set refined exactly (once per set of names and places)."""
+        """Return the exact fit of a set of effects, computed once for its names and places."""
         key = frozenset((u.term.name, u.term.where) for u in effects)
         if key not in self.fitted:
             fit = refine(self.train_data, (*self.base, *effects))
             self.fitted[key] = self._hypothesis(fit.terms[len(self.base) :], fit)
         return self.fitted[key]
 
-    def tried(self, sets: Sequence[tuple[Used, ...]]) -> list[Hypothesis]:
-        """Return the sets refined exactly."""
-        return [self.refined(effects) for effects in sets]
-
     def log_energy_ratio(self, hypothesis: Hypothesis, other: Hypothesis) -> float:
-        """Return how much more one set leaves than another: the sum of log ratios over equations.
+        """Return the sum over equations of log((E + B) / (E' + B)), energies above noise E and E'.
 
-        What the form of a loud effect leaves in its own equations must not hide a quiet one in
-        others, so that ratios count; what lies within the noise's band counts as nothing.
+        E is what `hypothesis` leaves, E' what `other` leaves, B the noise's band. Ratios are used
+        so that the form error of a large effect does not hide a small effect in other equations.
         """
         return sum(
             float(np.log((max(0.0, v) + band) / (max(0.0, other.excess_energy[e]) + band)))
             for e, v in hypothesis.excess_energy.items()
-            for band in (self.noise_band.band[e],)
+            for band in (self.noise_band.by_equation[e],)
         )
 
     def is_preferred(self, hypothesis: Hypothesis, other: Hypothesis) -> bool:
-        """Return whether `one` is to be preferred: much less left, or as little and simpler."""
+        """Return whether a set leaves much less than `other`, or about as little and is simpler."""
         slack = SEARCH.number_price * max(1, abs(hypothesis.size[1] - other.size[1]))
         more, near = self.log_energy_ratio(hypothesis, other), float(np.log(SEARCH.simpler_ratio))
         if hypothesis.size < other.size:
@@ -134,7 +141,7 @@ class HypothesisSet:
         return hypothesis.total < other.total
 
     def best(self, among: Sequence[Hypothesis]) -> Hypothesis:
-        """Return the preferred of several physical sets."""
+        """Return the simplest physical set of those that leave about the least, else `empty`."""
         allowed = [o for o in among if not self.physical_problem(o)]
         if not allowed:
             return self.empty
@@ -143,9 +150,9 @@ class HypothesisSet:
         return min(near, key=lambda o: (sum(o.size), o.size[0], o.total))
 
     def run(self, progress: Callable[[float], None] | None = None) -> Hypothesis:
-        """Search: singles and pairs beside the baseline, then extensions; returns the winner.
+        """Search single effects, pairs and extensions, and return the best set.
 
-        `progress` receives which share of the first columns is there.
+        `progress` is called with the share of the candidates' columns that is computed.
         """
         self.columns = variant_columns(
             self.train_data,
@@ -158,12 +165,12 @@ class HypothesisSet:
         return self.exchanged(self._searched(candidates, r))
 
     def _searched(self, candidates: linear_fit.CandidateColumns, r: Array) -> Hypothesis:
-        """Return the set found on the candidates for what the baseline leaves (M,)."""
-        singles = self.tried(self._singles(candidates, r))
+        """Return the best set for the baseline's residual r (M,), orthogonal to its columns."""
+        singles = [self.refined(effects) for effects in self._singles(candidates, r)]
         now = self.prune(self.best([self.empty, *singles]))
         if within_band(now.excess_energy, self.noise_band):
             return now
-        pairs = self.tried(self._pairs(candidates, r, singles))
+        pairs = [self.refined(effects) for effects in self._pairs(candidates, r)]
         if self.within_form_tolerance(now):
             others = [o for o in pairs if not now.keys & o.keys]
             far = [o for o in others if self.log_energy_ratio(o, now) < -SEARCH.far_log_gain]
@@ -182,16 +189,24 @@ class HypothesisSet:
         return now
 
     def within_form_tolerance(self, hypothesis: Hypothesis) -> bool:
-        """Return whether the rest may be the difference of form between effect and catalogue."""
+        """Return whether every equation keeps no more than noise or the effects' form error."""
         return all(self.negligible(e, residual) for e, residual in hypothesis.excess_energy.items())
 
     def negligible(self, equation: str, residual: float) -> bool:
-        """Return whether so much energy above noise may be left in an equation."""
-        allowed = (SEARCH.residual_limit / SEARCH.band) ** 2 * self.noise_band.band[equation]
+        """Return whether an equation may keep so much energy above noise.
+
+        It may keep noise of `SEARCH.residual_limit`, or `SEARCH.form_share` of what the baseline
+        leaves.
+        """
+        allowed = (SEARCH.residual_limit / SEARCH.band) ** 2 * self.noise_band.by_equation[equation]
         return residual <= max(allowed, SEARCH.form_share * self.empty.excess_energy[equation])
 
     def completed_to_noise(self, now: Hypothesis) -> Hypothesis:
-        """Add one more effect only if that leaves nothing but noise: else it fits a form."""
+        """Return the set with one more effect if that leaves only noise, else the set itself.
+
+        The set leaves no more than form error already: an effect that leaves less, but not only
+        noise, would just fit that error.
+        """
         if (
             within_band(now.excess_energy, self.noise_band)
             or len(now.effects) >= SEARCH.largest_set
@@ -209,7 +224,7 @@ class HypothesisSet:
 
         def allowed(entry: VariantColumns, coefficients: Array) -> bool:
             own = dict(zip(entry.names, map(float, coefficients), strict=True))
-            # No lower bound: what is smaller than the grid's first point is fitted exactly later.
+            # No lower bound: a size below that of the grid's first point is fitted exactly later.
             if not 0.0 <= own.get("", 0.0) <= SEARCH.size_ratio:
                 return False
             for c in entry.variant.effect.coefficients(rig):
@@ -237,9 +252,7 @@ class HypothesisSet:
                 out[variant.key] = (variant.used,)
         return list(out.values())
 
-    def _pairs(
-        self, candidates: linear_fit.CandidateColumns, r: Array, singles: Sequence[Hypothesis]
-    ) -> list[tuple[Used, ...]]:
+    def _pairs(self, candidates: linear_fit.CandidateColumns, r: Array) -> list[tuple[Used, ...]]:
         chosen = linear_fit.search(candidates, r)
         out = [
             tuple(candidates.entries[m].variant.used for m in chosen.members[: SEARCH.largest_set])
@@ -253,9 +266,9 @@ class HypothesisSet:
     def extensions(
         self, now: Hypothesis, equations: Collection[str] = (), free: bool = False
     ) -> list[Hypothesis]:
-        """Return sets with one more effect, found on data that have the set in their model.
+        """Return the best sets with one more effect, found on data with the set in their model.
 
-        With `equations` the search looks at these alone, with `free` at free mechanisms alone.
+        `equations` restricts the search to their rows, `free` to free mechanisms.
         """
         data = rebased(self.train_data, now.fit)
         taken = now.keys
@@ -265,7 +278,8 @@ class HypothesisSet:
         mask = np.ones(len(now.fit.residual))
         for s in data.segments:
             mask[s.where] = not equations or s.equation in equations
-        # The set's shapes move too when another effect joins: what they can take is not its gain.
+        # The set's shapes are fitted again with another effect: energy that they can remove
+        # themselves is no gain of that effect.
         moves = [jacobian(self.train_data, now.fit, used)[1] for used in now.effects]
         candidates = self._candidate_columns(
             replace(data, base=np.hstack((data.base, *moves))), columns, mask
@@ -277,12 +291,12 @@ class HypothesisSet:
             variant = candidates.entries[trial.members[0]].variant
             if len(out) < SEARCH.refined_extensions:
                 out.setdefault(variant.key, (*now.effects, variant.used))
-        return self.tried(list(out.values()))
+        return [self.refined(effects) for effects in out.values()]
 
     def exchanged(self, now: Hypothesis) -> Hypothesis:
-        """Return the set, or a better one with another effect in place of one that looks like it.
+        """Return the set, or a better one with an effect exchanged for one that is easily confused.
 
-        What was chosen before the last effect joined may be the wrong one beside it.
+        An effect that was chosen before the last one was added may be wrong beside it.
         """
         sets: list[tuple[Used, ...]] = []
         for used in now.effects if len(now.effects) > 1 else ():
@@ -293,18 +307,18 @@ class HypothesisSet:
                 fresh = Used(effect, effect.shape_of(self.train_data.rig, ()))
                 sets.append((*others, fresh))
                 if used.term.name in effect.includes and effect.where == used.term.where:
-                    # What a richer law needs no longer may have stood for what the simpler lacks.
+                    # Another effect may only have made up for what the simpler law lacks.
                     sets += [(*(u for u in others if u is not one), fresh) for one in others]
         if not sets:
             return now
-        other = self.prune(self.best([now, *self.tried(sets)]))
+        other = self.prune(self.best([now, *map(self.refined, sets)]))
         return now if other.keys == now.keys else self.exchanged(other)
 
     def extended_in(self, now: Hypothesis, equations: Collection[str]) -> Hypothesis | None:
-        """Return the set with the effect added that some equations ask for, None where none is.
+        """Return the set with the effect that removes most from `equations`, None where none does.
 
-        What is left of a loud equation, the form of its effect, hides what a quiet one lacks as
-        long as all are counted together.
+        Counted over all equations, the form error of a large effect in one equation would hide a
+        small effect in another.
         """
         if len(now.effects) >= SEARCH.largest_set:
             return None
@@ -330,7 +344,7 @@ class HypothesisSet:
         return min(near, key=lambda o: (o.size[1], residual(o)))
 
     def prune(self, hypothesis: Hypothesis) -> Hypothesis:
-        """Drop effects without which about as little is left."""
+        """Return the set without effects that are not needed or remove too little."""
         while len(hypothesis.effects) > 1:
             rest = [
                 self.refined(tuple(u for u in hypothesis.effects if u is not used))
@@ -348,12 +362,15 @@ class HypothesisSet:
         return hypothesis
 
     def removes_too_little(self, without: Hypothesis, hypothesis: Hypothesis) -> bool:
-        """Return whether the effect that `without` lacks takes too small a share away."""
+        """Return whether the effect that `without` lacks removes less than `SEARCH.add_share`."""
         return self.log_energy_ratio(without, hypothesis) < -float(np.log(1.0 - SEARCH.add_share))
 
 
 def _is_confusable(effect: Effect, used: Used) -> bool:
-    """Return whether a named effect at the same joint is easily taken for a used one."""
+    """Return whether a candidate is easily confused with an effect of the set.
+
+    It is another name of its mechanism at the same place, or one of its confounders at its joint.
+    """
     own = used.term
     assert isinstance(own, Effect)
     same = effect.mechanism == own.mechanism and effect.where == own.where
@@ -362,7 +379,7 @@ def _is_confusable(effect: Effect, used: Used) -> bool:
 
 
 def _joint(effect: Effect) -> list[str]:
-    """Return the joint of an effect's place, or the bench."""
+    """Return the words of an effect's place that name its joint, or the bench."""
     return effect.where.split()[:2]
 
 

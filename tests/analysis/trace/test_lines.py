@@ -112,7 +112,7 @@ def test_friction_shows_on_the_empty_odd_lines_and_a_null_on_the_even_ones(rig: 
     (loudest, *_) = friction.lines
     assert loudest.equation == "torque_2"
     assert "symmetric nonlinearity" in loudest.meaning
-    assert loudest.above_noise_after < 0.3 * loudest.loud
+    assert loudest.above_noise_after < 0.3 * loudest.above_noise
 
     null = traced(rig, u_null=5e-3)
     assert null.lines[0].equation.startswith("flow")
