@@ -1,11 +1,11 @@
-"""Clues: what an unexplained residual moves with. A clue is not a name.
+"""Clues: the variables that an unexplained residual depends on. A clue is not a name.
 
-For each variable v the residual's equation gets a free curve of v (hat functions over quantiles,
-filtered like any column, projected off the model's own columns) on one set of records, and is
-judged on the other: the share of the energy above noise that the curve takes from records it was
-not fitted to. Friedman's partial dependence, with the held-out record as its referee. The curve
-may also be the slope of another variable (Hastie and Tibshirani's varying coefficients): the
-direction of motion, with and without memory, the velocity, the pressure difference, the spool.
+For each variable v a free curve of v (hat functions over quantiles, filtered like any column,
+orthogonal to the model's own columns) is fitted to the equation's residual on one set of records.
+It is judged on the other set, by the share of the energy above noise that it removes there
+(Friedman's partial dependence, judged on held-out records). The curve may also multiply another
+variable (Hastie and Tibshirani's varying coefficients): the direction of motion, with and without
+memory, the velocity, the pressure difference, the spool.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
-# An equation's own balance makes these follow whatever it lacks: they answer and are no cause.
+# An equation's own balance makes these variables follow whatever the equation lacks, so that they
+# are no sign of a cause.
 FOLLOW_BY_BALANCE = {"torque": ("pressure", ch.DRIVE), "flow": ("velocity",)}
 
 
@@ -54,7 +55,10 @@ def dependences(
     holdout_residual: Array,
     equations: Sequence[str],
 ) -> list[Dependence]:
-    """Return what the residual moves with by share of the energy above noise, most telling first.
+    """Return the variables that the residual depends on, those with most evidence first.
+
+    The evidence is the share of energy above noise that a curve removes, times the variable's
+    weight (`_independence_weight`). Each variable is returned once.
 
     `residual` (M,) and `judge_left` are residuals under the model of `train` (rebased to it).
     """
@@ -104,10 +108,10 @@ def _dependence_of(
 def _independence_weight(
     name: str, equation: str, shares: Mapping[tuple[str, str], float]
 ) -> float:
-    """Return a variable's weight: what an equation's balance makes follow counts little.
+    """Return a variable's weight, small if the equation's own balance makes it follow the residual.
 
-    A torque's balance makes the difference of the pressures follow; one chamber's pressure that
-    says much more than the difference follows nothing, its sensor may be what is wrong.
+    A torque's balance makes the pressure difference follow. One chamber's pressure that removes
+    `CLUES.chamber_lead` more than the difference does not follow: its sensor may be wrong.
     """
     kind, number = equation.rsplit("_", 1)
     if kind == "torque" and name in (
@@ -126,10 +130,10 @@ def _independence_weight(
 def _curve_shares(
     rig: Rig, equation: str, first: EquationRows | None, second: EquationRows | None
 ) -> dict[tuple[str, str], float]:
-    """Return the share of every curve alone, factor alone (variable ''), and product of both.
+    """Return the explained share of every curve, factor (variable '') and product of both.
 
-    Each is fitted on either side and judged on the other; the larger counts: a curve fitted to
-    small motions says nothing of large ones, the other way round it does.
+    Each is fitted on one side and judged on the other, both ways round, and the larger share is
+    used: a curve fitted to small motions does not predict large ones, but the reverse does.
     """
     if first is None or second is None:
         return {}

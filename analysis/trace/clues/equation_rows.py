@@ -1,4 +1,4 @@
-"""One equation's rows of a set of records, ready to be tried against columns of any kind."""
+"""One equation's rows of a set of records, and fits of columns to their residual."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class EquationPart:
-    """A record's rows of one equation: signals as the model's terms prepare them, and weight."""
+    """A record's rows of one equation, signals `seen` by the model's terms, whitening weight."""
 
     conditioned: ConditionedRecord
     rows: Rows
@@ -31,7 +31,10 @@ class EquationPart:
 
 @dataclass(frozen=True)
 class EquationRows:
-    """One set of records' rows of one equation: residual (m,) off the model's `base` (m, r)."""
+    """The rows of one equation in a set of records.
+
+    `residual` (m,) is whitened and orthogonal to the model's orthonormal `base` (m, r).
+    """
 
     parts: tuple[EquationPart, ...]
     residual: Array
@@ -58,7 +61,10 @@ def equation_rows(data: RegressionData, residual: Array, equation: str) -> Equat
 
 
 def whitened_columns(side: EquationRows, made: Sequence[Array]) -> Array:
-    """Return columns (m, k) filtered as the rows are, whitened, off the model's own."""
+    """Return columns (m, k): filtered like the rows, whitened, orthogonal to the model's own.
+
+    `made` holds the unfiltered columns (n, k) of each part.
+    """
     stack = []
     for part, columns in zip(side.parts, made, strict=True):
         named = {str(k): columns[:, k] for k in range(columns.shape[1])}
@@ -69,14 +75,17 @@ def whitened_columns(side: EquationRows, made: Sequence[Array]) -> Array:
 
 
 def fitted_coefficients(columns: Array, side: EquationRows) -> Array:
-    """Return the coefficients (k,) of columns (m, k) that leave least of a side."""
+    """Return the least-squares coefficients (k,) of columns (m, k) for a residual."""
     return shortest(columns, side.residual, 1e-2)
 
 
 def explained_share(
     fitted: Array, side: EquationRows, judging: Array, other: EquationRows
 ) -> float:
-    """Return the share of the energy above noise that columns fitted to a side take of another."""
+    """Return the share of energy above noise in `other` that columns fitted to `side` remove.
+
+    `fitted` and `judging` are the same columns on either rows.
+    """
     curve = fitted_coefficients(fitted, side)
     q = other.residual
     before = float(q @ q) - len(q)

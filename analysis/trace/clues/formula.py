@@ -1,11 +1,11 @@
-"""A sparse generic fit of what stays unexplained: a formula as a clue, clearly not a name.
+"""A sparse fit of an unexplained residual by monomials: a formula as a clue, not a name.
 
-Monomials of a joint's variables, columns like any other (filtered, whitened, projected off the
-model's own), are joined one by one to the set that leaves least of training and held-out residual
-together, small motions and large ones (a cube and a line are alike in either); any that is idle
-then goes (forward and backward selection; sparse identification, Brunton, Proctor and Kutz 2016).
-Coefficients are the training records' alone, and the held-out ones judge. In a torque the
-monomials are forces at the piston, times the linkage's G.
+Monomials of a joint's variables are columns like any other (filtered, whitened, orthogonal to the
+model's own). They are added one by one to the set that leaves least of training and held-out
+residual together, since small or large motions alone do not separate a cube from a line; those that
+remove little are then dropped (forward and backward selection; sparse identification, Brunton,
+Proctor and Kutz 2016). Coefficients are fitted to the training records and judged on the held-out
+ones. In a torque the monomials are forces at the piston, times the linkage's G.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def formula(
     holdout_residual: Array,
     equation: str,
 ) -> Formula | None:
-    """Return the formula of what is left of an equation, None where none takes half of it.
+    """Return a formula for an equation's residual, None where none removes `CLUES.shown_share`.
 
     `residual` (M,) and `judge_left` are residuals under the model of `train` (rebased to it).
     """
@@ -68,10 +68,10 @@ def formula(
 
 
 def is_balance(equation: str, terms: Mapping[str, float]) -> bool:
-    """Whether a formula takes both chambers' pressures against each other by one factor.
+    """Return whether a formula holds both chambers' pressures with opposite signs and one factor.
 
-    That is the cylinder's force times the factor: a torque's own balance makes the force follow
-    whatever the torque lacks, and with a factor too it answers and is no cause.
+    That is the cylinder's force times the factor. A torque's own balance makes this force follow
+    whatever the torque lacks, so that it is no sign of a cause.
     """
     kind, joint = equation.rsplit("_", 1)
     sides = [ch.channel(side, int(joint)) for side in (ch.CAP, ch.ROD)]
@@ -85,7 +85,7 @@ def is_balance(equation: str, terms: Mapping[str, float]) -> bool:
 def _candidate_monomials(
     rig: Rig, equation: str, fitted: EquationRows, judged: EquationRows
 ) -> tuple[list[str], Array, Array]:  # fmt: skip
-    """Return the monomials' names and their columns on either side, what is one left out."""
+    """Return the monomials' names and columns on either side, nearly equal ones only once."""
     joint = int(equation.rsplit("_", 1)[1]) - 1
     every = [*fitted.parts, *judged.parts]
     travel = max(float(np.ptp(p.conditioned.signals.s[:, joint])) for p in every)
@@ -110,7 +110,7 @@ def _candidate_monomials(
 def _monomials(
     rig: Rig, equation: str, seen: Signals, joint: int, travel: float
 ) -> dict[str, Array]:  # fmt: skip
-    """Return the monomials (n,) by name, simpler ones first: of two that are one, these stay."""
+    """Return the monomials (n,) by name, simpler ones first: of equal ones the first is kept."""
     i, t = joint + 1, seen.t
     place, v = ch.channel(rig.position_kind, i), f"velocity_{i}"
     s, sd = (seen.q, seen.qd) if rig.electric else (seen.s, seen.sd)
@@ -129,11 +129,11 @@ def _monomials(
     for name, y in sides.items():
         out[f"{name} time"] = y * t
     if equation.startswith("torque"):
-        # Pressures, squared too, are the balance's other side: they would take whatever it lacks.
+        # Pressures and their squares are the balance's other side: they would fit any residual.
         out |= {f"{name} sign({v})": y * sign for name, y in sides.items()}
         return {name: seen.G[:, joint] * y for name, y in out.items()}
-    # So is the velocity in a flow's, whatever it is multiplied with: a boom that only comes down
-    # has all its products alike.
+    # So is the velocity in a flow's balance, and any product with it: for a boom that only comes
+    # down all these products are alike.
     out = {name: y for name, y in out.items() if v not in name}
     out |= {f"{name}²": y**2 for name, y in sides.items()}
     spool = ch.channel(ch.SPOOL, i)
@@ -144,7 +144,7 @@ def _monomials(
 
 
 def _selected_columns(columns: Array, side: EquationRows) -> list[int]:
-    """Return the columns chosen, in the order they were; none idle."""
+    """Return the numbers of the columns selected, in order of selection."""
     chosen: list[int] = []
     share = 0.0
     while len(chosen) < min(CLUES.monomials, columns.shape[1]):
@@ -162,5 +162,5 @@ def _selected_columns(columns: Array, side: EquationRows) -> list[int]:
 
 
 def _joint_share(chosen: list[int], columns: Array, side: EquationRows) -> float:
-    """Return the share of a side's energy above noise that the chosen columns take of it."""
+    """Return the share of a side's energy above noise that the chosen columns remove."""
     return explained_share(columns[:, chosen], side, columns[:, chosen], side)

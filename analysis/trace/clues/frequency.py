@@ -1,9 +1,9 @@
-"""A clue of its own: what is left repeats at one frequency, whatever the joint does.
+"""Frequency clue: the residual repeats at one frequency, whatever the joint does.
 
-Hum of a pump, of a mains supply, of a loop nearby. Of the training records' lines most of the power
-stands in one place though the excitation holds many; the frequency is then searched about it, and
-judged on the held-out records, where a sine and a cosine of it (phases are free in every record)
-must take the energy above noise.
+Causes are hum of a pump, of the mains, of a control loop. Most of the power of the training
+residual lies at one line although the excitation has many. The frequency is searched around that
+line and judged on the held-out records, where a sine and a cosine of it, with a phase for each
+record, must remove most of the energy above noise.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ def frequency_clue(
     holdout_data: RegressionData,
     holdout_residual: Array,
 ) -> Dependence | None:
-    """Return the clue of the loudest equation that repeats at one frequency, None of none.
+    """Return the clue of the equation with the largest residual at one frequency, None if none.
 
-    `residual` (M,) and `judge_left` are whitened residuals of averaged records, as in `clues`.
+    `residual` (M,) and `judge_left` are whitened residuals of averaged records, as in `dependence`.
     """
     for equation_lines in sorted(
         lines, key=lambda equation_lines: -equation_lines.above_noise_after
@@ -57,7 +57,7 @@ def frequency_clue(
 
 
 def _peak_frequency(lines: SpectralLines) -> float | None:
-    """Return where [Hz] most of what is left stands, None where it is spread."""
+    """Return the frequency [Hz] of most of the remaining power, None where it is spread."""
     power = np.maximum(lines.after, 0.0)
     power[0] = 0.0
     if int(lines.excited.sum()) < CLUES.least_lines or not power.any():
@@ -72,7 +72,7 @@ def _peak_frequency(lines: SpectralLines) -> float | None:
 
 
 def _energy_of_sine(data: RegressionData, residual: Array, equation: str, f: float) -> float:
-    """Return the energy above chance that a sine and a cosine of f [Hz] take in all records."""
+    """Return the energy above noise that a sine and a cosine of f [Hz] remove in all records."""
     total = 0.0
     for conditioned, rows in zip(data.records, data.rows, strict=True):
         for s in data.segments:

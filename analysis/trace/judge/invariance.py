@@ -1,8 +1,8 @@
-"""Invariance: a cause has the same size everywhere; a look-alike has another in every corner.
+"""Invariance: whether an effect has the same size in all parts of the records, as a cause has.
 
-The tangent of a fitted set is solved again on parts of the rows: each step, each half of the
-records, each direction of motion, fast and slow. A size that moves by more than noise, than what a
-catalogue's simpler form may cause, and than what a larger effect's form may spill onto it, is none.
+The linearised model is solved again on parts of the rows: each step, each half of the records, each
+direction of motion, fast and slow. The size must not differ by more than noise, the error of the
+catalogue's simpler form, and the form error of a larger effect together may cause.
 """
 
 from __future__ import annotations
@@ -22,7 +22,10 @@ Array = NDArray[np.float64]
 
 
 def row_subsets(train_data: RegressionData, joint: int | None) -> dict[str, Array]:
-    """Return masks (M,) of rows: each step, each half of the records, each direction of motion."""
+    """Return masks (M,) of the parts of the rows, by name.
+
+    Direction and speed are those of `joint` (0-based), or of each equation's own joint if None.
+    """
     M = train_data.base.shape[0]
     out: dict[str, Array] = {}
     early, ahead = np.zeros(M, dtype=bool), np.zeros(M, dtype=bool)
@@ -46,9 +49,9 @@ def row_subsets(train_data: RegressionData, joint: int | None) -> dict[str, Arra
 
 
 def _blocks_as_noise(train_data: RegressionData) -> NDArray[np.int64] | None:
-    """Return the block of every row (M,), None where all steps have repeats or periods.
+    """Return the number of the block of every row (M,), None where the noise was measured.
 
-    Else what is left has to stand for the noise, block by block.
+    Where a step has neither repeats nor periods, the residual is used as noise, block by block.
     """
     if all(floor.count > 1 for floor in train_data.floors):
         return None
@@ -59,7 +62,7 @@ def _blocks_as_noise(train_data: RegressionData) -> NDArray[np.int64] | None:
 
 
 def _blockwise_deviation(own: Array, residual: Array, clusters: NDArray[np.int64]) -> float:
-    """Return the root of the sum over blocks of (own . left)^2."""
+    """Return the root of the sum over blocks of (own . residual)^2."""
     _, index = np.unique(clusters, return_inverse=True)
     return float(np.linalg.norm(np.bincount(index, weights=own * residual)))
 
@@ -67,10 +70,10 @@ def _blockwise_deviation(own: Array, residual: Array, clusters: NDArray[np.int64
 def _energy_of_larger_effect(
     model: ExactFit, train_data: RegressionData, used: Used, mask: Array
 ) -> float:
-    """Return the energy that the largest other effect has on a subset, 0 if none is larger.
+    """Return the energy of the largest other effect in the rows `mask`, 0 if none is larger.
 
-    What its catalogue form misses of it (`SEARCH.form_share`) spills onto a smaller effect's
-    coefficient.
+    The error of its form, `SEARCH.form_share` of this energy, may change the coefficient of a
+    smaller effect.
     """
     rows = design_matrix(train_data, model.terms)
     energy = {}
@@ -86,7 +89,7 @@ def _energy_of_larger_effect(
 
 
 def _column_off_others(columns: Array, k: int) -> Array:
-    """Return column k (m,) without what the others say."""
+    """Return column k (m,) projected orthogonal to the other columns."""
     rest, own = np.delete(columns, k, axis=1), columns[:, k]
     if not rest.shape[1]:
         return own
@@ -97,13 +100,13 @@ def _column_off_others(columns: Array, k: int) -> Array:
 def invariance(
     train_data: RegressionData, model: ExactFit, used: Used, value: EffectErrors, joint: int | None
 ) -> list[tuple[str, str, float, float]]:
-    """Return where a parameter disagrees with itself: (subset, parameter, value there, error)."""
+    """Return the parts in which a size differs: (part, parameter, value there, standard error)."""
     names, J = jacobian(train_data, model, used)
     base = basis_of_others(train_data, model, names)
     if isinstance(used.term, Effect) and used.term.free:
         return _whole_effect_differences(train_data, model, used, base, joint)
     residual = model.residual
-    # A shape such as the presliding distance is the form's, not the effect's size.
+    # Shapes without a neutral value, such as a presliding distance, are no sizes.
     sizes = {c.parameter for c in used.term.coefficients(train_data.rig)}
     sizes |= {s.parameter for s in shapes_of(train_data.rig, used) if s.neutral is not None}
     units = {c.parameter: c.unit for c in used.term.coefficients(train_data.rig)}
@@ -114,7 +117,8 @@ def invariance(
     clusters = _blocks_as_noise(train_data)
     J_all = J - base @ (base.T @ J)
     whole = [float(np.sum(_column_off_others(J_all, k) ** 2)) for k in range(len(names))]
-    # What the effect's other numbers can stand for is no size of its own: then the whole is judged.
+    # A number that the effect's other numbers can replace is no size of its own: then the whole
+    # effect is judged.
     ridge = {
         name
         for k, name in enumerate(names)
@@ -135,7 +139,7 @@ def invariance(
                 continue
             own = _column_off_others(J_s, k)
             size = float(own @ own)
-            # What hardly acts there shows its form's tail, not its size.
+            # A part with little information shows the tail of the form, not the size.
             if (
                 size < TRACE.informative_share * whole[k]
                 or size <= 0
@@ -150,7 +154,8 @@ def invariance(
             spill = np.sqrt(
                 SEARCH.form_share * _energy_of_larger_effect(model, train_data, used, mask) / size
             )
-            # Two levels of one effect are judged by the larger: 2 N beside 100 N is a detail.
+            # Differences are relative to the largest number of the same unit: of two levels, 2 N
+            # and 100 N, the smaller is a detail.
             alike = [j for j, n in enumerate(names) if n in sizes and units[n] == units[name]]
             full = float(np.max(np.abs(value.value[alike] - neutral[alike])))
             if error > TRACE.subset_error * full:
@@ -166,10 +171,10 @@ def _whole_effect_differences(
     train_data: RegressionData, model: ExactFit, used: Used, base: Array,
     joint: int | None,
 ) -> list[tuple[str, str, float, float]]:  # fmt: skip
-    """Return where a whole effect disagrees with itself: the factor by which it would be larger.
+    """Return the parts in which a whole effect differs, with its size there over that overall.
 
-    Values of a curve trade places between knots, numbers on a ridge with each other; what must be
-    the same everywhere is what they make together.
+    Neighbouring values of a curve, and numbers that can replace each other, are uncertain one by
+    one; their common contribution to the rows must be the same everywhere.
     """
     whole = contribution(train_data, model, used)
     start = float(np.sum((whole - base @ (base.T @ whole)) ** 2))

@@ -1,10 +1,11 @@
-"""Effects with a hidden state once more: by multiple shooting, and which estimate stays.
+"""Shapes of effects with a hidden state by multiple shooting, and the choice between estimates.
 
-What the rows found begins the search (`analysis.identify.output_error.hidden_states`). The shapes
-so found take the place of the rows' where the model with them runs closer to held-out records and
-their rows are met as well as before. Else the rows' stay, for the trace's errors are errors of
-rows; but the interval of a shape is widened to hold both, since two routes to one number that
-differ by more than either allows say that the effect's form is simpler than the real one's.
+The search starts from the shapes found with the rows (see
+`analysis.identify.output_error.hidden_states`). Shapes from shooting are used where the model with
+them is closer to held-out records in simulation and the errors of held-out rows do not grow.
+Otherwise the shapes from the rows are kept, and the interval of each shape is extended to include
+both values: two estimates that differ by more than their errors show that the effect's form is
+simpler than the real one.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ShootingResult:
-    """The set with the shapes that stay, and every effect's shapes by shooting."""
+    """The set with the shapes chosen, and the shapes of every effect by shooting."""
 
     winner: Hypothesis
     shots: tuple[Shot, ...]
@@ -51,7 +52,10 @@ def shoot_hidden_states(
     holdout_data: RegressionData,
     winner: Hypothesis,
 ) -> ShootingResult:
-    """Shoot every effect of the winner that has a hidden state; `after` is its model."""
+    """Return the set after multiple shooting of every effect with a hidden state.
+
+    `after` is the identified model of the set `winner`; electric rigs are returned unchanged.
+    """
     if after.rig.electric or not hidden_effects(after):
         return ShootingResult(winner, ())
     ready = completed([*runs, *holdout], after)
@@ -88,7 +92,7 @@ def shoot_hidden_states(
 def _with_shapes_of(
     rig: Rig, terms: Sequence[Used], effect: Effect, shot: Shot
 ) -> tuple[Used, ...]:
-    """Return the terms with the shapes of a shot; shapes that it did not search stay."""
+    """Return the terms with the shapes from shooting; shapes that it did not search are kept."""
     found = {name: estimate.value for name, estimate in shot.shapes.items()}
     return tuple(
         Used(u.term, tuple({**shape_values(rig, u), **found}.values())) if u.term == effect else u
@@ -97,7 +101,7 @@ def _with_shapes_of(
 
 
 def with_shots(judged: JudgedEffect, shots: Sequence[Shot]) -> JudgedEffect:
-    """Return an effect with what shooting says of its shapes: taken over, or in the interval."""
+    """Return an effect with the shapes from shooting, or with intervals that include them."""
     for result in shots:
         if (result.name, result.where) == (judged.name, judged.where):
             shapes = {
@@ -110,6 +114,6 @@ def with_shots(judged: JudgedEffect, shots: Sequence[Shot]) -> JudgedEffect:
 
 
 def _interval_including(rows: Estimate, new: Estimate) -> Estimate:
-    """Return the rows' estimate with an interval that holds the other's value too."""
+    """Return the rows' estimate with an interval that includes the value of the other."""
     low, high = rows.ci95
     return replace(rows, ci95=(min(low, new.value), max(high, new.value)))

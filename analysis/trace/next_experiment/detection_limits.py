@@ -1,13 +1,13 @@
-"""Detection limits: how large an effect may be that the records would not have shown.
+"""Detection limits: the largest size of an effect that leaves no residual above the noise.
 
 With the whitened rows X of the model in use, an effect at its smallest size of interest adds y to
-them. Least squares takes the part X d of y, d = X^+ y, into the parameters; only the rest
-q = y - X d shows. A residual r then gives the effect's size as q'r / q'q with the standard error
-1 / |q| (in units of the smallest size), and the largest size that goes with the records is
+them. Least squares absorbs the part X d of y, d = X^+ y, into the parameters; only q = y - X d
+remains in the residual. A residual r then gives the effect's size as q'r / q'q with the standard
+error 1 / |q| (in units of the smallest size), and the largest size that agrees with the records is
 
     L = |q'r| / q'q + z / |q|,  z the normal quantile of 95 %.
 
-An effect of this size would have moved the parameters by L d without a trace in the residual
+An effect of this size would have changed the parameters by L d without a visible residual
 (omitted-variable bias; e.g. Greene, Econometric Analysis, section 4.3).
 """
 
@@ -40,11 +40,11 @@ Array = NDArray[np.float64]
 def detection_limits(
     train_data: RegressionData, effects: Sequence[Effect], winner: Hypothesis, model: Model
 ) -> list[DetectionLimit]:
-    """Return the effects that may hide and would change a parameter visibly, the worst first.
+    """Return the limits of effects that would change a parameter visibly, largest change first.
 
-    `effects` are the candidates, of which each name is returned once, where it changes most;
-    `winner` is the set in use and `model` the model identified with it. A curve that the data
-    draw takes what is alike into itself: beside one nothing is asked.
+    `effects` are the candidates; each name is returned once, at the place where it changes most.
+    `winner` is the set found and `model` the model identified with it. Beside a free form no limit
+    is computed, since its curve absorbs any similar effect.
     """
     if any(isinstance(u.term, Effect) and u.term.free for u in winner.effects):
         return []
@@ -78,9 +78,10 @@ def detection_limits(
 
 
 def _largest_multiple(shown: Array, residual: Array) -> float:
-    """Return how many times its smallest size an effect may have that shows `shown` (M,) of it.
+    """Return the largest size of an effect over its smallest size of interest.
 
-    Zero where it shows nothing at all: then no size can be stated.
+    `shown` (M,) is the part of the effect at its smallest size that remains in the residual; 0 is
+    returned where nothing remains, since no size can then be stated.
     """
     energy = float(shown @ shown)
     if not energy > 0.0:
@@ -91,9 +92,10 @@ def _largest_multiple(shown: Array, residual: Array) -> float:
 def _parameter_shifts(
     data: RegressionData, moved: Mapping[str, float], known: Mapping[str, float]
 ) -> dict[str, float]:
-    """Return how much of themselves parameters change that are moved beyond their interval.
+    """Return the relative change of the parameters that change by more than their interval.
 
-    `moved` holds changes of the rows' coefficients and of shapes, `known` half-widths.
+    `moved` are changes of the rows' coefficients and of shapes, `known` the half-widths of the
+    intervals, by name.
     """
     shapes = {n: v for u in data.terms for n, v in shape_values(data.rig, u).items()}
     before = {**data.beta, **shapes}

@@ -1,16 +1,15 @@
-"""How far apart two explanations would stand on records that have not been taken yet.
+"""Separation of two explanations on records that have not been taken yet.
 
-The twin gives a candidate excitation's noise-free record, and the record its rows under the
-baseline. A hypothesis (effects with sizes) predicts what it would add to those rows and to the
-rows already taken, y = sum of its columns times its sizes. What another hypothesis would leave of
-that is y projected off the baseline's columns, its own, and the derivatives of its shapes: it may
-be fitted anew, so only what it cannot imitate counts. With E_e the whitened energy left in
-equation e, the separation is
+The twin simulates a candidate excitation's noise-free record, which gives its rows under the
+baseline. An explanation (effects with sizes) predicts what it adds to these rows and to the rows
+already taken: y, the sum of its columns times its sizes. Another explanation leaves of y the part
+orthogonal to the baseline's columns, its own columns and the derivatives of its shapes, since it
+would be fitted again. With E_e the whitened energy left in equation e, the separation is
     s_e = sqrt(max(0, E_e(old and new rows) - E_e(old rows)) / (R n_e)),
-n_e new rows, R repeats: the rms that would stand out of one record, in units of its noise (the
-floor table's repeatable over noise). A pair is separated by the smaller of "one is true" and "the
-other is true", in the equation where that is largest. The criterion is T-optimality (Atkinson and
-Fedorov, Biometrika 62, 1975), the baseline's parameters profiled out.
+with n_e new rows and R repeats: the residual rms of one record in units of its noise. The
+separation of a pair is the smaller of the two with one or the other taken as true, each in the
+equation where it is largest. The criterion is T-optimality (Atkinson and Fedorov, Biometrika 62,
+1975), with the baseline's parameters profiled out.
 """
 
 from __future__ import annotations
@@ -49,7 +48,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Explanation:
-    """Effects with their shapes, and their coefficients by parameter name; none: the baseline."""
+    """Effects with shapes, and coefficients by parameter name; without effects the baseline."""
 
     effects: tuple[Used, ...] = ()
     beta: Mapping[str, float] = field(default_factory=dict)
@@ -71,8 +70,8 @@ class Explanation:
 def smallest_effect(effect: Effect, rig: Rig) -> Explanation | None:
     """Return an effect at its smallest size of interest, None where it has none or cannot show.
 
-    On poor excitation an effect of this size may leave nothing in the residual; then `clean` says
-    little about it.
+    With poor excitation an effect of this size may leave no residual: the verdict `clean` does not
+    exclude it then.
     """
     own = effect.least_shapes()
     if effect.absorbed(rig) or not (own or effect.least):
@@ -85,8 +84,9 @@ def smallest_effect(effect: Effect, rig: Rig) -> Explanation | None:
 
 @dataclass(frozen=True)
 class OpenQuestion:
-    """Which of `one` and `other` an experiment is to show; `both_ways` unless `one` is only
-    wanted visible against `other`.
+    """Which of two explanations, `one` or `other`, is true.
+
+    Without `both_ways` the experiment must only show `one`, if it is true.
     """
 
     one: Explanation
@@ -122,9 +122,10 @@ class MeasurementView:
 
 
 def noise_ratios(train_data: RegressionData) -> dict[str, float]:
-    """Return, by equation, the measured noise over what the rig's stated sensor noise would make.
+    """Return, by equation, the measured noise over that from the rig's stated sensor noise.
 
-    A faster excitation is filtered wider and so is noisier: the stated noise gives by how much.
+    Faster excitations have filters of larger bandwidth and so more noise; multiplied with this
+    ratio, the stated noise predicts it.
     """
     by_family: dict[str, list[float]] = {}
     for conditioned, rows in zip(train_data.records, train_data.rows, strict=True):
@@ -140,9 +141,9 @@ def noise_ratios(train_data: RegressionData) -> dict[str, float]:
 def measurement_view(
     train_data: RegressionData, excitation: CandidateExcitation, measured: Mapping[str, float]
 ) -> MeasurementView:
-    """Build the rows of an excitation as the trace would of its record.
+    """Return the rows of an excitation, as the trace would compute them from its record.
 
-    `measured` is the training data's `calibration`; of other equations nothing can be said: their
+    `measured` are the training data's `noise_ratios`. Equations without one are left out: their
     joint has never moved.
     """
     rig = ideal(train_data.rig)
@@ -160,7 +161,7 @@ def measurement_view(
 
 
 class ComparisonRows:
-    """Whitened rows on which hypotheses are compared: of the training data, then of a view if any.
+    """Whitened rows to compare explanations on: of the training data, then of a view if any.
 
     `base` (m, k) holds the baseline's columns, `equation` (m,) each row's equation.
     """
@@ -214,7 +215,7 @@ class ComparisonRows:
         return out
 
     def prediction(self, what: Explanation) -> Array:
-        """Return what a hypothesis adds to the rows (m,) at its sizes."""
+        """Return what an explanation adds to the rows (m,) at its sizes."""
         total = np.zeros(len(self.equation))
         for used in what.effects:
             for name, column in self.columns(used).items():
@@ -224,7 +225,7 @@ class ComparisonRows:
         return total
 
     def imitation_columns(self, what: Explanation) -> Array:
-        """Return what a hypothesis can imitate with: its columns and its shapes' derivatives."""
+        """Return the columns that an explanation is fitted with, shape derivatives included."""
         blocks = [self.base]
         for used in what.effects:
             blocks += [c[:, None] for c in self.columns(used).values()]
@@ -240,7 +241,7 @@ class ComparisonRows:
         return np.column_stack(blocks)
 
     def residual(self, true: Explanation, wrong: Explanation) -> Array:
-        """Return the residual (m,) that `wrong` leaves where `true` is there, without noise."""
+        """Return the noise-free residual (m,) of the fit of `wrong` where `true` is true."""
         X, y = self.imitation_columns(wrong), self.prediction(true)
         return np.asarray(y - X @ shortest(X, y, 1e-6))
 
@@ -255,7 +256,7 @@ class ComparisonRows:
 def separation(
     question: OpenQuestion, old: ComparisonRows, new: ComparisonRows
 ) -> tuple[float, str]:
-    """Return what an experiment separates [noise], and in which equation (see the module)."""
+    """Return the separation [noise] by an experiment, and its equation (see the module)."""
     assert new.seen is not None
     distances = []
     for true, wrong in _directions(question):
@@ -273,7 +274,7 @@ def separation(
 
 
 def present_separation(question: OpenQuestion, old: ComparisonRows) -> float:
-    """Return the same figure [noise] of the records already taken: their loudest segment's."""
+    """Return the separation [noise] by the records already taken, in their largest segment."""
     return min(
         largest_rms(old.train_data, old.residual(true, wrong))
         for true, wrong in _directions(question)

@@ -1,4 +1,4 @@
-"""Excitations that a rig can stand: the candidates among which the next experiment is chosen.
+"""Excitations within the limits of a rig: candidates for the next experiment.
 
 A candidate is one step: joints locked as in some step of the training records (or none locked),
 the others moved by one of a few families of lines. The families differ in what catalogue effects
@@ -35,8 +35,8 @@ log = logging.getLogger(__name__)
 class Family:
     """Lines from `low` to `high` [Hz] at multiples of `base`, amplitudes f^-tilt.
 
-    `level` is the share of the `fill` of the settings that is used, `centre` the place in the
-    stroke as a share of half of it, `words` what it is for a person.
+    `level` is the share of `EXPERIMENT.fill` that is used, `centre` the place in the
+    stroke as a share of half of it, `words` its description for the user.
     """
 
     name: str
@@ -70,7 +70,7 @@ FAMILIES: Final = (
 
 @dataclass(frozen=True)
 class JointSetting:
-    """Which joints (0-based) stand where [m], behind a closed valve or at an end; others move."""
+    """Position [m] of joints (0-based) behind a `closed` valve or `held` at an end; others move."""
 
     closed: Mapping[int, float]
     held: Mapping[int, float]

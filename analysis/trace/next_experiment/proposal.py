@@ -1,11 +1,11 @@
-"""Which experiment to run next, or none: what survives, what separates it, on which excitation.
+"""The next experiment, or none: open questions, and the excitation that answers them.
 
 `confounded`: the excitation on which the best set and its tied rivals differ most. `unexplained`:
-the one that separates the sets which leave least, else the one that carries a variable which the
-rest moves with farthest beyond the records, else one of many more lines than they hold. `clean`:
-the one on which effects of an interesting size that these records could not have shown would stand
-out. An experiment is only offered where it promises more than noise and clearly more than the
-records already hold.
+the one that separates the sets which leave least, else the one with the widest range of a variable
+that the residual depends on, else one with many more lines than the records. `clean`: the one that
+shows effects at their smallest size of interest which these records could not show. An experiment
+is proposed only where the predicted separation exceeds the noise and clearly exceeds that of the
+records.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ from rig.model.rig import Rig
 Array = NDArray[np.float64]
 
 TELL, COVER, SHOW = "tell apart", "cover", "make visible"
-PROMISE: Final = SEARCH.band  # of the noise: less is nothing to explain
+PROMISE: Final = SEARCH.band  # separation over noise; less would be within the noise's band
 
 
 @dataclass(frozen=True)
 class PredictedAnswer:
-    """What the records hold on a question, and what an experiment promises, in units of noise."""
+    """Separation of a question [noise]: by the records, and promised by an experiment."""
 
     question: OpenQuestion
     present: float
@@ -57,7 +57,7 @@ class PredictedAnswer:
 
     @property
     def open(self) -> bool:
-        """Whether the experiment promises an answer that the records do not hold."""
+        """Whether the experiment promises an answer that the records do not give."""
         return self.promised >= max(PROMISE, EXPERIMENT.least_gain * self.present)
 
 
@@ -65,7 +65,7 @@ def propose(
     hypotheses: HypothesisSet, winner: Hypothesis, effects: Sequence[JudgedEffect], verdict: str,
     moves: Sequence[Dependence], families: Sequence[ex.Family] = ex.FAMILIES,
 ) -> Mapping[str, Any] | None:  # fmt: skip
-    """Return the next experiment as plain data, None where none promises anything.
+    """Return the next experiment as plain data, None where none promises an answer.
 
     `protocol` and `holdout` are what a protocol file holds; `present` and `predicted` are the
     weakest question's separation in units of one record's noise.
@@ -91,14 +91,14 @@ def propose(
 
 
 def rig_with_estimates(train_data: RegressionData) -> Rig:
-    """Return the rig with what the records say of its parameters: a twin that is nearer to it."""
+    """Return the rig with nominal values from the records, so that its twin is more accurate."""
     plain = tuple(map(Used, baseline_of(train_data.rig)))
     parameters = parameter_values(train_data.rig, plain, dict(train_data.beta))
     before = train_data.rig.nominal
     likely = {
         name: value
         for name, value in parameters.items()
-        # A parameter that the records hardly move may come out as anything.
+        # A parameter that the records hardly determine may have any estimate.
         if name in before
         and 1 / EXPERIMENT.parameter_ratio < value / before[name] < EXPERIMENT.parameter_ratio
     }
@@ -127,14 +127,14 @@ def _questions(
 
 
 def explanation(hypothesis: Hypothesis) -> Explanation:
-    """Return a fitted set as a hypothesis."""
+    """Return a fitted set as an explanation."""
     return Explanation(hypothesis.effects, hypothesis.fit.beta)
 
 
 def tied_sets(
     hypotheses: HypothesisSet, winner: Hypothesis, effects: Sequence[JudgedEffect]
 ) -> list[Hypothesis]:
-    """Return the sets that the gates could not separate from the winner: one effect exchanged."""
+    """Return the sets with a tied rival in place of one effect of the winner."""
     out = []
     for effect in effects:
         tied = {(r.name, r.where) for r in effect.rivals if r.tied}
@@ -156,7 +156,7 @@ def _key(term: Any) -> tuple[str, str]:
 
 
 def _undecided_questions(hypotheses: HypothesisSet) -> list[OpenQuestion]:
-    """Return the best set against the others that leave about as little, and against none."""
+    """Return questions between the best set and others that leave about as little."""
     allowed = [
         o for o in hypotheses.fitted.values() if o.effects and not hypotheses.physical_problem(o)
     ]
@@ -165,7 +165,7 @@ def _undecided_questions(hypotheses: HypothesisSet) -> list[OpenQuestion]:
         return []
     best = allowed[0]
     limit = max(EXPERIMENT.near_energy * best.total, best.total + 0.1 * hypotheses.noise_band.total)
-    # A set that only adds to the best is not another explanation.
+    # A set that only adds effects to the best one is no other explanation.
     near = [o for o in allowed[1:] if o.total <= limit and not best.keys <= o.keys]
     near = near[: EXPERIMENT.rivals]
     return [OpenQuestion(explanation(best), explanation(o)) for o in near]
@@ -184,7 +184,7 @@ def _best_steps(
     views: Sequence[MeasurementView],
     old: ComparisonRows,
 ) -> tuple[list[ex.CandidateExcitation], list[PredictedAnswer]] | None:
-    """Return the steps that answer most, and what they promise; None if they promise nothing."""
+    """Return the steps that answer most questions, and their answers; None if there is none."""
     if not asked:
         return None
     table: list[list[PredictedAnswer]] = []
@@ -230,7 +230,7 @@ def _covering_experiment(
     tried: Sequence[ex.CandidateExcitation],
     views: Sequence[MeasurementView],
 ) -> Mapping[str, Any] | None:
-    """Return the experiment that shows what is unexplained where no record has been yet."""
+    """Return an experiment beyond the range or the lines of the records, None if none is."""
     candidates = wider_range(train_data, moves, views, EXPERIMENT.least_gain) or more_lines(
         train_data, moves, tried
     )
@@ -283,7 +283,7 @@ def _proposal(
 
 
 def _names(answers: Sequence[PredictedAnswer]) -> list[dict[str, str]]:
-    """Return names and places of all effects in question, each once."""
+    """Return names and places of all effects in the questions, each once."""
     keys = [k for a in answers for h in (a.question.one, a.question.other) for k in h.keys]
     names = dict.fromkeys((k["name"], k["where"]) for k in keys)
     return [{"name": name, "where": where} for name, where in names]
@@ -304,7 +304,7 @@ def _protocols(
 def _experiment_in_words(
     winner: Hypothesis, asked: Sequence[PredictedAnswer]
 ) -> Mapping[str, Any] | None:
-    """Say what separates tied effects where no twin can try it: the rig has no nominal values."""
+    """Describe an experiment in words, for rigs without nominal values and so without a twin."""
     texts = [getattr(known()[u.term.name], "separated_by", "") for u in winner.effects]
     return {
         "kind": TELL,

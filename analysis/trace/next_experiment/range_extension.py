@@ -1,4 +1,4 @@
-"""Where no explanation stands: excitations that go beyond the records, by reach or by lines."""
+"""Excitations that go beyond the records where no effect explains: by range or by lines."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from analysis.trace.result import Dependence
 from analysis.trace.settings import EXPERIMENT
 
 LINES: Final = "lines"
-TIME: Final = "time"  # goes on by itself
+TIME: Final = "time"  # no excitation extends it
 
 
 @dataclass(frozen=True)
 class RangeExtension:
-    """An excitation (its index) that carries a variable so many `times` as far as the records."""
+    """An excitation, by its index, with `times` the records' range of a variable."""
 
     index: int
     variable: str
@@ -36,9 +36,10 @@ def wider_range(
     views: Sequence[MeasurementView],
     least: float,
 ) -> RangeExtension | None:
-    """Return what carries a clue's variable farthest, for the first clue that can be carried so.
+    """Return the excitation with the widest range of a clue's variable, None if none is wider.
 
-    `least` times as far as the records, at least.
+    The first clue in `moves` is used for which an excitation reaches `least` times the range of the
+    records.
     """
     for clue in moves:
         joint = int(clue.equation.rsplit("_", 1)[1]) - 1
@@ -71,7 +72,7 @@ def _range_ratio(
     low: float,
     high: float,
 ) -> float:
-    """Return a variable's range over the records' and a candidate's, over the records' alone."""
+    """Return a variable's range in records and candidate together over that in the records."""
     if joint + 1 in view.conditioned.record.locked:
         return 0.0
     least, most = np.percentile(variables(train_data.rig, view.seen, joint)[name], [1, 99])
@@ -81,9 +82,9 @@ def _range_ratio(
 def more_lines(
     train_data: RegressionData, moves: Sequence[Dependence], tried: Sequence[CandidateExcitation]
 ) -> RangeExtension | None:
-    """Return the excitation of most lines where the records of the clue's joint hold few.
+    """Return the excitation with most lines where the records of the clue's joint have few.
 
-    One sine shows one path through every nonlinearity: many forms pass through it alike.
+    A single sine gives one path through a nonlinearity, which many forms fit equally well.
     """
     equation = moves[0].equation
     joint = int(equation.rsplit("_", 1)[1]) - 1

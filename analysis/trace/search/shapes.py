@@ -1,4 +1,4 @@
-"""Shapes of effects that somebody names: found on the records, where none are given."""
+"""Shapes of effects that the user names without shapes: fitted to the records."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from rig.model.rig import Rig
 
 
 def with_shapes(runs: Sequence[Run], terms: Sequence[Used]) -> tuple[Used, ...]:
-    """Return the terms of a model with the shapes that leave least in the runs' rows.
+    """Return the terms of a model with open shapes fitted to the runs' rows.
 
-    By variable projection, one effect after the other joining, each from the points of its grid
-    that leave least; shapes that are given stay. Raises InputError for unusable records.
+    By variable projection: effects are added one after another, each from the points of its shape
+    grid that leave least. Given shapes are kept. Raises InputError for unusable records.
     """
     rig = ck.common_rig(runs)
     wanted = [u for u in terms if open_shapes(rig, u)]
@@ -37,8 +37,8 @@ def with_shapes(runs: Sequence[Run], terms: Sequence[Used]) -> tuple[Used, ...]:
         assert isinstance(used.term, Effect)
         looks = shape_grid(used.term, rig, seen)
         trials = [(*data.terms, *refined, Used(used.term, p)) for p in looks]
-        # The least before the search need not be it afterwards: edges that no spool reaches leave
-        # little, and nothing to search along.
+        # Several starts, since the best point may be one from which no search leads on: a metering
+        # edge that no spool reaches has no derivative.
         near = sorted(trials, key=lambda trial: fit_coefficients(data, trial).energy)[
             : SEARCH.shape_starts
         ]
