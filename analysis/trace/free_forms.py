@@ -36,18 +36,18 @@ def explained_by_free_form(
     """
     if not free:
         return None
-    wide = hypotheses.with_candidates(free)
-    named = {kind.name for kind in wide.effects if not kind.free}
-    for hypothesis in _simplest_first(_sets_with_free_form(wide, winner, fewer)):
+    extended = hypotheses.with_candidates(free)
+    named = {kind.name for kind in extended.effects if not kind.free}
+    for hypothesis in _simplest_first(_sets_with_free_form(extended, winner, fewer)):
         compared = rows_within_curves(holdout_data, hypothesis.fit)
-        effects = gates.judge_effects(wide, hypothesis, compared, rng)
-        left = remainders(wide, hypothesis, compared)
+        effects = gates.judge_effects(extended, hypothesis, compared, rng)
+        left = remainders(extended, hypothesis, compared)
         failed = [(f.name, g.name, g.detail) for f in effects for g in f.gates if not g.ok]
         log.info("free form %s: %s %s", sorted(hypothesis.keys), [r.words for r in left], failed)
         passed = all(map(gates.passes_gates, effects)) and not any(r.veto for r in left)
         if passed and not _ties_with_name(effects, named):
             verdict = CONFOUNDED if has_tied_rival(effects) else EXPLAINED
-            return Judgement(wide, effects, hypothesis, verdict, tuple(left))
+            return Judgement(extended, effects, hypothesis, verdict, tuple(left))
     return None
 
 

@@ -50,26 +50,29 @@ def remainders(
     out = [
         Remainder(*r, True) for r in gates.equations_above_band(hypotheses, winner, holdout_data)
     ]
-    seen = _visible_shares(hypotheses, winner) if winner.effects else {}
+    visible = _visible_shares(hypotheses, winner) if winner.effects else {}
     known = {r.equation for r in out}
-    asked = [equation for equation in seen if equation not in known]
+    asked = [equation for equation in visible if equation not in known]
     if not asked:
         return [*out, *_tolerated_remainders(hypotheses, winner, out)]
-    now, later = rebased(hypotheses.train_data, winner.fit), rebased(holdout_data, winner.fit)
-    held = held_out.held_out_residual(holdout_data, winner.fit)
+    train_rows, holdout_rows = (
+        rebased(hypotheses.train_data, winner.fit),
+        rebased(holdout_data, winner.fit),
+    )
+    held_residual = held_out.held_out_residual(holdout_data, winner.fit)
     for equation in asked:
-        expression = formula(now, winner.fit.residual, later, held, equation)
+        expression = formula(train_rows, winner.fit.residual, holdout_rows, held_residual, equation)
         # A constant is no law of another cause: a form that is slightly off leaves one.
         if (
             expression is not None
             and expression.share >= TRACE.formula_share
             and expression.variables
         ):
-            share = plain(100 * seen[equation], 2)
+            share = plain(100 * visible[equation], 2)
             words = f"{share} % of the repeatable energy remains, and a formula fits it"
             loud = winner.excess_energy[equation] > hypotheses.noise_band.by_equation[equation]
-            veto = loud and seen[equation] < TRACE.unexplained_share
-            tail = "" if veto else _tolerance_words(seen[equation])
+            veto = loud and visible[equation] < TRACE.unexplained_share
+            tail = "" if veto else _tolerance_words(visible[equation])
             out.append(Remainder(equation, f"{words}: {expression.text}{tail}", veto))
     return [*out, *_tolerated_remainders(hypotheses, winner, out)]
 
@@ -92,7 +95,9 @@ def _tolerance_words(share: float) -> str:
     """Say why a remaining share of the energy does not speak against the named effects."""
     if share < TRACE.unexplained_share:
         return "; within the tolerance for the form of the named effect"
-    return "; nothing that is named acts there, and it is too near the noise to name more by"
+    return (
+        "; no named effect acts there, and the residual is too close to the noise to name another"
+    )
 
 
 def _visible_shares(hypotheses: HypothesisSet, winner: Hypothesis) -> dict[str, float]:
@@ -101,7 +106,7 @@ def _visible_shares(hypotheses: HypothesisSet, winner: Hypothesis) -> dict[str, 
     These keep more than `TRACE.formula_least_share`, and more energy than
     `TRACE.formula_deviations` standard deviations of the noise's own.
     """
-    rows = hypotheses.train_data.row_counts
+    counts = hypotheses.train_data.row_counts
     shares = {
         e: v / max(hypotheses.empty.excess_energy[e], 1e-30)
         for e, v in winner.excess_energy.items()
@@ -110,7 +115,7 @@ def _visible_shares(hypotheses: HypothesisSet, winner: Hypothesis) -> dict[str, 
         e: share
         for e, share in shares.items()
         if share > TRACE.formula_least_share
-        and winner.excess_energy[e] > TRACE.formula_deviations * np.sqrt(2 * rows[e])
+        and winner.excess_energy[e] > TRACE.formula_deviations * np.sqrt(2 * counts[e])
     }
 
 
@@ -124,14 +129,17 @@ def clues_to(
 
     `split` are the spectral lines of the training residual.
     """
-    residual, held = winner.fit.residual, held_out.held_out_residual(holdout_data, winner.fit)
-    now, later = rebased(train_data, winner.fit), rebased(holdout_data, winner.fit)
+    residual, held_residual = (
+        winner.fit.residual,
+        held_out.held_out_residual(holdout_data, winner.fit),
+    )
+    train_rows, holdout_rows = rebased(train_data, winner.fit), rebased(holdout_data, winner.fit)
     loud = [e for e, v in sorted(winner.excess_energy.items(), key=lambda kv: -kv[1]) if v > 0]
     total = sum(winner.excess_energy[e] for e in loud)
     loud = [e for e in loud if winner.excess_energy[e] > TRACE.clue_share * total]
-    moves = dependence.dependences(now, residual, later, held, loud)
-    hum = frequency_clue(split, train_data, residual, holdout_data, held)
-    candidates = [formula(now, residual, later, held, e) for e in loud]
+    moves = dependence.dependences(train_rows, residual, holdout_rows, held_residual, loud)
+    hum = frequency_clue(split, train_data, residual, holdout_data, held_residual)
+    candidates = [formula(train_rows, residual, holdout_rows, held_residual, e) for e in loud]
     formulas = tuple(expression for expression in candidates if expression is not None)
     first = _formula_clue(formulas) if hum is None else [hum]
     there = {d.variable for d in first}

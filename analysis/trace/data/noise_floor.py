@@ -103,8 +103,8 @@ def floors(
                 near = noise_by_neighbours(members[indices[0]], parts[0], residual[0])
                 if near is not None:
                     noise, source = max(near, DATA.least_noise * noise), NEIGHBOURS
-            rest = float(np.sqrt(max(0.0, total**2 - noise**2)))
-            out.append(Floor(group, equation, noise, rest, total, 1, source, sensors))
+            repeatable_rms = float(np.sqrt(max(0.0, total**2 - noise**2)))
+            out.append(Floor(group, equation, noise, repeatable_rms, total, 1, source, sensors))
     return out
 
 

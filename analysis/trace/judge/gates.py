@@ -76,14 +76,14 @@ def judge_effects(
     out = []
     for used in winner.effects:
         assert isinstance(used.term, Effect)
-        rest = _set_without(hypotheses, winner, used)
-        without = held_out_residual(holdout_data, rest.fit)
-        changes = _removed_energy(winner, rest)
-        near = _TieTest(holdout_data, changes, after, without)
-        rivals = _rivals(hypotheses, winner, used, rest, holdout_data, near)
+        alternative = _set_without(hypotheses, winner, used)
+        without = held_out_residual(holdout_data, alternative.fit)
+        changes = _removed_energy(winner, alternative)
+        tie_test = _TieTest(holdout_data, changes, after, without)
+        rivals = _rivals(hypotheses, winner, used, alternative, holdout_data, tie_test)
         removed = _removed_share(holdout_data, changes, without, after)
-        worse = _disturbed_equations(hypotheses, winner, rest)
-        p = inference.p_value(rest.fit.energy - winner.fit.energy, null)
+        disturbed = _disturbed_equations(hypotheses, winner, alternative)
+        p = inference.p_value(alternative.fit.energy - winner.fit.energy, null)
         errors = inference.effect_errors(train_data, winner.fit, used, values)
         differing = invariance(train_data, winner.fit, used, errors, _joint_index(used.term))
         unphysical = hypotheses.physical_problem(winner, used)
@@ -95,8 +95,8 @@ def judge_effects(
         gates = (
             Gate(
                 REMOVES,
-                removed >= TRACE.least_removed and not worse,
-                _removal_in_words(removed, worse),
+                removed >= TRACE.least_removed and not disturbed,
+                _removal_in_words(removed, disturbed),
             ),
             Gate(PHYSICAL, not unphysical, unphysical or "sign and size are possible"),
             Gate(INVARIANT, not differing, _differences_in_words(differing)),
@@ -132,12 +132,12 @@ def _set_without(hypotheses: HypothesisSet, winner: Hypothesis, used: Used) -> H
     readings of one law are removed together, since `readings` decides whether both are needed.
     """
     kept = [u for u in winner.effects if u is not used and not of_one_law(u.term, used.term)]  # type: ignore[arg-type]
-    rest = hypotheses.refined(kept)
+    without = hypotheses.refined(kept)
     rig = hypotheses.train_data.rig
     # A shape at its bound is an error of the form, not of physics.
-    at_bound = any(u.term.outside(rig, u.shape) for u in rest.effects)  # type: ignore[attr-defined]
-    if at_bound or not hypotheses.physical_problem(rest):
-        return rest
+    at_bound = any(u.term.outside(rig, u.shape) for u in without.effects)  # type: ignore[attr-defined]
+    if at_bound or not hypotheses.physical_problem(without):
+        return without
 
     def is_kept(other: Used) -> bool:
         """Return whether a kept effect, or one of its readings, is another set's effect."""
@@ -229,8 +229,8 @@ def _error_over_floor(holdout_data: RegressionData, residual: Array) -> dict[str
         floor[s.equation] = floor.get(s.equation, 0.0) + count * s.noise**2
         # The average has less noise than a record: the difference is added.
         part = residual[s.where]
-        excess = float(part @ part) + count * (1 - 1 / s.repeats)
-        energy[s.equation] = energy.get(s.equation, 0.0) + excess * s.noise**2
+        record_energy = float(part @ part) + count * (1 - 1 / s.repeats)
+        energy[s.equation] = energy.get(s.equation, 0.0) + record_energy * s.noise**2
     return {e: float(np.sqrt(energy[e] / floor[e])) for e in floor}
 
 
@@ -259,15 +259,17 @@ def _place(effect: Effect) -> str:
     return str(getattr(effect, "place", effect.where))
 
 
-def _removed_energy(winner: Hypothesis, rest: Hypothesis) -> dict[str, float]:
+def _removed_energy(winner: Hypothesis, alternative: Hypothesis) -> dict[str, float]:
     """Return the training energy that an effect removes, by equation in which it acts."""
-    change = {e: rest.excess_energy[e] - winner.excess_energy[e] for e in rest.excess_energy}
+    change = {
+        e: alternative.excess_energy[e] - winner.excess_energy[e] for e in alternative.excess_energy
+    }
     most = max(change.values())
     return {e: v for e, v in change.items() if v > SEARCH.acting_share * most}
 
 
 def _disturbed_equations(
-    hypotheses: HypothesisSet, winner: Hypothesis, rest: Hypothesis
+    hypotheses: HypothesisSet, winner: Hypothesis, alternative: Hypothesis
 ) -> list[str]:
     """Return the equations in which an effect leaves more energy than the baseline.
 
@@ -279,15 +281,15 @@ def _disturbed_equations(
         for e, now in winner.excess_energy.items()
         if now > before[e] + hypotheses.noise_band.by_equation[e]
         and now > TRACE.harm_ratio * before[e]
-        and now > rest.excess_energy[e]
+        and now > alternative.excess_energy[e]
     ]
 
 
-def _removal_in_words(removed: float, worse: Sequence[str]) -> str:
+def _removal_in_words(removed: float, disturbed: Sequence[str]) -> str:
     text = f"{100 * removed:.0f} % of the energy above noise"
-    if not worse:
+    if not disturbed:
         return text
-    return f"{text}, but the residual of {' '.join(worse)} is larger than under the baseline"
+    return f"{text}, but the residual of {' '.join(disturbed)} is larger than under the baseline"
 
 
 def _removed_share(
@@ -313,19 +315,22 @@ def _rivals(
     hypotheses: HypothesisSet,
     winner: Hypothesis,
     used: Used,
-    rest: Hypothesis,
+    alternative: Hypothesis,
     holdout_data: RegressionData,
-    judged: _TieTest,
+    held_out_test: _TieTest,
 ) -> list[Rival]:
     """Return the rivals of an effect: fitted sets with another effect in its place.
 
     Tied rivals come first, then by held-out rms. A simpler reading of the effect is no rival, since
     held-out records have shown that it is too simple.
     """
-    mine, key = used.term, (used.term.name, used.term.where)
+    judged_effect, key = used.term, (used.term.name, used.term.where)
     others, train_data = winner.keys - {key}, hypotheses.train_data
-    trained = _TieTest(
-        train_data, _removed_energy(winner, rest), winner.fit.residual, rest.fit.residual
+    training_test = _TieTest(
+        train_data,
+        _removed_energy(winner, alternative),
+        winner.fit.residual,
+        alternative.fit.residual,
     )
     out = []
     for hypothesis in hypotheses.fitted.values():
@@ -337,20 +342,22 @@ def _rivals(
         (other,) = fresh
         more = hypothesis.size[1] - winner.size[1]  # further free numbers, each with its price
         assert isinstance(other, Effect)
-        assert isinstance(mine, Effect)
+        assert isinstance(judged_effect, Effect)
         if (
             (more > 0 and hypothesis.total > winner.total - SEARCH.number_price * more)
-            or of_one_law(mine, other)
+            or of_one_law(judged_effect, other)
             or hypotheses.physical_problem(hypothesis, may_be_at_bounds=others)
-            or _disturbed_equations(hypotheses, hypothesis, rest)
+            or _disturbed_equations(hypotheses, hypothesis, alternative)
         ):
             continue
-        held = held_out_residual(holdout_data, hypothesis.fit)
-        if _is_refused_simpler_name(hypotheses, holdout_data, (mine, other), others, held):
+        rival_residual = held_out_residual(holdout_data, hypothesis.fit)
+        if _is_refused_simpler_name(
+            hypotheses, holdout_data, (judged_effect, other), others, rival_residual
+        ):
             continue
-        ratio = judged.ratio(held)
-        tied = judged.ties(held, TRACE.tie_ratio) and (
-            trained.ties(hypothesis.fit.residual, TRACE.tie_ratio_training)
+        ratio = held_out_test.ratio(rival_residual)
+        tied = held_out_test.ties(rival_residual, TRACE.tie_ratio) and (
+            training_test.ties(hypothesis.fit.residual, TRACE.tie_ratio_training)
             or ratio < TRACE.decisive_ratio
         )
         out.append(
@@ -358,7 +365,7 @@ def _rivals(
                 other.name,
                 _place(other),
                 ratio,
-                trained.ratio(hypothesis.fit.residual),
+                training_test.ratio(hypothesis.fit.residual),
                 tied,
                 other.where,
             )
@@ -369,7 +376,7 @@ def _rivals(
 
 def _is_refused_simpler_name(
     hypotheses: HypothesisSet, holdout_data: RegressionData, pair: tuple[Effect, Effect],
-    others: frozenset[Key], held: Array,
+    others: frozenset[Key], rival_residual: Array,
 ) -> bool:  # fmt: skip
     """Return whether a rival fits no better than a simpler reading of both, which is too simple.
 
@@ -379,7 +386,7 @@ def _is_refused_simpler_name(
     for name in set(other.includes) & set(mine.includes) if other.where == mine.where else ():
         simple = hypotheses.fitted.get(others | {(name, other.where)})
         if simple is not None:
-            more = loss_in_deviations(held_out_residual(holdout_data, simple.fit), held)
+            more = loss_in_deviations(held_out_residual(holdout_data, simple.fit), rival_residual)
             return more <= TRACE.standard_errors
     return False
 

@@ -40,11 +40,11 @@ def best_readings(
     while winner.effects:
         held = held_out_residual(holdout_data, winner.fit)
         richer = [o for o in _richer_sets(hypotheses, winner) if not hypotheses.physical_problem(o)]
-        kept = [o for o in richer if _needs_richer(hypotheses, winner, o, held, holdout_data)]
-        if not kept:
+        needed = [o for o in richer if _needs_richer(hypotheses, winner, o, held, holdout_data)]
+        if not needed:
             break
-        least = min(o.fit.energy for o in kept)
-        near = [o for o in kept if o.fit.energy <= least + SEARCH.number_price]
+        least = min(o.fit.energy for o in needed)
+        near = [o for o in needed if o.fit.energy <= least + SEARCH.number_price]
         best = min(near, key=lambda o: (o.size, o.fit.energy))
         log.info("richer reading: %s for %s", sorted(best.keys), sorted(winner.keys))
         winner = best

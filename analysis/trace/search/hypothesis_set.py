@@ -272,9 +272,9 @@ class HypothesisSet:
         """
         data = rebased(self.train_data, now.fit)
         taken = now.keys
-        looks = self._variants(data, now.fit.residual)
-        looks = [v for v in looks if v.key not in taken and (v.effect.free or not free)]
-        columns = variant_columns(data, looks)
+        tried = self._variants(data, now.fit.residual)
+        tried = [v for v in tried if v.key not in taken and (v.effect.free or not free)]
+        columns = variant_columns(data, tried)
         mask = np.ones(len(now.fit.residual))
         for s in data.segments:
             mask[s.where] = not equations or s.equation in equations
@@ -346,14 +346,14 @@ class HypothesisSet:
     def prune(self, hypothesis: Hypothesis) -> Hypothesis:
         """Return the set without effects that are not needed or remove too little."""
         while len(hypothesis.effects) > 1:
-            rest = [
+            smaller = [
                 self.refined(tuple(u for u in hypothesis.effects if u is not used))
                 for used in hypothesis.effects
             ]
-            rest = [o for o in rest if not self.physical_problem(o)]
+            smaller = [o for o in smaller if not self.physical_problem(o)]
             simpler = [
                 o
-                for o in rest
+                for o in smaller
                 if self.is_preferred(o, hypothesis) or self.removes_too_little(o, hypothesis)
             ]
             if not simpler:
