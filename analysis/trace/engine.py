@@ -254,7 +254,7 @@ def _judging_rows_above_band(
 
 
 def _evidence_notes(train_data: RegressionData, holdout_data: RegressionData) -> list[str]:
-    """State where the noise floor rests on little data, and which rows are left out."""
+    """State where the noise floor is from few data, and which rows are left out."""
     out = []
     sources = {f.source for f in train_data.floors}
     single = sorted({f.group[1] for f in train_data.floors if f.source == STATED})

@@ -91,7 +91,7 @@ def _question_separation(
     old: RegressionData, both: RegressionData, terms: tuple[Used, ...], index: int,
     first: Sequence[Mapping[str, Any]], other: Sequence[Mapping[str, Any]],
 ) -> float:  # fmt: skip
-    """Return one question's separation: the loudest equation's rms difference per new row."""
+    """Return one question's separation: the largest rms difference per new row of an equation."""
     gap = {}
     for train_data in (old, both):
         residual = [

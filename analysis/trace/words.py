@@ -107,7 +107,7 @@ def shot_in_words(effect: JudgedEffect) -> str:
     return f"by multiple shooting {values}; {judged}: {which}"
 
 
-def loudest(result: Trace) -> str:
+def equation_of_largest_reduction(result: Trace) -> str:
     """Return the equation whose error fell most, relative to its noise."""
     floor: Mapping[str, float] = result.noise_floor
     return max(result.before, key=lambda e: result.before[e] / max(floor.get(e, 1e-30), 1e-30))
@@ -116,7 +116,7 @@ def loudest(result: Trace) -> str:
 def _errors(result: Trace) -> str:
     if not result.before:
         return ""
-    e = loudest(result)
+    e = equation_of_largest_reduction(result)
     unit = unit_of_equation(result.model_before.rig, e)
     before, after, floor = (
         plain(error.get(e, float("nan")), 2)

@@ -47,7 +47,7 @@ from analysis.trace.data.spectral_lines import SpectralLines as Spectrum
 from analysis.trace.result import JudgedEffect, Rival, Trace
 from analysis.trace.search.refinement import ExactFit
 from analysis.trace.settings import TRACE
-from analysis.trace.words import loudest
+from analysis.trace.words import equation_of_largest_reduction
 from rig.model import channels as ch
 from rig.model.channels import kind_of
 from rig.model.records import Run
@@ -339,7 +339,7 @@ def equation_of(
     conditioned = next(iter(lines.values()))[0].conditioned
     own = [e for e in effect.abscissa(rig, conditioned.signals) if e in lines]
     if not own:
-        return loudest(result)
+        return equation_of_largest_reduction(result)
     return max(own, key=lambda e: result.before[e] / max(result.noise_floor[e], 1e-30))
 
 

@@ -61,7 +61,7 @@ class SignalCache:
         recording = _RecordingSignals(**vars(signals))
         value = make(recording)
         read = [(name, getattr(signals, name)) for name in vars(recording).get(READ, ())]
-        # The first entry belongs to the record's own signals, which most models use: it stays.
+        # The first entry belongs to the record's own signals, which most models use: it is kept.
         del stored[1 : len(stored) - DATA.cached_signal_sets + 2]
         stored.append((read, value))
         return value

@@ -216,7 +216,7 @@ def _shares(power: Array, noise: Array, excited: NDArray[np.bool_]) -> dict[str,
     return {kind: v / whole if whole > 0 else 0.0 for kind, v in sums.items()}
 
 
-def loudest(
+def largest_residual_lines(
     lines: Sequence[SpectralLines], least: float = 1.0, most: int = 3
 ) -> list[SpectralLines]:
     """Return at most `most` lines, one for each equation with a residual of `least` noises."""

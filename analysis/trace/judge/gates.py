@@ -21,7 +21,7 @@ from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge import inference
 from analysis.trace.judge.curves import curves_of
 from analysis.trace.judge.held_out import held_out_residual
-from analysis.trace.judge.invariance import invariance
+from analysis.trace.judge.invariance import Difference, invariance
 from analysis.trace.judge.readings import loss_in_deviations, of_one_law
 from analysis.trace.judge.scatter import form_shift
 from analysis.trace.result import Gate, JudgedEffect, Rival
@@ -442,12 +442,11 @@ def _parameters(
     }
 
 
-def _differences_in_words(differing: Sequence[tuple[str, str, float, float]]) -> str:
+def _differences_in_words(differing: Sequence[Difference]) -> str:
     if not differing:
         return "the same in every step, half, direction and speed"
     return "; ".join(
-        f"{name} = {with_interval(value, error)} in {label}"
-        for label, name, value, error in differing[:3]
+        f"{d.parameter} = {with_interval(d.value, d.error)} in {d.part}" for d in differing[:3]
     )
 
 

@@ -51,7 +51,7 @@ def held_out_residual(holdout_data: RegressionData, model: ExactFit) -> Array:
 
 
 def refitted_to_held_out(holdout_data: RegressionData, model: ExactFit) -> ExactFit:
-    """Return the model with coefficients fitted to held-out rows that these know much better.
+    """Return the model with coefficients fitted to held-out rows that determine them much better.
 
     They are the temperature part of 1/b (records at one temperature do not determine it, others
     then warm up), and every direction of the baseline's coefficients on which the held-out rows
@@ -67,7 +67,7 @@ def _refitted(rig: Rig, rows: DesignMatrix, model: ExactFit) -> ExactFit:
 
 
 def _with_better_known(rig: Rig, rows: DesignMatrix, model: ExactFit) -> ExactFit:
-    """Return the model with the directions of coefficients fitted to rows that know them better."""
+    """Return the model with directions of coefficients fitted to rows with more information."""
     of_effects = {
         c.parameter for u in model.terms if isinstance(u.term, Effect)
         for c in u.term.coefficients(rig)

@@ -7,6 +7,8 @@ catalogue's simpler form, and the form error of a larger effect together may cau
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,6 +21,18 @@ from analysis.trace.search.refinement import ExactFit, contribution, design_matr
 from analysis.trace.settings import SEARCH, TRACE
 
 Array = NDArray[np.float64]
+
+
+class Difference(NamedTuple):
+    """A part of the rows in which a parameter has another value than in all rows.
+
+    `value` is the value in the part, `error` its standard error, both in the parameter's unit.
+    """
+
+    part: str
+    parameter: str
+    value: float
+    error: float
 
 
 def row_subsets(train_data: RegressionData, joint: int | None) -> dict[str, Array]:
@@ -67,6 +81,23 @@ def _blockwise_deviation(own: Array, residual: Array, clusters: NDArray[np.int64
     return float(np.linalg.norm(np.bincount(index, weights=own * residual)))
 
 
+def _shift(
+    own: Array, residual: Array, base: Array, blocks: NDArray[np.int64] | None
+) -> tuple[float, float]:
+    """Return the change of a coefficient in a part of the rows, and its standard error.
+
+    `own` (m,) is its column orthogonal to the others, whose orthonormal basis is `base` (m, r).
+    With `blocks` (m,) the error is also computed from the `residual` (m,) as noise, by block.
+    """
+    size = float(own @ own)
+    shift = float(own @ residual) / size
+    error = 1.0 / np.sqrt(size)
+    if blocks is not None:
+        noise = residual - base @ (base.T @ residual) - own * shift
+        error = max(error, _blockwise_deviation(own, noise, blocks) / size)
+    return shift, float(error)
+
+
 def _energy_of_larger_effect(
     model: ExactFit, train_data: RegressionData, used: Used, mask: Array
 ) -> float:
@@ -99,8 +130,8 @@ def _column_off_others(columns: Array, k: int) -> Array:
 
 def invariance(
     train_data: RegressionData, model: ExactFit, used: Used, value: EffectErrors, joint: int | None
-) -> list[tuple[str, str, float, float]]:
-    """Return the parts in which a size differs: (part, parameter, value there, standard error)."""
+) -> list[Difference]:
+    """Return the parts of the rows in which a size of an effect differs from that of all rows."""
     names, J = jacobian(train_data, model, used)
     base = basis_of_others(train_data, model, names)
     if isinstance(used.term, Effect) and used.term.free:
@@ -146,11 +177,8 @@ def invariance(
                 or not np.isfinite(value.value[k])
             ):
                 continue
-            shift = float(own @ residual[mask]) / size
-            error = 1.0 / np.sqrt(size)
-            if clusters is not None:
-                rest_of = residual[mask] - B @ (B.T @ residual[mask]) - own * shift
-                error = max(error, _blockwise_deviation(own, rest_of, clusters[mask]) / size)
+            blocks = None if clusters is None else clusters[mask]
+            shift, error = _shift(own, residual[mask], B, blocks)
             spill = np.sqrt(
                 SEARCH.form_share * _energy_of_larger_effect(model, train_data, used, mask) / size
             )
@@ -163,14 +191,14 @@ def invariance(
             if abs(shift) > spill + TRACE.standard_errors * np.hypot(
                 error, TRACE.invariance_tolerance / TRACE.standard_errors * full
             ):
-                out.append((label, name, float(value.value[k]) + shift, error))
+                out.append(Difference(label, name, float(value.value[k]) + shift, error))
     return out
 
 
 def _whole_effect_differences(
     train_data: RegressionData, model: ExactFit, used: Used, base: Array,
     joint: int | None,
-) -> list[tuple[str, str, float, float]]:  # fmt: skip
+) -> list[Difference]:  # fmt: skip
     """Return the parts in which a whole effect differs, with its size there over that overall.
 
     Neighbouring values of a curve, and numbers that can replace each other, are uncertain one by
@@ -189,13 +217,10 @@ def _whole_effect_differences(
             whole[mask] @ whole[mask]
         ):
             continue
-        shift = float(own @ model.residual[mask]) / size
-        error = 1.0 / np.sqrt(size)
-        if clusters is not None:
-            rest = model.residual[mask] - B @ (B.T @ model.residual[mask]) - own * shift
-            error = max(error, _blockwise_deviation(own, rest, clusters[mask]) / size)
+        blocks = None if clusters is None else clusters[mask]
+        shift, error = _shift(own, model.residual[mask], B, blocks)
         if error <= TRACE.subset_error and abs(shift) > TRACE.standard_errors * np.hypot(
             error, TRACE.invariance_tolerance / TRACE.standard_errors
         ):
-            out.append((label, "the whole effect", 1.0 + shift, error))
+            out.append(Difference(label, "the whole effect", 1.0 + shift, error))
     return out
