@@ -60,7 +60,8 @@ def dependences(
     The evidence is the share of energy above noise that a curve removes, times the variable's
     weight (`_independence_weight`). Each variable is returned once.
 
-    `residual` (M,) and `judge_left` are residuals under the model of `train` (rebased to it).
+    `residual` (M,) and `holdout_residual` are the whitened residuals of the training and held-out
+    rows under the model of `train`.
     """
     weight = {
         e: max(0.0, v) for e, v in energy_above_noise(train, residual).items() if e in equations

@@ -47,7 +47,8 @@ def formula(
 ) -> Formula | None:
     """Return a formula for an equation's residual, None where none removes `CLUES.shown_share`.
 
-    `residual` (M,) and `judge_left` are residuals under the model of `train` (rebased to it).
+    `residual` (M,) and `holdout_residual` are the whitened residuals of the training and held-out
+    rows under the model of `train`.
     """
     first = equation_rows(train, residual, equation)
     second = equation_rows(holdout_data, holdout_residual, equation)

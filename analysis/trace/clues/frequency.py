@@ -33,7 +33,8 @@ def frequency_clue(
 ) -> Dependence | None:
     """Return the clue of the equation with the largest residual at one frequency, None if none.
 
-    `residual` (M,) and `judge_left` are whitened residuals of averaged records, as in `dependence`.
+    `residual` (M,) and `holdout_residual` are the whitened residuals of the averaged training and
+    held-out records.
     """
     for equation_lines in sorted(
         lines, key=lambda equation_lines: -equation_lines.above_noise_after
