@@ -54,12 +54,12 @@ class Round:
 
     @property
     def loudest(self) -> float:
-        """The largest repeatable residual of the baseline over its noise, over all records."""
+        """The largest ratio of the baseline's repeatable residual to its noise."""
         return max(f.ratio for f in self.result.floors)
 
     @property
     def residual(self) -> float:
-        """The largest held-out error over its noise floor, with what was found."""
+        """The largest ratio of a held-out error to its noise floor, with the effects found."""
         return self.result.worst(self.result.after)
 
 

@@ -84,7 +84,7 @@ class JointSetting:
 
 @dataclass(frozen=True)
 class CandidateExcitation:
-    """One candidate as played on the twin, with what makes a protocol of it."""
+    """One candidate excitation as simulated on the twin, with the data of its protocol step."""
 
     family: Family
     setting: JointSetting
@@ -93,12 +93,12 @@ class CandidateExcitation:
 
     @property
     def step(self) -> TwinStep:
-        """The step in device terms."""
+        """The step as the twin runs it."""
         return self.played.step
 
     @property
     def text(self) -> str:
-        """In plain words."""
+        """The excitation in words."""
         moved = " and ".join(str(j + 1) for j in self.tones)
         which = f"joint{'s' if len(self.tones) > 1 else ''} {moved} moved"
         stand = [
@@ -112,7 +112,7 @@ class CandidateExcitation:
 
 
 def joint_settings(rig: Rig, records: Sequence[ConditionedRecord]) -> list[JointSetting]:
-    """Return how the joints stood in each step of the records, and all of them free."""
+    """Return the joint settings of the steps of the records, and that of all joints free."""
     out: list[JointSetting] = []
     for conditioned in records:
         closed, held = {}, {}
@@ -132,7 +132,7 @@ def excitations(
     rig: Rig, records: Sequence[ConditionedRecord], rng: np.random.Generator,
     families: Sequence[Family] = FAMILIES,
 ) -> Iterator[CandidateExcitation]:  # fmt: skip
-    """Play every family in every setting on the twin; those it cannot follow are left out.
+    """Yield every family in every setting that the twin can follow within the limits.
 
     None for a rig without nominal values or with electric joints: there is no twin of it.
     """
@@ -209,7 +209,7 @@ def protocol(
     rig: Rig, chosen: Sequence[CandidateExcitation], name: str, scale: float = 1.0,
     rng: np.random.Generator | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Return the protocol file's mapping that runs these steps; `rng` draws other phases."""
+    """Return the mapping of a protocol file with these steps; with `rng` phases are drawn again."""
     return {
         "name": name,
         "description": "; ".join(candidate.text for candidate in chosen),
@@ -270,7 +270,10 @@ def _as_step(
 
 
 def _other_phases(tone: Tone, n: int, rng: np.random.Generator) -> Spectrum:
-    """Return the tone's amplitudes with other phases: of some draws the flattest, n samples."""
+    """Return a tone's spectrum with new phases, of several draws the one with the smallest peak.
+
+    `n` is the number of samples of a period.
+    """
     size, best, least = np.abs(tone.spectrum), tone.spectrum, np.inf
     for _ in range(EXPERIMENT.phase_draws):
         spectrum = size * np.exp(2j * np.pi * rng.random(len(size)))
