@@ -13,7 +13,7 @@ from analysis.report.identification.report import Provenance
 from analysis.report.page import page, write
 from analysis.report.plots import place_plot, trace_plots
 from analysis.trace.clues.frequency import FREQUENCY
-from analysis.trace.data.spectral_lines import loudest
+from analysis.trace.data.spectral_lines import largest_residual_lines
 from analysis.trace.result import CLEAN, CONFOUNDED, JudgedEffect, Trace
 from analysis.trace.settings import TRACE
 from analysis.trace.words import quantity, shot_in_words, unit_of_equation
@@ -147,7 +147,7 @@ def _spectra(rig: Rig, result: Trace) -> list[dict[str, Any]]:
                 lines, unit_of_equation(rig, lines.equation), f"l{k}", changed
             ),
         }
-        for k, lines in enumerate(loudest(result.lines))
+        for k, lines in enumerate(largest_residual_lines(result.lines))
     ]
 
 

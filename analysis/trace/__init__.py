@@ -1,1 +1,22 @@
-"""Trace: from what the model leaves to the effect that it lacks, or to an honest refusal."""
+"""Trace: names the physical effect that an identified model lacks, or says why it cannot.
+
+Order of work, with the module of each step (`engine.trace` calls them):
+ `data`: conditioned records, noise floor, whitened rows, candidates and their columns
+ `search`: linear search for a set of effects, exact fits of the best sets
+ `judge`: readings of one law, gates, errors on held-out records, intervals
+ `free_forms`: mechanisms without a named form, where no name explains
+ `remaining`, `clues`: equations that keep too much, and what their residual depends on
+ `finding`: all of these on given rows, with the verdict (`Judgement`, `Finding`)
+ `next_experiment`: the experiment that answers the open question, detection limits
+ `result`, `words`: the result as data, JSON and text
+
+Terms:
+ row: one instant of one equation (`torque_1`, `flow_cap_1`, `flow_rod_1`); M rows in all
+ group: the repeats of one step of one run; a segment holds one equation's rows of one group
+ energy above noise: sum of squared whitened residuals minus what noise alone gives
+ effect: an entry of the catalogue at one place; a variant is an effect at given shapes
+ hypothesis: a fitted set of effects; the winner is the one that the search prefers
+ mechanism, reading: the law behind several names; one of these names
+ form error: what the catalogue's formula of an effect misses of the real effect
+ choosing rows, judging rows: held-out rows that select effects; rows read once at the end
+"""

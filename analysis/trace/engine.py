@@ -1,4 +1,4 @@
-"""The trace: residual -> effect -> model with the effect -> error before and after."""
+"""The trace: from a residual to the effect that the model lacks, and the error with it."""
 
 from __future__ import annotations
 
@@ -25,26 +25,26 @@ from analysis.terms.base import FAMILIES, Used
 from analysis.trace.data.candidates import catalogue, free_mechanisms
 from analysis.trace.data.noise_floor import NEIGHBOURS, PERIODS, REPEATS, STATED
 from analysis.trace.data.regression_data import RegressionData, signals_of
-from analysis.trace.data.spectral_lines import lines
-from analysis.trace.data.temperature_nuisance import stripped, temperature_terms
-from analysis.trace.data.unrepeated import unrepeated
+from analysis.trace.data.spectral_lines import spectral_lines
+from analysis.trace.data.temperature_nuisance import at_nominal_temperature, temperature_terms
+from analysis.trace.data.unrepeated import unrepeated_notes
 from analysis.trace.finding import (
     Finding,
     TraceRows,
     TraceRuns,
-    at_rest,
-    dry,
     fitted_in_motion,
-    found_on,
+    joints_with_friction,
+    rest_phase_notes,
+    search_and_judge,
+    searched_in_motion,
     trace_rows,
-    without_rests,
-    without_tied,
+    without_unnamed_effects,
 )
 from analysis.trace.judge import gates, held_out
-from analysis.trace.judge.curves import beyond_in_words, within_curves
-from analysis.trace.judge.scatter import widened
-from analysis.trace.judge.shooting import reshaped, with_shots
-from analysis.trace.next_experiment.detection_limits import detection_limits, in_words
+from analysis.trace.judge.curves import beyond_curve_notes, rows_within_curves
+from analysis.trace.judge.scatter import with_form_errors
+from analysis.trace.judge.shooting import shoot_hidden_states, with_shots
+from analysis.trace.next_experiment.detection_limits import detection_limit_notes, detection_limits
 from analysis.trace.next_experiment.proposal import propose
 from analysis.trace.remaining import clues_to
 from analysis.trace.result import (
@@ -67,9 +67,10 @@ from rig.model.units import plain
 
 Array = NDArray[np.float64]
 
-# Others replace the columns where noise in them matters: the trace compares least squares alone.
+# Other estimators replace columns where noise in them matters; the trace compares residuals of
+# least squares only, before and after alike.
 ESTIMATOR = "ls"
-# Shares of a trace's time behind it, as measured on six records: reported as progress.
+# Share of the work done after each stage, as measured on six records: reported as progress.
 PREPARED, COLUMNS, JUDGED = 0.1, 0.55, 0.8
 
 
@@ -87,18 +88,22 @@ def trace(
 ) -> Trace:
     """Say what the baseline lacks on `runs`, name it or refuse to, and judge it by other records.
 
-    Records of `holdout` choose between effects and forms. Those of `judge` are read once, when all
-    is settled: they give the errors, and may refuse an explanation. Without them a third of the
-    held-out rows is set aside for that (`data.set_aside`).
+    All parameters are fitted to `runs`. Records of `holdout` choose between effects and forms.
+    Those of `judge` are read once, after everything is chosen: they give the errors, and may turn
+    the verdict into `unexplained`. Without them a third of the held-out rows is set aside for that
+    (`data.set_aside`).
 
-    `effects` are the candidates, by default the whole catalogue at every place. `seed` draws the
-    sign flips; `families` are the equations looked at, mechanical or fluid (they share no
-    parameter, so that what stays unexplained in one need not hide the other); `look_ahead` designs
-    the next experiment; `terms` take the baseline's place: a model's with its effects,
-    whose shapes stay as they are; with `free_forms` a mechanism whose curve the data draw may
-    explain what no named effect does; `progress` receives the share of the work done. Raises
-    InputError for records of different rigs, without held-out records, with held-out or judging
-    ones that have been seen before, or too short to judge by.
+    `effects`: the candidates, by default the whole catalogue at every place.
+    `seed`: of the sign flips.
+    `families`: the families of equations to trace, torque or flow. They share no parameter, so that
+    a remainder in one does not hide an effect in the other.
+    `look_ahead`: design the next experiment.
+    `terms`: a model's terms in place of the baseline's; shapes of its effects are not searched.
+    `free_forms`: try mechanisms whose curve the data give where no named effect explains.
+    `progress`: is called with the share of the work done.
+
+    Raises InputError for records of different rigs, for no held-out records, for held-out or
+    judging records that are equal to others, and for records that are too short.
     """
     started = time.perf_counter()
     rig = ck.common_rig([*runs, *holdout, *judge])
@@ -108,60 +113,70 @@ def trace(
     records = TraceRuns(tuple(runs), tuple(holdout), tuple(judge), tuple(families))
     rows = trace_rows(rig, terms, records)
     moving = len({s.equation.rsplit("_", 1)[1] for s in rows.train.segments})
-    candidates = _unknown(catalogue(rig) if effects is None else effects, known, moving)
-    free = _unknown(free_mechanisms(rig), known) if free_forms else []
-    done = progress or _nobody
+    candidates = _not_in_model(catalogue(rig) if effects is None else effects, known, moving)
+    free = _not_in_model(free_mechanisms(rig), known) if free_forms else []
+    done = progress or _no_progress
 
     def columns(share: float) -> None:
         done(PREPARED + (COLUMNS - PREPARED) * share)
 
     baseline = _identified(runs, rows.train.terms)
     before = baseline.model
-    notes = [*rows.unseen.notes, *_notes(rows.train, rows.unseen.choosing)]
-    notes += [*unrepeated(rows.train), *_undetermined(before)]
+    notes = [*rows.unseen.notes, *_evidence_notes(rows.train, rows.unseen.choosing)]
+    notes += [*unrepeated_notes(rows.train), *_undetermined_notes(before)]
     notes += [check.detail for check in baseline.checks if check.name == GEOMETRY]
-    finding = found_on(rows, candidates, free, seed, columns)
-    finding = without_tied(without_rests(rig, terms, records, candidates, free, seed, finding))
+    finding = search_and_judge(rows, candidates, free, seed, columns)
+    finding = without_unnamed_effects(
+        searched_in_motion(rig, terms, records, candidates, free, seed, finding)
+    )
     verdict, winner = finding.verdict, finding.winner
     judged_effects, refused = finding.named, finding.refused
     notes += finding.notes
     done(JUDGED)
     train_data, choosing = finding.rows.train, finding.rows.unseen.choosing
-    split = lines(train_data, winner.fit.residual)
+    split = spectral_lines(train_data, winner.fit.residual)
     moves, formulas = (
         ((), ()) if verdict in (CLEAN, EXPLAINED) else clues_to(train_data, choosing, winner, split)
     )
     hypotheses = finding.hypotheses
     further = propose(hypotheses, winner, judged_effects, verdict, moves) if look_ahead else None
-    after, unknown = _extended(runs, winner, before, finding.rows)
-    again = reshaped(runs, rows.unseen.choosing_runs, after, train_data, choosing, winner)
-    if again.winner is not winner:
-        winner = again.winner
-        after, unknown = _extended(runs, winner, before, finding.rows)
-        split = lines(train_data, winner.fit.residual)
-    judged_effects = tuple(
-        with_shots(_with_tolerances(f, unknown), again.shots) for f in judged_effects
+    after, from_tolerances = _identified_with_effects(runs, winner, before, finding.rows)
+    shooting = shoot_hidden_states(
+        runs, rows.unseen.choosing_runs, after, train_data, choosing, winner
     )
-    # All is settled: from here on the judging rows are read, and nothing is chosen.
+    if shooting.winner is not winner:
+        winner = shooting.winner
+        after, from_tolerances = _identified_with_effects(runs, winner, before, finding.rows)
+        split = spectral_lines(train_data, winner.fit.residual)
+    judged_effects = tuple(
+        with_shots(_with_tolerances(f, from_tolerances), shooting.shots) for f in judged_effects
+    )
+    # Everything is chosen. From here on the judging rows are read, and nothing is chosen by them.
     unseen = finding.rows.unseen
     first, last = (
-        held_out.settled(unseen.judging, hypotheses.empty.fit),
-        held_out.settled(unseen.judging, winner.fit),
+        held_out.refitted_to_held_out(unseen.judging, hypotheses.empty.fit),
+        held_out.refitted_to_held_out(unseen.judging, winner.fit),
     )
     error = held_out.errors(rig, unseen.members, first, last, unseen.divided)
-    verdict, kept = _judged(rig, terms, records, finding, winner)
+    verdict, kept = _final_verdict(rig, terms, records, finding, winner)
     hidden = (
         detection_limits(train_data, candidates, winner, after) if verdict != UNEXPLAINED else []
     )
-    notes += [*_better_known(winner.fit, last, after), *_weighed_with_a_curve(winner, after)]
-    notes += _remarks(train_data, winner)
-    notes += _undetermined(after, [n for n, e in before.parameters.items() if not e.identified])
-    notes += [*kept, *_missed_held(verdict, error, [*notes, *kept]), *in_words(hidden)]
+    notes += [*_refitted_notes(winner.fit, last, after), *_undetermined_weight_notes(winner, after)]
+    notes += _record_condition_notes(train_data, winner)
+    notes += _undetermined_notes(
+        after, [n for n, e in before.parameters.items() if not e.identified]
+    )
+    notes += [
+        *kept,
+        *_tolerated_error_notes(verdict, error, [*notes, *kept]),
+        *detection_limit_notes(hidden),
+    ]
     runs_before, runs_after = held_out.free_runs([*holdout, *judge], before, after)
     result = Trace(
         verdict, judged_effects, error.noise, error.before, error.after,
         runs_before.fit, runs_after.fit, before, after,
-        _fraction(hypotheses, winner), moves, further, rows.train.floors,
+        _remaining_fraction(hypotheses, winner), moves, further, rows.train.floors,
         first, last, tuple(notes), refused=refused, size=error.size,
         rmse_before=runs_before.rmse, rmse_after=runs_after.rmse,
         window_before=runs_before.window_rmse, window_after=runs_after.window_rmse,
@@ -172,8 +187,8 @@ def trace(
     return replace(result, sentence=sentence(result))
 
 
-def _nobody(_: float) -> None:
-    """Hear nothing."""
+def _no_progress(_: float) -> None:
+    """Ignore progress."""
 
 
 def _refuse_same(runs: Sequence[Run], holdout: Sequence[Run], judge: Sequence[Run] = ()) -> None:
@@ -199,7 +214,7 @@ def _refuse_same(runs: Sequence[Run], holdout: Sequence[Run], judge: Sequence[Ru
 
 
 def _digest(record: Record) -> str:
-    """Return a digest of a record's samples; what it is called does not matter."""
+    """Return a digest of a record's samples, the same whatever its name."""
     digest = hashlib.sha256()
     for name in sorted(record.channels):
         digest.update(name.encode())
@@ -207,33 +222,39 @@ def _digest(record: Record) -> str:
     return digest.hexdigest()
 
 
-def _judged(
+def _final_verdict(
     rig: Rig, terms: tuple[Used, ...], records: TraceRuns, finding: Finding, winner: Hypothesis
 ) -> tuple[str, list[str]]:
-    """Return the verdict of the rows that judge, and in words what these keep or cannot show."""
+    """Return the verdict after the judging rows, and notes on what they keep or cannot show.
+
+    Where only torque balances with friction of the set keep too much, their rows are judged again
+    with weights by speed, 0 at rest.
+    """
     if finding.verdict == UNEXPLAINED:
         return UNEXPLAINED, []
-    kept, words = _kept(finding.rows.unseen.judging, finding.hypotheses.empty, winner)
-    joints = dry(winner, kept)
+    kept, words = _judging_rows_above_band(
+        finding.rows.unseen.judging, finding.hypotheses.empty, winner
+    )
+    joints = joints_with_friction(winner, kept)
     if joints and not finding.rows.in_motion:
         rows, hypotheses, moving = fitted_in_motion(rig, terms, records, winner, joints)
-        if not _kept(rows.unseen.judging, hypotheses.empty, moving)[0]:
-            kept, words = set(), at_rest(joints, "include")
+        if not _judging_rows_above_band(rows.unseen.judging, hypotheses.empty, moving)[0]:
+            kept, words = set(), rest_phase_notes(joints, "include")
     return (UNEXPLAINED if kept else finding.verdict), words
 
 
-def _kept(
+def _judging_rows_above_band(
     judge_data: RegressionData, before: Hypothesis, after: Hypothesis
 ) -> tuple[set[str], list[str]]:
-    """Return the equations of which judging rows keep too much, and it all in words."""
-    known = within_curves(judge_data, after.fit)
-    kept = gates.remaining_held_out(known, before.fit, after.fit)
+    """Return the equations whose judging rows keep more than the band, and notes on them."""
+    known = rows_within_curves(judge_data, after.fit)
+    kept = gates.held_out_above_band(known, before.fit, after.fit)
     words = [f"{e}: {figure} in the records that judge" for e, figure in kept]
-    return {e for e, _ in kept}, [*words, *beyond_in_words(judge_data, known)]
+    return {e for e, _ in kept}, [*words, *beyond_curve_notes(judge_data, known)]
 
 
-def _notes(train_data: RegressionData, holdout_data: RegressionData) -> list[str]:
-    """State where the evidence is weaker than it should be."""
+def _evidence_notes(train_data: RegressionData, holdout_data: RegressionData) -> list[str]:
+    """State where the noise floor is from few data, and which rows are left out."""
     out = []
     sources = {f.source for f in train_data.floors}
     single = sorted({f.group[1] for f in train_data.floors if f.source == STATED})
@@ -248,11 +269,15 @@ def _notes(train_data: RegressionData, holdout_data: RegressionData) -> list[str
         out.append(f"one repeat per step: the noise floor comes from {where} within the record")
     if all(f.source == STATED for f in holdout_data.floors):
         out.append("the held-out noise floor is the rig file's stated sensor noise")
-    return [*out, *_masked("training", train_data), *_masked("held-out", holdout_data)]
+    return [
+        *out,
+        *_masked_row_notes("training", train_data),
+        *_masked_row_notes("held-out", holdout_data),
+    ]
 
 
-def _masked(kind: str, data: RegressionData) -> list[str]:
-    """Name the equations of which many rows are left out."""
+def _masked_row_notes(kind: str, data: RegressionData) -> list[str]:
+    """Name the equations of which at least `TRACE.masked_share` of the rows is left out."""
     kept: dict[str, int] = {}
     missing: dict[str, int] = {}
     for s in data.segments:
@@ -269,8 +294,8 @@ def _masked(kind: str, data: RegressionData) -> list[str]:
     ]
 
 
-def _undetermined(model: Model, known: Collection[str] = ()) -> list[str]:
-    """Name the parameters, but those `known`, that the records do not show."""
+def _undetermined_notes(model: Model, known: Collection[str] = ()) -> list[str]:
+    """Name the parameters that the records do not determine, except those `known` already."""
     missing = [n for n, e in model.parameters.items() if not e.identified and n not in known]
     if not missing:
         return []
@@ -280,8 +305,8 @@ def _undetermined(model: Model, known: Collection[str] = ()) -> list[str]:
     ]
 
 
-def _remarks(train_data: RegressionData, winner: Hypothesis) -> list[str]:
-    """State sizes at the conditions of the records where their parameters are given at others."""
+def _record_condition_notes(train_data: RegressionData, winner: Hypothesis) -> list[str]:
+    """State sizes at the conditions of the records, for parameters given at other conditions."""
     terms = [(u.term, u.shape) for u in winner.effects if isinstance(u.term, Effect)]
     if not terms:
         return []
@@ -290,20 +315,20 @@ def _remarks(train_data: RegressionData, winner: Hypothesis) -> list[str]:
     return [f"{name}: {text}" for name, text in said if text]
 
 
-def _better_known(fit: ExactFit, judged: ExactFit, model: Model) -> list[str]:
-    """Name the parameters that the errors are given with as the judging records show them."""
-    names = [n for n in held_out.fitted_anew(fit, judged) if n in model.parameters]
+def _refitted_notes(fit: ExactFit, judged: ExactFit, model: Model) -> list[str]:
+    """Name the parameters whose values in the stated errors were fitted to the judging rows."""
+    names = [n for n in held_out.refitted_names(fit, judged) if n in model.parameters]
     if not names:
         return []
     return [
         f"the held-out records show {', '.join(names)} at least "
-        f"{plain(TRACE.better_known**0.5, 1)} times more exactly than the training records do: the "
-        "errors are given with their values; record training motions like the held-out ones"
+        f"{plain(TRACE.information_ratio**0.5, 1)} times more exactly than the training records "
+        "do: the errors are given with their values; record training motions like the held-out ones"
     ]
 
 
-def _weighed_with_a_curve(winner: Hypothesis, after: Model) -> list[str]:
-    """Name weights that a free force over position leaves undetermined in one pose."""
+def _undetermined_weight_notes(winner: Hypothesis, after: Model) -> list[str]:
+    """Name the weight parameters that a free force over position makes undetermined in one pose."""
     joints = [u.term.joint + 1 for u in winner.effects if isinstance(u.term, PositionForce)]
     return [
         f"W{joint} is no measured weight: in one pose of the other joints gravity is a force over "
@@ -313,8 +338,13 @@ def _weighed_with_a_curve(winner: Hypothesis, after: Model) -> list[str]:
     ]
 
 
-def _missed_held(verdict: str, error: held_out.Errors, failures: Sequence[str]) -> list[str]:
-    """State what an explanation leaves in held-out records where nothing has been said of it."""
+def _tolerated_error_notes(
+    verdict: str, error: held_out.Errors, failures: Sequence[str]
+) -> list[str]:
+    """State held-out errors of an explanation above `TRACE.noted_ratio` times the noise floor.
+
+    Equations that one of the notes `failures` begins with are left out.
+    """
     if verdict not in (EXPLAINED, CONFOUNDED):
         return []
     out = []
@@ -331,37 +361,46 @@ def _missed_held(verdict: str, error: held_out.Errors, failures: Sequence[str]) 
     return out
 
 
-def _fraction(hypotheses: HypothesisSet, winner: Hypothesis) -> float:
-    """Return the share of the training records' repeatable energy that is left."""
+def _remaining_fraction(hypotheses: HypothesisSet, winner: Hypothesis) -> float:
+    """Return the share of the training energy above noise under the baseline that remains."""
     start = hypotheses.empty.total
     return float(min(1.0, winner.total / start)) if start > 0 else 0.0
 
 
-def _unknown(candidates: Sequence[Effect], known: Sequence[Used], moving: int = 1) -> list[Effect]:
-    """Return the candidates that are not in the model, and are something where so many move."""
+def _not_in_model(
+    candidates: Sequence[Effect], known: Sequence[Used], moving: int = 1
+) -> list[Effect]:
+    """Return the candidates that the model lacks and that can act where `moving` joints move."""
     there = {(u.term.name, u.term.where) for u in known}
     fresh = [c for c in candidates if (c.name, c.where) not in there]
     return [c for c in fresh if c.least_joints <= moving]
 
 
-def _extended(
+def _identified_with_effects(
     runs: Sequence[Run], winner: Hypothesis, before: Model, rows: TraceRows
 ) -> tuple[Model, dict[str, float]]:
-    """Identify everything again together with the effects, their shapes' errors included.
+    """Return the model identified together with the effects of a set, and errors by tolerance.
 
-    Also returns the part of each standard error that the rig's tolerances make, by name.
+    Its intervals include the uncertainty of shapes and forms. The second value is the part of each
+    standard error that the tolerances of the rig's geometry make, by parameter name.
     """
     if not winner.effects:
         return before, {}
     train_data = rows.train
     found = _identified(runs, (*train_data.terms, *winner.effects), rows.in_motion)
-    return stripped(widened(train_data, winner.fit, found.model)), by_geometry(found)
+    return at_nominal_temperature(
+        with_form_errors(train_data, winner.fit, found.model)
+    ), by_geometry(found)
 
 
 def _identified(
     runs: Sequence[Run], terms: Sequence[Used], in_motion: tuple[int, ...] = ()
 ) -> Identification:
-    """Identify a model's parameters; what acts beside it is fitted by the estimator itself."""
+    """Return a model's identified parameters.
+
+    Temperature and spool path are left out of `terms`: the estimator fits them itself. Torque rows
+    of the joints `in_motion` (0-based) are weighted by speed.
+    """
     beside = (BulkTemperature, SpoolPath)
     own = ordered([u for u in terms if not isinstance(u.term, beside)])
 
@@ -371,10 +410,10 @@ def _identified(
     return identify(runs, terms=own, filtering=filtering, estimator=ESTIMATOR)
 
 
-def _with_tolerances(effect: JudgedEffect, unknown: Mapping[str, float]) -> JudgedEffect:
-    """Return an effect whose intervals include the rig's tolerances; its shapes' are as before."""
+def _with_tolerances(effect: JudgedEffect, from_tolerances: Mapping[str, float]) -> JudgedEffect:
+    """Return an effect whose intervals include errors `from_tolerances`, by parameter name."""
     parameters = {
-        name: wider(estimate, unknown[name]) if name in unknown else estimate
+        name: wider(estimate, from_tolerances[name]) if name in from_tolerances else estimate
         for name, estimate in effect.parameters.items()
     }
     return replace(effect, parameters=parameters)

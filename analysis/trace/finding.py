@@ -1,4 +1,4 @@
-"""What is found on given rows: the search, the gates, free forms, and rests of dry friction."""
+"""What is found on given rows: search, gates, free forms, friction judged in motion only."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ from analysis.trace.data.conditioned_record import (
     trace_filtering,
 )
 from analysis.trace.data.regression_data import RegressionData, regression_data
-from analysis.trace.data.set_aside import Unseen, set_aside
+from analysis.trace.data.set_aside import UnseenRows, set_aside
 from analysis.trace.data.spool_path import path_terms
-from analysis.trace.free_forms import drawn_by_data, mechanisms
+from analysis.trace.free_forms import explained_by_free_form, mechanism_count
 from analysis.trace.judge import gates, readings
-from analysis.trace.remaining import Rest, left_over
+from analysis.trace.judgement import Judgement, has_tied_rival
+from analysis.trace.remaining import Remainder, remainders
 from analysis.trace.result import (
     CLEAN,
     CONFOUNDED,
@@ -29,14 +30,14 @@ from analysis.trace.result import (
     UNEXPLAINED,
     JudgedEffect,
 )
-from analysis.trace.search.hypothesis import Hypothesis, within
+from analysis.trace.search.hypothesis import Hypothesis, within_band
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import TRACE
 from rig.model.parse import InputError
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
 
-ELSEWHERE = (
+ONLY_HELD_OUT_MISSED = (
     "the training records are met to within the noise, the held-out ones are not: train on "
     "records with as much excitation as the held-out ones"
 )
@@ -44,7 +45,7 @@ ELSEWHERE = (
 
 @dataclass(frozen=True)
 class TraceRuns:
-    """Runs by what they are for, and the families of rows that are looked at."""
+    """Runs by their task, and the families of equations that are traced."""
 
     train: tuple[Run, ...]
     holdout: tuple[Run, ...]
@@ -54,51 +55,60 @@ class TraceRuns:
 
 @dataclass(frozen=True)
 class TraceRows:
-    """Rows that are fitted, and rows that the fit does not see."""
+    """Rows that are fitted (`train`), and rows that no parameter is fitted to (`unseen`)."""
 
     train: RegressionData
-    unseen: Unseen
+    unseen: UnseenRows
 
     @property
     def in_motion(self) -> tuple[int, ...]:
-        """The joints (0-based) whose rests do not count."""
+        """The joints (0-based) whose torque rows are weighted by speed, by 0 at rest."""
         return self.train.records[0].filtering.in_motion
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What was found on some rows: every effect judged, the set that stands, its verdict."""
+    """The answer on some rows: judged effects, the set of those that passed, and the verdict."""
 
     rows: TraceRows
     hypotheses: HypothesisSet
     winner: Hypothesis
     verdict: str
     effects: tuple[JudgedEffect, ...] = ()
-    rest: tuple[Rest, ...] = ()
+    remainders: tuple[Remainder, ...] = ()
     notes: tuple[str, ...] = ()
 
     @property
     def named(self) -> tuple[JudgedEffect, ...]:
-        """The effects that stand."""
-        return tuple(f for f in self.effects if _listed(f, self.verdict))
+        """The effects that are named."""
+        return tuple(f for f in self.effects if _is_named(f, self.verdict))
 
     @property
     def refused(self) -> tuple[JudgedEffect, ...]:
         """The effects that fitted best and are not named."""
-        tied = [f for f in self.effects if gates.stands(f) and not _listed(f, self.verdict)]
-        return (*gates.refused(self.effects), *tied)
+        tied = [f for f in self.effects if gates.passes_gates(f) and not _is_named(f, self.verdict)]
+        return (*gates.refused_effects(self.effects), *tied)
+
+
+def _is_named(effect: JudgedEffect, verdict: str) -> bool:
+    """Return whether an effect is named: it passes the gates; if `unexplained`, without a tie."""
+    return gates.passes_gates(effect) and not (verdict == UNEXPLAINED and has_tied_rival((effect,)))
 
 
 def trace_rows(
     rig: Rig, terms: tuple[Used, ...], records: TraceRuns,
     filtering: Callable[[Record], Filtering] = trace_filtering,
 ) -> TraceRows:  # fmt: skip
-    """Lay out all rows under the filters of each record."""
+    """Return the whitened rows of all runs under a model of `terms`.
+
+    `filtering` gives the row filter of each record. Coefficients are fitted to the training rows.
+    Raises InputError where a step leaves fewer than `TRACE.least_rows` rows of an equation.
+    """
 
     def conditioned(runs: Sequence[Run]) -> list[ConditionedRecord]:
         return conditioned_records(rig, runs, filtering, records.families)
 
-    train_data = _laid_out(rig, terms, conditioned(records.train))
+    train_data = _training_rows(rig, terms, conditioned(records.train))
     terms, beta = train_data.terms, train_data.beta
     members = conditioned(records.holdout)
     data = regression_data(rig, terms, members, beta)
@@ -106,131 +116,13 @@ def trace_rows(
         return TraceRows(train_data, set_aside(data, members, records.holdout))
     members = conditioned(records.judge)
     judging = regression_data(rig, terms, members, beta)
-    return TraceRows(train_data, Unseen(data, judging, tuple(members), records.holdout))
+    return TraceRows(train_data, UnseenRows(data, judging, tuple(members), records.holdout))
 
 
-def found_on(
-    rows: TraceRows, candidates: Sequence[Effect], free: Sequence[Effect], seed: int,
-    done: Callable[[float], None],
-) -> Finding:  # fmt: skip
-    """Search on the rows and judge what is found; `done` receives the share of the columns."""
-    hypotheses, holdout_data = HypothesisSet(rows.train, candidates), rows.unseen.choosing
-    quiet = within(hypotheses.empty.excess_energy, hypotheses.limits)
-    if quiet and not gates.remaining(hypotheses, hypotheses.empty, holdout_data):
-        return Finding(rows, hypotheses, hypotheses.empty, CLEAN)
-    winner = hypotheses.run(done)
-    hypotheses, effects, winner, verdict, rest = _settled(
-        hypotheses, winner, free, holdout_data, np.random.default_rng(seed)
-    )
-    named = any(map(gates.stands, effects))
-    notes = _rest_notes(verdict, rest, quiet, named)
-    return Finding(rows, hypotheses, winner, verdict, effects, tuple(rest), tuple(notes))
-
-
-def without_tied(finding: Finding) -> Finding:
-    """Drop the effects that are not named from the set that stands."""
-    named = {(f.name, f.at) for f in finding.named}
-    hypotheses, winner = finding.hypotheses, finding.winner
-    kept = [u for u in winner.effects if (u.term.name, u.term.where) in named]
-    if len(kept) == len(winner.effects):
-        return finding
-    winner = hypotheses.exact(kept) if kept else hypotheses.empty
-    rest = left_over(hypotheses, winner, finding.rows.unseen.choosing) if kept else []
-    notes = _rest_notes(finding.verdict, rest, quiet=False, named=bool(kept))
-    return replace(finding, winner=winner, rest=tuple(rest), notes=tuple(notes))
-
-
-def _listed(effect: JudgedEffect, verdict: str) -> bool:
-    """Return whether an effect is named: it stands, and beside an unknown one without a rival."""
-    return gates.stands(effect) and not (verdict == UNEXPLAINED and _tied([effect]))
-
-
-def without_rests(
-    rig: Rig, terms: tuple[Used, ...], records: TraceRuns, candidates: Sequence[Effect],
-    free: Sequence[Effect], seed: int, finding: Finding,
-) -> Finding:  # fmt: skip
-    """Search friction again without the joints' rests where only torque balances keep much.
-
-    At rest dry friction is whatever holds the joint: what stays there speaks against no law of the
-    speed, and hides the law in motion. Candidates are friction in these balances, named ones before
-    `free` curves, beside what else stood. It must act in each of them that is looked at without
-    rests, and take most of what the rests leave too.
-    """
-    loud = {r.equation for r in finding.rest if r.veto}
-    friction = [e for e in (*candidates, *free) if e.family == "friction"]
-    joints = {e.joint for e in friction if equation("torque", e.joint) in loud}
-    if finding.verdict != UNEXPLAINED or {equation("torque", i) for i in joints} != loud:
-        return finding
-    others = [u.term for u in finding.winner.effects if isinstance(u.term, Effect)]
-    others = [e for e in others if e.family != "friction"]
-
-    def searched(joints: Collection[int]) -> Finding:
-        rows = trace_rows(rig, terms, records, moving_filtering(joints))
-        here = [*others, *(e for e in friction if e.joint in joints)]
-        return _searched(rows, here, seed, at_rest(joints, "leave out"))
-
-    found = searched(joints)
-    acts = dry(found.winner, loud)
-    if acts and acts != joints:  # a parameter of several balances took friction into others
-        found = searched(acts)
-    if found.verdict not in (EXPLAINED, CONFOUNDED) or dry(found.winner, loud) != acts or not acts:
-        return finding
-    every = finding.hypotheses.exact(found.winner.effects).total / finding.hypotheses.empty.total
-    if every > 1.0 - TRACE.least_removed:
-        return finding
-    fallen = tuple(f for f in finding.effects if not gates.stands(f))
-    return replace(found, effects=(*found.effects, *fallen))
-
-
-def _searched(
-    rows: TraceRows, candidates: Sequence[Effect], seed: int, notes: Sequence[str]
-) -> Finding:
-    """Search among a few candidates, free ones last; `notes` come first."""
-    hypotheses = HypothesisSet(rows.train, [e for e in candidates if not e.free])
-    hypotheses, effects, winner, verdict, rest = _settled(
-        hypotheses, hypotheses.run(), [e for e in candidates if e.free], rows.unseen.choosing,
-        np.random.default_rng(seed),
-    )  # fmt: skip
-    notes = (*notes, *_rest_notes(verdict, rest, quiet=False, named=True))
-    return Finding(rows, hypotheses, winner, verdict, effects, tuple(rest), notes)
-
-
-def dry(winner: Hypothesis, equations: Collection[str]) -> set[int]:
-    """Return the joints (0-based) with dry friction of the set in one of some torque balances."""
-    return {
-        used.term.joint
-        for used in winner.effects
-        if isinstance(used.term, Effect)
-        and used.term.family == "friction"
-        and equation("torque", used.term.joint) in equations
-    }
-
-
-def fitted_in_motion(
-    rig: Rig, terms: tuple[Used, ...], records: TraceRuns, winner: Hypothesis, joints: Iterable[int]
-) -> tuple[TraceRows, HypothesisSet, Hypothesis]:
-    """Return rows that do not count the rests of some joints, and the set's effects fitted."""
-    rows = trace_rows(rig, terms, records, moving_filtering(joints))
-    hypotheses = HypothesisSet(rows.train, [])
-    return rows, hypotheses, hypotheses.exact(winner.effects)
-
-
-def at_rest(joints: Iterable[int], errors: str) -> list[str]:
-    """Return a note for each joint (0-based) whose samples at rest were not counted.
-
-    `errors` is what the errors do with them: "include" or "leave out".
-    """
-    return [
-        f"{equation('torque', joint)}: judged without the samples at which the joint rests, where "
-        f"dry friction is whatever holds it; the errors {errors} them"
-        for joint in sorted(joints)
-    ]
-
-
-def _laid_out(
+def _training_rows(
     rig: Rig, terms: tuple[Used, ...], train: Sequence[ConditionedRecord]
 ) -> RegressionData:
-    """Lay out the training records, spools' paths between samples beside the terms."""
+    """Return the training rows, with the columns of the spools' paths between samples."""
     data = regression_data(rig, terms, train)
     _refuse_short(data)
     paths = path_terms(data)
@@ -255,109 +147,259 @@ def _refuse_short(train_data: RegressionData) -> None:
             )
 
 
-def _drawn(
-    hypotheses: HypothesisSet, free: Sequence[Effect], winner: Hypothesis, verdict: str,
-    holdout_data: RegressionData, rng: np.random.Generator,
-) -> tuple[HypothesisSet, tuple[JudgedEffect, ...], Hypothesis, list[Rest]] | None:  # fmt: skip
-    """Try free mechanisms where no name explains, or only several with more than noise left."""
-    fewer = verdict != UNEXPLAINED
-    if fewer and (mechanisms(winner) < 2 or within(winner.excess_energy, hypotheses.limits)):
-        return None
-    return drawn_by_data(hypotheses, free, winner, holdout_data, rng, fewer)
+def search_and_judge(
+    rows: TraceRows, candidates: Sequence[Effect], free: Sequence[Effect], seed: int,
+    done: Callable[[float], None],
+) -> Finding:  # fmt: skip
+    """Search the candidates for what the model lacks and judge it on the choosing rows.
+
+    `free` are mechanisms without a named form, tried where no named effect explains; `seed` draws
+    the sign flips; `done` receives the share of the candidates' columns that is computed.
+    """
+    hypotheses, choosing = HypothesisSet(rows.train, candidates), rows.unseen.choosing
+    quiet = within_band(hypotheses.empty.excess_energy, hypotheses.noise_band)
+    if quiet and not gates.equations_above_band(hypotheses, hypotheses.empty, choosing):
+        return Finding(rows, hypotheses, hypotheses.empty, CLEAN)
+    winner = hypotheses.run(done)
+    found = _judge_winner(hypotheses, winner, free, choosing, np.random.default_rng(seed))
+    named = any(map(gates.passes_gates, found.effects))
+    return _finding(rows, found, _remainder_notes(found.verdict, found.remainders, quiet, named))
 
 
-def _settled(
+def _finding(rows: TraceRows, found: Judgement, notes: Iterable[str]) -> Finding:
+    return Finding(
+        rows, found.hypotheses, found.winner, found.verdict, found.effects, found.remainders,
+        tuple(notes),
+    )  # fmt: skip
+
+
+def without_unnamed_effects(finding: Finding) -> Finding:
+    """Return a finding whose set (`winner`) holds only the effects that are named."""
+    named = {(f.name, f.at) for f in finding.named}
+    hypotheses, winner = finding.hypotheses, finding.winner
+    kept = [u for u in winner.effects if (u.term.name, u.term.where) in named]
+    if len(kept) == len(winner.effects):
+        return finding
+    winner = hypotheses.refined(kept) if kept else hypotheses.empty
+    left = remainders(hypotheses, winner, finding.rows.unseen.choosing) if kept else []
+    notes = _remainder_notes(finding.verdict, left, quiet=False, named=bool(kept))
+    return replace(finding, winner=winner, remainders=tuple(left), notes=tuple(notes))
+
+
+def searched_in_motion(
+    rig: Rig, terms: tuple[Used, ...], records: TraceRuns, candidates: Sequence[Effect],
+    free: Sequence[Effect], seed: int, finding: Finding,
+) -> Finding:  # fmt: skip
+    """Search friction again in rows weighted by speed, where only torque balances keep too much.
+
+    While a joint rests, dry friction is any force up to its breakaway: no law of the speed meets
+    these rows, and they hide the law in motion. Candidates are friction in the torque balances that
+    keep too much, named forms before `free` curves, beside the other effects of `finding`. The
+    result is used if friction acts in each joint whose rows are weighted, and the set removes most
+    of the energy of all rows, rests included; else `finding` is returned.
+    """
+    loud = {r.equation for r in finding.remainders if r.veto}
+    friction = [e for e in (*candidates, *free) if e.family == "friction"]
+    joints = {e.joint for e in friction if equation("torque", e.joint) in loud}
+    if finding.verdict != UNEXPLAINED or {equation("torque", i) for i in joints} != loud:
+        return finding
+    others = [u.term for u in finding.winner.effects if isinstance(u.term, Effect)]
+    others = [e for e in others if e.family != "friction"]
+
+    def searched(joints: Collection[int]) -> Finding:
+        rows = trace_rows(rig, terms, records, moving_filtering(joints))
+        tried = [*others, *(e for e in friction if e.joint in joints)]
+        return _search_few(rows, tried, seed, rest_phase_notes(joints, "leave out"))
+
+    found = searched(joints)
+    acting = joints_with_friction(found.winner, loud)
+    if acting and acting != joints:  # an effect of several balances had spread friction to others
+        found = searched(acting)
+    explains = found.verdict in (EXPLAINED, CONFOUNDED)
+    if not explains or not acting or joints_with_friction(found.winner, loud) != acting:
+        return finding
+    on_all_rows = finding.hypotheses.refined(found.winner.effects)
+    if on_all_rows.total / finding.hypotheses.empty.total > 1.0 - TRACE.least_removed:
+        return finding
+    failed = tuple(f for f in finding.effects if not gates.passes_gates(f))
+    return replace(found, effects=(*found.effects, *failed))
+
+
+def _search_few(
+    rows: TraceRows, candidates: Sequence[Effect], seed: int, notes: Sequence[str]
+) -> Finding:
+    """Search and judge a few candidates, free forms last; `notes` are put before those of it."""
+    hypotheses = HypothesisSet(rows.train, [e for e in candidates if not e.free])
+    free = [e for e in candidates if e.free]
+    rng = np.random.default_rng(seed)
+    found = _judge_winner(hypotheses, hypotheses.run(), free, rows.unseen.choosing, rng)
+    more = _remainder_notes(found.verdict, found.remainders, quiet=False, named=True)
+    return _finding(rows, found, (*notes, *more))
+
+
+def joints_with_friction(winner: Hypothesis, equations: Collection[str]) -> set[int]:
+    """Return the joints (0-based) in whose torque balance, one of `equations`, friction acts."""
+    return {
+        used.term.joint
+        for used in winner.effects
+        if isinstance(used.term, Effect)
+        and used.term.family == "friction"
+        and equation("torque", used.term.joint) in equations
+    }
+
+
+def fitted_in_motion(
+    rig: Rig, terms: tuple[Used, ...], records: TraceRuns, winner: Hypothesis, joints: Iterable[int]
+) -> tuple[TraceRows, HypothesisSet, Hypothesis]:
+    """Return rows that are weighted by the speed of `joints` (0-based), and the set fitted to them.
+
+    The middle element is the collection of sets that the fitted set belongs to.
+    """
+    rows = trace_rows(rig, terms, records, moving_filtering(joints))
+    hypotheses = HypothesisSet(rows.train, [])
+    return rows, hypotheses, hypotheses.refined(winner.effects)
+
+
+def rest_phase_notes(joints: Iterable[int], errors: str) -> list[str]:
+    """Return a note for each joint (0-based) whose samples at rest were not judged.
+
+    `errors` says whether the stated errors "include" or "leave out" these samples.
+    """
+    return [
+        f"{equation('torque', joint)}: judged without the samples at which the joint rests, where "
+        f"dry friction is whatever holds it; the errors {errors} them"
+        for joint in sorted(joints)
+    ]
+
+
+def _judge_winner(
     hypotheses: HypothesisSet, winner: Hypothesis, free: Sequence[Effect],
     holdout_data: RegressionData, rng: np.random.Generator,
-) -> tuple[HypothesisSet, tuple[JudgedEffect, ...], Hypothesis, str, list[Rest]]:  # fmt: skip
-    """Judge what the search has found, names first, then free forms.
+) -> Judgement:  # fmt: skip
+    """Judge the set that the search has found, and try free forms where it does not explain."""
+    winner = readings.best_readings(hypotheses, winner, holdout_data)
+    found = _apply_gates(hypotheses, winner, holdout_data, rng)
+    by_free_form = _try_free_forms(found, free, holdout_data, rng)
+    if by_free_form is not None:
+        return by_free_form
+    if found.verdict == UNEXPLAINED:
+        unphysical = _refused_as_unphysical(hypotheses, holdout_data, rng)
+        return replace(found, effects=(*found.effects, *unphysical))
+    return found
 
-    Returns the sets tried, what was judged, the set that stands, the verdict and what it leaves.
+
+def _try_free_forms(
+    found: Judgement, free: Sequence[Effect], holdout_data: RegressionData,
+    rng: np.random.Generator,
+) -> Judgement | None:  # fmt: skip
+    """Return an explanation by a free form, None where none is needed or none explains.
+
+    One is needed where named effects do not explain, or explain with several mechanisms and leave
+    more than noise.
     """
-    winner = readings.settled(hypotheses, winner, holdout_data)
-    effects, winner, verdict, rest = _named(hypotheses, winner, holdout_data, rng)
-    drawn = _drawn(hypotheses, free, winner, verdict, holdout_data, rng)
-    if drawn is not None:
-        hypotheses, effects, winner, rest = drawn
-        verdict = CONFOUNDED if _tied(effects) else EXPLAINED
-    elif verdict == UNEXPLAINED:
-        effects += _unphysical(hypotheses, holdout_data, rng)
-    return hypotheses, effects, winner, verdict, rest
+    hypotheses, winner = found.hypotheses, found.winner
+    explained = found.verdict != UNEXPLAINED
+    to_noise = within_band(winner.excess_energy, hypotheses.noise_band)
+    if explained and (mechanism_count(winner) < 2 or to_noise):
+        return None
+    return explained_by_free_form(hypotheses, free, winner, holdout_data, rng, explained)
 
 
-def _unphysical(
+def _refused_as_unphysical(
     hypotheses: HypothesisSet, holdout_data: RegressionData, rng: np.random.Generator
 ) -> tuple[JudgedEffect, ...]:
-    """Return what physics alone refuses of the simplest set that would leave next to nothing."""
-    near = [o for o in hypotheses.fitted.values() if hypotheses.formed(o) and o.effects]
-    near = [o for o in near if hypotheses.physical(o)]
+    """Return the refused effects of the simplest set that explains with an unphysical number.
+
+    Only the gates of what an effect removes and of physics are asked; rivals are left out, since
+    they do not matter for an effect that physics refuses.
+    """
+    near = [o for o in hypotheses.fitted.values() if o.effects]
+    near = [
+        o for o in near if hypotheses.within_form_tolerance(o) and hypotheses.physical_problem(o)
+    ]
     if not near:
         return ()
     best = min(near, key=lambda o: (o.size[1], o.total))
-    effects = gates.judge(hypotheses, best, holdout_data, rng)
-    # What else fits is no matter where physics refuses.
-    asked = [
-        replace(f, gates=tuple(g for g in f.gates if g.name in (gates.REMOVES, gates.PHYSICAL)))
-        for f in effects
-    ]
-    return tuple(replace(f, rivals=()) for f in asked if not gates.stands(f))
+    effects = gates.judge_effects(hypotheses, best, holdout_data, rng)
+    asked = (gates.REMOVES, gates.PHYSICAL)
+    judged = [replace(f, gates=tuple(g for g in f.gates if g.name in asked)) for f in effects]
+    return tuple(replace(f, rivals=()) for f in judged if not gates.passes_gates(f))
 
 
-def _rest_notes(verdict: str, rest: Sequence[Rest], quiet: bool, named: bool) -> list[str]:
-    """State what stays, and whether it speaks against what was found."""
-    out = [ELSEWHERE] if quiet and verdict == UNEXPLAINED else []
-    if verdict == UNEXPLAINED and (named or quiet):
-        out += [f"{r.equation}: {r.words}" for r in rest if r.veto]
-    return [*out, *(f"{r.equation}: {r.words}" for r in rest if not r.veto)]
+def _remainder_notes(
+    verdict: str, left: Sequence[Remainder], quiet: bool, named: bool
+) -> list[str]:
+    """State what remains in each equation, where the verdict itself does not say it.
 
-
-def _named(
-    hypotheses: HypothesisSet,
-    winner: Hypothesis,
-    holdout_data: RegressionData,
-    rng: np.random.Generator,
-) -> tuple[tuple[JudgedEffect, ...], Hypothesis, str, list[Rest]]:
-    """Put the winner through the gates.
-
-    Returns what was judged, the set that stands, the verdict, and the equations that keep more than
-    is nothing, each with what it keeps.
+    `quiet`: the training records held nothing above the noise; `named`: an effect is named.
     """
-    effects: tuple[JudgedEffect, ...] = ()
+    out = [ONLY_HELD_OUT_MISSED] if quiet and verdict == UNEXPLAINED else []
+    if verdict == UNEXPLAINED and (named or quiet):
+        out += [f"{r.equation}: {r.words}" for r in left if r.veto]
+    return [*out, *(f"{r.equation}: {r.words}" for r in left if not r.veto)]
+
+
+def _apply_gates(
+    hypotheses: HypothesisSet, winner: Hypothesis, holdout_data: RegressionData,
+    rng: np.random.Generator,
+) -> Judgement:  # fmt: skip
+    """Put a set through the gates, extend it in single equations, and give the verdict.
+
+    Refused effects are among the judged ones only if the verdict is `unexplained`.
+    """
+    effects, refused, winner = _passing_set(hypotheses, winner, holdout_data, rng)
+    left = remainders(hypotheses, winner, holdout_data)
+    all_refused = bool(refused) and not winner.effects
+    if not all_refused:
+        effects, winner, left = _extended_set(hypotheses, effects, winner, left, holdout_data, rng)
+    if all_refused or any(r.veto for r in left):
+        verdict, effects = UNEXPLAINED, (*effects, *refused)
+    elif not winner.effects:  # too little remains for any effect to be needed
+        verdict = CLEAN
+    else:
+        verdict = CONFOUNDED if has_tied_rival(effects) else EXPLAINED
+    return Judgement(hypotheses, effects, winner, verdict, tuple(left))
+
+
+def _passing_set(
+    hypotheses: HypothesisSet, winner: Hypothesis, holdout_data: RegressionData,
+    rng: np.random.Generator,
+) -> tuple[tuple[JudgedEffect, ...], tuple[JudgedEffect, ...], Hypothesis]:  # fmt: skip
+    """Return the effects that pass every gate together, the refused ones, and the set of the first.
+
+    An effect may pass beside others and fail without them, so that a reduced set is judged again.
+    """
     refused: tuple[JudgedEffect, ...] = ()
-    # What stands beside others may fall without them: judged again until all that is left stands.
     while winner.effects:
-        effects = gates.judge(hypotheses, winner, holdout_data, rng)
-        fallen = tuple(f for f in effects if not gates.stands(f))
-        if not fallen:
-            break
-        refused += fallen
-        smaller = [u for u, f in zip(winner.effects, effects, strict=True) if gates.stands(f)]
-        if not smaller:
-            return (
-                refused,
-                hypotheses.empty,
-                UNEXPLAINED,
-                left_over(hypotheses, hypotheses.empty, holdout_data),
-            )
-        winner = hypotheses.exact(smaller)
-    rest = left_over(hypotheses, winner, holdout_data)
-    while rest:
-        more = hypotheses.closer(winner, {r.equation for r in rest})
-        wider = gates.judge(hypotheses, more, holdout_data, rng) if more else ()
-        later = left_over(hypotheses, more, holdout_data) if more else rest
-        # What speaks against nothing is named only if nothing else fits as well.
-        needed = any(r.veto for r in rest) or _tied(wider) == _tied(effects)
-        stand = needed and all(map(gates.stands, wider))
-        if more is None or len(later) >= len(rest) or not stand:
-            break
-        effects, winner, rest = wider, more, later
-    if any(r.veto for r in rest):
-        return (*effects, *refused), winner, UNEXPLAINED, rest
-    if not winner.effects:  # what is left is too little for any effect to be needed
-        return refused, winner, CLEAN, rest
-    return effects, winner, CONFOUNDED if _tied(effects) else EXPLAINED, rest
+        effects = gates.judge_effects(hypotheses, winner, holdout_data, rng)
+        failed = tuple(f for f in effects if not gates.passes_gates(f))
+        if not failed:
+            return effects, refused, winner
+        refused += failed
+        kept = [u for u, f in zip(winner.effects, effects, strict=True) if gates.passes_gates(f)]
+        winner = hypotheses.refined(kept) if kept else hypotheses.empty
+    return (), refused, winner
 
 
-def _tied(effects: Sequence[JudgedEffect]) -> bool:
-    """Whether another effect fits as well as one of those found."""
-    return any(r.tied for f in effects for r in f.rivals)
+def _extended_set(
+    hypotheses: HypothesisSet, effects: tuple[JudgedEffect, ...], winner: Hypothesis,
+    left: list[Remainder], holdout_data: RegressionData, rng: np.random.Generator,
+) -> tuple[tuple[JudgedEffect, ...], Hypothesis, list[Remainder]]:  # fmt: skip
+    """Add effects for equations that keep too much, while all pass and fewer equations do.
+
+    Returns the judged effects, their set, and what it leaves. Where no remainder speaks against the
+    set, a further effect must not change whether the answer has a tied rival.
+    """
+    while left:
+        larger = hypotheses.extended_in(winner, {r.equation for r in left})
+        if larger is None:
+            break
+        judged = gates.judge_effects(hypotheses, larger, holdout_data, rng)
+        less = remainders(hypotheses, larger, holdout_data)
+        needed = any(r.veto for r in left)
+        if not needed and has_tied_rival(judged) != has_tied_rival(effects):
+            break
+        if len(less) >= len(left) or not all(map(gates.passes_gates, judged)):
+            break
+        effects, winner, left = judged, larger, less
+    return effects, winner, left

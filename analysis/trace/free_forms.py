@@ -1,4 +1,4 @@
-"""Mechanisms without a name for their form: what is tried where no named effect explains."""
+"""Free forms: mechanisms whose curve the data give, tried where no named effect explains."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ import numpy as np
 from analysis.effects.base import Effect
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge import gates
-from analysis.trace.judge.curves import within_curves
-from analysis.trace.remaining import Rest, left_over
-from analysis.trace.result import JudgedEffect
+from analysis.trace.judge.curves import rows_within_curves
+from analysis.trace.judgement import Judgement, has_tied_rival
+from analysis.trace.remaining import remainders
+from analysis.trace.result import CONFOUNDED, EXPLAINED, JudgedEffect
 from analysis.trace.search.hypothesis import Hypothesis
 from analysis.trace.search.hypothesis_set import HypothesisSet
 from analysis.trace.settings import SEARCH
@@ -20,72 +21,84 @@ from analysis.trace.settings import SEARCH
 log = logging.getLogger(__name__)
 
 
-def drawn_by_data(
+def explained_by_free_form(
     hypotheses: HypothesisSet, free: Sequence[Effect], winner: Hypothesis,
     holdout_data: RegressionData, rng: np.random.Generator, fewer: bool = False,
-) -> tuple[HypothesisSet, tuple[JudgedEffect, ...], Hypothesis, list[Rest]] | None:  # fmt: skip
-    """Explain the records with a mechanism whose form the data draw; None where none does.
+) -> Judgement | None:  # fmt: skip
+    """Return the first set with a free form that explains the records, None where none does.
 
-    Returns the sets tried, what was judged, the set that stands and what it leaves. `free` are the
-    mechanisms, `winner` what stood of the named effects. A mechanism stands beside those effects,
-    or in the place of readings of it. Every gate of every effect must hold with it, nothing may be
-    left that speaks against it, and no named effect may fit as well: then what a name failed at is
-    no matter of form. With `fewer` the named effects explain, within what their forms may miss, but
-    need several mechanisms: what replaces them must need fewer and leave half as much.
+    `free` are the free mechanisms, `winner` the named effects that passed the gates. A free form
+    joins these effects, or replaces those of one mechanism. Every gate of every effect must hold
+    with it, no remainder may speak against the set, and no named effect may fit as well as the
+    free form. With `fewer` the named effects explain within the tolerance of their forms, but with
+    several mechanisms: a set in their place must need fewer and leave at most
+    `SEARCH.free_form_ratio` of their energy.
     """
     if not free:
         return None
-    wide = hypotheses.widened(free)
-    tried: list[Hypothesis] = []
-    for start in _starts(wide, winner, fewer):
-        for single in wide.extensions(start, free=True):
-            if wide.idle(start, single):  # it would be dropped beside a further effect
-                continue
-            hypothesis = single if wide.formed(single) else _with_more(wide, single)
-            simpler = mechanisms(hypothesis) < mechanisms(winner)
-            less = simpler and hypothesis.total < SEARCH.free_energy * winner.total
-            if wide.formed(hypothesis) and not wide.physical(hypothesis) and (less or not fewer):
-                tried.append(wide.prune(hypothesis))
-    least = min((hypothesis.total for hypothesis in tried), default=0.0)
-    first = sorted(
-        tried,
-        key=lambda hypothesis: (
-            hypothesis.total > SEARCH.free_near * least,
-            hypothesis.size[1],
-            hypothesis.total,
-        ),
-    )
-    for hypothesis in list({o.keys: o for o in first}.values())[: SEARCH.free_tried]:
-        known = within_curves(holdout_data, hypothesis.fit)
-        effects = gates.judge(wide, hypothesis, known, rng)
-        rest = left_over(wide, hypothesis, known)
+    extended = hypotheses.with_candidates(free)
+    named = {kind.name for kind in extended.effects if not kind.free}
+    for hypothesis in _simplest_first(_sets_with_free_form(extended, winner, fewer)):
+        compared = rows_within_curves(holdout_data, hypothesis.fit)
+        effects = gates.judge_effects(extended, hypothesis, compared, rng)
+        left = remainders(extended, hypothesis, compared)
         failed = [(f.name, g.name, g.detail) for f in effects for g in f.gates if not g.ok]
-        log.info("free form %s: %s %s", sorted(hypothesis.keys), [r.words for r in rest], failed)
-        names = {kind.name for kind in wide.effects if not kind.free}
-        named = any(r.tied and r.name in names for f in effects if f.free for r in f.rivals)
-        if named or not all(map(gates.stands, effects)) or any(r.veto for r in rest):
-            continue
-        return wide, effects, hypothesis, rest
+        log.info("free form %s: %s %s", sorted(hypothesis.keys), [r.words for r in left], failed)
+        passed = all(map(gates.passes_gates, effects)) and not any(r.veto for r in left)
+        if passed and not _ties_with_name(effects, named):
+            verdict = CONFOUNDED if has_tied_rival(effects) else EXPLAINED
+            return Judgement(extended, effects, hypothesis, verdict, tuple(left))
     return None
 
 
-def _with_more(wide: HypothesisSet, hypothesis: Hypothesis) -> Hypothesis:
-    """Return the set with one more effect where equations keep too much, else the set."""
+def _ties_with_name(effects: Sequence[JudgedEffect], named: set[str]) -> bool:
+    """Return whether one of the `named` effects fits as well as a free form."""
+    return any(r.tied and r.name in named for f in effects if f.free for r in f.rivals)
+
+
+def _sets_with_free_form(wide: HypothesisSet, winner: Hypothesis, fewer: bool) -> list[Hypothesis]:
+    """Return the physical sets with a free form that leave little enough (see the caller)."""
+    out: list[Hypothesis] = []
+    for start in _sets_to_extend(wide, winner, fewer):
+        for single in wide.extensions(start, free=True):
+            # Beside a further effect a form that removes too little would be dropped.
+            if wide.removes_too_little(start, single):
+                continue
+            enough = wide.within_form_tolerance(single)
+            hypothesis = single if enough else _with_further_effect(wide, single)
+            simpler = mechanism_count(hypothesis) < mechanism_count(winner)
+            less = simpler and hypothesis.total < SEARCH.free_form_ratio * winner.total
+            explains = wide.within_form_tolerance(hypothesis)
+            if explains and not wide.physical_problem(hypothesis) and (less or not fewer):
+                out.append(wide.prune(hypothesis))
+    return out
+
+
+def _simplest_first(sets: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Return the sets to judge: those near the least energy first, the simplest of them first."""
+    least = min((hypothesis.total for hypothesis in sets), default=0.0)
+    near = SEARCH.free_form_near * least
+    ordered = sorted(sets, key=lambda o: (o.total > near, o.size[1], o.total))
+    return list({o.keys: o for o in ordered}.values())[: SEARCH.free_forms_judged]
+
+
+def _with_further_effect(wide: HypothesisSet, hypothesis: Hypothesis) -> Hypothesis:
+    """Return the set with one more effect for the equations that keep too much, if there is one."""
     loud = {e for e, v in hypothesis.excess_energy.items() if not wide.negligible(e, v)}
-    return (
-        wide.closer(hypothesis, loud) if len(hypothesis.effects) < SEARCH.largest_set else None
-    ) or hypothesis
+    if len(hypothesis.effects) >= SEARCH.largest_set:
+        return hypothesis
+    return wide.extended_in(hypothesis, loud) or hypothesis
 
 
-def mechanisms(hypothesis: Hypothesis) -> int:
-    """Count the mechanisms, each at its place, that a set of effects needs."""
+def mechanism_count(hypothesis: Hypothesis) -> int:
+    """Return the number of mechanisms in a set of effects; one at two places counts twice."""
     return len({(u.term.mechanism, u.term.where) for u in hypothesis.effects})  # type: ignore[attr-defined]
 
 
-def _starts(wide: HypothesisSet, winner: Hypothesis, fewer: bool) -> list[Hypothesis]:
-    """Return what a free mechanism may join: what stood, and without readings of one mechanism.
+def _sets_to_extend(wide: HypothesisSet, winner: Hypothesis, fewer: bool) -> list[Hypothesis]:
+    """Return the sets that a free form may join: the winner, and it without one mechanism.
 
-    Where it must need `fewer`, nothing: it is tried alone.
+    With `fewer` the free form is tried alone, beside no effect.
     """
     if fewer:
         return [wide.empty]
@@ -93,6 +106,6 @@ def _starts(wide: HypothesisSet, winner: Hypothesis, fewer: bool) -> list[Hypoth
     for used in winner.effects:
         same = (used.term.mechanism, used.term.where)  # type: ignore[attr-defined]
         kept = [u for u in winner.effects if (u.term.mechanism, u.term.where) != same]  # type: ignore[attr-defined]
-        start = wide.exact(kept) if kept else wide.empty
+        start = wide.refined(kept) if kept else wide.empty
         out[start.keys] = start
     return list(out.values())

@@ -1,8 +1,8 @@
-"""Rounds of a loop: what was run, what the trace then said, what the experiment was worth.
+"""Rounds of a loop: the runs, the trace after them, and the separation that they achieved.
 
-An experiment's worth is measured as it was predicted (`discriminate`): both explanations are
-fitted to all records before and after it, and what one leaves more than the other in its rows is
-counted in units of one record's noise.
+The separation is measured as it was predicted (`next_experiment.discrimination`): both explanations
+are fitted to all records without and with the new ones. The energy that one leaves more than the
+other, per new row, is given as an rms in units of one record's noise.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from analysis.trace.next_experiment.discrimination import (
     ComparisonRows,
     Explanation,
     OpenQuestion,
-    present,
-    smallest,
+    present_separation,
+    smallest_effect,
 )
 from analysis.trace.next_experiment.proposal import SHOW
 from analysis.trace.result import Trace, to_json
-from analysis.trace.search.hypothesis import excess_of
+from analysis.trace.search.hypothesis import energy_above_noise
 from analysis.trace.search.refinement import refine
 from rig.model.records import Run
 from rig.model.rig import Rig
@@ -54,22 +54,22 @@ class Round:
 
     @property
     def loudest(self) -> float:
-        """The largest repeatable residual of the baseline over its noise, over all records."""
+        """The largest ratio of the baseline's repeatable residual to its noise."""
         return max(f.ratio for f in self.result.floors)
 
     @property
     def residual(self) -> float:
-        """The largest held-out error over its noise floor, with what was found."""
+        """The largest ratio of a held-out error to its noise floor, with the effects found."""
         return self.result.worst(self.result.after)
 
 
 def achieved(
     rig: Rig, before: Sequence[Run], new: Run, experiment: Mapping[str, Any]
 ) -> float | None:
-    """Return the separation [noise] that an experiment's records brought, None if none was asked.
+    """Return the separation [noise] that an experiment's records achieved, None if none was asked.
 
-    What it was to make visible is not there to be measured; then this is how large it would stand
-    on the records as they were taken.
+    An experiment that was to make a small effect visible has no such effect to measure: then this
+    is the rms that the effect would have in the records as they were taken.
     """
     if not experiment.get("questions"):
         return None
@@ -77,26 +77,27 @@ def achieved(
     both = regression_data(rig, terms, conditioned_records(rig, [*before, new]))
     if experiment["kind"] == SHOW:
         rows = ComparisonRows(both)
-        asked = [_small(q["one"], rig) for q in experiment["questions"]]
-        return min(present(q, rows) for q in asked)
+        asked = [_visibility_question(q["one"], rig) for q in experiment["questions"]]
+        return min(present_separation(q, rows) for q in asked)
     old = regression_data(rig, terms, conditioned_records(rig, before))
     rounds = [
-        _one(old, both, terms, len(before), q["one"], q["other"]) for q in experiment["questions"]
+        _question_separation(old, both, terms, len(before), q["one"], q["other"])
+        for q in experiment["questions"]
     ]
     return min(rounds)
 
 
-def _one(
+def _question_separation(
     old: RegressionData, both: RegressionData, terms: tuple[Used, ...], index: int,
     first: Sequence[Mapping[str, Any]], other: Sequence[Mapping[str, Any]],
 ) -> float:  # fmt: skip
-    """Return one question's separation: the loudest equation's rms difference per new row."""
+    """Return one question's separation: the largest rms difference per new row of an equation."""
     gap = {}
     for train_data in (old, both):
         residual = [
             refine(train_data, (*terms, *effects_of(side))).residual for side in (first, other)
         ]
-        ends = [excess_of(train_data, part) for part in residual]
+        ends = [energy_above_noise(train_data, part) for part in residual]
         gap[train_data is both] = {e: ends[1][e] - ends[0][e] for e in ends[0]}
     rows: dict[str, int] = {}
     for s in both.segments:
@@ -112,10 +113,12 @@ def _one(
     )
 
 
-def _small(effects: Sequence[Mapping[str, Any]], rig: Rig) -> OpenQuestion:
+def _visibility_question(effects: Sequence[Mapping[str, Any]], rig: Rig) -> OpenQuestion:
     (used,) = effects_of(effects)
     assert isinstance(used.term, Effect)
-    return OpenQuestion(smallest(used.term, rig) or Explanation((used,)), Explanation(), False)
+    return OpenQuestion(
+        smallest_effect(used.term, rig) or Explanation((used,)), Explanation(), False
+    )
 
 
 def effects_of(side: Sequence[Mapping[str, Any]]) -> list[Used]:

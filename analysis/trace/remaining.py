@@ -1,6 +1,6 @@
-"""What stays when a search has ended: whether it is nothing, and what describes it.
+"""What remains after a search: equations that keep too much, and clues to their residual.
 
-Clues describe it: variables, a frequency, a formula.
+A clue is a variable, a frequency or a formula that the residual follows.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from analysis.trace.clues import dependence
-from analysis.trace.clues.formula import formula, surest
+from analysis.trace.clues.formula import formula, surest_formula
 from analysis.trace.clues.frequency import frequency_clue
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.spectral_lines import SpectralLines
@@ -24,10 +24,11 @@ from analysis.trace.settings import TRACE
 from rig.model.units import plain
 
 
-class Rest(NamedTuple):
-    """What an equation keeps, in words; whether it speaks against what was named (`veto`).
+class Remainder(NamedTuple):
+    """An equation that keeps more than noise, and how much in `words`.
 
-    What does not may still be another effect's.
+    `veto`: it speaks against the named effects, and makes the verdict `unexplained`. Without a veto
+    a further effect may still act in the equation.
     """
 
     equation: str
@@ -35,62 +36,77 @@ class Rest(NamedTuple):
     veto: bool
 
 
-def left_over(
+def remainders(
     hypotheses: HypothesisSet, winner: Hypothesis, holdout_data: RegressionData
-) -> list[Rest]:
-    """Return the equations that keep more than is nothing, and say what.
+) -> list[Remainder]:
+    """Return the equations in which a set leaves more than noise and tolerances allow.
 
-    Beside those that keep more than the noise floor's band (`gates.remaining`), those whose rest
-    one formula holds: it is no noise, and no form that is only a little simpler. It speaks against
-    an effect that acts in this equation, where a bench with as much left would not be clean.
+    These are, in this order: equations above the band (`gates.equations_above_band`); equations in
+    which the set removes energy and whose residual one formula fits, which the simpler form of an
+    effect does not cause; equations that keep more than `HypothesisSet.negligible` allows. The
+    first speak against the set, the second do where the residual is above the noise's band and an
+    effect of the set acts there, the third do not.
     """
-    out = [Rest(*r, True) for r in gates.remaining(hypotheses, winner, holdout_data)]
-    seen = _seen(hypotheses, winner) if winner.effects else {}
+    out = [
+        Remainder(*r, True) for r in gates.equations_above_band(hypotheses, winner, holdout_data)
+    ]
+    visible = _visible_shares(hypotheses, winner) if winner.effects else {}
     known = {r.equation for r in out}
-    asked = [equation for equation in seen if equation not in known]
+    asked = [equation for equation in visible if equation not in known]
     if not asked:
-        return [*out, *_missed(hypotheses, winner, out)]
-    now, later = rebased(hypotheses.train_data, winner.fit), rebased(holdout_data, winner.fit)
-    held = held_out.residual(holdout_data, winner.fit)
+        return [*out, *_tolerated_remainders(hypotheses, winner, out)]
+    train_rows, holdout_rows = (
+        rebased(hypotheses.train_data, winner.fit),
+        rebased(holdout_data, winner.fit),
+    )
+    held_residual = held_out.held_out_residual(holdout_data, winner.fit)
     for equation in asked:
-        expression = formula(now, winner.fit.residual, later, held, equation)
-        # A constant is no law of another cause: it is what a form has too little or too much.
+        expression = formula(train_rows, winner.fit.residual, holdout_rows, held_residual, equation)
+        # A constant is no law of another cause: a form that is slightly off leaves one.
         if (
             expression is not None
             and expression.share >= TRACE.formula_share
             and expression.variables
         ):
-            share = plain(100 * seen[equation], 2)
+            share = plain(100 * visible[equation], 2)
             words = f"{share} % of the repeatable energy remains, and a formula fits it"
-            loud = winner.excess_energy[equation] > hypotheses.limits.band[equation]
-            veto = loud and seen[equation] < TRACE.unexplained_share
-            tail = "" if veto else _tolerated(seen[equation])
-            out.append(Rest(equation, f"{words}: {expression.text}{tail}", veto))
-    return [*out, *_missed(hypotheses, winner, out)]
+            loud = winner.excess_energy[equation] > hypotheses.noise_band.by_equation[equation]
+            veto = loud and visible[equation] < TRACE.unexplained_share
+            tail = "" if veto else _tolerance_words(visible[equation])
+            out.append(Remainder(equation, f"{words}: {expression.text}{tail}", veto))
+    return [*out, *_tolerated_remainders(hypotheses, winner, out)]
 
 
-def _missed(hypotheses: HypothesisSet, winner: Hypothesis, known: Sequence[Rest]) -> list[Rest]:
-    """Return the other equations that keep more than a further effect would leave unasked."""
+def _tolerated_remainders(
+    hypotheses: HypothesisSet, winner: Hypothesis, known: Sequence[Remainder]
+) -> list[Remainder]:
+    """Return the equations beside `known` that keep more than `HypothesisSet.negligible` allows."""
     listed = {r.equation for r in known}
     out = []
-    for e, residual in gates.left_in_training(hypotheses, winner).items():
+    for e, residual in gates.training_excess(hypotheses, winner).items():
         if winner.effects and e not in listed and not hypotheses.negligible(e, residual):
             share = residual / max(hypotheses.empty.excess_energy[e], 1e-30)
             words = f"{plain(100 * share, 2)} % of the repeatable energy remains"
-            out.append(Rest(e, words + _tolerated(share), False))
+            out.append(Remainder(e, words + _tolerance_words(share), False))
     return out
 
 
-def _tolerated(share: float) -> str:
-    """Say why a rest, a share of the energy before, speaks against nothing that is named."""
+def _tolerance_words(share: float) -> str:
+    """Say why a remaining share of the energy does not speak against the named effects."""
     if share < TRACE.unexplained_share:
         return "; within the tolerance for the form of the named effect"
-    return "; nothing that is named acts there, and it is too near the noise to name more by"
+    return (
+        "; no named effect acts there, and the residual is too close to the noise to name another"
+    )
 
 
-def _seen(hypotheses: HypothesisSet, winner: Hypothesis) -> dict[str, float]:
-    """Return the share that stays, by equation, where it stands out of the noise's own energy."""
-    rows = hypotheses.train_data.counts
+def _visible_shares(hypotheses: HypothesisSet, winner: Hypothesis) -> dict[str, float]:
+    """Return the remaining share of the baseline's energy, of equations that stand out of noise.
+
+    These keep more than `TRACE.formula_least_share`, and more energy than
+    `TRACE.formula_deviations` standard deviations of the noise's own.
+    """
+    counts = hypotheses.train_data.row_counts
     shares = {
         e: v / max(hypotheses.empty.excess_energy[e], 1e-30)
         for e, v in winner.excess_energy.items()
@@ -98,8 +114,8 @@ def _seen(hypotheses: HypothesisSet, winner: Hypothesis) -> dict[str, float]:
     return {
         e: share
         for e, share in shares.items()
-        if share > TRACE.formula_least_energy
-        and winner.excess_energy[e] > TRACE.visible_deviations * np.sqrt(2 * rows[e])
+        if share > TRACE.formula_least_share
+        and winner.excess_energy[e] > TRACE.formula_deviations * np.sqrt(2 * counts[e])
     }
 
 
@@ -109,24 +125,30 @@ def clues_to(
     winner: Hypothesis,
     split: Sequence[SpectralLines],
 ) -> tuple[tuple[Dependence, ...], tuple[Formula, ...]]:
-    """Return what the remaining residual moves with, most telling first, and formulas for it."""
-    residual, held = winner.fit.residual, held_out.residual(holdout_data, winner.fit)
-    now, later = rebased(train_data, winner.fit), rebased(holdout_data, winner.fit)
+    """Return the variables that the remaining residual follows, strongest first, and formulas.
+
+    `split` are the spectral lines of the training residual.
+    """
+    residual, held_residual = (
+        winner.fit.residual,
+        held_out.held_out_residual(holdout_data, winner.fit),
+    )
+    train_rows, holdout_rows = rebased(train_data, winner.fit), rebased(holdout_data, winner.fit)
     loud = [e for e, v in sorted(winner.excess_energy.items(), key=lambda kv: -kv[1]) if v > 0]
     total = sum(winner.excess_energy[e] for e in loud)
     loud = [e for e in loud if winner.excess_energy[e] > TRACE.clue_share * total]
-    moves = dependence.dependence(now, residual, later, held, loud)
-    hum = frequency_clue(split, train_data, residual, holdout_data, held)
-    candidates = [formula(now, residual, later, held, e) for e in loud]
+    moves = dependence.dependences(train_rows, residual, holdout_rows, held_residual, loud)
+    hum = frequency_clue(split, train_data, residual, holdout_data, held_residual)
+    candidates = [formula(train_rows, residual, holdout_rows, held_residual, e) for e in loud]
     formulas = tuple(expression for expression in candidates if expression is not None)
-    first = _leading(formulas) if hum is None else [hum]
+    first = _formula_clue(formulas) if hum is None else [hum]
     there = {d.variable for d in first}
     return (*first, *(d for d in moves if d.variable not in there)), formulas
 
 
-def _leading(formulas: Sequence[Formula]) -> list[Dependence]:
-    """Return the variable of the formula that leaves least, where one leaves next to nothing."""
-    best = surest(formulas)
+def _formula_clue(formulas: Sequence[Formula]) -> list[Dependence]:
+    """Return the variable of the best formula as a clue, none where no formula is sure."""
+    best = surest_formula(formulas)
     if best is None:
         return []
     variable, by = (*best.variables, "")[:2]

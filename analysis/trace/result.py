@@ -1,4 +1,4 @@
-"""What a trace says, as data and as the contract's JSON."""
+"""The result of a trace, as data and as JSON."""
 
 from __future__ import annotations
 
@@ -33,7 +33,11 @@ _NAME: Final = re.compile(r"[a-z]+(?:_[a-z]+)*(?:_[0-9]+)?")
 
 @dataclass(frozen=True)
 class Formula:
-    """What an equation lacks, about: coefficient [SI] by monomial, and the held-out share taken."""
+    """A formula that an equation's residual follows: coefficient [SI] by monomial.
+
+    `share` is the share of the held-out energy above noise that it removes; `at_piston`: its value
+    is a force at the piston [N], not the equation's torque or flow.
+    """
 
     equation: str
     terms: Mapping[str, float]
@@ -53,16 +57,16 @@ class Formula:
 
     @property
     def sure(self) -> bool:
-        """Whether it goes before free curves: a few monomials that leave next to nothing."""
+        """Whether it is listed before curves: few monomials, with a variable, that leave little."""
         return (
-            self.share >= CLUES.sure
-            and len(self.terms) <= CLUES.few_monomials
+            self.share >= CLUES.leading_share
+            and len(self.terms) <= CLUES.leading_monomials
             and bool(self.variables)
         )
 
     @property
     def variables(self) -> tuple[str, ...]:
-        """The variables of its first monomial that has any, in the order they stand there."""
+        """The variables of its first monomial that has any, in order."""
         for name in self.terms:
             names = [word for word in _NAME.findall(name) if word != "sign"]
             if names:
@@ -72,10 +76,11 @@ class Formula:
 
 @dataclass(frozen=True)
 class Rival:
-    """Another effect in the same part: what it leaves on held-out records over what the best does.
+    """An effect that may take the place of a judged one.
 
-    `ratio` and `training_ratio` are of whitened rms; `tied` says that the data cannot separate it
-    from the best. `at` is its place with the sensor or chamber, as the catalogue has it.
+    `ratio` and `training_ratio` are the whitened residual rms of the set with the rival over that
+    of the best set, held out and in training. `tied`: the records cannot separate the two. `at` is
+    the rival's place in the catalogue, with sensor or chamber.
     """
 
     name: str
@@ -93,7 +98,7 @@ class Rival:
 
 @dataclass(frozen=True)
 class Gate:
-    """One condition for a name: its word, whether it holds, and the figures."""
+    """One condition for naming an effect: its name, whether it holds, and the figures."""
 
     name: str
     ok: bool
@@ -117,12 +122,12 @@ class Curve:
 class JudgedEffect:
     """An effect with its parameters, evidence and the gates it passed or not.
 
-    `removed_fraction` is the share of the repeatable energy on held-out records, in the equations
-    that the effect touches, which goes with it, the other effects kept. `shot` is what multiple
-    shooting makes of an effect with a hidden state. `mechanism` is where it acts; a `free` one has
-    no name of its own and is what its `curves` say. `left_without` and `left_with` are the held-out
-    rms in the equations it touches without it and with it, the mean of the repeats' noise being 1.
-    `at` is its place with the sensor or chamber, as the catalogue has it.
+    `removed_fraction` is the share of held-out energy above noise that the effect removes in the
+    equations where it acts, beside the other effects. `shot` are the shapes of an effect with a
+    hidden state by multiple shooting. `mechanism` is the part of the physics in which it acts; a
+    `free` effect is described by its `curves` instead of a name. `left_without` and `left_with` are
+    the held-out rms in its equations without and with it, over the noise of the averaged repeats.
+    `at` is its place in the catalogue, with sensor or chamber.
     """
 
     name: str
@@ -154,9 +159,10 @@ class JudgedEffect:
 
 @dataclass(frozen=True)
 class Dependence:
-    """A variable that what is left moves with, and the share of it that it carries held out.
+    """A variable that the remaining residual depends on.
 
-    Its curve may multiply another variable, `by`; `words` say so where it is more than a curve.
+    `share` is the share of held-out energy above noise that its curve removes. The curve may
+    multiply another variable, `by`; `words` describe a dependence that is more than one curve.
     """
 
     variable: str
@@ -167,7 +173,7 @@ class Dependence:
 
     @property
     def text(self) -> str:
-        """What it moves with, in words."""
+        """The dependence in words."""
         return self.words or self.variable
 
 
@@ -188,10 +194,10 @@ class FreeCurves:
 
 @dataclass(frozen=True)
 class DetectionLimit:
-    """The largest size of an effect that the records would not have shown, and what it changes.
+    """The largest size of an effect that would leave no residual above the noise.
 
-    `size` [unit] is that of the effect's number `quantity`; an effect so large would have changed
-    `parameter` by `shift`, as a share of its value.
+    `size` [unit] is that of the effect's number `quantity`. An effect of this size would change
+    `parameter` by `shift`, a share of its value.
     """
 
     name: str
@@ -206,17 +212,17 @@ class DetectionLimit:
 
 @dataclass(frozen=True)
 class Trace:
-    """The whole result, SI and percent: errors are of the rows that judge, fits of whole records.
+    """The result of a trace, in SI units and percent; before and after: without, with the effects.
 
-    `fit` and `rmse` are of free runs, `window` of 0.25 s windows restarted from the data.
+    `noise_floor`, `before` and `after` are rms residuals of the judging rows, by equation; `size`
+    is the rms of each equation's right side. `fit_*` and `rmse_*` are of free runs over whole
+    held-out and judging records, `window_*` of 0.25 s windows restarted from the data.
 
-    `size` is the rms of each equation's right side, beside which an error is large or small.
-
-    `floors` are the training records' split residuals under the baseline, `notes` what a person
-    must know of the evidence's weakness; `refused` fitted best but did not pass the gates.
-    `lines` are the training residual's, the loudest first.
-    `rows_before` and `rows_after` are the fits behind the errors, what acts beside the baseline
-    included; the models are at the rig's nominal temperature.
+    `floors` are the training records' residuals under the baseline, split into repeatable part and
+    noise; `lines` are the spectral lines of the training residual, largest first. `notes` state
+    where the evidence is weak. `refused` are effects that fitted best but failed a gate.
+    `rows_before` and `rows_after` are the fits that the errors are computed with, temperature and
+    spool path included; the models are at the rig's nominal temperature.
     """
 
     verdict: str
@@ -250,7 +256,7 @@ class Trace:
 
     @property
     def tied_at(self) -> list[tuple[str, str]]:
-        """As `tied`, the places with sensor or chamber."""
+        """Name and catalogue place (with sensor or chamber) of the rivals of `tied`."""
         return sorted({(r.name, r.at or r.where) for e in self.effects for r in e.rivals if r.tied})
 
     @property
@@ -264,7 +270,7 @@ class Trace:
 
     @property
     def moves_with(self) -> tuple[str, ...]:
-        """The variables that what is left moves with, most telling first, each once."""
+        """The variables that the remaining residual depends on, strongest first, each once."""
         names = [name for d in self.depends_on for name in (d.variable, d.by) if name]
         return tuple(dict.fromkeys(names))
 
@@ -375,7 +381,8 @@ def _shot(shot: Shot) -> dict[str, Any]:
 
 def _lines(lines: SpectralLines) -> dict[str, Any]:
     return {
-        "step": lines.group[1], "equation": lines.equation, "above_noise": finite(lines.loud),
+        "step": lines.group[1], "equation": lines.equation,
+        "above_noise": finite(lines.above_noise),
         "shares": _numbers(lines.shares), "shares_after": _numbers(lines.shares_after),
         "text": lines.text,
     }  # fmt: skip

@@ -1,8 +1,12 @@
-"""Thresholds by which the trace judges: each with its unit, what it means and where it is from.
+"""Thresholds of the trace, each with its unit, meaning and origin; without unit: share or ratio.
 
 Origins: *tuned* on benches of odd seeds of `python -m tests.studies foreign` and seeds below 100 of
 `python -m tests.studies trace`, judged on others; *convention* of statistics; *contract* of what
-users rely on; *arithmetic* of what a computer can resolve.
+users rely on; *arithmetic* of what a computer can resolve. A setting without origin limits effort
+or length only.
+
+"Energy" is the sum of squared whitened residuals, "energy above noise" that energy minus what noise
+alone gives. "The baseline" is the model without effects.
 """
 
 from __future__ import annotations
@@ -13,163 +17,201 @@ from typing import Final
 
 @dataclass(frozen=True)
 class TraceSettings:
-    """Judging of the effects found; numbers without unit are shares or ratios."""
+    """Judgement of the effects found."""
 
     # Gates of an effect.
     least_removed: float = 0.5
-    """Of the held-out energy above noise in the equations it touches: a cause takes most."""
+    """Least share of the held-out energy above noise that an effect removes in the equations where
+    it acts: a cause removes most of it."""
     p_limit: float = 0.01
-    """Family-wise p over all candidates and shapes (convention)."""
+    """Largest family-wise p over all candidates and shapes (convention)."""
     tie_ratio: float = 1.10
-    """Held-out rms of a rival over the best's, below which they cannot be separated (tuned); of an
-    effect that takes less than the noise, the same share of what it takes."""
+    """Held-out rms of a rival over that of the best set: a rival with less is tied (tuned). For an
+    effect that removes less energy than remains, the ratio applies to what the effect removes."""
     tie_ratio_training: float = 1.25
-    """The same on training records; a rival that fits these worse has another size (tuned)."""
-    clear_lead: float = 0.95
-    """Held-out rms of a rival over the best's: with less, training records do not count (tuned)."""
+    """Training rms of a rival over that of the best set: a tied rival must have less, since one
+    that fits the training records worse has another size (tuned)."""
+    decisive_ratio: float = 0.95
+    """Held-out rms of a rival over that of the best set: a rival with less is tied whatever its
+    training rms (tuned)."""
     harm_ratio: float = 1.2
-    """Energy above noise in an equation over that before: a cause makes none worse (tuned)."""
-    # What may stay.
+    """Energy above noise of an equation with an effect over that under the baseline: with more, the
+    effect is refused (tuned)."""
+    # Residual that may remain.
     training_share: float = 0.05
-    """Of an equation's energy before: what a named form may miss of the real one (tuned: seals of
-    LuGre's and Karnopp's law, turbulent leaks)."""
+    """Largest remaining share of an equation's training energy above noise under the baseline: so
+    much may a named form differ from the real one (tuned: seals of LuGre's and Karnopp's law,
+    turbulent leaks)."""
     held_out_share: float = 0.10
-    """The same on held-out records, which may be quieter (tuned)."""
+    """Largest remaining share of an equation's held-out energy above noise under the baseline;
+    held-out records may be quieter than training records (tuned)."""
     held_out_band: float = 1.5
-    """Held-out rms over the noise floor, by equation (tuned on clean benches: none is above)."""
-    beyond_knots: float = 0.05
-    """Of a free curve's range: so far beyond its outermost knots it is still compared (tuned)."""
-    better_known: float = 10.0
-    """Ratio of what held-out rows know of a direction of the baseline's coefficients to what the
-    training rows know: from here on it is fitted to the held-out rows (tuned: joints locked in
+    """Largest held-out rms of an equation over its noise floor (tuned: no clean bench is above)."""
+    knot_margin: float = 0.05
+    """Share of a free curve's range by which rows may lie beyond its outermost knots and still be
+    compared with it (tuned)."""
+    information_ratio: float = 10.0
+    """Information of held-out rows over that of training rows on a direction of the baseline's
+    coefficients: with more, the direction is fitted to the held-out rows (tuned: joints locked in
     turn, then moved together, give 20 to 50 for the coupling inertia, all others 0.3 to 6)."""
     cavitating_share: float = 0.2
-    """Of an equation's rows at which the oil cavitates under a model: up to here they speak neither
-    way (tuned: a gain of 5 % put 8 % of the rows below zero pressure, a cross-talk of 3 % 14 %)."""
+    """Largest share of an equation's rows at which a model makes the oil cavitate: up to it these
+    rows count neither for nor against the model (tuned: a gain of 5 % put 8 % of the rows below
+    zero pressure, a cross-talk of 3 % 14 %)."""
     masked_share: float = 0.05
-    """Of an equation's rows: from here on a note says that they are left out (tuned: an end cushion
-    that shows only while its pressure is beyond its sensor left out 10 %)."""
+    """Share of an equation's rows that are left out, from which a note says so (tuned: an end
+    cushion that shows only while its pressure is beyond its sensor left out 10 %)."""
     noted_ratio: float = 1.3
-    """The same, from which an explanation says what stays (contract)."""
-    visible_deviations: float = 8.0
-    """Standard deviations of the noise's own energy from which a rest is asked for a formula."""
-    formula_least_energy: float = 0.005
-    """Of an equation's energy before: less is not asked for a formula (tuned)."""
+    """Held-out rms of an equation over its noise floor, from which a note beside an explanation
+    states what remains (contract)."""
+    formula_deviations: float = 8.0
+    """Energy above noise of an equation over the standard deviation of the noise's own energy, from
+    which a formula is fitted to the residual."""
+    formula_least_share: float = 0.005
+    """Remaining share of an equation's energy above noise under the baseline, from which a formula
+    is fitted to it (tuned)."""
     formula_share: float = 0.7
-    """Of the rest: from here on a formula holds it (tuned on hardening springs)."""
+    """Share of the held-out residual that a formula removes, from which the residual counts as
+    following it (tuned on hardening springs)."""
     unexplained_share: float = 0.5
-    """Of an equation's energy before: where more is left no effect acts (tuned)."""
+    """Remaining share of an equation's energy above noise under the baseline, from which no effect
+    found acts in the equation (tuned)."""
     clue_share: float = 0.1
-    """Of all that is left: an equation with less asks for no clue (tuned)."""
+    """Share of the remaining energy of all equations, below which an equation is not searched for
+    clues (tuned)."""
     # Invariance.
     invariance_tolerance: float = 0.2
-    """Relative disagreement that a catalogue's simpler form may cause (tuned)."""
+    """Relative difference of a size between parts of the rows that a catalogue's simpler form may
+    cause (tuned)."""
     standard_errors: float = 3.5
-    """Standard errors of a subset's own estimate, and of what held-out records lose by a simpler
-    reading or a rival (convention: 1 in 2000, some 10 subsets)."""
+    """Standard errors by which a size must differ in a part of the rows, and standard deviations of
+    noise that held-out records must lose by a simpler name or a rival, to count (convention: 1 in
+    2000, for some 10 parts)."""
     informative_share: float = 0.12
-    """Of a column's energy off the others': a subset with less holds its form's tail, not its size
-    (tuned: tails of seals reach 0.09, wrong names show from 0.2 on)."""
+    """Share of a column's energy, orthogonal to all other columns, that a part of the rows must
+    hold to be judged: a part with less shows the tail of the form, not the size (tuned: tails of
+    seals reach 0.09, wrong names show from 0.2 on)."""
     separable_share: float = 0.01
-    """Of a column's energy that the effect's others cannot make: with less the whole effect is
-    judged, not this number (convention: a variance inflation factor of 100)."""
+    """Share of a column's energy that the effect's other columns cannot make: with less the whole
+    effect is judged, not this number (convention: a variance inflation factor of 100)."""
     subset_error: float = 0.25
-    """Relative standard error beyond which a subset judges nothing (tuned)."""
-    reading_share: float = 0.15
-    """Of what a law leaves above noise: less does not earn it a further number (tuned: that took
-    0.5 to 8 % where a form was wrong, 27 % and more where two levels were true)."""
-    nearly: float = 2.5
-    """Times the tolerance within which a richer reading is a simpler one: up to here its further
-    number must take more than the form leaves (tuned: Maxwell slip shows 13 % of difference)."""
-    # Chance.
+    """Relative standard error of a size in a part of the rows, beyond which that part is not judged
+    (tuned)."""
+    richer_name_share: float = 0.15
+    """Share of the energy above noise left by the simpler of two names of one law, that the richer
+    one must remove (tuned: it removed 0.5 to 8 % where a form was wrong, 27 % and more where two
+    levels were true)."""
+    near_tolerance: float = 2.5
+    """Multiple of the form's tolerance up to which the richer of two names is close to the simpler:
+    its further number must then remove more than the richer form itself leaves (tuned: Maxwell slip
+    shows 13 % of difference)."""
+    # Significance.
     sign_flips: int = 199
-    """Sign flips: p not below 0.005 (convention)."""
+    """Number of sign flips; p is not below 0.005 (convention)."""
     enough_repeats: int = 8
-    """Repeats from which whole records are flipped: 2^-7 is below `p_limit` (arithmetic)."""
+    """Number of repeats from which whole records are flipped: 2^-7 is below `p_limit`
+    (arithmetic)."""
     flip_block: float = 2.0
-    """[s] of a block that is flipped as one: twenty times the row filter's memory (arithmetic)."""
+    """[s] Length of a block that is flipped as one: twenty times the row filter's memory
+    (arithmetic)."""
     # Others.
     shooting_ratio: float = 0.99
-    """Of what held-out windows leave: with less, shapes by shooting are taken (tuned)."""
+    """Error of held-out windows with the shapes from shooting over that with the shapes from the
+    rows: below it the shapes from shooting are used (tuned)."""
     shooting_cost: float = 1.02
-    """Times the held-out rms of any equation's rows that these may cost (tuned)."""
+    """Largest held-out rms of any equation's rows with the shapes from shooting over that with the
+    shapes from the rows (tuned)."""
     rank_limit: float = 1e-4
-    """Smallest over largest singular value of unit columns: the noise of where a locked joint
-    stands (10 um of 0.1 m, some thousand samples) makes 1e-6 to 1e-5 (arithmetic)."""
+    """Smallest singular value of unit columns over the largest, below which a direction counts as
+    undetermined: the noise of a locked joint's position (10 um of 0.1 m, some thousand samples)
+    makes 1e-6 to 1e-5 (arithmetic)."""
     least_rows: int = 40
-    """Rows of an equation in one record (arithmetic)."""
+    """Least number of rows of an equation in one step (arithmetic)."""
     most_rivals: int = 4
-    """Rivals in a result."""
-    visible_shift: float = 0.01
-    """Of a parameter: an effect below its detection limit that changes one by more is noted
-    (tuned: with good excitation none does)."""
-    most_limits: int = 3
-    """Detection limits that are noted."""
+    """Largest number of rivals in a result."""
+    noted_shift: float = 0.01
+    """Relative change of a parameter from which it is noted: by an effect at its detection limit,
+    or by the fit to held-out rows (tuned: with good excitation no detection limit reaches it)."""
+    most_detection_limits: int = 3
+    """Largest number of detection limits in the notes."""
     normal_quantile: float = 1.96
     """Half-width of a 95 % interval over the standard error (convention)."""
-    dependent_share: float = 1e-10
-    """Of the largest eigenvalue: columns with a smaller one depend on each other (arithmetic)."""
+    eigenvalue_ratio: float = 1e-10
+    """Smallest eigenvalue of columns over the largest, below which the columns depend on each other
+    (arithmetic)."""
     curve_seconds: float = 4.0
-    """[s] of a free run that are kept to be drawn."""
+    """[s] Length of the free run that is kept to be drawn."""
     curve_points: int = 400
-    """Of them, about."""
+    """Approximate number of its points."""
 
 
 @dataclass(frozen=True)
 class DataSettings:
-    """What the records are weighed by, and which columns are offered."""
+    """Preparation of the records: noise floor, judging blocks, shape grids, spectral lines."""
 
-    judge_block: float = 1.0
-    """[s] of a held-out record: every third such block judges only (arithmetic: ten times the row
-    filter's memory, and a short record still has several)."""
+    judging_block: float = 1.0
+    """[s] Length of a block of a held-out record, of which the second of every three only judges
+    (arithmetic: ten times the row filter's memory, and a short record still has several)."""
     least_noise: float = 0.2
-    """Of the noise that the rig file states: a floor measured lower is chance (tuned)."""
+    """Smallest noise floor over the noise that the rig file states; a floor measured lower is set
+    to it (tuned)."""
     unrepeated_ratio: float = 5.0
-    """Scatter between repeats over what the stated sensor noise makes: more is no sensor's noise
-    that a data sheet would state (tuned: clean benches stay below 2)."""
+    """Scatter between repeats over the scatter that the stated sensor noise makes, from which a
+    note says that something else acts (tuned: clean benches stay below 2)."""
     unrepeated_share: float = 0.5
-    """Of that scatter's energy: with more at one frequency, this is stated (convention)."""
-    # Noise by neighbouring states.
-    pair_apart: float = 0.5
-    """[s] between the two rows of a pair: the row filter's memory is a tenth of a second."""
+    """Share of that scatter's energy at one frequency, from which the note states the frequency
+    (convention)."""
+    # Noise from neighbouring states.
+    pair_time: float = 0.5
+    """[s] Least time between the two rows of a pair: five times the row filter's memory."""
     pair_distance: float = 0.2
-    """Between their states, in standard deviations of each: beyond it a residual that changes with
-    the state passes for noise (tuned: EMPS 0.01, crane 0.1, multisines of one period 0.5)."""
-    nearest_pairs: float = 0.33
-    """Of the rows: the nearest pairs, whose differences count (tuned)."""
+    """Largest distance between the states of a pair, in standard deviations of each state: farther
+    apart, a residual that changes with the state passes for noise (tuned: EMPS 0.01, crane 0.1,
+    multisines of one period 0.5)."""
+    nearest_pair_share: float = 0.33
+    """Share of the rows whose pairs, the nearest ones, are used (tuned)."""
     least_pairs: int = 40
-    """Pairs: a noise by fewer is uncertain by more than a tenth (arithmetic)."""
+    """Least number of pairs: noise from fewer is uncertain by more than a tenth (arithmetic)."""
     neighbours_asked: int = 64
-    """Rows nearest to a row, among which one far enough away in time is looked for."""
+    """Number of rows nearest to a row, among which one at least `pair_time` away is searched."""
     temperature_span: float = 0.05
-    """[K] between all records: less moves b by a fraction of 0.001 (arithmetic)."""
+    """[K] Least span of the oil temperature over all records for a temperature column: less changes
+    b by less than a fraction of 0.001 (arithmetic)."""
     grid_points: int = 24
-    """Of a candidate's shape grid: two shapes of five points each, or one of many."""
-    remembered_rows: float = 2e8
-    """Bytes of rows that are kept since other models need them again."""
-    remembered_signals: float = 5e7
-    """Bytes of signals kept for the same."""
-    remembered_readings: int = 4
-    """Sets of columns that are kept of a term, each of other signals."""
+    """Largest number of points of a candidate's shape grid: two shapes of about five points each,
+    or one of many."""
+    cached_row_bytes: float = 2e8
+    """[byte] Largest total size of cached rows."""
+    cached_signal_bytes: float = 5e7
+    """[byte] Largest total size of cached signals."""
+    cached_signal_sets: int = 4
+    """Number of different signals for which a term's columns are cached."""
     # Spectral lines.
     line_band: float = 1.2
-    """Band over the row filter's cutoff, where that filter ends (arithmetic)."""
-    period_present: float = 0.7
-    """Of a period's pairs of rows that must be there (tuned)."""
+    """Highest line considered over the row filter's cutoff: the filter blocks all above
+    (arithmetic)."""
+    least_period_share: float = 0.7
+    """Least share of a period's pairs of rows that must be present (tuned)."""
     lines_per_pair: float = 0.8
-    """A pair gives two numbers and a line has two: fewer lines than pairs (arithmetic)."""
+    """Largest number of lines per pair of rows: a pair gives two numbers and a line has two
+    (arithmetic)."""
     line_ridge: float = 1e-2
-    """Of a line's own weight, against what short gaps leave undetermined (arithmetic)."""
+    """Ridge of the line fit over a line's own weight, for lines that short gaps leave undetermined
+    (arithmetic)."""
     line_deviations: float = 4.0
-    """Standard deviations of what noise alone puts into a kind of lines (convention)."""
-    asymmetric: float = 0.25
-    """Of the energy, from which an asymmetric nonlinearity is reported (tuned)."""
-    symmetric: float = 0.1
-    """The same of a symmetric one (tuned)."""
-    noted_share: float = 0.005
-    """Of the energy, below which a kind of lines is not reported (tuned)."""
+    """Power of a kind of lines over the standard deviation that noise alone gives it, below which
+    the kind counts as empty (convention)."""
+    asymmetric_share: float = 0.25
+    """Share of the power on even lines from which an asymmetric nonlinearity is reported; also the
+    share of the power off line 0 below which the residual counts as constant (tuned)."""
+    symmetric_share: float = 0.1
+    """Share of the power on empty odd lines from which a symmetric nonlinearity is reported
+    (tuned)."""
+    noted_line_share: float = 0.005
+    """Share of the power below which a kind of lines is not reported (tuned)."""
     velocity_ratio: float = 3.0
-    """Times the velocity's own share of even or odd lines, which no nonlinearity made (tuned)."""
+    """Share of the residual's power on even or empty odd lines over that of the joint's velocity,
+    which has such lines without any nonlinearity: with less none is reported (tuned)."""
 
 
 @dataclass(frozen=True)
@@ -177,113 +219,129 @@ class SearchSettings:
     """Search for the set of effects that explains the residual."""
 
     band: float = 0.7
-    """Repeatable rms over noise, below which there is nothing to explain (tuned)."""
-    residual_limit: float = 1.0
-    """Repeatable rms over noise that an explanation may leave (tuned)."""
-    form_share: float = 0.02
-    """Of the energy before: what the catalogue's form of an effect may miss of the real (tuned)."""
-    add_share: float = 0.3
-    """Of what is left in the equations an effect acts on: less does not earn a place (tuned)."""
-    simpler_ratio: float = 1.25
-    """What a simpler candidate may leave over the best, as a product over equations (tuned)."""
-    touched: float = 0.05
-    """Of the largest change that an effect makes to any equation: with less it does not act there
+    """Repeatable rms of an equation over its noise, below which there is nothing to explain
     (tuned)."""
-    least_growth: float = 0.1
-    """Sum over equations of log ratios of what is left: with less nothing was gained (tuned)."""
-    far_less: float = 2.3
-    """The same by which another pair must leave less than an effect that only the tolerance for its
-    form lets pass (tuned: a tenth)."""
+    residual_limit: float = 1.0
+    """Repeatable rms of an equation over its noise that an explanation may leave (tuned)."""
+    form_share: float = 0.02
+    """Share of an equation's energy above noise under the baseline, by which the catalogue's form
+    of an effect may differ from the real one (tuned)."""
+    add_share: float = 0.3
+    """Least share of the remaining energy, in the equations where an effect acts, that the effect
+    must remove to be added (tuned)."""
+    simpler_ratio: float = 1.25
+    """Largest remaining energy of a simpler set over that of the best one, as a product over
+    equations, at which the simpler set is chosen (tuned)."""
+    acting_share: float = 0.05
+    """Energy that an effect removes from an equation over the most that it removes from any: with
+    less it does not act there (tuned)."""
+    least_log_gain: float = 0.1
+    """Sum over equations of log ratios of remaining energy that a further effect must gain
+    (tuned)."""
+    far_log_gain: float = 2.3
+    """Sum over equations of log ratios of remaining energy that another pair must gain over a
+    single effect that is accepted by the tolerance for its form only (tuned: a tenth)."""
     number_price: float = 20.0
-    """Energy that each further free number must take: ten times what noise gives it (tuned)."""
-    visible: float = 0.03
-    """Of a column's length that must stand out of the baseline's columns (arithmetic)."""
+    """Energy that each further free number must remove: ten times what noise gives it (tuned)."""
+    least_projected_length: float = 0.03
+    """Length of a column orthogonal to the baseline's columns over its whole length: a column with
+    less does not show (arithmetic)."""
     size_ratio: float = 3.0
-    """Largest size over that of a shape's column; smaller ones are nearer to linear (tuned)."""
-    # How much is tried.
+    """Largest fitted size over the size for which the first-order column of a signal change was
+    computed; smaller sizes are closer to linear (tuned)."""
+    # Effort.
     largest_linear_set: int = 4
-    """Effects in a set of the linear search."""
+    """Largest number of effects in a set of the linear search."""
     largest_set: int = 3
-    """Effects in a set found by extension."""
+    """Largest number of effects in a set that is extended."""
     pair_starts: int = 10
-    """Single candidates from which pairs are tried."""
+    """Number of single candidates from which pairs are tried."""
     full_fits: int = 40
-    """Best entries that are fitted in full."""
+    """Number of best candidates that are fitted together with the set."""
     refined_singles: int = 14
-    """Single candidates refined exactly, best first."""
+    """Number of single candidates that are refined exactly, best first."""
     refined_pairs: int = 6
-    """Pairs refined exactly."""
+    """Number of pairs that are refined exactly."""
     refined_extensions: int = 6
-    """Extensions of a set that are refined exactly."""
+    """Number of extensions of a set that are refined exactly."""
     near_gain: float = 0.25
-    """Of the best gain: a single candidate with less is no rival (tuned)."""
+    """Energy that a single candidate removes over what the best one removes: one with less is not
+    refined (tuned)."""
     shape_starts: int = 3
-    """Points of an effect's grid that a search for its shapes begins at."""
+    """Number of points of an effect's shape grid from which a search for its shapes begins."""
     # Refinement.
     tolerance: float = 1e-4
     """Relative change of cost and shapes at which a refinement ends (arithmetic)."""
     steps: int = 10
-    """Of a refinement, at most."""
+    """Largest number of steps of a refinement."""
     shape_error: float = 0.25
-    """Relative standard error of a shape beside its effect's details, at most (tuned: contacts that
-    stiffen have 0.01 to 0.07, noise at rest that passes for one 0.4 to 1)."""
+    """Largest relative standard error of a shape beside the details of its effect's form (tuned:
+    contacts that stiffen have 0.01 to 0.07, noise at rest that passes for one 0.4 to 1)."""
     detail_share: float = 0.05
-    """Of what is left above noise: less does not earn a detail of the form (tuned)."""
+    """Share of the remaining energy above noise that a detail of the form must remove (tuned)."""
     # Free forms.
-    free_tried: int = 4
-    """Free forms that are put through the gates."""
-    free_energy: float = 0.5
-    """Of what several named mechanisms leave: the most that one in their place may (tuned)."""
-    free_near: float = 2.0
-    """Times the least energy left: of sets within it the simplest goes first (tuned)."""
+    free_forms_judged: int = 4
+    """Largest number of free forms that are put through the gates."""
+    free_form_ratio: float = 0.5
+    """Largest remaining energy of a free form over that of the several named mechanisms which it
+    replaces (tuned)."""
+    free_form_near: float = 2.0
+    """Remaining energy over the least of all sets with a free form: of the sets with less, the
+    simplest is judged first (tuned)."""
 
 
 @dataclass(frozen=True)
 class ClueSettings:
-    """What is said of a residual that no effect explains."""
+    """Clues to a residual that no effect explains."""
 
     knots: int = 9
-    """Of a curve of the residual over a variable."""
+    """Number of knots of a curve of the residual over a variable."""
     least_share: float = 0.05
-    """Of the held-out energy, below which a variable is no clue (tuned)."""
-    answer_weight: float = 0.3
-    """Weight of a variable that an equation's own balance makes follow what it lacks (tuned)."""
+    """Share of the held-out energy above noise below which a variable is no clue (tuned)."""
+    by_balance_weight: float = 0.3
+    """Weight, in the order of clues, of a variable that follows by the equation's own balance
+    whatever the equation lacks (tuned)."""
     spool_weight: float = 0.6
     """Weight of the spool in a torque: it acts through the pressures (tuned)."""
     chamber_lead: float = 0.2
-    """By which one chamber's pressure must beat the difference to be no answer (tuned)."""
+    """Share that one chamber's pressure must remove beyond the pressure difference, to count as not
+    following by balance (tuned)."""
     product_gain: float = 0.05
-    """That a product of two variables must take beyond either of them (tuned)."""
-    slow: float = 0.1
-    """Of the rms speed: below it the direction of motion turns gradually."""
-    memory: float = 0.1
-    """Of the largest travel: how far a motion goes before its direction counts."""
+    """Share that a product of two variables must remove beyond either of them (tuned)."""
+    direction_speed: float = 0.1
+    """Speed over its rms below which the direction of motion changes gradually."""
+    direction_memory: float = 0.1
+    """Travel over the joint's largest travel after which the direction with memory has changed."""
     # Formula.
     monomials: int = 3
-    """Of a formula, at most."""
-    few_monomials: int = 2
-    """Of a formula that goes before free curves: three bend to much (tuned)."""
-    sure: float = 0.9
-    """Of the energy, from which a formula goes before free curves (tuned)."""
+    """Largest number of monomials of a formula."""
+    leading_monomials: int = 2
+    """Largest number of monomials of a formula that is listed before curves: three fit too much
+    (tuned)."""
+    leading_share: float = 0.9
+    """Share of the energy above noise that a formula must remove to be listed before curves
+    (tuned)."""
     monomial_gain: float = 0.05
-    """Of the held-out energy above noise that one more monomial must take (tuned)."""
-    offered: float = 0.5
-    """Of it that a formula must take to be worth reading (tuned)."""
-    alike: float = 0.999
-    """Correlation from which two columns are one (arithmetic)."""
+    """Share of the energy above noise that one more monomial must remove (tuned)."""
+    shown_share: float = 0.5
+    """Share of the held-out energy above noise that a formula must remove to be shown (tuned)."""
+    duplicate_correlation: float = 0.999
+    """Correlation from which two columns count as the same (arithmetic)."""
     # Frequency.
-    many_lines: int = 8
-    """Excited lines: of fewer, most of anything stands in one place (tuned)."""
+    least_lines: int = 8
+    """Least number of excited lines: with fewer, most of any power lies at one of them (tuned)."""
     side_lines: int = 1
-    """On either side of the highest: a frequency between two lines stands in both (arithmetic)."""
+    """Lines on either side of the highest that are added to it: a frequency between two lines shows
+    in both (arithmetic)."""
     first_line: int = 5
-    """Fewer turns in a period are drift (tuned)."""
-    peak: float = 0.6
-    """Of the power that stands at one frequency (tuned)."""
+    """Lowest line of a frequency clue: less than five turns in a period are drift (tuned)."""
+    peak_share: float = 0.6
+    """Least share of the power at one frequency (tuned)."""
     frequency_share: float = 0.5
-    """Of the held-out energy that a sine of it must take (tuned)."""
+    """Least share of the held-out energy above noise that a sine of the frequency removes
+    (tuned)."""
     frequency_steps: int = 41
-    """Of the search, over one line on either side."""
+    """Number of frequencies tried within one line on either side."""
 
 
 @dataclass(frozen=True)
@@ -291,51 +349,56 @@ class ExperimentSettings:
     """The next experiment: what it may do to the machine, and when it is worth doing."""
 
     fill: float = 0.9
-    """Of the tightest limit that an experiment uses on the twin."""
+    """Share of the tightest limit that an experiment uses on the twin."""
     plays: int = 4
-    """On the twin, to find the amplitude."""
+    """Largest number of simulations on the twin to find the amplitude."""
     first_rms: float = 0.1
-    """[V] of the first of them."""
+    """[V] Rms of the command in the first of them."""
     phase_draws: int = 40
-    """Sets of random phases, of which the flattest is taken."""
+    """Number of random sets of phases, of which the one with the smallest peak is used."""
     phase_rounds: int = 40
-    """Of the search for phases."""
+    """Number of rounds of the search for phases."""
     seed: int = 0
-    """Of the phases."""
-    at_end: float = 2e-3
-    """[m] from its end: a locked piston so near stands at it."""
+    """Seed of the phases."""
+    end_distance: float = 2e-3
+    """[m] Distance of a locked piston from its end, below which it counts as standing there."""
     closed_travel: float = 5e-3
-    """[m] that a joint behind a closed valve may move."""
+    """[m] Largest motion of a joint behind a closed valve."""
     end_travel: float = 2e-3
-    """[m] that a joint at its end may move."""
+    """[m] Largest motion of a joint at its end."""
     centring_offset: float = 4e-3
-    """[m] that a record's centre may be off."""
+    """[m] Largest offset of a record's centre."""
     position_gain: float = 2.0
-    """[V/m] of the loop that centres before the records."""
+    """[V/m] Gain of the loop that centres the piston before a record."""
     repeats: int = 4
-    """Of each training record."""
+    """Number of repeats of each training record."""
     held_out_amplitude: float = 0.85
-    """Of the training amplitude: what shows at the limits is soon gone below."""
+    """Amplitude of held-out over training records: what shows at the limits disappears soon below
+    them."""
     held_out_repeats: int = 3
-    """Of each held-out record."""
+    """Number of repeats of each held-out record."""
     line_ratio: float = 5.0
-    """Lines over those that the records hold."""
+    """Least number of lines of a proposed excitation over that of the records."""
     shape_step: float = 0.02
-    """Of a shape's value, or of its range where it is zero, to differentiate by (arithmetic)."""
-    more: float = 1.3
-    """Times what the records hold already: less is no progress (tuned)."""
-    enough: float = 3.0
-    """Times the noise: more shows no more (convention)."""
+    """Step of a numerical derivative over the shape's value, or over its range where the value is
+    zero (arithmetic)."""
+    least_gain: float = 1.3
+    """Least separation, or range of a variable, that an experiment promises over that of the
+    records (tuned)."""
+    useful_separation: float = 3.0
+    """Separation over the noise beyond which more shows no more (convention)."""
     steps: int = 3
-    """Of an experiment, at most."""
-    worth: float = 0.3
-    """That a further step must add to the sum over questions (tuned)."""
+    """Largest number of steps of an experiment."""
+    least_step_gain: float = 0.3
+    """Separation over the noise, summed over questions, that a further step must add (tuned)."""
     near_energy: float = 2.0
-    """Times the energy that the best set leaves: another is still in question (tuned)."""
+    """Remaining energy of a set over that of the best one, up to which the set is still in question
+    (tuned)."""
     rivals: int = 3
-    """Sets in question."""
-    likely: float = 2.0
-    """Times its nominal value that a parameter may be."""
+    """Largest number of sets in question beside the best one."""
+    parameter_ratio: float = 2.0
+    """Largest ratio of an estimated parameter to its nominal value, and of the nominal value to it,
+    at which the twin uses the estimate."""
 
 
 TRACE: Final = TraceSettings()

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from analysis.simulation.model import Estimate
-from analysis.trace.clues.formula import surest
+from analysis.trace.clues.formula import surest_formula
 from analysis.trace.result import CLEAN, CONFOUNDED, EXPLAINED, JudgedEffect, Trace
 from rig.model.channels import place_in_words
 from rig.model.rig import Rig
@@ -25,7 +25,7 @@ def unit_of_equation(rig: Rig, equation: str) -> str:
 
 
 def sentence(result: Trace) -> str:
-    """Return one paragraph that a person can act on."""
+    """Return the verdict, the effects and the errors of a trace in one paragraph."""
     if result.verdict == CLEAN:
         return (
             "No residual exceeds the noise: the baseline model explains these records; no effect "
@@ -34,7 +34,7 @@ def sentence(result: Trace) -> str:
     named = "; ".join(_effect(e) for e in result.effects)
     errors = _errors(result)
     if result.verdict == EXPLAINED:
-        return f"{_moves(result.effects)}: {named}. {errors}"
+        return f"{_variables_in_words(result.effects)}: {named}. {errors}"
     if result.verdict == CONFOUNDED:
         rivals = ", ".join(
             f"{name.replace('_', ' ')} at {place_in_words(at)}" for name, at in result.tied_at
@@ -56,20 +56,20 @@ def sentence(result: Trace) -> str:
 
 
 def _formula(result: Trace) -> str:
-    """Return the sparse fit that leaves least in words ('' where none is sure)."""
-    best = surest(result.formulas)
+    """Return the sure formula that leaves least, in words ('' where none is sure)."""
+    best = surest_formula(result.formulas)
     return f"; a sparse fit is {best.text}" if best else ""
 
 
 def _symmetry(result: Trace) -> str:
-    """Say what the lines of the loudest remainder show of its cause ('' without such lines)."""
-    loud = max(result.lines, key=lambda lines: lines.loud_after, default=None)
-    if loud is None or loud.loud_after < 1.0:
+    """Say what spectral lines show of the largest remaining residual ('' if none exceeds noise)."""
+    loud = max(result.lines, key=lambda lines: lines.above_noise_after, default=None)
+    if loud is None or loud.above_noise_after < 1.0:
         return ""
     return f"; its spectral lines in {loud.equation} show that it is {loud.meaning_after}"
 
 
-def _moves(effects: tuple[JudgedEffect, ...]) -> str:
+def _variables_in_words(effects: tuple[JudgedEffect, ...]) -> str:
     variables = [e.variable for e in effects if e.variable and not _constant(e.variable)]
     if len(variables) < len(effects) and variables:
         variables.append("a constant")
@@ -91,7 +91,7 @@ def quantity(estimate: Estimate) -> str:
 
 
 def shot_in_words(effect: JudgedEffect) -> str:
-    """Return what multiple shooting makes of an effect's shapes ('' where it has no such state)."""
+    """Return an effect's shapes from multiple shooting in words ('' without a hidden state)."""
     if effect.shot is None:
         return ""
     shot = effect.shot
@@ -107,7 +107,7 @@ def shot_in_words(effect: JudgedEffect) -> str:
     return f"by multiple shooting {values}; {judged}: {which}"
 
 
-def loudest(result: Trace) -> str:
+def equation_of_largest_reduction(result: Trace) -> str:
     """Return the equation whose error fell most, relative to its noise."""
     floor: Mapping[str, float] = result.noise_floor
     return max(result.before, key=lambda e: result.before[e] / max(floor.get(e, 1e-30), 1e-30))
@@ -116,7 +116,7 @@ def loudest(result: Trace) -> str:
 def _errors(result: Trace) -> str:
     if not result.before:
         return ""
-    e = loudest(result)
+    e = equation_of_largest_reduction(result)
     unit = unit_of_equation(result.model_before.rig, e)
     before, after, floor = (
         plain(error.get(e, float("nan")), 2)

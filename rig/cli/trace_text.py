@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from analysis.trace.data.spectral_lines import loudest
+from analysis.trace.data.spectral_lines import largest_residual_lines
 from analysis.trace.loop_rounds import Round
 from analysis.trace.result import JudgedEffect, Trace
 from analysis.trace.words import quantity, shot_in_words, unit_of_equation
@@ -59,7 +59,8 @@ def trace_text(result: Trace) -> str:
     if changed:
         lines += [table(["parameter", "before", "after", "change"], changed), ""]
     lines += [
-        f"spectral lines: {lines_of_equation.text}" for lines_of_equation in loudest(result.lines)
+        f"spectral lines: {lines_of_equation.text}"
+        for lines_of_equation in largest_residual_lines(result.lines)
     ]
     if result.depends_on:
         moves = ", ".join(f"{d.text} ({100 * d.share:.0f} %)" for d in result.depends_on[:4])

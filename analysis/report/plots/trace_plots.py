@@ -39,15 +39,15 @@ from analysis.trace.data.conditioned_record import (
     conditioned_records,
     filtered,
     model_rows,
-    prepared,
+    prepared_signals,
     row_residual,
 )
-from analysis.trace.data.spectral_lines import CONSTANT, EVEN, EXCITED, ODD, members
+from analysis.trace.data.spectral_lines import CONSTANT, EVEN, EXCITED, ODD, lines_by_kind
 from analysis.trace.data.spectral_lines import SpectralLines as Spectrum
 from analysis.trace.result import JudgedEffect, Rival, Trace
 from analysis.trace.search.refinement import ExactFit
 from analysis.trace.settings import TRACE
-from analysis.trace.words import loudest
+from analysis.trace.words import equation_of_largest_reduction
 from rig.model import channels as ch
 from rig.model.channels import kind_of
 from rig.model.records import Run
@@ -103,7 +103,7 @@ def abscissae(
     out = []
     for line in lines:
         if effect is not None:
-            seen = prepared(rig, model.terms, line.conditioned)
+            seen = prepared_signals(rig, model.terms, line.conditioned)
             raw = effect.abscissa(rig, seen)[equation]
         else:
             raw = variables(rig, line.conditioned.signals, joint)[variable]
@@ -275,7 +275,7 @@ def over_noise(result: Trace, key: str = "overnoise") -> Markup:
 
 def spectrum(shown: Spectrum, unit: str, key: str, after: bool) -> Markup:
     """Draw the lines of a residual by kind, before beside after, over the noise of one repeat."""
-    of = members(shown.excited)
+    of = lines_by_kind(shown.excited)
     kinds = (
         ("excited", of[EXCITED], "o", INK, 4.0),
         ("odd, left empty", of[ODD], "s", MODEL, 3.2),
@@ -339,7 +339,7 @@ def equation_of(
     conditioned = next(iter(lines.values()))[0].conditioned
     own = [e for e in effect.abscissa(rig, conditioned.signals) if e in lines]
     if not own:
-        return loudest(result)
+        return equation_of_largest_reduction(result)
     return max(own, key=lambda e: result.before[e] / max(result.noise_floor[e], 1e-30))
 
 

@@ -1,11 +1,11 @@
-"""Clues: what an unexplained residual moves with. A clue is not a name.
+"""Clues: the variables that an unexplained residual depends on. A clue is not a name.
 
-For each variable v the residual's equation gets a free curve of v (hat functions over quantiles,
-filtered like any column, projected off the model's own columns) on one set of records, and is
-judged on the other: the share of the energy above noise that the curve takes from records it was
-not fitted to. Friedman's partial dependence, with the held-out record as its referee. The curve
-may also be the slope of another variable (Hastie and Tibshirani's varying coefficients): the
-direction of motion, with and without memory, the velocity, the pressure difference, the spool.
+For each variable v a free curve of v (hat functions over quantiles, filtered like any column,
+orthogonal to the model's own columns) is fitted to the equation's residual on one set of records.
+It is judged on the other set, by the share of the energy above noise that it removes there
+(Friedman's partial dependence, judged on held-out records). The curve may also multiply another
+variable (Hastie and Tibshirani's varying coefficients): the direction of motion, with and without
+memory, the velocity, the pressure difference, the spool.
 """
 
 from __future__ import annotations
@@ -18,25 +18,26 @@ from numpy.typing import NDArray
 from analysis.trace.clues.equation_rows import (
     EquationPart,
     EquationRows,
-    columns_of,
-    judged,
-    side_of,
+    equation_rows,
+    explained_share,
+    whitened_columns,
 )
 from analysis.trace.clues.variables import factor_of, factors, variables
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.result import Dependence
-from analysis.trace.search.hypothesis import excess_of
+from analysis.trace.search.hypothesis import energy_above_noise
 from analysis.trace.settings import CLUES
 from rig.model import channels as ch
 from rig.model.rig import Rig
 
 Array = NDArray[np.float64]
 
-# An equation's own balance makes these follow whatever it lacks: they answer and are no cause.
-ANSWERS = {"torque": ("pressure", ch.DRIVE), "flow": ("velocity",)}
+# An equation's own balance makes these variables follow whatever the equation lacks, so that they
+# are no sign of a cause.
+FOLLOW_BY_BALANCE = {"torque": ("pressure", ch.DRIVE), "flow": ("velocity",)}
 
 
-def hats(v: Array, knots: Array) -> Array:
+def hat_functions(v: Array, knots: Array) -> Array:
     """Return the hat functions (n, k) of a piecewise linear curve with the given knots."""
     out = np.zeros((len(v), len(knots)))
     place = np.clip(np.searchsorted(knots, v) - 1, 0, len(knots) - 2)
@@ -47,23 +48,32 @@ def hats(v: Array, knots: Array) -> Array:
     return out
 
 
-def dependence(
+def dependences(
     train: RegressionData,
     residual: Array,
     holdout_data: RegressionData,
-    judge_left: Array,
+    holdout_residual: Array,
     equations: Sequence[str],
 ) -> list[Dependence]:
-    """Return what the residual moves with by share of the energy above noise, most telling first.
+    """Return the variables that the residual depends on, those with most evidence first.
 
-    `residual` (M,) and `judge_left` are residuals under the model of `train` (rebased to it).
+    The evidence is the share of energy above noise that a curve removes, times the variable's
+    weight (`_independence_weight`). Each variable is returned once.
+
+    `residual` (M,) and `holdout_residual` are the whitened residuals of the training and held-out
+    rows under the model of `train`.
     """
-    weight = {e: max(0.0, v) for e, v in excess_of(train, residual).items() if e in equations}
+    weight = {
+        e: max(0.0, v) for e, v in energy_above_noise(train, residual).items() if e in equations
+    }
     total = sum(weight.values()) or 1.0
     shares: dict[tuple[str, str], dict[str, float]] = {}
     for equation in equations:
-        sides = side_of(train, residual, equation), side_of(holdout_data, judge_left, equation)
-        for key, share in _shares(train.rig, equation, *sides).items():
+        sides = (
+            equation_rows(train, residual, equation),
+            equation_rows(holdout_data, holdout_residual, equation),
+        )
+        for key, share in _curve_shares(train.rig, equation, *sides).items():
             shares.setdefault(key, {})[equation] = share
     sums = {k: sum(s * weight[e] / total for e, s in by.items()) for k, by in shares.items()}
     out: list[tuple[float, Dependence]] = []
@@ -74,19 +84,21 @@ def dependence(
         if share < CLUES.least_share or (product and share < max(parts) + CLUES.product_gain):
             continue
         equation = max(by, key=lambda e: by[e])
-        independence = 1.0 if factor else _telling(name, equation, sums)
-        out.append((share * independence, _dependence(name, factor, share, equation, independence)))
+        independence = 1.0 if factor else _independence_weight(name, equation, sums)
+        out.append(
+            (share * independence, _dependence_of(name, factor, share, equation, independence))
+        )
     best: dict[str, Dependence] = {}
     for _, clue in sorted(out, key=lambda pair: -pair[0]):
         best.setdefault(clue.variable, clue)
     return list(best.values())
 
 
-def _dependence(
+def _dependence_of(
     name: str, factor: str, share: float, equation: str, independence: float
 ) -> Dependence:  # fmt: skip
     if not factor:
-        words = f"{name} by balance" if independence == CLUES.answer_weight else ""
+        words = f"{name} by balance" if independence == CLUES.by_balance_weight else ""
         return Dependence(name, share, equation, words=words)
     by = factors(equation)[factor]
     if not name:
@@ -94,11 +106,13 @@ def _dependence(
     return Dependence(name, share, equation, by.variable, f"{name} times {by.words}")
 
 
-def _telling(name: str, equation: str, shares: Mapping[tuple[str, str], float]) -> float:
-    """Return a variable's weight: what an equation's balance makes follow counts little.
+def _independence_weight(
+    name: str, equation: str, shares: Mapping[tuple[str, str], float]
+) -> float:
+    """Return a variable's weight, small if the equation's own balance makes it follow the residual.
 
-    A torque's balance makes the difference of the pressures follow; one chamber's pressure that
-    says much more than the difference follows nothing, its sensor may be what is wrong.
+    A torque's balance makes the pressure difference follow. One chamber's pressure that removes
+    `CLUES.chamber_lead` more than the difference does not follow: its sensor may be wrong.
     """
     kind, number = equation.rsplit("_", 1)
     if kind == "torque" and name in (
@@ -109,18 +123,18 @@ def _telling(name: str, equation: str, shares: Mapping[tuple[str, str], float]) 
         if shares[name, ""] > difference + CLUES.chamber_lead:
             return 1.0
     kind = kind.split("_", 1)[0]
-    if any(word in name for word in ANSWERS[kind]):
-        return CLUES.answer_weight
+    if any(word in name for word in FOLLOW_BY_BALANCE[kind]):
+        return CLUES.by_balance_weight
     return CLUES.spool_weight if kind == "torque" and name.startswith(ch.SPOOL) else 1.0
 
 
-def _shares(
+def _curve_shares(
     rig: Rig, equation: str, first: EquationRows | None, second: EquationRows | None
 ) -> dict[tuple[str, str], float]:
-    """Return the share of every curve alone, factor alone (variable ''), and product of both.
+    """Return the explained share of every curve, factor (variable '') and product of both.
 
-    Each is fitted on either side and judged on the other; the larger counts: a curve fitted to
-    small motions says nothing of large ones, the other way round it does.
+    Each is fitted on one side and judged on the other, both ways round, and the larger share is
+    used: a curve fitted to small motions does not predict large ones, but the reverse does.
     """
     if first is None or second is None:
         return {}
@@ -138,7 +152,7 @@ def _shares(
         moving = [v[name] for v, p in zip(values, every, strict=True) if _moves(p, joint)]
         knots = _knots(np.concatenate(moving)) if moving else None
         if knots is not None:
-            curves[name] = [hats(v[name], knots) for v in values]
+            curves[name] = [hat_functions(v[name], knots) for v in values]
     count = len(first.parts)
     out = {}
     for name, curve in curves.items():
@@ -148,9 +162,11 @@ def _shares(
                 if factor
                 else curve
             )
-            one, two = columns_of(first, made[:count]), columns_of(second, made[count:])
+            one, two = whitened_columns(first, made[:count]), whitened_columns(second, made[count:])
             out[name, factor] = max(
-                0.0, judged(one, first, two, second), judged(two, second, one, first)
+                0.0,
+                explained_share(one, first, two, second),
+                explained_share(two, second, one, first),
             )
     return out
 

@@ -1,4 +1,4 @@
-"""One equation's rows of a set of records, ready to be tried against columns of any kind."""
+"""One equation's rows of a set of records, and fits of columns to their residual."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from analysis.regression.conditioned import ConditionedRecord
 from analysis.regression.least_squares import shortest
 from analysis.regression.rows import Rows
 from analysis.signals.conditioning import Signals
-from analysis.trace.data.conditioned_record import filtered, prepared
+from analysis.trace.data.conditioned_record import filtered, prepared_signals
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.search.linear_fit import orthonormal
 
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class EquationPart:
-    """A record's rows of one equation: signals as the model's terms prepare them, and weight."""
+    """A record's rows of one equation, signals `seen` by the model's terms, whitening weight."""
 
     conditioned: ConditionedRecord
     rows: Rows
@@ -31,21 +31,24 @@ class EquationPart:
 
 @dataclass(frozen=True)
 class EquationRows:
-    """One set of records' rows of one equation: residual (m,) off the model's `base` (m, r)."""
+    """The rows of one equation in a set of records.
+
+    `residual` (m,) is whitened and orthogonal to the model's orthonormal `base` (m, r).
+    """
 
     parts: tuple[EquationPart, ...]
-    rest: Array
+    residual: Array
     base: Array
 
 
-def side_of(data: RegressionData, residual: Array, equation: str) -> EquationRows | None:
+def equation_rows(data: RegressionData, residual: Array, equation: str) -> EquationRows | None:
     """Return the rows of an equation with its `residual` (M,), None where it has no rows."""
     parts, rest, base = [], [], []
     for s in data.segments:
         if s.equation != equation:
             continue
         conditioned, rows = data.source(s)
-        seen = prepared(data.rig, data.terms, conditioned)
+        seen = prepared_signals(data.rig, data.terms, conditioned)
         weight = float(np.sqrt(s.repeats)) / s.noise
         parts.append(EquationPart(conditioned, rows, seen, weight))
         rest.append(residual[s.where])
@@ -57,8 +60,11 @@ def side_of(data: RegressionData, residual: Array, equation: str) -> EquationRow
     return EquationRows(tuple(parts), r - B @ (B.T @ r), B)
 
 
-def columns_of(side: EquationRows, made: Sequence[Array]) -> Array:
-    """Return columns (m, k) filtered as the rows are, whitened, off the model's own."""
+def whitened_columns(side: EquationRows, made: Sequence[Array]) -> Array:
+    """Return columns (m, k): filtered like the rows, whitened, orthogonal to the model's own.
+
+    `made` holds the unfiltered columns (n, k) of each part.
+    """
     stack = []
     for part, columns in zip(side.parts, made, strict=True):
         named = {str(k): columns[:, k] for k in range(columns.shape[1])}
@@ -68,15 +74,20 @@ def columns_of(side: EquationRows, made: Sequence[Array]) -> Array:
     return np.asarray(D - side.base @ (side.base.T @ D))
 
 
-def fitted_to(columns: Array, side: EquationRows) -> Array:
-    """Return the coefficients (k,) of columns (m, k) that leave least of a side."""
-    return shortest(columns, side.rest, 1e-2)
+def fitted_coefficients(columns: Array, side: EquationRows) -> Array:
+    """Return the least-squares coefficients (k,) of columns (m, k) for a residual."""
+    return shortest(columns, side.residual, 1e-2)
 
 
-def judged(fitted: Array, side: EquationRows, judging: Array, other: EquationRows) -> float:
-    """Return the share of the energy above noise that columns fitted to a side take of another."""
-    curve = fitted_to(fitted, side)
-    q = other.rest
+def explained_share(
+    fitted: Array, side: EquationRows, judging: Array, other: EquationRows
+) -> float:
+    """Return the share of energy above noise in `other` that columns fitted to `side` remove.
+
+    `fitted` and `judging` are the same columns on either rows.
+    """
+    curve = fitted_coefficients(fitted, side)
+    q = other.residual
     before = float(q @ q) - len(q)
     after = float(np.sum((q - judging @ curve) ** 2)) - len(q)
     return min(1.0, (before - after) / before) if before > 0 else 0.0

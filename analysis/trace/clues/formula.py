@@ -1,11 +1,11 @@
-"""A sparse generic fit of what stays unexplained: a formula as a clue, clearly not a name.
+"""A sparse fit of an unexplained residual by monomials: a formula as a clue, not a name.
 
-Monomials of a joint's variables, columns like any other (filtered, whitened, projected off the
-model's own), are joined one by one to the set that leaves least of training and held-out residual
-together, small motions and large ones (a cube and a line are alike in either); any that is idle
-then goes (forward and backward selection; sparse identification, Brunton, Proctor and Kutz 2016).
-Coefficients are the training records' alone, and the held-out ones judge. In a torque the
-monomials are forces at the piston, times the linkage's G.
+Monomials of a joint's variables are columns like any other (filtered, whitened, orthogonal to the
+model's own). They are added one by one to the set that leaves least of training and held-out
+residual together, since small or large motions alone do not separate a cube from a line; those that
+remove little are then dropped (forward and backward selection; sparse identification, Brunton,
+Proctor and Kutz 2016). Coefficients are fitted to the training records and judged on the held-out
+ones. In a torque the monomials are forces at the piston, times the linkage's G.
 """
 
 from __future__ import annotations
@@ -16,7 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.signals.conditioning import Signals
-from analysis.trace.clues.equation_rows import EquationRows, columns_of, fitted_to, judged, side_of
+from analysis.trace.clues.equation_rows import (
+    EquationRows,
+    equation_rows,
+    explained_share,
+    fitted_coefficients,
+    whitened_columns,
+)
 from analysis.trace.clues.variables import factor_of
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.result import Formula
@@ -27,7 +33,7 @@ from rig.model.rig import Rig
 Array = NDArray[np.float64]
 
 
-def surest(formulas: Sequence[Formula]) -> Formula | None:
+def surest_formula(formulas: Sequence[Formula]) -> Formula | None:
     """Return the sure formula that leaves least, None where none is sure."""
     return max((f for f in formulas if f.sure), key=lambda f: f.share, default=None)
 
@@ -36,24 +42,25 @@ def formula(
     train: RegressionData,
     residual: Array,
     holdout_data: RegressionData,
-    judge_left: Array,
+    holdout_residual: Array,
     equation: str,
 ) -> Formula | None:
-    """Return the formula of what is left of an equation, None where none takes half of it.
+    """Return a formula for an equation's residual, None where none removes `CLUES.shown_share`.
 
-    `residual` (M,) and `judge_left` are residuals under the model of `train` (rebased to it).
+    `residual` (M,) and `holdout_residual` are the whitened residuals of the training and held-out
+    rows under the model of `train`.
     """
-    first = side_of(train, residual, equation)
-    second = side_of(holdout_data, judge_left, equation)
+    first = equation_rows(train, residual, equation)
+    second = equation_rows(holdout_data, holdout_residual, equation)
     if first is None or second is None:
         return None
-    names, fitted, checked = _library(train.rig, equation, first, second)
-    both = EquationRows((), np.concatenate((first.rest, second.rest)), np.zeros((0, 0)))
-    chosen = _selected(np.concatenate((fitted, checked)), both)
-    share = judged(fitted[:, chosen], first, checked[:, chosen], second) if chosen else 0.0
-    if share < CLUES.offered:
+    names, fitted, checked = _candidate_monomials(train.rig, equation, first, second)
+    both = EquationRows((), np.concatenate((first.residual, second.residual)), np.zeros((0, 0)))
+    chosen = _selected_columns(np.concatenate((fitted, checked)), both)
+    share = explained_share(fitted[:, chosen], first, checked[:, chosen], second) if chosen else 0.0
+    if share < CLUES.shown_share:
         return None
-    values = fitted_to(fitted[:, chosen], first)
+    values = fitted_coefficients(fitted[:, chosen], first)
     terms = {names[k]: float(v) for k, v in zip(chosen, values, strict=True)}
     if is_balance(equation, terms):
         return None
@@ -62,10 +69,10 @@ def formula(
 
 
 def is_balance(equation: str, terms: Mapping[str, float]) -> bool:
-    """Whether a formula takes both chambers' pressures against each other by one factor.
+    """Return whether a formula holds both chambers' pressures with opposite signs and one factor.
 
-    That is the cylinder's force times the factor: a torque's own balance makes the force follow
-    whatever the torque lacks, and with a factor too it answers and is no cause.
+    That is the cylinder's force times the factor. A torque's own balance makes this force follow
+    whatever the torque lacks, so that it is no sign of a cause.
     """
     kind, joint = equation.rsplit("_", 1)
     sides = [ch.channel(side, int(joint)) for side in (ch.CAP, ch.ROD)]
@@ -76,10 +83,10 @@ def is_balance(equation: str, terms: Mapping[str, float]) -> bool:
     return kind == "torque" and any(cap[by] * rod[by] < 0.0 for by in cap.keys() & rod.keys())
 
 
-def _library(
+def _candidate_monomials(
     rig: Rig, equation: str, fitted: EquationRows, judged: EquationRows
 ) -> tuple[list[str], Array, Array]:  # fmt: skip
-    """Return the monomials' names and their columns on either side, what is one left out."""
+    """Return the monomials' names and columns on either side, nearly equal ones only once."""
     joint = int(equation.rsplit("_", 1)[1]) - 1
     every = [*fitted.parts, *judged.parts]
     travel = max(float(np.ptp(p.conditioned.signals.s[:, joint])) for p in every)
@@ -87,13 +94,16 @@ def _library(
     names = list(made[0])
     stacks = [np.column_stack([m[n] for n in names]) for m in made]
     count = len(fitted.parts)
-    first, second = columns_of(fitted, stacks[:count]), columns_of(judged, stacks[count:])
+    first, second = (
+        whitened_columns(fitted, stacks[:count]),
+        whitened_columns(judged, stacks[count:]),
+    )
     both = np.concatenate((first, second))
     size = np.linalg.norm(both, axis=0)
     kept: list[int] = []
     for k in np.flatnonzero(size > 1e-12):
         unit = both[:, k] / size[k]
-        if all(abs(float(unit @ both[:, j])) < CLUES.alike * size[j] for j in kept):
+        if all(abs(float(unit @ both[:, j])) < CLUES.duplicate_correlation * size[j] for j in kept):
             kept.append(int(k))
     return [names[k] for k in kept], first[:, kept], second[:, kept]
 
@@ -101,7 +111,7 @@ def _library(
 def _monomials(
     rig: Rig, equation: str, seen: Signals, joint: int, travel: float
 ) -> dict[str, Array]:  # fmt: skip
-    """Return the monomials (n,) by name, simpler ones first: of two that are one, these stay."""
+    """Return the monomials (n,) by name, simpler ones first: of equal ones the first is kept."""
     i, t = joint + 1, seen.t
     place, v = ch.channel(rig.position_kind, i), f"velocity_{i}"
     s, sd = (seen.q, seen.qd) if rig.electric else (seen.s, seen.sd)
@@ -120,11 +130,11 @@ def _monomials(
     for name, y in sides.items():
         out[f"{name} time"] = y * t
     if equation.startswith("torque"):
-        # Pressures, squared too, are the balance's other side: they would take whatever it lacks.
+        # Pressures and their squares are the balance's other side: they would fit any residual.
         out |= {f"{name} sign({v})": y * sign for name, y in sides.items()}
         return {name: seen.G[:, joint] * y for name, y in out.items()}
-    # So is the velocity in a flow's, whatever it is multiplied with: a boom that only comes down
-    # has all its products alike.
+    # So is the velocity in a flow's balance, and any product with it: for a boom that only comes
+    # down all these products are alike.
     out = {name: y for name, y in out.items() if v not in name}
     out |= {f"{name}²": y**2 for name, y in sides.items()}
     spool = ch.channel(ch.SPOOL, i)
@@ -134,24 +144,24 @@ def _monomials(
     return out | {f"{place} {spool}": x * u, f"{spool} time": u * t}
 
 
-def _selected(columns: Array, side: EquationRows) -> list[int]:
-    """Return the columns chosen, in the order they were; none idle."""
+def _selected_columns(columns: Array, side: EquationRows) -> list[int]:
+    """Return the numbers of the columns selected, in order of selection."""
     chosen: list[int] = []
     share = 0.0
     while len(chosen) < min(CLUES.monomials, columns.shape[1]):
         free = [k for k in range(columns.shape[1]) if k not in chosen]
-        shares = {k: _share([*chosen, k], columns, side) for k in free}
+        shares = {k: _joint_share([*chosen, k], columns, side) for k in free}
         best = max(free, key=lambda k: shares[k])
         if shares[best] < share + CLUES.monomial_gain:
             break
         chosen, share = [*chosen, best], shares[best]
     for k in list(chosen):
         rest = [j for j in chosen if j != k]
-        if rest and _share(rest, columns, side) > share - CLUES.monomial_gain:
+        if rest and _joint_share(rest, columns, side) > share - CLUES.monomial_gain:
             chosen = rest
     return chosen
 
 
-def _share(chosen: list[int], columns: Array, side: EquationRows) -> float:
-    """Return the share of a side's energy above noise that the chosen columns take of it."""
-    return judged(columns[:, chosen], side, columns[:, chosen], side)
+def _joint_share(chosen: list[int], columns: Array, side: EquationRows) -> float:
+    """Return the share of a side's energy above noise that the chosen columns remove."""
+    return explained_share(columns[:, chosen], side, columns[:, chosen], side)

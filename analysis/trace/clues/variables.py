@@ -1,4 +1,4 @@
-"""What an unexplained residual may move with: variables of a joint, and factors of their curves."""
+"""Variables of a joint that a residual may depend on, and factors of their curves."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Factor:
-    """What a curve may multiply: the `variable` that it is made of and what it is in `words`."""
+    """A factor of a curve: the `variable` that it is computed from, and the factor in `words`."""
 
     variable: str
     words: str
 
 
 def factors(equation: str) -> dict[str, Factor]:
-    """Return the factors of an equation's curves by name: variables, and what is made of one."""
+    """Return the factors of an equation's curves by name."""
     kind, number = equation.rsplit("_", 1)
     velocity = f"velocity_{number}"
     if kind == "torque":
@@ -39,17 +39,17 @@ def factors(equation: str) -> dict[str, Factor]:
 
 
 def factor_of(name: str, signals: Signals, joint: int, travel: float) -> Array:
-    """Return a factor (n,) that is no variable; `travel` is the joint's largest [m, rad]."""
+    """Return the factor `direction` or `memory` (n,); `travel` [m, rad] is the joint's largest."""
     if name == "direction":
         speed = signals.sd[:, joint]
         rms = float(np.sqrt(np.mean(speed**2)))
-        return np.asarray(np.tanh(speed / max(CLUES.slow * rms, 1e-12)))
+        return np.asarray(np.tanh(speed / max(CLUES.direction_speed * rms, 1e-12)))
     place = np.ascontiguousarray(signals.s[:, joint])
-    return np.asarray(contact_state(place, max(CLUES.memory * travel, 1e-12)))
+    return np.asarray(contact_state(place, max(CLUES.direction_memory * travel, 1e-12)))
 
 
 def variables(rig: Rig, signals: Signals, joint: int) -> dict[str, Array]:
-    """Return the variables (n,) that a residual of a joint (0-based) may move with, by name."""
+    """Return the variables (n,) that a residual of a joint (0-based) may depend on, by name."""
     i, cap, rod = joint, signals.p_cap[:, joint], signals.p_rod[:, joint]
     if rig.electric:
         return {

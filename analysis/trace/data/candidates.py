@@ -1,4 +1,4 @@
-"""Candidates: every effect of the catalogue at every place, with points of first look."""
+"""Candidates: every effect of the catalogue at every place, with a grid of shapes to start from."""
 
 from __future__ import annotations
 
@@ -44,15 +44,17 @@ def catalogue(rig: Rig, names: Sequence[str] | None = None) -> list[Effect]:
 
 
 def free_mechanisms(rig: Rig) -> list[Effect]:
-    """Return every mechanism whose form the data draw, at every place it can be at."""
+    """Return every mechanism whose curve the data give, at every place it can be at."""
     kinds = [kind for _, kind in sorted(known().items()) if issubclass(kind, Effect) and kind.free]
     return [kind(where) for kind in kinds for where in kind.places(rig)]
 
 
-def points(effect: Effect, rig: Rig, evidence: Evidence | None = None) -> list[tuple[float, ...]]:
+def shape_grid(
+    effect: Effect, rig: Rig, evidence: Evidence | None = None
+) -> list[tuple[float, ...]]:
     """Return the shape grid of an effect, thinned where it has too many points.
 
-    Of an effect that takes its points from the data, those; none without `evidence`.
+    An effect whose points depend on the data has none without `evidence`.
     """
     if effect.by_data:
         return list(effect.points(rig, evidence)) if evidence is not None else []
@@ -74,14 +76,13 @@ def variants(
     rig: Rig, effects: Sequence[Effect], evidence: Evidence | None = None
 ) -> list[Variant]:
     """Return every candidate at every point of its grid."""
-    return [Variant(effect, shape) for effect in effects for shape in points(effect, rig, evidence)]
+    return [
+        Variant(effect, shape) for effect in effects for shape in shape_grid(effect, rig, evidence)
+    ]
 
 
 def complexity(rig: Rig, used: Sequence[Used]) -> tuple[int, int]:
-    """Return the number of effects and of their free numbers: the simpler of two equals wins.
-
-    Details of a form do not count.
-    """
+    """Return the number of effects and of their free numbers, details of forms not counted."""
     free = sum(
         len(u.term.coefficients(rig))
         + sum(not (shape.detail or shape.fixed) for shape in shapes_of(rig, u))

@@ -1,11 +1,9 @@
-"""Evidence: every record conditioned once, its rows, and columns of candidates beside them.
+"""Rows of conditioned records under a model, and columns of candidates for them.
 
-A `Sheet` holds one record's rows of every equation under a model, whitened by the noise floor of
-their group (run, step, equation), so that a residual of 1 is the size of the noise whatever its
-unit. Effects that change the signals (`prepare`) enter as a pseudo-column: with X', y' the rows
-after the change and beta the present coefficients,
+Effects that change the signals (`prepare`) enter as a pseudo-column: with X, y the rows before and
+X', y' the rows after the change, and beta the present coefficients,
  d = (y - X beta) - (y' - X' beta),
-which to first order in the change is what the effect puts into the residual.
+which to first order in the change is what the effect adds to the residual.
 """
 
 from __future__ import annotations
@@ -37,7 +35,7 @@ from analysis.regression.rows import (
 )
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import FAMILIES, Term, Used
-from analysis.trace.data.memory import RowMemory
+from analysis.trace.data.cache import RowCache
 from rig.model.records import Record, Run
 from rig.model.rig import Rig
 
@@ -57,7 +55,7 @@ def trace_filtering(record: Record) -> Filtering:
 
 
 def moving_filtering(joints: Iterable[int]) -> Callable[[Record], Filtering]:
-    """Return the trace's filters, of rows that do not count the rests of some joints (0-based)."""
+    """Return the trace's filters, with torque rows of `joints` (0-based) weighted by speed."""
     return lambda record: replace(trace_filtering(record), in_motion=tuple(sorted(joints)))
 
 
@@ -72,10 +70,10 @@ def conditioned_records(
     return condition_runs(rig, runs, filtering, families)
 
 
-def held(term: Term, conditioned: ConditionedRecord) -> bool:
-    """Return whether an effect at a joint cannot show because the joint is locked.
+def is_hidden_by_lock(term: Term, conditioned: ConditionedRecord) -> bool:
+    """Return whether an effect cannot show in a record because its joint is locked there.
 
-    The sensor of a locked joint's piston still shows where that joint stands.
+    An error of the piston sensor shows in a locked joint too, by the position where it stands.
     """
     where = term.where
     piston = getattr(term, "stage", None) == SENSOR and where.endswith("piston")
@@ -85,13 +83,13 @@ def held(term: Term, conditioned: ConditionedRecord) -> bool:
 
 
 def changes_signals(term: Term) -> bool:
-    """Return whether a term changes what all terms see, or where the equations hold."""
+    """Return whether a term changes the signals of all terms, or the samples that are valid."""
     kind = type(term)
     return kind.prepare is not Term.prepare or kind.valid is not Term.valid
 
 
 def families_of(rig: Rig, term: Term) -> frozenset[str]:
-    """Return the families of rows that need a term: it has columns or alters the signals there."""
+    """Return the families of rows in which a term has columns or changes the signals."""
     altered = getattr(term, "alters", FAMILIES) if changes_signals(term) else ()
     return frozenset((*altered, *(c.family for c in term.coefficients(rig))))
 
@@ -103,7 +101,7 @@ def model_rows(rig: Rig, terms: Sequence[Used], conditioned: ConditionedRecord) 
     )
 
 
-def prepared(rig: Rig, terms: Sequence[Used], conditioned: ConditionedRecord) -> Signals:
+def prepared_signals(rig: Rig, terms: Sequence[Used], conditioned: ConditionedRecord) -> Signals:
     """Return the signals of a record as the terms of a model see them."""
     signals = conditioned.signals
     for used in ordered(terms):
@@ -116,25 +114,27 @@ def filtered(
 ) -> dict[str, Array]:
     """Filter point-by-point columns (n,) as `rows` were, at the instants of `rows`."""
     made = low_passed(columns, conditioned.filtering)
-    return {name: column[_at(conditioned, len(column), rows)] for name, column in made.items()}
+    return {
+        name: column[_row_places(conditioned, len(column), rows)] for name, column in made.items()
+    }
 
 
-def _at(conditioned: ConditionedRecord, count: int, rows: Rows) -> Indices:
-    """Return the places of rows (m,) among all `count` filtered ones of their record."""
+def _row_places(conditioned: ConditionedRecord, count: int, rows: Rows) -> Indices:
+    """Return the numbers of rows (m,) among all `count` filtered rows of their record."""
     time = instants(conditioned.signals.t, conditioned.filtering, count)
     return np.searchsorted(time, rows.time - 1e-9)
 
 
 def shared_rows(
-    rig: Rig, terms: Sequence[Used], conditioned: ConditionedRecord, memory: RowMemory
+    rig: Rig, terms: Sequence[Used], conditioned: ConditionedRecord, cache: RowCache
 ) -> dict[str, Rows]:
-    """Return a record's rows under the terms that can show in it, each part of them built once.
+    """Return a record's rows under the terms that can show in it; parts are shared by `cache`.
 
-    Many models share what acts on a family of rows. A term that only has columns has them filtered
-    alone, beside the rows of the others.
+    Many models share the terms that act on a family of rows. The columns of an effect that changes
+    no signal are filtered separately and appended to the rows of the other terms.
     """
-    here = [u for u in terms if not held(u.term, conditioned)]
-    families = memory.families
+    here = [u for u in terms if not is_hidden_by_lock(u.term, conditioned)]
+    families = cache.families
     for u in here:
         if u.term not in families:
             families[u.term] = families_of(rig, u.term)
@@ -144,64 +144,68 @@ def shared_rows(
         added = [u for u in acting if isinstance(u.term, Effect) and not changes_signals(u.term)]
         others = tuple(u for u in acting if u not in added)
         key, own = (conditioned.group, family, others), replace(conditioned, families=(family,))
-        # The families of rows share signals, whatever other terms they have.
+        # Signals depend only on the terms that change them, so that families of rows share them.
         changing = tuple(u for u in others if type(u.term).prepare is not Term.prepare)
         seen = partial(
-            memory.signals.of, (conditioned.group, changing), partial(prepared, rig, changing, own)
+            cache.signals.get,
+            (conditioned.group, changing),
+            partial(prepared_signals, rig, changing, own),
         )
-        bare: dict[str, Rows] = memory.rows.of(
-            key, partial(_bare_rows, rig, others, own, seen, memory)
+        bare: dict[str, Rows] = cache.rows.get(
+            key, partial(_rows_of_family, rig, others, own, seen, cache)
         )
         rows = bare
         for u in added:
-            more = memory.rows.of((*key, u), partial(_own_columns, rig, own, seen, bare, u, memory))
-            rows = {e: _beside(r, more.get(e, {})) for e, r in rows.items()}
+            more = cache.rows.get(
+                (*key, u), partial(_added_columns, rig, own, seen, bare, u, cache)
+            )
+            rows = {e: _with_columns(r, more.get(e, {})) for e, r in rows.items()}
         out |= rows
     return out
 
 
-def _bare_rows(
+def _rows_of_family(
     rig: Rig, terms: Sequence[Used], conditioned: ConditionedRecord, seen: Callable[[], Signals],
-    memory: RowMemory,
+    cache: RowCache,
 ) -> dict[str, Rows]:  # fmt: skip
-    """Return the rows of the record's one family under terms."""
+    """Return the rows of a record with one family, under `terms` and their signals `seen`."""
     (family,), filtering = conditioned.families, conditioned.filtering
     terms, signals = ordered(terms), seen()
-    parts = [_part(rig, u, conditioned, family, signals, memory) for u in terms]
+    parts = [_term_part(rig, u, conditioned, family, signals, cache) for u in terms]
     key = conditioned.group, family
-    sides = memory.parts.of(key, signals, lambda x: right_parts(rig, x, filtering, family))
+    sides = cache.parts.get(key, signals, lambda x: right_parts(rig, x, filtering, family))
     return assembled(parameters_of(rig, terms, family), parts, sides, filtering)
 
 
-def _part(
+def _term_part(
     rig: Rig, used: Used, conditioned: ConditionedRecord, family: str, signals: Signals,
-    memory: RowMemory,
+    cache: RowCache,
 ) -> TermPart:  # fmt: skip
     key, filtering = (conditioned.group, family, used), conditioned.filtering
-    part: TermPart = memory.parts.of(
+    part: TermPart = cache.parts.get(
         key, signals, lambda x: term_part(rig, used, x, filtering, family, conditioned.signals)
     )
     return part
 
 
-def _own_columns(
+def _added_columns(
     rig: Rig, conditioned: ConditionedRecord, seen: Callable[[], Signals],
-    rows: Mapping[str, Rows], used: Used, memory: RowMemory,
+    rows: Mapping[str, Rows], used: Used, cache: RowCache,
 ) -> dict[str, dict[str, Array]]:  # fmt: skip
-    """Return what a term that leaves the signals alone adds to rows: equation -> name -> column."""
+    """Return the columns of a term that changes no signal: equation -> parameter -> column (m,)."""
     out: dict[str, dict[str, Array]] = {}
     for family in conditioned.families:
-        part = _part(rig, used, conditioned, family, seen(), memory)
+        part = _term_part(rig, used, conditioned, family, seen(), cache)
         for name, columns in part.columns.items():
             if name in rows and any(np.any(v) for v in columns.values()):
                 count = len(next(iter(columns.values())))
-                at = _at(conditioned, count, rows[name])
+                at = _row_places(conditioned, count, rows[name])
                 out[name] = {parameter: v[at] for parameter, v in columns.items()}
     return {name: out[name] for name in rows if name in out}
 
 
-def _beside(rows: Rows, columns: Mapping[str, Array]) -> Rows:
-    """Return rows with columns (m,) of further parameters."""
+def _with_columns(rows: Rows, columns: Mapping[str, Array]) -> Rows:
+    """Return rows with appended columns (m,) of further parameters."""
     if not columns:
         return rows
     matrix = np.column_stack([rows.matrix, *columns.values()])
@@ -216,18 +220,18 @@ def candidate_columns(
     rows: Mapping[str, Rows],
     beta: Mapping[str, float],
     used: Used,
-    memory: RowMemory,
+    cache: RowCache,
 ) -> dict[str, dict[str, Array]]:
-    """Return what a candidate would add to a record's rows: equation -> name -> column.
+    """Return the columns that a candidate adds to a record's rows: equation -> name -> column (m,).
 
-    `seen` are the signals under `terms`, `rows` the rows under `terms`, `beta` their coefficients
-    (of the rows, b as 1/b). The pseudo-column of a change of signals is named ''.
+    `seen` and `rows` are the signals and rows under `terms`, `beta` the coefficients of the rows
+    (1/b for b). The pseudo-column of a change of signals (see the module) is named ''.
     """
     if not changes_signals(used.term):
-        return _own_columns(rig, conditioned, lambda: seen, rows, used, memory)
+        return _added_columns(rig, conditioned, lambda: seen, rows, used, cache)
     acting = families_of(rig, used.term)
     families = tuple(f for f in conditioned.families if f in acting)
-    changed = shared_rows(rig, (*terms, used), replace(conditioned, families=families), memory)
+    changed = shared_rows(rig, (*terms, used), replace(conditioned, families=families), cache)
     own = [c.parameter for c in used.term.coefficients(rig)]
     out: dict[str, dict[str, Array]] = {}
     for name, after in changed.items():
@@ -235,7 +239,7 @@ def candidate_columns(
             continue
         before = rows[name]
         here, there = in_common(before, after)
-        # Column by column: where a column is the same the difference is exactly nothing.
+        # Column by column, so that an unchanged column gives a difference of exactly 0.
         moved = -before.matrix[here]
         for k, n in enumerate(before.names):
             if n in after.names:  # a column of zeros is left out of rows

@@ -2,16 +2,16 @@
 
 With n repeats r_k(t) of one excitation,
  noise^2 = mean_t var_k r_k (ddof 1),   repeatable^2 = mean_t (mean_k r_k)^2 - noise^2 / n.
-A record that is the only repeat of its step is cut into its periods, which repeat one another as
-records do. Where there is neither, but the motion comes back to states x where it was before,
+A record that is the only repeat of its step is cut into its periods, which serve as repeats. Where
+there are no periods either, but the motion comes back to states x where it was before,
  noise^2 = mean 1/2 (r(x') - r(x))^2 over the nearest pairs of states
 (a difference estimator: Rice 1984; Evans and Jones 2002). Where the motion does not come back, the
-rig's stated sensor noise, put through the same rows, stands in: that holds no noise that the rig
+rig's stated sensor noise, put through the same rows, is used. It lacks every noise that the rig
 file does not state, and a note says so.
 
-The floor lies no lower than `DATA.least_noise` of the stated noise: with sensors so much better
-than their data sheet (or simulated without noise) repeats separate what no bench would ask about,
-and a clean one would never be clean.
+The floor is at least `DATA.least_noise` of the stated noise: with sensors much better than their
+data sheet (or simulated without noise), repeats would resolve differences of no practical interest,
+and a clean bench would never be `clean`.
 """
 
 from __future__ import annotations
@@ -35,15 +35,16 @@ Array = NDArray[np.float64]
 
 REPEATS, PERIODS, NEIGHBOURS, STATED = "repeats", "periods", "neighbouring states", "stated noise"
 Group = tuple[int, str]
-NO_ROWS = 1e-30  # SI: where every row is masked nothing is weighed by it
+NO_ROWS = 1e-30  # SI: noise of an equation whose rows are all masked; it weights no row
 
 
 @dataclass(frozen=True)
 class Floor:
     """The split of one equation's residual in one group of records, SI.
 
-    `source` says what the noise was computed from; `count` repeats or periods stand behind it.
-    `stated` is what the rig file's sensor noise alone makes.
+    `noise`, `repeatable` and `total` are rms values of the residual. `source` says what the noise
+    was computed from, `count` from how many repeats or periods. `stated` is the rms that the rig
+    file's sensor noise alone makes.
     """
 
     group: Group
@@ -61,7 +62,7 @@ class Floor:
         return self.repeatable / self.noise if self.noise > 0 else float("inf")
 
 
-def split(repeats: Array) -> tuple[float, float]:
+def noise_and_repeatable(repeats: Array) -> tuple[float, float]:
     """Return noise and repeatable rms of residuals (n, m) of n repeats."""
     n = len(repeats)
     noise2 = float(np.mean(np.var(repeats, axis=0, ddof=1)))
@@ -89,9 +90,9 @@ def floors(
             every = np.concatenate(residual)
             total = float(np.sqrt(np.mean(every**2))) if len(every) else 0.0  # all rows masked
             sensors = stated[equation]
-            table, source = repeats_of(members[indices[0]], parts, residual)
+            table, source = stacked_repeats(members[indices[0]], parts, residual)
             if table is not None:
-                noise, repeatable = split(table)
+                noise, repeatable = noise_and_repeatable(table)
                 noise = max(noise, DATA.least_noise * sensors)
                 out.append(
                     Floor(group, equation, noise, repeatable, total, len(table), source, sensors)
@@ -99,15 +100,17 @@ def floors(
                 continue
             noise, source = sensors, STATED
             if len(parts) == 1:
-                near = neighbours(members[indices[0]], parts[0], residual[0])
+                near = noise_by_neighbours(members[indices[0]], parts[0], residual[0])
                 if near is not None:
                     noise, source = max(near, DATA.least_noise * noise), NEIGHBOURS
-            rest = float(np.sqrt(max(0.0, total**2 - noise**2)))
-            out.append(Floor(group, equation, noise, rest, total, 1, source, sensors))
+            repeatable_rms = float(np.sqrt(max(0.0, total**2 - noise**2)))
+            out.append(Floor(group, equation, noise, repeatable_rms, total, 1, source, sensors))
     return out
 
 
-def neighbours(conditioned: ConditionedRecord, rows: Rows, residual: Array) -> float | None:
+def noise_by_neighbours(
+    conditioned: ConditionedRecord, rows: Rows, residual: Array
+) -> float | None:
     """Return the noise (rms, SI) of a residual (m,) by pairs of rows at neighbouring states.
 
     A state is position, velocity, spool (or drive) and pressures of every moving joint, each over
@@ -118,12 +121,12 @@ def neighbours(conditioned: ConditionedRecord, rows: Rows, residual: Array) -> f
     x = _states(conditioned, rows)
     count = min(len(x), DATA.neighbours_asked)
     distance, other = cKDTree(x).query(x, k=count)
-    apart = np.abs(rows.time[other] - rows.time[:, None]) > DATA.pair_apart
-    first = np.argmax(apart, axis=1)  # the nearest neighbour that is no close predecessor
+    apart = np.abs(rows.time[other] - rows.time[:, None]) > DATA.pair_time
+    first = np.argmax(apart, axis=1)  # the nearest neighbour at least `pair_time` away
     here = np.flatnonzero(apart.any(axis=1))
     d = distance[here, first[here]] ** 2
     half = 0.5 * (residual[other[here, first[here]]] - residual[here]) ** 2
-    nearest = np.argsort(d)[: int(DATA.nearest_pairs * len(x))]
+    nearest = np.argsort(d)[: int(DATA.nearest_pair_share * len(x))]
     if len(nearest) < DATA.least_pairs or d[nearest[-1]] > DATA.pair_distance**2:
         return None
     return float(np.sqrt(np.mean(half[nearest])))
@@ -139,10 +142,10 @@ def _states(conditioned: ConditionedRecord, rows: Rows) -> Array:
     return np.asarray(columns[:, spread > 0] / spread[spread > 0])
 
 
-def repeats_of(
+def stacked_repeats(
     conditioned: ConditionedRecord, parts: Sequence[Rows], residual: Sequence[Array]
 ) -> tuple[Array | None, str]:
-    """Return residuals of repeats, or of one record's periods, one under the other (n, m)."""
+    """Return the residuals (n, m) of n repeats, or of one record's n periods, and their source."""
     if len(parts) > 1:
         common = parts[0].time
         for rows in parts[1:]:
@@ -158,10 +161,10 @@ def repeats_of(
 
 
 def _periods(conditioned: ConditionedRecord, rows: Rows, residual: Array) -> Array | None:
-    """Cut a record's residual into whole periods, one under the other.
+    """Return a record's residual cut into whole periods (n, m), None where there are too few.
 
-    Of a record of less than three, what the first two have in common, if that is a quarter of a
-    period or more; None where there is less than that, or periods of fewer than five rows.
+    A record of less than three periods gives the part that the first two have in common, if that is
+    at least a quarter of a period. A period needs at least five rows.
     """
     period, step = conditioned.record.period, conditioned.filtering.step
     if not period or period % step or not len(rows.time):
@@ -191,7 +194,7 @@ def stated_noise(
     beta: Mapping[str, float],
 ) -> dict[str, float]:
     """Return the rms that the rig's stated sensor noise alone puts into each residual."""
-    rng = np.random.default_rng(0)  # a prediction, the same every time
+    rng = np.random.default_rng(0)  # fixed seed: the prediction is the same every time
     again = model_rows(rig, terms, conditioned.again(rig, disturbed(rig, conditioned.record, rng)))
     out = {}
     for name, before in rows.items():

@@ -1,10 +1,10 @@
 """Regression data: averaged records, their whitened residuals, every candidate's columns on them.
 
-Repeats of one excitation are averaged channel by channel; the average's rows carry the columns,
-and each repeat keeps its own residual. So 12 records of 10 s become a table of a few thousand
-rows in which the whole catalogue fits, and sign flips cost one product each.
-Rows are whitened by the noise floor and weighted by the root of the number of repeats: noise then
-adds 1 per row to a residual's energy, whatever the unit and the number of repeats.
+Repeats of one excitation (a group: run and step) are averaged channel by channel. The columns are
+those of the average; each repeat has its own residual. So 12 records of 10 s become a few thousand
+rows for the whole catalogue, and a sign flip costs one product.
+Rows are divided by the noise floor of their group and equation, and multiplied by the root of the
+number of repeats: noise then adds 1 per row to a residual's energy, whatever unit and repeats.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from analysis.regression.least_squares import shortest
 from analysis.regression.rows import Rows
 from analysis.signals.conditioning import Signals
 from analysis.terms.base import Used
+from analysis.trace.data.cache import RowCache
 from analysis.trace.data.candidates import Variant
 from analysis.trace.data.conditioned_record import (
     candidate_columns,
-    held,
+    is_hidden_by_lock,
     model_rows,
-    prepared,
+    prepared_signals,
     row_residual,
 )
-from analysis.trace.data.memory import RowMemory
 from analysis.trace.data.noise_floor import Floor, Group, floors
 from analysis.trace.settings import TRACE
 from rig.model.parse import InputError
@@ -43,7 +43,10 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Segment:
-    """Rows of one equation of one group: `rows[where]`, of `repeats` records."""
+    """The rows (`where`) of one equation of one group, averaged over `repeats` records.
+
+    `noise` is the noise floor of one record [SI], `locked` are the locked joints (1-based).
+    """
 
     group: Group
     equation: str
@@ -55,9 +58,11 @@ class Segment:
 
 @dataclass(frozen=True)
 class RegressionData:
-    """Whitened rows: `base` (M, k) of `names`, `residual` (R, M) residuals of the repeats.
+    """Whitened rows of records under a model with coefficients `beta`.
 
-    `residual[r]` is NaN on segments with fewer repeats. `records` are the averaged records.
+    `base` (M, k) holds the columns of the coefficients `names`; `residual` (R, M) the residual of
+    each repeat over its noise, NaN on segments with fewer repeats. `records` are the averaged
+    records, `rows` their rows before whitening [SI], `floors` the split of the residuals.
     """
 
     rig: Rig
@@ -70,18 +75,18 @@ class RegressionData:
     floors: tuple[Floor, ...]
     records: tuple[ConditionedRecord, ...]
     rows: tuple[Mapping[str, Rows], ...]
-    memory: RowMemory = field(default_factory=RowMemory, repr=False, compare=False)
+    cache: RowCache = field(default_factory=RowCache, repr=False, compare=False)
 
     @property
-    def mean(self) -> Array:
-        """The averaged residual (M,), in units of its own noise."""
+    def mean_residual(self) -> Array:
+        """The averaged residual (M,) over its own noise, that of one record over root repeats."""
         weights = np.zeros(self.residual.shape[1])
         for segment in self.segments:
             weights[segment.where] = np.sqrt(segment.repeats)
         return np.asarray(np.nanmean(self.residual, axis=0) * weights)
 
     @property
-    def counts(self) -> Counter[str]:
+    def row_counts(self) -> Counter[str]:
         """How many rows each equation has."""
         rows: Counter[str] = Counter()
         for s in self.segments:
@@ -89,12 +94,12 @@ class RegressionData:
         return rows
 
     def source(self, segment: Segment) -> tuple[ConditionedRecord, Rows]:
-        """Return the averaged record that a segment is of, and the record's rows behind it."""
+        """Return the averaged record of a segment, and its rows of the segment's equation [SI]."""
         k = [conditioned.group for conditioned in self.records].index(segment.group)
         return self.records[k], self.rows[k][segment.equation]
 
     def at(self, mask: NDArray[np.bool_]) -> RegressionData:
-        """Return the data with only the rows of a mask (M,), weighed by the floors of all."""
+        """Return the data with the rows of a mask (M,); noise floors stay those of all rows."""
         index = {conditioned.group: k for k, conditioned in enumerate(self.records)}
         rows: tuple[dict[str, Rows], ...] = tuple({} for _ in self.records)
         segments, start = [], 0
@@ -102,17 +107,17 @@ class RegressionData:
             kept, k = mask[s.where], index[s.group]
             if kept.any():
                 whole = self.rows[k][s.equation]
-                rows[k][s.equation] = _at(whole, whole.time[kept])
+                rows[k][s.equation] = _rows_at(whole, whole.time[kept])
                 segments.append(replace(s, where=slice(start, start + int(kept.sum()))))
                 start = segments[-1].where.stop
         return replace(
             self, base=self.base[mask], residual=self.residual[:, mask],
-            segments=tuple(segments), rows=rows, memory=RowMemory(),
+            segments=tuple(segments), rows=rows, cache=RowCache(),
         )  # fmt: skip
 
 
-def averaged(rig: Rig, members: Sequence[ConditionedRecord]) -> list[ConditionedRecord]:
-    """Return one scene per group: the repeats' channels averaged, filtered as they were."""
+def averaged_records(rig: Rig, members: Sequence[ConditionedRecord]) -> list[ConditionedRecord]:
+    """Return one record per group: the average of the repeats' channels, filtered like them."""
     groups: dict[Group, list[ConditionedRecord]] = {}
     for conditioned in members:
         groups.setdefault(conditioned.group, []).append(conditioned)
@@ -141,7 +146,7 @@ def _average(rig: Rig, repeats: Sequence[ConditionedRecord]) -> ConditionedRecor
 
 
 def least_squares(rig: Rig, rows: Sequence[Mapping[str, Rows]]) -> dict[str, float]:
-    """Return the coefficients of stacked rows, equations unweighted, shortest where not unique."""
+    """Return the unweighted least-squares coefficients of all rows, the shortest if not unique."""
     out: dict[str, float] = {}
     for kinds in (("torque",), ("flow_cap", "flow_rod")):
         parts = [
@@ -160,20 +165,24 @@ def regression_data(
     members: Sequence[ConditionedRecord],
     beta: Mapping[str, float] | None = None,
 ) -> RegressionData:
-    """Lay out records under a model with coefficients `beta`, or fitted here; see the module."""
+    """Return the whitened rows of records under a model (see the module).
+
+    Without `beta` the coefficients are fitted to these records. Raises InputError where filter
+    edges leave no rows.
+    """
     every = [model_rows(rig, terms, conditioned) for conditioned in members]
     beta = least_squares(rig, every) if beta is None else beta
     split = floors(rig, terms, members, every, beta)
-    mean_scenes = averaged(rig, members)
-    mean_rows = [model_rows(rig, terms, conditioned) for conditioned in mean_scenes]
+    averages = averaged_records(rig, members)
+    mean_rows = [model_rows(rig, terms, conditioned) for conditioned in averages]
     names = tuple(
         dict.fromkeys(n for record in mean_rows for r in record.values() for n in r.names)
     )
     noise = {(f.group, f.equation): f.noise for f in split}
-    most = max(sum(s.group == conditioned.group for s in members) for conditioned in mean_scenes)
+    most = max(sum(s.group == conditioned.group for s in members) for conditioned in averages)
     base, residual, segments, start = [], [], [], 0
     kept_rows: list[dict[str, Rows]] = []
-    for conditioned, rows in zip(mean_scenes, mean_rows, strict=True):
+    for conditioned, rows in zip(averages, mean_rows, strict=True):
         own = [
             record for s, record in zip(members, every, strict=True) if s.group == conditioned.group
         ]
@@ -184,13 +193,13 @@ def regression_data(
                 time = np.intersect1d(time, record[equation].time)
             if len(time) < 5:
                 continue
-            cut = _at(mean, time)
+            cut = _rows_at(mean, time)
             kept_rows[-1][equation] = cut
             sigma = max(noise[conditioned.group, equation], 1e-30)
-            base.append(_spread(cut, names) * np.sqrt(len(own)) / sigma)
+            base.append(_matrix_of(cut, names) * np.sqrt(len(own)) / sigma)
             table = np.full((most, len(time)), np.nan)
             for k, record in enumerate(own):
-                table[k] = row_residual(_at(record[equation], time), beta) / sigma
+                table[k] = row_residual(_rows_at(record[equation], time), beta) / sigma
             residual.append(table)
             where = slice(start, start + len(time))
             segments.append(
@@ -205,17 +214,17 @@ def regression_data(
         )
     return RegressionData(
         rig, tuple(terms), beta, names, np.concatenate(base), np.concatenate(residual, axis=1),
-        tuple(segments), tuple(split), tuple(mean_scenes), tuple(kept_rows),
+        tuple(segments), tuple(split), tuple(averages), tuple(kept_rows),
     )  # fmt: skip
 
 
-def _at(rows: Rows, time: Array) -> Rows:
+def _rows_at(rows: Rows, time: Array) -> Rows:
     kept = np.isin(rows.time, time)
     return replace(rows, matrix=rows.matrix[kept], rhs=rows.rhs[kept], time=rows.time[kept])
 
 
-def _spread(rows: Rows, names: Sequence[str]) -> Array:
-    """Return the rows' matrix under a longer list of names."""
+def _matrix_of(rows: Rows, names: Sequence[str]) -> Array:
+    """Return the rows' matrix (m, k) with a column for each of `names`, 0 for those it lacks."""
     out = np.zeros((len(rows.rhs), len(names)))
     out[:, [names.index(n) for n in rows.names]] = rows.matrix
     return out
@@ -223,7 +232,7 @@ def _spread(rows: Rows, names: Sequence[str]) -> Array:
 
 @dataclass(frozen=True)
 class VariantColumns:
-    """A variant's whitened columns (M, c) with their names, and the equations that it touches."""
+    """A variant's whitened columns (M, c) with their names, and the equations that they act in."""
 
     variant: Variant
     names: tuple[str, ...]
@@ -232,9 +241,9 @@ class VariantColumns:
 
 
 def evidence(data: RegressionData, residual: Array) -> Evidence:
-    """Return what the records offer effects that look at the data first.
+    """Return signals and residuals for effects whose shape grid depends on the data.
 
-    `residual` (M,) is what a model leaves.
+    `residual` (M,) is the whitened residual of a model.
     """
     left: list[dict[str, tuple[Array, Array]]] = []
     for conditioned, rows in zip(data.records, data.rows, strict=True):
@@ -244,34 +253,34 @@ def evidence(data: RegressionData, residual: Array) -> Evidence:
 
 
 def signals_of(data: RegressionData) -> list[Signals]:
-    """Return the signals of every record as the data's own terms see them."""
-    return [prepared(data.rig, data.terms, conditioned) for conditioned in data.records]
+    """Return the signals of every record after the changes by the data's own terms."""
+    return [prepared_signals(data.rig, data.terms, conditioned) for conditioned in data.records]
 
 
 def variant_columns(
     data: RegressionData, chosen: Sequence[Variant], progress: Callable[[float], None] | None = None
 ) -> list[VariantColumns]:
-    """Return the columns of every variant that shows in the data, in the variants' order.
+    """Return the columns of every variant that acts in the data, in the variants' order.
 
-    `progress` receives after each which share of them is done.
+    `progress` is called after each with the share of the variants done.
     """
     seen = signals_of(data)
     columns = []
     for variant in chosen:
-        columns.append(_entry(data, variant, seen))
+        columns.append(_columns_of_variant(data, variant, seen))
         if progress is not None:
             progress(len(columns) / len(chosen))
     return [entry for entry in columns if entry is not None]
 
 
-def _entry(
+def _columns_of_variant(
     data: RegressionData, variant: Variant, seen: Sequence[Signals]
 ) -> VariantColumns | None:
     columns: dict[str, Array] = {}
     touched = set()
     M = data.base.shape[0]
     for index, conditioned in enumerate(data.records):
-        if held(variant.effect, conditioned):
+        if is_hidden_by_lock(variant.effect, conditioned):
             continue
         rows = data.rows[index]
         candidate = candidate_columns(
@@ -282,7 +291,7 @@ def _entry(
             rows,
             data.beta,
             variant.used,
-            data.memory,
+            data.cache,
         )
         for segment in data.segments:
             if segment.group == conditioned.group and segment.equation in candidate:

@@ -1,10 +1,10 @@
-"""What the fit does not see: rows that choose between effects, and rows that judge at the end.
+"""Rows that no parameter is fitted to: those that choose between effects, those that judge.
 
-Where no records are given to judge alone, held-out ones are divided. What chooses has been looked
-at many times, and its error flatters what was chosen. Of every three blocks of `DATA.judge_block`
-by time in the record the second is therefore set aside: its rows are read once, when everything is
-settled. The noise floor that rows are weighed by stays that of the whole record, for periods and
-neighbouring states are not found within blocks.
+Rows that choose are read many times, so that their error is smaller for what was chosen than on
+other rows. Where no records are given to judge, the second of every three blocks of
+`DATA.judging_block` of each held-out record is therefore set aside: its rows are read once, after
+everything is chosen. Rows are weighted by the noise floor of the whole record, since periods and
+neighbouring states cannot be found within blocks.
 """
 
 from __future__ import annotations
@@ -26,17 +26,18 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
-def judging(time: Array) -> Mask:
-    """Return which instants (n,) of a record [s] lie in a block that is set aside."""
-    return np.asarray(np.floor(time / DATA.judge_block) % 3 == 1)
+def in_judging_block(time: Array) -> Mask:
+    """Return whether each instant (n,) [s] of a record lies in a block that is set aside."""
+    return np.asarray(np.floor(time / DATA.judging_block) % 3 == 1)
 
 
 @dataclass(frozen=True)
-class Unseen:
-    """Rows that choose and rows that judge; `members` are the records of these, repeats apart.
+class UnseenRows:
+    """Rows that choose between effects and rows that judge.
 
-    Of the groups that are `divided` only the judging blocks of a member count. `choosing_runs` are
-    the records that choose, to be simulated.
+    `members` are the records of the judging rows, each repeat by itself; of those whose group is in
+    `divided`, only the judging blocks count. `choosing_runs` are the records that choose, for
+    simulations. `notes` say how the rows were divided.
     """
 
     choosing: RegressionData
@@ -49,8 +50,8 @@ class Unseen:
 
 def set_aside(
     data: RegressionData, members: Sequence[ConditionedRecord], runs: Sequence[Run]
-) -> Unseen:
-    """Divide held-out `runs`, of which `data` are the rows.
+) -> UnseenRows:
+    """Divide the rows `data` of held-out `runs` into choosing and judging rows.
 
     A group is not divided where an equation of it would have fewer than `TRACE.least_rows` on
     either side: all its rows then choose and judge.
@@ -58,7 +59,7 @@ def set_aside(
     judge = np.zeros(data.base.shape[0], dtype=bool)
     short = set()
     for s in data.segments:
-        judge[s.where] = here = judging(data.source(s)[1].time)
+        judge[s.where] = here = in_judging_block(data.source(s)[1].time)
         if min(here.sum(), (~here).sum()) < TRACE.least_rows:
             short.add(s.group)
     choose = ~judge
@@ -66,37 +67,38 @@ def set_aside(
         if s.group in short:
             judge[s.where] = choose[s.where] = True
     divided = frozenset(conditioned.group for conditioned in data.records) - short
-    return Unseen(
+    return UnseenRows(
         data.at(choose), data.at(judge), tuple(members), _without_blocks(runs, divided), divided,
-        (_said(divided, sorted({step for _, step in short})),),
+        (_division_note(divided, sorted({step for _, step in short})),),
     )  # fmt: skip
 
 
 def judging_rows(rows: Rows) -> Rows:
     """Return a record's rows in the blocks that are set aside."""
-    kept = judging(rows.time)
+    kept = in_judging_block(rows.time)
     return replace(rows, matrix=rows.matrix[kept], rhs=rows.rhs[kept], time=rows.time[kept])
 
 
 def _without_blocks(runs: Sequence[Run], divided: Collection[Group]) -> tuple[Run, ...]:
-    """Return the runs with the samples that are set aside lost, and what filters spread of them."""
+    """Return the runs with NaN at the samples that are set aside in `divided` groups."""
     out = []
     for number, run in enumerate(runs):
         records = [
-            _lost(record) if (number, record.step) in divided else record for record in run.records
+            _without_judging_samples(record) if (number, record.step) in divided else record
+            for record in run.records
         ]
         out.append(replace(run, records=tuple(records)))
     return tuple(out)
 
 
-def _lost(record: Record) -> Record:
-    aside = judging(np.asarray(record.time))
+def _without_judging_samples(record: Record) -> Record:
+    aside = in_judging_block(np.asarray(record.time))
     channels = {name: np.where(aside, np.nan, x) for name, x in record.channels.items()}
     return replace(record, channels=channels)
 
 
-def _said(divided: Collection[Group], short: Sequence[str]) -> str:
-    """Say in a sentence what judges where no records were given for it."""
+def _division_note(divided: Collection[Group], short: Sequence[str]) -> str:
+    """Return a note on which rows judge where no records were given for it."""
     if not divided:
         return (
             "the held-out records are too short to set rows aside: the same rows choose and "
@@ -104,6 +106,6 @@ def _said(divided: Collection[Group], short: Sequence[str]) -> str:
         )
     rest = f"; too short for that, {' '.join(short)} does both" if short else ""
     return (
-        f"a third of the held-out rows (every third block of {DATA.judge_block:g} s) judges and "
+        f"a third of the held-out rows (every third block of {DATA.judging_block:g} s) judges and "
         f"the rest chooses; `--judge RUN` gives both in full{rest}"
     )

@@ -1,15 +1,15 @@
-"""Lines: where in frequency a residual repeats, and whether its cause is symmetric.
+"""Spectral lines: at which frequencies a residual repeats, and whether its cause is symmetric.
 
-A multisine of odd lines leaves all even lines and some odd ones empty. What is linear answers on
+A multisine of odd lines leaves all even lines and some odd ones empty. A linear cause answers on
 the excited lines alone, a symmetric nonlinearity (dry friction, a dead band) also on the empty odd
-ones, an asymmetric one (tank pressure, other levels either way) on the even ones (Pintelon and
-Schoukens, System Identification: A Frequency Domain Approach, 2012, ch. 4). With A_k,r the rms
-amplitude of line k in repeat r,
+lines, an asymmetric one (tank pressure, friction that differs by direction) on the even lines
+(Pintelon and Schoukens, System Identification: A Frequency Domain Approach, 2012, ch. 4). With
+A_k,r the rms amplitude of line k in repeat r,
  repeatable_k = |mean_r A_k,r|^2 - noise_k / n,   noise_k = var_r A_k,r (ddof 1).
-Rows at a record's ends and masked ones are absent. Half the sum and half the difference of what is
-half a period apart hold even and odd lines alone; in each the lines are fitted by least squares.
-The linkage and the two piston areas bend every motion a little: the piston's own velocity says how
-much of a linear cause lies off the excited lines.
+Rows at a record's ends and masked ones are absent. Half the sum and half the difference of samples
+half a period apart contain the even and the odd lines alone; in each the lines are fitted by least
+squares. The linkage and the two piston areas put any motion slightly on empty lines: the piston's
+own velocity shows how much of a linear cause lies off the excited lines.
 """
 
 from __future__ import annotations
@@ -41,10 +41,11 @@ WORDS = {
 class SpectralLines:
     """The lines 0..K of one equation's residual in one group of records, powers (rms squared, SI).
 
-    `frequency` [Hz], `repeatable` and `noise` of one repeat, each (K + 1,); `after` is what repeats
-    under the model that the trace ended with; `excited` marks the excited lines. `shares` are of
-    the repeatable power by kind, `shares_after` those of what is left, `own` those of the joint's
-    velocity; `loud` is the repeatable rms over the noise of the whole residual.
+    `frequency` [Hz], `repeatable` power under the baseline and `noise` power of one repeat, each
+    (K + 1,); `after` is the repeatable power under the final model; `excited` marks the excited
+    lines. `shares` are the shares of `repeatable` by kind of line, `shares_after` those of `after`,
+    `velocity_shares` those of the joint's velocity. `above_noise` is the repeatable rms under the
+    baseline over the noise, both of the whole residual.
     """
 
     group: Group
@@ -56,46 +57,46 @@ class SpectralLines:
     excited: NDArray[np.bool_]
     shares: Mapping[str, float]
     shares_after: Mapping[str, float]
-    own: Mapping[str, float]
-    loud: float
+    velocity_shares: Mapping[str, float]
+    above_noise: float
 
     @property
-    def loud_after(self) -> float:
-        """What repeats after, rms over the noise of one repeat, both over all lines."""
+    def above_noise_after(self) -> float:
+        """Repeatable rms under the final model over the noise rms of one repeat, of all lines."""
         return float(np.sqrt(max(0.0, self.after.sum()) / max(float(self.noise.sum()), 1e-300)))
 
     @property
     def text(self) -> str:
-        """Where it repeats, and what that means, in words."""
+        """On which kinds of lines the residual repeats, and what that means, in words."""
         where = ", ".join(
             f"{100 * share:.0f} % {WORDS[kind]}"
             for kind, share in self.shares.items()
-            if share >= DATA.noted_share
+            if share >= DATA.noted_line_share
         )
         return f"{self.equation} in {self.group[1]}: {where or 'no line'}: {self.meaning}"
 
     @property
     def meaning(self) -> str:
-        """What the lines say of the cause of the whole residual."""
-        return meaning(self.shares, self.own)
+        """The cause that the lines of the residual under the baseline show."""
+        return meaning(self.shares, self.velocity_shares)
 
     @property
     def meaning_after(self) -> str:
-        """What the lines say of the cause of what is left."""
-        return meaning(self.shares_after, self.own)
+        """The cause that the lines of the residual under the final model show."""
+        return meaning(self.shares_after, self.velocity_shares)
 
 
 def meaning(shares: Mapping[str, float], own: Mapping[str, float]) -> str:
-    """Return what the shares of a residual say of its cause, beside those of the velocity."""
+    """Return the cause in words, from the shares by kind of line: residual's, velocity's `own`."""
     if not any(shares.values()):
         return "not above the noise"
     moving = 1.0 - shares[CONSTANT]
-    if moving < DATA.asymmetric:
+    if moving < DATA.asymmetric_share:
         return "constant"
     meanings = []
     for kind, least, word in (
-        (EVEN, DATA.asymmetric, "asymmetric"),
-        (ODD, DATA.symmetric, "a symmetric nonlinearity"),
+        (EVEN, DATA.asymmetric_share, "asymmetric"),
+        (ODD, DATA.symmetric_share, "a symmetric nonlinearity"),
     ):
         share = shares[kind] / moving
         if share > least and share > DATA.velocity_ratio * own[kind]:
@@ -108,10 +109,10 @@ def meaning(shares: Mapping[str, float], own: Mapping[str, float]) -> str:
     return " and ".join(word for _, word in meanings)
 
 
-def lines(data: RegressionData, after: Array) -> tuple[SpectralLines, ...]:
-    """Return the lines of every equation and group excited by odd lines, the loudest first.
+def spectral_lines(data: RegressionData, after: Array) -> tuple[SpectralLines, ...]:
+    """Return the lines of every equation and group excited by odd lines, largest residual first.
 
-    `after` (M,) is the averaged whitened residual of the model that the trace ended with.
+    `after` (M,) is the averaged whitened residual of the final model.
     """
     loud = {(f.group, f.equation): f.ratio for f in data.floors}
     out = []
@@ -124,22 +125,22 @@ def lines(data: RegressionData, after: Array) -> tuple[SpectralLines, ...]:
                 residual = data.residual[: s.repeats, s.where] * s.noise
                 rest = after[s.where] * s.noise / np.sqrt(s.repeats)
                 both = np.vstack((residual, rest))
-                excited = loud[s.group, s.equation]
-                of_segment = _of_segment(s, conditioned, rows[s.equation], both, excited)
+                ratio = loud[s.group, s.equation]
+                of_segment = _segment_lines(s, conditioned, rows[s.equation], both, ratio)
                 if of_segment is not None:
                     out.append(of_segment)
-    return tuple(sorted(out, key=lambda equation_lines: -equation_lines.loud))
+    return tuple(sorted(out, key=lambda equation_lines: -equation_lines.above_noise))
 
 
-def _of_segment(
+def _segment_lines(
     s: Segment, conditioned: ConditionedRecord, rows: Rows, residuals: Array, loud: float
 ) -> SpectralLines | None:
-    """Return the lines of residuals (repeats + 1, m), the last of them what is left."""
+    """Return the lines of residuals (repeats + 1, m) [SI]; the last one is of the final model."""
     record = conditioned.record
     highest = max(record.lines)
     per = record.period // conditioned.filtering.step
     place = np.rint((rows.time - rows.time[0]) * record.sample_rate / conditioned.filtering.step)
-    pairs = _pairs(place.astype(np.int64), per)
+    pairs = _half_period_pairs(place.astype(np.int64), per)
     base = record.sample_rate / record.period
     beyond = DATA.line_band * lines_cutoff(record) / base
     K = int(min([beyond, *(DATA.lines_per_pair * len(p) for p in pairs)]))
@@ -151,30 +152,30 @@ def _of_segment(
     spectra = np.stack([spectrum(place[p[:, 0]] / per, series[:, p], K) for p in pairs])
     single = spectra[:, :-2].reshape(-1, K + 1)  # periods of one repeat are repeats too
     n = len(single)
-    # The noise of a single one is unknown: the floor's, spread evenly.
+    # A single period does not show its noise: the noise floor is spread evenly over the lines.
     noise = single.var(axis=0, ddof=1) if n > 1 else np.full(K + 1, s.noise**2 / (K + 1))
     excited = np.isin(np.arange(K + 1), record.lines)
     own = np.abs(spectra[:, -1].mean(axis=0)) ** 2
-    own[0] = 0.0  # a mean velocity is what the ends of the record cut
+    own[0] = 0.0  # a mean velocity only comes from the ends that were cut off
     before = np.abs(single.mean(axis=0)) ** 2 - noise / n
-    rest = np.abs(spectra[:, -2].mean(axis=0)) ** 2 - noise / n
+    remaining = np.abs(spectra[:, -2].mean(axis=0)) ** 2 - noise / n
     frequency = np.asarray(np.arange(K + 1) * base, dtype=np.float64)
     return SpectralLines(
-        s.group, s.equation, frequency, before, noise, rest, excited,
-        _shares(before, noise / n, excited), _shares(rest, noise / n, excited),
+        s.group, s.equation, frequency, before, noise, remaining, excited,
+        _shares(before, noise / n, excited), _shares(remaining, noise / n, excited),
         _shares(own, np.zeros(K + 1), excited), loud,
     )  # fmt: skip
 
 
-def _pairs(place: NDArray[np.int64], per: int) -> list[NDArray[np.int64]]:
-    """Return, for each period that is there nearly whole, its rows half a period apart (p, 2)."""
+def _half_period_pairs(place: NDArray[np.int64], per: int) -> list[NDArray[np.int64]]:
+    """Return the pairs (p, 2) of row numbers half a period apart, for each nearly whole period."""
     if per % 2:
         return []
     at = np.full(int(place[-1]) + 1 + per if len(place) else per, -1)
     at[place] = np.arange(len(place))
     whole = at[: len(at) // per * per].reshape(-1, 2, per // 2).transpose(0, 2, 1)
     complete = [p[(p >= 0).all(axis=1)] for p in whole]
-    return [p for p in complete if len(p) >= DATA.period_present * per / 2]
+    return [p for p in complete if len(p) >= DATA.least_period_share * per / 2]
 
 
 def spectrum(phase: Array, series: Array, K: int) -> NDArray[np.complex128]:
@@ -196,8 +197,8 @@ def spectrum(phase: Array, series: Array, K: int) -> NDArray[np.complex128]:
     return out
 
 
-def members(excited: NDArray[np.bool_]) -> dict[str, NDArray[np.bool_]]:
-    """Return which of the lines 0..K are of which kind, each (K + 1,)."""
+def lines_by_kind(excited: NDArray[np.bool_]) -> dict[str, NDArray[np.bool_]]:
+    """Return a mask (K + 1,) of the lines 0..K for each kind of line."""
     number = np.arange(len(excited))
     odd = (number % 2 == 1) & ~excited
     even = (number % 2 == 0) & (number > 0)
@@ -205,9 +206,9 @@ def members(excited: NDArray[np.bool_]) -> dict[str, NDArray[np.bool_]]:
 
 
 def _shares(power: Array, noise: Array, excited: NDArray[np.bool_]) -> dict[str, float]:
-    """Return the share of the power by kind of line; 0 of a kind that noise would explain."""
+    """Return the share of the power by kind of line, 0 for a kind that noise would explain."""
     sums = {}
-    for kind, own in members(excited).items():
+    for kind, own in lines_by_kind(excited).items():
         total = float(power[own].sum())
         scatter = float(np.sqrt(np.sum(noise[own] ** 2)))
         sums[kind] = total if total > DATA.line_deviations * scatter else 0.0
@@ -215,12 +216,12 @@ def _shares(power: Array, noise: Array, excited: NDArray[np.bool_]) -> dict[str,
     return {kind: v / whole if whole > 0 else 0.0 for kind, v in sums.items()}
 
 
-def loudest(
+def largest_residual_lines(
     lines: Sequence[SpectralLines], least: float = 1.0, most: int = 3
 ) -> list[SpectralLines]:
-    """Return the loudest, one of each equation, where the residual is above its noise."""
+    """Return at most `most` lines, one for each equation with a residual of `least` noises."""
     best: dict[str, SpectralLines] = {}
     for equation_lines in lines:
-        if equation_lines.loud >= least:
+        if equation_lines.above_noise >= least:
             best.setdefault(equation_lines.equation, equation_lines)
     return list(best.values())[:most]

@@ -1,9 +1,9 @@
-"""How a held command bends the spool's path between samples: known physics, nothing to name.
+"""The spool's path between samples under a held command: known physics, fitted but never named.
 
 The rows take the spool for linear between its samples. Under a held command a first-order spool of
 time constant tau runs along an exponential there, which in the flows acts as a lead of dt^2/(12
 tau): one column a joint, C T du/dt sqrt(dp) (`analysis.identify.estimators.nuisance.SpoolPath`).
-Without it a quick spool passes for a late sensor of some tens of microseconds.
+Without it a quick spool looks like a sensor that is late by some tens of microseconds.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from rig.model.parameters import gain_names
 
 
 def path_terms(data: RegressionData) -> tuple[Used, ...]:
-    """Return the paths that belong beside the data's own terms: those of joints that move.
+    """Return the spool-path terms to add to the data's own: one for each joint that moves.
 
-    Not one whose lead is more than `BETWEEN_SAMPLES` of a sample: something else is late there.
+    A path whose fitted lead exceeds `BETWEEN_SAMPLES` of a sample is left out: another delay acts.
     """
     kinds = [s.equation.rsplit("_", 1) for s in data.segments]
     joints = sorted({int(number) - 1 for kind, number in kinds if kind.startswith("flow")})

@@ -1,9 +1,9 @@
-"""What is known to act beside the baseline and is no effect to be named: the oil's temperature.
+"""The oil's temperature: known physics beside the baseline, fitted but never named.
 
 Oil warms from record to record, and its bulk modulus falls with it. On records that measure the
 temperature this is one column (`analysis.identify.estimators.nuisance.BulkTemperature`) with
-nothing to guess. Without it every long experiment leaves a residual that repeats, and true effects
-found in the same equations could not be taken to the noise floor.
+no shape to search. Without it every long experiment leaves a repeatable residual, and effects in
+the same equations would not reach the noise floor.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from rig.model.rig import Rig
 
 
 def base_terms(rig: Rig, runs: Sequence[Run]) -> tuple[Used, ...]:
-    """Return the rig's baseline terms with those that belong beside them on these records."""
+    """Return the rig's baseline terms, with the temperature term where the records need it."""
     terms = tuple(map(Used, baseline_of(rig)))
     return (*terms, *temperature_terms(terms, runs))
 
@@ -34,15 +34,15 @@ def base_terms(rig: Rig, runs: Sequence[Run]) -> tuple[Used, ...]:
 def temperature_terms(
     terms: Sequence[Used], runs: Sequence[Run], holdout: Sequence[Run] = ()
 ) -> tuple[Used, ...]:
-    """Return the terms that belong beside the baseline on these records, held-out ones included.
+    """Return the temperature term to add to `terms`, none where the temperature hardly changes.
 
-    Their b is that of the mean temperature of `runs`: what these records know best, and what a
-    change of temperature in others turns about.
+    The span over `runs` and `holdout` must reach `DATA.temperature_span`. The parameter b is then
+    that at the mean temperature of `runs`, which these records determine best.
     """
     if "compressibility" not in {used.term.name for used in terms}:
         return ()
     train, holdout_data = (_temperatures(x) for x in (runs, holdout))
-    # Nor where one was not measured: its span is not a number.
+    # A record without measured temperature makes the span NaN: then no term is added either.
     if not train or not np.ptp([*train, *holdout_data]) >= DATA.temperature_span:
         return ()
     return (Used(BulkTemperature(reference=float(np.mean(train)))),)
@@ -59,8 +59,8 @@ def _temperatures(runs: Sequence[Run]) -> list[float]:
     ]
 
 
-def plausible(kappa: float, beta: Mapping[str, float]) -> float:
-    """Return 1/b's change per kelvin [1/(Pa K)], held to what oil and hoses can do."""
+def within_plausible_slope(kappa: float, beta: Mapping[str, float]) -> float:
+    """Return the change of 1/b with temperature [1/(Pa K)], limited to values of oil and hoses."""
     size = abs(beta.get("b", 0.0))  # of the rows: 1/b
     low, high = (
         -(IDENTIFY.bulk_slope + sign * IDENTIFY.implausible_deviations * IDENTIFY.bulk_slope_std)
@@ -70,8 +70,8 @@ def plausible(kappa: float, beta: Mapping[str, float]) -> float:
     return float(np.clip(kappa, low, high))
 
 
-def stripped(model: Model) -> Model:
-    """Return the model at the rig's nominal temperature: the parameters without the nuisance."""
+def at_nominal_temperature(model: Model) -> Model:
+    """Return the model with b at the rig's nominal temperature and without the temperature term."""
     (term,) = [u.term for u in model.terms if isinstance(u.term, BulkTemperature)] or (None,)
     names = list(model.parameters)
     if term is None or KAPPA not in names:
@@ -81,7 +81,7 @@ def stripped(model: Model) -> Model:
     covariance = model.covariance.copy()
     if bulk.identified and term.reference is not None:
         kelvin = model.rig.oil.temperature - term.reference
-        bulk, more = _at(bulk, model.parameters[KAPPA], kelvin)
+        bulk, more = _bulk_modulus_at(bulk, model.parameters[KAPPA], kelvin)
         covariance[b, b] += more
     kept = [k for k in range(len(names)) if k != kappa]
     return replace(
@@ -92,10 +92,11 @@ def stripped(model: Model) -> Model:
     )
 
 
-def _at(b: Estimate, kappa: Estimate, kelvin: float) -> tuple[Estimate, float]:
-    """Return b `kelvin` warmer, and by how much its variance grows.
+def _bulk_modulus_at(b: Estimate, kappa: Estimate, kelvin: float) -> tuple[Estimate, float]:
+    """Return b at a temperature higher by `kelvin` [K], and the increase of its variance [Pa^2].
 
-    1/b(T) = 1/b + kappa (T - T0); kappa is the records' joined to what is known beforehand.
+    1/b(T) = 1/b + kappa (T - T0), with kappa as the mean of the records' value and the prior one
+    (`IDENTIFY.bulk_slope`), each weighted by its inverse variance.
     """
     believed, spread = -IDENTIFY.bulk_slope / b.value, IDENTIFY.bulk_slope_std / b.value
     own = kappa.std if math.isfinite(kappa.std) else math.inf

@@ -1,7 +1,7 @@
-"""What differs between repeats and is no sensor noise: a cause that does not follow the excitation.
+"""Notes on scatter between repeats that is not sensor noise.
 
 A pump, a neighbouring machine or a fault that comes and goes acts with another phase in every
-repeat. It is then part of the noise floor, and no residual stands out of it.
+repeat. It is then part of the noise floor and leaves no repeatable residual.
 """
 
 from __future__ import annotations
@@ -18,8 +18,11 @@ from rig.model.units import plain
 Array = NDArray[np.float64]
 
 
-def unrepeated(data: RegressionData) -> list[str]:
-    """State, for each equation, a scatter between repeats that the stated sensor noise is not."""
+def unrepeated_notes(data: RegressionData) -> list[str]:
+    """Return a note for each equation whose scatter between repeats exceeds stated sensor noise.
+
+    The limit is `DATA.unrepeated_ratio`; of several groups the one with the largest ratio is noted.
+    """
     loudest: dict[str, Floor] = {}
     for floor in data.floors:
         measured = floor.source in (REPEATS, PERIODS)
@@ -27,14 +30,14 @@ def unrepeated(data: RegressionData) -> list[str]:
             best = loudest.get(floor.equation)
             if best is None or floor.noise / floor.stated > best.noise / best.stated:
                 loudest[floor.equation] = floor
-    return [_words(data, floor) for floor in loudest.values()]
+    return [_unrepeated_note(data, floor) for floor in loudest.values()]
 
 
-def _words(data: RegressionData, floor: Floor) -> str:
+def _unrepeated_note(data: RegressionData, floor: Floor) -> str:
     segment = next(
         s for s in data.segments if (s.group, s.equation) == (floor.group, floor.equation)
     )
-    frequency, share = _line(data, segment)
+    frequency, share = _dominant_frequency(data, segment)
     at = ""
     if share > DATA.unrepeated_share:
         at = f", {plain(100 * share, 2)} % of it at {plain(frequency, 3)} Hz"
@@ -45,7 +48,7 @@ def _words(data: RegressionData, floor: Floor) -> str:
     )
 
 
-def _line(data: RegressionData, segment: Segment) -> tuple[float, float]:
+def _dominant_frequency(data: RegressionData, segment: Segment) -> tuple[float, float]:
     """Return the frequency [Hz] at which most of the scatter between repeats lies, and its share.
 
     The share is of the energy, 0 with fewer than two repeats (periods hold no other frequency).

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 
 def curves_of(data: RegressionData, model: ExactFit, used: Used) -> tuple[Curve, ...]:
-    """Return the lines of an effect's curve with their 95 % band from the rows' noise."""
+    """Return the lines of an effect's curve with 95 % bands from noise, none without a curve."""
     effect = used.term
     lines = effect.branches(data.rig, used.shape) if isinstance(effect, Effect) else ()
     if not lines:
@@ -39,11 +39,11 @@ def curves_of(data: RegressionData, model: ExactFit, used: Used) -> tuple[Curve,
     return tuple(out)
 
 
-def within_curves(data: RegressionData, model: ExactFit) -> RegressionData:
-    """Return data with only the rows where every free curve of a model is known.
+def rows_within_curves(data: RegressionData, model: ExactFit) -> RegressionData:
+    """Return the data with only the rows within the outermost knots of a model's free curves.
 
-    Beyond its outermost knots a curve is a guess, a straight line, that speaks neither for nor
-    against the mechanism. All rows are returned where too few would be left to judge by.
+    Beyond them a curve is extrapolated by a straight line, which is no evidence on the mechanism.
+    All rows are returned where an equation would keep fewer than `TRACE.least_rows`.
     """
     inside = np.ones(len(data.base), dtype=bool)
     for used in model.terms:
@@ -56,9 +56,9 @@ def within_curves(data: RegressionData, model: ExactFit) -> RegressionData:
     return data if inside.all() or least < TRACE.least_rows else data.at(inside)
 
 
-def beyond_in_words(whole: RegressionData, known: RegressionData) -> list[str]:
-    """Return a sentence for every equation of which `known` lacks rows (see `within_curves`)."""
-    rows, left = whole.counts, known.counts
+def beyond_curve_notes(whole: RegressionData, known: RegressionData) -> list[str]:
+    """Return a note for every equation of which `known` lacks rows (see `rows_within_curves`)."""
+    rows, left = whole.row_counts, known.row_counts
     return [
         f"{e}: {plain(100 * (1 - left[e] / rows[e]), 2)} % of the judging rows lie beyond the "
         "range of the fitted curve: they are in the errors, but speak neither for nor against it; "
@@ -74,20 +74,20 @@ def _between_knots(data: RegressionData, used: Used) -> NDArray[np.bool_]:
     assert isinstance(effect, Effect)
     named = zip(shapes_of(data.rig, used), used.shape, strict=True)
     knots = [value for shape, value in named if "_knot_" in shape.parameter]
-    margin = TRACE.beyond_knots * (knots[-1] - knots[0])
+    margin = TRACE.knot_margin * (knots[-1] - knots[0])
     for segment in data.segments:
         conditioned, rows = data.source(segment)
         values = effect.abscissa(data.rig, conditioned.signals).get(segment.equation)
         if values is not None:
             x = values[conditioned.samples_at(rows.time)]
-            # A curve of an amount begins at zero.
+            # A curve whose knots begin at zero is over the absolute value.
             x = np.abs(x) if knots[0] == 0.0 else x
             inside[segment.where] = (x >= knots[0] - margin) & (x <= knots[-1] + margin)
     return inside
 
 
 def _covariance(data: RegressionData, model: ExactFit) -> tuple[tuple[str, ...], Array]:
-    """Return names and covariance of everything free in a model, noise as the floor has it."""
+    """Return names and covariance from noise (p, p) of a model's coefficients and shapes."""
     names, X = tangent(data, model)
     scale = np.linalg.norm(X, axis=0)
     scale[scale == 0] = 1.0

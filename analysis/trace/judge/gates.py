@@ -1,8 +1,9 @@
-"""Naming gates: significance is not naming, so a name must pass all of these.
+"""Gates: the conditions that an effect must meet to be named.
 
-A deterministic misfit makes every correlated candidate significant. The cause differs from its
-look-alikes in that it works on records of another excitation, at a physical size, with the same
-coefficient everywhere, whichever repeats are taken, and better than anything else.
+Significance is not enough, since a model error makes every correlated candidate significant. The
+cause differs from these in that it reduces the error of records with another excitation, has a
+physically possible size, has the same size in all parts of the records, and fits better than any
+other effect.
 """
 
 from __future__ import annotations
@@ -19,14 +20,14 @@ from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge import inference
 from analysis.trace.judge.curves import curves_of
-from analysis.trace.judge.held_out import residual as held_left
-from analysis.trace.judge.invariance import invariance
-from analysis.trace.judge.readings import loss, related
+from analysis.trace.judge.held_out import held_out_residual
+from analysis.trace.judge.invariance import Difference, invariance
+from analysis.trace.judge.readings import loss_in_deviations, of_one_law
 from analysis.trace.judge.scatter import form_shift
 from analysis.trace.result import Gate, JudgedEffect, Rival
-from analysis.trace.search.hypothesis import Hypothesis, excess_of, parameter_values
+from analysis.trace.search.hypothesis import Hypothesis, energy_above_noise, parameter_values
 from analysis.trace.search.hypothesis_set import HypothesisSet, effect_of
-from analysis.trace.search.refinement import ExactFit, table
+from analysis.trace.search.refinement import ExactFit, design_matrix
 from analysis.trace.settings import SEARCH, TRACE
 from rig.model.units import plain, with_interval
 
@@ -34,63 +35,73 @@ Array = NDArray[np.float64]
 Key = tuple[str, str]
 
 
-REMOVES, PHYSICAL, INVARIANT, SIGNIFICANT, ALONE = (
+REMOVES, PHYSICAL, INVARIANT, SIGNIFICANT, NO_RIVAL = (
     "removes on held-out", "physical", "invariant", "significant", "no rival",
 )  # fmt: skip
 
 
-def stands(effect: JudgedEffect) -> bool:
+def passes_gates(effect: JudgedEffect) -> bool:
     """Return whether an effect passes every gate but that of rivals, which makes it confounded."""
-    return all(gate.ok for gate in effect.gates if gate.name != ALONE)
+    return all(gate.ok for gate in effect.gates if gate.name != NO_RIVAL)
 
 
-def refused(effects: Sequence[JudgedEffect]) -> tuple[JudgedEffect, ...]:
-    """Return the effects that stand in no set, each once where it removes most, in that order."""
+def refused_effects(effects: Sequence[JudgedEffect]) -> tuple[JudgedEffect, ...]:
+    """Return the effects that fail a gate, each once, those that remove most first.
+
+    An effect that passes the gates in one of its judgements is left out.
+    """
     once: dict[Key, JudgedEffect] = {}
-    for effect in sorted(effects, key=lambda f: (not stands(f), -f.removed_fraction)):
+    for effect in sorted(effects, key=lambda f: (not passes_gates(f), -f.removed_fraction)):
         once.setdefault((effect.name, effect.at or effect.where), effect)
-    return tuple(f for f in once.values() if not stands(f))
+    return tuple(f for f in once.values() if not passes_gates(f))
 
 
-def judge(
+def judge_effects(
     hypotheses: HypothesisSet,
     winner: Hypothesis,
     holdout_data: RegressionData,
     rng: np.random.Generator,
 ) -> tuple[JudgedEffect, ...]:
-    """Put every effect of the winner through the gates."""
+    """Return every effect of the set `winner` with its gates, rivals, parameters and intervals.
+
+    `holdout_data` are the choosing rows; `rng` draws the sign flips.
+    """
     train_data = hypotheses.train_data
     values = parameter_values(train_data.rig, winner.fit.terms, dict(winner.fit.beta))
     null = inference.null_maximum(
-        hypotheses.candidates, train_data, _noise_like(train_data, winner.fit.residual), rng
+        hypotheses.candidates, train_data, _noise_samples(train_data, winner.fit.residual), rng
     )
-    after = held_left(holdout_data, winner.fit)
+    after = held_out_residual(holdout_data, winner.fit)
     shift = form_shift(train_data, winner.fit)
     out = []
     for used in winner.effects:
         assert isinstance(used.term, Effect)
-        rest = _without(hypotheses, winner, used)
-        without = held_left(holdout_data, rest.fit)
-        changes = _changes(winner, rest)
-        near = _Near(holdout_data, changes, after, without)
-        rivals = _rivals(hypotheses, winner, used, rest, holdout_data, near)
-        removed = _removed(holdout_data, changes, without, after)
-        worse = _worse(hypotheses, winner, rest)
-        p = inference.p_value(rest.fit.energy - winner.fit.energy, null)
-        errors = inference.spread(train_data, winner.fit, used, values)
-        differing = invariance(train_data, winner.fit, used, errors, _joint(used.term))
-        unphysical = hypotheses.physical(winner, used)
+        alternative = _set_without(hypotheses, winner, used)
+        without = held_out_residual(holdout_data, alternative.fit)
+        changes = _removed_energy(winner, alternative)
+        tie_test = _TieTest(holdout_data, changes, after, without)
+        rivals = _rivals(hypotheses, winner, used, alternative, holdout_data, tie_test)
+        removed = _removed_share(holdout_data, changes, without, after)
+        disturbed = _disturbed_equations(hypotheses, winner, alternative)
+        p = inference.p_value(alternative.fit.energy - winner.fit.energy, null)
+        errors = inference.effect_errors(train_data, winner.fit, used, values)
+        differing = invariance(train_data, winner.fit, used, errors, _joint_index(used.term))
+        unphysical = hypotheses.physical_problem(winner, used)
         tied = [r for r in rivals if r.tied]
         twins = [
             Rival(name, _place(effect_of(name, at)), 1.0, 1.0, True, at)
             for name, at in used.term.twins()
         ]
         gates = (
-            Gate(REMOVES, removed >= TRACE.least_removed and not worse, _taken(removed, worse)),
+            Gate(
+                REMOVES,
+                removed >= TRACE.least_removed and not disturbed,
+                _removal_in_words(removed, disturbed),
+            ),
             Gate(PHYSICAL, not unphysical, unphysical or "sign and size are possible"),
-            Gate(INVARIANT, not differing, _differences(differing)),
+            Gate(INVARIANT, not differing, _differences_in_words(differing)),
             Gate(SIGNIFICANT, p <= TRACE.p_limit, f"family-wise p = {p:.3g}"),
-            Gate(ALONE, not (tied or twins), _told_apart([*twins, *rivals])),
+            Gate(NO_RIVAL, not (tied or twins), _rivals_in_words([*twins, *rivals])),
         )
         out.append(
             JudgedEffect(
@@ -113,77 +124,84 @@ def judge(
     return tuple(out)
 
 
-def _without(hypotheses: HypothesisSet, winner: Hypothesis, used: Used) -> Hypothesis:
-    """Return the set without one effect, or the best physical one of readings of the others.
+def _set_without(hypotheses: HypothesisSet, winner: Hypothesis, used: Used) -> Hypothesis:
+    """Return the set without one effect and its other readings, as the alternative to the effect.
 
-    Two levels of friction of opposite signs make a torque offset: what physics refuses is no
-    alternative to an effect. Two readings of one law go together: whether both are needed is
-    asked in `readings`.
+    An unphysical set is no alternative (two levels of friction of opposite signs make a torque
+    offset): then the best physical set of the other effects or readings of them is returned. Two
+    readings of one law are removed together, since `readings` decides whether both are needed.
     """
-    kept = [u for u in winner.effects if u is not used and not related(u.term, used.term)]  # type: ignore[arg-type]
-    rest = hypotheses.exact(kept)
+    kept = [u for u in winner.effects if u is not used and not of_one_law(u.term, used.term)]  # type: ignore[arg-type]
+    without = hypotheses.refined(kept)
     rig = hypotheses.train_data.rig
-    # A shape at its bound is a matter of form.
-    at_bound = any(u.term.outside(rig, u.shape) for u in rest.effects)  # type: ignore[attr-defined]
-    if at_bound or not hypotheses.physical(rest):
-        return rest
-    simpler = [
-        o
-        for o in hypotheses.fitted.values()
-        if not hypotheses.physical(o)
-        and all(any(u.term == k.term or related(u.term, k.term) for k in kept) for u in o.effects)  # type: ignore[arg-type]
-    ]
+    # A shape at its bound is an error of the form, not of physics.
+    at_bound = any(u.term.outside(rig, u.shape) for u in without.effects)  # type: ignore[attr-defined]
+    if at_bound or not hypotheses.physical_problem(without):
+        return without
+
+    def is_kept(other: Used) -> bool:
+        """Return whether a kept effect, or one of its readings, is another set's effect."""
+        return any(other.term == k.term or of_one_law(other.term, k.term) for k in kept)  # type: ignore[arg-type]
+
+    physical = [o for o in hypotheses.fitted.values() if not hypotheses.physical_problem(o)]
+    simpler = [o for o in physical if all(map(is_kept, o.effects))]
     return min([hypotheses.empty, *simpler], key=lambda o: o.total)
 
 
-def remaining(
+def equations_above_band(
     hypotheses: HypothesisSet, winner: Hypothesis, holdout_data: RegressionData
 ) -> list[tuple[str, str]]:
-    """Return the equations that keep more than the noise floor's band, and say on which records.
+    """Return the equations that keep more than the band, and in words how much in which records.
 
-    What a catalogue's simpler form misses of an effect is a share of what was there before, however
-    well it is measured.
+    The band of training records is noise or `TRACE.training_share` of the baseline's energy,
+    whichever is larger; for held-out records see `held_out_above_band`. The error of an effect's
+    form is a share of the effect, which better sensors do not make smaller.
     """
     out = []
-    for e, residual in left_in_training(hypotheses, winner).items():
+    for e, residual in training_excess(hypotheses, winner).items():
         share = residual / max(hypotheses.empty.excess_energy[e], 1e-30)
         if share > TRACE.training_share and not hypotheses.negligible(e, residual):
-            times = residual / hypotheses.limits.band[e]
+            times = residual / hypotheses.noise_band.by_equation[e]
             stays = f"{plain(100 * share, 2)} % of the repeatable energy remains"
             grown = share > 1.0 + SEARCH.tolerance
             words = "the repeatable energy is larger than under the baseline" if grown else stays
             out.append((e, f"{words}, {plain(times, 2)} times the band"))
-    return out + remaining_held_out(holdout_data, hypotheses.empty.fit, winner.fit)
+    return out + held_out_above_band(holdout_data, hypotheses.empty.fit, winner.fit)
 
 
-def left_in_training(hypotheses: HypothesisSet, winner: Hypothesis) -> dict[str, float]:
-    """Return the energy above noise by equation, without the few instants of cavitating oil."""
+def training_excess(hypotheses: HypothesisSet, winner: Hypothesis) -> dict[str, float]:
+    """Return the training energy above noise by equation, cavitating instants left out."""
     data = hypotheses.train_data
-    return excess_of(data, _liquid(data, winner.fit, winner.fit.residual))
+    return energy_above_noise(data, _zeroed_where_cavitating(data, winner.fit, winner.fit.residual))
 
 
-def remaining_held_out(
+def held_out_above_band(
     holdout_data: RegressionData, before: ExactFit, after: ExactFit
 ) -> list[tuple[str, str]]:
-    """Return the equations that keep more than the band in these held-out rows, and how much."""
-    left = _liquid(holdout_data, after, held_left(holdout_data, after))
-    start = excess_of(holdout_data, held_left(holdout_data, before))
-    now = excess_of(holdout_data, left)
+    """Return the equations that keep more than the band in held-out rows, and in words how much.
+
+    The band is an rms of `TRACE.held_out_band` noise floors or `TRACE.held_out_share` of the energy
+    above noise that the model `before` leaves, whichever is larger.
+    """
+    left = _zeroed_where_cavitating(holdout_data, after, held_out_residual(holdout_data, after))
+    start = energy_above_noise(holdout_data, held_out_residual(holdout_data, before))
+    now = energy_above_noise(holdout_data, left)
     return [
         (e, f"held-out error {r:.2f} times the noise floor")
-        for e, r in _held_ratio(holdout_data, left).items()
+        for e, r in _error_over_floor(holdout_data, left).items()
         if r > TRACE.held_out_band and now[e] > TRACE.held_out_share * start[e]
     ]
 
 
-def _liquid(data: RegressionData, model: ExactFit, residual: Array) -> Array:
-    """Return a residual (M,), zero at the few instants at which the oil cavitates under a model.
+def _zeroed_where_cavitating(data: RegressionData, model: ExactFit, residual: Array) -> Array:
+    """Return a residual (M,) set to zero where the oil cavitates under a model.
 
-    A pressure's true gain puts some below zero, where no flow can be compared: these instants count
-    neither for nor against a model. Where they are many, they count.
+    A true gain of a pressure sensor puts some pressures below zero, where no flow can be compared:
+    these instants count neither for nor against the model. An equation with more than
+    `TRACE.cavitating_share` of them keeps its residual.
     """
-    outside = np.asarray(~np.any(table(data, model.terms).matrix, axis=1))
-    if not outside.any():  # nearly always
+    outside = np.asarray(~np.any(design_matrix(data, model.terms).matrix, axis=1))
+    if not outside.any():  # the usual case
         return residual
     rows: dict[str, list[int]] = {}
     for s in data.segments:
@@ -202,24 +220,24 @@ def _rms(data: RegressionData, residual: Array, equations: Collection[str]) -> f
     return float(np.sqrt(np.mean(np.concatenate(parts) ** 2))) if parts else float("nan")
 
 
-def _held_ratio(holdout_data: RegressionData, residual: Array) -> dict[str, float]:
+def _error_over_floor(holdout_data: RegressionData, residual: Array) -> dict[str, float]:
     """Return the held-out error of single records over the noise floor, by equation."""
     floor: dict[str, float] = {}
     energy: dict[str, float] = {}
     for s in holdout_data.segments:
         count = (s.where.stop - s.where.start) * s.repeats
         floor[s.equation] = floor.get(s.equation, 0.0) + count * s.noise**2
-        # Averaging has taken noise out: put back what a single record would show.
+        # The average has less noise than a record: the difference is added.
         part = residual[s.where]
-        excess = float(part @ part) + count * (1 - 1 / s.repeats)
-        energy[s.equation] = energy.get(s.equation, 0.0) + excess * s.noise**2
+        record_energy = float(part @ part) + count * (1 - 1 / s.repeats)
+        energy[s.equation] = energy.get(s.equation, 0.0) + record_energy * s.noise**2
     return {e: float(np.sqrt(energy[e] / floor[e])) for e in floor}
 
 
-def _noise_like(train_data: RegressionData, residual: Array) -> Array:
-    """Return the repeats' residuals without what repeats: (R, M), scaled to the full noise.
+def _noise_samples(train_data: RegressionData, residual: Array) -> Array:
+    """Return samples (R, M) of the noise: the repeats' residuals without their mean.
 
-    Of a step with one repeat, what the winner leaves (M,).
+    They are scaled to the full noise. A step with one repeat has the `residual` (M,) of the winner.
     """
     out = train_data.residual.copy()
     for s in train_data.segments:
@@ -232,7 +250,7 @@ def _noise_like(train_data: RegressionData, residual: Array) -> Array:
     return out
 
 
-def _joint(effect: Effect) -> int | None:
+def _joint_index(effect: Effect) -> int | None:
     words = effect.where.split()
     return int(words[1]) - 1 if words[0] == "joint" else None
 
@@ -241,44 +259,48 @@ def _place(effect: Effect) -> str:
     return str(getattr(effect, "place", effect.where))
 
 
-def _changes(winner: Hypothesis, rest: Hypothesis) -> dict[str, float]:
-    """Return the energy that an effect removes in training, by equation where that is visible."""
-    change = {e: rest.excess_energy[e] - winner.excess_energy[e] for e in rest.excess_energy}
+def _removed_energy(winner: Hypothesis, alternative: Hypothesis) -> dict[str, float]:
+    """Return the training energy that an effect removes, by equation in which it acts."""
+    change = {
+        e: alternative.excess_energy[e] - winner.excess_energy[e] for e in alternative.excess_energy
+    }
     most = max(change.values())
-    return {e: v for e, v in change.items() if v > SEARCH.touched * most}
+    return {e: v for e, v in change.items() if v > SEARCH.acting_share * most}
 
 
-def _worse(hypotheses: HypothesisSet, winner: Hypothesis, rest: Hypothesis) -> list[str]:
-    """Return equations that were quieter under the baseline and that this effect disturbs.
+def _disturbed_equations(
+    hypotheses: HypothesisSet, winner: Hypothesis, alternative: Hypothesis
+) -> list[str]:
+    """Return the equations in which an effect leaves more energy than the baseline.
 
-    What it adds would alone be more than the noise's band.
+    It must be more by the noise's band and by `TRACE.harm_ratio`, and more than without the effect.
     """
     before = {e: max(0.0, v) for e, v in hypotheses.empty.excess_energy.items()}
     return [
         e
         for e, now in winner.excess_energy.items()
-        if now > before[e] + hypotheses.limits.band[e]
+        if now > before[e] + hypotheses.noise_band.by_equation[e]
         and now > TRACE.harm_ratio * before[e]
-        and now > rest.excess_energy[e]
+        and now > alternative.excess_energy[e]
     ]
 
 
-def _taken(removed: float, worse: Sequence[str]) -> str:
+def _removal_in_words(removed: float, disturbed: Sequence[str]) -> str:
     text = f"{100 * removed:.0f} % of the energy above noise"
-    if not worse:
+    if not disturbed:
         return text
-    return f"{text}, but the residual of {' '.join(worse)} is larger than under the baseline"
+    return f"{text}, but the residual of {' '.join(disturbed)} is larger than under the baseline"
 
 
-def _removed(
+def _removed_share(
     holdout_data: RegressionData, changes: Mapping[str, float], without: Array, after: Array
 ) -> float:
     """Return the share of held-out energy above noise that an effect removes.
 
-    It is the mean over equations, weighed by what the effect removes there in training (`changes`):
-    what a baseline that was badly determined leaves in another equation does not count against it.
+    It is the mean over equations, weighted by the training energy that the effect removes in each
+    (`changes`): an error of the baseline in another equation does not count against the effect.
     """
-    before, now = excess_of(holdout_data, without), excess_of(holdout_data, after)
+    before, now = energy_above_noise(holdout_data, without), energy_above_noise(holdout_data, after)
     weights = {e: v for e, v in changes.items() if before.get(e, 0.0) > 0.0}
     total = sum(weights.values())
     if total <= 0.0:
@@ -293,17 +315,23 @@ def _rivals(
     hypotheses: HypothesisSet,
     winner: Hypothesis,
     used: Used,
-    rest: Hypothesis,
+    alternative: Hypothesis,
     holdout_data: RegressionData,
-    judged: _Near,
+    held_out_test: _TieTest,
 ) -> list[Rival]:
-    """Return the sets that have another effect in place of one, those that leave least first.
+    """Return the rivals of an effect: fitted sets with another effect in its place.
 
-    A simpler reading of the effect is no rival: held-out records have said that it is too simple.
+    Tied rivals come first, then by held-out rms. A simpler reading of the effect is no rival, since
+    held-out records have shown that it is too simple.
     """
-    mine, key = used.term, (used.term.name, used.term.where)
+    judged_effect, key = used.term, (used.term.name, used.term.where)
     others, train_data = winner.keys - {key}, hypotheses.train_data
-    trained = _Near(train_data, _changes(winner, rest), winner.fit.residual, rest.fit.residual)
+    training_test = _TieTest(
+        train_data,
+        _removed_energy(winner, alternative),
+        winner.fit.residual,
+        alternative.fit.residual,
+    )
     out = []
     for hypothesis in hypotheses.fitted.values():
         fresh = [
@@ -312,30 +340,32 @@ def _rivals(
         if key in hypothesis.keys or not others <= hypothesis.keys or len(fresh) != 1:
             continue
         (other,) = fresh
-        more = hypothesis.size[1] - winner.size[1]  # free numbers, which must earn their price
+        more = hypothesis.size[1] - winner.size[1]  # further free numbers, each with its price
         assert isinstance(other, Effect)
-        assert isinstance(mine, Effect)
+        assert isinstance(judged_effect, Effect)
         if (
             (more > 0 and hypothesis.total > winner.total - SEARCH.number_price * more)
-            or related(mine, other)
-            or hypotheses.physical(hypothesis, formed=others)
-            or _worse(hypotheses, hypothesis, rest)
+            or of_one_law(judged_effect, other)
+            or hypotheses.physical_problem(hypothesis, may_be_at_bounds=others)
+            or _disturbed_equations(hypotheses, hypothesis, alternative)
         ):
             continue
-        held = held_left(holdout_data, hypothesis.fit)
-        if _refused_already(hypotheses, holdout_data, (mine, other), others, held):
+        rival_residual = held_out_residual(holdout_data, hypothesis.fit)
+        if _is_refused_simpler_name(
+            hypotheses, holdout_data, (judged_effect, other), others, rival_residual
+        ):
             continue
-        ratio = judged.ratio(held)
-        tied = judged.near(held, TRACE.tie_ratio) and (
-            trained.near(hypothesis.fit.residual, TRACE.tie_ratio_training)
-            or ratio < TRACE.clear_lead
+        ratio = held_out_test.ratio(rival_residual)
+        tied = held_out_test.ties(rival_residual, TRACE.tie_ratio) and (
+            training_test.ties(hypothesis.fit.residual, TRACE.tie_ratio_training)
+            or ratio < TRACE.decisive_ratio
         )
         out.append(
             Rival(
                 other.name,
                 _place(other),
                 ratio,
-                trained.ratio(hypothesis.fit.residual),
+                training_test.ratio(hypothesis.fit.residual),
                 tied,
                 other.where,
             )
@@ -344,24 +374,27 @@ def _rivals(
     return out[: TRACE.most_rivals]
 
 
-def _refused_already(
+def _is_refused_simpler_name(
     hypotheses: HypothesisSet, holdout_data: RegressionData, pair: tuple[Effect, Effect],
-    others: frozenset[Key], held: Array,
+    others: frozenset[Key], rival_residual: Array,
 ) -> bool:  # fmt: skip
-    """Return whether a rival says no more than a simpler reading of both, which is refused."""
+    """Return whether a rival fits no better than a simpler reading of both, which is too simple.
+
+    `held` (M,) is the rival's held-out residual, `others` the set's other effects.
+    """
     mine, other = pair
     for name in set(other.includes) & set(mine.includes) if other.where == mine.where else ():
         simple = hypotheses.fitted.get(others | {(name, other.where)})
         if simple is not None:
-            more = loss(held_left(holdout_data, simple.fit), held)
+            more = loss_in_deviations(held_out_residual(holdout_data, simple.fit), rival_residual)
             return more <= TRACE.standard_errors
     return False
 
 
-class _Near:
-    """Whether another fit leaves about as little as the best in the equations of an effect.
+class _TieTest:
+    """Comparison of other fits with the best one, in the equations in which an effect acts.
 
-    `left` (M,) is what the best leaves, `without` (M,) what is left without the effect.
+    `left` (M,) is the whitened residual of the best fit, `without` (M,) that without the effect.
     """
 
     def __init__(
@@ -375,19 +408,21 @@ class _Near:
         self.taken = float(without[self.rows] @ without[self.rows]) - self.energy
 
     def ratio(self, other: Array) -> float:
-        """Return the rms of what another fit leaves over that of the best."""
+        """Return the residual rms of another fit (M,) over that of the best."""
         energy = float(other[self.rows] @ other[self.rows])
         return float(np.sqrt(energy / self.energy)) if self.energy > 0 else float("nan")
 
-    def near(self, other: Array, tie: float) -> bool:
-        """Return whether another fit (M,) loses no more than noise, or than `tie` times the rms.
+    def ties(self, other: Array, tie: float) -> bool:
+        """Return whether another fit (M,) has less than `tie` times the rms, or loses only noise.
 
-        Of an effect that takes less than is left, what it takes is the measure, not the noise.
+        For an effect that removes less energy than remains, the ratio is of the removed energy.
         """
         change = other[self.rows] - self.left
         lost = float(change @ (other[self.rows] + self.left))
         share = (tie**2 - 1.0) * min(self.energy, max(self.taken, 0.0))
-        return lost < share or loss(other[self.rows], self.left) <= TRACE.standard_errors
+        return (
+            lost < share or loss_in_deviations(other[self.rows], self.left) <= TRACE.standard_errors
+        )
 
 
 def _parameters(
@@ -407,16 +442,15 @@ def _parameters(
     }
 
 
-def _differences(differing: Sequence[tuple[str, str, float, float]]) -> str:
+def _differences_in_words(differing: Sequence[Difference]) -> str:
     if not differing:
         return "the same in every step, half, direction and speed"
     return "; ".join(
-        f"{name} = {with_interval(value, error)} in {label}"
-        for label, name, value, error in differing[:3]
+        f"{d.parameter} = {with_interval(d.value, d.error)} in {d.part}" for d in differing[:3]
     )
 
 
-def _told_apart(rivals: Sequence[Rival]) -> str:
+def _rivals_in_words(rivals: Sequence[Rival]) -> str:
     if not rivals:
         return "no other set fits nearly as well"
     nearest = rivals[0]

@@ -1,4 +1,4 @@
-"""Error before and after, on held-out records only."""
+"""Errors of the models before and after, on records that they were not fitted to."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from analysis.trace.data.conditioned_record import model_rows, row_residual
 from analysis.trace.data.noise_floor import Group, floors
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.data.set_aside import judging_rows
-from analysis.trace.data.temperature_nuisance import plausible
+from analysis.trace.data.temperature_nuisance import within_plausible_slope
 from analysis.trace.result import FreeCurves
-from analysis.trace.search.refinement import DesignMatrix, ExactFit, table
+from analysis.trace.search.refinement import DesignMatrix, ExactFit, design_matrix
 from analysis.trace.settings import TRACE
 from rig.model.parse import InputError
 from rig.model.records import Run
@@ -44,30 +44,30 @@ class Errors:
     after: Mapping[str, float]
 
 
-def residual(holdout_data: RegressionData, model: ExactFit) -> Array:
-    """Return the whitened held-out residual (M,) of a model fitted to other records."""
-    rows = table(holdout_data, model.terms)
-    return rows.residual(_settled(holdout_data.rig, rows, model).beta)
+def held_out_residual(holdout_data: RegressionData, model: ExactFit) -> Array:
+    """Return the whitened residual (M,) of a model after `refitted_to_held_out`."""
+    rows = design_matrix(holdout_data, model.terms)
+    return rows.residual(_refitted(holdout_data.rig, rows, model).beta)
 
 
-def settled(holdout_data: RegressionData, model: ExactFit) -> ExactFit:
-    """Return the model with what its own records hardly show as the held-out records have it.
+def refitted_to_held_out(holdout_data: RegressionData, model: ExactFit) -> ExactFit:
+    """Return the model with coefficients fitted to held-out rows that determine them much better.
 
-    That is the oil's temperature part of 1/b, which is no parameter of the model and no effect
-    (records at one temperature say nothing of it, and others then warm up), and every direction of
-    the baseline's coefficients that the held-out rows know `TRACE.better_known` times better: two
-    joints that move at once show an inertia that joints locked in turn hide in noise, and its error
-    would be taken for one of the model. No coefficient of an effect is fitted anew.
+    They are the temperature part of 1/b (records at one temperature do not determine it, others
+    then warm up), and every direction of the baseline's coefficients on which the held-out rows
+    have `TRACE.information_ratio` times the information of the training rows: two joints that move
+    together show a coupling inertia that joints locked in turn do not, and its error would look
+    like an error of the model. No coefficient of an effect is changed.
     """
-    return _settled(holdout_data.rig, table(holdout_data, model.terms), model)
+    return _refitted(holdout_data.rig, design_matrix(holdout_data, model.terms), model)
 
 
-def _settled(rig: Rig, rows: DesignMatrix, model: ExactFit) -> ExactFit:
+def _refitted(rig: Rig, rows: DesignMatrix, model: ExactFit) -> ExactFit:
     return _with_better_known(rig, rows, _at_temperature(rows, model))
 
 
 def _with_better_known(rig: Rig, rows: DesignMatrix, model: ExactFit) -> ExactFit:
-    """Return the model with the coefficients fitted to rows where these know them much better."""
+    """Return the model with directions of coefficients fitted to rows with more information."""
     of_effects = {
         c.parameter for u in model.terms if isinstance(u.term, Effect)
         for c in u.term.coefficients(rig)
@@ -76,22 +76,22 @@ def _with_better_known(rig: Rig, rows: DesignMatrix, model: ExactFit) -> ExactFi
     X, known = rows.matrix[:, at], model.information[np.ix_(at, at)]
     seen = X.T @ X
     scale = np.sqrt(np.maximum(np.diag(seen) + np.diag(known), 1e-300))
-    least = TRACE.dependent_share * np.eye(len(at))
+    least = TRACE.eigenvalue_ratio * np.eye(len(at))
     ratio, directions = eigh(seen / np.outer(scale, scale), known / np.outer(scale, scale) + least)
-    free = directions[:, ratio > TRACE.better_known] / scale[:, None]
-    if not free.shape[1]:  # nearly always
+    free = directions[:, ratio > TRACE.information_ratio] / scale[:, None]
+    if not free.shape[1]:  # the usual case
         return model
     step = free @ np.linalg.lstsq(X @ free, rows.residual(model.beta), rcond=None)[0]
     changed = {rows.names[k]: float(v) for k, v in zip(at, step, strict=True)}
     return replace(model, beta={n: v + changed.get(n, 0.0) for n, v in model.beta.items()})
 
 
-def fitted_anew(before: ExactFit, after: ExactFit) -> list[str]:
-    """Name the coefficients that held-out records have changed visibly (`settled`)."""
+def refitted_names(before: ExactFit, after: ExactFit) -> list[str]:
+    """Return the coefficients that `refitted_to_held_out` changed by more than `noted_shift`."""
     return [
         name
         for name, value in before.beta.items()
-        if name != KAPPA and abs(after.beta[name] - value) > TRACE.visible_shift * abs(value)
+        if name != KAPPA and abs(after.beta[name] - value) > TRACE.noted_shift * abs(value)
     ]
 
 
@@ -101,7 +101,7 @@ def _at_temperature(rows: DesignMatrix, model: ExactFit) -> ExactFit:
     column = rows.matrix[:, rows.names.index(KAPPA)]
     size = float(column @ column)
     step = float(column @ rows.residual(model.beta)) / size if size > 0 else 0.0
-    kappa = plausible(model.beta.get(KAPPA, 0.0) + step, model.beta)
+    kappa = within_plausible_slope(model.beta.get(KAPPA, 0.0) + step, model.beta)
     return replace(model, beta={**model.beta, KAPPA: kappa})
 
 
@@ -114,9 +114,9 @@ def errors(
 ) -> Errors:
     """Return every equation's error under both models, its size and noise floor, over all records.
 
-    Of groups that are `divided` only the rows set aside count. The floor is what does not repeat
-    under the model after: its columns carry the sensors' noise into the residual as the baseline's
-    do. A single record repeats itself only as a whole.
+    `members` are the records, each repeat by itself; of those in `divided` groups only the judging
+    rows count. The noise floor is that of the residual under the model `after`. A record without
+    repeats has a floor by its periods or neighbouring states, for which all its rows are used.
     """
     whole = [model_rows(rig, after.terms, conditioned) for conditioned in members]
     first, other = (
@@ -153,7 +153,7 @@ def errors(
 def _by_equation(
     built: Sequence[Mapping[str, Rows]], part: Callable[[Rows], Array]
 ) -> dict[str, float]:
-    """Return the rms of a part of every equation's rows over all records."""
+    """Return the rms of `part(rows)` over all records, by equation."""
     collected: dict[str, list[Array]] = {}
     for rows_of in built:
         for equation, rows in rows_of.items():
@@ -163,7 +163,7 @@ def _by_equation(
 
 def rms_of(holdout_data: RegressionData, model: ExactFit) -> dict[str, float]:
     """Return the rms of every equation's held-out residual, SI, repeats averaged."""
-    rest = residual(holdout_data, model)
+    rest = held_out_residual(holdout_data, model)
     collected: dict[str, list[Array]] = {}
     for s in holdout_data.segments:
         collected.setdefault(s.equation, []).append(rest[s.where] * s.noise / np.sqrt(s.repeats))
@@ -177,10 +177,10 @@ def _rms(parts: Sequence[Array]) -> float:
 
 @dataclass(frozen=True)
 class FreeRunErrors:
-    """Simulations of the held-out records, by channel: mean FIT [%] and RMSE [SI] of free runs.
+    """Errors of simulations, by channel: mean FIT [%] and RMSE [SI] of free runs over all records.
 
-    `window_rmse` [SI] is of windows restarted from the data; NaN where the model failed. `first` is
-    the first record whose free run did not fail.
+    `window_rmse` [SI] is of windows restarted from the data. A failed simulation makes a figure
+    NaN. `first` is the first record whose free run did not fail.
     """
 
     fit: Mapping[str, float]

@@ -1,10 +1,10 @@
-"""How sure: sign flips for significance, repeats for errors.
+"""Significance of an effect by sign flips, and standard errors of its parameters.
 
-The unit is the repeat. Under the null hypothesis a residual is noise, symmetric and independent
-from repeat to repeat, so that the signs of whole repeats may be flipped. With few repeats flips of
-whole records cannot give a small p (4 repeats: not below 1/8); then blocks of a record are
-flipped, each a whole period where the record holds several, else several of the longest excited
-wave: the noise that passes the row filter forgets itself within a tenth of a second.
+Under the null hypothesis a residual is noise, symmetric and independent from repeat to repeat, so
+that the signs of whole repeats may be flipped. With few repeats, flips of whole records cannot give
+a small p (4 repeats: not below 1/8). Then blocks of a record are flipped: whole periods where the
+record holds at least three, else `TRACE.flip_block` seconds. The noise behind the row filter is
+uncorrelated after a tenth of a second.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from analysis.effects.base import shape_values
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
-from analysis.trace.judge.scatter import scatter
+from analysis.trace.judge.scatter import parameter_covariance
 from analysis.trace.search.linear_fit import CandidateColumns, orthonormal
 from analysis.trace.search.refinement import ExactFit, jacobian, tangent
 from analysis.trace.settings import SEARCH, TRACE
@@ -27,10 +27,11 @@ Array = NDArray[np.float64]
 Key = tuple[str, str]
 
 
-def blocks(train_data: RegressionData) -> NDArray[np.int64]:
-    """Return for each row the number of its block within its record (M,).
+def flip_blocks(train_data: RegressionData) -> NDArray[np.int64]:
+    """Return for each row (M,) the number of its block within its record.
 
-    A block is a period of a record that holds three of them.
+    With `TRACE.enough_repeats` a record is one block; else a block is a period if the record holds
+    at least three, or `TRACE.flip_block` seconds.
     """
     out = np.zeros(train_data.base.shape[0], dtype=np.int64)
     for segment in train_data.segments:
@@ -45,11 +46,11 @@ def blocks(train_data: RegressionData) -> NDArray[np.int64]:
     return out
 
 
-def flipped(
+def sign_flipped(
     train_data: RegressionData, count: int, rng: np.random.Generator, residual: Array
 ) -> Array:
-    """Return residuals (M, count), averaged after random signs of every repeat's blocks."""
-    numbers = blocks(train_data)
+    """Return averages (M, count) of `residual` (R, M) after random sign flips of its blocks."""
+    numbers = flip_blocks(train_data)
     M = train_data.base.shape[0]
     out = np.zeros((M, count))
     groups = sorted({s.group for s in train_data.segments})
@@ -70,12 +71,12 @@ def null_maximum(
     residual: Array,
     rng: np.random.Generator,
 ) -> Array:
-    """Return the largest gain of any candidate at any shape under each flip (flips,)."""
-    r = flipped(train_data, TRACE.sign_flips, rng, residual)
+    """Return the largest energy (flips,) that any candidate at any shape removes, by flip."""
+    r = sign_flipped(train_data, TRACE.sign_flips, rng, residual)
     r = r - candidates.basis @ (candidates.basis.T @ r)
     c = candidates.columns.T @ r
     diagonal = np.diag(candidates.K)
-    shows = (diagonal > SEARCH.visible**2 * candidates.raw) & (candidates.raw > 0)
+    shows = (diagonal > SEARCH.least_projected_length**2 * candidates.raw) & (candidates.raw > 0)
     best = (
         np.max(c[shows] ** 2 / diagonal[shows, None], axis=0)
         if shows.any()
@@ -90,13 +91,13 @@ def null_maximum(
 
 
 def p_value(gain: float, null: Array) -> float:
-    """Return the family-wise p of a gain against the flips' largest gains."""
+    """Return the family-wise p of a removed energy `gain` against those under flips (`null`)."""
     return float((1 + np.sum(null >= gain)) / (1 + len(null)))
 
 
 @dataclass(frozen=True)
 class EffectErrors:
-    """An effect's parameters (k,) with standard errors, and the t distributions' dof (k,)."""
+    """An effect's parameters (k,), standard errors (k,) and degrees of freedom (k,) of their t."""
 
     names: tuple[str, ...]
     value: Array
@@ -104,22 +105,25 @@ class EffectErrors:
     dof: Array
 
 
-def spread(
+def effect_errors(
     train_data: RegressionData, model: ExactFit, used: Used, values: Mapping[str, float]
 ) -> EffectErrors:
-    """Return an effect's parameters with errors: scatter between repeats, and lack of fit."""
+    """Return an effect's parameters with errors from repeats and lack of fit.
+
+    `values` are the values of the model's parameters by name (b itself, not 1/b).
+    """
     names, J = jacobian(train_data, model, used)
-    base = others(train_data, model, names)
+    base = basis_of_others(train_data, model, names)
     J_p = J - base @ (base.T @ J)
     scale = np.linalg.norm(J_p, axis=0)  # units differ by many powers of ten
     scale[scale == 0] = 1.0
-    error = scatter(train_data, J_p / scale, model.residual)
+    error = parameter_covariance(train_data, J_p / scale, model.residual)
     known = {**shape_values(train_data.rig, used), **values}
     value = np.array([known.get(n, np.nan) for n in names])
     return EffectErrors(names, value, np.sqrt(np.diag(error.covariance)) / scale, error.dof)
 
 
-def others(train_data: RegressionData, model: ExactFit, own: Sequence[str]) -> Array:
-    """Return a basis of everything in the model but the named parameters, other shapes included."""
+def basis_of_others(train_data: RegressionData, model: ExactFit, own: Sequence[str]) -> Array:
+    """Return an orthonormal basis (M, r) of a model's tangent without the parameters `own`."""
     names, X = tangent(train_data, model)
     return orthonormal(X[:, [k for k, n in enumerate(names) if n not in own]])

@@ -1,11 +1,13 @@
-"""Invariance: a cause has the same size everywhere; a look-alike has another in every corner.
+"""Invariance: whether an effect has the same size in all parts of the records, as a cause has.
 
-The tangent of a fitted set is solved again on parts of the rows: each step, each half of the
-records, each direction of motion, fast and slow. A size that moves by more than noise, than what a
-catalogue's simpler form may cause, and than what a larger effect's form may spill onto it, is none.
+The linearised model is solved again on parts of the rows: each step, each half of the records, each
+direction of motion, fast and slow. The size must not differ by more than noise, the error of the
+catalogue's simpler form, and the form error of a larger effect together may cause.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,16 +15,31 @@ from numpy.typing import NDArray
 from analysis.effects.base import Effect, shapes_of
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
-from analysis.trace.judge.inference import EffectErrors, blocks, others
+from analysis.trace.judge.inference import EffectErrors, basis_of_others, flip_blocks
 from analysis.trace.search.linear_fit import orthonormal
-from analysis.trace.search.refinement import ExactFit, contribution, jacobian, table
+from analysis.trace.search.refinement import ExactFit, contribution, design_matrix, jacobian
 from analysis.trace.settings import SEARCH, TRACE
 
 Array = NDArray[np.float64]
 
 
-def subsets(train_data: RegressionData, joint: int | None) -> dict[str, Array]:
-    """Return masks (M,) of rows: each step, each half of the records, each direction of motion."""
+class Difference(NamedTuple):
+    """A part of the rows in which a parameter has another value than in all rows.
+
+    `value` is the value in the part, `error` its standard error, both in the parameter's unit.
+    """
+
+    part: str
+    parameter: str
+    value: float
+    error: float
+
+
+def row_subsets(train_data: RegressionData, joint: int | None) -> dict[str, Array]:
+    """Return masks (M,) of the parts of the rows, by name.
+
+    Direction and speed are those of `joint` (0-based), or of each equation's own joint if None.
+    """
     M = train_data.base.shape[0]
     out: dict[str, Array] = {}
     early, ahead = np.zeros(M, dtype=bool), np.zeros(M, dtype=bool)
@@ -45,32 +62,51 @@ def subsets(train_data: RegressionData, joint: int | None) -> dict[str, Array]:
     return out
 
 
-def _unmeasured(train_data: RegressionData) -> NDArray[np.int64] | None:
-    """Return the block of every row (M,), None where all steps have repeats or periods.
+def _blocks_as_noise(train_data: RegressionData) -> NDArray[np.int64] | None:
+    """Return the number of the block of every row (M,), None where the noise was measured.
 
-    Else what is left has to stand for the noise, block by block.
+    Where a step has neither repeats nor periods, the residual is used as noise, block by block.
     """
     if all(floor.count > 1 for floor in train_data.floors):
         return None
-    numbers = blocks(train_data)
+    numbers = flip_blocks(train_data)
     for k, s in enumerate(train_data.segments):
         numbers[s.where] += (int(numbers.max()) + 1) * k
     return numbers
 
 
-def _clustered(own: Array, residual: Array, clusters: NDArray[np.int64]) -> float:
-    """Return the root of the sum over blocks of (own . left)^2."""
+def _blockwise_deviation(own: Array, residual: Array, clusters: NDArray[np.int64]) -> float:
+    """Return the root of the sum over blocks of (own . residual)^2."""
     _, index = np.unique(clusters, return_inverse=True)
     return float(np.linalg.norm(np.bincount(index, weights=own * residual)))
 
 
-def _larger(model: ExactFit, train_data: RegressionData, used: Used, mask: Array) -> float:
-    """Return the energy that the largest other effect has on a subset, 0 if none is larger.
+def _shift(
+    own: Array, residual: Array, base: Array, blocks: NDArray[np.int64] | None
+) -> tuple[float, float]:
+    """Return the change of a coefficient in a part of the rows, and its standard error.
 
-    What its catalogue form misses of it (`SEARCH.form_share`) spills onto a smaller effect's
-    coefficient.
+    `own` (m,) is its column orthogonal to the others, whose orthonormal basis is `base` (m, r).
+    With `blocks` (m,) the error is also computed from the `residual` (m,) as noise, by block.
     """
-    rows = table(train_data, model.terms)
+    size = float(own @ own)
+    shift = float(own @ residual) / size
+    error = 1.0 / np.sqrt(size)
+    if blocks is not None:
+        noise = residual - base @ (base.T @ residual) - own * shift
+        error = max(error, _blockwise_deviation(own, noise, blocks) / size)
+    return shift, float(error)
+
+
+def _energy_of_larger_effect(
+    model: ExactFit, train_data: RegressionData, used: Used, mask: Array
+) -> float:
+    """Return the energy of the largest other effect in the rows `mask`, 0 if none is larger.
+
+    The error of its form, `SEARCH.form_share` of this energy, may change the coefficient of a
+    smaller effect.
+    """
+    rows = design_matrix(train_data, model.terms)
     energy = {}
     for u in model.terms:
         if isinstance(u.term, Effect):
@@ -83,8 +119,8 @@ def _larger(model: ExactFit, train_data: RegressionData, used: Used, mask: Array
     return most if most > mine else 0.0
 
 
-def _alone(columns: Array, k: int) -> Array:
-    """Return column k (m,) without what the others say."""
+def _column_off_others(columns: Array, k: int) -> Array:
+    """Return column k (m,) projected orthogonal to the other columns."""
     rest, own = np.delete(columns, k, axis=1), columns[:, k]
     if not rest.shape[1]:
         return own
@@ -94,14 +130,14 @@ def _alone(columns: Array, k: int) -> Array:
 
 def invariance(
     train_data: RegressionData, model: ExactFit, used: Used, value: EffectErrors, joint: int | None
-) -> list[tuple[str, str, float, float]]:
-    """Return where a parameter disagrees with itself: (subset, parameter, value there, error)."""
+) -> list[Difference]:
+    """Return the parts of the rows in which a size of an effect differs from that of all rows."""
     names, J = jacobian(train_data, model, used)
-    base = others(train_data, model, names)
+    base = basis_of_others(train_data, model, names)
     if isinstance(used.term, Effect) and used.term.free:
-        return _of_whole(train_data, model, used, base, joint)
+        return _whole_effect_differences(train_data, model, used, base, joint)
     residual = model.residual
-    # A shape such as the presliding distance is the form's, not the effect's size.
+    # Shapes without a neutral value, such as a presliding distance, are no sizes.
     sizes = {c.parameter for c in used.term.coefficients(train_data.rig)}
     sizes |= {s.parameter for s in shapes_of(train_data.rig, used) if s.neutral is not None}
     units = {c.parameter: c.unit for c in used.term.coefficients(train_data.rig)}
@@ -109,19 +145,20 @@ def invariance(
     nothing = {s.parameter: s.neutral or 0.0 for s in shapes_of(train_data.rig, used)}
     neutral = np.array([nothing.get(n, 0.0) for n in names])
     out = []
-    clusters = _unmeasured(train_data)
+    clusters = _blocks_as_noise(train_data)
     J_all = J - base @ (base.T @ J)
-    whole = [float(np.sum(_alone(J_all, k) ** 2)) for k in range(len(names))]
-    # What the effect's other numbers can stand for is no size of its own: then the whole is judged.
+    whole = [float(np.sum(_column_off_others(J_all, k) ** 2)) for k in range(len(names))]
+    # A number that the effect's other numbers can replace is no size of its own: then the whole
+    # effect is judged.
     ridge = {
         name
         for k, name in enumerate(names)
         if name in sizes and whole[k] < TRACE.separable_share * float(J_all[:, k] @ J_all[:, k])
     }
     if ridge:
-        out += _of_whole(train_data, model, used, base, joint)
+        out += _whole_effect_differences(train_data, model, used, base, joint)
         sizes -= ridge
-    for label, mask in subsets(train_data, joint).items():
+    for label, mask in row_subsets(train_data, joint).items():
         if not mask.any():
             continue
         B = orthonormal(base[mask])
@@ -131,22 +168,22 @@ def invariance(
                 continue
             if np.linalg.norm(J_s[:, k]) < 0.1 * np.linalg.norm(J[mask][:, k]):
                 continue
-            own = _alone(J_s, k)
+            own = _column_off_others(J_s, k)
             size = float(own @ own)
-            # What hardly acts there shows its form's tail, not its size.
+            # A part with little information shows the tail of the form, not the size.
             if (
                 size < TRACE.informative_share * whole[k]
                 or size <= 0
                 or not np.isfinite(value.value[k])
             ):
                 continue
-            shift = float(own @ residual[mask]) / size
-            error = 1.0 / np.sqrt(size)
-            if clusters is not None:
-                rest_of = residual[mask] - B @ (B.T @ residual[mask]) - own * shift
-                error = max(error, _clustered(own, rest_of, clusters[mask]) / size)
-            spill = np.sqrt(SEARCH.form_share * _larger(model, train_data, used, mask) / size)
-            # Two levels of one effect are judged by the larger: 2 N beside 100 N is a detail.
+            blocks = None if clusters is None else clusters[mask]
+            shift, error = _shift(own, residual[mask], B, blocks)
+            spill = np.sqrt(
+                SEARCH.form_share * _energy_of_larger_effect(model, train_data, used, mask) / size
+            )
+            # Differences are relative to the largest number of the same unit: of two levels, 2 N
+            # and 100 N, the smaller is a detail.
             alike = [j for j, n in enumerate(names) if n in sizes and units[n] == units[name]]
             full = float(np.max(np.abs(value.value[alike] - neutral[alike])))
             if error > TRACE.subset_error * full:
@@ -154,23 +191,23 @@ def invariance(
             if abs(shift) > spill + TRACE.standard_errors * np.hypot(
                 error, TRACE.invariance_tolerance / TRACE.standard_errors * full
             ):
-                out.append((label, name, float(value.value[k]) + shift, error))
+                out.append(Difference(label, name, float(value.value[k]) + shift, error))
     return out
 
 
-def _of_whole(
+def _whole_effect_differences(
     train_data: RegressionData, model: ExactFit, used: Used, base: Array,
     joint: int | None,
-) -> list[tuple[str, str, float, float]]:  # fmt: skip
-    """Return where a whole effect disagrees with itself: the factor by which it would be larger.
+) -> list[Difference]:  # fmt: skip
+    """Return the parts in which a whole effect differs, with its size there over that overall.
 
-    Values of a curve trade places between knots, numbers on a ridge with each other; what must be
-    the same everywhere is what they make together.
+    Neighbouring values of a curve, and numbers that can replace each other, are uncertain one by
+    one; their common contribution to the rows must be the same everywhere.
     """
     whole = contribution(train_data, model, used)
     start = float(np.sum((whole - base @ (base.T @ whole)) ** 2))
-    clusters, out = _unmeasured(train_data), []
-    for label, mask in subsets(train_data, joint).items():
+    clusters, out = _blocks_as_noise(train_data), []
+    for label, mask in row_subsets(train_data, joint).items():
         if not mask.any():
             continue
         B = orthonormal(base[mask])
@@ -180,13 +217,10 @@ def _of_whole(
             whole[mask] @ whole[mask]
         ):
             continue
-        shift = float(own @ model.residual[mask]) / size
-        error = 1.0 / np.sqrt(size)
-        if clusters is not None:
-            rest = model.residual[mask] - B @ (B.T @ model.residual[mask]) - own * shift
-            error = max(error, _clustered(own, rest, clusters[mask]) / size)
+        blocks = None if clusters is None else clusters[mask]
+        shift, error = _shift(own, model.residual[mask], B, blocks)
         if error <= TRACE.subset_error and abs(shift) > TRACE.standard_errors * np.hypot(
             error, TRACE.invariance_tolerance / TRACE.standard_errors
         ):
-            out.append((label, "the whole effect", 1.0 + shift, error))
+            out.append(Difference(label, "the whole effect", 1.0 + shift, error))
     return out

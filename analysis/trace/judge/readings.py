@@ -1,9 +1,9 @@
-"""Readings of one mechanism: whether the simpler name loses more than noise and its form may.
+"""Readings: names of one mechanism's law, of which the simplest one that fits is chosen.
 
 A name is a restriction of its mechanism's law: one level of dry friction where the law has two, no
-breakaway, no line behind the tank. The energy that a fit leaves cannot show whether a restriction
-holds, for its scatter grows with all rows; what the number set to nothing would change in the
-held-out rows is one direction in them, along which noise is one.
+breakaway, no line behind the tank. The remaining energy cannot show whether a restriction holds,
+since its scatter grows with the number of rows. The change that the further number makes in the
+whitened held-out rows is one direction, along which the noise has a standard deviation of 1.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from analysis.effects.base import Effect
 from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
-from analysis.trace.judge.held_out import residual as held_left
+from analysis.trace.judge.held_out import held_out_residual
 from analysis.trace.search.hypothesis import Hypothesis, Key, parameter_values
 from analysis.trace.search.hypothesis_set import HypothesisSet, effect_of
 from analysis.trace.settings import SEARCH, TRACE
@@ -25,121 +25,132 @@ Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
 
-def settled(
+def best_readings(
     hypotheses: HypothesisSet, winner: Hypothesis, holdout_data: RegressionData
 ) -> Hypothesis:
-    """Return the winner with the simplest reading of every mechanism that loses no more than noise.
+    """Return the winner with the simplest reading of every mechanism that the records allow.
 
-    First each effect is tried as one that it includes. A richer reading then takes the place of
-    one that it includes, or stands beside it. It must be physical, which asks that its own number
-    is more than a form's tolerance. By the restriction training records must lose
-    `TRACE.reading_share` of what it leaves and more than `TRACE.standard_errors` of their noise for
-    each number, held-out ones as much of theirs. Where the numbers differ little, the further one
-    must take more than the richer form itself leaves; beside a name it must take the share of what
-    is left that a further effect must. Of several that leave about as little the one with the
-    fewest numbers stays.
+    Each effect is first replaced by a simpler one that it includes, where `_needs_richer` finds
+    that nothing is lost. Then a richer reading replaces a simpler one, or is added to it, as long
+    as `_needs_richer` asks for it and it is physical, its further number above the form's tolerance
+    included. Of several richer sets within `SEARCH.number_price` of the least energy the one with
+    the fewest numbers is chosen.
     """
-    winner = _restricted(hypotheses, winner, holdout_data)
+    winner = _simplified(hypotheses, winner, holdout_data)
     while winner.effects:
-        held = held_left(holdout_data, winner.fit)
-        richer = [o for o in _richer(hypotheses, winner) if not hypotheses.physical(o)]
-        kept = [o for o in richer if _lost(hypotheses, winner, o, held, holdout_data)]
-        if not kept:
+        held = held_out_residual(holdout_data, winner.fit)
+        richer = [o for o in _richer_sets(hypotheses, winner) if not hypotheses.physical_problem(o)]
+        needed = [o for o in richer if _needs_richer(hypotheses, winner, o, held, holdout_data)]
+        if not needed:
             break
-        least = min(o.fit.energy for o in kept)
-        near = [o for o in kept if o.fit.energy <= least + SEARCH.number_price]
+        least = min(o.fit.energy for o in needed)
+        near = [o for o in needed if o.fit.energy <= least + SEARCH.number_price]
         best = min(near, key=lambda o: (o.size, o.fit.energy))
         log.info("richer reading: %s for %s", sorted(best.keys), sorted(winner.keys))
         winner = best
     return winner
 
 
-def _restricted(
+def _simplified(
     hypotheses: HypothesisSet, winner: Hypothesis, holdout_data: RegressionData
 ) -> Hypothesis:
-    """Return the winner with every effect as the one it includes, where nothing is lost by that."""
+    """Return the winner with effects replaced by simpler ones they include, if nothing is lost."""
     known = {(u.term.name, u.term.where) for u in hypotheses.base if isinstance(u.term, Effect)}
     for used in winner.effects:
         assert isinstance(used.term, Effect)
         for name in used.term.includes:
-            if (name, used.term.where) in known:  # the model has it: it is no new name
+            if (name, used.term.where) in known:  # the model has this effect already
                 continue
             effects = [u for u in winner.effects if u is not used]
             if (name, used.term.where) not in winner.keys:
                 simple = effect_of(name, used.term.where)
                 shape = simple.shape_of(hypotheses.train_data.rig, ())
                 effects.append(Used(simple, shape))
-            other = hypotheses.exact(effects)
-            held = held_left(holdout_data, other.fit)
-            if not hypotheses.physical(other) and not _lost(
+            other = hypotheses.refined(effects)
+            held = held_out_residual(holdout_data, other.fit)
+            if not hypotheses.physical_problem(other) and not _needs_richer(
                 hypotheses, other, winner, held, holdout_data
             ):
                 log.info("simpler reading: %s for %s", sorted(other.keys), sorted(winner.keys))
-                return _restricted(hypotheses, other, holdout_data)
+                return _simplified(hypotheses, other, holdout_data)
     return winner
 
 
-def loss(restricted: Array, richer: Array) -> float:
-    """Return by how many standard deviations of noise residuals (M,) lose by a restriction.
+def loss_in_deviations(restricted: Array, richer: Array) -> float:
+    """Return what the restricted model loses to the richer one, in standard deviations of noise.
 
-    Both are whitened and of records that neither was fitted to. Noise alone gives a normal number;
-    what the richer model says rightly adds the length of the difference.
+    Both residuals (M,) are whitened and of records that neither model was fitted to. With
+    d = restricted - richer the loss is restricted . d / |d|: a standard normal number if the
+    restriction holds, and larger by |d| if the richer model is right.
     """
     change = restricted - richer
     size = float(np.linalg.norm(change))
     return float(restricted @ change) / size if size > 0 else 0.0
 
 
-def related(effect: Effect, other: Effect) -> bool:
-    """Return whether one of two effects is a reading of the other's law at the same place."""
+def of_one_law(effect: Effect, other: Effect) -> bool:
+    """Return whether one of two effects at the same place includes the other as a special case."""
     near = effect.name in other.includes or other.name in effect.includes
     return near and effect.where == other.where
 
 
-def _lost(
+def _needs_richer(
     hypotheses: HypothesisSet, hypothesis: Hypothesis, other: Hypothesis, held: Array,
     holdout_data: RegressionData,
 ) -> bool:  # fmt: skip
-    """Return whether training and held-out records lose by taking `one` for the richer `other`."""
+    """Return whether training and held-out records need `other`, the richer of two sets.
+
+    In training `other` must remove: with the same number of effects `TRACE.richer_name_share` of
+    what `hypothesis` leaves, more than noise for each number, and `_form_error_energy`; with one
+    more effect what a further effect must. In held-out records `hypothesis`, whose residual there
+    is `held` (M,), must lose more than `TRACE.standard_errors`.
+    """
     more = other.size[1] - hypothesis.size[1]
     if len(other.effects) > len(hypothesis.effects):
         least = max(SEARCH.number_price * more, SEARCH.add_share * hypothesis.total)
     else:
-        # What a law leaves is no noise alone: a number that takes a little of it bends the form.
-        share = TRACE.reading_share * hypothesis.total
+        # A law leaves form error beside noise: a number that removes little only adapts the form.
+        share = TRACE.richer_name_share * hypothesis.total
         noise = TRACE.standard_errors**2 * more
-        least = max(noise, share, _form_error(hypotheses, hypothesis, other))
+        least = max(noise, share, _form_error_energy(hypotheses, hypothesis, other))
     if hypothesis.fit.energy - other.fit.energy <= least:
         return False
-    return loss(held, held_left(holdout_data, other.fit)) > TRACE.standard_errors
+    return (
+        loss_in_deviations(held, held_out_residual(holdout_data, other.fit)) > TRACE.standard_errors
+    )
 
 
-def _form_error(hypotheses: HypothesisSet, hypothesis: Hypothesis, other: Hypothesis) -> float:
-    """Return the energy that the richer of two readings leaves, where it is nearly the simpler one.
+def _form_error_energy(
+    hypotheses: HypothesisSet, hypothesis: Hypothesis, other: Hypothesis
+) -> float:
+    """Return the energy above noise that the richer set leaves, 0 if it is far from the simpler.
 
-    Where its numbers differ little, so much may be the form's error and no further number.
+    Where the numbers of the richer reading differ little, its further number may only adapt to an
+    error of its form, which is as large as this energy.
     """
     values = parameter_values(hypotheses.train_data.rig, other.fit.terms, dict(other.fit.beta))
     near = any(
-        (u.term.simpler(hypotheses.train_data.rig, values, TRACE.nearly), u.term.where)
+        (u.term.simpler(hypotheses.train_data.rig, values, TRACE.near_tolerance), u.term.where)
         in hypothesis.keys
         for u in other.effects
         if isinstance(u.term, Effect)
     )
-    left = sum(max(0.0, v - hypotheses.limits.band[e]) for e, v in other.excess_energy.items())
+    left = sum(
+        max(0.0, v - hypotheses.noise_band.by_equation[e]) for e, v in other.excess_energy.items()
+    )
     return left if near else 0.0
 
 
-def _richer(hypotheses: HypothesisSet, hypothesis: Hypothesis) -> list[Hypothesis]:
-    """Return the sets with a further number of a mechanism's law.
+def _richer_sets(hypotheses: HypothesisSet, hypothesis: Hypothesis) -> list[Hypothesis]:
+    """Return the sets with a richer reading of one effect.
 
-    A reading takes the place of one that it includes; another part of the same law stands beside.
+    It replaces the effect if it includes it, or is added if either is a part `beside` the other.
     """
     rig, sets = hypotheses.train_data.rig, dict[frozenset[Key], tuple[Used, ...]]()
     for used in hypothesis.effects:
         assert isinstance(used.term, Effect)
         for effect in hypotheses.effects:
-            if not related(effect, used.term) or (effect.name, effect.where) in hypothesis.keys:
+            if not of_one_law(effect, used.term) or (effect.name, effect.where) in hypothesis.keys:
                 continue
             kept = [u for u in hypothesis.effects if u is not used]
             if effect.beside or used.term.beside:
@@ -150,4 +161,4 @@ def _richer(hypotheses: HypothesisSet, hypothesis: Hypothesis) -> list[Hypothesi
                 continue
             effects = (*kept, Used(effect, effect.shape_of(rig, ())))
             sets[frozenset((u.term.name, u.term.where) for u in effects)] = effects
-    return [hypotheses.exact(effects) for effects in sets.values()]
+    return [hypotheses.refined(effects) for effects in sets.values()]

@@ -1,9 +1,9 @@
-"""How far an effect's parameters may be off: noise between repeats, and what the form misses.
+"""Errors of an effect's parameters: scatter between repeats, and errors of the effect's form.
 
 The rows' influence on a parameter is grouped as in `analysis.identify.estimators.covariance`: by
 repeat, by the part of the excitation's period, and by the level of the state that a law depends on
-(a chamber's pressure; a piston's place and its speed). What the groups differ by beyond noise is a
-model that is wrong somewhere in every repeat alike, and enters as a systematic part.
+(a chamber's pressure; a piston's position and its speed). Differences between groups beyond noise
+come from a model error that is the same in every repeat, and enter as a systematic part.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from analysis.simulation.model import Model
 from analysis.trace.data.regression_data import RegressionData, Segment
 from analysis.trace.search.refinement import (
     ExactFit,
-    alternatives,
     contribution,
-    table,
+    design_matrix,
+    fits_in_other_forms,
     tangent,
 )
 from analysis.trace.settings import SEARCH, TRACE
@@ -36,36 +36,42 @@ Indices = NDArray[np.int64]
 PERIOD, STATE, SPEED = "period", "state", "speed"
 
 
-def scatter(train_data: RegressionData, columns: Array, residual: Array) -> CovarianceParts:
-    """Return the covariance of coefficients of `columns` (M, k), all else projected off them.
+def parameter_covariance(
+    train_data: RegressionData, columns: Array, residual: Array
+) -> CovarianceParts:
+    """Return the covariance of the coefficients of `columns` (M, k).
 
-    `residual` (M,) is what the fitted model leaves of the averaged records. Of columns that depend
-    on each other what the rows determine counts, and every coefficient has its least dof.
+    The columns are orthogonal to all other columns of the model; `residual` (M,) is the whitened
+    residual of the averaged records. Where columns depend on each other, the covariance is that of
+    the combinations that the rows determine, and every coefficient has the least dof of these.
     """
     size, V = np.linalg.eigh(columns.T @ columns)
-    determined = V[:, size > TRACE.dependent_share * max(float(size[-1]), 1e-300)]
+    determined = V[:, size > TRACE.eigenvalue_ratio * max(float(size[-1]), 1e-300)]
     if determined.shape[1] < len(V):
         k = len(V)
         if not determined.shape[1]:
             return CovarianceParts(np.zeros((k, k)), np.ones(k), np.zeros(k))
-        inner = scatter(train_data, columns @ determined, residual)
+        inner = parameter_covariance(train_data, columns @ determined, residual)
         whole = determined @ inner.covariance @ determined.T
         return CovarianceParts(
             whole, np.full(k, inner.dof.min()), np.full(k, inner.systematic.max())
         )
     inverse = np.asarray((V / size) @ V.T, dtype=np.float64)
-    groupings = [_pieces(train_data, columns, residual, by) for by in (PERIOD, STATE, SPEED)]
+    groupings = [_scores(train_data, columns, residual, by) for by in (PERIOD, STATE, SPEED)]
     return spread(groupings, inverse)
 
 
-def _pieces(train_data: RegressionData, columns: Array, residual: Array, by: str) -> Pieces:
-    """Return scores and information of every step, repeat and group of rows."""
+def _scores(train_data: RegressionData, columns: Array, residual: Array, by: str) -> Pieces:
+    """Return scores and information of every step, repeat and group of rows.
+
+    `by` says what rows are grouped by: PERIOD, STATE or SPEED.
+    """
     strata = {g: k for k, g in enumerate(sorted({s.group for s in train_data.segments}))}
     pieces: dict[tuple[int, int, int], tuple[Array, Array]] = {}
     for number, s in enumerate(train_data.segments):
         conditioned, rows = train_data.source(s)
-        label = _labels(conditioned, s, rows.time, by)
-        # In period the equations of one instant belong together; a level is an equation's own.
+        label = _row_groups(conditioned, s, rows.time, by)
+        # Parts of a period group all equations; levels of a state group each equation by itself.
         label = label if by == PERIOD else label + number * IDENTIFY.state_levels
         own = columns[s.where] / np.sqrt(s.repeats)
         noise = train_data.residual[: s.repeats, s.where]
@@ -85,7 +91,7 @@ def _pieces(train_data: RegressionData, columns: Array, residual: Array, by: str
     )  # fmt: skip
 
 
-def _labels(conditioned: ConditionedRecord, s: Segment, time: Array, by: str) -> Indices:
+def _row_groups(conditioned: ConditionedRecord, s: Segment, time: Array, by: str) -> Indices:
     """Return the group of each row (m,): part of the period, or level of a state."""
     record = conditioned.record
     if by == PERIOD:
@@ -100,19 +106,19 @@ def _labels(conditioned: ConditionedRecord, s: Segment, time: Array, by: str) ->
 
 
 def form_shift(train_data: RegressionData, fit: ExactFit) -> dict[str, float]:
-    """Return how far every coefficient and shape may be off since an effect's form is not known.
+    """Return the possible error of every coefficient and shape by unknown forms, by name.
 
-    Where an effect has another form (`Effect.other_forms`), that is fitted as well. The two differ
-    by a shift of each coefficient; of it counts sqrt(E / E'), of the energies E and E' that they
-    leave above noise: nothing where the chosen form leaves noise only, all of it where the other
-    is as good. And an effect may grow otherwise than in proportion, x (1 + e |x| / rms x) in place
-    of its contribution x to the rows: where the rows show such an e beyond noise, the shift counts
-    that it makes.
+    Two errors are added as squares. (1) Where an effect has another form (`Effect.other_forms`),
+    that is fitted too and shifts each coefficient. The shift counts by sqrt(E / E'), with E and E'
+    the energies above noise that the chosen and the other form leave: in full where the other is as
+    good. (2) An effect may not grow in proportion, with x (1 + e |x| / rms x) in place of its
+    contribution x to the rows. Where e exceeds `TRACE.standard_errors` of its noise, the shift that
+    it makes counts.
     """
     noise = len(fit.residual)
     own = max(fit.energy - noise, np.sqrt(2.0 * noise))
-    squares = _by_growth(train_data, fit)
-    for other in alternatives(train_data, fit):
+    squares = _growth_shift_squares(train_data, fit)
+    for other in fits_in_other_forms(train_data, fit):
         left = max(other.energy - noise, np.sqrt(2.0 * noise))
         share = min(1.0, own / left)
         for name, value in other.beta.items():
@@ -121,8 +127,8 @@ def form_shift(train_data: RegressionData, fit: ExactFit) -> dict[str, float]:
     return {name: float(np.sqrt(v)) for name, v in squares.items()}
 
 
-def _by_growth(train_data: RegressionData, fit: ExactFit) -> dict[str, float]:
-    """Return the squares of what effects that grow otherwise shift, by name."""
+def _growth_shift_squares(train_data: RegressionData, fit: ExactFit) -> dict[str, float]:
+    """Return the squared shifts by effects that do not grow in proportion (2), by name."""
     names, X = tangent(train_data, fit)
     scale = np.linalg.norm(X, axis=0)
     scale[scale == 0] = 1.0
@@ -136,7 +142,7 @@ def _by_growth(train_data: RegressionData, fit: ExactFit) -> dict[str, float]:
         moved = np.linalg.lstsq(X / scale, column, rcond=1e-6)[0]
         own = column - X @ (moved / scale)
         energy = float(own @ own)
-        if energy <= SEARCH.visible**2 * float(column @ column):
+        if energy <= SEARCH.least_projected_length**2 * float(column @ column):
             continue
         e = float(own @ fit.residual) / energy
         if abs(e) * np.sqrt(energy) > TRACE.standard_errors:
@@ -145,16 +151,19 @@ def _by_growth(train_data: RegressionData, fit: ExactFit) -> dict[str, float]:
     return squares
 
 
-def widened(train_data: RegressionData, fit: ExactFit, model: Model) -> Model:
-    """Return the model with what is not known of its effects' shapes and forms in every interval.
+def with_form_errors(train_data: RegressionData, fit: ExactFit, model: Model) -> Model:
+    """Return the model with intervals that include the uncertainty of shapes and forms.
 
-    A model is identified with its shapes taken for exact. With the covariance S of shapes t, and
-    to first order beta(t) = beta - A^-1 X' J_t (t - t0), its variances grow by that of beta(t), and
-    by the square of `form_shift`.
+    `model` was identified with the shapes taken as exact. With shapes t of covariance S, X the
+    columns of the coefficients, J_t those of the shapes and A = X'X, to first order
+    beta(t) = beta - A^-1 X' J_t (t - t0). Variances grow by that of beta(t), and by the square of
+    `form_shift`.
     """
-    rows = table(train_data, fit.terms)
+    rows = design_matrix(train_data, fit.terms)
     size = np.linalg.norm(rows.matrix, axis=0)
-    more = _by_shapes(train_data, fit, rows.matrix / np.where(size > 0, size, 1.0), rows.names)
+    more = _variance_from_shapes(
+        train_data, fit, rows.matrix / np.where(size > 0, size, 1.0), rows.names
+    )
     shift = form_shift(train_data, fit)
     parameters, covariance = dict(model.parameters), model.covariance.copy()
     names = list(parameters)
@@ -172,8 +181,10 @@ def widened(train_data: RegressionData, fit: ExactFit, model: Model) -> Model:
     return replace(model, parameters=parameters, covariance=covariance)
 
 
-def _by_shapes(train_data: RegressionData, fit: ExactFit, X: Array, own: Sequence[str]) -> Array:
-    """Return what the shapes' covariance adds to the variance of each coefficient of X (M, k)."""
+def _variance_from_shapes(
+    train_data: RegressionData, fit: ExactFit, X: Array, own: Sequence[str]
+) -> Array:
+    """Return the variance (k,) of the coefficients of X (M, k) by the covariance of the shapes."""
     names, columns = tangent(train_data, fit)
     shapes = columns[:, [k for k, n in enumerate(names) if n not in own]]
     shapes = shapes[:, np.linalg.norm(shapes, axis=0) > 0]
@@ -181,6 +192,6 @@ def _by_shapes(train_data: RegressionData, fit: ExactFit, X: Array, own: Sequenc
         return np.zeros(X.shape[1])
     unit = shapes / np.linalg.norm(shapes, axis=0)
     moved = np.linalg.lstsq(X, unit, rcond=1e-6)[0]
-    error = scatter(train_data, unit - X @ moved, fit.residual)
+    error = parameter_covariance(train_data, unit - X @ moved, fit.residual)
     variance = np.einsum("ki,ij,kj->k", moved, error.covariance, moved)
     return np.asarray(np.maximum(variance, 0.0))

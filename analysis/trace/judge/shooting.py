@@ -1,10 +1,11 @@
-"""Effects with a hidden state once more: by multiple shooting, and which estimate stays.
+"""Shapes of effects with a hidden state by multiple shooting, and the choice between estimates.
 
-What the rows found begins the search (`analysis.identify.output_error.hidden_states`). The shapes
-so found take the place of the rows' where the model with them runs closer to held-out records and
-their rows are met as well as before. Else the rows' stay, for the trace's errors are errors of
-rows; but the interval of a shape is widened to hold both, since two routes to one number that
-differ by more than either allows say that the effect's form is simpler than the real one's.
+The search starts from the shapes found with the rows (see
+`analysis.identify.output_error.hidden_states`). Shapes from shooting are used where the model with
+them is closer to held-out records in simulation and the errors of held-out rows do not grow.
+Otherwise the shapes from the rows are kept, and the interval of each shape is extended to include
+both values: two estimates that differ by more than their errors show that the effect's form is
+simpler than the real one.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ from analysis.terms.base import Used
 from analysis.trace.data.regression_data import RegressionData
 from analysis.trace.judge.held_out import rms_of
 from analysis.trace.result import JudgedEffect
-from analysis.trace.search import refinement
-from analysis.trace.search.hypothesis import Hypothesis, excess_of
+from analysis.trace.search.hypothesis import Hypothesis, energy_above_noise
+from analysis.trace.search.refinement import fit_coefficients
 from analysis.trace.settings import TRACE
 from rig.model.records import Run
 from rig.model.rig import Rig
@@ -36,37 +37,42 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Reshaped:
-    """The set with the shapes that stay, and every effect's shapes by shooting."""
+class ShootingResult:
+    """The set with the shapes chosen, and the shapes of every effect by shooting."""
 
     winner: Hypothesis
     shots: tuple[Shot, ...]
 
 
-def reshaped(
+def shoot_hidden_states(
     runs: Sequence[Run],
     holdout: Sequence[Run],
     after: Model,
     train_data: RegressionData,
     holdout_data: RegressionData,
     winner: Hypothesis,
-) -> Reshaped:
-    """Shoot every effect of the winner that has a hidden state; `after` is its model."""
+) -> ShootingResult:
+    """Return the set after multiple shooting of every effect with a hidden state.
+
+    `after` is the identified model of the set `winner`; electric rigs are returned unchanged.
+    """
     if after.rig.electric or not hidden_effects(after):
-        return Reshaped(winner, ())
+        return ShootingResult(winner, ())
     ready = completed([*runs, *holdout], after)
     if ready is None:
-        return Reshaped(winner, ())
+        return ShootingResult(winner, ())
     shots, after = [], ready
     for effect in hidden_effects(after):
         shot_effect = shot(runs, after, effect)
         if shot_effect is None:
             continue
-        other = _with(after.rig, after.terms, effect, shot_effect)
+        other = _with_shapes_of(after.rig, after.terms, effect, shot_effect)
         before, now = (
             rest_of(holdout, model, effect) for model in (after, replace(after, terms=other))
         )
-        fitted = refinement.fit(train_data, _with(after.rig, winner.fit.terms, effect, shot_effect))
+        fitted = fit_coefficients(
+            train_data, _with_shapes_of(after.rig, winner.fit.terms, effect, shot_effect)
+        )
         rows, again = (rms_of(holdout_data, fit) for fit in (winner.fit, fitted))
         better = now < TRACE.shooting_ratio * before and all(
             again[e] <= TRACE.shooting_cost * rows[e] for e in rows
@@ -76,15 +82,17 @@ def reshaped(
         )
         if shots[-1].taken:
             winner = replace(
-                winner, effects=_with(after.rig, winner.effects, effect, shot_effect), fit=fitted,
-                excess_energy=excess_of(train_data, fitted.residual),
+                winner, effects=_with_shapes_of(after.rig, winner.effects, effect, shot_effect),
+                fit=fitted, excess_energy=energy_above_noise(train_data, fitted.residual),
             )  # fmt: skip
             after = replace(after, terms=other)
-    return Reshaped(winner, tuple(shots))
+    return ShootingResult(winner, tuple(shots))
 
 
-def _with(rig: Rig, terms: Sequence[Used], effect: Effect, shot: Shot) -> tuple[Used, ...]:
-    """Return the terms with the shapes of a shot; shapes that it did not search stay."""
+def _with_shapes_of(
+    rig: Rig, terms: Sequence[Used], effect: Effect, shot: Shot
+) -> tuple[Used, ...]:
+    """Return the terms with the shapes from shooting; shapes that it did not search are kept."""
     found = {name: estimate.value for name, estimate in shot.shapes.items()}
     return tuple(
         Used(u.term, tuple({**shape_values(rig, u), **found}.values())) if u.term == effect else u
@@ -93,19 +101,19 @@ def _with(rig: Rig, terms: Sequence[Used], effect: Effect, shot: Shot) -> tuple[
 
 
 def with_shots(judged: JudgedEffect, shots: Sequence[Shot]) -> JudgedEffect:
-    """Return an effect with what shooting says of its shapes: taken over, or in the interval."""
+    """Return an effect with the shapes from shooting, or with intervals that include them."""
     for result in shots:
         if (result.name, result.where) == (judged.name, judged.where):
             shapes = {
                 name: new if result.taken
-                else _wide(judged.parameters[name], new)
+                else _interval_including(judged.parameters[name], new)
                 for name, new in result.shapes.items()
             }  # fmt: skip
             return replace(judged, parameters={**judged.parameters, **shapes}, shot=result)
     return judged
 
 
-def _wide(rows: Estimate, new: Estimate) -> Estimate:
-    """Return the rows' estimate with an interval that holds the other's value too."""
+def _interval_including(rows: Estimate, new: Estimate) -> Estimate:
+    """Return the rows' estimate with an interval that includes the value of the other."""
     low, high = rows.ci95
     return replace(rows, ci95=(min(low, new.value), max(high, new.value)))

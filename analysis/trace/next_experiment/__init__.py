@@ -1,1 +1,1 @@
-"""The experiment that would separate the explanations that remain."""
+"""The next experiment that answers an open question, and detection limits of effects."""

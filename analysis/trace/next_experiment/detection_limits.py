@@ -1,13 +1,13 @@
-"""Detection limits: how large an effect may be that the records would not have shown.
+"""Detection limits: the largest size of an effect that leaves no residual above the noise.
 
 With the whitened rows X of the model in use, an effect at its smallest size of interest adds y to
-them. Least squares takes the part X d of y, d = X^+ y, into the parameters; only the rest
-q = y - X d shows. A residual r then gives the effect's size as q'r / q'q with the standard error
-1 / |q| (in units of the smallest size), and the largest size that goes with the records is
+them. Least squares absorbs the part X d of y, d = X^+ y, into the parameters; only q = y - X d
+remains in the residual. A residual r then gives the effect's size as q'r / q'q with the standard
+error 1 / |q| (in units of the smallest size), and the largest size that agrees with the records is
 
     L = |q'r| / q'q + z / |q|,  z the normal quantile of 95 %.
 
-An effect of this size would have moved the parameters by L d without a trace in the residual
+An effect of this size would have changed the parameters by L d without a visible residual
 (omitted-variable bias; e.g. Greene, Econometric Analysis, section 4.3).
 """
 
@@ -22,7 +22,11 @@ from analysis.effects.base import Effect, shape_values, shapes_of
 from analysis.regression.least_squares import shortest
 from analysis.simulation.model import Model
 from analysis.trace.data.regression_data import RegressionData
-from analysis.trace.next_experiment.discrimination import ComparisonRows, Explanation, smallest
+from analysis.trace.next_experiment.discrimination import (
+    ComparisonRows,
+    Explanation,
+    smallest_effect,
+)
 from analysis.trace.result import DetectionLimit
 from analysis.trace.search.hypothesis import Hypothesis, parameter_values
 from analysis.trace.search.refinement import rebased, tangent
@@ -36,32 +40,34 @@ Array = NDArray[np.float64]
 def detection_limits(
     train_data: RegressionData, effects: Sequence[Effect], winner: Hypothesis, model: Model
 ) -> list[DetectionLimit]:
-    """Return the effects that may hide and would change a parameter visibly, the worst first.
+    """Return the limits of effects that would change a parameter visibly, largest change first.
 
-    `effects` are the candidates, of which each name is returned once, where it changes most;
-    `winner` is the set in use and `model` the model identified with it. A curve that the data
-    draw takes what is alike into itself: beside one nothing is asked.
+    `effects` are the candidates; each name is returned once, at the place where it changes most.
+    `winner` is the set found and `model` the model identified with it. Beside a free form no limit
+    is computed, since its curve absorbs any similar effect.
     """
     if any(isinstance(u.term, Effect) and u.term.free for u in winner.effects):
         return []
     rows = ComparisonRows(rebased(train_data, winner.fit) if winner.effects else train_data)
     asked = [effect for effect in effects if (effect.name, effect.where) not in winner.keys]
-    small = [what for effect in asked if (what := smallest(effect, train_data.rig)) is not None]
+    small = [
+        what for effect in asked if (what := smallest_effect(effect, train_data.rig)) is not None
+    ]
     if not small:
         return []
     names, X = tangent(train_data, winner.fit)
-    added = np.column_stack([rows.adds(what) for what in small])
+    added = np.column_stack([rows.prediction(what) for what in small])
     taken = shortest(X, added, TRACE.rank_limit)
     shown = added - X @ taken
     known = {n: p.half for n, p in model.parameters.items() if abs(p.value) > 2.0 * p.half}
     found = []
     for k, what in enumerate(small):
-        times = _times(shown[:, k], winner.fit.residual)
+        times = _largest_multiple(shown[:, k], winner.fit.residual)
         moved = dict(zip(names, times * taken[:, k], strict=True))
-        shifts = _shifts(rows.train_data, moved, known)
+        shifts = _parameter_shifts(rows.train_data, moved, known)
         most = max(shifts, key=lambda name: shifts[name], default="")
-        if most and shifts[most] >= TRACE.visible_shift:
-            key, size = what.keys[0], _size(rows.train_data, what, times)
+        if most and shifts[most] >= TRACE.noted_shift:
+            key, size = what.keys[0], _effect_size(rows.train_data, what, times)
             found.append(
                 DetectionLimit(key["name"], key["where"], key["at"], *size, most, shifts[most])
             )
@@ -71,10 +77,11 @@ def detection_limits(
     return list(once.values())
 
 
-def _times(shown: Array, residual: Array) -> float:
-    """Return how many times its smallest size an effect may have that shows `shown` (M,) of it.
+def _largest_multiple(shown: Array, residual: Array) -> float:
+    """Return the largest size of an effect over its smallest size of interest.
 
-    Zero where it shows nothing at all: then no size can be stated.
+    `shown` (M,) is the part of the effect at its smallest size that remains in the residual; 0 is
+    returned where nothing remains, since no size can then be stated.
     """
     energy = float(shown @ shown)
     if not energy > 0.0:
@@ -82,12 +89,13 @@ def _times(shown: Array, residual: Array) -> float:
     return float((abs(shown @ residual) + TRACE.normal_quantile * energy**0.5) / energy)
 
 
-def _shifts(
+def _parameter_shifts(
     data: RegressionData, moved: Mapping[str, float], known: Mapping[str, float]
 ) -> dict[str, float]:
-    """Return how much of themselves parameters change that are moved beyond their interval.
+    """Return the relative change of the parameters that change by more than their interval.
 
-    `moved` holds changes of the rows' coefficients and of shapes, `known` half-widths.
+    `moved` are changes of the rows' coefficients and of shapes, `known` the half-widths of the
+    intervals, by name.
     """
     shapes = {n: v for u in data.terms for n, v in shape_values(data.rig, u).items()}
     before = {**data.beta, **shapes}
@@ -103,7 +111,7 @@ def _shifts(
     }
 
 
-def _size(data: RegressionData, what: Explanation, times: float) -> tuple[str, float, str]:
+def _effect_size(data: RegressionData, what: Explanation, times: float) -> tuple[str, float, str]:
     """Return name, value and unit of the number that says how large an effect is."""
     (used,) = what.effects
     for c in used.term.coefficients(data.rig):
@@ -115,11 +123,11 @@ def _size(data: RegressionData, what: Explanation, times: float) -> tuple[str, f
     return shapes[k].parameter, abs(used.shape[k] - neutral) * times, shapes[k].unit
 
 
-def in_words(limits: Sequence[DetectionLimit]) -> list[str]:
+def detection_limit_notes(limits: Sequence[DetectionLimit]) -> list[str]:
     """Return a sentence for each of the largest limits."""
     return [
         f"not excluded by these records: {d.name} at {place_in_words(d.at)} up to {d.quantity} = "
         f"{f'{plain(d.size, 2)} {typeset(d.unit)}'.strip()}, which would change {d.parameter} by "
         f"{plain(100 * d.shift, 2)} % without a residual above the noise"
-        for d in limits[: TRACE.most_limits]
+        for d in limits[: TRACE.most_detection_limits]
     ]

@@ -1,16 +1,15 @@
-"""How far apart two explanations would stand on records that have not been taken yet.
+"""Separation of two explanations on records that have not been taken yet.
 
-The twin gives a candidate excitation's noise-free record, and the record its rows under the
-baseline. A hypothesis (effects with sizes) predicts what it would add to those rows and to the
-rows already taken, y = sum of its columns times its sizes. What another hypothesis would leave of
-that is y projected off the baseline's columns, its own, and the derivatives of its shapes: it may
-be fitted anew, so only what it cannot imitate counts. With E_e the whitened energy left in
-equation e, the separation is
+The twin simulates a candidate excitation's noise-free record, which gives its rows under the
+baseline. An explanation (effects with sizes) predicts what it adds to these rows and to the rows
+already taken: y, the sum of its columns times its sizes. Another explanation leaves of y the part
+orthogonal to the baseline's columns, its own columns and the derivatives of its shapes, since it
+would be fitted again. With E_e the whitened energy left in equation e, the separation is
     s_e = sqrt(max(0, E_e(old and new rows) - E_e(old rows)) / (R n_e)),
-n_e new rows, R repeats: the rms that would stand out of one record, in units of its noise (the
-floor table's repeatable over noise). A pair is separated by the smaller of "one is true" and "the
-other is true", in the equation where that is largest. The criterion is T-optimality (Atkinson and
-Fedorov, Biometrika 62, 1975), the baseline's parameters profiled out.
+with n_e new rows and R repeats: the residual rms of one record in units of its noise. The
+separation of a pair is the smaller of the two with one or the other taken as true, each in the
+equation where it is largest. The criterion is T-optimality (Atkinson and Fedorov, Biometrika 62,
+1975), with the baseline's parameters profiled out.
 """
 
 from __future__ import annotations
@@ -29,15 +28,15 @@ from analysis.regression.least_squares import shortest
 from analysis.regression.rows import Rows
 from analysis.signals.conditioning import Signals, condition
 from analysis.terms.base import Used
+from analysis.trace.data.cache import RowCache
 from analysis.trace.data.candidates import Variant
 from analysis.trace.data.conditioned_record import (
     candidate_columns,
-    held,
+    is_hidden_by_lock,
     model_rows,
-    prepared,
+    prepared_signals,
     trace_filtering,
 )
-from analysis.trace.data.memory import RowMemory
 from analysis.trace.data.noise_floor import stated_noise
 from analysis.trace.data.regression_data import RegressionData, variant_columns
 from analysis.trace.next_experiment.excitations import CandidateExcitation
@@ -49,7 +48,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Explanation:
-    """Effects with their shapes, and their coefficients by parameter name; none: the baseline."""
+    """Effects with shapes, and coefficients by parameter name; without effects the baseline."""
 
     effects: tuple[Used, ...] = ()
     beta: Mapping[str, float] = field(default_factory=dict)
@@ -68,11 +67,11 @@ class Explanation:
         )
 
 
-def smallest(effect: Effect, rig: Rig) -> Explanation | None:
+def smallest_effect(effect: Effect, rig: Rig) -> Explanation | None:
     """Return an effect at its smallest size of interest, None where it has none or cannot show.
 
-    On poor excitation an effect of this size may leave nothing in the residual; then `clean` says
-    little about it.
+    With poor excitation an effect of this size may leave no residual: the verdict `clean` does not
+    exclude it then.
     """
     own = effect.least_shapes()
     if effect.absorbed(rig) or not (own or effect.least):
@@ -85,8 +84,9 @@ def smallest(effect: Effect, rig: Rig) -> Explanation | None:
 
 @dataclass(frozen=True)
 class OpenQuestion:
-    """Which of `one` and `other` an experiment is to show; `both_ways` unless `one` is only
-    wanted visible against `other`.
+    """Which of two explanations, `one` or `other`, is true.
+
+    Without `both_ways` the experiment must only show `one`, if it is true.
     """
 
     one: Explanation
@@ -105,15 +105,15 @@ class MeasurementView:
     seen: Signals
     rows: Mapping[str, Rows]
     noise: Mapping[str, float]
-    memory: RowMemory = field(default_factory=RowMemory, repr=False, compare=False)
+    cache: RowCache = field(default_factory=RowCache, repr=False, compare=False)
 
     def columns(self, used: Used) -> Mapping[str, Mapping[str, Array]]:
         """Return what an effect would add in SI: equation -> name -> column."""
-        if held(used.term, self.conditioned):
+        if is_hidden_by_lock(used.term, self.conditioned):
             return {}
         return candidate_columns(
             self.rig, self.terms, self.conditioned, self.seen, self.rows, self.beta, used,
-            self.memory,
+            self.cache,
         )  # fmt: skip
 
     def weight(self, equation: str) -> float:
@@ -121,10 +121,11 @@ class MeasurementView:
         return float(np.sqrt(EXPERIMENT.repeats) / max(self.noise[equation], 1e-30))
 
 
-def calibration(train_data: RegressionData) -> dict[str, float]:
-    """Return, by equation, the measured noise over what the rig's stated sensor noise would make.
+def noise_ratios(train_data: RegressionData) -> dict[str, float]:
+    """Return, by equation, the measured noise over that from the rig's stated sensor noise.
 
-    A faster excitation is filtered wider and so is noisier: the stated noise gives by how much.
+    Faster excitations have filters of larger bandwidth and so more noise; multiplied with this
+    ratio, the stated noise predicts it.
     """
     by_family: dict[str, list[float]] = {}
     for conditioned, rows in zip(train_data.records, train_data.rows, strict=True):
@@ -137,12 +138,12 @@ def calibration(train_data: RegressionData) -> dict[str, float]:
     return {e: float(np.sqrt(np.mean(np.square(v)))) for e, v in by_family.items()}
 
 
-def view(
+def measurement_view(
     train_data: RegressionData, excitation: CandidateExcitation, measured: Mapping[str, float]
 ) -> MeasurementView:
-    """Build the rows of an excitation as the trace would of its record.
+    """Return the rows of an excitation, as the trace would compute them from its record.
 
-    `measured` is the training data's `calibration`; of other equations nothing can be said: their
+    `measured` are the training data's `noise_ratios`. Equations without one are left out: their
     joint has never moved.
     """
     rig = ideal(train_data.rig)
@@ -153,14 +154,14 @@ def view(
     rows = {e: r for e, r in every.items() if e in measured and len(r.rhs)}
     stated = stated_noise(rig, train_data.terms, conditioned, rows, train_data.beta)
     noise = {e: measured[e] * stated[e] for e in rows}
-    seen = prepared(rig, train_data.terms, conditioned)
+    seen = prepared_signals(rig, train_data.terms, conditioned)
     return MeasurementView(
         rig, tuple(train_data.terms), train_data.beta, conditioned, seen, rows, noise
     )
 
 
 class ComparisonRows:
-    """Whitened rows on which hypotheses are compared: of the training data, then of a view if any.
+    """Whitened rows to compare explanations on: of the training data, then of a view if any.
 
     `base` (m, k) holds the baseline's columns, `equation` (m,) each row's equation.
     """
@@ -188,16 +189,20 @@ class ComparisonRows:
     def columns(self, used: Used) -> dict[str, Array]:
         """Return an effect's columns (m,) by name; '' is the change of the signals it makes."""
         if used not in self._known:
-            before = self._old.columns(used) if self._old is not None else self._on_board(used)
-            self._known[used] = before if self.seen is None else self._extended(used, before)
+            before = (
+                self._old.columns(used) if self._old is not None else self._training_columns(used)
+            )
+            self._known[used] = (
+                before if self.seen is None else self._with_view_columns(used, before)
+            )
         return self._known[used]
 
-    def _on_board(self, used: Used) -> dict[str, Array]:
+    def _training_columns(self, used: Used) -> dict[str, Array]:
         assert isinstance(used.term, Effect)
         columns = variant_columns(self.train_data, [Variant(used.term, used.shape)])
         return dict(zip(columns[0].names, columns[0].columns.T, strict=True)) if columns else {}
 
-    def _extended(self, used: Used, before: Mapping[str, Array]) -> dict[str, Array]:
+    def _with_view_columns(self, used: Used, before: Mapping[str, Array]) -> dict[str, Array]:
         assert self.seen is not None
         new = self.seen.columns(used)
         out = {}
@@ -209,8 +214,8 @@ class ComparisonRows:
             out[name] = np.concatenate(parts)
         return out
 
-    def adds(self, what: Explanation) -> Array:
-        """Return what a hypothesis adds to the rows (m,) at its sizes."""
+    def prediction(self, what: Explanation) -> Array:
+        """Return what an explanation adds to the rows (m,) at its sizes."""
         total = np.zeros(len(self.equation))
         for used in what.effects:
             for name, column in self.columns(used).items():
@@ -219,8 +224,8 @@ class ComparisonRows:
                     total += column * (what.beta.get(name, 0.0) if name else 1.0)
         return total
 
-    def spans(self, what: Explanation) -> Array:
-        """Return what a hypothesis can imitate with: its columns and its shapes' derivatives."""
+    def imitation_columns(self, what: Explanation) -> Array:
+        """Return the columns that an explanation is fitted with, shape derivatives included."""
         blocks = [self.base]
         for used in what.effects:
             blocks += [c[:, None] for c in self.columns(used).values()]
@@ -231,13 +236,13 @@ class ComparisonRows:
                 step = EXPERIMENT.shape_step * (abs(value) or shape.high - shape.low)
                 near = value + step if value + step <= shape.high else value - step
                 moved = Used(used.term, (*used.shape[:j], near, *used.shape[j + 1 :]))
-                ends = [self.adds(Explanation((u,), what.beta)) for u in (moved, used)]
+                ends = [self.prediction(Explanation((u,), what.beta)) for u in (moved, used)]
                 blocks.append((ends[0] - ends[1])[:, None])
         return np.column_stack(blocks)
 
     def residual(self, true: Explanation, wrong: Explanation) -> Array:
-        """Return the residual (m,) that `wrong` leaves where `true` is there, without noise."""
-        X, y = self.spans(wrong), self.adds(true)
+        """Return the noise-free residual (m,) of the fit of `wrong` where `true` is true."""
+        X, y = self.imitation_columns(wrong), self.prediction(true)
         return np.asarray(y - X @ shortest(X, y, 1e-6))
 
     def energy(self, residual: Array) -> dict[str, float]:
@@ -251,10 +256,10 @@ class ComparisonRows:
 def separation(
     question: OpenQuestion, old: ComparisonRows, new: ComparisonRows
 ) -> tuple[float, str]:
-    """Return what an experiment separates [noise], and in which equation (see the module)."""
+    """Return the separation [noise] by an experiment, and its equation (see the module)."""
     assert new.seen is not None
     distances = []
-    for true, wrong in _ways(question):
+    for true, wrong in _directions(question):
         before = old.energy(old.residual(true, wrong))
         after = new.energy(new.residual(true, wrong))
         by_equation = {
@@ -268,20 +273,21 @@ def separation(
     return min(distances)
 
 
-def present(question: OpenQuestion, old: ComparisonRows) -> float:
-    """Return the same figure [noise] of the records already taken: their loudest segment's."""
+def present_separation(question: OpenQuestion, old: ComparisonRows) -> float:
+    """Return the separation [noise] by the records already taken, in their largest segment."""
     return min(
-        loudest(old.train_data, old.residual(true, wrong)) for true, wrong in _ways(question)
+        largest_rms(old.train_data, old.residual(true, wrong))
+        for true, wrong in _directions(question)
     )
 
 
-def loudest(train_data: RegressionData, residual: Array) -> float:
+def largest_rms(train_data: RegressionData, residual: Array) -> float:
     """Return the largest rms of a residual (M,) in one step and equation [noise of a record]."""
     return max(
         float(np.sqrt(np.mean(residual[s.where] ** 2) / s.repeats)) for s in train_data.segments
     )
 
 
-def _ways(question: OpenQuestion) -> Sequence[tuple[Explanation, Explanation]]:
+def _directions(question: OpenQuestion) -> Sequence[tuple[Explanation, Explanation]]:
     there = (question.one, question.other)
     return (there, there[::-1]) if question.both_ways else (there,)

@@ -1,4 +1,4 @@
-"""Excitations that a rig can stand: the candidates among which the next experiment is chosen.
+"""Excitations within the limits of a rig: candidates for the next experiment.
 
 A candidate is one step: joints locked as in some step of the training records (or none locked),
 the others moved by one of a few families of lines. The families differ in what catalogue effects
@@ -35,8 +35,8 @@ log = logging.getLogger(__name__)
 class Family:
     """Lines from `low` to `high` [Hz] at multiples of `base`, amplitudes f^-tilt.
 
-    `level` is the share of the `fill` of the settings that is used, `centre` the place in the
-    stroke as a share of half of it, `words` what it is for a person.
+    `level` is the share of `EXPERIMENT.fill` that is used, `centre` the place in the
+    stroke as a share of half of it, `words` its description for the user.
     """
 
     name: str
@@ -69,8 +69,8 @@ FAMILIES: Final = (
 
 
 @dataclass(frozen=True)
-class Setting:
-    """Which joints (0-based) stand where [m], behind a closed valve or at an end; others move."""
+class JointSetting:
+    """Position [m] of joints (0-based) behind a `closed` valve or `held` at an end; others move."""
 
     closed: Mapping[int, float]
     held: Mapping[int, float]
@@ -84,21 +84,21 @@ class Setting:
 
 @dataclass(frozen=True)
 class CandidateExcitation:
-    """One candidate as played on the twin, with what makes a protocol of it."""
+    """One candidate excitation as simulated on the twin, with the data of its protocol step."""
 
     family: Family
-    setting: Setting
+    setting: JointSetting
     tones: Mapping[int, Tone]
     played: Played
 
     @property
     def step(self) -> TwinStep:
-        """The step in device terms."""
+        """The step as the twin runs it."""
         return self.played.step
 
     @property
     def text(self) -> str:
-        """In plain words."""
+        """The excitation in words."""
         moved = " and ".join(str(j + 1) for j in self.tones)
         which = f"joint{'s' if len(self.tones) > 1 else ''} {moved} moved"
         stand = [
@@ -111,20 +111,20 @@ class CandidateExcitation:
         return ", ".join([f"{which} {self.family.words}", *stand])
 
 
-def settings(rig: Rig, records: Sequence[ConditionedRecord]) -> list[Setting]:
-    """Return how the joints stood in each step of the records, and all of them free."""
-    out: list[Setting] = []
+def joint_settings(rig: Rig, records: Sequence[ConditionedRecord]) -> list[JointSetting]:
+    """Return the joint settings of the steps of the records, and that of all joints free."""
+    out: list[JointSetting] = []
     for conditioned in records:
         closed, held = {}, {}
         for joint in conditioned.record.locked:
             piston = float(np.nanmean(conditioned.record.channels[ch.channel(ch.PISTON, joint)]))
             half = 0.5 * rig.joints[joint - 1].cylinder.stroke
-            if half - abs(piston) < EXPERIMENT.at_end:
+            if half - abs(piston) < EXPERIMENT.end_distance:
                 held[joint - 1] = float(np.copysign(half, piston))
             else:
                 closed[joint - 1] = round(piston, 3) + 0.0  # no -0
-        out.append(Setting(closed, held))
-    out.append(Setting({}, {}))
+        out.append(JointSetting(closed, held))
+    out.append(JointSetting({}, {}))
     return [s for k, s in enumerate(out) if s.moving(rig) and s not in out[:k]]
 
 
@@ -132,13 +132,13 @@ def excitations(
     rig: Rig, records: Sequence[ConditionedRecord], rng: np.random.Generator,
     families: Sequence[Family] = FAMILIES,
 ) -> Iterator[CandidateExcitation]:  # fmt: skip
-    """Play every family in every setting on the twin; those it cannot follow are left out.
+    """Yield every family in every setting that the twin can follow within the limits.
 
     None for a rig without nominal values or with electric joints: there is no twin of it.
     """
     if rig.electric:
         return
-    for setting in settings(rig, records):
+    for setting in joint_settings(rig, records):
         for family in families:
             candidate = excitation(rig, setting, family, rng)
             if candidate is not None:
@@ -146,7 +146,7 @@ def excitations(
 
 
 def excitation(
-    rig: Rig, setting: Setting, family: Family, rng: np.random.Generator
+    rig: Rig, setting: JointSetting, family: Family, rng: np.random.Generator
 ) -> CandidateExcitation | None:
     """Return a family in a setting, scaled to its share of the limits; None where impossible."""
     tones = {j: _tone(j, family, k, rng) for k, j in enumerate(setting.moving(rig))}
@@ -185,7 +185,7 @@ def _tone(joint: int, family: Family, turn: int, rng: np.random.Generator) -> To
 
 
 def _step(
-    rig: Rig, setting: Setting, family: Family, tones: Mapping[int, Tone]
+    rig: Rig, setting: JointSetting, family: Family, tones: Mapping[int, Tone]
 ) -> TwinStep:  # fmt: skip
     period = round(rig.sample_rate / family.base)
     places = {j: family.centre * 0.5 * rig.joints[j].cylinder.stroke for j in tones}
@@ -209,7 +209,7 @@ def protocol(
     rig: Rig, chosen: Sequence[CandidateExcitation], name: str, scale: float = 1.0,
     rng: np.random.Generator | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Return the protocol file's mapping that runs these steps; `rng` draws other phases."""
+    """Return the mapping of a protocol file with these steps; with `rng` phases are drawn again."""
     return {
         "name": name,
         "description": "; ".join(candidate.text for candidate in chosen),
@@ -270,7 +270,10 @@ def _as_step(
 
 
 def _other_phases(tone: Tone, n: int, rng: np.random.Generator) -> Spectrum:
-    """Return the tone's amplitudes with other phases: of some draws the flattest, n samples."""
+    """Return a tone's spectrum with new phases, of several draws the one with the smallest peak.
+
+    `n` is the number of samples of a period.
+    """
     size, best, least = np.abs(tone.spectrum), tone.spectrum, np.inf
     for _ in range(EXPERIMENT.phase_draws):
         spectrum = size * np.exp(2j * np.pi * rng.random(len(size)))

@@ -1,11 +1,11 @@
-"""Which experiment to run next, or none: what survives, what separates it, on which excitation.
+"""The next experiment, or none: open questions, and the excitation that answers them.
 
 `confounded`: the excitation on which the best set and its tied rivals differ most. `unexplained`:
-the one that separates the sets which leave least, else the one that carries a variable which the
-rest moves with farthest beyond the records, else one of many more lines than they hold. `clean`:
-the one on which effects of an interesting size that these records could not have shown would stand
-out. An experiment is only offered where it promises more than noise and clearly more than the
-records already hold.
+the one that separates the sets which leave least, else the one with the widest range of a variable
+that the residual depends on, else one with many more lines than the records. `clean`: the one that
+shows effects at their smallest size of interest which these records could not show. An experiment
+is proposed only where the predicted separation exceeds the noise and clearly exceeds that of the
+records.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from analysis.trace.next_experiment.discrimination import (
     Explanation,
     MeasurementView,
     OpenQuestion,
-    calibration,
-    loudest,
-    present,
+    largest_rms,
+    measurement_view,
+    noise_ratios,
+    present_separation,
     separation,
-    smallest,
-    view,
+    smallest_effect,
 )
-from analysis.trace.next_experiment.range_extension import LINES, farther, richer
+from analysis.trace.next_experiment.range_extension import LINES, more_lines, wider_range
 from analysis.trace.result import CLEAN, CONFOUNDED, UNEXPLAINED, Dependence, JudgedEffect
 from analysis.trace.search.hypothesis import Hypothesis, parameter_values
 from analysis.trace.search.hypothesis_set import HypothesisSet
@@ -43,12 +43,12 @@ from rig.model.rig import Rig
 Array = NDArray[np.float64]
 
 TELL, COVER, SHOW = "tell apart", "cover", "make visible"
-PROMISE: Final = SEARCH.band  # of the noise: less is nothing to explain
+PROMISE: Final = SEARCH.band  # separation over noise; less would be within the noise's band
 
 
 @dataclass(frozen=True)
-class ExperimentProposal:
-    """What the records hold on a question, and what an experiment promises, in units of noise."""
+class PredictedAnswer:
+    """Separation of a question [noise]: by the records, and promised by an experiment."""
 
     question: OpenQuestion
     present: float
@@ -57,15 +57,15 @@ class ExperimentProposal:
 
     @property
     def open(self) -> bool:
-        """Whether the experiment promises an answer that the records do not hold."""
-        return self.promised >= max(PROMISE, EXPERIMENT.more * self.present)
+        """Whether the experiment promises an answer that the records do not give."""
+        return self.promised >= max(PROMISE, EXPERIMENT.least_gain * self.present)
 
 
 def propose(
     hypotheses: HypothesisSet, winner: Hypothesis, effects: Sequence[JudgedEffect], verdict: str,
     moves: Sequence[Dependence], families: Sequence[ex.Family] = ex.FAMILIES,
 ) -> Mapping[str, Any] | None:  # fmt: skip
-    """Return the next experiment as plain data, None where none promises anything.
+    """Return the next experiment as plain data, None where none promises an answer.
 
     `protocol` and `holdout` are what a protocol file holds; `present` and `predicted` are the
     weakest question's separation in units of one record's noise.
@@ -76,30 +76,31 @@ def propose(
     if not questions and not (verdict == UNEXPLAINED and moves):
         return None
     rng = np.random.default_rng(EXPERIMENT.seed)
-    tried = list(ex.excitations(learned(train_data), train_data.records, rng, families))
+    tried = list(ex.excitations(rig_with_estimates(train_data), train_data.records, rng, families))
     if not tried:
-        return _in_words(winner, questions) if verdict == CONFOUNDED else None
-    measured = calibration(train_data)
-    views = [view(train_data, candidate, measured) for candidate in tried]
+        return _experiment_in_words(winner, questions) if verdict == CONFOUNDED else None
+    measured = noise_ratios(train_data)
+    views = [measurement_view(train_data, candidate, measured) for candidate in tried]
     kind = SHOW if verdict == CLEAN else TELL
-    best = _choose(questions, tried, views, old)
+    best = _best_steps(questions, tried, views, old)
     if best is not None:
         return _proposal(train_data, kind, *best)
     if verdict == UNEXPLAINED and moves:
-        return _explored(train_data, winner, moves, tried, views)
+        return _covering_experiment(train_data, winner, moves, tried, views)
     return None
 
 
-def learned(train_data: RegressionData) -> Rig:
-    """Return the rig with what the records say of its parameters: a twin that is nearer to it."""
+def rig_with_estimates(train_data: RegressionData) -> Rig:
+    """Return the rig with nominal values from the records, so that its twin is more accurate."""
     plain = tuple(map(Used, baseline_of(train_data.rig)))
     parameters = parameter_values(train_data.rig, plain, dict(train_data.beta))
     before = train_data.rig.nominal
     likely = {
         name: value
         for name, value in parameters.items()
-        # A parameter that the records hardly move may come out as anything.
-        if name in before and 1 / EXPERIMENT.likely < value / before[name] < EXPERIMENT.likely
+        # A parameter that the records hardly determine may have any estimate.
+        if name in before
+        and 1 / EXPERIMENT.parameter_ratio < value / before[name] < EXPERIMENT.parameter_ratio
     }
     return train_data.rig.model_copy(update={"nominal": {**before, **likely}})
 
@@ -110,30 +111,30 @@ def _questions(
     effects: Sequence[JudgedEffect],
     verdict: str,
     old: ComparisonRows,
-) -> list[ExperimentProposal]:
+) -> list[PredictedAnswer]:
     if verdict == CLEAN:
-        asked = [OpenQuestion(h, Explanation(), False) for h in _small(hypotheses)]
-        answers = [ExperimentProposal(q, present(q, old)) for q in asked]
+        asked = [OpenQuestion(h, Explanation(), False) for h in _smallest_effects(hypotheses)]
+        answers = [PredictedAnswer(q, present_separation(q, old)) for q in asked]
         return [a for a in answers if a.present < PROMISE]
     if verdict == CONFOUNDED:
         others = tied_sets(hypotheses, winner, effects)
         pairs = [OpenQuestion(explanation(winner), explanation(o)) for o in others]
     elif verdict == UNEXPLAINED:
-        pairs = _unsettled(hypotheses)
+        pairs = _undecided_questions(hypotheses)
     else:
         return []
-    return [ExperimentProposal(q, present(q, old)) for q in pairs]
+    return [PredictedAnswer(q, present_separation(q, old)) for q in pairs]
 
 
 def explanation(hypothesis: Hypothesis) -> Explanation:
-    """Return a fitted set as a hypothesis."""
+    """Return a fitted set as an explanation."""
     return Explanation(hypothesis.effects, hypothesis.fit.beta)
 
 
 def tied_sets(
     hypotheses: HypothesisSet, winner: Hypothesis, effects: Sequence[JudgedEffect]
 ) -> list[Hypothesis]:
-    """Return the sets that the gates could not separate from the winner: one effect exchanged."""
+    """Return the sets with a tied rival in place of one effect of the winner."""
     out = []
     for effect in effects:
         tied = {(r.name, r.where) for r in effect.rivals if r.tied}
@@ -154,83 +155,88 @@ def _key(term: Any) -> tuple[str, str]:
     return term.name, str(getattr(term, "place", term.where))
 
 
-def _unsettled(hypotheses: HypothesisSet) -> list[OpenQuestion]:
-    """Return the best set against the others that leave about as little, and against none."""
-    allowed = [o for o in hypotheses.fitted.values() if o.effects and not hypotheses.physical(o)]
+def _undecided_questions(hypotheses: HypothesisSet) -> list[OpenQuestion]:
+    """Return questions between the best set and others that leave about as little."""
+    allowed = [
+        o for o in hypotheses.fitted.values() if o.effects and not hypotheses.physical_problem(o)
+    ]
     allowed.sort(key=lambda o: o.total)
     if not allowed or allowed[0].total >= hypotheses.empty.total:
         return []
     best = allowed[0]
-    limit = max(EXPERIMENT.near_energy * best.total, best.total + 0.1 * hypotheses.limits.total)
-    # A set that only adds to the best is not another explanation.
+    limit = max(EXPERIMENT.near_energy * best.total, best.total + 0.1 * hypotheses.noise_band.total)
+    # A set that only adds effects to the best one is no other explanation.
     near = [o for o in allowed[1:] if o.total <= limit and not best.keys <= o.keys]
     near = near[: EXPERIMENT.rivals]
     return [OpenQuestion(explanation(best), explanation(o)) for o in near]
 
 
-def _small(hypotheses: HypothesisSet) -> list[Explanation]:
+def _smallest_effects(hypotheses: HypothesisSet) -> list[Explanation]:
     rig = hypotheses.train_data.rig
     effects = dict.fromkeys(hypotheses.effects)
-    smallest_sizes = (smallest(effect, rig) for effect in effects)
+    smallest_sizes = (smallest_effect(effect, rig) for effect in effects)
     return [h for h in smallest_sizes if h is not None]
 
 
-def _choose(
-    asked: Sequence[ExperimentProposal],
+def _best_steps(
+    asked: Sequence[PredictedAnswer],
     tried: Sequence[ex.CandidateExcitation],
     views: Sequence[MeasurementView],
     old: ComparisonRows,
-) -> tuple[list[ex.CandidateExcitation], list[ExperimentProposal]] | None:
-    """Return the steps that answer most, and what they promise; None if they promise nothing."""
+) -> tuple[list[ex.CandidateExcitation], list[PredictedAnswer]] | None:
+    """Return the steps that answer most questions, and their answers; None if there is none."""
     if not asked:
         return None
-    table: list[list[ExperimentProposal]] = []
+    table: list[list[PredictedAnswer]] = []
     for seen in views:
         new = ComparisonRows(old.train_data, seen, old)
         table.append(
             [
-                ExperimentProposal(a.question, a.present, *separation(a.question, old, new))
+                PredictedAnswer(a.question, a.present, *separation(a.question, old, new))
                 for a in asked
             ]
         )
     chosen: list[int] = []
     while len(chosen) < min(EXPERIMENT.steps, len(tried)):
-        worth = [_worth(_best(table, [*chosen, k])) for k in range(len(tried))]
+        worth = [_total_answered(_best_answers(table, [*chosen, k])) for k in range(len(tried))]
         k = int(np.argmax(worth))
-        if worth[k] - (_worth(_best(table, chosen)) if chosen else 0.0) < EXPERIMENT.worth:
+        if (
+            worth[k] - (_total_answered(_best_answers(table, chosen)) if chosen else 0.0)
+            < EXPERIMENT.least_step_gain
+        ):
             break
         chosen.append(k)
     if not chosen:
         return None
-    answered = [a for a in _best(table, chosen) if a.open]
+    answered = [a for a in _best_answers(table, chosen) if a.open]
     return ([tried[k] for k in chosen], answered) if answered else None
 
 
-def _best(
-    table: Sequence[Sequence[ExperimentProposal]], chosen: Sequence[int]
-) -> list[ExperimentProposal]:
+def _best_answers(
+    table: Sequence[Sequence[PredictedAnswer]], chosen: Sequence[int]
+) -> list[PredictedAnswer]:
     rows = [table[k] for k in chosen]
     return [max(column, key=lambda a: a.promised) for column in zip(*rows, strict=True)]
 
 
-def _worth(answers: Sequence[ExperimentProposal]) -> float:
-    return sum(min(a.promised, EXPERIMENT.enough) for a in answers if a.open)
+def _total_answered(answers: Sequence[PredictedAnswer]) -> float:
+    return sum(min(a.promised, EXPERIMENT.useful_separation) for a in answers if a.open)
 
 
-def _explored(
+def _covering_experiment(
     train_data: RegressionData,
     winner: Hypothesis,
     moves: Sequence[Dependence],
     tried: Sequence[ex.CandidateExcitation],
     views: Sequence[MeasurementView],
 ) -> Mapping[str, Any] | None:
-    """Return the experiment that shows what is unexplained where no record has been yet."""
-    candidates = farther(train_data, moves, views, EXPERIMENT.more) or richer(
+    """Return an experiment beyond the range or the lines of the records, None if none is."""
+    candidates = wider_range(train_data, moves, views, EXPERIMENT.least_gain) or more_lines(
         train_data, moves, tried
     )
     if candidates is None:
         return None
-    now = loudest(train_data, winner.fit.residual)
+    now = largest_rms(train_data, winner.fit.residual)
     return {
         "kind": COVER,
         "separates": [],
@@ -247,7 +253,7 @@ def _proposal(
     train_data: RegressionData,
     kind: str,
     chosen: Sequence[ex.CandidateExcitation],
-    answers: Sequence[ExperimentProposal],
+    answers: Sequence[PredictedAnswer],
 ) -> Mapping[str, Any]:
     weakest = min(answers, key=lambda a: a.promised)
     separates = _names(answers)
@@ -276,8 +282,8 @@ def _proposal(
     }  # fmt: skip
 
 
-def _names(answers: Sequence[ExperimentProposal]) -> list[dict[str, str]]:
-    """Return names and places of all effects in question, each once."""
+def _names(answers: Sequence[PredictedAnswer]) -> list[dict[str, str]]:
+    """Return names and places of all effects in the questions, each once."""
     keys = [k for a in answers for h in (a.question.one, a.question.other) for k in h.keys]
     names = dict.fromkeys((k["name"], k["where"]) for k in keys)
     return [{"name": name, "where": where} for name, where in names]
@@ -295,8 +301,10 @@ def _protocols(
     }
 
 
-def _in_words(winner: Hypothesis, asked: Sequence[ExperimentProposal]) -> Mapping[str, Any] | None:
-    """Say what separates tied effects where no twin can try it: the rig has no nominal values."""
+def _experiment_in_words(
+    winner: Hypothesis, asked: Sequence[PredictedAnswer]
+) -> Mapping[str, Any] | None:
+    """Describe an experiment in words, for rigs without nominal values and so without a twin."""
     texts = [getattr(known()[u.term.name], "separated_by", "") for u in winner.effects]
     return {
         "kind": TELL,

@@ -1,4 +1,4 @@
-"""Where no explanation stands: excitations that go beyond the records, by reach or by lines."""
+"""Excitations that go beyond the records where no effect explains: by range or by lines."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from analysis.trace.result import Dependence
 from analysis.trace.settings import EXPERIMENT
 
 LINES: Final = "lines"
-TIME: Final = "time"  # goes on by itself
+TIME: Final = "time"  # no excitation extends it
 
 
 @dataclass(frozen=True)
-class Beyond:
-    """An excitation (its index) that carries a variable so many `times` as far as the records."""
+class RangeExtension:
+    """An excitation, by its index, with `times` the records' range of a variable."""
 
     index: int
     variable: str
@@ -30,15 +30,16 @@ class Beyond:
     words: str
 
 
-def farther(
+def wider_range(
     train_data: RegressionData,
     moves: Sequence[Dependence],
     views: Sequence[MeasurementView],
     least: float,
-) -> Beyond | None:
-    """Return what carries a clue's variable farthest, for the first clue that can be carried so.
+) -> RangeExtension | None:
+    """Return the excitation with the widest range of a clue's variable, None if none is wider.
 
-    `least` times as far as the records, at least.
+    The first clue in `moves` is used for which an excitation reaches `least` times the range of the
+    records.
     """
     for clue in moves:
         joint = int(clue.equation.rsplit("_", 1)[1]) - 1
@@ -50,7 +51,8 @@ def farther(
                 continue
             low, high = np.percentile(np.concatenate(values), [1, 99])
             reach = [
-                _reach(train_data, view, joint, name, float(low), float(high)) for view in views
+                _range_ratio(train_data, view, joint, name, float(low), float(high))
+                for view in views
             ]
             k = int(np.argmax(reach))
             if reach[k] >= least:
@@ -58,11 +60,11 @@ def farther(
                     f"covers {reach[k]:.1f} times the range of {name}, on which the remaining "
                     "residual depends"
                 )
-                return Beyond(k, name, reach[k], clue.equation, words)
+                return RangeExtension(k, name, reach[k], clue.equation, words)
     return None
 
 
-def _reach(
+def _range_ratio(
     train_data: RegressionData,
     view: MeasurementView,
     joint: int,
@@ -70,19 +72,19 @@ def _reach(
     low: float,
     high: float,
 ) -> float:
-    """Return a variable's range over the records' and a candidate's, over the records' alone."""
+    """Return a variable's range in records and candidate together over that in the records."""
     if joint + 1 in view.conditioned.record.locked:
         return 0.0
     least, most = np.percentile(variables(train_data.rig, view.seen, joint)[name], [1, 99])
     return float((max(most, high) - min(least, low)) / max(high - low, 1e-30))
 
 
-def richer(
+def more_lines(
     train_data: RegressionData, moves: Sequence[Dependence], tried: Sequence[CandidateExcitation]
-) -> Beyond | None:
-    """Return the excitation of most lines where the records of the clue's joint hold few.
+) -> RangeExtension | None:
+    """Return the excitation with most lines where the records of the clue's joint have few.
 
-    One sine shows one path through every nonlinearity: many forms pass through it alike.
+    A single sine gives one path through a nonlinearity, which many forms fit equally well.
     """
     equation = moves[0].equation
     joint = int(equation.rsplit("_", 1)[1]) - 1
@@ -97,4 +99,4 @@ def richer(
     if times < EXPERIMENT.line_ratio:
         return None
     words = f"excites joint {joint + 1} at {counts[k]} frequencies instead of {max(held)}"
-    return Beyond(k, LINES, times, equation, words)
+    return RangeExtension(k, LINES, times, equation, words)

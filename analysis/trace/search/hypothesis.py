@@ -1,4 +1,4 @@
-"""What a fitted set of effects leaves: energy above noise by equation, and what is nothing."""
+"""A fitted set of effects, the energy above noise that it leaves, and the noise's band."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ Key = tuple[str, str]
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A set of effects on the list: its exact fit and energy above noise by equation."""
+    """A set of effects: its exact fit, energy above noise by equation, and `size`.
+
+    `size` is the number of effects and of their free numbers (`candidates.complexity`).
+    """
 
     effects: tuple[Used, ...]
     fit: ExactFit
@@ -34,20 +37,20 @@ class Hypothesis:
 
     @property
     def total(self) -> float:
-        """All energy left above noise, not below zero in any equation."""
+        """Energy above noise of all equations, each counted as at least zero."""
         return sum(max(0.0, e) for e in self.excess_energy.values())
 
 
 @dataclass(frozen=True)
 class NoiseBand:
-    """Energy that counts as nothing, by equation."""
+    """Energy above noise `by_equation` that counts as nothing."""
 
-    band: dict[str, float]
+    by_equation: dict[str, float]
 
     @property
     def total(self) -> float:
         """The sum over equations."""
-        return sum(self.band.values())
+        return sum(self.by_equation.values())
 
 
 def parameter_values(rig: Rig, terms: Sequence[Used], beta: dict[str, float]) -> dict[str, float]:
@@ -60,7 +63,9 @@ def parameter_values(rig: Rig, terms: Sequence[Used], beta: dict[str, float]) ->
     return out
 
 
-def excess_of(data: RegressionData, residual: Array, noise: float = 1.0) -> dict[str, float]:
+def energy_above_noise(
+    data: RegressionData, residual: Array, noise: float = 1.0
+) -> dict[str, float]:
     """Return the energy above noise that a residual (M,) has in each equation."""
     out: dict[str, float] = {}
     for segment in data.segments:
@@ -70,16 +75,16 @@ def excess_of(data: RegressionData, residual: Array, noise: float = 1.0) -> dict
     return out
 
 
-def limits(data: RegressionData) -> NoiseBand:
-    """Return the band of every equation (`SEARCH.band` times the noise, and chance)."""
+def noise_band(data: RegressionData) -> NoiseBand:
+    """Return the band of every equation: `SEARCH.band` times the noise, at least 4 deviations."""
     band: dict[str, float] = {}
-    rows = data.counts
+    rows = data.row_counts
     for s in data.segments:
         count = s.where.stop - s.where.start
         band[s.equation] = band.get(s.equation, 0.0) + SEARCH.band**2 * s.repeats * count
     return NoiseBand({e: max(v, 4 * np.sqrt(2 * rows[e])) for e, v in band.items()})
 
 
-def within(excess_energy: dict[str, float], limit: NoiseBand) -> bool:
-    """Return whether nothing is left above the band in any equation."""
-    return all(value <= limit.band[e] for e, value in excess_energy.items())
+def within_band(excess_energy: dict[str, float], limit: NoiseBand) -> bool:
+    """Return whether every equation's energy above noise lies within its band."""
+    return all(value <= limit.by_equation[e] for e, value in excess_energy.items())

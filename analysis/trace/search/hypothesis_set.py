@@ -1,8 +1,8 @@
-"""Sets of effects fitted exactly, found by a linear search on the regression data.
+"""The search for a set of effects: a linear search on columns, then exact fits of the best sets.
 
-The columns searched are first-order; a set found there is refined exactly and, where something is
-left, extended from data that have the set among their terms. Every set fitted on the way stays
-on the list: the rivals of the winner come from it.
+The columns are of first order in a change of signals. A set found with them is refined exactly and,
+where more than noise remains, extended from data that have the set among their terms. Every set
+fitted on the way is kept, since the rivals of the winner are taken from these sets.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from analysis.trace.search import linear_fit
 from analysis.trace.search.hypothesis import (
     Hypothesis,
     Key,
-    excess_of,
-    limits,
+    energy_above_noise,
+    noise_band,
     parameter_values,
-    within,
+    within_band,
 )
-from analysis.trace.search.refinement import ExactFit, fit, jacobian, rebased, refine
+from analysis.trace.search.refinement import ExactFit, fit_coefficients, jacobian, rebased, refine
 from analysis.trace.settings import SEARCH
 from rig.model.channels import place_in_words
 
@@ -43,28 +43,36 @@ log = logging.getLogger(__name__)
 
 
 class HypothesisSet:
-    """Sets of effects on the same training data, fitted exactly once each."""
+    """Sets of effects on the same training data, each fitted exactly once.
+
+    `base` are the model's own terms, `effects` the candidates, `fitted` all sets fitted so far by
+    names and places, `empty` the set without effects (the baseline), `noise_band` the energy that
+    counts as nothing. `columns` and `candidates` are set by `run`.
+    """
 
     def __init__(self, train_data: RegressionData, effects: Sequence[Effect]) -> None:
         self.train_data = train_data
         self.base = tuple(train_data.terms)
         self.effects = tuple(effects)
-        self.limits = limits(train_data)
+        self.noise_band = noise_band(train_data)
         self.fitted: dict[frozenset[Key], Hypothesis] = {}
-        self.empty = self._hypothesis((), fit(train_data, self.base))
+        self.empty = self._hypothesis((), fit_coefficients(train_data, self.base))
 
     def _hypothesis(self, effects: tuple[Used, ...], fit: ExactFit) -> Hypothesis:
         rig = self.train_data.rig
         return Hypothesis(
-            effects, fit, excess_of(self.train_data, fit.residual), complexity(rig, effects)
+            effects,
+            fit,
+            energy_above_noise(self.train_data, fit.residual),
+            complexity(rig, effects),
         )
 
-    def widened(self, effects: Sequence[Effect]) -> HypothesisSet:
-        """Return the sets with more candidates beside those that were searched already."""
+    def with_candidates(self, effects: Sequence[Effect]) -> HypothesisSet:
+        """Return a copy with further candidates; sets that were fitted already are shared."""
         wide = copy.copy(self)
         wide.effects = tuple(effects)
         more = variant_columns(
-            self.train_data, wide._variants(self.train_data, self.train_data.mean)
+            self.train_data, wide._variants(self.train_data, self.train_data.mean_residual)
         )
         wide.columns = [*self.columns, *more]
         wide.candidates = self._candidate_columns(self.train_data, wide.columns)
@@ -72,58 +80,60 @@ class HypothesisSet:
         return wide
 
     def _variants(self, data: RegressionData, residual: Array) -> list[Variant]:
-        """Return the candidates' points of first look on data that leave a residual (M,)."""
+        """Return the candidates at every point of their shape grids.
+
+        `residual` (M,) of the data places the points of effects whose grid depends on the data.
+        """
         seen = evidence(data, residual) if any(e.by_data for e in self.effects) else None
         return variants(data.rig, self.effects, seen)
 
-    def physical(
-        self, hypothesis: Hypothesis, of: Used | None = None, formed: Collection[Key] = ()
+    def physical_problem(
+        self,
+        hypothesis: Hypothesis,
+        first: Used | None = None,
+        may_be_at_bounds: Collection[Key] = (),
     ) -> str:
-        """Say whose number makes a set unphysical, and why ('' if none does).
+        """Return in words which number of a set is physically impossible ('' if none is).
 
-        The effect `of` is asked first; its own number is stated without its name. The shapes of
-        effects `formed` (name, where) are a matter of form, and may lie at their bounds.
+        The effect `first` is asked first, and its number is stated without its name. Shapes of the
+        effects `may_be_at_bounds` (name, where) may lie at their bounds.
         """
         rig = self.train_data.rig
         values = parameter_values(rig, hypothesis.fit.terms, dict(hypothesis.fit.beta))
-        for used in sorted(hypothesis.effects, key=lambda used: used is not of):
+        for used in sorted(hypothesis.effects, key=lambda used: used is not first):
             assert isinstance(used.term, Effect)
             problem = used.term.problem(rig, values, used.shape)
-            if (used.term.name, used.term.where) not in formed:
+            if (used.term.name, used.term.where) not in may_be_at_bounds:
                 problem = problem or used.term.outside(rig, used.shape)
             if problem:
                 whose = f"of {used.term.name} at {place_in_words(used.term.where)}: "
-                return problem if used is of else whose + problem
+                return problem if used is first else whose + problem
         return ""
 
-    def exact(self, effects: Sequence[Used]) -> Hypothesis:
-        """Return the set refined exactly (once per set of names and places)."""
+    def refined(self, effects: Sequence[Used]) -> Hypothesis:
+        """Return the exact fit of a set of effects, computed once for its names and places."""
         key = frozenset((u.term.name, u.term.where) for u in effects)
         if key not in self.fitted:
             fit = refine(self.train_data, (*self.base, *effects))
             self.fitted[key] = self._hypothesis(fit.terms[len(self.base) :], fit)
         return self.fitted[key]
 
-    def tried(self, sets: Sequence[tuple[Used, ...]]) -> list[Hypothesis]:
-        """Return the sets refined exactly."""
-        return [self.exact(effects) for effects in sets]
+    def log_energy_ratio(self, hypothesis: Hypothesis, other: Hypothesis) -> float:
+        """Return the sum over equations of log((E + B) / (E' + B)), energies above noise E and E'.
 
-    def excess(self, hypothesis: Hypothesis, other: Hypothesis) -> float:
-        """Return how much more one set leaves than another: the sum of log ratios over equations.
-
-        What the form of a loud effect leaves in its own equations must not hide a quiet one in
-        others, so that ratios count; what lies within the noise's band counts as nothing.
+        E is what `hypothesis` leaves, E' what `other` leaves, B the noise's band. Ratios are used
+        so that the form error of a large effect does not hide a small effect in other equations.
         """
         return sum(
             float(np.log((max(0.0, v) + band) / (max(0.0, other.excess_energy[e]) + band)))
             for e, v in hypothesis.excess_energy.items()
-            for band in (self.limits.band[e],)
+            for band in (self.noise_band.by_equation[e],)
         )
 
-    def better(self, hypothesis: Hypothesis, other: Hypothesis) -> bool:
-        """Return whether `one` is to be preferred: much less left, or as little and simpler."""
+    def is_preferred(self, hypothesis: Hypothesis, other: Hypothesis) -> bool:
+        """Return whether a set leaves much less than `other`, or about as little and is simpler."""
         slack = SEARCH.number_price * max(1, abs(hypothesis.size[1] - other.size[1]))
-        more, near = self.excess(hypothesis, other), float(np.log(SEARCH.simpler_ratio))
+        more, near = self.log_energy_ratio(hypothesis, other), float(np.log(SEARCH.simpler_ratio))
         if hypothesis.size < other.size:
             return more <= near or hypothesis.total <= other.total + slack
         if hypothesis.size > other.size:
@@ -131,62 +141,78 @@ class HypothesisSet:
         return hypothesis.total < other.total
 
     def best(self, among: Sequence[Hypothesis]) -> Hypothesis:
-        """Return the preferred of several physical sets."""
-        allowed = [o for o in among if not self.physical(o)]
+        """Return the simplest physical set of those that leave about the least, else `empty`."""
+        allowed = [o for o in among if not self.physical_problem(o)]
         if not allowed:
             return self.empty
         least = min(allowed, key=lambda o: o.total)
-        near = [o for o in allowed if o is least or self.better(o, least)]
+        near = [o for o in allowed if o is least or self.is_preferred(o, least)]
         return min(near, key=lambda o: (sum(o.size), o.size[0], o.total))
 
     def run(self, progress: Callable[[float], None] | None = None) -> Hypothesis:
-        """Search: singles and pairs beside the baseline, then extensions; returns the winner.
+        """Search single effects, pairs and extensions, and return the best set.
 
-        `progress` receives which share of the first columns is there.
+        `progress` is called with the share of the candidates' columns that is computed.
         """
         self.columns = variant_columns(
-            self.train_data, self._variants(self.train_data, self.train_data.mean), progress
+            self.train_data,
+            self._variants(self.train_data, self.train_data.mean_residual),
+            progress,
         )
         candidates = self.candidates = self._candidate_columns(self.train_data, self.columns)
-        r = self.train_data.mean
+        r = self.train_data.mean_residual
         r = r - candidates.basis @ (candidates.basis.T @ r)
-        return self.exchanged(self._found(candidates, r))
+        return self.exchanged(self._searched(candidates, r))
 
-    def _found(self, candidates: linear_fit.CandidateColumns, r: Array) -> Hypothesis:
-        """Return the set found on the candidates for what the baseline leaves (M,)."""
-        singles = self.tried(self._singles(candidates, r))
+    def _searched(self, candidates: linear_fit.CandidateColumns, r: Array) -> Hypothesis:
+        """Return the best set for the baseline's residual r (M,), orthogonal to its columns."""
+        singles = [self.refined(effects) for effects in self._singles(candidates, r)]
         now = self.prune(self.best([self.empty, *singles]))
-        if within(now.excess_energy, self.limits):
+        if within_band(now.excess_energy, self.noise_band):
             return now
-        pairs = self.tried(self._pairs(candidates, r, singles))
-        if self.formed(now):
+        pairs = [self.refined(effects) for effects in self._pairs(candidates, r)]
+        if self.within_form_tolerance(now):
             others = [o for o in pairs if not now.keys & o.keys]
-            far = [o for o in others if self.excess(o, now) < -SEARCH.far_less]
-            return self.completed(self.prune(self.best([now, *far])))
+            far = [o for o in others if self.log_energy_ratio(o, now) < -SEARCH.far_log_gain]
+            return self.completed_to_noise(self.prune(self.best([now, *far])))
         now = self.prune(self.best([self.empty, *singles, *pairs]))
-        while not within(now.excess_energy, self.limits) and len(now.effects) < SEARCH.largest_set:
+        while (
+            not within_band(now.excess_energy, self.noise_band)
+            and len(now.effects) < SEARCH.largest_set
+        ):
             grown = self.prune(self.best([now, *self.extensions(now)]))
-            if grown.keys == now.keys or self.excess(now, grown) < SEARCH.least_growth:
+            if grown.keys == now.keys or self.log_energy_ratio(now, grown) < SEARCH.least_log_gain:
                 break
             now = grown
-            if self.formed(now):
-                return self.completed(now)
+            if self.within_form_tolerance(now):
+                return self.completed_to_noise(now)
         return now
 
-    def formed(self, hypothesis: Hypothesis) -> bool:
-        """Return whether the rest may be the difference of form between effect and catalogue."""
+    def within_form_tolerance(self, hypothesis: Hypothesis) -> bool:
+        """Return whether every equation keeps no more than noise or the effects' form error."""
         return all(self.negligible(e, residual) for e, residual in hypothesis.excess_energy.items())
 
     def negligible(self, equation: str, residual: float) -> bool:
-        """Return whether so much energy above noise may be left in an equation."""
-        allowed = (SEARCH.residual_limit / SEARCH.band) ** 2 * self.limits.band[equation]
+        """Return whether an equation may keep so much energy above noise.
+
+        It may keep noise of `SEARCH.residual_limit`, or `SEARCH.form_share` of what the baseline
+        leaves.
+        """
+        allowed = (SEARCH.residual_limit / SEARCH.band) ** 2 * self.noise_band.by_equation[equation]
         return residual <= max(allowed, SEARCH.form_share * self.empty.excess_energy[equation])
 
-    def completed(self, now: Hypothesis) -> Hypothesis:
-        """Add one more effect only if that leaves nothing but noise: else it fits a form."""
-        if within(now.excess_energy, self.limits) or len(now.effects) >= SEARCH.largest_set:
+    def completed_to_noise(self, now: Hypothesis) -> Hypothesis:
+        """Return the set with one more effect if that leaves only noise, else the set itself.
+
+        The set leaves no more than form error already: an effect that leaves less, but not only
+        noise, would just fit that error.
+        """
+        if (
+            within_band(now.excess_energy, self.noise_band)
+            or len(now.effects) >= SEARCH.largest_set
+        ):
             return now
-        more = [o for o in self.extensions(now) if within(o.excess_energy, self.limits)]
+        more = [o for o in self.extensions(now) if within_band(o.excess_energy, self.noise_band)]
         best = self.best(more) if more else now
         return best if best.effects and self.prune(best).keys == best.keys else now
 
@@ -198,7 +224,7 @@ class HypothesisSet:
 
         def allowed(entry: VariantColumns, coefficients: Array) -> bool:
             own = dict(zip(entry.names, map(float, coefficients), strict=True))
-            # No lower bound: what is smaller than the grid's first point is fitted exactly later.
+            # No lower bound: a size below that of the grid's first point is fitted exactly later.
             if not 0.0 <= own.get("", 0.0) <= SEARCH.size_ratio:
                 return False
             for c in entry.variant.effect.coefficients(rig):
@@ -226,9 +252,7 @@ class HypothesisSet:
                 out[variant.key] = (variant.used,)
         return list(out.values())
 
-    def _pairs(
-        self, candidates: linear_fit.CandidateColumns, r: Array, singles: Sequence[Hypothesis]
-    ) -> list[tuple[Used, ...]]:
+    def _pairs(self, candidates: linear_fit.CandidateColumns, r: Array) -> list[tuple[Used, ...]]:
         chosen = linear_fit.search(candidates, r)
         out = [
             tuple(candidates.entries[m].variant.used for m in chosen.members[: SEARCH.largest_set])
@@ -242,19 +266,20 @@ class HypothesisSet:
     def extensions(
         self, now: Hypothesis, equations: Collection[str] = (), free: bool = False
     ) -> list[Hypothesis]:
-        """Return sets with one more effect, found on data that have the set in their model.
+        """Return the best sets with one more effect, found on data with the set in their model.
 
-        With `equations` the search looks at these alone, with `free` at free mechanisms alone.
+        `equations` restricts the search to their rows, `free` to free mechanisms.
         """
         data = rebased(self.train_data, now.fit)
         taken = now.keys
-        looks = self._variants(data, now.fit.residual)
-        looks = [v for v in looks if v.key not in taken and (v.effect.free or not free)]
-        columns = variant_columns(data, looks)
+        tried = self._variants(data, now.fit.residual)
+        tried = [v for v in tried if v.key not in taken and (v.effect.free or not free)]
+        columns = variant_columns(data, tried)
         mask = np.ones(len(now.fit.residual))
         for s in data.segments:
             mask[s.where] = not equations or s.equation in equations
-        # The set's shapes move too when another effect joins: what they can take is not its gain.
+        # The set's shapes are fitted again with another effect: energy that they can remove
+        # themselves is no gain of that effect.
         moves = [jacobian(self.train_data, now.fit, used)[1] for used in now.effects]
         candidates = self._candidate_columns(
             replace(data, base=np.hstack((data.base, *moves))), columns, mask
@@ -262,38 +287,38 @@ class HypothesisSet:
         r = now.fit.residual * mask
         r = r - candidates.basis @ (candidates.basis.T @ r)
         out: dict[Key, tuple[Used, ...]] = {}
-        for trial in linear_fit.options(candidates, (), r, 1.0):
+        for trial in linear_fit.sets_with_one_more(candidates, (), r, 1.0):
             variant = candidates.entries[trial.members[0]].variant
             if len(out) < SEARCH.refined_extensions:
                 out.setdefault(variant.key, (*now.effects, variant.used))
-        return self.tried(list(out.values()))
+        return [self.refined(effects) for effects in out.values()]
 
     def exchanged(self, now: Hypothesis) -> Hypothesis:
-        """Return the set, or a better one with another effect in place of one that looks like it.
+        """Return the set, or a better one with an effect exchanged for one that is easily confused.
 
-        What was chosen before the last effect joined may be the wrong one beside it.
+        An effect that was chosen before the last one was added may be wrong beside it.
         """
         sets: list[tuple[Used, ...]] = []
         for used in now.effects if len(now.effects) > 1 else ():
             others = tuple(u for u in now.effects if u is not used)
             for effect in self.effects:
-                if (effect.name, effect.where) in now.keys or not _alike(effect, used):
+                if (effect.name, effect.where) in now.keys or not _is_confusable(effect, used):
                     continue
                 fresh = Used(effect, effect.shape_of(self.train_data.rig, ()))
                 sets.append((*others, fresh))
                 if used.term.name in effect.includes and effect.where == used.term.where:
-                    # What a richer law needs no longer may have stood for what the simpler lacks.
+                    # Another effect may only have made up for what the simpler law lacks.
                     sets += [(*(u for u in others if u is not one), fresh) for one in others]
         if not sets:
             return now
-        other = self.prune(self.best([now, *self.tried(sets)]))
+        other = self.prune(self.best([now, *map(self.refined, sets)]))
         return now if other.keys == now.keys else self.exchanged(other)
 
-    def closer(self, now: Hypothesis, equations: Collection[str]) -> Hypothesis | None:
-        """Return the set with the effect added that some equations ask for, None where none is.
+    def extended_in(self, now: Hypothesis, equations: Collection[str]) -> Hypothesis | None:
+        """Return the set with the effect that removes most from `equations`, None where none does.
 
-        What is left of a loud equation, the form of its effect, hides what a quiet one lacks as
-        long as all are counted together.
+        Counted over all equations, the form error of a large effect in one equation would hide a
+        small effect in another.
         """
         if len(now.effects) >= SEARCH.largest_set:
             return None
@@ -303,12 +328,14 @@ class HypothesisSet:
 
         def earned(hypothesis: Hypothesis) -> bool:
             drop = {e: now.excess_energy[e] - hypothesis.excess_energy[e] for e in equations}
-            here = [e for e, v in drop.items() if v >= SEARCH.touched * max(drop.values())]
+            here = [e for e, v in drop.items() if v >= SEARCH.acting_share * max(drop.values())]
             start = sum(max(0.0, now.excess_energy[e]) for e in here)
             least = SEARCH.number_price * (hypothesis.size[1] - now.size[1])
             return sum(drop[e] for e in here) > max(least, SEARCH.add_share * start)
 
-        more = [o for o in self.extensions(now, equations) if earned(o) and not self.physical(o)]
+        more = [
+            o for o in self.extensions(now, equations) if earned(o) and not self.physical_problem(o)
+        ]
         if not more:
             return None
         best = min(map(residual, more))
@@ -317,26 +344,33 @@ class HypothesisSet:
         return min(near, key=lambda o: (o.size[1], residual(o)))
 
     def prune(self, hypothesis: Hypothesis) -> Hypothesis:
-        """Drop effects without which about as little is left."""
+        """Return the set without effects that are not needed or remove too little."""
         while len(hypothesis.effects) > 1:
-            rest = [
-                self.exact(tuple(u for u in hypothesis.effects if u is not used))
+            smaller = [
+                self.refined(tuple(u for u in hypothesis.effects if u is not used))
                 for used in hypothesis.effects
             ]
-            rest = [o for o in rest if not self.physical(o)]
-            simpler = [o for o in rest if self.better(o, hypothesis) or self.idle(o, hypothesis)]
+            smaller = [o for o in smaller if not self.physical_problem(o)]
+            simpler = [
+                o
+                for o in smaller
+                if self.is_preferred(o, hypothesis) or self.removes_too_little(o, hypothesis)
+            ]
             if not simpler:
                 break
             hypothesis = min(simpler, key=lambda o: o.total)
         return hypothesis
 
-    def idle(self, without: Hypothesis, hypothesis: Hypothesis) -> bool:
-        """Return whether the effect that `without` lacks takes too small a share away."""
-        return self.excess(without, hypothesis) < -float(np.log(1.0 - SEARCH.add_share))
+    def removes_too_little(self, without: Hypothesis, hypothesis: Hypothesis) -> bool:
+        """Return whether the effect that `without` lacks removes less than `SEARCH.add_share`."""
+        return self.log_energy_ratio(without, hypothesis) < -float(np.log(1.0 - SEARCH.add_share))
 
 
-def _alike(effect: Effect, used: Used) -> bool:
-    """Return whether a named effect at the same joint is easily taken for a used one."""
+def _is_confusable(effect: Effect, used: Used) -> bool:
+    """Return whether a candidate is easily confused with an effect of the set.
+
+    It is another name of its mechanism at the same place, or one of its confounders at its joint.
+    """
     own = used.term
     assert isinstance(own, Effect)
     same = effect.mechanism == own.mechanism and effect.where == own.where
@@ -345,7 +379,7 @@ def _alike(effect: Effect, used: Used) -> bool:
 
 
 def _joint(effect: Effect) -> list[str]:
-    """Return the joint of an effect's place, or the bench."""
+    """Return the words of an effect's place that name its joint, or the bench."""
     return effect.where.split()[:2]
 
 

@@ -1,11 +1,11 @@
-"""Search: which candidates, alone, in pairs and in larger sets, take the residual down to noise.
+"""Linear search: candidates, alone and in sets, whose columns remove the residual down to noise.
 
-Everything is projected off the baseline's columns first: what least squares has absorbed already
-is no evidence for anything. On the projected columns D (M, V) and residual r (M,), with
-K = D'D and c = D'r, the gain of a candidate with columns j is c_j' K_jj^-1 c_j; taking it into the
+All columns are made orthogonal to the baseline's, since the baseline's fit can absorb any part of
+them along its own. On the projected columns D (M, V) and residual r (M,), with K = D'D and c = D'r,
+the energy that a candidate with columns j removes (its gain) is c_j' K_jj^-1 c_j. Adding it to the
 set updates K and c by a Schur complement, so that a search over the whole catalogue with pairs
-costs no more than products of small matrices. Of candidates that leave equally little, the one
-with the fewest free numbers is taken.
+costs products of small matrices only. Of candidates that leave about the same energy, the one with
+the fewest free numbers is chosen.
 """
 
 from __future__ import annotations
@@ -26,10 +26,12 @@ Key = tuple[str, str]
 
 @dataclass(frozen=True)
 class CandidateColumns:
-    """Projected candidates: `columns` (M, V), groups of column numbers, what is admissible.
+    """Candidates (`entries`) with columns orthogonal to the data's own.
 
-    `equations` maps an equation to its rows; `admissible(entry, coefficients)` is the physics'
-    veto. `size` counts the free numbers of each entry.
+    `columns` (M, V), `K` (V, V) their products, `basis` (M, r) of the data's own columns, `groups`
+    the column numbers of each entry, `raw` (V,) the squared lengths before projection, `rows` the
+    row numbers of each equation, `band` its noise band, `size` the free numbers of each entry.
+    `admissible(entry, coefficients)` says whether physics allows these sizes.
     """
 
     entries: tuple[VariantColumns, ...]
@@ -46,7 +48,10 @@ class CandidateColumns:
 
 @dataclass(frozen=True)
 class LinearFit:
-    """A set of candidates: energy above noise by equation, and the residual (M,)."""
+    """A fitted set of candidates: energy above noise by equation, and the residual (M,).
+
+    `members` are numbers of entries, `coefficients` the fitted ones of each.
+    """
 
     members: tuple[int, ...]
     coefficients: tuple[Array, ...]
@@ -55,7 +60,7 @@ class LinearFit:
 
     @property
     def total(self) -> float:
-        """All energy left above noise, not below zero in any equation."""
+        """Energy above noise of all equations, each counted as at least zero."""
         return sum(max(0.0, e) for e in self.excess_energy.values())
 
 
@@ -63,7 +68,10 @@ def project(
     data: RegressionData, columns: Sequence[VariantColumns], size: Callable[[VariantColumns], int],
     admissible: Callable[[VariantColumns, Array], bool], mask: Array | None = None,
 ) -> CandidateColumns:  # fmt: skip
-    """Project the entries off the data's own columns; `mask` (M,) switches rows off."""
+    """Return the entries with columns orthogonal to the data's own.
+
+    `mask` (M,) is 0 for rows that are not used.
+    """
     keep = np.ones(data.base.shape[0]) if mask is None else mask
     basis = orthonormal(data.base * keep[:, None])
     groups, start = [], 0
@@ -98,29 +106,34 @@ def orthonormal(columns: Array) -> Array:
 
 
 def gains(K: Array, c: Array, groups: Sequence[tuple[int, ...]], raw: Array) -> Array:
-    """Return the energy that each group of columns takes away, 0 for those that do not show."""
+    """Return the energy that each group of columns removes.
+
+    It is 0 for groups without a column of `SEARCH.least_projected_length`.
+    """
     out = np.zeros(len(groups))
     for g, group in enumerate(groups):
         if len(group) == 1:
             j = group[0]
-            if K[j, j] > SEARCH.visible**2 * raw[j] and raw[j] > 0:
+            if K[j, j] > SEARCH.least_projected_length**2 * raw[j] and raw[j] > 0:
                 out[g] = c[j] ** 2 / K[j, j]
             continue
-        seen = [j for j in group if K[j, j] > SEARCH.visible**2 * raw[j] and raw[j] > 0]
+        seen = [
+            j for j in group if K[j, j] > SEARCH.least_projected_length**2 * raw[j] and raw[j] > 0
+        ]
         if seen:
             index = np.ix_(seen, seen)
             out[g] = c[seen] @ np.linalg.pinv(K[index], rcond=1e-6, hermitian=True) @ c[seen]
     return out
 
 
-def without(K: Array, c: Array, group: Sequence[int]) -> tuple[Array, Array]:
-    """Return K and c after the group's columns were taken into the set (Schur complement)."""
+def schur_complement(K: Array, c: Array, group: Sequence[int]) -> tuple[Array, Array]:
+    """Return K and c with the columns of `group` eliminated, which have joined the set."""
     j = list(group)
     inverse = np.linalg.pinv(K[np.ix_(j, j)], rcond=1e-8, hermitian=True)
     return K - K[:, j] @ inverse @ K[j], c - K[:, j] @ (inverse @ c[j])
 
 
-def judged(
+def fit_members(
     candidates: CandidateColumns, members: Sequence[int], r: Array, noise: float
 ) -> LinearFit:
     """Fit a set to the projected residual r (M,); `noise` is its noise energy per row."""
@@ -141,41 +154,41 @@ def judged(
 
 
 def in_band(candidates: CandidateColumns, chosen: LinearFit, noise: float) -> bool:
-    """Return whether what is left of every equation is too little to explain."""
+    """Return whether every equation's energy above noise lies within its band."""
     return all(
         excess_energy <= max(candidates.band[e], 4 * noise * np.sqrt(2 * len(candidates.rows[e])))
         for e, excess_energy in chosen.excess_energy.items()
     )
 
 
-def touched(candidates: CandidateColumns, member: int, chosen: LinearFit) -> float:
-    """Return the energy above noise that a set leaves in the equations an entry touches."""
+def energy_touched(candidates: CandidateColumns, member: int, chosen: LinearFit) -> float:
+    """Return the energy above noise that a set leaves in the equations where an entry acts."""
     return sum(
         max(0.0, chosen.excess_energy.get(e, 0.0)) for e in candidates.entries[member].touched
     )
 
 
-def options(
+def sets_with_one_more(
     candidates: CandidateColumns, members: Sequence[int], r: Array, noise: float
 ) -> list[LinearFit]:
-    """Return the sets with one more entry that earn their place, the best choice first.
+    """Return the sets with one more entry that removes enough energy, the best set first.
 
-    Among sets that leave about equally little the simplest stands first, then the others by what
-    they leave.
+    Sets that leave about the least come first, by number of free numbers; then the others by the
+    energy that they leave.
     """
-    now = judged(candidates, members, r, noise)
+    now = fit_members(candidates, members, r, noise)
     K, c = candidates.K, candidates.columns.T @ r
     for m in members:
-        K, c = without(K, c, candidates.groups[m])
+        K, c = schur_complement(K, c, candidates.groups[m])
     g = gains(K, c, candidates.groups, candidates.raw)
     taken = {candidates.entries[m].variant.key for m in members}
     trials: list[LinearFit] = []
     for i in map(int, np.argsort(-g)[: SEARCH.full_fits]):
         if g[i] <= 0 or candidates.entries[i].variant.key in taken:
             continue
-        if g[i] < SEARCH.add_share * touched(candidates, i, now):
+        if g[i] < SEARCH.add_share * energy_touched(candidates, i, now):
             continue
-        trial = judged(candidates, (*members, i), r, noise)
+        trial = fit_members(candidates, (*members, i), r, noise)
         if admissible(candidates, trial):
             trials.append(trial)
     if not trials:
@@ -201,22 +214,22 @@ def admissible(candidates: CandidateColumns, choice: LinearFit) -> bool:
 
 
 def search(candidates: CandidateColumns, r: Array, noise: float = 1.0) -> LinearFit:
-    """Find the set: forward with swaps and backward pruning, from nothing and from pairs."""
-    empty = judged(candidates, (), r, noise)
+    """Return the best set, grown from the empty set and from pairs with `grow`."""
+    empty = fit_members(candidates, (), r, noise)
     if in_band(candidates, empty, noise) or not candidates.entries:
         return empty
     greedy = grow(candidates, (), r, noise)
     if len(greedy.members) == 1 and in_band(candidates, greedy, noise):
         return greedy
     best, seen = greedy, set[Key]()
-    for first in options(candidates, (), r, noise)[: 3 * SEARCH.pair_starts] or _blind(
-        candidates, r
-    ):
+    for first in sets_with_one_more(candidates, (), r, noise)[
+        : 3 * SEARCH.pair_starts
+    ] or _best_singles(candidates, r):
         key = candidates.entries[first.members[0]].variant.key
         if key in seen or len(seen) >= SEARCH.pair_starts:
             continue
         seen.add(key)
-        for pair in options(candidates, first.members, r, noise)[:1]:
+        for pair in sets_with_one_more(candidates, first.members, r, noise)[:1]:
             other = grow(candidates, pair.members, r, noise)
             if len(other.members) <= max(2, len(best.members)) and other.total < 0.7 * best.total:
                 best = other
@@ -224,34 +237,34 @@ def search(candidates: CandidateColumns, r: Array, noise: float = 1.0) -> Linear
 
 
 def best_pairs(candidates: CandidateColumns, r: Array, count: int) -> list[LinearFit]:
-    """Return the pairs of different candidates that leave least, whatever they are alone."""
+    """Return the `count` pairs of different candidates that leave least."""
     starts: dict[Key, LinearFit] = {}
-    for first in _blind(candidates, r):
+    for first in _best_singles(candidates, r):
         starts.setdefault(candidates.entries[first.members[0]].variant.key, first)
     pairs: dict[frozenset[Key], LinearFit] = {}
     for first in list(starts.values())[: SEARCH.pair_starts]:
-        for pair in options(candidates, first.members, r, 1.0)[:3]:
+        for pair in sets_with_one_more(candidates, first.members, r, 1.0)[:3]:
             keys = frozenset(candidates.entries[m].variant.key for m in pair.members)
             if keys not in pairs or pair.total < pairs[keys].total:
                 pairs[keys] = pair
     return sorted(pairs.values(), key=lambda p: p.total)[:count]
 
 
-def _blind(candidates: CandidateColumns, r: Array) -> list[LinearFit]:
-    """Return the best single entries although none earns a place alone: a pair may."""
+def _best_singles(candidates: CandidateColumns, r: Array) -> list[LinearFit]:
+    """Return the best single entries, even if none removes enough alone: a pair may."""
     g = gains(candidates.K, candidates.columns.T @ r, candidates.groups, candidates.raw)
     return [
-        judged(candidates, (int(i),), r, 1.0)
+        fit_members(candidates, (int(i),), r, 1.0)
         for i in np.argsort(-g)[: 6 * SEARCH.pair_starts]
         if g[i] > 0
     ]
 
 
 def grow(candidates: CandidateColumns, members: Sequence[int], r: Array, noise: float) -> LinearFit:
-    """Add entries while they earn their place, swapping and dropping earlier ones."""
-    now = judged(candidates, members, r, noise)
+    """Return a set with entries added while they remove enough; earlier ones may be exchanged."""
+    now = fit_members(candidates, members, r, noise)
     while not in_band(candidates, now, noise) and len(now.members) < SEARCH.largest_linear_set:
-        more = options(candidates, now.members, r, noise)
+        more = sets_with_one_more(candidates, now.members, r, noise)
         if not more:
             break
         grown = prune(candidates, swap(candidates, more[0], r, noise), r, noise)
@@ -262,12 +275,12 @@ def grow(candidates: CandidateColumns, members: Sequence[int], r: Array, noise: 
 
 
 def swap(candidates: CandidateColumns, chosen: LinearFit, r: Array, noise: float) -> LinearFit:
-    """Exchange members for better ones, the others kept, until none is."""
+    """Return the set with members exchanged, one by one, for entries that leave less."""
     for _ in range(2):
         before = chosen
         for m in chosen.members[:-1]:
             others = tuple(k for k in chosen.members if k != m)
-            for trial in options(candidates, others, r, noise)[:1]:
+            for trial in sets_with_one_more(candidates, others, r, noise)[:1]:
                 if trial.total < 0.9 * chosen.total:
                     chosen = trial
                     break
@@ -277,20 +290,23 @@ def swap(candidates: CandidateColumns, chosen: LinearFit, r: Array, noise: float
 
 
 def prune(candidates: CandidateColumns, chosen: LinearFit, r: Array, noise: float) -> LinearFit:
-    """Drop members without which about as little is left in the equations they touch."""
+    """Return the set without members that remove less than `SEARCH.add_share`."""
     while len(chosen.members) > 1:
-        shares = {m: share(candidates, chosen, m, r, noise) for m in chosen.members}
+        shares = {m: removed_share(candidates, chosen, m, r, noise) for m in chosen.members}
         worst = min(shares, key=lambda m: shares[m])
         if shares[worst] >= SEARCH.add_share:
             break
-        chosen = judged(candidates, tuple(m for m in chosen.members if m != worst), r, noise)
+        chosen = fit_members(candidates, tuple(m for m in chosen.members if m != worst), r, noise)
     return chosen
 
 
-def share(
+def removed_share(
     candidates: CandidateColumns, chosen: LinearFit, member: int, r: Array, noise: float
 ) -> float:
-    """Return which share of the energy above noise goes with a member, the others kept."""
-    rest = judged(candidates, tuple(m for m in chosen.members if m != member), r, noise)
-    before, after = touched(candidates, member, rest), touched(candidates, member, chosen)
+    """Return the share of energy above noise that a member removes in its equations."""
+    rest = fit_members(candidates, tuple(m for m in chosen.members if m != member), r, noise)
+    before, after = (
+        energy_touched(candidates, member, rest),
+        energy_touched(candidates, member, chosen),
+    )
     return (before - after) / before if before > 0 else 0.0

@@ -1,9 +1,9 @@
-"""Refinement: a set of effects fitted exactly, shapes by variable projection.
+"""Refinement: the exact fit of a set of effects, with shapes by variable projection.
 
-The rows of the averaged records are rebuilt at every shape, linear coefficients are solved for,
-and only the shapes are searched (Golub and Pereyra, 1973). An effect that rescales the right side
-(a sensor's gain) must not win by making everything small: rows are scaled back to the right
-side's size before the change.
+The rows of the averaged records are computed again at every shape, the linear coefficients are
+solved for, and only the shapes are searched (Golub and Pereyra, 1973). An effect that changes the
+size of the right side (a sensor's gain) must not reduce the residual by that: rows are scaled back
+to the right side's size before the change.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares as search_shapes
+from scipy.optimize import least_squares as minimise
 
 from analysis.effects.base import Effect, Shape, shapes_of
 from analysis.regression.rows import in_common
@@ -43,10 +43,10 @@ class DesignMatrix:
 
 @dataclass(frozen=True)
 class ExactFit:
-    """A model with shapes found: terms, the rows' coefficients, residual (M,).
+    """A fitted model: terms with shapes, coefficients of the rows, whitened residual (M,).
 
-    `information` (k, k) is what the fitted rows say of the coefficients, in their order: the
-    inverse of their covariance from noise.
+    `information` (k, k) of the coefficients, in the order of `beta`, is the inverse of their
+    covariance from noise.
     """
 
     terms: tuple[Used, ...]
@@ -56,20 +56,20 @@ class ExactFit:
 
     @property
     def energy(self) -> float:
-        """Whitened energy of the residual."""
+        """Energy of the whitened residual."""
         return float(self.residual @ self.residual)
 
 
-def table(data: RegressionData, terms: Sequence[Used]) -> DesignMatrix:
-    """Return the whitened rows of a model on the averaged records and instants.
+def design_matrix(data: RegressionData, terms: Sequence[Used]) -> DesignMatrix:
+    """Return the whitened rows of a model at the instants of the averaged records.
 
-    Of instants that the model masks stays what the data's own model leaves of them, so that no
-    effect explains rows by moving its signals out of the model's domain.
+    Instants that the model masks keep the residual of the data's own model, so that no effect
+    removes a residual by moving signals to where the equations do not hold.
     """
-    built = [shared_rows(data.rig, terms, record, data.memory) for record in data.records]
+    built = [shared_rows(data.rig, terms, record, data.cache) for record in data.records]
     names = tuple(dict.fromkeys(c.parameter for u in terms for c in u.term.coefficients(data.rig)))
     M = data.base.shape[0]
-    X, y = np.zeros((M, len(names))), data.mean.copy()
+    X, y = np.zeros((M, len(names))), data.mean_residual.copy()
     index = {conditioned.group: k for k, conditioned in enumerate(data.records)}
     for segment in data.segments:
         k = index[segment.group]
@@ -86,9 +86,9 @@ def table(data: RegressionData, terms: Sequence[Used]) -> DesignMatrix:
     return DesignMatrix(names, X, y)
 
 
-def fit(data: RegressionData, terms: Sequence[Used]) -> ExactFit:
-    """Solve a model's coefficients on regression data, shapes as they are."""
-    rows = table(data, terms)
+def fit_coefficients(data: RegressionData, terms: Sequence[Used]) -> ExactFit:
+    """Return the least-squares fit of a model's coefficients, with its shapes as given."""
+    rows = design_matrix(data, terms)
     scale = np.linalg.norm(rows.matrix, axis=0)
     scale[scale == 0] = 1.0
     Q, R = np.linalg.qr(rows.matrix / scale)
@@ -98,35 +98,36 @@ def fit(data: RegressionData, terms: Sequence[Used]) -> ExactFit:
 
 
 def refine(data: RegressionData, terms: Sequence[Used], steps: int = SEARCH.steps) -> ExactFit:
-    """Search the shape parameters that the data's own terms do not have, from where they are.
+    """Return the fit with the shapes of all effects that are not among the data's own terms.
 
-    Where an effect has another form, the one that leaves less stays. Then details of forms join,
-    one after another, that take more away than chance, and a share of what is left.
+    The search starts from the shapes given. Of the forms of an effect the one that leaves least is
+    used. Then details of the form are added that remove more than chance (`SEARCH.number_price`)
+    and more than `SEARCH.detail_share` of the remaining energy above noise.
     """
-    fit = _searched(data, terms, steps)
+    fit = _with_searched_shapes(data, terms, steps)
     for k in range(len(terms)):
         used = fit.terms[k]
         if used in data.terms or not isinstance(used.term, Effect):
             continue
         fit = _in_best_form(data, fit, k, steps)
         used = fit.terms[k]
-        opened = _in_detail(data.rig, used)
+        opened = _with_details(data.rig, used)
         asked = max(SEARCH.number_price, SEARCH.detail_share * (fit.energy - len(fit.residual)))
-        # Half, since in a straight line a detail promises less than it takes.
-        if opened == used or _promise(data, fit, used, opened) < 0.5 * asked:
+        # Half, since the linear prediction is less than what a detail removes.
+        if opened == used or _predicted_gain(data, fit, used, opened) < 0.5 * asked:
             continue
-        more = _searched(data, _with(fit.terms, used, opened), steps)
-        if fit.energy - more.energy > asked and _shaped(data, more, more.terms[k]):
+        more = _with_searched_shapes(data, _with_term(fit.terms, used, opened), steps)
+        if fit.energy - more.energy > asked and _determines_shapes(data, more, more.terms[k]):
             fit = more
     return fit
 
 
-def _shaped(data: RegressionData, fit: ExactFit, used: Used) -> bool:
-    """Return whether the rows still determine an effect's shapes beside its details.
+def _determines_shapes(data: RegressionData, fit: ExactFit, used: Used) -> bool:
+    """Return whether the rows determine an effect's shapes beside the details of its form.
 
-    A detail that leaves them open, or drives them or itself to a bound, stands for something else:
-    noise that reverses a contact at rest looks like a long presliding distance that shrinks with
-    speed.
+    Each shape must have a relative standard error of at most `SEARCH.shape_error`, and neither it
+    nor a detail may lie at its bound. Otherwise the detail fits something else: noise that reverses
+    a contact at rest looks like a long presliding distance that shrinks with speed.
     """
     assert isinstance(used.term, Effect)
     shapes = shapes_of(data.rig, used)
@@ -150,12 +151,12 @@ def _shaped(data: RegressionData, fit: ExactFit, used: Used) -> bool:
 
 
 def _in_best_form(data: RegressionData, fit: ExactFit, place: int, steps: int) -> ExactFit:
-    """Return the fit with one term in the form that leaves least, changed as long as that helps."""
+    """Return the fit with the term number `place` in the form that leaves least."""
     while True:
         used = fit.terms[place]
         assert isinstance(used.term, Effect)
         others = [
-            _searched(data, _with(fit.terms, used, Used(used.term, shape)), steps)
+            _with_searched_shapes(data, _with_term(fit.terms, used, Used(used.term, shape)), steps)
             for shape in used.term.other_forms(data.rig, used.shape)
         ]
         best = min(others, key=lambda other: other.energy, default=fit)
@@ -164,33 +165,35 @@ def _in_best_form(data: RegressionData, fit: ExactFit, place: int, steps: int) -
         fit = best
 
 
-def _promise(data: RegressionData, fit: ExactFit, used: Used, opened: Used) -> float:
-    """Return the energy that a term with its details would take, were all linear in them."""
-    column = table(data, _with(fit.terms, used, opened)).residual(fit.beta) - fit.residual
-    absorbed = np.hstack((table(data, fit.terms).matrix, jacobian(data, fit, used)[1]))
+def _predicted_gain(data: RegressionData, fit: ExactFit, used: Used, opened: Used) -> float:
+    """Return the energy that the details of a term would remove, to first order."""
+    column = (
+        design_matrix(data, _with_term(fit.terms, used, opened)).residual(fit.beta) - fit.residual
+    )
+    absorbed = np.hstack((design_matrix(data, fit.terms).matrix, jacobian(data, fit, used)[1]))
     basis = orthonormal(absorbed)
     column = column - basis @ (basis.T @ column)
     size = float(column @ column)
     return float(column @ fit.residual) ** 2 / size if size > 0 else 0.0
 
 
-def _with(terms: Sequence[Used], used: Used, other: Used) -> tuple[Used, ...]:
-    """Return the terms with another in the place of one."""
+def _with_term(terms: Sequence[Used], used: Used, other: Used) -> tuple[Used, ...]:
+    """Return the terms with `other` in place of `used`."""
     return tuple(other if u is used else u for u in terms)
 
 
-def _in_detail(rig: Rig, used: Used) -> Used:
-    """Return a term with the details that its shape does without, at their first look."""
+def _with_details(rig: Rig, used: Used) -> Used:
+    """Return a term with the details of its form at the values where their search starts."""
     if not isinstance(used.term, Effect) or not len(used.shape):
         return used
     return Used(used.term, used.term.in_detail(rig, used.shape))
 
 
-def _searched(data: RegressionData, terms: Sequence[Used], steps: int) -> ExactFit:
-    free = _free(data, terms)
+def _with_searched_shapes(data: RegressionData, terms: Sequence[Used], steps: int) -> ExactFit:
+    free = _free_shapes(data, terms)
     if not free:
-        return fit(data, terms)
-    terms = _on_the_right_side(data, terms, free)
+        return fit_coefficients(data, terms)
+    terms = _on_better_side(data, terms, free)
     start = np.array([_to_unit(terms[k].shape[j], s) for k, j, s in free])
 
     def at(x: Array) -> tuple[Used, ...]:
@@ -202,16 +205,16 @@ def _searched(data: RegressionData, terms: Sequence[Used], steps: int) -> ExactF
             for u, v in zip(terms, shapes, strict=True)
         )
 
-    search = search_shapes(
-        lambda x: fit(data, at(x)).residual, np.clip(start, 1e-6, 1 - 1e-6), bounds=(0.0, 1.0),
-        diff_step=1e-3, xtol=SEARCH.tolerance, ftol=SEARCH.tolerance, gtol=1e-12,
+    search = minimise(
+        lambda x: fit_coefficients(data, at(x)).residual, np.clip(start, 1e-6, 1 - 1e-6),
+        bounds=(0.0, 1.0), diff_step=1e-3, xtol=SEARCH.tolerance, ftol=SEARCH.tolerance, gtol=1e-12,
         max_nfev=steps,
     )  # fmt: skip
-    return fit(data, at(search.x))
+    return fit_coefficients(data, at(search.x))
 
 
-def _free(data: RegressionData, terms: Sequence[Used]) -> list[tuple[int, int, Shape]]:
-    """Return the shapes to be searched: place of the term, of the shape in it, and what it is."""
+def _free_shapes(data: RegressionData, terms: Sequence[Used]) -> list[tuple[int, int, Shape]]:
+    """Return the shapes to be searched: number of the term, number of the shape in it, shape."""
     return [
         (k, j, s)
         for k, u in enumerate(terms)
@@ -221,13 +224,13 @@ def _free(data: RegressionData, terms: Sequence[Used]) -> list[tuple[int, int, S
     ]
 
 
-def _on_the_right_side(
+def _on_better_side(
     data: RegressionData, terms: Sequence[Used], free: Sequence[tuple[int, int, Shape]]
 ) -> tuple[Used, ...]:
     """Return the terms with every free shape on the side of its neutral value that leaves less.
 
-    A column's first fit gives the size, not the sign; and from the wrong side a search runs
-    away to the bound, not through the neutral value.
+    The linear search gives the size, not the sign, and from the wrong side the search of shapes
+    runs to the bound instead of through the neutral value.
     """
     terms, least = tuple(terms), np.nan
     for k, j, s in free:
@@ -237,9 +240,9 @@ def _on_the_right_side(
         mirrored = float(np.clip(2 * s.neutral - used.shape[j], s.low, s.high))
         shape = (*used.shape[:j], mirrored, *used.shape[j + 1 :])
         other = (*terms[:k], Used(used.term, shape), *terms[k + 1 :])
-        if np.isnan(least):  # few effects lie on either side of nothing
-            least = fit(data, terms).energy
-        energy = fit(data, other).energy
+        if np.isnan(least):  # fitted only if a shape has two sides, which few have
+            least = fit_coefficients(data, terms).energy
+        energy = fit_coefficients(data, other).energy
         if energy < least:
             terms, least = other, energy
     return terms
@@ -250,7 +253,7 @@ def _logarithmic(shape: Shape) -> bool:
 
 
 def _to_unit(value: float, shape: Shape) -> float:
-    """Map a shape parameter to 0..1 between its bounds, by its logarithm where these lie far."""
+    """Return a shape value mapped to 0..1 between its bounds, by logarithm if far apart."""
     if _logarithmic(shape):
         return float(np.log(value / shape.low) / np.log(shape.high / shape.low))
     return (value - shape.low) / (shape.high - shape.low)
@@ -265,9 +268,9 @@ def _from_unit(x: float, shape: Shape) -> float:
 def jacobian(data: RegressionData, model: ExactFit, used: Used) -> tuple[tuple[str, ...], Array]:
     """Return names and whitened columns (M, p) of an effect's coefficients and shapes.
 
-    A column is what a unit more of the parameter adds to the model's side of the rows.
+    A column is the derivative of the model's side of the rows with respect to the parameter.
     """
-    rows = table(data, model.terms)
+    rows = design_matrix(data, model.terms)
     own = [c.parameter for c in used.term.coefficients(data.rig)]
     names, columns = list(own), [rows.matrix[:, rows.names.index(n)] for n in own]
     for j, shape in enumerate(shapes_of(data.rig, used)):
@@ -281,7 +284,9 @@ def jacobian(data: RegressionData, model: ExactFit, used: Used) -> tuple[tuple[s
         ends = []
         for value in (up, down):
             changed = Used(used.term, (*used.shape[:j], value, *used.shape[j + 1 :]))
-            ends.append(table(data, _with(model.terms, used, changed)).residual(model.beta))
+            ends.append(
+                design_matrix(data, _with_term(model.terms, used, changed)).residual(model.beta)
+            )
         names.append(shape.parameter)
         columns.append(-(ends[0] - ends[1]) / (up - down))
     stack = np.column_stack(columns) if columns else np.zeros((len(model.residual), 0))
@@ -289,8 +294,8 @@ def jacobian(data: RegressionData, model: ExactFit, used: Used) -> tuple[tuple[s
 
 
 def tangent(data: RegressionData, model: ExactFit) -> tuple[tuple[str, ...], Array]:
-    """Return names and whitened columns (M, p) of all that is free in a model, shapes included."""
-    rows = table(data, model.terms)
+    """Return names and whitened derivatives (M, p) of all coefficients and shapes of a model."""
+    rows = design_matrix(data, model.terms)
     names, columns = list(rows.names), [rows.matrix]
     for used in model.terms:
         if used.shape and isinstance(used.term, Effect):
@@ -302,7 +307,7 @@ def tangent(data: RegressionData, model: ExactFit) -> tuple[tuple[str, ...], Arr
 
 
 def contribution(data: RegressionData, model: ExactFit, used: Used) -> Array:
-    """Return what an effect adds to the whitened rows (M,): its tangent times its own numbers."""
+    """Return what an effect adds to the whitened rows (M,): its derivatives times its values."""
     _, J = jacobian(data, model, used)
     amounts = [model.beta.get(c.parameter, 0.0) for c in used.term.coefficients(data.rig)]
     for shape, value in zip(shapes_of(data.rig, used), used.shape, strict=True):
@@ -311,24 +316,24 @@ def contribution(data: RegressionData, model: ExactFit, used: Used) -> Array:
     return np.asarray(J @ np.array(amounts))
 
 
-def alternatives(data: RegressionData, fit: ExactFit) -> list[ExactFit]:
-    """Return the fit with each effect in its other forms, one after another."""
+def fits_in_other_forms(data: RegressionData, fit: ExactFit) -> list[ExactFit]:
+    """Return the fits with each effect in each of its other forms."""
     out = []
     for used in fit.terms:
         if used in data.terms or not isinstance(used.term, Effect):
             continue
         for shape in used.term.other_forms(data.rig, used.shape):
-            terms = _with(fit.terms, used, Used(used.term, shape))
-            out.append(_searched(data, terms, SEARCH.steps))
+            terms = _with_term(fit.terms, used, Used(used.term, shape))
+            out.append(_with_searched_shapes(data, terms, SEARCH.steps))
     return out
 
 
 def rebased(data: RegressionData, model: ExactFit) -> RegressionData:
-    """Return regression data with a fitted model in place of their own."""
-    rows = table(data, model.terms)
+    """Return regression data whose own model is a fitted model."""
+    rows = design_matrix(data, model.terms)
     built = []
     for conditioned, before in zip(data.records, data.rows, strict=True):
-        now = shared_rows(data.rig, model.terms, conditioned, data.memory)
+        now = shared_rows(data.rig, model.terms, conditioned, data.cache)
         kept = {}
         for equation, old in before.items():
             here, there = in_common(old, now[equation])

@@ -46,30 +46,30 @@ class Searched:
         """Return the gates' verdict on a set: the winner, or that of the named candidates."""
         one = self.set_of(*names) if names else self.winner
         rng = np.random.default_rng(seed)
-        return list(gates.judge(self.hypotheses, one, self.holdout_data, rng))
+        return list(gates.judge_effects(self.hypotheses, one, self.holdout_data, rng))
 
     def set_of(self, *names: str) -> Hypothesis:
         """Return the fitted set of the named candidates, each at its first look."""
         entries = [v.variant for v in self.hypotheses.columns]
-        return self.hypotheses.exact(
+        return self.hypotheses.refined(
             [next(v.used for v in entries if v.effect.name == name) for name in names]
         )
 
     def named(self) -> set[str]:
         """Return the names that pass the gates, quiet equations searched again."""
         rng = np.random.default_rng(0)
-        found, *_ = finding._named(self.hypotheses, self.winner, self.holdout_data, rng)
-        return {f.name for f in found if gates.stands(f)}
+        found = finding._apply_gates(self.hypotheses, self.winner, self.holdout_data, rng)
+        return {f.name for f in found.effects if gates.passes_gates(f)}
 
     def vetoes(self, one: Hypothesis) -> str:
         """Return what is left and speaks against a set, in words; '' for nothing."""
-        rest = remaining.left_over(self.hypotheses, one, self.holdout_data)
+        rest = remaining.remainders(self.hypotheses, one, self.holdout_data)
         return "; ".join(r.words for r in rest if r.veto)
 
     def left_in(self, one: Hypothesis) -> dict[str, str]:
         """Return what equations keep that is more than the bands allow, in words."""
         out: dict[str, str] = {}
-        for equation, words in gates.remaining(self.hypotheses, one, self.holdout_data):
+        for equation, words in gates.equations_above_band(self.hypotheses, one, self.holdout_data):
             out[equation] = f"{out.get(equation, '')} {words}".strip()
         return out
 
@@ -106,7 +106,9 @@ def gains(candidates: CandidateColumns, r: Array) -> Array:
     out = []
     for group in candidates.groups:
         X = candidates.columns[:, list(group)]
-        visible = np.linalg.norm(X, axis=0) > SEARCH.visible * np.sqrt(candidates.raw[list(group)])
+        visible = np.linalg.norm(X, axis=0) > SEARCH.least_projected_length * np.sqrt(
+            candidates.raw[list(group)]
+        )
         X = X[:, visible]
         out.append(r @ X @ np.linalg.lstsq(X, r, rcond=1e-6)[0] if X.shape[1] else 0.0)
     return np.array(out)

@@ -13,9 +13,13 @@ from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import regression_data
-from analysis.trace.data.temperature_nuisance import plausible, stripped, temperature_terms
+from analysis.trace.data.temperature_nuisance import (
+    at_nominal_temperature,
+    temperature_terms,
+    within_plausible_slope,
+)
 from analysis.trace.judge import held_out
-from analysis.trace.search.refinement import fit
+from analysis.trace.search.refinement import fit_coefficients
 from rig.model.records import Run
 from rig.model.rig import Rig
 
@@ -62,7 +66,9 @@ def test_a_warmer_day_is_judged_at_its_own_temperature(rig: Rig, days: tuple[Run
     for label, extra in (("without", ()), ("with", temperature_terms(terms, days[:1], days[1:]))):
         train_data = regression_data(rig, (*terms, *extra), train)
         holdout_data = regression_data(rig, (*terms, *extra), judged, train_data.beta)
-        model = held_out.settled(holdout_data, fit(train_data, train_data.terms))
+        model = held_out.refitted_to_held_out(
+            holdout_data, fit_coefficients(train_data, train_data.terms)
+        )
         found[label] = held_out.errors(rig, judged, model, model)
     floor = found["with"].noise
     assert found["without"].after["flow_cap_2"] > 1.3 * floor["flow_cap_2"]
@@ -78,27 +84,31 @@ def test_a_cold_morning_is_judged_though_the_fit_knows_warm_oil_alone(rig: Rig) 
     train, judged = (conditioned_records(rig, runs) for runs in (warm, cold))
     train_data = regression_data(rig, every, train)
     holdout_data = regression_data(rig, every, judged, train_data.beta)
-    model = held_out.settled(holdout_data, fit(train_data, train_data.terms))
+    model = held_out.refitted_to_held_out(
+        holdout_data, fit_coefficients(train_data, train_data.terms)
+    )
     found = held_out.errors(rig, judged, model, model)
     for equation, error in found.after.items():
         assert error < 1.15 * found.noise[equation], equation
-    known = stripped(identify(warm, terms=every, estimator="plain").model).parameters["b"]
+    known = at_nominal_temperature(identify(warm, terms=every, estimator="plain").model).parameters[
+        "b"
+    ]
     assert known.value == pytest.approx(rig.nominal["b"], rel=0.01)
     assert known.ci95[0] < rig.nominal["b"] < known.ci95[1]
 
 
 def test_oil_can_do_only_so_much() -> None:
     beta = {"b": 1e-9}  # 1/b of the rows
-    assert plausible(4e-12, beta) == 4e-12  # 0.4 % per kelvin
-    assert plausible(1.0, beta) == pytest.approx(15e-12, rel=1e-6, abs=0)
-    assert plausible(-1.0, beta) == pytest.approx(-9e-12)
+    assert within_plausible_slope(4e-12, beta) == 4e-12  # 0.4 % per kelvin
+    assert within_plausible_slope(1.0, beta) == pytest.approx(15e-12, rel=1e-6, abs=0)
+    assert within_plausible_slope(-1.0, beta) == pytest.approx(-9e-12)
 
 
 def test_the_model_file_is_that_of_the_rigs_temperature(rig: Rig, days: tuple[Run, Run]) -> None:
     terms = tuple(map(Used, baseline_of(rig)))
     full = identify(days, terms=(*terms, *temperature_terms(terms, days)), estimator="plain").model
-    kept = stripped(full)
+    kept = at_nominal_temperature(full)
     assert set(full.parameters) - set(kept.parameters) == {"1/b per kelvin"}
     assert kept.parameters["b"].value == pytest.approx(rig.nominal["b"], rel=0.01)
     assert kept.covariance.shape == (len(kept.parameters),) * 2
-    assert stripped(kept) is kept
+    assert at_nominal_temperature(kept) is kept

@@ -12,7 +12,7 @@ from analysis.terms.base import Used
 from analysis.trace.clues.frequency import FREQUENCY, frequency_clue
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import RegressionData, regression_data
-from analysis.trace.data.spectral_lines import lines
+from analysis.trace.data.spectral_lines import spectral_lines
 from analysis.trace.result import Dependence
 from rig.model.records import Run
 from rig.model.rig import Rig
@@ -47,11 +47,11 @@ def clue_of(rig: Rig, train: Run, held_out: Run) -> Dependence | None:
     train_data = laid_out(train)
     holdout_data = laid_out(held_out, train_data)
     return frequency_clue(
-        lines(train_data, train_data.mean),
+        spectral_lines(train_data, train_data.mean_residual),
         train_data,
-        train_data.mean,
+        train_data.mean_residual,
         holdout_data,
-        holdout_data.mean,
+        holdout_data.mean_residual,
     )
 
 

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from analysis.signals.conditioning import Signals
 from analysis.terms import baseline_of
 from analysis.terms.base import Used
-from analysis.trace.clues.dependence import dependence
+from analysis.trace.clues.dependence import dependences
 from analysis.trace.clues.variables import factor_of
-from analysis.trace.data.conditioned_record import conditioned_records, filtered, prepared
+from analysis.trace.data.conditioned_record import conditioned_records, filtered, prepared_signals
 from analysis.trace.data.regression_data import RegressionData, regression_data
 from analysis.trace.result import Dependence
 from rig.model.rig import Rig
@@ -43,7 +43,7 @@ def residual(
         if s.equation == equation:
             k = index[s.group]
             conditioned, rows = train_data.records[k], train_data.rows[k][equation]
-            raw = force(prepared(train_data.rig, train_data.terms, conditioned))
+            raw = force(prepared_signals(train_data.rig, train_data.terms, conditioned))
             found = filtered({"x": raw}, conditioned, rows)["x"]
             out[s.where] += np.sqrt(s.repeats) / s.noise * found
     return out
@@ -54,7 +54,7 @@ def clues(
 ) -> list[Dependence]:
     rng = np.random.default_rng(3)
     one, other = (residual(b, equation, force, rng) for b in boards)
-    return dependence(boards[0], one, boards[1], other, [equation])
+    return dependences(boards[0], one, boards[1], other, [equation])
 
 
 def test_a_spring_that_hardens_moves_with_the_piston_alone(

@@ -5,14 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from analysis.trace.next_experiment.discrimination import MeasurementView, calibration, view
+from analysis.trace.next_experiment.discrimination import (
+    MeasurementView,
+    measurement_view,
+    noise_ratios,
+)
 from analysis.trace.next_experiment.excitations import (
     FAMILIES,
     CandidateExcitation,
     excitation,
-    settings,
+    joint_settings,
 )
-from analysis.trace.next_experiment.range_extension import LINES, farther, richer
+from analysis.trace.next_experiment.range_extension import LINES, more_lines, wider_range
 from analysis.trace.result import Dependence
 from tests.analysis.trace.test_next_experiment import sine
 
@@ -21,12 +25,12 @@ from tests.analysis.trace.test_next_experiment import sine
 def candidates() -> tuple[list[CandidateExcitation], list[MeasurementView]]:
     """Joint 2 moved at creeping speed and at all frequencies, on the twin of the bench."""
     rig, train_data = sine()
-    first = settings(rig, train_data.records)[0]
+    first = joint_settings(rig, train_data.records)[0]
     families = [f for f in FAMILIES if f.name in ("creep", "wide")]
     tried = [excitation(rig, first, family, np.random.default_rng(1)) for family in families]
     found = [one for one in tried if one is not None]
     assert [one.family.name for one in found] == ["wide", "creep"]
-    return found, [view(train_data, one, calibration(train_data)) for one in found]
+    return found, [measurement_view(train_data, one, noise_ratios(train_data)) for one in found]
 
 
 def clue(variable: str, by: str = "") -> Dependence:
@@ -37,7 +41,7 @@ def test_what_moves_with_the_acceleration_asks_for_faster_lines(
     candidates: tuple[list[CandidateExcitation], list[MeasurementView]],
 ) -> None:
     _, train_data = sine()
-    found = farther(train_data, [clue("acceleration_2")], candidates[1], 1.3)
+    found = wider_range(train_data, [clue("acceleration_2")], candidates[1], 1.3)
     assert found is not None
     assert candidates[0][found.index].family.name == "wide"
     assert found.times > 1.3
@@ -49,20 +53,20 @@ def test_a_clue_that_cannot_be_carried_farther_yields_to_the_next(
 ) -> None:
     _, train_data = sine()
     moves = [clue("time"), clue("piston_2", "acceleration_2")]
-    found = farther(train_data, moves, candidates[1], 1.3)
+    found = wider_range(train_data, moves, candidates[1], 1.3)
     assert found is not None
     assert found.variable == "acceleration_2"  # the sine has been all over the stroke
-    assert farther(train_data, moves, candidates[1], 1e3) is None
+    assert wider_range(train_data, moves, candidates[1], 1e3) is None
 
 
 def test_records_of_one_sine_ask_for_many_lines(
     candidates: tuple[list[CandidateExcitation], list[MeasurementView]],
 ) -> None:
     _, train_data = sine()
-    found = richer(train_data, [clue("supply_pressure")], candidates[0])
+    found = more_lines(train_data, [clue("supply_pressure")], candidates[0])
     assert found is not None
     assert (found.variable, candidates[0][found.index].family.name) == (LINES, "wide")
     assert "frequencies instead of 1" in found.words
     assert (
-        richer(train_data, [clue("supply_pressure")], candidates[0][1:]) is None
+        more_lines(train_data, [clue("supply_pressure")], candidates[0][1:]) is None
     )  # creep has 2 lines

@@ -15,7 +15,7 @@ from analysis.terms.base import Used
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.noise_floor import NEIGHBOURS, REPEATS, STATED, Floor, floors, stated_noise
 from analysis.trace.data.regression_data import regression_data
-from analysis.trace.data.unrepeated import unrepeated
+from analysis.trace.data.unrepeated import unrepeated_notes
 from analysis.trace.settings import DATA
 from rig.model.records import Run
 from rig.model.rig import Rig
@@ -114,7 +114,7 @@ def test_a_pump_that_does_not_follow_the_excitation_is_noted_with_its_frequency(
 
     terms = tuple(map(Used, baseline_of(rig)))
     before, after = (
-        unrepeated(regression_data(rig, terms, conditioned_records(rig, [run])))
+        unrepeated_notes(regression_data(rig, terms, conditioned_records(rig, [run])))
         for run in (quiet, shaken(quiet))
     )
     assert before == []

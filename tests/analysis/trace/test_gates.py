@@ -173,7 +173,7 @@ def a_null_and_its_sensors_offset_are_confounded(b: Benches) -> None:
 
 def a_gain_and_a_crosstalk_that_fit_alike_are_confounded(b: Benches) -> None:
     s = b.searched(b.runs(gain_cap_pressure=1.01), "sensor_gain", "sensor_crosstalk")
-    assert not gate(s.judged(), gates.ALONE)
+    assert not gate(s.judged(), gates.NO_RIVAL)
 
 
 def _hardened(b: Benches) -> tuple[Run, Run]:
@@ -300,7 +300,7 @@ def the_order_of_the_repeats_changes_nothing(b: Benches) -> None:
         b.runs(c_internal=LEAK), "internal_leakage", "torque_offset"
     ).hypotheses.train_data
     turned = with_residual(data, data.residual[::-1])
-    assert turned.mean == pytest.approx(data.mean)
+    assert turned.mean_residual == pytest.approx(data.mean_residual)
 
 
 def intervals_are_as_wide_as_estimates_scatter(b: Benches) -> None:
@@ -308,7 +308,7 @@ def intervals_are_as_wide_as_estimates_scatter(b: Benches) -> None:
     s = b.searched(b.runs(c_internal=LEAK), "internal_leakage", "torque_offset")
     data, fit, used = s.hypotheses.train_data, s.winner.fit, s.winner.effects[0]
     (name,), column = jacobian(data, fit, used)
-    base = inference.others(data, fit, (name,))
+    base = inference.basis_of_others(data, fit, (name,))
     own = (column - base @ (base.T @ column))[:, 0]
     rng, values, halves = np.random.default_rng(1), [], []
     for _ in range(30):
@@ -318,7 +318,7 @@ def intervals_are_as_wide_as_estimates_scatter(b: Benches) -> None:
         left = mean - base @ (base.T @ mean) - own * values[-1]
         drawn = with_residual(data, noise)
         model = replace(fit, residual=left)
-        errors = inference.spread(drawn, model, used, {name: values[-1]})
+        errors = inference.effect_errors(drawn, model, used, {name: values[-1]})
         low, high = gates._parameters(drawn, used, errors, {})[name].ci95
         halves.append(0.5 * (high - low))
     assert 1.4 < np.mean(halves) / np.std(values) < 3.2

@@ -15,11 +15,11 @@ from analysis.terms.base import Used
 from analysis.trace import engine
 from analysis.trace.data.conditioned_record import conditioned_records
 from analysis.trace.data.regression_data import RegressionData, regression_data
-from analysis.trace.data.set_aside import judging, set_aside
+from analysis.trace.data.set_aside import in_judging_block, set_aside
 from analysis.trace.engine import trace
 from analysis.trace.judge import held_out
 from analysis.trace.result import Trace
-from analysis.trace.search.refinement import fit, table
+from analysis.trace.search.refinement import design_matrix, fit_coefficients
 from analysis.trace.settings import TRACE
 from rig.cli.main import app
 from rig.model.parse import InputError
@@ -136,7 +136,7 @@ def same(one: RegressionData, other: RegressionData) -> None:
         for equation, rows in mine.items():
             np.testing.assert_array_equal(rows.matrix, theirs[equation].matrix)
             np.testing.assert_array_equal(rows.time, theirs[equation].time)
-    now, later = (table(data, data.terms) for data in (one, other))
+    now, later = (design_matrix(data, data.terms) for data in (one, other))
     np.testing.assert_array_equal(now.matrix, later.matrix)
     np.testing.assert_array_equal(now.rhs, later.rhs)
 
@@ -146,16 +146,18 @@ def test_a_part_of_the_data_is_what_its_records_alone_would_make(
 ) -> None:
     train, held_out = (replace(run, records=run.records[:2]) for run in leaky)
     both, first = rows_of(rig, train, held_out), rows_of(rig, train)
-    assert table(both, both.terms).matrix.shape == both.base.shape  # remembered from here on
+    assert (
+        design_matrix(both, both.terms).matrix.shape == both.base.shape
+    )  # remembered from here on
     mask = np.arange(len(both.base)) < len(first.base)
     part = both.at(mask)
-    assert part.memory is not both.memory
+    assert part.cache is not both.cache
     same(part, first)
     same(both.at(np.ones(len(both.base), dtype=bool)), both)
     every_other = np.arange(len(first.base)) % 2 == 0
-    thinned = table(first.at(every_other), first.terms)
+    thinned = design_matrix(first.at(every_other), first.terms)
     np.testing.assert_allclose(
-        thinned.matrix, table(first, first.terms).matrix[every_other], rtol=1e-12
+        thinned.matrix, design_matrix(first, first.terms).matrix[every_other], rtol=1e-12
     )
 
 
@@ -166,12 +168,12 @@ def test_every_third_second_is_set_aside_and_no_row_is_in_both(
     unseen = set_aside(data, (), (leaky[1],))
     for equation, rows in unseen.judging.rows[0].items():
         others = unseen.choosing.rows[0][equation].time
-        assert judging(rows.time).all()
-        assert not judging(others).any()
+        assert in_judging_block(rows.time).all()
+        assert not in_judging_block(others).any()
         assert len(rows.time) + len(others) == len(data.rows[0][equation].time)
     (lost,) = unseen.choosing_runs
     nan = np.isnan(lost.records[0].channels["piston_2"])
-    np.testing.assert_array_equal(nan, judging(np.asarray(lost.records[0].time)))
+    np.testing.assert_array_equal(nan, in_judging_block(np.asarray(lost.records[0].time)))
 
 
 def test_a_record_too_short_to_be_divided_chooses_and_judges(
@@ -198,20 +200,20 @@ def test_what_the_judging_records_know_far_better_is_no_error_of_the_model(
     for name, run in zip(("train", "held"), leaky, strict=True):
         terms = tuple(map(Used, baseline_of(rig)))
         data[name] = regression_data(rig, terms, conditioned_records(rig, [run]))
-    model = fit(data["train"], data["train"].terms)
+    model = fit_coefficients(data["train"], data["train"].terms)
     at = list(model.beta).index("M2")
     wrong = replace(model, beta={**model.beta, "M2": 1.5 * model.beta["M2"]})
     poor = wrong.information.copy()
     poor[at, :], poor[:, at] = 0.1 * poor[at, :], 0.1 * poor[:, at]
     poor[at, at] *= 0.1
     sizes = [
-        float(np.linalg.norm(held_out.residual(data["held"], m)))
+        float(np.linalg.norm(held_out.held_out_residual(data["held"], m)))
         for m in (model, wrong, replace(wrong, information=poor))
     ]
     assert sizes[1] > 2 * sizes[0]
     assert sizes[2] == pytest.approx(sizes[0], rel=0.02)
-    settled = held_out.settled(data["held"], replace(wrong, information=poor))
-    assert held_out.fitted_anew(wrong, settled) == ["M2"]
+    settled = held_out.refitted_to_held_out(data["held"], replace(wrong, information=poor))
+    assert held_out.refitted_names(wrong, settled) == ["M2"]
 
 
 def test_rows_that_are_left_out_are_spoken_of(rig: Rig, leaky: tuple[Run, Run]) -> None:
@@ -227,6 +229,6 @@ def test_rows_that_are_left_out_are_spoken_of(rig: Rig, leaky: tuple[Run, Run]) 
         )
         for share in (0.01, 0.1)
     )
-    assert engine._masked("training", few) == []
-    notes = engine._masked("training", many)
+    assert engine._masked_row_notes("training", few) == []
+    notes = engine._masked_row_notes("training", many)
     assert any(n.startswith("flow_cap_2: 9 % of the training rows") for n in notes), notes

@@ -15,8 +15,8 @@ from analysis.trace.data.spectral_lines import (
     EXCITED,
     KINDS,
     ODD,
-    lines,
     meaning,
+    spectral_lines,
     spectrum,
 )
 from analysis.trace.engine import trace
@@ -99,7 +99,7 @@ def traced(rig: Rig, **wrong: float) -> Trace:
 def test_a_single_sine_is_followed_to_where_the_row_filter_ends() -> None:
     """Its harmonics are what tells: the odd ones are all empty lines."""
     _, train_data = sine()
-    found = lines(train_data, train_data.mean)
+    found = spectral_lines(train_data, train_data.mean_residual)
     assert {one.equation for one in found} == {"torque_2", "flow_cap_2", "flow_rod_2"}
     for one in found:
         assert np.flatnonzero(one.excited).tolist() == [1]
@@ -112,7 +112,7 @@ def test_friction_shows_on_the_empty_odd_lines_and_a_null_on_the_even_ones(rig: 
     (loudest, *_) = friction.lines
     assert loudest.equation == "torque_2"
     assert "symmetric nonlinearity" in loudest.meaning
-    assert loudest.loud_after < 0.3 * loudest.loud
+    assert loudest.above_noise_after < 0.3 * loudest.above_noise
 
     null = traced(rig, u_null=5e-3)
     assert null.lines[0].equation.startswith("flow")

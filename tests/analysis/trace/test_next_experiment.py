@@ -16,19 +16,19 @@ from analysis.trace.next_experiment.discrimination import (
     ComparisonRows,
     Explanation,
     OpenQuestion,
-    calibration,
-    loudest,
-    present,
+    largest_rms,
+    measurement_view,
+    noise_ratios,
+    present_separation,
     separation,
-    smallest,
-    view,
+    smallest_effect,
 )
 from analysis.trace.next_experiment.excitations import (
     FAMILIES,
-    Setting,
+    JointSetting,
     excitation,
+    joint_settings,
     protocol,
-    settings,
 )
 from hil_sim.scenario.file import Scenario
 from protocols.files.plan import Overrides
@@ -56,15 +56,22 @@ def sine() -> tuple[Rig, RegressionData]:
 def rows_of_both(family: str = "fast") -> tuple[ComparisonRows, ComparisonRows]:
     rig, train_data = sine()
     chosen = next(f for f in FAMILIES if f.name == family)
-    found = excitation(rig, settings(rig, train_data.records)[0], chosen, np.random.default_rng(1))
+    found = excitation(
+        rig, joint_settings(rig, train_data.records)[0], chosen, np.random.default_rng(1)
+    )
     assert found is not None
     old = ComparisonRows(train_data)
-    return old, ComparisonRows(train_data, view(train_data, found, calibration(train_data)), old)
+    return old, ComparisonRows(
+        train_data, measurement_view(train_data, found, noise_ratios(train_data)), old
+    )
 
 
 def test_how_the_joints_stood_is_read_from_the_records() -> None:
     rig, train_data = sine()
-    assert settings(rig, train_data.records) == [Setting({0: 0.0}, {}), Setting({}, {})]
+    assert joint_settings(rig, train_data.records) == [
+        JointSetting({0: 0.0}, {}),
+        JointSetting({}, {}),
+    ]
 
 
 def test_what_an_explanation_can_imitate_is_no_separation() -> None:
@@ -100,8 +107,8 @@ def test_the_separation_is_the_rms_that_stands_out_of_the_new_rows() -> None:
 def test_air_hardly_shows_on_the_sine_and_shows_on_fast_lines() -> None:
     old, new = rows_of_both()
     question = OpenQuestion(AIR, Explanation(), False)
-    assert present(question, old) < 0.5
-    assert separation(question, old, new)[0] > 2 * present(question, old)
+    assert present_separation(question, old) < 0.5
+    assert separation(question, old, new)[0] > 2 * present_separation(question, old)
     _, small = rows_of_both("small")
     assert separation(question, old, small)[0] < separation(question, old, new)[0]
 
@@ -115,7 +122,9 @@ def test_faster_lines_are_noisier_than_the_sine_and_it_is_foreseen() -> None:
 
 def test_an_excitation_fills_its_share_of_the_limits_and_is_a_protocol() -> None:
     rig, train_data = sine()
-    one = excitation(rig, settings(rig, train_data.records)[0], FAST, np.random.default_rng(2))
+    one = excitation(
+        rig, joint_settings(rig, train_data.records)[0], FAST, np.random.default_rng(2)
+    )
     assert one is not None
     piston = one.played.motion["piston"][:, 1]
     low, high = rig.joints[1].limits.piston
@@ -131,13 +140,13 @@ def test_an_excitation_fills_its_share_of_the_limits_and_is_a_protocol() -> None
 def test_a_rig_without_a_twin_offers_nothing() -> None:
     rig, train_data = sine()
     blind = rig.model_copy(update={"nominal": {}})
-    where = settings(rig, train_data.records)[0]
+    where = joint_settings(rig, train_data.records)[0]
     assert excitation(blind, where, FAST, np.random.default_rng(0)) is None
 
 
 def test_every_effect_that_can_show_has_a_size_worth_knowing() -> None:
     rig, train_data = sine()
-    without = [e for e in catalogue(rig) if smallest(e, rig) is None]
+    without = [e for e in catalogue(rig) if smallest_effect(e, rig) is None]
     assert "payload" in {e.name for e in without}
     assert all(e.absorbed(rig) for e in without)
-    assert loudest(train_data, np.zeros(train_data.base.shape[0])) == 0.0
+    assert largest_rms(train_data, np.zeros(train_data.base.shape[0])) == 0.0

@@ -15,7 +15,7 @@ def test_two_levels_that_energy_takes_for_one_are_asymmetric_friction(rig: Rig) 
     runs = pair_of_runs(rig, Hidden(21.0, 38.0), repeats=1, noise=8.0)
     s = searched(rig, *runs, "coulomb_friction", "asymmetric_friction")
     assert [u.term.name for u in s.winner.effects] == ["coulomb_friction"]
-    settled = readings.settled(s.hypotheses, s.winner, s.holdout_data)
+    settled = readings.best_readings(s.hypotheses, s.winner, s.holdout_data)
     assert [u.term.name for u in settled.effects] == ["asymmetric_friction"]
     assert settled.fit.beta["F_ext_2"] == pytest.approx(21.0, rel=0.2)
     assert settled.fit.beta["F_ret_2"] == pytest.approx(38.0, rel=0.2)
@@ -24,5 +24,5 @@ def test_two_levels_that_energy_takes_for_one_are_asymmetric_friction(rig: Rig) 
 def test_one_level_in_the_same_noise_stays_coulomb_friction(rig: Rig) -> None:
     runs = pair_of_runs(rig, Hidden(30.0, 30.0), repeats=1, noise=8.0)
     s = searched(rig, *runs, "coulomb_friction", "asymmetric_friction")
-    settled = readings.settled(s.hypotheses, s.winner, s.holdout_data)
+    settled = readings.best_readings(s.hypotheses, s.winner, s.holdout_data)
     assert [u.term.name for u in settled.effects] == ["coulomb_friction"]

@@ -30,7 +30,7 @@ def test_a_gain_is_found_from_the_wrong_side_of_one_too(
         left = np.array([residual, 0.1])
         return refinement.ExactFit(tuple(terms), {}, left, np.zeros((0, 0)))
 
-    monkeypatch.setattr(refinement, "fit", fit)
+    monkeypatch.setattr(refinement, "fit_coefficients", fit)
     train_data: Any = SimpleNamespace(rig=rig, terms=())
     used = Used(make("sensor_gain", "joint 2 cap"), (start,))
     found = refinement.refine(train_data, (used,))
@@ -54,9 +54,11 @@ def test_an_effect_explains_nothing_by_moving_pressures_beyond_the_supplys(rig: 
     records = conditioned_records(rig, [bench.run(rig, bench.Wrong.of(Fc=80), 0.03, 1)])
     train_data = regression_data(rig, tuple(map(Used, baseline())), records)
     outside = Used(make("sensor_offset", "joint 2 cap"), (-8e6,))
-    found = refinement.fit(train_data, (*train_data.terms, outside))
+    found = refinement.fit_coefficients(train_data, (*train_data.terms, outside))
     (flow,) = [s.where for s in train_data.segments if s.equation == "flow_cap_2"]
-    assert np.linalg.norm(found.residual[flow]) > 10 * np.linalg.norm(train_data.mean[flow])
+    assert np.linalg.norm(found.residual[flow]) > 10 * np.linalg.norm(
+        train_data.mean_residual[flow]
+    )
 
 
 def test_a_chamber_below_the_tanks_pressure_draws_oil_from_the_tank(rig: Rig) -> None:
@@ -80,8 +82,8 @@ def test_a_detail_at_its_bound_or_one_that_leaves_the_shape_open_is_no_form(rig:
 
     def shaped(*shape: float) -> bool:
         used = Used(friction, shape)
-        return refinement._shaped(
-            train_data, refinement.fit(train_data, (*train_data.terms, used)), used
+        return refinement._determines_shapes(
+            train_data, refinement.fit_coefficients(train_data, (*train_data.terms, used)), used
         )
 
     assert shaped(100e-6, 30.0)

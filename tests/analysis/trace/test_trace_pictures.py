@@ -14,7 +14,7 @@ import rig as rig_package
 from analysis.report.plots import place_plot, trace_plots
 from analysis.report.plots.style import MODEL, ORANGE
 from analysis.trace.data.candidates import catalogue, free_mechanisms
-from analysis.trace.judge.gates import refused
+from analysis.trace.judge.gates import refused_effects
 from analysis.trace.result import Gate, JudgedEffect, Rival, Trace
 from rig.model.channels import place_in_words
 from rig.model.parse import parse_model
@@ -156,6 +156,6 @@ def test_an_effect_that_several_sets_hold_is_refused_once_where_it_removes_most(
         JudgedEffect("sensor_lag", "joint 1", {}, 0.01, removed, (), failed, at=at)
         for removed, at in ((0.1, "joint 1 spool"), (0.4, "joint 1 spool"), (0.2, "joint 1 piston"))
     )
-    assert refused([first, LEAK, second, other]) == (second, other)
+    assert refused_effects([first, LEAK, second, other]) == (second, other)
     named = replace(first, gates=())
-    assert refused([named, second, other]) == (other,)
+    assert refused_effects([named, second, other]) == (other,)

@@ -127,7 +127,7 @@ def effects_table(
     one = hypotheses.empty
     for name, where in (("", ""), *chain):
         if name:
-            one = hypotheses.exact((*one.effects, _start(rig, name, where)))
+            one = hypotheses.refined((*one.effects, _start(rig, name, where)))
         error = held_out.rms_of(bench, one.fit)
         words = f"+ {name} at {where}" if name else "baseline"
         shares = [f"{100 * error[e] / size[e]:.1f} %" for e in size]

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from analysis.trace import engine, finding
 from analysis.trace.judge import held_out
-from analysis.trace.judge.shooting import Reshaped
+from analysis.trace.judge.shooting import ShootingResult
 from analysis.trace.result import Trace
 from analysis.trace.search import hypothesis_set
 from rig.model.records import Run
@@ -91,8 +91,12 @@ def decisions_only(kept: Kept) -> Iterator[None]:
     )
     changes = (
         *((module, name, kept(getattr(module, name), key)) for module, name, key in remembered),
-        (engine, "_extended", lambda runs, winner, before, *_: (before, {})),
-        (engine, "reshaped", lambda runs, holdout, after, train, judged, one: Reshaped(one, ())),
+        (engine, "_identified_with_effects", lambda runs, winner, before, *_: (before, {})),
+        (
+            engine,
+            "shoot_hidden_states",
+            lambda runs, holdout, after, train, judged, one: ShootingResult(one, ()),
+        ),
         (engine, "clues_to", lambda *_: ((), ())),
         (held_out, "free_runs", lambda *_: (held_out.FreeRunErrors({}, {}, {}),) * 2),
     )

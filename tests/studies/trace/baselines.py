@@ -26,7 +26,7 @@ from analysis.terms import baseline_of
 from analysis.terms.base import Used
 from analysis.trace.clues.variables import variables
 from analysis.trace.data.candidates import catalogue, complexity, variants
-from analysis.trace.data.conditioned_record import conditioned_records, filtered, prepared
+from analysis.trace.data.conditioned_record import conditioned_records, filtered, prepared_signals
 from analysis.trace.data.regression_data import (
     RegressionData,
     VariantColumns,
@@ -35,9 +35,9 @@ from analysis.trace.data.regression_data import (
     variant_columns,
 )
 from analysis.trace.engine import trace
-from analysis.trace.judge.held_out import residual
+from analysis.trace.judge.held_out import held_out_residual
 from analysis.trace.result import CLEAN, EXPLAINED
-from analysis.trace.search.hypothesis import excess_of
+from analysis.trace.search.hypothesis import energy_above_noise
 from rig.model.records import Run
 from tests.studies.foreign.bench import runs_of
 from tests.studies.foreign.cases import NONE, Case, case_of
@@ -105,7 +105,7 @@ def answers(case: Case, train: Run, held_out: Sequence[Run]) -> list[MethodAnswe
     products, count = _sparse(fitted, judging)
     return [
         answer(TRACE, answer_of(case, found.verdict, set(names), set(found.tied)), names,
-               len(names), _share(*(_above(judging, residual(judging, rows))
+               len(names), _share(*(_above(judging, held_out_residual(judging, rows))
                              for rows in (found.rows_before, found.rows_after)))),
         answer(STEPWISE, answer_of(case, verdict, set(keys), set()), keys, len(keys),
                _taken_by_entries(fitted, judging, chosen)),
@@ -115,7 +115,7 @@ def answers(case: Case, train: Run, held_out: Sequence[Run]) -> list[MethodAnswe
 
 def stepwise(data: RegressionData) -> list[VariantColumns]:
     """Return the catalogue's entries that Schwarz's criterion lets join, in order of joining."""
-    r = data.mean
+    r = data.mean_residual
     looks = variants(data.rig, catalogue(data.rig), evidence(data, r))
     entries = variant_columns(data, looks)
     chosen: list[VariantColumns] = []
@@ -184,7 +184,8 @@ def _taken_by_entries(
     here = np.column_stack([_as_named(other, entry.names) for entry, other in pairs])
     basis = _basis(fitted, ())
     sizes = _least_squares(
-        there - basis @ (basis.T @ there), fitted.mean - basis @ (basis.T @ fitted.mean)
+        there - basis @ (basis.T @ there),
+        fitted.mean_residual - basis @ (basis.T @ fitted.mean_residual),
     )
     return _taken(fitted, there, judging, here, sizes)
 
@@ -206,13 +207,13 @@ def _taken(
     `there` are the columns on the training side, where the baseline's coefficients are fitted anew
     beside them, `here` those on the held-out side.
     """
-    base = np.zeros((len(judging.mean), len(fitted.names)))
+    base = np.zeros((len(judging.mean_residual), len(fitted.names)))
     for k, name in enumerate(fitted.names):
         if name in judging.names:
             base[:, k] = judging.base[:, judging.names.index(name)]
-    moved = _least_squares(fitted.base, fitted.mean - there @ sizes)
-    after = judging.mean - here @ sizes - base @ moved
-    return _share(_above(judging, judging.mean), _above(judging, after))
+    moved = _least_squares(fitted.base, fitted.mean_residual - there @ sizes)
+    after = judging.mean_residual - here @ sizes - base @ moved
+    return _share(_above(judging, judging.mean_residual), _above(judging, after))
 
 
 def _least_squares(columns: Array, y: Array) -> Array:
@@ -222,7 +223,7 @@ def _least_squares(columns: Array, y: Array) -> Array:
 
 
 def _above(data: RegressionData, left: Array) -> float:
-    return sum(max(0.0, value) for value in excess_of(data, left).values())
+    return sum(max(0.0, value) for value in energy_above_noise(data, left).values())
 
 
 def _share(before: float, after: float) -> float:
@@ -239,7 +240,7 @@ def _sparse(fitted: RegressionData, judging: RegressionData) -> tuple[float, int
     )
     basis = _basis(fitted, ())
     own = there - basis @ (basis.T @ there)
-    left = fitted.mean - basis @ (basis.T @ fitted.mean)
+    left = fitted.mean_residual - basis @ (basis.T @ fitted.mean_residual)
     seen = np.linalg.norm(own, axis=0) > 1e-3 * np.linalg.norm(there, axis=0)
     own, there, here = own[:, seen], there[:, seen], here[:, seen]
     method = STLSQ(threshold=PRICE**0.5, alpha=RIDGE, normalize_columns=True, max_iter=50)
@@ -260,7 +261,7 @@ def _largest(data: RegressionData) -> dict[int, dict[str, float]]:
     """Return the largest size of every joint's variables, so that products are of order one."""
     out: dict[int, dict[str, float]] = {}
     for conditioned in data.records:
-        seen = prepared(data.rig, data.terms, conditioned)
+        seen = prepared_signals(data.rig, data.terms, conditioned)
         for joint in range(len(data.rig.joints)):
             sizes = out.setdefault(joint, {})
             for name, v in variables(data.rig, seen, joint).items():
@@ -277,7 +278,7 @@ def _products(
     for s in data.segments:
         joint = int(s.equation.rsplit("_", 1)[1]) - 1
         conditioned = data.records[index[s.group]]
-        seen = prepared(data.rig, data.terms, conditioned)
+        seen = prepared_signals(data.rig, data.terms, conditioned)
         v = variables(data.rig, seen, joint)
         X = np.column_stack([v[name] / scales[joint][name] for name in v])
         raw = np.asarray(library.fit_transform(X))
@@ -285,7 +286,7 @@ def _products(
         found = filtered(named, conditioned, data.rows[index[s.group]][s.equation])
         columns = np.column_stack(list(found.values())) * np.sqrt(s.repeats) / s.noise
         blocks[s.equation].append((s.where, columns))
-    M = len(data.mean)
+    M = len(data.mean_residual)
     out = []
     for parts in blocks.values():
         block = np.zeros((M, parts[0][1].shape[1]))

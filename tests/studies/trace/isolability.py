@@ -31,7 +31,7 @@ from analysis.trace.data.regression_data import (
     regression_data,
     variant_columns,
 )
-from analysis.trace.next_experiment.discrimination import smallest
+from analysis.trace.next_experiment.discrimination import smallest_effect
 from analysis.trace.search.linear_fit import orthonormal
 from rig.model.records import Run
 from tests.studies.pages import Picture, Section, Table
@@ -79,7 +79,9 @@ def isolability(run: Run, joint: int = 2) -> Isolability:
     least = {e: found for e in here if (found := _least(data, e)) is not None}
     changes = {e: change for e, (change, _) in least.items()}
     grids: dict[Effect, list[Array]] = {e: [columns] for e, (_, columns) in least.items()}
-    for entry in variant_columns(data, variants(rig, list(changes), evidence(data, data.mean))):
+    for entry in variant_columns(
+        data, variants(rig, list(changes), evidence(data, data.mean_residual))
+    ):
         if entry.variant.effect in grids:
             grids[entry.variant.effect].append(entry.columns)
     base = orthonormal(data.base)
@@ -110,7 +112,7 @@ def _least(data: RegressionData, effect: Effect) -> tuple[Array, Array] | None:
 
     None where it has no such size, or does not show on these records.
     """
-    explanation = smallest(effect, data.rig)
+    explanation = smallest_effect(effect, data.rig)
     if explanation is None:
         return None
     (used,) = explanation.effects

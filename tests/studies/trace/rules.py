@@ -74,10 +74,10 @@ def _one_candidate(
     candidates: linear_fit.CandidateColumns, train_data: Any, residual: Array, rng: Any
 ) -> Array:
     """Return the gain of the candidate that stands first under each flip, of no other."""
-    r = inference.flipped(train_data, TRACE.sign_flips, rng, residual)
+    r = inference.sign_flipped(train_data, TRACE.sign_flips, rng, residual)
     r = r - candidates.basis @ (candidates.basis.T @ r)
     size = np.maximum(np.diag(candidates.K), 1e-300)
-    first = int(np.argmax(size > SEARCH.visible**2 * candidates.raw))
+    first = int(np.argmax(size > SEARCH.least_projected_length**2 * candidates.raw))
     gain: Array = (candidates.columns[:, first] @ r) ** 2 / size[first]
     return gain
 
@@ -126,7 +126,7 @@ RULES: Final = (
     Rule("no harm elsewhere", "an effect may increase the residual of another equation",
          (setting("harm_ratio", math.inf),)),
     Rule("physics", "any sign, size and shape passes",
-         ((HypothesisSet, "physical", lambda *_, **__: ""),)),
+         ((HypothesisSet, "physical_problem", lambda *_, **__: ""),)),
     Rule("invariance", "a size may differ between steps, halves, directions and speeds",
          ((gates, "invariance", lambda *_: []),)),
     Rule("family-wise p", "no significance test", (setting("p_limit", 1.0),)),
@@ -142,7 +142,7 @@ RULES: Final = (
          "a residual that a formula fits refuses effects of any equation",
          (setting("unexplained_share", math.inf),)),
     Rule("further search", "no further effect is searched for in single equations",
-         ((HypothesisSet, "closer", lambda *_: None),)),
+         ((HypothesisSet, "extended_in", lambda *_: None),)),
     Rule("price of parameters", "a further parameter costs nothing",
          ((SEARCH, "number_price", 0.0), (SEARCH, "simpler_ratio", 1.0),
           (SEARCH, "add_share", 0.0)),
@@ -156,9 +156,10 @@ RULES: Final = (
     Rule("second form", "an effect is tried in its first form only",
          ((Friction, "other_forms", lambda *_: ()),), refits=True),
     Rule("rests", "what stays while a joint rests speaks against its dry friction",
-         ((engine, "without_rests", lambda *given: given[-1]), (engine, "dry", lambda *_: set()))),
+         ((engine, "searched_in_motion", lambda *given: given[-1]),
+          (engine, "joints_with_friction", lambda *_: set()))),
     Rule("free forms", "no mechanism without a named form",
-         ((finding, "_drawn", lambda *_: None),)),
+         ((finding, "_try_free_forms", lambda *_: None),)),
 )  # fmt: skip
 
 FAULTS: Final = (
@@ -167,9 +168,9 @@ FAULTS: Final = (
     Rule("no family", "the null is one candidate's, not the largest of all",
          ((inference, "null_maximum", _one_candidate),)),
     Rule("flips by sample", "noise with a memory counts as many independent samples",
-         ((inference, "blocks", _single_rows),)),
+         ((inference, "flip_blocks", _single_rows),)),
     Rule("harm never seen", "no equation is said to get worse",
-         ((gates, "_worse", lambda *_: []),)),
+         ((gates, "_disturbed_equations", lambda *_: []),)),
     Rule("held-out floor x 2", "held-out errors of 3 times the floor pass",
          (setting("held_out_band", 3.0),)),
     Rule("form tolerance x 10", "half of what repeated may stay",
@@ -185,17 +186,17 @@ FAULTS: Final = (
     Rule("same records pass", "a held-out record may be a training record",
          ((engine, "_refuse_same", lambda *_: None),)),
     Rule("first repeat alone", "the average is the first repeat",
-         ((regression_data.RegressionData, "mean", property(_first_repeat)),), True),
+         ((regression_data.RegressionData, "mean_residual", property(_first_repeat)),), True),
     Rule("intervals x 0.5", "intervals are half as wide", ((gates, "half_width", _widths(0.5)),)),
     Rule("intervals x 3", "intervals are three times as wide",
          ((gates, "half_width", _widths(3.0)),)),
     Rule("tolerance x 10", "a size may differ twofold between parts",
          (setting("invariance_tolerance", 2.0),)),
     Rule("nothing is left", "whatever stays counts as nothing",
-         ((remaining, "left_over", lambda *_: []), (finding, "left_over", lambda *_: []),
-          (gates, "remaining_held_out", lambda *_: []))),
+         ((remaining, "remainders", lambda *_: []), (finding, "remainders", lambda *_: []),
+          (gates, "held_out_above_band", lambda *_: []))),
     Rule("judging rows unread", "nobody asks what the judging rows keep",
-         ((engine, "_kept", lambda *_: (set(), [])),)),
+         ((engine, "_judging_rows_above_band", lambda *_: (set(), [])),)),
 )  # fmt: skip
 
 

@@ -7,27 +7,27 @@ from dataclasses import replace
 import numpy as np
 
 from analysis.signals.conditioning import Array, Signals
-from analysis.trace.data.memory import Memory, Readings
+from analysis.trace.data.cache import Cache, SignalCache
 from rig.model.rig import Rig
 
 
 def test_what_is_asked_for_again_is_not_made_again() -> None:
-    memory, made = Memory(1e6), []
+    cache, made = Cache(1e6), []
     for _ in range(3):
-        memory.of("rows", lambda: made.append("rows") or {"torque_1": np.zeros(10)})
+        cache.get("rows", lambda: made.append("rows") or {"torque_1": np.zeros(10)})
     assert made == ["rows"]
 
 
 def test_the_oldest_goes_first() -> None:
-    memory, made = Memory(2.5 * 80), []
+    cache, made = Cache(2.5 * 80), []
 
     def asked(key: str) -> None:
-        memory.of(key, lambda: made.append(key) or np.zeros(10))
+        cache.get(key, lambda: made.append(key) or np.zeros(10))
 
     for key in "abacba":  # c pushes a out
         asked(key)
     assert made == ["a", "b", "c", "a"]
-    assert memory.used <= memory.most
+    assert cache.used <= cache.most
 
 
 def test_what_reads_no_changed_signal_is_not_made_again(rig: Rig) -> None:
@@ -37,7 +37,7 @@ def test_what_reads_no_changed_signal_is_not_made_again(rig: Rig) -> None:
     bench = {name: np.ones(n) for name in ("t", "p_s", "p_tank", "temperature")}
     marks = {"excited": np.ones(N, dtype=bool), "valid": np.ones((n, N), dtype=bool)}
     signals = Signals(rate=1e3, **arrays, **bench, **marks)
-    readings, made = Readings(), []
+    values, made = SignalCache(), []
 
     def rate(seen: Signals) -> Array:
         made.append("rate")
@@ -46,5 +46,5 @@ def test_what_reads_no_changed_signal_is_not_made_again(rig: Rig) -> None:
     for other in (
         signals, replace(signals, u=2.0 * signals.u), replace(signals, V_cap=2.0 * signals.V_cap)
     ):  # fmt: skip
-        assert np.array_equal(readings.of("rate", other, rate), other.V_cap * other.pd_cap)
+        assert np.array_equal(values.get("rate", other, rate), other.V_cap * other.pd_cap)
     assert made == ["rate", "rate"]
