@@ -22,6 +22,7 @@ from rig.cli.options import (
     ScaleOption,
     StepOption,
     WaveSeedOption,
+    writable_file,
 )
 from rig.cli.output import progress, table, write_json
 
@@ -294,7 +295,10 @@ def run(
         typer.Option(help="A command that gets JSON on its standard input: trip, failure, end."),
     ] = None,
     page: Annotated[
-        Path | None, typer.Option(help="Write the page of the night here when the queue ends.")
+        Path | None,
+        typer.Option(
+            help="Write the page of the night here when the queue ends.", callback=writable_file
+        ),
     ] = None,
     queue: QueueOption = None,
     json: JsonOption = None,
@@ -322,7 +326,10 @@ def run(
         if page is not None:
             from rig.cli.night import write_page
 
-            write_page(page, store, began)
+            try:
+                write_page(page, store, began)
+            except InputError as error:  # what the queue did, and its exit code, count more
+                progress(f"bramah: {error}")
     document = {
         "code": report.code,
         "reason": report.reason,
@@ -338,7 +345,9 @@ def run(
 
 
 def write_night_page(
-    out: Annotated[Path, typer.Option(help="The HTML file to write.")] = Path("night.html"),
+    out: Annotated[
+        Path, typer.Option(help="The HTML file to write.", callback=writable_file)
+    ] = Path("night.html"),
     since: Annotated[
         str | None, typer.Option(help="Only since 2026-03-01T22:00, or 12h ago.")
     ] = None,
