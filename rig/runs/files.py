@@ -78,10 +78,15 @@ def no_place_for(path: Path) -> str:
 
 def replace_text(path: Path, text: str) -> None:
     """Replace a file so that a reader sees the old or the new text, never half; raises OSError."""
+    replace_bytes(path, text.encode("utf-8"))
+
+
+def replace_bytes(path: Path, content: bytes) -> None:
+    """Replace a file so that a reader sees the old or the new one, never half; raises OSError."""
     fresh = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        with fresh.open("w", encoding="utf-8") as stream:
-            stream.write(text)
+        with fresh.open("wb") as stream:
+            stream.write(content)
             stream.flush()
             os.fsync(stream.fileno())
         fresh.replace(path)
