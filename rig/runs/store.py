@@ -38,6 +38,7 @@ from rig.runs.versions import versions
 T = TypeVar("T", Record, RecordHead)
 
 ARCHIVE = "records.h5"
+CRATE_METADATA = "ro-crate-metadata.json"  # in the copy of a run for an archive
 _OWN_FILES = (HEADER, ARCHIVE, JOURNAL, EVENTS, "state", "trip.csv")
 _FORMAT = 1
 _NOTE = "# How this run was taken. Numbers are SI: m, Pa, V, s, Hz, rad, degC.\n"
@@ -141,6 +142,11 @@ def whole_run(out: Path, rig: Rig, source: str) -> Iterator[Path]:
 def is_run(folder: Path) -> bool:
     """Whether a folder holds a run."""
     return (folder / HEADER).is_file()
+
+
+def is_crate(folder: Path) -> bool:
+    """Whether a folder holds the copy of a run that `bramah export --format ro-crate` makes."""
+    return (folder / CRATE_METADATA).is_file()
 
 
 def is_file_of_run(path: Path) -> bool:
