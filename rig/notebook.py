@@ -33,7 +33,7 @@ from rig.cli.protocol_run import ProtocolJob, run_protocol
 from rig.cli.simulated_bench import simulated_bench
 from rig.model.parse import InputError, first_problem
 from rig.model.records import Record, Run
-from rig.runs.files import replace_text
+from rig.runs.files import replace_bytes, replace_text
 from rig.runs.rigs import load_bench, load_rig
 from rig.runs.store import load_run
 
@@ -63,9 +63,14 @@ class Plot:
         return text.getvalue()
 
     def save(self, path: str | Path) -> Path:
-        """Write it as the format that the path's ending names; returns the path."""
-        self.figure.savefig(path)
-        return Path(path)
+        """Write it as the format that the path's ending names; returns the path.
+
+        An old file is replaced when the new one is complete. Raises OSError.
+        """
+        file, content = Path(path), io.BytesIO()
+        self.figure.savefig(content, format=file.suffix.removeprefix(".") or None)
+        replace_bytes(file, content.getvalue())
+        return file
 
 
 def record(run: Run, name: str) -> Record:

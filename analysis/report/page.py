@@ -27,6 +27,7 @@ def page(template: str, context: Mapping[str, Any]) -> str:
 def write(path: Path, text: str) -> None:
     """Write a page whole or not at all; raises InputError where it cannot be written."""
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         replace_text(path, text)
     except OSError as error:
         raise InputError(f"cannot write the report {path}: {error.strerror or error}") from error

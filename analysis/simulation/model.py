@@ -137,6 +137,7 @@ def model_json(model: Model) -> dict[str, Any]:
 def save_model(model: Model, path: str | Path) -> None:
     """Write the model file, replacing an old one only when the new one is complete."""
     text = json.dumps(model_json(model), indent=1, allow_nan=False)
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
     replace_text(Path(path), text + "\n")
 
 

@@ -7,13 +7,20 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.options import JsonOption, ModelOption, NominalOption, ProtocolArgument, RigOption
+from rig.cli.options import (
+    JsonOption,
+    ModelOption,
+    NominalOption,
+    ProtocolArgument,
+    RigOption,
+    writable_file,
+)
 
 
 def design(
     protocol: ProtocolArgument,
     rig: RigOption,
-    out: Annotated[Path, typer.Option(help="The protocol file to write.")],
+    out: Annotated[Path, typer.Option(help="The protocol file to write.", callback=writable_file)],
     criterion: Annotated[
         str, typer.Option(help="D, E, or the name of the parameter to improve.")
     ] = "E",

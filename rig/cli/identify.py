@@ -11,6 +11,7 @@ import typer
 from rig.cli.options import (
     JsonOption,
     RunsArgument,
+    writable_file,
 )
 from rig.cli.output import Countdown, progress, write_json
 
@@ -126,8 +127,12 @@ def identify(
         str, typer.Option(help="default, moving-average (the paper's) or butterworth.")
     ] = "default",
     json: JsonOption = None,
-    model: Annotated[Path | None, typer.Option(help="Write the model file here.")] = None,
-    report: Annotated[Path | None, typer.Option(help="Write an HTML report here.")] = None,
+    model: Annotated[
+        Path | None, typer.Option(help="Write the model file here.", callback=writable_file)
+    ] = None,
+    report: Annotated[
+        Path | None, typer.Option(help="Write an HTML report here.", callback=writable_file)
+    ] = None,
     truth: Annotated[
         Path | None, typer.Option(help="Compare with this file of `bramah sim --truth`.")
     ] = None,
@@ -171,6 +176,7 @@ def identify(
     if filtering not in FILTERINGS:
         raise InputError(f"--filtering {filtering}: expected one of: {' '.join(FILTERINGS)}")
     filters = FILTERINGS[filtering]
+    known = None if truth is None else read_truth(truth)
     if like is not None and effects:
         raise InputError("--like takes a model's terms as they are: leave --with away")
     if stream or cluster is not None:
@@ -199,13 +205,14 @@ def identify(
 
         result, document, consistent = make_physical(result)
         more += consistent
-    if model is not None:
-        save_identified(result.model, model, progress)
-    write_json(json, document)
-    if report is not None:
-        from rig.cli.reports import write_identification
+    try:
+        if model is not None:
+            save_identified(result.model, model, progress)
+        write_json(json, document)
+        if report is not None:
+            from rig.cli.reports import write_identification
 
-        write_identification(report, load_runs(runs), result)
-    if json != Path("-"):
-        known = None if truth is None else read_truth(truth)
-        typer.echo(identification_text(result, known) + more)
+            write_identification(report, load_runs(runs), result)
+    finally:  # a file that the disk does not take must not take the result with it
+        if json != Path("-"):
+            typer.echo(identification_text(result, known) + more)

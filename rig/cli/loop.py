@@ -10,7 +10,14 @@ from typing import Annotated, Any
 
 import typer
 
-from rig.cli.options import EndpointOption, JsonOption, RepeatsOption, RigOption, ScaleOption
+from rig.cli.options import (
+    EndpointOption,
+    JsonOption,
+    RepeatsOption,
+    RigOption,
+    ScaleOption,
+    writable_file,
+)
 from rig.cli.output import progress, write_json
 
 
@@ -42,7 +49,10 @@ def loop(
     ] = None,
     json: JsonOption = None,
     report: Annotated[
-        Path | None, typer.Option(help="The report of all rounds.  [default: OUT/loop.html]")
+        Path | None,
+        typer.Option(
+            help="The report of all rounds.  [default: OUT/loop.html]", callback=writable_file
+        ),
     ] = None,
     operator: Annotated[
         str | None, typer.Option(help="Written into the runs.  [default: you]")
@@ -105,13 +115,15 @@ def _show_result(experiments: Any, json: Path | None, report: Path) -> None:
     document = rounds_json(experiments.rounds, experiments.stopped)
     write_json(experiments.request.out / "loop.json", document)
     write_json(json, document)
-    if experiments.rounds:
-        report.parent.mkdir(parents=True, exist_ok=True)
+    if not experiments.rounds:
+        return
+    last = experiments.rounds[-1].result.model_after
+    try:
+        save_identified(last, experiments.request.out / "model.json", progress)
         write_loop(
             report, experiments.train, experiments.judge, experiments.rounds, experiments.stopped
         )
-        last = experiments.rounds[-1].result.model_after
-        save_identified(last, experiments.request.out / "model.json", progress)
+    finally:  # a file that the disk does not take must not take the result with it
         if json != Path("-"):
             typer.echo(rounds_text(experiments.rounds, experiments.stopped))
             typer.echo(f"report: {report}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
@@ -24,6 +24,38 @@ def _protocols(incomplete: str) -> list[str]:
     from protocols.files.library import shipped_names
 
     return [name for name in shipped_names() if name.startswith(incomplete)]
+
+
+_TAKEN: Final = "output files"  # key of a context's notes: file to option
+
+
+def writable_file(
+    context: typer.Context, param: typer.CallbackParam, path: Path | None
+) -> Path | None:
+    """Return the file that a verb shall write; raises InputError where it could not.
+
+    Called while the options are read: what is refused here has cost no computation.
+    """
+    if path is None or str(path) == "-":
+        return path
+    from rig.model.parse import InputError
+    from rig.runs.files import no_place_for
+    from rig.runs.store import is_file_of_run
+
+    option = f"{param.opts[0]} {path}"
+    if path.is_dir():
+        raise InputError(f"{option}: is a folder; expected the name of a file in it")
+    if path.exists() and not path.is_file():
+        raise InputError(f"{option}: is no regular file; expected the name of a file to write")
+    if is_file_of_run(path):
+        raise InputError(f"{option}: is part of the run {path.parent}; name another file")
+    if reason := no_place_for(path):
+        raise InputError(f"{option}: {reason}; name a file in a folder that can be written")
+    taken = context.meta.setdefault(_TAKEN, {})
+    other = taken.setdefault(path.absolute(), param.opts[0])
+    if other != param.opts[0]:
+        raise InputError(f"{option}: {other} writes that file as well; name two files")
+    return path
 
 
 RigOption = Annotated[
@@ -54,7 +86,11 @@ EndpointOption = Annotated[
 ]
 JsonOption = Annotated[
     Path | None,
-    typer.Option("--json", help="Write the machine-readable result here; - is standard output."),
+    typer.Option(
+        "--json",
+        help="Write the machine-readable result here; - is standard output.",
+        callback=writable_file,
+    ),
 ]
 ModelOption = Annotated[
     Path | None,

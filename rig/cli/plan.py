@@ -7,15 +7,20 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.options import JsonOption, RigOption
+from rig.cli.options import JsonOption, RigOption, writable_file
 from rig.cli.output import progress, write_json
 
 
 def plan(
     rig: RigOption,
-    out: Annotated[Path | None, typer.Option(help="Write the protocol file here.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Write the protocol file here.", callback=writable_file)
+    ] = None,
     validation: Annotated[
-        Path | None, typer.Option(help="Write a protocol of new data to validate on here.")
+        Path | None,
+        typer.Option(
+            help="Write a protocol of new data to validate on here.", callback=writable_file
+        ),
     ] = None,
     prove: Annotated[
         str | None, typer.Option(help="Prove this protocol (a name or a file) and generate none.")

@@ -22,6 +22,7 @@ from rig.cli.options import (
     ScaleOption,
     StepOption,
     WaveSeedOption,
+    writable_file,
 )
 from rig.cli.output import progress, table, write_json
 
@@ -131,7 +132,7 @@ def add(
     from protocols.files.library import shipped_names
     from rig.cli.queue_add import prove
     from rig.model.parse import InputError
-    from rig.queue.items import DONE, QueueJob, channel_condition, check_wanted, parse_time
+    from rig.queue.items import DONE, QueueJob, channel_condition, parse_time
     from rig.runs.rigs import shipped_rigs
     from rig.runs.store import refuse_occupied
 
@@ -145,8 +146,6 @@ def add(
     changed += ("--nominal",) if nominal else ()
     if wanted is not None and after is None:
         raise InputError("--if says what is wanted of an earlier item: name it with --after NUMBER")
-    if wanted is not None:
-        check_wanted(wanted)
     if when is not None:
         channel_condition(when)
     times = {
@@ -177,7 +176,7 @@ def add(
             **times,
         )
         if after is not None:
-            store.item(after)
+            _refuse_wanted(store.item(after), wanted or DONE)
         progress(f"checking {title} on the twin")
         item = store.add(job, priority, prove(job))
     seconds = item.proof.get("seconds")
@@ -185,6 +184,23 @@ def add(
     if item.proof.get("warning"):
         progress(f"WARNING: {item.proof['warning']}")
     _show(item, json, f"queued{length}; it will run into {item.job.out}")
+
+
+def _refuse_wanted(earlier: Item, wanted: str) -> None:
+    """Raise InputError where what is wanted of an earlier item can never be."""
+    from rig.model.parameters import parameter_names
+    from rig.model.parse import InputError
+    from rig.queue.items import ENDED, OVER, check_wanted
+    from rig.runs.rigs import load_bench
+
+    if wanted in (ENDED, *OVER):
+        return
+    check_wanted(wanted, parameter_names(len(load_bench(earlier.job.rig).joints)))
+    if not earlier.job.identify:
+        raise InputError(
+            f"--if {wanted!r}: item {earlier.id} was added with --no-identify, so that no "
+            "parameter is known after it; give --if a state, such as done"
+        )
 
 
 def _line(item: Item) -> tuple[str, ...]:
@@ -294,7 +310,10 @@ def run(
         typer.Option(help="A command that gets JSON on its standard input: trip, failure, end."),
     ] = None,
     page: Annotated[
-        Path | None, typer.Option(help="Write the page of the night here when the queue ends.")
+        Path | None,
+        typer.Option(
+            help="Write the page of the night here when the queue ends.", callback=writable_file
+        ),
     ] = None,
     queue: QueueOption = None,
     json: JsonOption = None,
@@ -322,7 +341,10 @@ def run(
         if page is not None:
             from rig.cli.night import write_page
 
-            write_page(page, store, began)
+            try:
+                write_page(page, store, began)
+            except InputError as error:  # what the queue did, and its exit code, count more
+                progress(f"bramah: {error}")
     document = {
         "code": report.code,
         "reason": report.reason,
@@ -338,7 +360,9 @@ def run(
 
 
 def write_night_page(
-    out: Annotated[Path, typer.Option(help="The HTML file to write.")] = Path("night.html"),
+    out: Annotated[
+        Path, typer.Option(help="The HTML file to write.", callback=writable_file)
+    ] = Path("night.html"),
     since: Annotated[
         str | None, typer.Option(help="Only since 2026-03-01T22:00, or 12h ago.")
     ] = None,

@@ -24,6 +24,14 @@ from rig.cli.options import (
 from rig.cli.output import progress
 
 
+def _above_zero(param: typer.CallbackParam, value: float) -> float:
+    if not value > 0.0:
+        from rig.model.parse import InputError
+
+        raise InputError(f"{param.opts[0]} {value:g}: expected more than 0 s")
+    return value
+
+
 def run(
     protocol: ProtocolArgument,
     rig: RigOption,
@@ -44,7 +52,8 @@ def run(
         bool, typer.Option("--track", help="Follow b and the flow gains while it runs.")
     ] = False,
     memory: Annotated[
-        float, typer.Option(help="Of --track: forget with this time constant [s].")
+        float,
+        typer.Option(help="Of --track: forget with this time constant [s].", callback=_above_zero),
     ] = float("inf"),
     attended: Annotated[
         bool | None,

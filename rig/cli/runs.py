@@ -46,7 +46,7 @@ def runs(
     from rig.model.parse import InputError
     from rig.runs.listing.index import indexed_runs
     from rig.runs.listing.index import rebuild as rebuild_index
-    from rig.runs.listing.summary import UNREADABLE
+    from rig.runs.listing.summary import UNREADABLE, crates
     from rig.runs.runstate import STATES
 
     for wanted in state or ():
@@ -66,6 +66,9 @@ def runs(
         and _named(entry.rig, rig)
         and _named(entry.protocol, protocol)
     ]
+    if copies := crates(folder):
+        names = " ".join(copy.name for copy in copies)
+        progress(f"not listed, copies of runs as RO-Crates: {names}")
     write_json(json, [{**asdict(entry), "path": str(entry.path)} for entry in selected])
     if json == Path("-"):
         return

@@ -7,9 +7,14 @@ from typing import Annotated
 
 import typer
 
+from rig.cli.options import writable_file
+
 
 def schema(
-    out: Annotated[Path | None, typer.Option(help="Write it here.  [default: stdout]")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Write it here.  [default: stdout]", callback=writable_file),
+    ] = None,
 ) -> None:
     """Print the JSON schema of protocol files, with which editors complete and check them.
 

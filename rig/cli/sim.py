@@ -10,6 +10,7 @@ import typer
 
 from rig.cli.options import (
     RigOption,
+    writable_file,
 )
 
 
@@ -39,7 +40,10 @@ def sim(
     ] = False,
     truth: Annotated[
         Path | None,
-        typer.Option(help="Write true parameters and what is hidden to this JSON file."),
+        typer.Option(
+            help="Write true parameters and what is hidden to this JSON file.",
+            callback=writable_file,
+        ),
     ] = None,
     parent: Annotated[int | None, typer.Option(hidden=True)] = None,
 ) -> None:

@@ -7,7 +7,7 @@ from typing import Annotated, Final
 
 import typer
 
-from rig.cli.options import JsonOption
+from rig.cli.options import JsonOption, writable_file
 from rig.cli.output import Countdown, progress, write_json
 
 FAMILIES_OF: Final = {
@@ -29,13 +29,16 @@ def trace(
     ] = None,
     json: JsonOption = None,
     model: Annotated[
-        Path | None, typer.Option(help="Write the model file with the effects here.")
+        Path | None,
+        typer.Option(help="Write the model file with the effects here.", callback=writable_file),
     ] = None,
     like: Annotated[
         Path | None,
         typer.Option(help="Start from this model file, its effects taken as known."),
     ] = None,
-    report: Annotated[Path | None, typer.Option(help="Write an HTML report here.")] = None,
+    report: Annotated[
+        Path | None, typer.Option(help="Write an HTML report here.", callback=writable_file)
+    ] = None,
     equations: Annotated[
         str, typer.Option(help="Equations to trace: all, torque or flow.")
     ] = "all",
@@ -72,12 +75,14 @@ def trace(
         loaded, chosen_by, seed=seed, families=FAMILIES_OF[equations], terms=known,
         progress=Countdown("tracing"), judge=judged_by,
     )  # fmt: skip
-    write_json(json, to_json(result))
-    if model is not None:
-        save_identified(result.model_after, model, progress)
-    if report is not None:
-        from rig.cli.reports import write_trace
+    try:
+        write_json(json, to_json(result))
+        if model is not None:
+            save_identified(result.model_after, model, progress)
+        if report is not None:
+            from rig.cli.reports import write_trace
 
-        write_trace(report, unseen, result)
-    if json != Path("-"):
-        typer.echo(trace_text(result))
+            write_trace(report, unseen, result)
+    finally:  # a file that the disk does not take must not take the result with it
+        if json != Path("-"):
+            typer.echo(trace_text(result))

@@ -31,6 +31,8 @@ def validate(
 
     refuse_repeated(runs)
     results = validate_model(load_model(model), [load_run(folder) for folder in runs])
-    write_json(json, to_json(results))
-    if json != Path("-"):
-        typer.echo(validation_text(results))
+    try:
+        write_json(json, to_json(results))
+    finally:  # a file that the disk does not take must not take the result with it
+        if json != Path("-"):
+            typer.echo(validation_text(results))

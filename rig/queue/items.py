@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import operator
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from datetime import UTC, datetime
 from typing import Any, Final
@@ -112,13 +112,21 @@ def result_condition(text: str) -> StartCondition:
     return StartCondition(text, parts["name"], part, parts["sign"], scale * float(parts["number"]))
 
 
-def check_wanted(text: str) -> None:
-    """Raise InputError unless `text` is a final state, ``ended``, or a result's condition."""
+def check_wanted(text: str, known: Collection[str]) -> None:
+    """Raise InputError unless `text` is a final state, ``ended``, or a result's condition.
+
+    `known` are the names of the parameters that are identified from the item waited for.
+    """
     if text == ENDED or text in OVER:
         return
     if re.fullmatch(r"[a-z ]+", text):
         raise InputError(f"--if {text!r}: expected one of: {', '.join((ENDED, *OVER))}")
-    result_condition(text)
+    name = result_condition(text).name
+    if name not in known:
+        raise InputError(
+            f"--if {text!r}: {name!r} is no parameter of that item's rig; expected one of: "
+            f"{' '.join(known)}"
+        )
 
 
 def parse_time(text: str, now: datetime, option: str) -> datetime:

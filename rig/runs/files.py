@@ -60,12 +60,33 @@ def sync_to_disk(path: Path) -> None:
         os.close(handle)
 
 
+def no_place_for(path: Path) -> str:
+    """Say why no file or folder of this name can be made, '' where it can; makes nothing.
+
+    Folders above it that are missing can be made where the last one that exists may be written.
+    """
+    try:
+        above = path.absolute().parent
+        while not above.exists() and not above.is_symlink():
+            above = above.parent
+        if not above.is_dir():
+            return f"{above} is no folder"
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the path
+        return getattr(error, "strerror", None) or str(error)
+    return "" if os.access(above, os.W_OK | os.X_OK) else f"the folder {above} cannot be written"
+
+
 def replace_text(path: Path, text: str) -> None:
     """Replace a file so that a reader sees the old or the new text, never half; raises OSError."""
+    replace_bytes(path, text.encode("utf-8"))
+
+
+def replace_bytes(path: Path, content: bytes) -> None:
+    """Replace a file so that a reader sees the old or the new one, never half; raises OSError."""
     fresh = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        with fresh.open("w", encoding="utf-8") as stream:
-            stream.write(text)
+        with fresh.open("wb") as stream:
+            stream.write(content)
             stream.flush()
             os.fsync(stream.fileno())
         fresh.replace(path)

@@ -17,9 +17,10 @@ from rig.model.parse import InputError, first_problem, load_yaml
 from rig.model.records import Record, RecordHead, Run
 from rig.model.rig import Rig
 from rig.model.trips import RecordingFailed
-from rig.runs.files import new_folder, read_text, replace_text
+from rig.runs.files import new_folder, no_place_for, read_text, replace_text
 from rig.runs.runstate import (
     DONE,
+    EVENTS,
     HEADER,
     INTERRUPTED,
     JOURNAL,
@@ -37,6 +38,8 @@ from rig.runs.versions import versions
 T = TypeVar("T", Record, RecordHead)
 
 ARCHIVE = "records.h5"
+CRATE_METADATA = "ro-crate-metadata.json"  # in the copy of a run for an archive
+_OWN_FILES = (HEADER, ARCHIVE, JOURNAL, EVENTS, "state", "trip.csv")
 _FORMAT = 1
 _NOTE = "# How this run was taken. Numbers are SI: m, Pa, V, s, Hz, rad, degC.\n"
 
@@ -64,6 +67,8 @@ def refuse_occupied(folder: Path) -> None:
     """Raise InputError unless `folder` is new or an empty folder."""
     try:
         if not folder.exists() and not folder.is_symlink():
+            if reason := no_place_for(folder):
+                raise InputError(f"{folder}: {reason}; name another folder for the run")
             return
         if not folder.is_dir():
             raise InputError(f"{folder}: is not a folder; name a new folder for the run")
@@ -137,6 +142,16 @@ def whole_run(out: Path, rig: Rig, source: str) -> Iterator[Path]:
 def is_run(folder: Path) -> bool:
     """Whether a folder holds a run."""
     return (folder / HEADER).is_file()
+
+
+def is_crate(folder: Path) -> bool:
+    """Whether a folder holds the copy of a run that `bramah export --format ro-crate` makes."""
+    return (folder / CRATE_METADATA).is_file()
+
+
+def is_file_of_run(path: Path) -> bool:
+    """Whether a file holds what a run has recorded or how it was taken."""
+    return path.name in _OWN_FILES and is_run(path.parent)
 
 
 def read_header(folder: Path) -> Header:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import resource
 from pathlib import Path
 from typing import Any
 
@@ -115,6 +116,23 @@ def test_a_record_or_channel_that_is_not_there_is_named() -> None:
         notebook.plot(run, "s_r1", ["piston_9"])
     assert notebook.units(run) == {"piston_1": "m"}
     assert notebook.plot(run, "s_r1")._repr_svg_().lstrip().startswith("<?xml")
+
+
+def test_a_plot_that_the_disk_does_not_take_leaves_the_one_before(tmp_path: Path) -> None:
+    one = Record("s_r1", "s", (1,), 1, 1000.0, {"piston_1": np.zeros(10)})
+    drawn = notebook.plot(Run(load_rig("shinshu-2dof"), (one,), "somewhere"), "s_r1")
+    saved = drawn.save(tmp_path / "stroke.svg")
+    before = saved.read_bytes()
+    assert before.rstrip().endswith(b"</svg>")
+    allowed = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) // 2, allowed[1]))
+    try:
+        with pytest.raises(OSError, match="too large"):
+            drawn.save(saved)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, allowed)
+    assert saved.read_bytes() == before
+    assert [path.name for path in tmp_path.iterdir()] == ["stroke.svg"]
 
 
 def test_the_page_names_every_function() -> None:

@@ -29,6 +29,9 @@ def test_a_night_on_a_bench_from_add_to_its_page(tmp_path: Path) -> None:
         assert "not queued: step 'step1', joint 2: the command reaches 7.2 V" in error
         for words in (("--if", "done"), ("--after", 7), ("--when", "oil > 3 degC")):
             assert add(*words)[0] == 2
+        code, _, error = add("--after", 1, "--if", "C_pp2.rsd < 20 %")
+        assert code == 2
+        assert "'C_pp2' is no parameter of that item's rig; expected one of: M1 M2" in error
         code, _, error = add("--after", 1, "--if", "C_pp_2.rsd < 20 %", "--", "--repeats", 1)
         assert code == 0, error
 

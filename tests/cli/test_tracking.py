@@ -200,6 +200,16 @@ def test_a_run_is_tracked_to_what_identify_finds(tmp_path: Path) -> None:
     assert "--memory 0: expected more than 0 s" in wrong.stderr
 
 
+@pytest.mark.parametrize("memory", ["0", "-1", "nan", "-inf"])
+def test_a_memory_that_cannot_be_is_refused_before_anything_is_read(memory: str) -> None:
+    done = bramah_here(
+        "run", "no-protocol", "--rig", "no-rig", "--out", "x", "--track", "--memory", memory
+    )
+    assert done.returncode == 2
+    assert "--memory" in done.stderr
+    assert "no-rig" not in done.stderr
+
+
 def test_one_line_says_what_is_known() -> None:
     known = {"value": 233.4e6, "ci95": [232.4e6, 234.4e6]}
     unknown = {"value": None, "ci95": [None, None]}

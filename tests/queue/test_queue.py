@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rig.model.parameters import parameter_names
 from rig.model.parse import InputError
 from rig.queue.items import channel_condition, check_wanted, parse_time, result_condition
 from rig.queue.processes import reason_in
@@ -276,7 +277,13 @@ def test_a_condition_of_no_channel_or_unit_is_refused(text: str) -> None:
 @pytest.mark.parametrize("text", ["finished", "b.rsd", "b < 2 m", "M1 > x", "b.rsd < 1 mm"])
 def test_a_wanted_result_that_none_can_be_is_refused(text: str) -> None:
     with pytest.raises(InputError, match="--if"):
-        check_wanted(text)
+        check_wanted(text, parameter_names(2))
+
+
+def test_a_parameter_that_is_misspelt_is_refused_with_those_that_there_are() -> None:
+    check_wanted("C_pp_1.rsd < 5 %", parameter_names(2))
+    with pytest.raises(InputError, match=r"'B' is no parameter .* expected one of: M1 M2 R12 .* b"):
+        check_wanted("B.rsd < 0.5 %", parameter_names(2))
 
 
 @given(st.floats(-300, 300), st.sampled_from(["<", "<=", ">", ">="]))

@@ -19,6 +19,7 @@ from rig.model.rig import Rig
 from rig.runs.recorder import Recorder
 from rig.runs.recover import recover
 from rig.runs.store import load_run
+from tests.cli.bench import bramah_here
 from tests.services.children import RIG, finish
 from tests.services.fake_driver import FakeDriver
 
@@ -114,6 +115,18 @@ def test_the_crate_s_records_are_those_of_the_run(run: Path) -> None:
     first, again = load_run(run).records[0], load_run(folder).records[0]
     for name, values in first.channels.items():
         assert (values == again.channels[name]).all()
+
+
+def test_a_crate_beside_its_run_is_not_counted_as_another_run(run: Path) -> None:
+    before = bramah_here("runs", run.parent, "--json", "-")
+    names = [Path(entry["path"]).name for entry in json.loads(before.stdout)]
+    export(run, "--out", str(run.parent / "for-the-archive"))
+    after = bramah_here("runs", run.parent, "--json", "-")
+    assert [Path(entry["path"]).name for entry in json.loads(after.stdout)] == names
+    assert "copies of runs as RO-Crates:" in after.stderr
+    assert "for-the-archive" in after.stderr
+    itself = bramah_here("runs", run.parent / "for-the-archive")
+    assert "for-the-archive  done" in itself.stdout
 
 
 def test_a_killed_and_recovered_run_says_so_in_its_crate(tmp_path: Path) -> None:

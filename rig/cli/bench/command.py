@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.options import JsonOption
+from rig.cli.options import JsonOption, writable_file
 from rig.cli.output import progress, write_json
 
 
@@ -29,7 +29,9 @@ def bench(
     quick: Annotated[
         bool, typer.Option("--quick", help="Of the screen: 10 stops by key instead of 200.")
     ] = False,
-    docs: Annotated[Path | None, typer.Option(help="Also write the table as a page.")] = None,
+    docs: Annotated[
+        Path | None, typer.Option(help="Also write the table as a page.", callback=writable_file)
+    ] = None,
 ) -> None:
     """Measure this machine: plant, identification, ten unseen benches, acquisition.
 
@@ -39,8 +41,11 @@ def bench(
     from rig.runs.files import replace_text
 
     figures = measure(minutes, seeds, only, progress, quick=quick)
-    write_json(json, as_json(figures))
-    if docs is not None:
-        replace_text(docs, page(figures))
-    if json != Path("-"):
-        typer.echo(text(figures))
+    try:
+        write_json(json, as_json(figures))
+        if docs is not None:
+            docs.parent.mkdir(parents=True, exist_ok=True)
+            replace_text(docs, page(figures))
+    finally:  # a file that the disk does not take must not take the result with it
+        if json != Path("-"):
+            typer.echo(text(figures))

@@ -18,10 +18,9 @@ from rig.model.parse import InputError
 from rig.runs import store
 from rig.runs.files import new_folder
 from rig.runs.runstate import ABORTED, DONE, EVENTS, HEADER, read_events
-from rig.runs.store import ARCHIVE, Header
+from rig.runs.store import ARCHIVE, CRATE_METADATA, Header
 from rig.runs.stream import RunHead, read_run_head
 
-METADATA: Final = "ro-crate-metadata.json"
 CONTEXT: Final = "https://w3id.org/ro/crate/1.1/context"
 CRATE: Final = "https://w3id.org/ro/crate/1.1"
 PROFILE: Final = "https://w3id.org/ro/wfrun/process/0.5"
@@ -60,10 +59,10 @@ def export_crate(run: Path, out: Path, licence: str = "") -> list[Path]:
             for name in names:
                 shutil.copyfile(run / name, folder / name)
             text = json.dumps(describe(folder, head, header, names, licence), indent=2) + "\n"
-            (folder / METADATA).write_text(text, encoding="utf-8")
+            (folder / CRATE_METADATA).write_text(text, encoding="utf-8")
     except OSError as error:
         raise InputError(f"{out}: the crate cannot be written: {error.strerror}") from error
-    return [out / name for name in (*names, METADATA)]
+    return [out / name for name in (*names, CRATE_METADATA)]
 
 
 def describe(
@@ -89,7 +88,7 @@ def describe(
     }
     graph: list[Entity] = [
         {
-            "@id": METADATA,
+            "@id": CRATE_METADATA,
             "@type": "CreativeWork",
             "conformsTo": _ref(CRATE),
             "about": _ref("./"),

@@ -11,7 +11,7 @@ from typing import Any, Final
 from rig.model.parse import InputError
 from rig.runs.runstate import INTERRUPTED, JOURNAL, RUNNING, read_events, read_state
 from rig.runs.sections import Written
-from rig.runs.store import ARCHIVE, is_run, read_header
+from rig.runs.store import ARCHIVE, is_crate, is_run, read_header
 
 UNREADABLE: Final = "unreadable"
 _UNKNOWN = Written(-1, 0, -1, 0, 0, -1)
@@ -123,15 +123,26 @@ def _count_journal(path: Path) -> Written:
 
 
 def run_folders(folder: str | Path) -> list[Path]:
-    """Return the run folders in a folder, or itself if it is one; raises InputError."""
+    """Return the run folders in a folder, or itself if it is one; raises InputError.
+
+    The copy of a run as an RO-Crate is not listed beside other runs: it would count twice.
+    """
     root = Path(folder)
     if not root.is_dir():
         raise InputError(f"{root}: no such folder")
     try:
         # A hidden folder is an export whose process was killed.
-        return [root] if is_run(root) else [c for c in root.glob("[!.]*") if is_run(c)]
+        if is_run(root):
+            return [root]
+        return [c for c in root.glob("[!.]*") if is_run(c) and not is_crate(c)]
     except OSError as error:
         raise InputError(f"{root}: cannot be read: {error.strerror}") from error
+
+
+def crates(folder: str | Path) -> list[Path]:
+    """Return the RO-Crates in a folder of runs, none where the folder itself is a run."""
+    root = Path(folder)
+    return [] if is_run(root) else sorted(c for c in root.glob("[!.]*") if is_crate(c))
 
 
 def in_order(summaries: list[RunSummary]) -> list[RunSummary]:
