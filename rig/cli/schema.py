@@ -9,9 +9,11 @@ import typer
 
 
 def schema(
-    out: Annotated[Path | None, typer.Option(help="Write it here.  [default: stdout]")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Write the schema here.  [default: stdout]")
+    ] = None,
 ) -> None:
-    """Print the JSON schema of protocol files, with which editors complete and check them.
+    """Print the JSON schema of protocol files, for completion and checks in editors.
 
     Example: bramah schema --out protocol.schema.json
     """
